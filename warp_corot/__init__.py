@@ -1,0 +1,1 @@
+"""Corotational finite elements for soft tissue in NVIDIA Warp."""
