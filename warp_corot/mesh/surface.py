@@ -37,8 +37,9 @@ def boundary_faces(tets: ArrayLike, points: ArrayLike | None = None) -> tuple[ND
             det(x1−x0, x2−x0, x3−x0) > 0.
 
     Returns:
-        ``faces`` int32 [F, 3], in the order of the tetrahedra they come from, and ``parents`` int32 [F], the tetrahedron
-        of each. A face shared by three or more tetrahedra (they overlap) is no boundary; a warning counts such faces.
+        ``faces`` int32 [F, 3], in the order of the tetrahedra they come from, and ``parents`` int32 [F], the
+        tetrahedron of each. A face shared by three or more tetrahedra (they overlap) is no boundary; a warning counts
+        such faces.
     """
     t = np.ascontiguousarray(tets, dtype=np.int32).reshape(-1, 4)
     if len(t) == 0:
@@ -69,11 +70,8 @@ def _sort_faces(corners: NDArray[np.int32]) -> tuple[NDArray[np.intp], NDArray[n
     high = corners.max(axis=1).astype(np.uint64)
     middle = corners.astype(np.int64).sum(axis=1).astype(np.uint64) - low - high
     count = int(high.max()) + 1
-    keys = (low * np.uint64(count) + middle,)
-    if count**3 < 2**64:
-        keys = (keys[0] * np.uint64(count) + high,)
-    else:
-        keys = (high, *keys)
+    pair = low * np.uint64(count) + middle
+    keys = (pair * np.uint64(count) + high,) if count**3 < 2**64 else (high, pair)
     order = np.argsort(keys[0], kind="stable") if len(keys) == 1 else np.lexsort(keys)
     first = np.zeros(len(order), bool)
     first[0] = True

@@ -1,0 +1,86 @@
+"""Meshes that come with Warp's wheel, each with a scale and a material under which it moves well."""
+
+import importlib.util
+from dataclasses import dataclass
+from pathlib import Path
+
+from warp_corot.errors import InputError
+
+
+@dataclass(frozen=True)
+class Asset:
+    """A mesh at hand, and defaults for it.
+
+    Attributes:
+        name: Short name, after ``warp:``.
+        file: Path below Warp's package folder.
+        scale: Factor on the file's coordinates.
+        young: Young's modulus [Pa].
+        poisson: Poisson's ratio.
+        density: Mass density [kg/m³].
+        fix: Expression in scaled rest coordinates [m] for the nodes that are held.
+        damping: Mass-proportional damping [1/s].
+        duration: Simulated time [s] after which it is about at rest.
+        note: Why these numbers.
+    """
+
+    name: str
+    file: str
+    scale: float
+    young: float
+    poisson: float
+    density: float
+    fix: str
+    damping: float
+    duration: float
+    note: str
+
+    @property
+    def path(self) -> Path:
+        """Where the file is.
+
+        Raises:
+            InputError: Warp is not installed, or without its examples.
+        """
+        spec = importlib.util.find_spec("warp")
+        folders = list(spec.submodule_search_locations or ()) if spec else []
+        for folder in folders:
+            candidate = Path(folder) / self.file
+            if candidate.is_file():
+                return candidate
+        raise InputError(f"warp:{self.name}: {self.file} is not in the installed Warp package")
+
+
+ASSETS: dict[str, Asset] = {
+    asset.name: asset
+    for asset in [
+        Asset(
+            name="bear",
+            file="examples/assets/bear.usd",
+            scale=0.1,
+            young=1.0e5,
+            poisson=0.45,
+            density=1000.0,
+            fix="y < 0.01",
+            damping=1.0,
+            duration=5.0,
+            note="a soft-toy bear of 55 cm, about as heavy and as soft as soft silicone rubber; "
+            "it sags by about a tenth of its height",
+        ),
+    ]
+}
+
+
+def find_asset(name: str | Path) -> Asset | None:
+    """The asset that ``warp:NAME`` names, or None for a name without ``warp:``.
+
+    Raises:
+        InputError: ``warp:`` and no such asset.
+    """
+    prefix, colon, rest = str(name).partition(":")
+    if prefix != "warp" or not colon:
+        return None
+    if rest not in ASSETS:
+        known = ", ".join(f"warp:{known}" for known in ASSETS)
+        raise InputError(f"warp:{rest}: no such asset, should be {known}")
+    return ASSETS[rest]
