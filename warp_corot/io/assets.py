@@ -2,6 +2,7 @@
 
 import importlib.util
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 
 from warp_corot.errors import InputError
@@ -71,7 +72,7 @@ ASSETS: dict[str, Asset] = {
 }
 
 
-def find_asset(name: str | Path) -> Asset | None:
+def find_asset(name: str | PathLike[str]) -> Asset | None:
     """The asset that ``warp:NAME`` names, or None for a name without ``warp:``.
 
     Raises:

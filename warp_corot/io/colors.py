@@ -22,8 +22,8 @@ def stress_colors(count: int = 256) -> NDArray[np.float64]:
 
 
 def color_index(values: ArrayLike, lowest: float, highest: float, count: int = 256) -> NDArray[np.int32]:
-    """Rows of a table of ``count`` colours: ``lowest`` → 0, ``highest`` → the last, clamped; not a number → the last."""
-    scaled = (np.asarray(values, dtype=np.float32) - lowest) * (1.0 / max(highest - lowest, 1e-30))
+    """Rows of a table of ``count`` colours: ``lowest`` → 0, ``highest`` → last, clamped; not a number → last."""
+    scaled = (np.asarray(values, dtype=np.float64) - lowest) * (1.0 / max(highest - lowest, 1e-30))
     scaled = np.where(np.isfinite(scaled), scaled, 1.0)
     return np.rint(np.clip(scaled, 0.0, 1.0) * (count - 1)).astype(np.int32)
 
@@ -34,12 +34,15 @@ def srgb_to_linear(color: ArrayLike) -> NDArray[np.float64]:
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
 
 
+_ROUND_STEPS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+
+
 def round_limit(value: float) -> float:
-    """The smallest of 1, 2, 5 × 10ᵏ that is at least ``value``; 0 for 0, negative and not-finite values."""
+    """The smallest of 1, 1.5, 2, 3, 4, 5, 6, 8 × 10ᵏ not below ``value``; 0 unless that is positive and finite."""
     if not np.isfinite(value) or value <= 0.0:
         return 0.0
     power = 10.0 ** np.floor(np.log10(value))
-    return float(next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= value * (1.0 - 1e-9)))
+    return float(next(step * power for step in _ROUND_STEPS if step * power >= value * (1.0 - 1e-9)))
 
 
 class VertexAverage:

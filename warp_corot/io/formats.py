@@ -3,9 +3,10 @@
 import contextlib
 import io
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,7 @@ class LoadedMesh:
     source: Path
 
 
-def load_tets(path: str | Path, scale: float = 1.0) -> LoadedMesh:
+def load_tets(path: str | PathLike[str], scale: float = 1.0) -> LoadedMesh:
     """Loads the tetrahedra of a file, in metres.
 
     USD stages are read with OpenUSD (unit, up axis and world transforms applied, several prims joined); other files
@@ -89,16 +90,13 @@ def load_tets(path: str | Path, scale: float = 1.0) -> LoadedMesh:
     return LoadedMesh(points, tets.astype(np.int32), up_axis, metres, asset.name if asset else source.stem, source)
 
 
-Reader = Callable[[Path], tuple[NDArray[np.float64], NDArray[np.int32], str, float]]
-
-
-def _read_usd(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], str, float]:
+def _read_usd(path: Path) -> tuple[NDArray[np.float64], NDArray[Any], str, float]:
     from warp_corot.io.usd_reader import read_usd_tets
 
     return read_usd_tets(path)
 
 
-def _read_meshio(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], str, float]:
+def _read_meshio(path: Path) -> tuple[NDArray[np.float64], NDArray[Any], str, float]:
     try:
         import meshio
     except ImportError:

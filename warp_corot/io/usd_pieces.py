@@ -1,0 +1,375 @@
+"""A growing USD animation on disk that opens at every moment, whatever ends the process that writes it.
+
+A USD file saved again and again in place does not open when the process dies while saving. So frames are collected and
+written aside as *pieces*, complete binary files in a folder ``NAME.usd.pieces`` beside the stage, each written under a
+temporary name, synced to disk and renamed. After each piece a small root stage that plays all of them (value clips)
+replaces the file at the final path in one rename. At the end everything is joined into one file, again written aside
+and renamed over the final path, and the pieces are removed.
+"""
+
+import contextlib
+import os
+import re
+import tempfile
+import time
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import IO, Any
+
+from pxr import Sdf, Tf, Vt
+
+from warp_corot.errors import InputError
+
+try:
+    import fcntl
+except ImportError:  # Windows: two runs on one output are not told apart there
+    fcntl = None  # type: ignore[assignment]
+
+STAGE_SUFFIXES = (".usd", ".usda", ".usdc")
+_OURS = re.compile(r"((piece|part)-\d{6}\.usdc|(part-)?(static|manifest|root|joined)\.usd[ac]?|lock)")
+_CLIP_SET = "default"
+
+Samples = dict[str, Any]
+"""Values of one frame: attribute path → value."""
+
+
+class PieceStore:
+    """Keeps the frames of one stage: `add` each, then `finish`.
+
+    Args:
+        path: The stage, .usd, .usda or .usdc. A file there stays as it is until the first piece is complete.
+        flush_seconds: About the most wall time [s] of frames that a sudden end may lose. Doubled and more where
+            writing is so slow that it would take more than a fifth of the time.
+        flush_bytes: A piece is also written when this much data waits.
+
+    Raises:
+        InputError: Another extension, a folder in the way, an output folder that is not there or not writable,
+            a write-protected file, or another process that is writing this very stage.
+    """
+
+    def __init__(self, path: str | Path, *, flush_seconds: float = 2.0, flush_bytes: int = 256 << 20):
+        self.path = Path(path)
+        _check_output(self.path)
+        self.pieces_folder = self.path.with_name(self.path.name + ".pieces")
+        self._run = self.pieces_folder / f"run-{uuid.uuid4().hex[:8]}"
+        self._lock: IO[str] | None = None
+        self._refuse_second_writer(InputError)
+
+        self.custom_data: dict[str, Any] = {}
+        """Custom data of the default prim as of the last frame added."""
+        self._static: Sdf.Layer | None = None
+        self._varying: dict[str, Sdf.ValueTypeName] = {}
+        self._root: Sdf.Layer | None = None
+        self._pieces: list[tuple[float, float]] = []  # first and last time code of each
+        self._pending: list[tuple[float, Samples]] = []
+        self._pending_bytes = 0
+        self._flush_seconds = flush_seconds
+        self._flush_bytes = flush_bytes
+        self._flush_cost = 0.0
+        self._last_flush = self._last_add = time.monotonic()
+        self._broken = False
+
+    def declare(self, static: Sdf.Layer) -> None:
+        """Takes the layer with all that does not change; its attributes without a value are the ones that frames give.
+
+        Its stage metadata (units, axis, frame rate) become those of the stage; it must name a default prim.
+        """
+        self._static = static
+
+        def visit(path: Sdf.Path) -> None:
+            spec = static.GetAttributeAtPath(path) if path.IsPropertyPath() else None
+            if spec and not spec.HasInfo("default") and not spec.HasInfo("connectionPaths"):
+                self._varying[str(path)] = spec.typeName
+
+        static.Traverse(Sdf.Path.absoluteRootPath, visit)
+
+    def add(self, time_code: float, samples: Samples, nbytes: int) -> None:
+        """Takes the values of one frame, ``nbytes`` of them, and writes a piece when it is time to.
+
+        Raises:
+            OSError: Could not be written, as when the disk is full; what was written before stays and plays.
+        """
+        if self._broken:
+            raise OSError(f"{self.path}: could not be written further, see the error before")
+        unknown = samples.keys() - self._varying.keys()
+        assert not unknown, f"not declared as varying: {unknown}"
+        self._pending.append((time_code, samples))
+        self._pending_bytes += nbytes
+        now = time.monotonic()
+        gap, self._last_add = now - self._last_add, now
+        interval = max(self._flush_seconds, 4.0 * self._flush_cost)
+        # The next frame comes after another such gap: waiting for it must not outlast the interval.
+        if now - self._last_flush + gap >= interval or self._pending_bytes >= self._flush_bytes:
+            self.flush()
+
+    def flush(self) -> None:
+        """Writes the frames that wait as a piece and lets the stage play it.
+
+        Raises:
+            OSError: as `add`.
+        """
+        if not self._pending:
+            return
+        started = time.monotonic()
+        try:
+            if not self._pieces:
+                self._open_run()
+            name = f"piece-{len(self._pieces):06d}.usdc"
+            self._write(self._piece_layer(), self._run / name)
+            first, last = self._pending[0][0], self._pending[-1][0]
+            root = self._root_layer([*self._pieces, (first, last)])
+            self._write(root, self.path)
+        except OSError as error:
+            self._broken = True
+            if not self._pieces:
+                self._remove_run(self._run)
+            raise OSError(f"{error}; {self._kept()}") from None
+        self._pieces.append((first, last))
+        self._pending, self._pending_bytes = [], 0
+        if len(self._pieces) == 1:
+            self._remove_stale_runs()
+        self._last_flush = time.monotonic()
+        self._flush_cost = self._last_flush - started
+
+    def finish(self, transform: Callable[[Samples], Mapping[str, Any]] | None = None) -> None:
+        """Joins all frames into one file at the final path and removes the pieces.
+
+        Args:
+            transform: Called with the values of each frame; returns those that change.
+
+        Raises:
+            OSError: The joined file could not be written. The pieces stay, and the stage plays them.
+        """
+        if self._broken:  # the error has been raised before; the root stage plays what there is
+            self._release()
+            return
+        if self._static is None or not (self._pieces or self._pending):
+            self._release()
+            return
+        joined = Sdf.Layer.CreateAnonymous(self.path.suffix)
+        joined.TransferContent(self._static)
+        opened: list[Sdf.Layer] = []  # kept open: the joined layer's arrays lie in their mapped files
+        try:
+            for time_code, samples in self._frames(opened):
+                if transform:
+                    samples = {**samples, **transform(samples)}
+                for path, value in samples.items():
+                    joined.SetTimeSample(path, time_code, value)
+                _set_time_range(joined, time_code)
+            self._annotate(joined)
+            self._run.mkdir(parents=True, exist_ok=True)
+            self._write(joined, self.path, aside=f"part-joined{self.path.suffix}")
+        except OSError as error:
+            if self._pieces:
+                with contextlib.suppress(OSError):
+                    self.flush()
+            else:
+                self._remove_run(self._run)
+            self._release()
+            raise OSError(f"{error}; {self._kept()}") from None
+        del joined
+        opened.clear()
+        self._release()
+        self._remove_run(self._run)
+        self._remove_stale_runs()
+
+    def _kept(self) -> str:
+        """After a failure: what is left, in words."""
+        if not self._pieces:
+            return "no frame could be kept"
+        return (
+            f"the frames up to {self._pieces[-1][1]:g} are kept in {self.pieces_folder}, which {self.path.name} plays"
+        )
+
+    def _frames(self, opened: list[Sdf.Layer]) -> Iterator[tuple[float, Samples]]:
+        """All frames in order, from the pieces and from memory."""
+        for index in range(len(self._pieces)):
+            name = self._run / f"piece-{index:06d}.usdc"
+            try:
+                piece = Sdf.Layer.OpenAsAnonymous(str(name))
+            except Tf.ErrorException:
+                piece = None
+            if piece is None:
+                raise OSError(f"{self.path}: {name} is no longer there or cannot be read")
+            opened.append(piece)
+            for time_code in sorted(piece.ListAllTimeSamples()):
+                values = ((path, piece.QueryTimeSample(path, time_code)) for path in self._varying)
+                yield time_code, {path: value for path, value in values if value is not None}
+        yield from self._pending
+
+    def _piece_layer(self) -> Sdf.Layer:
+        layer = Sdf.Layer.CreateAnonymous(".usdc")
+        self._declare_varying(layer)
+        for time_code, samples in self._pending:
+            for path, value in samples.items():
+                layer.SetTimeSample(path, time_code, value)
+        layer.startTimeCode = self._pending[0][0]
+        layer.endTimeCode = self._pending[-1][0]
+        return layer
+
+    def _declare_varying(self, layer: Sdf.Layer) -> None:
+        assert self._static is not None
+        layer.timeCodesPerSecond = self._static.timeCodesPerSecond
+        layer.framesPerSecond = self._static.framesPerSecond
+        for path, type_name in self._varying.items():
+            prim = Sdf.CreatePrimInLayer(layer, Sdf.Path(path).GetPrimPath())
+            Sdf.AttributeSpec(prim, Sdf.Path(path).name, type_name)
+
+    def _root_layer(self, pieces: list[tuple[float, float]]) -> Sdf.Layer:
+        """The small stage that plays the pieces; paths in it are relative, so folder and stage move together."""
+        assert self._static is not None
+        static = self._static
+        relative = f"./{self.pieces_folder.name}/{self._run.name}"
+        if self._root is None:
+            root = self._root = Sdf.Layer.CreateAnonymous(self.path.suffix)
+            for key in static.pseudoRoot.ListInfoKeys():
+                if key not in ("startTimeCode", "endTimeCode"):
+                    root.pseudoRoot.SetInfo(key, static.pseudoRoot.GetInfo(key))
+            root.subLayerPaths.append(f"{relative}/static.usdc")
+            root.startTimeCode = pieces[0][0]
+        root = self._root
+        root.endTimeCode = pieces[-1][1]
+        prim = Sdf.CreatePrimInLayer(root, f"/{static.defaultPrim}")
+        files = [Sdf.AssetPath(f"{relative}/piece-{index:06d}.usdc") for index in range(len(pieces))]
+        active = [(first, float(index)) for index, (first, _) in enumerate(pieces)]
+        clips = {
+            "assetPaths": Sdf.AssetPathArray(files),
+            "active": Vt.Vec2dArray(active),
+            "manifestAssetPath": Sdf.AssetPath(f"{relative}/manifest.usda"),
+            "primPath": f"/{static.defaultPrim}",
+        }
+        prim.SetInfo("clips", {_CLIP_SET: clips})
+        self._annotate(root)
+        return root
+
+    def _annotate(self, layer: Sdf.Layer) -> None:
+        if self.custom_data:
+            layer.GetPrimAtPath(f"/{layer.defaultPrim}").SetInfo("customData", self.custom_data)
+
+    def _open_run(self) -> None:
+        """Makes the folder of this run with what all its pieces share."""
+        assert self._static is not None
+        self._refuse_second_writer(OSError)
+        try:
+            self._run.mkdir(parents=True)
+            self._lock = (self._run / "lock").open("w")
+        except OSError as error:
+            raise OSError(f"{self.path}: cannot make {self._run} ({error.strerror})") from None
+        if fcntl:
+            with contextlib.suppress(OSError):  # some network file systems have no locks
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        self._write(self._static, self._run / "static.usdc")
+        manifest = Sdf.Layer.CreateAnonymous(".usda")
+        self._declare_varying(manifest)
+        self._write(manifest, self._run / "manifest.usda")
+
+    def _write(self, layer: Sdf.Layer, target: Path, aside: str | None = None) -> None:
+        """Writes a layer wholly or not at all: aside in the run's folder, synced, then renamed over the target."""
+        part = self._run / (aside or (f"part-root{target.suffix}" if target == self.path else f"part-{target.name}"))
+        if part.name.startswith("part-piece-"):
+            part = part.with_name(part.name.replace("part-piece-", "part-"))
+        try:
+            if not layer.Export(str(part)):
+                raise OSError(f"{self.path}: writing {part.name} failed")
+            _sync(part)
+            os.replace(part, target)
+            _sync(target.parent)
+        except Tf.ErrorException as error:
+            raise OSError(f"{self.path}: cannot be written: {_reason(error)}") from None
+        except OSError as error:
+            raise OSError(f"{self.path}: cannot be written: {error.strerror or error}") from None
+        finally:
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
+
+    def _refuse_second_writer(self, kind: type[Exception]) -> None:
+        for run in self._other_runs():
+            if _is_locked(run / "lock"):
+                raise kind(f"{self.path}: another process is writing it (its pieces are in {run})")
+
+    def _other_runs(self) -> list[Path]:
+        if not self.pieces_folder.is_dir():
+            return []
+        return [run for run in self.pieces_folder.glob("run-*") if run.is_dir() and run != self._run]
+
+    def _remove_stale_runs(self) -> None:
+        """Removes what killed runs on this path left: nothing plays it any more."""
+        for run in self._other_runs():
+            if not _is_locked(run / "lock"):
+                self._remove_run(run)
+
+    def _remove_run(self, run: Path) -> None:
+        """Removes the files that are ours from a run's folder, and the folders if nothing else is in them."""
+        if run == self._run:
+            self._release()
+        with contextlib.suppress(OSError):
+            for file in run.iterdir():
+                if _OURS.fullmatch(file.name) and file.is_file():
+                    file.unlink()
+        for folder in (run, self.pieces_folder):
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+
+    def _release(self) -> None:
+        if self._lock:
+            self._lock.close()
+            self._lock = None
+        self._pending, self._root = [], None
+
+
+def _check_output(path: Path) -> None:
+    """Says before the simulation begins what would stop its result from being written."""
+    if path.suffix.lower() not in STAGE_SUFFIXES:
+        raise InputError(f"{path}: extension {path.suffix or '(none)'}, should be {', '.join(STAGE_SUFFIXES)}")
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, should be a file name")
+    folder = path.parent
+    if not folder.is_dir():
+        raise InputError(f"{path}: output folder {folder} {'is a file' if folder.exists() else 'is not there'}")
+    if path.exists() and not os.access(path, os.W_OK):
+        raise InputError(f"{path}: is write-protected")
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"{path}: output folder {folder} cannot be written to ({error.strerror})") from None
+
+
+def _is_locked(lock: Path) -> bool:
+    """Whether a living process holds a lock file; the system frees the locks of dead ones."""
+    if not fcntl:
+        return False
+    try:
+        with lock.open("r+") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
+def _set_time_range(layer: Sdf.Layer, time_code: float) -> None:
+    if not layer.HasStartTimeCode():
+        layer.startTimeCode = time_code
+    layer.endTimeCode = time_code
+
+
+def _reason(error: Tf.ErrorException) -> str:
+    """The operating system's own words out of OpenUSD's many lines."""
+    found = re.search(r"Error occurred (?:writing|opening) file: ([^'\n]+)", str(error))
+    if found:
+        return found.group(1).strip()
+    lines = [line for line in str(error).splitlines() if line.strip()]
+    return " ".join((lines or ["unknown reason"])[0].split())
+
+
+def _sync(path: Path) -> None:
+    """Has the operating system put a file, or a folder's entries where it can, on the disk."""
+    with contextlib.suppress(OSError) if path.is_dir() else contextlib.nullcontext():
+        descriptor = os.open(path, os.O_RDONLY if os.name != "nt" else os.O_RDWR)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
