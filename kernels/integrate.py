@@ -1,0 +1,131 @@
+"""Time stepping on the nodes: symplectic Euler, prescribed motion, and the two ways positions and displacements meet.
+
+The state is the displacement from rest: float32 positions would lose what small strains need. Positions are published
+for users after each run of steps, and adopted before the next where somebody changed them.
+"""
+
+import warp as wp
+
+from .elements import xyz
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def pad(a: wp.vec3):
+    return wp.vec4(a[0], a[1], a[2], 0.0)
+
+
+@wp.func
+def is_finite(a: wp.vec3):
+    """False where any component is NaN or infinite."""
+    return wp.abs(a[0]) + wp.abs(a[1]) + wp.abs(a[2]) <= 3.0e38
+
+
+@wp.kernel(enable_backward=False)
+def step_symplectic_euler(
+    # In
+    dt: float,
+    damping: float,
+    gravity: wp.vec3,
+    mass: wp.array[wp.float32],
+    inverse_mass: wp.array[wp.float32],
+    has_load: int,
+    load: wp.array[wp.vec4],
+    clock: wp.array[wp.int64],
+    offset: int,
+    # In and out
+    f: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    v: wp.array[wp.vec4],
+    # Out
+    reactions: wp.array[wp.vec4],
+    bad_step: wp.array[wp.int64],
+):
+    """v <- (v + dt (f/m + g)) / (1 + dt damping); u <- u + dt v; f <- 0 for the next step to add to.
+
+    ``clock`` counts the steps before this run of recorded ones and ``offset`` this one's place in the run.
+    A node without inverse mass moves with the velocity it has (zero if fixed), and its support takes what is left of
+    Newton's second law: the weight, the elastic force and the load.
+    """
+    i = wp.tid()
+    force = xyz(f[i])
+    if has_load != 0:
+        force += xyz(load[i])
+    w = inverse_mass[i]
+    velocity = xyz(v[i])
+    if w > 0.0:
+        velocity = (velocity + dt * (w * force + gravity)) / (1.0 + dt * damping)
+        v[i] = pad(velocity)
+    else:
+        reactions[i] = pad(-(force + mass[i] * gravity))
+    displacement = xyz(u[i]) + dt * velocity
+    u[i] = pad(displacement)
+    f[i] = wp.vec4()
+    if not is_finite(displacement):
+        wp.atomic_min(bad_step, 0, clock[0] + wp.int64(offset + 1))
+
+
+@wp.kernel(enable_backward=False)
+def advance_clock(steps: int, clock: wp.array[wp.int64]):
+    """Count a run of recorded steps; within the run each step carries its offset."""
+    clock[0] = clock[0] + wp.int64(steps)
+
+
+@wp.kernel(enable_backward=False)
+def follow_trajectory(
+    # In
+    nodes: wp.array[wp.int32],
+    times: wp.array[wp.float64],
+    displacements: wp.array2d[wp.vec3],
+    dt: float,
+    clock: wp.array[wp.int64],
+    offset: int,
+    u: wp.array[wp.vec4],
+    # Out
+    v: wp.array[wp.vec4],
+):
+    """Give prescribed nodes the velocity that takes them to their keyframed displacement at the end of the step."""
+    k = wp.tid()
+    t = wp.float64(clock[0] + wp.int64(offset + 1)) * wp.float64(dt)
+    last = times.shape[0] - 1
+    key = int(0)
+    while key < last - 1 and times[key + 1] <= t:
+        key += 1
+    s = (t - times[key]) / (times[wp.min(key + 1, last)] - times[key])
+    s = wp.clamp(s, wp.float64(0.0), wp.float64(1.0))
+    row = wp.min(k, displacements.shape[1] - 1)
+    a = displacements[key, row]
+    b = displacements[wp.min(key + 1, last), row]
+    target = a + float(s) * (b - a)
+    i = nodes[k]
+    v[i] = pad((target - xyz(u[i])) / dt)
+
+
+@wp.kernel(enable_backward=False)
+def publish_positions(
+    # In
+    rest: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    # Out
+    positions: wp.array[wp.vec4],
+):
+    i = wp.tid()
+    positions[i] = pad(xyz(rest[i]) + xyz(u[i]))
+
+
+@wp.kernel(enable_backward=False)
+def adopt_positions(
+    # In
+    rest: wp.array[wp.vec4],
+    positions: wp.array[wp.vec4],
+    # In and out
+    u: wp.array[wp.vec4],
+):
+    """Take over the positions that somebody wrote since they were published; untouched ones keep their digits."""
+    i = wp.tid()
+    x = xyz(rest[i])
+    p = xyz(positions[i])
+    q = x + xyz(u[i])
+    if p[0] != q[0] or p[1] != q[1] or p[2] != q[2]:
+        u[i] = pad(p - x)

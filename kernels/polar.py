@@ -1,0 +1,26 @@
+"""Rotations of arrays of matrices."""
+
+import functools
+
+import warp as wp
+
+from .rotation import warm_rotation
+
+wp.set_module_options({"enable_backward": False})
+
+
+@functools.cache
+def rotate_all(rotation: wp.Function) -> wp.Kernel:
+    @wp.kernel(module="unique", enable_backward=False)
+    def rotate_all(matrices: wp.array[wp.mat33], rotations: wp.array[wp.mat33]):
+        i = wp.tid()
+        rotations[i] = rotation(matrices[i])
+
+    return rotate_all
+
+
+@wp.kernel(enable_backward=False)
+def turn_all(matrices: wp.array[wp.mat33], guesses: wp.array[wp.mat33], rotations: wp.array[wp.mat33]):
+    i = wp.tid()
+    guess = wp.normalize(wp.quat_from_matrix(guesses[i]))
+    rotations[i] = wp.quat_to_matrix(warm_rotation(matrices[i], guess))

@@ -1,0 +1,233 @@
+"""Rotations from deformation gradients: the proper rotation R that maximises tr(R^T F), det R = +1 for every F.
+
+``byers_xu`` is the paper's method: Newton's iteration with the scaling of Byers and Xu (2008),
+    X <- (zeta X + X^-T / zeta) / 2.
+Its stopping test as printed (eq. 6) measures ||X - X*||, which does not vanish at a rotation; what tends to zero is the
+step, and that is what is tested here against the paper's 3.85e-5.
+``mcadams_svd`` is the baseline, U V^T of Warp's 3x3 SVD (McAdams et al. 2011).
+``turn_quaternion`` iterates on a quaternion that the caller keeps (Müller et al. 2016), with the exact Hessian where it
+is positive definite (Kugelstadt, Koschier and Bender 2018).
+
+Newton's iteration has no answer for a singular F and gives a reflection for an inverted one. Both leave through
+``robust_rotation``: scaled SVD, which orders the signs, then quaternion steps, since the SVD alone is off by up to 1e-2
+where singular values nearly meet.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+#: The paper's sigma.
+DEFAULT_TOLERANCE = 3.85e-5
+
+# det F / |F|^3 below which an element counts as flattened or inverted. For singular values (1, 1, s): s < 3e-3.
+FLATNESS = wp.constant(1.0e-3)
+MAX_NEWTON = wp.constant(16)
+MAX_TURNS = wp.constant(40)
+MAX_FLOAT = wp.constant(3.4028234e38)
+
+
+@wp.func
+def identity3():
+    return wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+
+@wp.func
+def column(a: wp.mat33, j: int):
+    return wp.vec3(a[0, j], a[1, j], a[2, j])
+
+
+@wp.func
+def cofactor(a: wp.mat33):
+    """det(A) A^-T, which exists for every A."""
+    a0 = column(a, 0)
+    a1 = column(a, 1)
+    a2 = column(a, 2)
+    return wp.matrix_from_cols(wp.cross(a1, a2), wp.cross(a2, a0), wp.cross(a0, a1))
+
+
+@wp.func
+def frobenius(a: wp.mat33):
+    return wp.sqrt(wp.ddot(a, a))
+
+
+@wp.func
+def largest_entry(a: wp.mat33):
+    m = float(0.0)
+    for i in range(3):
+        for j in range(3):
+            m = wp.max(m, wp.abs(a[i, j]))
+    return m
+
+
+@wp.func
+def all_finite(a: wp.mat33):
+    ok = bool(True)
+    for i in range(3):
+        for j in range(3):
+            # A comparison with NaN is false, and so is one with an infinity beyond the largest float.
+            ok = ok and (wp.abs(a[i, j]) <= MAX_FLOAT)
+    return ok
+
+
+@wp.func
+def is_well_shaped(f: wp.mat33):
+    """Whether Newton's iteration may be used: det F well above zero, and no power of F out of range."""
+    n2 = wp.ddot(f, f)
+    return n2 > 1.0e-8 and n2 < 1.0e8 and wp.determinant(f) > FLATNESS * n2 * wp.sqrt(n2)
+
+
+@wp.func
+def leading_eigenvector(s: wp.mat33, scale: float):
+    """About the eigenvector of the largest eigenvalue of a symmetric matrix of entries up to ``scale``."""
+    m = s / scale + 3.0 * identity3()
+    for _ in range(5):
+        m = m * m
+        m = m / largest_entry(m)
+    v = column(m, 0)
+    for j in range(1, 3):
+        if wp.length_sq(column(m, j)) > wp.length_sq(v):
+            v = column(m, j)
+    return wp.normalize(v)
+
+
+@wp.func
+def turn(f: wp.mat33, q: wp.quat):
+    """The rotation vector, in the rotated frame, that carries q towards the maximum of tr(R^T F)."""
+    b = wp.transpose(wp.quat_to_matrix(q)) * f
+    axial = wp.vec3(b[2, 1] - b[1, 2], b[0, 2] - b[2, 0], b[1, 0] - b[0, 1])
+    trace = wp.trace(b)
+    s = 0.5 * (b + wp.transpose(b))
+    h = trace * identity3() - s
+    minor = h[0, 0] * h[1, 1] - h[0, 1] * h[0, 1]
+    det = wp.determinant(h)
+    scale = wp.max(largest_entry(b), 1.0e-30)
+    w = axial / (wp.abs(trace) + scale)
+    if h[0, 0] > 1.0e-3 * scale and minor > 1.0e-4 * scale * scale and det > 1.0e-6 * scale * scale * scale:
+        w = wp.transpose(cofactor(h)) * axial / det
+    else:
+        # Past the reach of Newton's step: where the slope is small it would creep along a saddle, so leave about the axis
+        # of upward curvature.
+        axis = leading_eigenvector(s, scale)
+        if wp.dot(axis, h * axis) < -1.0e-3 * scale:
+            w += wp.where(wp.dot(axis, axial) < 0.0, -0.7, 0.7) * axis
+    return w
+
+
+@wp.func
+def turn_quaternion(f: wp.mat33, guess: wp.quat, iterations: int, tolerance: float):
+    """The rotation of F as a quaternion, by at most ``iterations`` steps from ``guess``; F of order one."""
+    q = guess
+    for _ in range(iterations):
+        w = turn(f, q)
+        q = wp.normalize(q * wp.quat(0.5 * w[0], 0.5 * w[1], 0.5 * w[2], 1.0))
+        if wp.length_sq(w) < tolerance * tolerance:
+            break
+    return q
+
+
+@wp.func
+def warm_rotation(f: wp.mat33, guess: wp.quat):
+    """The rotation of any F as a quaternion, started from ``guess``; a non-finite or zero F returns the guess."""
+    m = largest_entry(f)
+    q = guess
+    if all_finite(f) and m > 0.0:
+        # The step after one of 1e-4 would be of order 1e-8: quadratic convergence has done the rest already.
+        q = turn_quaternion(f / m, guess, MAX_TURNS, 1.0e-4)
+    return q
+
+
+@wp.func
+def mcadams_svd(f: wp.mat33):
+    """U V^T of Warp's SVD, of F scaled to order one; the identity for a zero or non-finite F."""
+    r = identity3()
+    m = largest_entry(f)
+    if all_finite(f) and m > 0.0:
+        u, _s, v = wp.svd3(f / m)
+        r = u * wp.transpose(v)
+    return r
+
+
+@wp.func
+def robust_rotation(f: wp.mat33):
+    """The rotation of an F of any rank, sign and size: SVD, then quaternion steps to float32 accuracy."""
+    r = identity3()
+    m = largest_entry(f)
+    if all_finite(f) and m > 0.0:
+        a = f / m
+        q = wp.normalize(wp.quat_from_matrix(mcadams_svd(a)))
+        r = wp.quat_to_matrix(turn_quaternion(a, q, 4, 1.0e-4))
+    return r
+
+
+@wp.func
+def newton_step(x: wp.mat33, zeta: float):
+    c = cofactor(x)
+    det = wp.dot(column(x, 0), column(c, 0))
+    return (0.5 * zeta) * x + (0.5 / (zeta * det)) * c
+
+
+@wp.func
+def next_zeta(zeta: float):
+    return wp.sqrt(2.0 / (zeta + 1.0 / zeta))
+
+
+@wp.func
+def first_zetas(f: wp.mat33):
+    """zeta_0 and zeta_1 of Byers and Xu from the bounds a = 1/||F^-1||_F <= sigma_min and b = ||F||_F >= sigma_max."""
+    b = frobenius(f)
+    a = wp.determinant(f) / frobenius(cofactor(f))
+    root = wp.sqrt(b / a)
+    return 1.0 / wp.sqrt(a * b), wp.sqrt(2.0 / (root + 1.0 / root))
+
+
+@wp.func
+def byers_xu_newton(f: wp.mat33, tolerance: float):
+    zeta0, zeta = first_zetas(f)
+    x = newton_step(f, zeta0)
+    step = float(1.0)
+    iteration = int(1)
+    while step > tolerance and iteration < MAX_NEWTON:
+        y = newton_step(x, zeta)
+        step = frobenius(y - x)
+        x = y
+        zeta = next_zeta(zeta)
+        iteration += 1
+    return x
+
+
+@wp.func
+def byers_xu(f: wp.mat33):
+    """Byers-Xu to the paper's tolerance."""
+    r = wp.mat33()
+    if is_well_shaped(f):
+        r = byers_xu_newton(f, wp.static(DEFAULT_TOLERANCE))
+    elif all_finite(f) and is_well_shaped(f / wp.max(largest_entry(f), 1.0e-38)):
+        r = byers_xu_newton(f / largest_entry(f), wp.static(DEFAULT_TOLERANCE))
+    else:
+        r = robust_rotation(f)
+    return r
+
+
+def byers_xu_fixed(iterations: int) -> wp.Function:
+    """Byers-Xu with a fixed number of iterations, unrolled: no test, no divergence."""
+
+    @wp.func
+    def byers_xu_unrolled(f: wp.mat33):
+        r = wp.mat33()
+        a = f
+        well_shaped = is_well_shaped(f)
+        if not well_shaped and all_finite(f):
+            a = f / wp.max(largest_entry(f), 1.0e-38)
+            well_shaped = is_well_shaped(a)
+        if well_shaped:
+            zeta0, zeta = first_zetas(a)
+            r = newton_step(a, zeta0)
+            for _ in range(wp.static(iterations - 1)):
+                r = newton_step(r, zeta)
+                zeta = next_zeta(zeta)
+        else:
+            r = robust_rotation(f)
+        return r
+
+    return byers_xu_unrolled

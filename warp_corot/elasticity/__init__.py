@@ -1,0 +1,30 @@
+"""Elastic models, one file each, all from the same Young's modulus and Poisson's ratio. A new one is listed here."""
+
+from .corotated import Corotated
+from .edge_stvk import EdgeStVK
+from .linear import Linear
+from .mass_spring import MassSpring
+from .model import ForceField, Model
+from .neo_hookean import NeoHookean
+from .stvk import StVenantKirchhoff
+
+MODELS: dict[str, type[Model]] = {
+    "linear": Linear,
+    "corotated": Corotated,
+    "stvk": StVenantKirchhoff,
+    "neo-hookean": NeoHookean,
+    "edge-stvk": EdgeStVK,
+    "mass-spring": MassSpring,
+}
+
+__all__ = [
+    "MODELS",
+    "Corotated",
+    "EdgeStVK",
+    "ForceField",
+    "Linear",
+    "MassSpring",
+    "Model",
+    "NeoHookean",
+    "StVenantKirchhoff",
+]

@@ -1,0 +1,22 @@
+"""Linear elasticity: small strain of the whole displacement. Exact for small rotations, grows in volume for large ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+from ..kernels.constitutive import linear_cauchy, linear_energy, linear_stress
+from .model import ForceField, LawField, Model
+
+if TYPE_CHECKING:
+    from ..body import SoftBody
+
+
+@dataclass(frozen=True)
+class Linear(Model):
+    """W = V (mu e:e + lambda/2 tr(e)^2) with e = sym(F) - I. Conserves linear but not angular momentum."""
+
+    step_safety: ClassVar[float] = 0.8
+
+    def bind(self, body: SoftBody) -> ForceField:
+        return LawField(body, stress=linear_stress, energy=linear_energy, cauchy=linear_cauchy)

@@ -1,0 +1,108 @@
+"""What every elastic model is: a small description, and the force field that it becomes on a body."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from ..kernels.forces import element_energies, element_von_mises, scatter_forces
+
+if TYPE_CHECKING:
+    from ..body import SoftBody
+
+
+class ForceField(ABC):
+    """An elastic model on one body: launches that read displacements and add forces.
+
+    Launches only; nothing here waits for the device or comes back to the host but ``elastic_energy``.
+    """
+
+    def __init__(self, body: SoftBody):
+        self.body = body
+        self.device = body.device
+        self.elements = body.elements
+        self.element_count = len(body.mesh.tets)
+
+    @abstractmethod
+    def add_forces(self, u: wp.array, f: wp.array) -> None:
+        """Add the elastic nodal forces [N] of displacements u to f; both vec4 [N]."""
+
+    @abstractmethod
+    def add_energies(self, u: wp.array, energies: wp.array) -> None:
+        """Write the strain energies [J] that make up the whole; float64."""
+
+    @abstractmethod
+    def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
+        """Write the von Mises stress of each element [Pa], float32 [T]."""
+
+    @property
+    def energy_count(self) -> int:
+        """How many energies ``add_energies`` writes."""
+        return self.element_count
+
+    @property
+    def state(self) -> dict[str, wp.array]:
+        """Arrays that must be kept for the steps to go on as they would have."""
+        return {}
+
+    def elastic_energy(self, u: wp.array) -> float:
+        """Strain energy of the body [J]."""
+        energies = wp.zeros(self.energy_count, dtype=wp.float64, device=self.device)
+        self.add_energies(u, energies)
+        return float(energies.numpy().sum())
+
+    def von_mises(self, u: wp.array) -> npt.NDArray[np.float32]:
+        """Von Mises stress of each element [Pa], float32 [T]."""
+        stress = wp.zeros(self.element_count, dtype=wp.float32, device=self.device)
+        self.write_von_mises(u, stress)
+        return stress.numpy()
+
+    def launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+    @property
+    def material_inputs(self) -> list:
+        """The kernel arguments mu, lam and stride."""
+        return [self.body.mu, self.body.lam, self.body.material_stride]
+
+
+class Model(ABC):
+    """The description of an elastic model: a frozen dataclass of plain values.
+
+    Class attributes:
+        step_safety: Share of the linearly stable step that is taken by default; nonlinear models stiffen when strained.
+    """
+
+    step_safety: ClassVar[float] = 0.5
+
+    @abstractmethod
+    def bind(self, body: SoftBody) -> ForceField:
+        """The model's force field on a body.
+
+        Raises:
+            InputError: The model cannot be used with this body's mesh.
+        """
+
+
+class LawField(ForceField):
+    """Force field of a constitutive law that needs nothing but each element's deformation gradient."""
+
+    def __init__(self, body: SoftBody, *, stress: wp.Function, energy: wp.Function, cauchy: wp.Function):
+        super().__init__(body)
+        kind = body.element_kind
+        self._forces = scatter_forces(kind, stress)
+        self._energies = element_energies(kind, energy)
+        self._von_mises = element_von_mises(kind, cauchy)
+
+    def add_forces(self, u: wp.array, f: wp.array) -> None:
+        self.launch(self._forces, self.element_count, [self.elements, *self.material_inputs, u], [f])
+
+    def add_energies(self, u: wp.array, energies: wp.array) -> None:
+        self.launch(self._energies, self.element_count, [self.elements, *self.material_inputs, u], [energies])
+
+    def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
+        self.launch(self._von_mises, self.element_count, [self.elements, *self.material_inputs, u], [stress])

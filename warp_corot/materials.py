@@ -1,0 +1,58 @@
+"""Materials."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from .errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Isotropic:
+    """An isotropic elastic material, uniform or with a value per element.
+
+    Attributes:
+        young: Young's modulus E > 0 [Pa], a number or [T].
+        poisson: Poisson's ratio, -1 < nu < 0.5, a number or [T].
+        density: Mass per rest volume > 0 [kg/m^3], a number or [T].
+
+    Raises:
+        InputError: A value out of its range, or arrays that are neither numbers nor one-dimensional.
+    """
+
+    young: float | npt.NDArray[np.floating]
+    poisson: float | npt.NDArray[np.floating]
+    density: float | npt.NDArray[np.floating]
+
+    def __post_init__(self) -> None:
+        for name, unit, low, high in (
+            ("young", "Pa", 0.0, np.inf),
+            ("poisson", "", -1.0, 0.5),
+            ("density", "kg/m^3", 0.0, np.inf),
+        ):
+            try:
+                values = np.asarray(getattr(self, name), dtype=np.float64)
+            except (TypeError, ValueError):
+                raise InputError(f"{name} is {getattr(self, name)!r}; it must be a number or an array") from None
+            if values.ndim > 1:
+                raise InputError(f"{name} has shape {values.shape}; it must be a number or have one entry per element")
+            bad = np.flatnonzero(~(np.isfinite(values) & (values > low) & (values < high)))
+            if len(bad):
+                bound = f"above {low:g}" if high == np.inf else f"above {low:g} and below {high:g}"
+                where = f" of element {bad[0]}" if values.ndim else ""
+                value = values.ravel()[bad[0]]
+                raise InputError(f"{name}{where} is {value:g}{' ' + unit if unit else ''}; it must be {bound}")
+            object.__setattr__(self, name, values if values.ndim else float(values))
+
+    @property
+    def mu(self) -> float | npt.NDArray[np.float64]:
+        """Second Lamé parameter (shear modulus) [Pa]."""
+        return self.young / (2.0 * (1.0 + self.poisson))
+
+    @property
+    def lam(self) -> float | npt.NDArray[np.float64]:
+        """First Lamé parameter [Pa]."""
+        return self.young * self.poisson / ((1.0 + self.poisson) * (1.0 - 2.0 * self.poisson))

@@ -1,0 +1,317 @@
+"""The forest of bisected tetrahedra: a grid of cubes, each split into six path tetrahedra, each the root of a binary tree.
+
+A tetrahedron (x0, x1, x2, x3) of level l is bisected at the midpoint z of its refinement edge x0-xk, k = 3 - (l mod 3),
+into (x0, .., x(k-1), z, x(k+1), .., x3) and (x1, .., xk, z, x(k+1), .., x3) (Maubach 1995; Tagawa et al. 2013). Vertices lie
+on an integer lattice. The tree keeps every ancestor; the leaves are the mesh. Everything is built with array operations.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ..errors import InputError
+
+#: A root cube has 2**LATTICE_BITS lattice intervals a side, so levels may go to 3 * LATTICE_BITS.
+LATTICE_BITS = 16
+MAX_LEVEL = 3 * LATTICE_BITS
+
+
+@dataclass(frozen=True, eq=False)
+class Tree:
+    """Every tetrahedron of the forest, roots first, the two children of one parent next to each other.
+
+    Attributes:
+        tets: Nodes in Maubach order, int32 [M, 4].
+        level: int32 [M].
+        parent: Index of the parent, -1 for roots, int32 [M].
+        first_child: Index of the first of the two children, -1 for leaves, int32 [M].
+    """
+
+    tets: np.ndarray
+    level: np.ndarray
+    parent: np.ndarray
+    first_child: np.ndarray
+
+    @cached_property
+    def leaves(self) -> np.ndarray:
+        """Leaves in tree order (each subtree's leaves side by side, first child first), int32 [T]."""
+        leaves = np.flatnonzero(self.first_child < 0)
+        root = leaves.copy()
+        path = np.zeros(len(leaves), np.uint64)
+        climbing = np.flatnonzero(self.parent[root] >= 0)
+        while len(climbing):
+            child = root[climbing]
+            parent = self.parent[child]
+            is_second = (child - self.first_child[parent]).astype(np.uint64)
+            # The path from the root, most significant bit first.
+            path[climbing] |= is_second << (np.uint64(64) - self.level[child].astype(np.uint64))
+            root[climbing] = parent
+            climbing = climbing[self.parent[parent] >= 0]
+        return leaves[np.lexsort((path, root))].astype(np.int32)
+
+    def ancestors(self, elements: np.ndarray, level: int) -> np.ndarray:
+        """The ancestor at ``level`` of each element, or the element itself where it lies above that level; int32."""
+        found = np.array(elements, dtype=np.int32)
+        below = np.flatnonzero(self.level[found] > level)
+        while len(below):
+            found[below] = self.parent[found[below]]
+            below = below[self.level[found[below]] > level]
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class TetForest:
+    """A conforming mesh of right-angled tetrahedra of three shapes, the leaves of a forest of binary trees.
+
+    Attributes:
+        cells: Number of root cubes along x, y, z.
+        cell_size: Edge length of a root cube [m].
+        origin: Position of the lattice's point (0, 0, 0) [m].
+        lattice: Lattice coordinates of the nodes, 2**16 intervals a cube edge, int32 [N, 3].
+        node_ends: The two ends of the edge whose midpoint a node is; -1, -1 for corners of cubes; int32 [N, 2].
+        tree: All tetrahedra of all levels.
+        up_axis: "X", "Y" or "Z".
+    """
+
+    cells: tuple[int, int, int]
+    cell_size: float
+    origin: tuple[float, float, float]
+    lattice: np.ndarray
+    node_ends: np.ndarray
+    tree: Tree
+    up_axis: str = "Y"
+
+    @classmethod
+    def box(
+        cls,
+        cells: tuple[int, int, int] = (1, 1, 1),
+        cell_size: float = 1.0,
+        level: int = 0,
+        *,
+        origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        up_axis: str = "Y",
+    ) -> TetForest:
+        """A box of root cubes, uniformly bisected.
+
+        Args:
+            cells: Number of root cubes along x, y, z, each at least 1.
+            cell_size: Edge length of a root cube [m].
+            level: How often every root is bisected, 0 to 48; three levels halve the edge length.
+            origin: Lower corner of the box [m].
+            up_axis: Which axis points up where results are drawn.
+
+        Raises:
+            InputError: An argument is out of its range.
+        """
+        cells = _checked_cells(cells)
+        if not (np.isfinite(cell_size) and cell_size > 0):
+            raise InputError(f"cell_size is {cell_size}; it must be a positive length in metres")
+        if level != int(level) or not 0 <= level <= MAX_LEVEL:
+            raise InputError(f"level is {level}; it must be a whole number from 0 to {MAX_LEVEL}")
+        if up_axis not in ("X", "Y", "Z"):
+            raise InputError(f"up_axis is {up_axis!r}; it must be 'X', 'Y' or 'Z'")
+        corners = np.asarray(origin, dtype=float)
+        if corners.shape != (3,) or not np.isfinite(corners).all():
+            raise InputError(f"origin is {origin}; it must be three finite coordinates in metres")
+        growing = _Growth.of_roots(cells)
+        for _ in range(int(level)):
+            growing.bisect(growing.newest)
+        lattice, ends, tree = growing.finished()
+        order = _order_of_first_touch(tree.tets[tree.leaves], len(lattice))
+        rank = np.empty(len(order), np.int32)
+        rank[order] = np.arange(len(order), dtype=np.int32)
+        ends = ends[order]
+        ends = np.where(ends >= 0, rank[ends], -1).astype(np.int32)
+        tree = Tree(rank[tree.tets], tree.level, tree.parent, tree.first_child)
+        x, y, z = (float(c) for c in corners)
+        return cls(cells, float(cell_size), (x, y, z), lattice[order], ends, tree, up_axis)
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """Rest positions of the nodes [m], float64 [N, 3]."""
+        return np.asarray(self.origin) + self.lattice * (self.cell_size / 2**LATTICE_BITS)
+
+    @cached_property
+    def tets(self) -> np.ndarray:
+        """The leaves' nodes in Maubach order, in tree order, int32 [T, 4]."""
+        return self.tree.tets[self.tree.leaves]
+
+    @cached_property
+    def levels(self) -> np.ndarray:
+        """Level of each leaf, int32 [T]."""
+        return self.tree.level[self.tree.leaves]
+
+    @cached_property
+    def volumes(self) -> np.ndarray:
+        """Rest volume of each leaf [m^3], float64 [T]."""
+        h = self.cell_size * 0.5 ** (self.levels // 3)
+        return h**3 / np.array([6.0, 12.0, 24.0])[self.levels % 3]
+
+    def ancestors(self, level: int) -> np.ndarray:
+        """For each leaf the tetrahedron of the tree at ``level`` above it, or the leaf itself; indices int32 [T]."""
+        return self.tree.ancestors(self.tree.leaves, level)
+
+    def refine(self, leaves: np.ndarray) -> TetForest:
+        """A forest in which the chosen leaves are bisected, and as many others as conformity asks for.
+
+        A leaf with an active midpoint on any edge must be bisected itself, until none has (the closure of the set of
+        midpoints). Nodes keep their numbers; new ones are appended.
+
+        Args:
+            leaves: Mask bool [T] or indices into the leaves.
+
+        Raises:
+            InputError: Mask of the wrong length, an index out of range, or a leaf already at the deepest level.
+        """
+        chosen = np.asarray(leaves)
+        count = len(self.tets)
+        if chosen.dtype == bool:
+            if chosen.shape != (count,):
+                raise InputError(f"the mask of leaves has shape {chosen.shape}; the forest has {count} leaves")
+            chosen = np.flatnonzero(chosen)
+        elif chosen.size and (chosen.min() < -count or chosen.max() >= count):
+            raise InputError(f"leaf index {int(chosen.max())} is out of range: the forest has {count} leaves")
+        growing = _Growth.of_forest(self)
+        wanted = np.unique(growing.edge_keys(growing.refinement_edges(self.tree.leaves[chosen.astype(int)])))
+        active = np.union1d(wanted, growing.edge_keys(self.node_ends[self.node_ends[:, 0] >= 0]))
+        while True:
+            current = growing.leaves()
+            tets = growing.tets()[current]
+            edges = np.stack([growing.edge_keys(tets[:, [i, j]]) for i, j in itertools.combinations(range(4), 2)], 1)
+            broken = current[np.isin(edges, active).any(axis=1)]
+            if not len(broken):
+                break
+            active = np.union1d(active, growing.edge_keys(growing.refinement_edges(broken)))
+            growing.bisect(broken)
+        lattice, ends, tree = growing.finished()
+        return TetForest(self.cells, self.cell_size, self.origin, lattice, ends, tree, self.up_axis)
+
+
+def _checked_cells(cells: tuple[int, int, int]) -> tuple[int, int, int]:
+    counts = np.asarray(cells)
+    limit = 2 ** (31 - LATTICE_BITS) - 1
+    if counts.shape != (3,) or not np.issubdtype(counts.dtype, np.integer) or counts.min() < 1 or counts.max() > limit:
+        raise InputError(f"cells is {cells}; it must be three whole numbers from 1 to {limit}")
+    x, y, z = (int(c) for c in counts)
+    return x, y, z
+
+
+def _order_of_first_touch(tets: np.ndarray, node_count: int) -> np.ndarray:
+    """Nodes in the order in which the elements first name them, so that neighbours in memory are neighbours in space."""
+    touched = tets.ravel()
+    first = np.empty(node_count, np.int64)
+    # Where a node is written more than once the last write stays: walk backwards to keep the first.
+    first[touched[::-1]] = np.arange(len(touched) - 1, -1, -1)
+    return np.argsort(first)
+
+
+class _Growth:
+    """A forest being grown: lists of chunks that each bisection appends to."""
+
+    def __init__(self, lattice, ends, tets, level, parent, first_child):
+        self._lattice = [lattice]
+        self._ends = [ends]
+        self._tets = [tets]
+        self._level = [level]
+        self._parent = [parent]
+        self._first_child = first_child
+        self._nodes = len(lattice)
+        self.newest = np.arange(len(tets), dtype=np.int32)
+
+    @classmethod
+    def of_roots(cls, cells: tuple[int, int, int]) -> _Growth:
+        grid = np.stack(np.meshgrid(*(np.arange(n + 1) for n in cells), indexing="ij"), -1).reshape(-1, 3)
+        strides = np.array([(cells[1] + 1) * (cells[2] + 1), cells[2] + 1, 1])
+        corners = np.stack(np.meshgrid(*(np.arange(n) for n in cells), indexing="ij"), -1).reshape(-1, 3)
+        paths = []
+        for order in itertools.permutations(range(3)):
+            walk = np.zeros((4, 3), int)
+            for step, axis in enumerate(order):
+                walk[step + 1 :, axis] = 1
+            paths.append(walk)
+        tets = ((corners[:, None, None, :] + np.array(paths)) @ strides).reshape(-1, 4).astype(np.int32)
+        count = len(tets)
+        lattice = (grid << LATTICE_BITS).astype(np.int32)
+        ends = np.full((len(grid), 2), -1, np.int32)
+        none = np.full(count, -1, np.int32)
+        return cls(lattice, ends, tets, np.zeros(count, np.int32), none, none.copy())
+
+    @classmethod
+    def of_forest(cls, forest: TetForest) -> _Growth:
+        tree = forest.tree
+        return cls(forest.lattice, forest.node_ends, tree.tets, tree.level, tree.parent, tree.first_child.copy())
+
+    def tets(self) -> np.ndarray:
+        return _merged(self._tets)
+
+    def leaves(self) -> np.ndarray:
+        return np.flatnonzero(self._first_child < 0).astype(np.int32)
+
+    def refinement_edges(self, elements: np.ndarray) -> np.ndarray:
+        """End nodes x0, xk of the edge on which each element is bisected [n, 2]."""
+        tets, level = self.tets()[elements], _merged(self._level)[elements]
+        k = 3 - level % 3
+        return np.stack([tets[:, 0], tets[np.arange(len(tets)), k]], axis=1)
+
+    @staticmethod
+    def edge_keys(ends: np.ndarray) -> np.ndarray:
+        """One integer for each unordered pair of nodes, whatever nodes are added later."""
+        low = ends.min(axis=1).astype(np.int64)
+        return (low << 32) | ends.max(axis=1)
+
+    def bisect(self, elements: np.ndarray) -> None:
+        """Bisect the elements, making the midpoints that are not there yet."""
+        tets, level = self.tets()[elements], _merged(self._level)[elements]
+        if len(level) and level.max() >= MAX_LEVEL:
+            raise InputError(f"a tetrahedron is already at level {MAX_LEVEL}, the deepest that the lattice can hold")
+        middle = self._midpoints(self.refinement_edges(elements))
+        children = np.empty((len(tets), 2, 4), np.int32)
+        for kind in range(3):
+            chosen = np.flatnonzero(level % 3 == kind)
+            x, z, k = tets[chosen], middle[chosen], 3 - kind
+            tail = [x[:, i] for i in range(k + 1, 4)]
+            children[chosen, 0] = np.stack([*(x[:, i] for i in range(k)), z, *tail], axis=1)
+            children[chosen, 1] = np.stack([*(x[:, i] for i in range(1, k + 1)), z, *tail], axis=1)
+        count = len(self._first_child)
+        self._first_child[elements] = count + 2 * np.arange(len(elements), dtype=np.int32)
+        self._first_child = np.concatenate([self._first_child, np.full(2 * len(elements), -1, np.int32)])
+        self._tets.append(children.reshape(-1, 4))
+        self._level.append(np.repeat(level + 1, 2))
+        self._parent.append(np.repeat(elements, 2))
+        self.newest = np.arange(count, count + 2 * len(elements), dtype=np.int32)
+
+    def _midpoints(self, edges: np.ndarray) -> np.ndarray:
+        """The node at the middle of each edge, made where there is none yet; int32."""
+        keys, which = np.unique(self.edge_keys(edges), return_inverse=True)
+        ends = np.stack([keys >> 32, keys & 0xFFFFFFFF], axis=1).astype(np.int32)
+        node = np.full(len(keys), -1, np.int32)
+        all_ends = _merged(self._ends)
+        inner = np.flatnonzero(all_ends[:, 0] >= 0)
+        known = self.edge_keys(all_ends[inner])
+        order = np.argsort(known)
+        if len(known):
+            at = np.minimum(np.searchsorted(known, keys, sorter=order), len(known) - 1)
+            there = known[order[at]] == keys
+            node[there] = inner[order[at[there]]]
+        new = np.flatnonzero(node < 0)
+        node[new] = self._nodes + np.arange(len(new), dtype=np.int32)
+        lattice = _merged(self._lattice)
+        self._lattice.append((lattice[ends[new, 0]] + lattice[ends[new, 1]]) // 2)
+        self._ends.append(ends[new])
+        self._nodes += len(new)
+        return node[which]
+
+    def finished(self) -> tuple[np.ndarray, np.ndarray, Tree]:
+        tree = Tree(_merged(self._tets), _merged(self._level), _merged(self._parent), self._first_child)
+        return _merged(self._lattice), _merged(self._ends), tree
+
+
+def _merged(chunks: list[np.ndarray]) -> np.ndarray:
+    """All chunks as one array, and the list shortened to it."""
+    if len(chunks) > 1:
+        chunks[:] = [np.concatenate(chunks)]
+    return chunks[0]
