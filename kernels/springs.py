@@ -153,7 +153,9 @@ def scatter_edge_stvk(Elements: Any, biquadratic: bool) -> wp.Kernel:
             i = FIRST_NODE[e]
             j = SECOND_NODE[e]
             rest = q * (x[j] - x[i])
-            d[e], pull[e] = edge_stretch(rest, xyz(u[nodes[j]]) - xyz(u[nodes[i]]), wp.static(biquadratic))
+            measure, factor = edge_stretch(rest, xyz(u[nodes[j]]) - xyz(u[nodes[i]]), wp.static(biquadratic))
+            d[e] = measure
+            pull[e] = factor
         tension = edge_tensions(elements, t, d, mu[t * stride], lam[t * stride])
         for e in range(6):
             i = FIRST_NODE[e]
@@ -186,12 +188,12 @@ def edge_stvk_energies(Elements: Any, biquadratic: bool) -> wp.Kernel:
         q = frame(elements, t)
         x = rest_nodes(elements, t)
         d = vec6()
-        pull = float(0.0)
         for e in range(6):
             i = FIRST_NODE[e]
             j = SECOND_NODE[e]
             rest = q * (x[j] - x[i])
-            d[e], pull = edge_stretch(rest, xyz(u[nodes[j]]) - xyz(u[nodes[i]]), wp.static(biquadratic))
+            measure, _factor = edge_stretch(rest, xyz(u[nodes[j]]) - xyz(u[nodes[i]]), wp.static(biquadratic))
+            d[e] = measure
         tension = edge_tensions(elements, t, d, mu[t * stride], lam[t * stride])
         energies[t] = wp.float64(0.5 * wp.dot(d, tension))
 

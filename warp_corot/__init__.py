@@ -1,1 +1,36 @@
-"""Corotational finite elements for soft tissue in NVIDIA Warp."""
+"""Corotational finite elements for soft tissue at interactive rates, in NVIDIA Warp, on CPU and CUDA.
+
+After Tagawa, Yamada and Tanaka, *A Rectangular Tetrahedral Adaptive Mesh Based Corotated Finite Element Model for
+Interactive Soft Tissue Simulation* (IEEE EMBC 2013).
+"""
+
+from .body import SoftBody
+from .elasticity import Corotated, EdgeStVK, Linear, MassSpring, NeoHookean, StVenantKirchhoff
+from .errors import InputError, StabilityWarning, UnstableError
+from .materials import Isotropic
+from .mesh import TetForest, TetMesh
+from .rotations import polar_rotation
+from .simulation import Energy, Simulation
+from .solvers import SymplecticEuler
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Corotated",
+    "EdgeStVK",
+    "Energy",
+    "InputError",
+    "Isotropic",
+    "Linear",
+    "MassSpring",
+    "NeoHookean",
+    "Simulation",
+    "SoftBody",
+    "StVenantKirchhoff",
+    "StabilityWarning",
+    "SymplecticEuler",
+    "TetForest",
+    "TetMesh",
+    "UnstableError",
+    "polar_rotation",
+]

@@ -7,3 +7,7 @@ class InputError(ValueError):
 
 class UnstableError(RuntimeError):
     """The state is no longer finite: the message names the step at which this was seen."""
+
+
+class StabilityWarning(UserWarning):
+    """The time step is beyond what the explicit integrator can hold."""

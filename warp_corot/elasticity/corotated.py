@@ -93,10 +93,10 @@ class CorotatedField(ForceField):
         self._fused = model.rotation_level is None and model.rotation != "warm" and model.stiffness == "factored"
         self._unit = wp.array(unit.ravel(), dtype=wp.int32, device=self.device)
         self._rotations = wp.empty(self.unit_count, dtype=wp.mat33, device=self.device)
-        self._quaternions = wp.empty(0, dtype=wp.quat, device=self.device)
+        self._state: dict[str, wp.array] = {}
         if model.rotation == "warm":
             identity = np.tile(np.array([0.0, 0.0, 0.0, 1.0], np.float32), (self.unit_count, 1))
-            self._quaternions = wp.array(identity, dtype=wp.quat, device=self.device)
+            self._state["quaternions"] = wp.array(identity, dtype=wp.quat, device=self.device)
             self._extract = extract_warm_rotations(kind)
         else:
             rotation = rotation_function(model.rotation, model.iterations)
@@ -111,13 +111,11 @@ class CorotatedField(ForceField):
 
     @property
     def state(self) -> dict[str, wp.array]:
-        return {"quaternions": self._quaternions} if self.model.rotation == "warm" else {}
+        return self._state
 
-    def extract_rotations(self, u: wp.array, quaternions: wp.array | None = None) -> wp.array:
-        """The rotation of every unit, mat33 [units]; ``quaternions`` stand in for the kept ones."""
-        outputs = [self._rotations]
-        if self.model.rotation == "warm":
-            outputs = [self._quaternions if quaternions is None else quaternions, self._rotations]
+    def extract_rotations(self, u: wp.array) -> wp.array:
+        """The rotation of every unit, mat33 [units]."""
+        outputs = [*self.state.values(), self._rotations]
         self.launch(self._extract, self.unit_count, [self._units, u], outputs)
         return self._rotations
 
@@ -132,17 +130,13 @@ class CorotatedField(ForceField):
             self.extract_rotations(u)
             self.add_rotated_forces(u, f)
 
-    def add_energies(self, u: wp.array, energies: wp.array) -> None:
-        self._look(u)
+    def write_energies(self, u: wp.array, energies: wp.array) -> None:
+        self.extract_rotations(u)
         self._launch_with_rotations(self._energies, u, energies)
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
-        self._look(u)
+        self.extract_rotations(u)
         self._launch_with_rotations(self._von_mises, u, stress)
-
-    def _look(self, u: wp.array) -> None:
-        """Extract rotations without touching the state that steps go on from."""
-        self.extract_rotations(u, wp.clone(self._quaternions))
 
     def _launch_with_rotations(self, kernel: wp.Kernel, u: wp.array, output: wp.array) -> None:
         inputs = [self.elements, *self.material_inputs, u, self._rotations, self._unit]

@@ -46,7 +46,7 @@ class EdgeStVKField(ForceField):
     def add_forces(self, u: wp.array, f: wp.array) -> None:
         self.launch(self._forces, self.element_count, [self.elements, *self.material_inputs, u], [f])
 
-    def add_energies(self, u: wp.array, energies: wp.array) -> None:
+    def write_energies(self, u: wp.array, energies: wp.array) -> None:
         self.launch(self._energies, self.element_count, [self.elements, *self.material_inputs, u], [energies])
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:

@@ -59,7 +59,7 @@ class MassSpringField(ForceField):
     def add_forces(self, u: wp.array, f: wp.array) -> None:
         self.launch(scatter_mass_spring, len(self._edges), [self._edges, self._rest, self._stiffness, u], [f])
 
-    def add_energies(self, u: wp.array, energies: wp.array) -> None:
+    def write_energies(self, u: wp.array, energies: wp.array) -> None:
         inputs = [self._edges, self._rest, self._stiffness, u]
         self.launch(mass_spring_energies, len(self._edges), inputs, [energies])
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -32,7 +34,7 @@ class ForceField(ABC):
         """Add the elastic nodal forces [N] of displacements u to f; both vec4 [N]."""
 
     @abstractmethod
-    def add_energies(self, u: wp.array, energies: wp.array) -> None:
+    def write_energies(self, u: wp.array, energies: wp.array) -> None:
         """Write the strain energies [J] that make up the whole; float64."""
 
     @abstractmethod
@@ -41,7 +43,7 @@ class ForceField(ABC):
 
     @property
     def energy_count(self) -> int:
-        """How many energies ``add_energies`` writes."""
+        """How many energies ``write_energies`` writes."""
         return self.element_count
 
     @property
@@ -49,16 +51,35 @@ class ForceField(ABC):
         """Arrays that must be kept for the steps to go on as they would have."""
         return {}
 
+    @contextmanager
+    def state_kept(self) -> Iterator[None]:
+        """Whatever is launched inside leaves no trace in the state that steps go on from."""
+        kept = {name: wp.clone(array) for name, array in self.state.items()}
+        try:
+            yield
+        finally:
+            for name, array in self.state.items():
+                wp.copy(array, kept[name])
+
+    def elastic_forces(self, u: wp.array) -> wp.array:
+        """Elastic nodal forces [N] of displacements u, a new vec4 [N]."""
+        f = wp.zeros_like(u)
+        with self.state_kept():
+            self.add_forces(u, f)
+        return f
+
     def elastic_energy(self, u: wp.array) -> float:
         """Strain energy of the body [J]."""
         energies = wp.zeros(self.energy_count, dtype=wp.float64, device=self.device)
-        self.add_energies(u, energies)
+        with self.state_kept():
+            self.write_energies(u, energies)
         return float(energies.numpy().sum())
 
     def von_mises(self, u: wp.array) -> npt.NDArray[np.float32]:
         """Von Mises stress of each element [Pa], float32 [T]."""
         stress = wp.zeros(self.element_count, dtype=wp.float32, device=self.device)
-        self.write_von_mises(u, stress)
+        with self.state_kept():
+            self.write_von_mises(u, stress)
         return stress.numpy()
 
     def launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
@@ -101,7 +122,7 @@ class LawField(ForceField):
     def add_forces(self, u: wp.array, f: wp.array) -> None:
         self.launch(self._forces, self.element_count, [self.elements, *self.material_inputs, u], [f])
 
-    def add_energies(self, u: wp.array, energies: wp.array) -> None:
+    def write_energies(self, u: wp.array, energies: wp.array) -> None:
         self.launch(self._energies, self.element_count, [self.elements, *self.material_inputs, u], [energies])
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:

@@ -1,0 +1,183 @@
+"""Checkpoints: everything that a simulation needs to go on, in one NumPy archive without pickles."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import tempfile
+import warnings
+import zipfile
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..body import SoftBody
+from ..elasticity import MODELS
+from ..errors import InputError, StabilityWarning
+from ..materials import Isotropic
+from ..mesh import TetForest, TetMesh, Tree
+from ..simulation import Simulation
+from ..solvers import INTEGRATORS
+
+FORMAT = "warp-corot checkpoint"
+VERSION = 1
+
+
+def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
+    """Write the simulation's state to ``path``, whole or not at all: aside, to the disk, and then renamed.
+
+    Raises:
+        InputError: The folder is not there, the path is a folder, or it cannot be written to.
+    """
+    target = Path(path)
+    if not target.parent.is_dir():
+        raise InputError(f"cannot save {target}: the folder {target.parent} is not there")
+    if target.is_dir():
+        raise InputError(f"cannot save {target}: it is a folder")
+    arrays: dict[str, np.ndarray] = {}
+    header: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
+        "device": str(sim.device),
+        "dt": sim.dt,
+        "steps": sim.steps,
+        "gravity": sim.gravity,
+        "integrator": _described(sim.integrator, INTEGRATORS),
+        "bodies": [],
+    }
+    for number, (body, model, field) in enumerate(zip(sim.bodies, sim.models, sim.fields, strict=True)):
+        body.adopt_positions()
+        prefix = f"body{number}."
+        header["bodies"].append(
+            {
+                "model": _described(model, MODELS),
+                "mesh": _pack_mesh(body.mesh, prefix, arrays),
+                "trajectories": len(body.trajectories),
+                "field": sorted(field.state),
+            }
+        )
+        for name in ("young", "poisson", "density"):
+            arrays[prefix + name] = np.asarray(getattr(body.material, name))
+        arrays[prefix + "displacements"] = body.node_displacements.numpy()
+        arrays[prefix + "velocities"] = body.node_velocities.numpy()
+        arrays[prefix + "reactions"] = body.node_reactions.numpy()
+        arrays[prefix + "constrained"] = body.constrained
+        if body.has_loads:
+            arrays[prefix + "loads"] = body.node_loads.numpy()
+        for k, trajectory in enumerate(body.trajectories):
+            arrays[f"{prefix}trajectory{k}.nodes"] = trajectory.nodes.numpy()
+            arrays[f"{prefix}trajectory{k}.times"] = trajectory.times.numpy()
+            arrays[f"{prefix}trajectory{k}.displacements"] = trajectory.displacements.numpy()
+        for name, array in field.state.items():
+            arrays[f"{prefix}field.{name}"] = array.numpy()
+    arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    _write_whole(target, arrays)
+
+
+def load_checkpoint(path: str | PathLike[str], device: str | wp.Device | None = None) -> Simulation:
+    """The simulation that ``save_checkpoint`` wrote; see ``Simulation.load``."""
+    source = Path(path)
+    if not source.is_file():
+        raise InputError(f"there is no checkpoint {source}")
+    try:
+        with np.load(source, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        header = json.loads(arrays["header"].tobytes())
+        if header["format"] != FORMAT:
+            raise KeyError("format")
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{source} is not a whole checkpoint of warp_corot") from error
+    if header["version"] > VERSION:
+        raise InputError(f"{source} is of version {header['version']}; this warp_corot reads up to version {VERSION}")
+    bodies, models = [], []
+    for number, described in enumerate(header["bodies"]):
+        prefix = f"body{number}."
+        mesh = _unpack_mesh(described["mesh"], prefix, arrays)
+        material = Isotropic(*(arrays[prefix + name][()] for name in ("young", "poisson", "density")))
+        body = SoftBody(mesh, material, device=header["device"] if device is None else device)
+        body.fix(arrays[prefix + "constrained"])
+        for k in range(described["trajectories"]):
+            motion = f"{prefix}trajectory{k}."
+            keys = arrays[motion + "displacements"]
+            body.prescribe(
+                arrays[motion + "nodes"],
+                times=arrays[motion + "times"],
+                displacements=keys[:, 0] if keys.shape[1] == 1 else keys,
+            )
+        if prefix + "loads" in arrays:
+            body.load(np.arange(body.node_count), arrays[prefix + "loads"][:, :3])
+        body.displacements = arrays[prefix + "displacements"][:, :3]
+        body.velocities = arrays[prefix + "velocities"][:, :3]
+        body.node_reactions.assign(arrays[prefix + "reactions"])
+        bodies.append(body)
+        models.append(_rebuilt(described["model"], MODELS))
+    integrator = dataclasses.replace(_rebuilt(header["integrator"], INTEGRATORS), dt=header["dt"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", StabilityWarning)  # it was given when the simulation was made
+        sim = Simulation(bodies, model=models, integrator=integrator, gravity=header["gravity"])
+    sim.clock.fill_(header["steps"])
+    for number, (described, field) in enumerate(zip(header["bodies"], sim.fields, strict=True)):
+        for name in described["field"]:
+            field.state[name].assign(arrays[f"body{number}.field.{name}"])
+    return sim
+
+
+def _described(thing: Any, names: dict[str, Any]) -> dict[str, Any]:
+    """A listed dataclass of plain values as JSON: its name in the list and its values."""
+    for name, cls in names.items():
+        if type(thing) is cls:
+            return {"name": name, "values": dataclasses.asdict(thing)}
+    raise InputError(f"a {type(thing).__name__} cannot be saved; only {', '.join(c.__name__ for c in names.values())}")
+
+
+def _rebuilt(described: dict[str, Any], names: dict[str, Any]) -> Any:
+    return names[described["name"]](**described["values"])
+
+
+def _pack_mesh(mesh: TetForest | TetMesh, prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    if isinstance(mesh, TetMesh):
+        arrays[prefix + "points"], arrays[prefix + "tets"] = mesh.points, mesh.tets
+        return {"kind": "general", "up_axis": mesh.up_axis, "repaired": mesh.repaired}
+    arrays[prefix + "lattice"], arrays[prefix + "node_ends"] = mesh.lattice, mesh.node_ends
+    for field in dataclasses.fields(Tree):
+        arrays[f"{prefix}tree.{field.name}"] = getattr(mesh.tree, field.name)
+    return {
+        "kind": "forest",
+        "up_axis": mesh.up_axis,
+        "cells": mesh.cells,
+        "cell_size": mesh.cell_size,
+        "origin": mesh.origin,
+    }
+
+
+def _unpack_mesh(described: dict[str, Any], prefix: str, arrays: dict[str, np.ndarray]) -> TetForest | TetMesh:
+    if described["kind"] == "general":
+        mesh = TetMesh(arrays[prefix + "points"], arrays[prefix + "tets"], up_axis=described["up_axis"])
+        mesh.repaired = described["repaired"]
+        return mesh
+    tree = Tree(**{field.name: arrays[f"{prefix}tree.{field.name}"] for field in dataclasses.fields(Tree)})
+    x, y, z = described["cells"]
+    a, b, c = described["origin"]
+    lattice, ends = arrays[prefix + "lattice"], arrays[prefix + "node_ends"]
+    return TetForest((x, y, z), described["cell_size"], (a, b, c), lattice, ends, tree, described["up_axis"])
+
+
+def _write_whole(target: Path, arrays: dict[str, np.ndarray]) -> None:
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
+    except OSError as error:
+        raise InputError(f"cannot save {target}: {error.strerror}") from error
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(name, target)
+    except OSError as error:
+        raise InputError(f"cannot save {target}: {error.strerror}") from error
+    finally:
+        Path(name).unlink(missing_ok=True)

@@ -1,0 +1,310 @@
+"""Bodies in motion: an elastic model, an integrator and gravity, stepped in recorded graphs."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from .body import SoftBody, vec3_view
+from .elasticity import Corotated, Model
+from .errors import InputError, StabilityWarning, UnstableError
+from .kernels.integrate import advance_clock
+from .solvers import Integrator, SymplecticEuler, largest_frequency
+from .solvers.integrator import StepContext
+
+#: Steps recorded in one graph, so that Python is out of the loop.
+GRAPH_STEPS = 64
+
+#: Steps after which a run looks whether its state is still finite.
+CHECK_STEPS = 1024
+
+_NEVER = np.iinfo(np.int64).max
+
+
+class Energy(NamedTuple):
+    """Energies of all bodies together [J]; gravitational about the origin."""
+
+    kinetic: float
+    elastic: float
+    gravitational: float
+
+    @property
+    def total(self) -> float:
+        return self.kinetic + self.elastic + self.gravitational
+
+
+@dataclass(frozen=True)
+class _Hook:
+    callback: Callable[[Simulation], None]
+    every: int
+
+
+class Simulation:
+    """One or several soft bodies, stepped together.
+
+    Args:
+        bodies: A ``SoftBody`` or several on one device; they do not touch one another.
+        model: Elastic model, or one for each body.
+        integrator: Time integrator; with ``dt=None`` a stable step is found.
+        gravity: [m/s^2]; None for 9.81 down the up axis of the first body's mesh.
+
+    Attributes:
+        bodies: Tuple of the bodies.
+        dt: Time step [s].
+        stable_dt: Largest linearly stable step at rest [s], estimated; infinite where nothing can vibrate.
+        gravity: Tuple [m/s^2].
+
+    Raises:
+        InputError: No body, bodies on different devices, a number of models that is not the number of bodies, a body of
+            which no node is free to move, non-finite gravity, or a model that does not go with its mesh.
+
+    Warns:
+        StabilityWarning: The given step is larger than ``stable_dt``.
+    """
+
+    def __init__(
+        self,
+        bodies: SoftBody | Sequence[SoftBody],
+        *,
+        model: Model | Sequence[Model] | None = None,
+        integrator: Integrator | None = None,
+        gravity: npt.ArrayLike | None = None,
+    ):
+        self.bodies = (bodies,) if isinstance(bodies, SoftBody) else tuple(bodies)
+        if not self.bodies:
+            raise InputError("a simulation needs at least one body")
+        self.device = self.bodies[0].device
+        for body in self.bodies:
+            if body.device != self.device:
+                raise InputError(f"bodies are on {self.device} and {body.device}; they must be on one device")
+            if not (body.node_inverse_mass.numpy() > 0).any():
+                raise InputError(f"all {body.node_count} nodes of the body are held; at least one must be free to move")
+        given = Corotated() if model is None else model
+        self.models = (given,) * len(self.bodies) if isinstance(given, Model) else tuple(given)
+        if len(self.models) != len(self.bodies):
+            raise InputError(f"there are {len(self.models)} models for {len(self.bodies)} bodies")
+        self.integrator = SymplecticEuler() if integrator is None else integrator
+        self.gravity = _checked_gravity(gravity, self.bodies[0].mesh.up_axis)
+
+        self.fields = tuple(m.bind(body) for m, body in zip(self.models, self.bodies, strict=True))
+        frequencies = [largest_frequency(body, f) for body, f in zip(self.bodies, self.fields, strict=True)]
+        steps = [2.0 / w if w > 0 else math.inf for w in frequencies]
+        self.stable_dt = min(steps)
+        if self.integrator.dt is not None:
+            self.dt = float(self.integrator.dt)
+            if self.dt > self.stable_dt:
+                warnings.warn(
+                    f"the time step {self.dt:.3g} s is beyond the largest stable one, about {self.stable_dt:.3g} s",
+                    StabilityWarning,
+                    stacklevel=2,
+                )
+        else:
+            safe = min(m.step_safety * dt for m, dt in zip(self.models, steps, strict=True))
+            self.dt = safe if math.isfinite(safe) else 1e-3
+
+        self.clock = wp.zeros(1, dtype=wp.int64, device=self.device)
+        self._bad_step = wp.array([_NEVER], dtype=wp.int64, device=self.device)
+        context = StepContext(self.dt, wp.vec3(*self.gravity), self.clock, self._bad_step)
+        self._steppers = [
+            self.integrator.bind(body, f, context) for body, f in zip(self.bodies, self.fields, strict=True)
+        ]
+        self._hooks: list[_Hook] = []
+        self._graphs: dict[tuple[int, bool], wp.Graph] = {}
+        self._recorded_revisions: tuple[int, ...] = ()
+
+    # --- stepping --------------------------------------------------------------------------------------------------
+
+    @property
+    def body(self) -> SoftBody:
+        """The first body."""
+        return self.bodies[0]
+
+    @property
+    def steps(self) -> int:
+        """Time steps done."""
+        return int(self.clock.numpy()[0])
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return self.steps * self.dt
+
+    def step(self) -> None:
+        """Advance by one time step.
+
+        Inside somebody else's capture on this device the step's launches are recorded, nothing else: no hooks are called and
+        nothing is checked. On CUDA the call does not wait for the device unless hooks are set.
+
+        Raises:
+            UnstableError: On the CPU: the state is not finite any more.
+        """
+        if self.device.is_capturing:
+            self._launch_steps(1, whole=True)
+            return
+        self._run(1, whole=True)
+        if self.device.is_cpu or self._hooks:
+            self._check_finite()
+            self._call_hooks()
+
+    def advance(self, seconds: float) -> None:
+        """Advance by the whole number of steps nearest to ``seconds``; the state is there when the call returns.
+
+        Raises:
+            InputError: Negative or non-finite time.
+            UnstableError: The state is not finite any more; the message says since which step.
+        """
+        if not (math.isfinite(seconds) and seconds >= 0):
+            raise InputError(f"cannot advance by {seconds} s; it must be zero or a positive time")
+        if self.device.is_capturing:
+            raise InputError("advance cannot be called while its device is capturing; call step, which records")
+        self.advance_steps(round(seconds / self.dt))
+
+    def advance_steps(self, count: int) -> None:
+        """Advance by ``count`` time steps; as ``advance``."""
+        done = self.steps
+        end = done + count
+        while done < end:
+            due = min([end, done + CHECK_STEPS, *((done // h.every + 1) * h.every for h in self._hooks)])
+            for body in self.bodies:
+                body.adopt_positions()
+            remaining = due - done
+            while remaining:
+                run = GRAPH_STEPS if remaining >= GRAPH_STEPS else 1
+                self._run(run, whole=False)
+                remaining -= run
+            for body in self.bodies:
+                body.publish_positions()
+            self._check_finite()
+            done = due
+            self._call_hooks()
+        wp.synchronize_device(self.device)
+
+    def on_step(self, callback: Callable[[Simulation], None], every: int = 1) -> None:
+        """Call ``callback(sim)`` after every ``every``-th step, counted from the beginning of the simulation.
+
+        Raises:
+            InputError: ``every`` is not a positive whole number.
+        """
+        if isinstance(every, bool) or every != int(every) or every < 1:
+            raise InputError(f"every is {every}; it must be a positive whole number of steps")
+        self._hooks.append(_Hook(callback, int(every)))
+
+    # --- looking ---------------------------------------------------------------------------------------------------
+
+    def energy(self) -> Energy:
+        """Kinetic, elastic and gravitational energy of all bodies in the present state [J]."""
+        kinetic = elastic = gravitational = 0.0
+        for body, field in zip(self.bodies, self.fields, strict=True):
+            body.adopt_positions()
+            v = body.velocities.numpy().astype(np.float64)
+            u = body.node_displacements.numpy()[:, :3].astype(np.float64)
+            kinetic += 0.5 * float(body.masses @ np.einsum("ni,ni->n", v, v))
+            elastic += field.elastic_energy(body.node_displacements)
+            gravitational -= float(body.masses @ ((body.mesh.points + u) @ np.asarray(self.gravity)))
+        return Energy(kinetic, elastic, gravitational)
+
+    def forces(self, body: SoftBody | None = None) -> wp.array:
+        """Elastic nodal forces in the present state [N], vec3 [N]; of the first body unless another is named."""
+        chosen = self._index(body)
+        self.bodies[chosen].adopt_positions()
+        return vec3_view(self.fields[chosen].elastic_forces(self.bodies[chosen].node_displacements))
+
+    def von_mises(self, body: SoftBody | None = None) -> npt.NDArray[np.float32]:
+        """Von Mises stress of each element in the present state [Pa], float32 [T]."""
+        chosen = self._index(body)
+        self.bodies[chosen].adopt_positions()
+        return self.fields[chosen].von_mises(self.bodies[chosen].node_displacements)
+
+    # --- keeping ---------------------------------------------------------------------------------------------------
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write everything needed to go on to one file (.npz, no pickle), whole or not at all; hooks are not kept.
+
+        Raises:
+            InputError: The folder is not there or cannot be written to.
+        """
+        from .io.checkpoint import save_checkpoint
+
+        save_checkpoint(self, path)
+
+    @classmethod
+    def load(cls, path: str | PathLike[str], *, device: str | wp.Device | None = None) -> Simulation:
+        """Go on from a saved simulation; on the CPU bit by bit as if it had never stopped.
+
+        Args:
+            path: A file that ``save`` wrote.
+            device: Where to go on; None: where it was saved.
+
+        Raises:
+            InputError: No such file, not a checkpoint, one of a newer version, or no such device.
+        """
+        from .io.checkpoint import load_checkpoint
+
+        return load_checkpoint(path, device)
+
+    # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _index(self, body: SoftBody | None) -> int:
+        if body is None:
+            return 0
+        if body not in self.bodies:
+            raise InputError("the body is not one of this simulation's")
+        return self.bodies.index(body)
+
+    def _launch_steps(self, count: int, *, whole: bool) -> None:
+        """Launch steps; ``whole`` ones take over positions first and publish them after."""
+        if whole:
+            for body in self.bodies:
+                body.adopt_positions()
+        for offset in range(count):
+            for stepper in self._steppers:
+                stepper.step(offset)
+        wp.launch(advance_clock, dim=1, inputs=[count], outputs=[self.clock], device=self.device)
+        if whole:
+            for body in self.bodies:
+                body.publish_positions()
+
+    def _run(self, count: int, *, whole: bool) -> None:
+        """Replay recorded steps, recording them first where they are new or the bodies' launches have changed."""
+        revisions = tuple(body.revision for body in self.bodies)
+        if revisions != self._recorded_revisions:
+            self._graphs.clear()
+            self._recorded_revisions = revisions
+        key = (count, whole)
+        if key not in self._graphs:
+            with wp.ScopedCapture(device=self.device) as capture:
+                self._launch_steps(count, whole=whole)
+            self._graphs[key] = capture.graph
+        wp.capture_launch(self._graphs[key])
+
+    def _check_finite(self) -> None:
+        step = int(self._bad_step.numpy()[0])
+        if step != _NEVER:
+            hint = f"dt is {self.dt:.3g} s, the largest stable step at rest about {self.stable_dt:.3g} s"
+            raise UnstableError(f"the state is not finite any more since step {step} (t = {step * self.dt:.4g} s); {hint}")
+
+    def _call_hooks(self) -> None:
+        steps = self.steps if self._hooks else 0
+        for hook in self._hooks:
+            if steps % hook.every == 0:
+                hook.callback(self)
+
+
+def _checked_gravity(gravity: npt.ArrayLike | None, up_axis: str) -> tuple[float, float, float]:
+    if gravity is None:
+        down = np.zeros(3)
+        down["XYZ".index(up_axis)] = -9.81
+    else:
+        down = np.asarray(gravity, dtype=np.float64)
+        if down.shape != (3,) or not np.isfinite(down).all():
+            raise InputError(f"gravity is {gravity}; it must be three finite accelerations in m/s^2")
+    x, y, z = (float(a) for a in down)
+    return x, y, z

@@ -1,0 +1,90 @@
+"""Symplectic Euler: explicit, first order, without drift of energy."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from ..elasticity import ForceField
+from ..errors import InputError
+from ..kernels.integrate import follow_trajectory, step_symplectic_euler
+from .integrator import Integrator, StepContext, Stepper
+
+if TYPE_CHECKING:
+    from ..body import SoftBody
+
+
+@dataclass(frozen=True)
+class SymplecticEuler(Integrator):
+    """v <- (v + dt (f/m + g)) / (1 + dt damping); x <- x + dt v, with lumped masses.
+
+    Attributes:
+        dt: Time step [s]; None: a stable one is found from mesh and material.
+        damping: Rate of mass-proportional damping >= 0 [1/s], taken implicitly, so that it never limits the step.
+
+    Raises:
+        InputError: A value out of its range.
+    """
+
+    dt: float | None = None
+    damping: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.dt is not None and not (math.isfinite(self.dt) and self.dt > 0):
+            raise InputError(f"dt is {self.dt}; it must be a positive number of seconds, or None")
+        if not (math.isfinite(self.damping) and self.damping >= 0):
+            raise InputError(f"damping is {self.damping}; it must be zero or a positive rate in 1/s")
+
+    def bind(self, body: SoftBody, field: ForceField, context: StepContext) -> Stepper:
+        return SymplecticEulerStepper(body, field, context, self.damping)
+
+
+class SymplecticEulerStepper(Stepper):
+    def __init__(self, body: SoftBody, field: ForceField, context: StepContext, damping: float):
+        self.body = body
+        self.field = field
+        self.context = context
+        self.damping = damping
+
+    def step(self, offset: int) -> None:
+        body, context = self.body, self.context
+        for trajectory in body.trajectories:
+            wp.launch(
+                follow_trajectory,
+                dim=len(trajectory.nodes),
+                inputs=[
+                    trajectory.nodes,
+                    trajectory.times,
+                    trajectory.displacements,
+                    context.dt,
+                    context.clock,
+                    offset,
+                    body.node_displacements,
+                ],
+                outputs=[body.node_velocities],
+                device=body.device,
+            )
+        self.field.add_forces(body.node_displacements, body.node_forces)
+        wp.launch(
+            step_symplectic_euler,
+            dim=body.node_count,
+            inputs=[
+                context.dt,
+                self.damping,
+                context.gravity,
+                body.node_mass,
+                body.node_inverse_mass,
+                int(body.has_loads),
+                body.node_loads,
+                context.clock,
+                offset,
+                body.node_forces,
+                body.node_displacements,
+                body.node_velocities,
+            ],
+            outputs=[body.node_reactions, context.bad_step],
+            device=body.device,
+        )
