@@ -1,4 +1,4 @@
-"""The corotated force of the paper: f = -R K (R^T x - x0), with every element's own rotation or one shared down the tree.
+"""The corotated force of the paper, f = -R K (R^T x - x0), with own rotations or rotations shared down the tree.
 
 Own rotations are found and used in one kernel. Shared ones take two: ``extract_rotations`` finds the rotation of each
 ancestor from its four vertices, the force kernels gather it. A rotation R maps rest space to world space; an element's

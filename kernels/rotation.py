@@ -53,7 +53,7 @@ def frobenius(a: wp.mat33):
 
 @wp.func
 def largest_entry(a: wp.mat33):
-    m = float(0.0)
+    m = 0.0
     for i in range(3):
         for j in range(3):
             m = wp.max(m, wp.abs(a[i, j]))
@@ -62,7 +62,7 @@ def largest_entry(a: wp.mat33):
 
 @wp.func
 def all_finite(a: wp.mat33):
-    ok = bool(True)
+    ok = True
     for i in range(3):
         for j in range(3):
             # A comparison with NaN is false, and so is one with an infinity beyond the largest float.
@@ -106,8 +106,8 @@ def turn(f: wp.mat33, q: wp.quat):
     if h[0, 0] > 1.0e-3 * scale and minor > 1.0e-4 * scale * scale and det > 1.0e-6 * scale * scale * scale:
         w = wp.transpose(cofactor(h)) * axial / det
     else:
-        # Past the reach of Newton's step: where the slope is small it would creep along a saddle, so leave about the axis
-        # of upward curvature.
+        # Past the reach of Newton's step: where the slope is small it would creep along a saddle, so leave about the
+        # axis of upward curvature.
         axis = leading_eigenvector(s, scale)
         if wp.dot(axis, h * axis) < -1.0e-3 * scale:
             w += wp.where(wp.dot(axis, axial) < 0.0, -0.7, 0.7) * axis
@@ -185,8 +185,8 @@ def first_zetas(f: wp.mat33):
 def byers_xu_newton(f: wp.mat33, tolerance: float):
     zeta0, zeta = first_zetas(f)
     x = newton_step(f, zeta0)
-    step = float(1.0)
-    iteration = int(1)
+    step = 1.0
+    iteration = 1
     while step > tolerance and iteration < MAX_NEWTON:
         y = newton_step(x, zeta)
         step = frobenius(y - x)

@@ -50,9 +50,7 @@ def edge_stiffness(shape: int) -> tuple[list[list[float]], list[list[float]]]:
         first.append([VOLUME[shape] * 0.25 * c_e * gram(shape, k, m) for k, m in EDGES])
         second.append(
             [
-                VOLUME[shape]
-                * 0.25
-                * (gram(shape, j, k) * gram(shape, i, m) + gram(shape, j, m) * gram(shape, i, k))
+                VOLUME[shape] * 0.25 * (gram(shape, j, k) * gram(shape, i, m) + gram(shape, j, m) * gram(shape, i, k))
                 for k, m in EDGES
             ]
         )

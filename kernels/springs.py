@@ -103,7 +103,7 @@ def edge_tensions(elements: GeneralElements, t: int, d: vec6, mu: float, lam: fl
     for e in range(6):
         i = FIRST_NODE[e]
         j = SECOND_NODE[e]
-        total = float(0.0)
+        total = 0.0
         for k in range(6):
             m = FIRST_NODE[k]
             n = SECOND_NODE[k]
@@ -119,7 +119,7 @@ def edge_stretch(rest: wp.vec3, stretch: wp.vec3, biquadratic: bool):
     ``rest`` is the edge at rest, ``stretch`` what its ends' displacements differ by: l^2 - L^2 without cancellation.
     """
     d = 2.0 * wp.dot(rest, stretch) + wp.dot(stretch, stretch)
-    factor = float(2.0)
+    factor = 2.0
     if not biquadratic:
         length = wp.length(rest + stretch)
         rest_length = wp.length(rest)

@@ -27,8 +27,10 @@ class SoftBody:
     """The state of one body: displacements, velocities, masses, constraints and loads of its nodes.
 
     Nodal vectors live in 16-byte vec4 arrays, the fourth lane unused, so that a node is one load and, where the card
-    can, one reduction. The state proper is the displacement from rest, which keeps the digits of small strains;
-    ``positions`` are published after each run of steps, and positions that you write are taken over before the next.
+    can, one reduction. The state proper is the displacement from rest, which keeps the digits of small strains: the
+    static end of a linear beam comes out to 1e-6 of its deflection, from float32 positions to 4e-6 with the beam at the
+    origin and to 3e-5 with it one metre away. ``positions`` are published after each run of steps, and positions that
+    you write are taken over before the next.
 
     Args:
         mesh: A ``TetForest`` or ``TetMesh``.
@@ -328,7 +330,7 @@ def vec3_view(a: wp.array) -> wp.array:
 def lumped_masses(mesh: Mesh, material: Isotropic) -> npt.NDArray[np.float64]:
     """A quarter of each element's mass at each of its nodes [kg], float64 [N]."""
     quarter = mesh.volumes * material.density / 4.0
-    return np.bincount(mesh.tets.ravel(), np.repeat(quarter, 4), len(mesh.points))
+    return np.bincount(mesh.tets.ravel(), np.repeat(quarter, 4), len(mesh.points)).astype(np.float64)
 
 
 def checked_device(device: str | wp.Device | None) -> wp.Device:

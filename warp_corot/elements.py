@@ -58,7 +58,7 @@ def shape_codes(corners: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.
     shape = level % 3
     half_edge = (1 << (LATTICE_BITS - 1 - level // 3))[:, None]
     x0, x1, x2, x3 = (corners[:, n] for n in range(4))
-    # Twice the columns' rest differences in units of the edge length: -1, 0 or 1 after halving, before the diagonal's root.
+    # The columns at rest, in half edge lengths, a diagonal before its root is taken: -2, 0 or 2.
     diagonal = (shape == 2)[:, None]
     middle = (shape == 1)[:, None]
     first = np.where(diagonal, 2 * (x0 - x2), x1 - x0)

@@ -48,11 +48,11 @@ class Isotropic:
             object.__setattr__(self, name, values if values.ndim else float(values))
 
     @property
-    def mu(self) -> float | npt.NDArray[np.float64]:
+    def mu(self) -> float | npt.NDArray[np.floating]:
         """Second Lamé parameter (shear modulus) [Pa]."""
         return self.young / (2.0 * (1.0 + self.poisson))
 
     @property
-    def lam(self) -> float | npt.NDArray[np.float64]:
+    def lam(self) -> float | npt.NDArray[np.floating]:
         """First Lamé parameter [Pa]."""
         return self.young * self.poisson / ((1.0 + self.poisson) * (1.0 - 2.0 * self.poisson))

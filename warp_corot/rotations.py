@@ -28,7 +28,7 @@ def rotation_function(method: str, iterations: int | None = None) -> wp.Function
         if method != "byers-xu":
             raise InputError(f"iterations is {iterations}; only 'byers-xu' takes a fixed number, not {method!r}")
         if isinstance(iterations, bool) or iterations != int(iterations) or not 2 <= iterations <= MAX_ITERATIONS:
-            raise InputError(f"iterations is {iterations}; it must be None or a whole number from 2 to {MAX_ITERATIONS}")
+            raise InputError(f"iterations is {iterations}; it must be None or an integer from 2 to {MAX_ITERATIONS}")
         return byers_xu_fixed(int(iterations))
     functions = {"byers-xu": byers_xu, "svd": mcadams_svd}
     if method not in functions:
@@ -52,7 +52,8 @@ def polar_rotation(
     Args:
         F: Matrices [n, 3, 3] (or one, [3, 3]).
         method: "byers-xu": Newton's iteration with the scaling of Byers and Xu (2008), to the paper's tolerance;
-            "svd": U V^T of Warp's 3x3 SVD (McAdams et al. 2011); "warm": iteration on a quaternion (Müller et al. 2016).
+            "svd": U V^T of Warp's 3x3 SVD (McAdams et al. 2011), the baseline, off by up to 0.05 where singular values
+            nearly meet in an inverted F; "warm": iteration on a quaternion (Müller et al. 2016).
         iterations: For "byers-xu": this many iterations (2 to 12) in place of the tolerance.
         guess: For "warm": rotations to start from [n, 3, 3]; the identity by default.
         device: Where to work; None for Warp's default.

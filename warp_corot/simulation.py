@@ -140,8 +140,8 @@ class Simulation:
     def step(self) -> None:
         """Advance by one time step.
 
-        Inside somebody else's capture on this device the step's launches are recorded, nothing else: no hooks are called and
-        nothing is checked. On CUDA the call does not wait for the device unless hooks are set.
+        Inside somebody else's capture on this device the step's launches are recorded, nothing else: no hooks are
+        called and nothing is checked. On CUDA the call does not wait for the device unless hooks are set.
 
         Raises:
             UnstableError: On the CPU: the state is not finite any more.
@@ -289,7 +289,7 @@ class Simulation:
         step = int(self._bad_step.numpy()[0])
         if step != _NEVER:
             hint = f"dt is {self.dt:.3g} s, the largest stable step at rest about {self.stable_dt:.3g} s"
-            raise UnstableError(f"the state is not finite any more since step {step} (t = {step * self.dt:.4g} s); {hint}")
+            raise UnstableError(f"the state is not finite since step {step} (t = {step * self.dt:.4g} s); {hint}")
 
     def _call_hooks(self) -> None:
         steps = self.steps if self._hooks else 0

@@ -1,4 +1,4 @@
-"""Corotated linear elasticity, the paper's model: linear in a frame that turns with each element, or with its ancestor."""
+"""Corotated linear elasticity, the paper's model: linear in a frame that turns with the element or its ancestor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Linear elasticity: small strain of the whole displacement. Exact for small rotations, grows in volume for large ones."""
+"""Linear elasticity: small strain of the whole displacement. Right for small rotations, swells in large ones."""
 
 from __future__ import annotations
 

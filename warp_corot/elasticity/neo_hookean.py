@@ -17,8 +17,8 @@ class NeoHookean(Model):
     """W = V (mu/2 (tr F^T F - 3) - mu ln J + lambda/2 (ln J)^2), P = mu (F - F^-T) + lambda ln J F^-T.
 
     Below J = 0.1 the logarithm is continued by its second-order Taylor expansion about 0.1, so that energy and force
-    are defined and continuous for every F and push an inverted element back. Total-Lagrangian too: with explicit central
-    differences, TLED (Miller et al. 2007).
+    are defined and continuous for every F and push an inverted element back. Total-Lagrangian too: with explicit
+    central differences, TLED (Miller et al. 2007).
     """
 
     def bind(self, body: SoftBody) -> ForceField:

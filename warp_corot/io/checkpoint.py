@@ -173,7 +173,7 @@ def _write_whole(target: Path, arrays: dict[str, np.ndarray]) -> None:
         raise InputError(f"cannot save {target}: {error.strerror}") from error
     try:
         with os.fdopen(handle, "wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+            np.savez(file, allow_pickle=False, **arrays)
             file.flush()
             os.fsync(file.fileno())
         os.replace(name, target)

@@ -1,8 +1,8 @@
-"""The forest of bisected tetrahedra: a grid of cubes, each split into six path tetrahedra, each the root of a binary tree.
+"""The forest of bisected tetrahedra: a grid of cubes, six path tetrahedra each, every one the root of a binary tree.
 
 A tetrahedron (x0, x1, x2, x3) of level l is bisected at the midpoint z of its refinement edge x0-xk, k = 3 - (l mod 3),
-into (x0, .., x(k-1), z, x(k+1), .., x3) and (x1, .., xk, z, x(k+1), .., x3) (Maubach 1995; Tagawa et al. 2013). Vertices lie
-on an integer lattice. The tree keeps every ancestor; the leaves are the mesh. Everything is built with array operations.
+into (x0, .., x(k-1), z, x(k+1), .., x3) and (x1, .., xk, z, x(k+1), .., x3) (Maubach 1995; Tagawa et al. 2013). Vertices
+lie on an integer lattice. The tree keeps every ancestor; the leaves are the mesh. All is built with array operations.
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ def _checked_cells(cells: tuple[int, int, int]) -> tuple[int, int, int]:
 
 
 def _order_of_first_touch(tets: np.ndarray, node_count: int) -> np.ndarray:
-    """Nodes in the order in which the elements first name them, so that neighbours in memory are neighbours in space."""
+    """Nodes in the order in which the elements first name them: neighbours in memory are neighbours in space."""
     touched = tets.ravel()
     first = np.empty(node_count, np.int64)
     # Where a node is written more than once the last write stays: walk backwards to keep the first.

@@ -16,8 +16,8 @@ FLAT = 1e-7
 class TetMesh:
     """Tetrahedra of any shape.
 
-    Wrongly wound tetrahedra (negative volume) are turned round by exchanging their last two nodes; ``repaired`` says how
-    many. Nodes that no tetrahedron names are kept, in their place, and stay at rest.
+    Wrongly wound tetrahedra (negative volume) are turned round by exchanging their last two nodes; ``repaired`` says
+    how many. Nodes that no tetrahedron names are kept, in their place, and stay at rest.
 
     Args:
         points: Rest positions [m], [N, 3].

@@ -20,9 +20,9 @@ PROBE = 1e-3
 def largest_frequency(body: SoftBody, field: ForceField) -> float:
     """Largest angular frequency [rad/s] of small motions about rest; explicit central differences need dt < 2 / it.
 
-    Lanczos' iteration on M^-1/2 K M^-1/2, where K is applied as the force field itself does it for small displacements, so
-    that whatever model and elements there are is what is measured. The Ritz value's residual is added to it. Zero if no
-    node is free to move.
+    Lanczos' iteration on M^-1/2 K M^-1/2, where K is applied as the force field itself does it for small displacements,
+    so that whatever model and elements there are is what is measured. The Ritz value's residual is added to it. Zero if
+    no node is free to move.
     """
     weight = np.sqrt(body.node_inverse_mass.numpy().astype(np.float64))
     free = weight > 0
