@@ -1,0 +1,172 @@
+"""Elastic forces and energies of every model, on every kind of mesh, against the float64 oracle.
+
+The forces are float32: each is a sum of terms that rounding changes by some 1e-7 of the largest stress, times the few
+operations and elements around a node. A wrong weight, sign or index is 1e-2 or more.
+"""
+
+import numpy as np
+import oracle
+import pytest
+from cases import (
+    MATERIAL,
+    MESHES,
+    MODELS,
+    edge_scale,
+    jittered,
+    mixed_forest,
+    oracle_mesh,
+    place,
+    random_displacement,
+    simulation,
+)
+
+import warp_corot as wc
+
+MU, LAM = oracle.lame(MATERIAL["young"], MATERIAL["poisson"])
+# nearly incompressible: lambda is 49 mu, so that a rounding of the trace weighs 100 times that of a strain
+FORCE_TOLERANCE = 1e-5  # of the largest nodal force
+
+
+def compare(sim, body, model, u, mu=MU, lam=LAM, tolerance=FORCE_TOLERANCE, **options):
+    reference = oracle_mesh(body.mesh)
+    energies, expected = oracle.evaluate(model, reference, reference.points + u.astype(float), mu, lam, **options)
+    forces = sim.forces().numpy()
+    assert np.isfinite(forces).all()
+    assert np.abs(forces - expected).max() < tolerance * np.abs(expected).max()
+    assert sim.energy().elastic == pytest.approx(energies.sum(), rel=tolerance)
+
+
+@pytest.mark.parametrize("mesh", MESHES)
+@pytest.mark.parametrize("model", MODELS)
+def test_forces_and_energy_equal_the_oracle(model, mesh, device, rng):
+    """Strains around 0.3, turned by a large rotation where the model allows it."""
+    mesh = MESHES[mesh]()
+    sim, body = simulation(mesh, model, device)
+    u = random_displacement(mesh, rng, 0.1)
+    if model != "linear":
+        turn = oracle.polar(rng.standard_normal((3, 3)))
+        u = ((mesh.points + u) @ turn.T - mesh.points).astype(np.float32)
+    place(body, u)
+    compare(sim, body, model, u)
+
+
+@pytest.mark.parametrize("model", [model for model in MODELS if "quadratic" not in model and model != "mass_spring"])
+def test_inverted_elements_equal_the_oracle(model, device, rng):
+    """Displacements of a whole edge turn elements inside out; forces stay those of the stated energy.
+
+    Corotated: an inverted element whose two smaller singular values nearly meet has no well-defined rotation; only
+    nodes that no such element touches are compared.
+    """
+    mesh = wc.TetForest.box((1, 1, 1), 0.064, 3)
+    sim, body = simulation(mesh, model, device)
+    u = random_displacement(mesh, rng, 0.9)
+    place(body, u)
+    reference = oracle_mesh(mesh)
+    F = reference.deformation_gradients(mesh.points + u.astype(float))
+    assert (np.linalg.det(F) < -0.1).sum() > 5
+    _, expected = oracle.evaluate(model, reference, mesh.points + u.astype(float), MU, LAM)
+    sigma = np.linalg.svd(F, compute_uv=False)
+    gap = sigma[:, 1] + sigma[:, 2] * np.sign(np.linalg.det(F))
+    well = np.ones(len(mesh.points), bool)
+    if model == "corotated":
+        well[mesh.tets[gap < 0.1 * sigma[:, 0]]] = False
+    assert well.sum() > 10
+    assert np.abs(sim.forces().numpy() - expected)[well].max() < FORCE_TOLERANCE * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("make", [mixed_forest, jittered])
+def test_material_per_element(model, make, device, rng):
+    mesh = make()
+    count = len(mesh.tets)
+    young, poisson, density = rng.uniform(200, 2000, count), rng.uniform(0.0, 0.45, count), rng.uniform(5, 20, count)
+    sim, body = simulation(mesh, model, device, material={"young": young, "poisson": poisson, "density": density})
+    u = random_displacement(mesh, rng, 0.1)
+    place(body, u)
+    compare(sim, body, model, u, *oracle.lame(young, poisson))
+    assert body.masses == pytest.approx(oracle_mesh(mesh).masses(density), rel=1e-12)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_force_is_minus_energy_gradient(model, device, rng):
+    """The solver's forces are minus the gradient of the solver's own energy.
+
+    Along a direction d, W(u + h d) - W(u - h d) = -2 h f.d + O(h^3). The energy is a sum of float32 terms, so that h is
+    large (a fiftieth of an edge), the O(h^3) term is removed by Richardson extrapolation from h and h/2, and d is
+    random but not across f.
+    """
+    mesh = mixed_forest()
+    sim, body = simulation(mesh, model, device)
+    u = random_displacement(mesh, rng, 0.1).astype(float)
+    place(body, u)
+    forces = sim.forces().numpy().astype(float)
+    d = forces * rng.uniform(0.2, 1.8, (len(forces), 1))
+    d *= 0.02 * (edge_scale(mesh) / np.linalg.norm(d, axis=1, keepdims=True)).min()
+
+    def slope(h):
+        energies = []
+        for sign in (1, -1):
+            place(body, u + sign * h * d)
+            energies.append(sim.energy().elastic)
+        return (energies[0] - energies[1]) / (2 * h)
+
+    assert (4 * slope(0.5) - slope(1.0)) / 3 == pytest.approx(-np.sum(forces * d), rel=2e-4)
+
+
+def test_edge_springs_equal_the_total_lagrangian_form(device, rng):
+    mesh = jittered()
+    u = random_displacement(mesh, rng, 0.2)
+    forces = []
+    for model in (wc.EdgeStVK(), wc.StVenantKirchhoff()):
+        sim, body = simulation(mesh, model, device)
+        place(body, u)
+        forces.append(sim.forces().numpy())
+    assert np.abs(forces[0] - forces[1]).max() < 2 * FORCE_TOLERANCE * np.abs(forces[1]).max()
+
+
+@pytest.mark.parametrize("model", [model for model in MODELS if model != "mass_spring"])
+def test_small_strain_stiffness(model, device, rng):
+    """At strains of 1e-3 every model feels the same small-strain stiffness, to first order in the strain."""
+    mesh = mixed_forest()
+    sim, body = simulation(mesh, model, device)
+    u = random_displacement(mesh, rng, 1e-3)
+    place(body, u)
+    reference = oracle_mesh(mesh)
+    K = oracle.stiffness(reference, MU, LAM)
+    expected = reference.assemble(-np.einsum("tpq,tq->tp", K, u[mesh.tets].reshape(-1, 12)).reshape(-1, 4, 3))
+    tolerance = FORCE_TOLERANCE if model == "linear" else 0.02
+    assert np.abs(sim.forces().numpy() - expected).max() < tolerance * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_trajectory_equals_the_oracle(model, device, rng):
+    """A hundred symplectic Euler steps with gravity, damping and fixed nodes, against the same in float64."""
+    mesh = mixed_forest(seed=3, level=3, passes=1)
+    fixed = mesh.points[:, 2] < 1e-9
+    scheme = {"damping": 5.0, "gravity": (0.0, -9.8, 1.0)}
+    sim, body = simulation(mesh, model, device, dt=1e-4, fixed=fixed, **scheme)
+    u = np.where(fixed[:, None], 0, random_displacement(mesh, rng, 0.1)).astype(np.float32)
+    place(body, u)
+    reference = oracle_mesh(mesh)
+    x, v = oracle.symplectic_euler(
+        model,
+        reference,
+        mesh.points + u.astype(float),
+        np.zeros_like(mesh.points),
+        MU,
+        LAM,
+        reference.masses(MATERIAL["density"]),
+        1e-4,
+        100,
+        fixed=fixed,
+        **scheme,
+    )
+    for _ in range(10):
+        sim.step()
+    sim.advance(90e-4)
+    assert sim.steps == 100
+    assert sim.time == pytest.approx(0.01)
+    moved = np.abs(x - mesh.points).max()
+    assert np.abs(body.displacements.numpy() - (x - mesh.points)).max() < 1e-5 * moved
+    assert np.abs(body.velocities.numpy() - v).max() < 1e-5 * np.abs(v).max()
+    assert np.abs(body.positions.numpy() - x).max() < 1e-5 * moved + 1e-7 * np.abs(x).max()
