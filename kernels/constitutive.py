@@ -96,8 +96,8 @@ def stvk_cauchy(g: wp.mat33, q: wp.mat33, mu: float, lam: float):
 @wp.func
 def continued_log(j: float):
     """L(J) and L'(J): ln J and 1/J, below J0 the Taylor expansion of second order about J0."""
-    value = 0.0
-    slope = 0.0
+    value = float(0.0)
+    slope = float(0.0)
     if j >= J0:
         value = wp.log(j)
         slope = 1.0 / j

@@ -62,7 +62,7 @@ def frame(elements: ForestElements, t: int):
 
 
 @wp.func
-def frame(elements: GeneralElements, t: int):  # noqa: F811
+def frame(elements: GeneralElements, t: int):
     return wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -79,7 +79,7 @@ def rest_volume(elements: ForestElements, t: int):
 
 
 @wp.func
-def rest_volume(elements: GeneralElements, t: int):  # noqa: F811
+def rest_volume(elements: GeneralElements, t: int):
     return elements.volume[t]
 
 
@@ -108,7 +108,7 @@ def local_gradient(elements: ForestElements, t: int, u: wp.array[wp.vec4]):
 
 
 @wp.func
-def local_gradient(elements: GeneralElements, t: int, u: wp.array[wp.vec4]):  # noqa: F811
+def local_gradient(elements: GeneralElements, t: int, u: wp.array[wp.vec4]):
     u0, u1, u2, u3 = node_displacements(elements.nodes[t], u)
     return wp.matrix_from_cols(u1 - u0, u2 - u0, u3 - u0) * elements.rest_inverse[t]
 
@@ -148,7 +148,7 @@ def scatter_stress(elements: ForestElements, t: int, p: wp.mat33, f: wp.array[wp
 
 
 @wp.func
-def scatter_stress(elements: GeneralElements, t: int, p: wp.mat33, f: wp.array[wp.vec4]):  # noqa: F811
+def scatter_stress(elements: GeneralElements, t: int, p: wp.mat33, f: wp.array[wp.vec4]):
     nodes = elements.nodes[t]
     h = (-elements.volume[t]) * p * wp.transpose(elements.rest_inverse[t])
     f1 = wp.vec3(h[0, 0], h[1, 0], h[2, 0])

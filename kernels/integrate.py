@@ -89,7 +89,7 @@ def follow_trajectory(
     k = wp.tid()
     t = wp.float64(clock[0] + wp.int64(offset + 1)) * wp.float64(dt)
     last = times.shape[0] - 1
-    key = 0
+    key = int(0)
     while key < last - 1 and times[key + 1] <= t:
         key += 1
     s = (t - times[key]) / (times[wp.min(key + 1, last)] - times[key])

@@ -53,7 +53,7 @@ def frobenius(a: wp.mat33):
 
 @wp.func
 def largest_entry(a: wp.mat33):
-    m = 0.0
+    m = float(0.0)
     for i in range(3):
         for j in range(3):
             m = wp.max(m, wp.abs(a[i, j]))
@@ -62,7 +62,7 @@ def largest_entry(a: wp.mat33):
 
 @wp.func
 def all_finite(a: wp.mat33):
-    ok = True
+    ok = bool(True)
     for i in range(3):
         for j in range(3):
             # A comparison with NaN is false, and so is one with an infinity beyond the largest float.
@@ -185,8 +185,8 @@ def first_zetas(f: wp.mat33):
 def byers_xu_newton(f: wp.mat33, tolerance: float):
     zeta0, zeta = first_zetas(f)
     x = newton_step(f, zeta0)
-    step = 1.0
-    iteration = 1
+    step = float(1.0)
+    iteration = int(1)
     while step > tolerance and iteration < MAX_NEWTON:
         y = newton_step(x, zeta)
         step = frobenius(y - x)

@@ -43,7 +43,7 @@ def rest_nodes(elements: ForestElements, t: int):
 
 
 @wp.func
-def rest_nodes(elements: GeneralElements, t: int):  # noqa: F811
+def rest_nodes(elements: GeneralElements, t: int):
     edges = wp.transpose(wp.inverse(elements.rest_inverse[t]))
     x = mat43()
     x[1] = edges[0]
@@ -90,7 +90,7 @@ def edge_tensions(elements: ForestElements, t: int, d: vec6, mu: float, lam: flo
 
 
 @wp.func
-def edge_tensions(elements: GeneralElements, t: int, d: vec6, mu: float, lam: float):  # noqa: F811
+def edge_tensions(elements: GeneralElements, t: int, d: vec6, mu: float, lam: float):
     b = elements.rest_inverse[t]
     gradients = mat43()
     gradients[0] = -(b[0] + b[1] + b[2])
@@ -103,7 +103,7 @@ def edge_tensions(elements: GeneralElements, t: int, d: vec6, mu: float, lam: fl
     for e in range(6):
         i = FIRST_NODE[e]
         j = SECOND_NODE[e]
-        total = 0.0
+        total = float(0.0)
         for k in range(6):
             m = FIRST_NODE[k]
             n = SECOND_NODE[k]
@@ -119,7 +119,7 @@ def edge_stretch(rest: wp.vec3, stretch: wp.vec3, biquadratic: bool):
     ``rest`` is the edge at rest, ``stretch`` what its ends' displacements differ by: l^2 - L^2 without cancellation.
     """
     d = 2.0 * wp.dot(rest, stretch) + wp.dot(stretch, stretch)
-    factor = 2.0
+    factor = float(2.0)
     if not biquadratic:
         length = wp.length(rest + stretch)
         rest_length = wp.length(rest)

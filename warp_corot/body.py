@@ -60,9 +60,7 @@ class SoftBody:
         self.masses = lumped_masses(mesh, material)
 
         n = len(mesh.points)
-        rest = np.zeros((n, 4), np.float32)
-        rest[:, :3] = mesh.points
-        self.node_rest = wp.array(rest, dtype=wp.vec4, device=self.device)
+        self.node_rest = wp.array(_padded(mesh.points), dtype=wp.vec4, device=self.device)
         self.node_positions = wp.clone(self.node_rest)
         self.node_displacements = wp.zeros(n, dtype=wp.vec4, device=self.device)
         self.node_velocities = wp.zeros(n, dtype=wp.vec4, device=self.device)
@@ -92,7 +90,7 @@ class SoftBody:
     @positions.setter
     def positions(self, values: npt.ArrayLike) -> None:
         # In float64 and by way of the displacement, so that no digit of what is given is lost.
-        self.displacements = np.asarray(values, dtype=np.float64) - self.mesh.points
+        self._set_displacements(self._checked_vectors(values, "positions") - self.mesh.points)
 
     @property
     def displacements(self) -> wp.array:
@@ -102,8 +100,7 @@ class SoftBody:
 
     @displacements.setter
     def displacements(self, values: npt.ArrayLike) -> None:
-        self.node_displacements.assign(self._padded(values, "positions or displacements"))
-        self.publish_positions()
+        self._set_displacements(self._checked_vectors(values, "displacements"))
 
     @property
     def velocities(self) -> wp.array:
@@ -112,7 +109,7 @@ class SoftBody:
 
     @velocities.setter
     def velocities(self, values: npt.ArrayLike) -> None:
-        self.node_velocities.assign(self._padded(values, "velocities"))
+        self.node_velocities.assign(_padded(self._checked_vectors(values, "velocities")))
 
     @property
     def reactions(self) -> wp.array:
@@ -255,13 +252,15 @@ class SoftBody:
     def _floats(self, values: np.ndarray) -> wp.array:
         return wp.array(np.ascontiguousarray(values), dtype=wp.float32, device=self.device)
 
-    def _padded(self, values: npt.ArrayLike, name: str) -> np.ndarray:
+    def _checked_vectors(self, values: npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:
         given = np.asarray(values, dtype=np.float64)
         if given.shape != (self.node_count, 3):
-            raise InputError(f"{name} have shape {given.shape}; they must be [{self.node_count}, 3]")
-        padded = np.zeros((self.node_count, 4), np.float32)
-        padded[:, :3] = given
-        return padded
+            raise InputError(f"{name} has shape {given.shape}; it must be [{self.node_count}, 3]")
+        return given
+
+    def _set_displacements(self, values: npt.NDArray[np.float64]) -> None:
+        self.node_displacements.assign(_padded(values))
+        self.publish_positions()
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=self.node_count, inputs=inputs, outputs=outputs, device=self.device)
@@ -320,6 +319,13 @@ class SoftBody:
 
 def _squeezed(rows: np.ndarray) -> np.ndarray:
     return rows[:, 0] if rows.shape[1] == 1 else rows
+
+
+def _padded(vectors: np.ndarray) -> npt.NDArray[np.float32]:
+    """[N, 3] as the float32 [N, 4] that nodal arrays hold."""
+    padded = np.zeros((len(vectors), 4), np.float32)
+    padded[:, :3] = vectors
+    return padded
 
 
 def vec3_view(a: wp.array) -> wp.array:

@@ -1,0 +1,140 @@
+"""A resumed run is the run that was never interrupted; a checkpoint is whole or not there."""
+
+import os
+import resource
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import warp_corot as wc
+
+MATERIAL = wc.Isotropic(young=2e4, poisson=0.4, density=1000.0)
+
+
+def forest_body(device):
+    mesh = wc.TetForest.box(cells=(1, 1, 2), cell_size=0.1, level=3).refine([0, 7])
+    body = wc.SoftBody(mesh, MATERIAL, device=device)
+    body.fix(mesh.points[:, 2] < 1e-9)
+    return body
+
+
+def general_body(device):
+    forest = wc.TetForest.box(cells=(1, 1, 2), cell_size=0.1, level=2)
+    rng = np.random.default_rng(3)
+    mesh = wc.TetMesh(forest.points + 0.003 * rng.standard_normal(forest.points.shape), forest.tets)
+    young = 1e4 * (1 + rng.random(len(mesh.tets)))
+    body = wc.SoftBody(mesh, wc.Isotropic(young, 0.4, 1000.0), device=device)
+    top = np.flatnonzero(forest.points[:, 2] > 0.2 - 1e-9)
+    body.fix(forest.points[:, 2] < 1e-9)
+    body.prescribe(top, times=[0, 0.05, 0.1], displacements=[[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]])
+    body.load([5], [0.1, 0, 0])
+    return body
+
+
+@pytest.mark.parametrize(
+    ("make", "model"),
+    [
+        (forest_body, wc.Corotated()),
+        (forest_body, wc.Corotated(rotation="warm", rotation_level=1)),
+        (forest_body, wc.Corotated(iterations=4, stiffness="sparse")),
+        (forest_body, wc.EdgeStVK("quadratic")),
+        (general_body, wc.Corotated(rotation="svd")),
+        (general_body, wc.NeoHookean()),
+        (general_body, wc.MassSpring()),
+    ],
+    ids=lambda v: getattr(v, "__name__", repr(v)),
+)
+def test_a_resumed_run_is_the_uninterrupted_one(device, tmp_path, make, model):
+    integrator = wc.SymplecticEuler(damping=2.0)
+    whole = wc.Simulation(make(device), model=model, integrator=integrator, gravity=(0.1, -9.8, 0))
+    parted = wc.Simulation(make(device), model=model, integrator=integrator, gravity=(0.1, -9.8, 0))
+    whole.advance_steps(150)
+    parted.advance_steps(70)
+    parted.save(tmp_path / "state.npz")
+    resumed = wc.Simulation.load(tmp_path / "state.npz")
+    assert resumed.dt == whole.dt
+    assert resumed.steps == 70
+    resumed.advance_steps(80)
+    assert resumed.time == whole.time
+    for name in ("positions", "displacements", "velocities", "reactions"):
+        a, b = getattr(whole.body, name).numpy(), getattr(resumed.body, name).numpy()
+        if whole.device.is_cpu:
+            np.testing.assert_array_equal(a, b, err_msg=name)
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4 * np.abs(a).max(), err_msg=name)
+
+
+def test_several_bodies_are_kept(tmp_path):
+    bodies = [forest_body("cpu"), general_body("cpu")]
+    sim = wc.Simulation(bodies, model=[wc.Linear(), wc.StVenantKirchhoff()])
+    sim.advance_steps(10)
+    sim.save(tmp_path / "two.npz")
+    again = wc.Simulation.load(tmp_path / "two.npz", device="cpu")
+    assert again.models == sim.models
+    assert again.energy() == sim.energy()
+    np.testing.assert_array_equal(again.bodies[1].constrained, bodies[1].constrained)
+    assert again.bodies[0].mesh.levels.tolist() == bodies[0].mesh.levels.tolist()
+    assert again.bodies[1].mesh.up_axis == "Y"
+
+
+def test_a_failed_save_leaves_the_good_checkpoint(tmp_path):
+    sim = wc.Simulation(forest_body("cpu"))
+    path = tmp_path / "state.npz"
+    sim.save(path)
+    good = path.read_bytes()
+    sim.advance_steps(5)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    import signal
+
+    old = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
+    try:
+        with pytest.raises(wc.InputError, match="cannot save"):
+            sim.save(path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, old)
+    assert path.read_bytes() == good
+    assert [p.name for p in tmp_path.iterdir()] == ["state.npz"]
+
+
+def test_a_killed_save_leaves_the_good_checkpoint(tmp_path):
+    path = tmp_path / "state.npz"
+    sim = wc.Simulation(forest_body("cpu"))
+    sim.save(path)
+    script = f"""
+import os, threading, time
+import warp_corot as wc
+sim = wc.Simulation.load({os.fspath(path)!r})
+threading.Timer(0.2, lambda: os.kill(os.getpid(), 9)).start()
+while True:
+    sim.save({os.fspath(path)!r})
+"""
+    subprocess.run([sys.executable, "-c", script], check=False, capture_output=True)
+    assert wc.Simulation.load(path).steps == 0
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no archive", b"PK\x03\x04 half an archive"])
+def test_what_is_no_checkpoint_is_refused(tmp_path, content):
+    path = tmp_path / "state.npz"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(wc.InputError, match="checkpoint"):
+        wc.Simulation.load(path)
+
+
+def test_other_archives_and_pickles_are_refused(tmp_path):
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    np.savez(tmp_path / "pickle.npz", header=np.array([{"format": 1}], dtype=object))
+    for name in ("other.npz", "pickle.npz"):
+        with pytest.raises(wc.InputError, match="not a whole checkpoint"):
+            wc.Simulation.load(tmp_path / name)
+
+
+def test_a_missing_folder_is_named(tmp_path):
+    sim = wc.Simulation(forest_body("cpu"))
+    with pytest.raises(wc.InputError, match="is not there"):
+        sim.save(tmp_path / "nowhere" / "state.npz")
+    with pytest.raises(wc.InputError, match="is a folder"):
+        sim.save(tmp_path)
