@@ -32,8 +32,8 @@ def bar(device, model=None, *, dt=None, damping=0.0, gravity=(0.0, -9.81, 0.0), 
 
 @pytest.mark.parametrize("model", MODELS, ids=repr)
 def test_supports_carry_the_weight_of_a_body_at_rest(device, model):
-    sim = bar(device, model, damping=30.0)
-    sim.advance(1.5)
+    sim = bar(device, model, damping=12.0)
+    sim.advance(4.0)
     weight = sim.body.masses.sum() * 9.81
     # Float32 sums of opposing elastic forces: 1e-4 of the weight is two digits above rounding.
     np.testing.assert_allclose(sim.body.reactions.numpy().sum(axis=0), [0, weight, 0], atol=2e-4 * weight)
@@ -147,7 +147,10 @@ def test_stable_step_is_the_edge_of_stability(device, model, level):
         rng = np.random.default_rng(0)
         start = 1e-7 * rng.standard_normal((sim.body.node_count, 3))
         sim.body.velocities = start * ~sim.body.constrained[:, None]
-        sim.advance_steps(256)
+        try:
+            sim.advance_steps(256)
+        except wc.UnstableError:
+            return np.inf
         return np.abs(sim.body.displacements.numpy()).max() / (1e-7 * sim.dt)
 
     assert growth(0.98) < 1e3

@@ -1,7 +1,7 @@
 """The forest of bisected tetrahedra: a grid of cubes, six path tetrahedra each, every one the root of a binary tree.
 
 A tetrahedron (x0, x1, x2, x3) of level l is bisected at the midpoint z of its refinement edge x0-xk, k = 3 - (l mod 3),
-into (x0, .., x(k-1), z, x(k+1), .., x3) and (x1, .., xk, z, x(k+1), .., x3) (Maubach 1995; Tagawa et al. 2013). Vertices
+into (x0 .. x(k-1), z, x(k+1) .. x3) and (x1 .. xk, z, x(k+1) .. x3) (Maubach 1995; Tagawa et al. 2013). Vertices
 lie on an integer lattice. The tree keeps every ancestor; the leaves are the mesh. All is built with array operations.
 """
 
