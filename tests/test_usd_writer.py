@@ -217,6 +217,18 @@ def test_the_stage_grows_and_what_was_there_stays_until_it_is_safe(tmp_path):
     assert_frames(path, 6)
 
 
+def test_pieces_are_written_without_being_asked_for(tmp_path):
+    path = tmp_path / "out.usd"
+    writer = UsdWriter(path, Cube, fps=25, flush_seconds=0.0)
+    frames = list(frames_of(Cube, 3))
+    write_frames(writer, frames[:1])
+    assert not path.exists()  # a run that fails at once replaces nothing
+    while writer._store._flush_cost == 0.0:
+        write_frames(writer, frames[1:2])
+    assert frames_in(path) == writer.frames
+    writer.close()
+
+
 def test_no_frames_leave_no_file(tmp_path):
     path = tmp_path / "out.usd"
     path.write_text("a good file")

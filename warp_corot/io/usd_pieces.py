@@ -94,13 +94,15 @@ class PieceStore:
             raise OSError(f"{self.path}: could not be written further, see the error before")
         unknown = samples.keys() - self._varying.keys()
         assert not unknown, f"not declared as varying: {unknown}"
+        now = time.monotonic()
+        if not self._pieces and not self._pending:  # what came before the first frame is no frame to lose
+            self._last_flush = self._last_add = now
         self._pending.append((time_code, samples))
         self._pending_bytes += nbytes
-        now = time.monotonic()
         gap, self._last_add = now - self._last_add, now
         interval = max(self._flush_seconds, 4.0 * self._flush_cost)
         # The next frame comes after another such gap: waiting for it must not outlast the interval.
-        if now - self._last_flush + gap >= interval or self._pending_bytes >= self._flush_bytes:
+        if now - self._last_flush + gap > interval or self._pending_bytes >= self._flush_bytes:
             self.flush()
 
     def flush(self) -> None:
