@@ -249,9 +249,9 @@ def test_default_gravity_is_down_the_up_axis(device):
 
 
 BODY_MISTAKES = {
-    "mask of the wrong length": (lambda b: b.fix(np.zeros(3, bool)), r"mask of nodes has shape \(3,\)"),
+    "mask of the wrong length": (lambda b: b.fix(np.zeros(3, bool)), r"node mask has shape \(3,\)"),
     "index out of range": (lambda b: b.fix([10**6]), "node 1000000 is out of range"),
-    "fractions for nodes": (lambda b: b.fix([0.5]), "must be a mask or whole numbers"),
+    "fractions for nodes": (lambda b: b.fix([0.5]), "must be a mask"),
     "NaN force": (lambda b: b.load([0], [np.nan, 0, 0]), "finite"),
     "force of the wrong shape": (lambda b: b.load([0], [1.0, 0]), "must be finite"),
     "both ways to prescribe": (lambda b: b.prescribe([0], velocity=(0, 0, 0), times=[0, 1]), "either velocity"),

@@ -10,6 +10,7 @@ import warp as wp
 
 from .elements import Mesh, device_elements, element_kind
 from .errors import InputError
+from .indices import checked_indices
 from .kernels.integrate import adopt_positions, publish_positions
 from .materials import Isotropic
 
@@ -228,21 +229,7 @@ class SoftBody:
         Raises:
             InputError: Mask of the wrong length, index out of range, or neither.
         """
-        chosen = np.asarray(nodes)
-        n = self.node_count
-        if chosen.dtype == bool:
-            if chosen.shape != (n,):
-                raise InputError(f"the mask of nodes has shape {chosen.shape}; the body has {n} nodes")
-            return np.flatnonzero(chosen)
-        if not chosen.size:
-            return np.zeros(0, np.intp)
-        if not np.issubdtype(chosen.dtype, np.integer):
-            raise InputError(f"nodes has dtype {chosen.dtype}; it must be a mask or whole numbers")
-        chosen = np.atleast_1d(chosen).ravel()
-        bad = chosen[(chosen < -n) | (chosen >= n)]
-        if len(bad):
-            raise InputError(f"node {bad[0]} is out of range: the body has {n} nodes")
-        return (chosen % n).astype(np.intp)
+        return checked_indices(nodes, self.node_count, "node")
 
     def _material_arrays(self) -> tuple[wp.array, wp.array, int]:
         mu, lam = np.broadcast_arrays(np.atleast_1d(self.material.mu), np.atleast_1d(self.material.lam))

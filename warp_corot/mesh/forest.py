@@ -12,8 +12,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
 from ..errors import InputError
+from ..indices import checked_indices
 
 #: A root cube has 2**LATTICE_BITS lattice intervals a side, so levels may go to 3 * LATTICE_BITS.
 LATTICE_BITS = 16
@@ -155,7 +157,7 @@ class TetForest:
         """For each leaf the tetrahedron of the tree at ``level`` above it, or the leaf itself; indices int32 [T]."""
         return self.tree.ancestors(self.tree.leaves, level)
 
-    def refine(self, leaves: np.ndarray) -> TetForest:
+    def refine(self, leaves: npt.ArrayLike) -> TetForest:
         """A forest in which the chosen leaves are bisected, and as many others as conformity asks for.
 
         A leaf with an active midpoint on any edge must be bisected itself, until none has (the closure of the set of
@@ -165,18 +167,11 @@ class TetForest:
             leaves: Mask bool [T] or indices into the leaves.
 
         Raises:
-            InputError: Mask of the wrong length, an index out of range, or a leaf already at the deepest level.
+            InputError: Not a mask or indices of leaves, or a leaf already at the deepest level.
         """
-        chosen = np.asarray(leaves)
-        count = len(self.tets)
-        if chosen.dtype == bool:
-            if chosen.shape != (count,):
-                raise InputError(f"the mask of leaves has shape {chosen.shape}; the forest has {count} leaves")
-            chosen = np.flatnonzero(chosen)
-        elif chosen.size and (chosen.min() < -count or chosen.max() >= count):
-            raise InputError(f"leaf index {int(chosen.max())} is out of range: the forest has {count} leaves")
+        chosen = checked_indices(leaves, len(self.tets), "leaf")
         growing = _Growth.of_forest(self)
-        wanted = np.unique(growing.edge_keys(growing.refinement_edges(self.tree.leaves[chosen.astype(int)])))
+        wanted = np.unique(growing.edge_keys(growing.refinement_edges(self.tree.leaves[chosen])))
         active = np.union1d(wanted, growing.edge_keys(self.node_ends[self.node_ends[:, 0] >= 0]))
         while True:
             current = growing.leaves()
