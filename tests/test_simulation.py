@@ -1,4 +1,4 @@
-"""Stepping: constraints, loads, prescribed motion, hooks, recording, the stable step, and what bad input is met with."""
+"""Stepping: constraints, loads, prescribed motion, hooks, recording, the stable step, and what mistakes are met with."""
 
 import warnings
 
@@ -113,7 +113,7 @@ def test_keyframes_are_followed_and_then_held(device):
 
 def test_positions_written_by_the_user_are_where_the_next_step_starts(device):
     sim = bar(device, gravity=(0, 0, 0), fixed=False)
-    moved = sim.body.mesh.points + [0.3, -0.2, 0.1]
+    moved = sim.body.mesh.points + np.array([0.3, -0.2, 0.1])
     sim.body.positions.assign(moved.astype(np.float32))
     sim.step()
     np.testing.assert_allclose(sim.body.positions.numpy(), moved, atol=1e-6)
