@@ -259,6 +259,7 @@ def test_pieces_of_a_killed_run_are_replaced_and_foreign_files_kept(tmp_path):
     assert_frames(path, 3)
     (tmp_path / "out.usd.pieces" / "notes.txt").write_text("mine")
     (stale,) = (tmp_path / "out.usd.pieces").glob("run-*")
+    (stale / "part-joined.aB3xYz").write_text("OpenUSD's own temporary file")
     writer = UsdWriter(path, Cube, fps=25, flush_seconds=60.0)
     assert_frames(path, 3)
     write_frames(writer, frames_of(Cube, 5))

@@ -27,7 +27,8 @@ except ImportError:  # Windows: two runs on one output are not told apart there
     fcntl = None  # type: ignore[assignment]
 
 STAGE_SUFFIXES = (".usd", ".usda", ".usdc")
-_OURS = re.compile(r"((piece|part)-\d{6}\.usdc|(part-)?(static|manifest|root|joined)\.usd[ac]?|lock)")
+# All that a run's folder ever holds; \w{6} is what OpenUSD's own temporary files end in.
+_OURS = re.compile(r"(piece|part)-\d{6}\.usdc|(part-)?(static|manifest|root|joined)\.usd[ac]?|part-\w+\.\w{6}|lock")
 _CLIP_SET = "default"
 
 Samples = dict[str, Any]
