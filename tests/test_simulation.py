@@ -1,4 +1,4 @@
-"""Stepping: constraints, loads, prescribed motion, hooks, recording, the stable step, and what mistakes are met with."""
+"""Stepping: constraints, loads, prescribed motion, hooks, recording, the stable step, and what mistakes meet."""
 
 import warnings
 
