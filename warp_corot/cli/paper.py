@@ -1,0 +1,119 @@
+"""``warp-corot paper``: the paper's experiment as a table, results.json and figures."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..errors import InputError
+
+if TYPE_CHECKING:
+    from ..experiments.paper import Results, Settings
+
+RESULTS = "results.json"
+
+
+def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
+    """Add the command to ``warp-corot``."""
+    from ..experiments.paper import FULL_DURATION, SHORT_DURATION
+
+    parser = subparsers.add_parser(
+        "paper",
+        help="run the paper's experiment: a table, results.json and figures 5 to 8",
+        description="Lets the beam of Tagawa, Yamada and Tanaka (IEEE EMBC 2013) fall under its own weight with "
+        "linear, corotated (rotations at every level of the tree), St. Venant-Kirchhoff and neo-Hookean elements; "
+        "compares the displacement of its free end, its volume and the computation time; puts the claims to the "
+        "test. Prints a table and writes results.json and the counterparts of figures 5 to 8 as PNG.",
+        epilog="Absolute times are given for CUDA devices only; a CPU's are relative to linear FEM in the same run.",
+    )
+    parser.add_argument("-o", "--output", required=True, type=Path, metavar="DIR", help="folder; made if need be")
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument("--full", action="store_true", help=f"the paper's {FULL_DURATION:g} s (minutes on a CPU)")
+    length.add_argument(
+        "--duration",
+        type=float,
+        default=SHORT_DURATION,
+        metavar="S",
+        help=f"simulated time [s] (default: {SHORT_DURATION:g}, in which the beam comes to rest)",
+    )
+    parser.add_argument(
+        "--level", type=int, default=6, metavar="L", help="bisections of the mesh (default: the paper's 6)"
+    )
+    parser.add_argument("--dt", type=float, default=2e-4, metavar="S", help="time step [s] (default: 0.0002)")
+    parser.add_argument("--device", help='"cpu", "cuda:0", ... (default: Warp\'s choice)')
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command; returns the exit status.
+
+    Raises:
+        InputError: Bad options; nothing has been simulated or written.
+        UnstableError: A state is not finite any more; nothing has been written.
+    """
+    from ..experiments import figures, report
+    from ..experiments.paper import FULL_DURATION, SHORT_DURATION, Settings
+
+    settings = Settings(duration=FULL_DURATION if args.full else args.duration, level=args.level, dt=args.dt)
+    figures.check_matplotlib()
+    folder = checked_folder(args.output)
+    if not args.full and args.duration == SHORT_DURATION:
+        print(
+            f"Short form: {SHORT_DURATION:g} s simulated, until the beam is at rest; "
+            f"the paper's {FULL_DURATION:g} s with --full.",
+            flush=True,
+        )
+    try:
+        results = _with_progress(settings, args.device)
+        print(report.table(results), flush=True)
+        folder.mkdir(exist_ok=True)
+        report.write_json(folder / RESULTS, results)
+        files = [folder / RESULTS, *figures.draw_figures(folder, results)]
+    except KeyboardInterrupt:
+        print("warp-corot: interrupted; files that were there before are whole", file=sys.stderr)
+        return 130
+    except OSError as error:
+        print(f"warp-corot: error: {folder}: cannot be written to: {error.strerror or error}", file=sys.stderr)
+        return 1
+    print(f"\nWritten to {folder}: {', '.join(file.name for file in files)}")
+    return 0
+
+
+def checked_folder(folder: Path) -> Path:
+    """Says before a long run whether results can be written there; makes nothing yet.
+
+    Raises:
+        InputError: A file in the way, no folder to make it in, or no permission.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file, should be a folder")
+    there = folder if folder.exists() else folder.absolute().parent
+    if not there.is_dir():
+        raise InputError(f"{folder}: its parent folder {there} is not there")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise InputError(f"{folder}: cannot be written to")
+    return folder
+
+
+def _with_progress(settings: Settings, device: str | None) -> Results:
+    from tqdm import tqdm
+
+    from ..experiments.paper import run_experiment, work
+
+    with tqdm(
+        total=work(settings),
+        desc="preparing",
+        unit="look",
+        leave=False,
+        disable=None,
+        bar_format="{desc:24}{percentage:3.0f} % |{bar}| {remaining} left",
+    ) as bar:
+
+        def tell(what: str, done: int) -> None:
+            bar.set_description_str(what, refresh=not done)
+            bar.update(done)
+
+        return run_experiment(settings, device=device, progress=tell)

@@ -1,0 +1,238 @@
+"""The paper's experiment: a beam held at one end falls under its weight, by model and by the level of its rotations.
+
+After Tagawa, Yamada and Tanaka (IEEE EMBC 2013), section III. What the paper does not publish is chosen so that its two
+figures come out (3.6 and 22 mm): symplectic Euler, a step of 0.2 ms and mass-proportional damping of 15 /s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from ..body import SoftBody, checked_device
+from ..elasticity import Corotated, Linear, Model, NeoHookean, StVenantKirchhoff
+from ..errors import InputError
+from ..materials import Isotropic
+from ..mesh import TetForest
+from ..mesh.surface import signed_volumes
+from ..simulation import GRAPH_STEPS, Simulation
+from ..solvers import SymplecticEuler
+from .timing import Stages, Times, measure_times
+
+Array = npt.NDArray[np.float64]
+
+CELLS, CELL_SIZE = (1, 1, 3), 0.064
+#: The node whose displacement is compared [m]: the middle of the free end.
+OBSERVED = (0.032, 0.032, 0.192)
+GRAVITY = (0.0, -9.8, 0.0)
+MATERIAL = {"young": 500.0, "poisson": 0.49, "density": 10.0}
+
+#: Simulated time [s]: the paper's, and one in which the beam comes to rest, for the impatient.
+FULL_DURATION, SHORT_DURATION = 80.0, 4.0
+
+#: Names of the models that others are compared with.
+REFERENCE, PEER, OWN = "stvk", "linear", "corotated"
+
+#: Steps between two looks at the beam; as many as are recorded in one graph, so that looking costs next to nothing.
+SAMPLE_STEPS = GRAPH_STEPS
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What may be chosen about the experiment.
+
+    Attributes:
+        duration: Simulated time [s].
+        dt: Time step [s].
+        damping: Rate of mass-proportional damping [1/s].
+        level: Bisections of the mesh; the paper's is 6.
+        rounds: Timing: how often every stage is timed, in turn.
+
+    Raises:
+        InputError: A value out of its range.
+    """
+
+    duration: float = SHORT_DURATION
+    dt: float = 2e-4
+    damping: float = 15.0
+    level: int = 6
+    rounds: int = 21
+
+    def __post_init__(self) -> None:
+        if self.level < 2:
+            raise InputError(f"level is {self.level}; it must be at least 2, where the observed node appears")
+        if not (np.isfinite(self.dt) and self.dt > 0):
+            raise InputError(f"dt is {self.dt}; it must be a positive number of seconds")
+        if not (np.isfinite(self.duration) and self.duration >= SAMPLE_STEPS * self.dt):
+            least = SAMPLE_STEPS * self.dt
+            raise InputError(f"duration is {self.duration} s; it must be at least {SAMPLE_STEPS} steps, {least:.3g} s")
+        if self.rounds < 1:
+            raise InputError(f"rounds is {self.rounds}; it must be at least 1")
+
+    @property
+    def samples(self) -> int:
+        """How often the beam is looked at; the run ends at the last look, which is the one nearest to ``duration``."""
+        return max(round(self.duration / (SAMPLE_STEPS * self.dt)), 1)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One of the models compared.
+
+    Attributes:
+        name: Short, in results.json.
+        label: For people.
+        model: The elastic model.
+        rotation_level: Of a corotated model whose rotations are shared.
+    """
+
+    name: str
+    label: str
+    model: Model
+    rotation_level: int | None = None
+
+
+def cases(level: int) -> list[Case]:
+    """The models compared on a mesh of that level, the reference first."""
+    return [
+        Case(REFERENCE, "St. Venant–Kirchhoff", StVenantKirchhoff()),
+        Case("neo-hookean", "neo-Hookean", NeoHookean()),
+        Case(PEER, "linear", Linear()),
+        *(Case(f"{OWN}-{k}", f"corotated, level {k}", Corotated(rotation_level=k), k) for k in range(level + 1)),
+        Case(OWN, "corotated, own", Corotated()),
+    ]
+
+
+@dataclass(frozen=True)
+class Run:
+    """One model's run.
+
+    Attributes:
+        case: Which model.
+        path: Displacement of the observed node at each sample [m], float64 [S, 3].
+        growth: Volume of the beam over its volume at rest, less 1, at each sample, float64 [S].
+        positions: Nodes at the end [m], float64 [N, 3].
+        speed: Largest speed of a node at the end [m/s]; rounding keeps it from being zero.
+        rotations: How many rotations are extracted a step.
+        times: What a step costs; None where it was not asked for.
+    """
+
+    case: Case
+    path: Array
+    growth: Array
+    positions: Array
+    speed: float
+    rotations: int
+    times: Times | None = None
+
+
+@dataclass(frozen=True)
+class Results:
+    """The whole experiment.
+
+    Attributes:
+        settings: As asked for.
+        mesh: The beam.
+        device: Where it ran.
+        times: Time of each sample [s], float64 [S].
+        runs: By name, in the order of ``cases``.
+    """
+
+    settings: Settings
+    mesh: TetForest
+    device: wp.Device
+    times: Array
+    runs: dict[str, Run] = field(default_factory=dict)
+
+    def error(self, name: str, reference: str = REFERENCE) -> Array:
+        """Distance of the observed node from where it is in the reference's run at the same time [m], float64 [S]."""
+        return np.linalg.norm(self.runs[name].path - self.runs[reference].path, axis=1)
+
+    @cached_property
+    def levels(self) -> list[Run]:
+        """Runs with shared rotations, by level."""
+        return [run for run in self.runs.values() if run.case.rotation_level is not None]
+
+
+def run_experiment(
+    settings: Settings | None = None,
+    *,
+    device: str | wp.Device | None = None,
+    progress: Callable[[str, int], None] | None = None,
+) -> Results:
+    """Run every model, then time the stages of their steps in turn.
+
+    Args:
+        settings: None: the short form.
+        device: "cpu", "cuda:0", …; None for Warp's default.
+        progress: Called with what is under way and the number of units of work done since the last call, of
+            ``work(settings)`` in all.
+
+    Raises:
+        InputError: A device that is not there, or a step beyond what the mesh can hold.
+        UnstableError: A state is not finite any more.
+    """
+    chosen = settings or Settings()
+    tell = progress or (lambda what, done: None)
+    where = checked_device(device)
+    mesh = TetForest.box(CELLS, CELL_SIZE, chosen.level)
+    count = chosen.samples
+    times = (SAMPLE_STEPS * chosen.dt * np.arange(1, count + 1)).astype(np.float64)
+    runs, stages = {}, {}
+    for case in cases(chosen.level):
+        tell(case.label, 0)
+        sim = beam(mesh, case.model, chosen, where)
+        runs[case.name] = follow(sim, case, count, tell)
+        stages[case.name] = Stages(sim)
+    measured = measure_times(stages, PEER, chosen.rounds, lambda: tell("timing the stages", 1))
+    timed = {name: replace(run, times=measured[name]) for name, run in runs.items()}
+    return Results(chosen, mesh, where, times, timed)
+
+
+def work(settings: Settings) -> int:
+    """Units of work of the experiment: one a sample of a model, one a round of timing."""
+    return settings.samples * len(cases(settings.level)) + settings.rounds
+
+
+def beam(mesh: TetForest, model: Model, settings: Settings, device: wp.Device) -> Simulation:
+    """The beam at rest, held at z = 0, about to fall.
+
+    Raises:
+        InputError: The step is beyond the largest stable one.
+    """
+    body = SoftBody(mesh, Isotropic(**MATERIAL), device=device)
+    body.fix(mesh.points[:, 2] < 1e-9)
+    integrator = SymplecticEuler(damping=settings.damping)
+    stable = Simulation(body, model=model, integrator=integrator, gravity=GRAVITY).stable_dt
+    if settings.dt > stable:
+        raise InputError(
+            f"dt is {settings.dt:.3g} s; on a mesh of level {settings.level} it must be below {stable:.3g} s"
+        )
+    integrator = SymplecticEuler(dt=settings.dt, damping=settings.damping)
+    return Simulation(body, model=model, integrator=integrator, gravity=GRAVITY)
+
+
+def follow(sim: Simulation, case: Case, samples: int, tell: Callable[[str, int], None]) -> Run:
+    """Let the beam fall and look at it as it goes."""
+    body = sim.body
+    mesh = body.mesh
+    node = int(np.argmin(np.linalg.norm(mesh.points - OBSERVED, axis=1)))
+    side = np.sign(signed_volumes(mesh.points, mesh.tets))
+    rest = float(mesh.volumes.sum())
+    path, growth = np.empty((samples, 3)), np.empty(samples)
+    positions = mesh.points
+    for sample in range(samples):
+        sim.advance_steps(SAMPLE_STEPS)
+        u = body.displacements.numpy().astype(np.float64)
+        positions = mesh.points + u
+        path[sample] = u[node]
+        growth[sample] = float(side @ signed_volumes(positions, mesh.tets)) / rest - 1.0
+        tell(case.label, 1)
+    speed = float(np.linalg.norm(body.velocities.numpy(), axis=1).max())
+    units = getattr(sim.fields[0], "unit_count", 0)
+    return Run(case, path, growth, positions, speed, units)
