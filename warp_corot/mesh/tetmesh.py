@@ -8,6 +8,7 @@ from os import PathLike
 import numpy as np
 
 from ..errors import InputError
+from .surface import signed_volumes
 
 #: A tetrahedron of less volume than this times its longest edge cubed cannot be told from a flat one in float32.
 FLAT = 1e-7
@@ -58,7 +59,7 @@ class TetMesh:
         self.points = points * scale
         self.tets = np.array(given, dtype=np.int32)
         self.up_axis = up_axis
-        volumes = _signed_volumes(self.points, self.tets)
+        volumes = signed_volumes(self.points, self.tets)
         bad = np.flatnonzero(np.abs(volumes) <= FLAT * _longest_edges(self.points, self.tets) ** 3)
         if len(bad):
             raise InputError(
@@ -89,12 +90,7 @@ class TetMesh:
     @cached_property
     def volumes(self) -> np.ndarray:
         """Rest volume of each tetrahedron [m^3], float64 [T]."""
-        return _signed_volumes(self.points, self.tets)
-
-
-def _signed_volumes(points: np.ndarray, tets: np.ndarray) -> np.ndarray:
-    x = points[tets]
-    return np.linalg.det(x[:, 1:] - x[:, :1]) / 6.0
+        return signed_volumes(self.points, self.tets)
 
 
 def _longest_edges(points: np.ndarray, tets: np.ndarray) -> np.ndarray:
