@@ -132,9 +132,9 @@ def draw_shapes(path: Path, results: Results) -> None:
     named += [(OWN, "corotated, own rotations"), (f"{OWN}-0", "corotated, level 0")]
     shown = np.concatenate([mesh.points, *(results.runs[name].positions for name, _ in named)])
     camera = Camera.fit(shown, mesh.up_axis, azimuth=68.0, elevation=12.0)
-    figure = _figure(9.6, 5.6)
-    width, height = 1.0 / 3.0, 0.42
-    corners = [(column * width, 0.44 - row * 0.435) for row in range(2) for column in range(3)]
+    figure = _figure(9.6, 6.4)
+    width, height = 1.0 / 3.0, 0.335
+    corners = [(column * width, 0.46 - row * 0.445) for row in range(2) for column in range(3)]
     window, _ = camera.project(shown)
     low, high = window.min(axis=0), window.max(axis=0)
     pad = 0.07 * (high - low)
@@ -146,9 +146,9 @@ def draw_shapes(path: Path, results: Results) -> None:
         ax.set_ylim(low[1] - pad[1], high[1] + pad[1])
         growth = f"{100 * run.growth[-1]:+.1f} %".replace("-", "−")
         strong = abs(run.growth[-1]) > VOLUME_KEPT
-        _caption(figure, left + width / 2, bottom + height - 0.02, label, f"volume {growth}", strong)
+        _caption(figure, left + width / 2, bottom + height + 0.036, label, f"volume {growth}", strong)
     left, bottom = corners[-1]
-    _draw_outlines(figure.add_axes((left + 0.03, bottom + 0.02, width - 0.05, height - 0.07)), results)
+    _draw_outlines(figure.add_axes((left + 0.025, bottom, width - 0.05, height + 0.03)), results)
     _head(figure, "Deformed shapes at the end", results)
     save(figure, path)
 
@@ -230,7 +230,7 @@ def _draw_errors(
     panels[0].set_xlabel("time [s]")
     if long:
         panels[1].tick_params(axis="y", left=False, labelleft=False)
-        panels[1].set_xticks([20.0, 40.0, 60.0, 80.0] if end == 80.0 else np.linspace(low, high, 3)[1:])
+        panels[1].set_xticks([20.0, 40.0, 60.0, 80.0] if round(end) == 80 else np.linspace(low, high, 3)[1:])
         panels[1].spines["left"].set_color("#d8d6dc")
     _label_ends(panels[-1], [e[-1] for e in errors], [(label, color) for _, label, color, _ in lines], top)
     _head(figure, title, results)
@@ -262,7 +262,11 @@ def _draw_outlines(ax: Axes, results: Results) -> None:
     ax.plot([0, 0], [-12, 76], color=_INK, linewidth=3, solid_capstyle="butt")
     ax.set_aspect("equal")
     ax.set_axis_off()
-    ax.legend(loc="lower right", frameon=False, fontsize=8.5, labelcolor=_INK, handlelength=1.6)
+    ax.set_ylim(-108, 82)
+    ax.legend(
+        loc="lower center", bbox_to_anchor=(0.5, -0.03), ncols=4, frameon=False, fontsize=8, labelcolor=_INK,
+        handlelength=1.5, columnspacing=1.0, handletextpad=0.5,
+    )  # fmt: skip
 
 
 def _label_ends(ax: Axes, values: list[float], labels: list[tuple[str, object]], top: float) -> None:
@@ -286,7 +290,7 @@ def _label_ends(ax: Axes, values: list[float], labels: list[tuple[str, object]],
         ax.plot(ends, [values[index], place], transform=across, color=color, linewidth=1.2, clip_on=False)
         text = f"{label}  {values[index]:.1f}"
         ax.text(1.0 + 3.0 * unit, place, text, transform=across, fontsize=9, color=_INK, va="center")
-    ax.text(1.0 + 3.0 * unit, 1.02 * top, "at the end [mm]", transform=across, fontsize=8.5, color=_FAINT, va="bottom")
+    ax.text(1.0 + 3.0 * unit, 0.96 * top, "at the end [mm]", transform=across, fontsize=8.5, color=_FAINT, va="bottom")
 
 
 def _caption(figure: Figure, x: float, y: float, label: str, note: str, strong: bool) -> None:
