@@ -29,22 +29,43 @@ def strain(mesh, body):
     return np.abs(now / rest - 1).max()
 
 
+@pytest.mark.parametrize("rotation", ["byers-xu", "warm", "svd"])
 @pytest.mark.parametrize("level", [0, 3])
 @pytest.mark.parametrize("case", CRUSHED)
-def test_crushed_cube_comes_to_rest(case, level, device, rng):
+def test_crushed_cube_comes_to_rest(case, level, rotation, device, rng):
+    """Energy never rises and ends in an equilibrium, not always the rest shape: inverted elements can hold others.
+
+    Which come back, of ten that differ by noise of 1e-7 m (Byers-Xu, this step and damping, CPU):
+    six elements: plane 10, skew plane 10, line 7, point 9, shuffled 7;
+    48 elements: plane 4, skew plane 4, line 3, point 3, shuffled none (1 in 10 with the warm start);
+    384 elements (of three, half the step): skew plane 1, none of the others.
+    Those that do not keep 0.2 to 5 % of the energy. Noise decides, so that the test says nothing on the shape.
+    """
     mesh = wc.TetForest.box((1, 1, 1), CUBE, level)
-    sim, body = simulation(mesh, "corotated", device, dt=5e-5, damping=30.0)
+    sim, body = simulation(mesh, wc.Corotated(rotation=rotation), device, dt=5e-5, damping=30.0)
     place(body, (crushed(mesh.points, case, rng) - mesh.points).astype(np.float32))
-    record = [sim.energy().total]
-    for _ in range(60):
-        sim.advance(0.05)
+    record, pulled = [sim.energy().total], np.abs(sim.forces().numpy()).max()
+    for _ in range(30):
+        sim.advance(0.1)
         record.append(sim.energy().total)
-    left = strain(mesh, body)
-    print(f"{case}, level {level}, {device}: energy {record[0]:.2e} to {record[-1]:.2e} J, strain left {left:.1e}")
+    print(f"{case}, level {level}, {rotation}, {device}: ", end="")
+    print(f"energy {record[0]:.2e} to {record[-1]:.2e} J, strain left {strain(mesh, body):.1e}")
     assert np.isfinite(record).all()
     assert np.isfinite(body.displacements.numpy()).all()
-    assert (np.diff(record) < 1e-3 * record[0]).all()
-    assert sim.energy().kinetic < 1e-8 * record[0]
+    assert (np.diff(record) < 1e-6 * record[0]).all()
+    assert sim.energy().kinetic < 1e-9 * record[0]
+    assert np.abs(sim.forces().numpy()).max() < 1e-4 * pulled
+
+
+@pytest.mark.parametrize("level", [0, 3, 6])
+def test_flattened_cube_comes_back(level, device, rng):
+    """Well short of inversion the rest shape is where it ends: pressed to half its height, with noise."""
+    mesh = wc.TetForest.box((1, 1, 1), CUBE, level)
+    sim, body = simulation(mesh, "corotated", device, dt=5e-5, damping=30.0)
+    pressed = mesh.points * [1, 1, 0.5] + 1e-4 * rng.standard_normal(mesh.points.shape)
+    place(body, (pressed - mesh.points).astype(np.float32))
+    sim.advance(2.0)
+    assert strain(mesh, body) < 1e-4
 
 
 @pytest.mark.parametrize("stretch", [0.0, -0.2, -1.0, -3.0])
