@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -59,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
 
     settings = Settings(duration=FULL_DURATION if args.full else args.duration, level=args.level, dt=args.dt)
     figures.check_matplotlib()
-    folder = checked_folder(args.output)
+    folder = checked_folder(args.output, [RESULTS, *figures.FILES.values()])
     if not args.full and args.duration == SHORT_DURATION:
         print(
             f"Short form: {SHORT_DURATION:g} s simulated, until the beam is at rest; "
@@ -75,6 +76,8 @@ def run(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         print("warp-corot: interrupted; files that were there before are whole", file=sys.stderr)
         return 130
+    except BrokenPipeError:
+        raise
     except OSError as error:
         print(f"warp-corot: error: {folder}: cannot be written to: {error.strerror or error}", file=sys.stderr)
         return 1
@@ -82,11 +85,11 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def checked_folder(folder: Path) -> Path:
-    """Says before a long run whether results can be written there; makes nothing yet.
+def checked_folder(folder: Path, names: Iterable[str] = ()) -> Path:
+    """Says before a long run whether files of these names can be written there; makes nothing yet.
 
     Raises:
-        InputError: A file in the way, no folder to make it in, or no permission.
+        InputError: A file or folder in the way, no folder to make it in, or no permission.
     """
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file, should be a folder")
@@ -95,6 +98,9 @@ def checked_folder(folder: Path) -> Path:
         raise InputError(f"{folder}: its parent folder {there} is not there")
     if not os.access(there, os.W_OK | os.X_OK):
         raise InputError(f"{folder}: cannot be written to")
+    for name in names:
+        if (folder / name).is_dir():
+            raise InputError(f"{folder / name}: is a folder, should be a file or nothing")
     return folder
 
 
