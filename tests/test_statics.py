@@ -43,9 +43,10 @@ def check_static_end(model, level, dt, duration, device):
     assert np.abs(ended - halfway).max() < 1e-6
     assert np.abs(ended - x).max() < 1e-6
     assert np.array_equal(ended[fixed], mesh.points[fixed])
-    # the wall carries the whole weight, by forces many times larger that hold the moment of the bending beam
+    # the wall carries the whole weight; rounding of u by 1e-9 m, times 500 N/m of stiffness a node, is some 1e-6 N each
     reactions = body.reactions.numpy().astype(float)
-    assert reactions.sum(0) == pytest.approx([0, body.masses.sum() * 9.8, 0], abs=1e-5 * np.abs(reactions).sum())
+    weight = body.masses.sum() * 9.8
+    assert reactions.sum(0) == pytest.approx([0, weight, 0], abs=1e-3 * weight)
     assert not reactions[~fixed].any()
 
 
