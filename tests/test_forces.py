@@ -170,3 +170,49 @@ def test_trajectory_equals_the_oracle(model, device, rng):
     assert np.abs(body.displacements.numpy() - (x - mesh.points)).max() < 1e-5 * moved
     assert np.abs(body.velocities.numpy() - v).max() < 1e-5 * np.abs(v).max()
     assert np.abs(body.positions.numpy() - x).max() < 1e-5 * moved + 1e-7 * np.abs(x).max()
+
+
+def cauchy_von_mises(model, mesh, x, mu, lam):
+    """sqrt(3/2 s:s), s the deviator of the Cauchy stress P F^T / J (linear, corotated: of Hooke's) [T] (Pa)."""
+    F = mesh.deformation_gradients(x)
+    if model == "corotated":
+        P = np.swapaxes(oracle.polar(F), 1, 2) @ oracle.stress(model, mesh, x, mu, lam)
+    else:
+        P = oracle.stress("stvk" if model == "edge_stvk" else model, mesh, x, mu, lam)
+        if model != "linear":
+            P = P @ np.swapaxes(F, 1, 2) / np.linalg.det(F)[:, None, None]
+    deviator = P - np.trace(P, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
+    return np.sqrt(1.5 * np.sum(deviator**2, axis=(1, 2)))
+
+
+@pytest.mark.parametrize("make", [mixed_forest, jittered])
+@pytest.mark.parametrize("model", ["linear", "corotated", "stvk", "neo_hookean", "edge_stvk"])
+def test_von_mises_stress(model, make, device, rng):
+    mesh = make()
+    sim, body = simulation(mesh, model, device)
+    u = random_displacement(mesh, rng, 0.1)
+    place(body, u)
+    expected = cauchy_von_mises(model, oracle_mesh(mesh), mesh.points + u.astype(float), MU, LAM)
+    stress = sim.von_mises()
+    assert stress.dtype == np.float32
+    assert np.abs(stress - expected).max() < FORCE_TOLERANCE * LAM
+
+
+@pytest.mark.parametrize("strain", [1e-3, 1e-5])
+@pytest.mark.parametrize("model", ["linear", "stvk", "edge_stvk", "edge_stvk_quadratic", "corotated", "neo_hookean"])
+def test_digits_of_small_strains(model, strain, device, rng):
+    """What is left of float32's seven digits when strains are small.
+
+    Models written in the displacement gradient alone keep them all. Corotated strain is a difference R^T F - I and
+    neo-Hookean stress one of F and F^-T: they see strains no smaller than the rounding of a rotation, 1e-7.
+    """
+    mesh = mixed_forest()
+    sim, body = simulation(mesh, model, device)
+    u = random_displacement(mesh, rng, 0.3 * strain)
+    place(body, u)
+    reference = oracle_mesh(mesh)
+    _, expected = oracle.evaluate(model, reference, mesh.points + u.astype(float), MU, LAM)
+    tolerance = 1e-6 / strain if model in ("corotated", "neo_hookean") else 1e-5
+    error = np.abs(sim.forces().numpy() - expected).max() / np.abs(expected).max()
+    print(f"{model}, strain {strain}, {device}: {error:.1e}")
+    assert error < tolerance
