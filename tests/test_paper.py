@@ -11,6 +11,7 @@ import pytest
 import warp_corot as wc
 from warp_corot.cli import paper as command
 from warp_corot.experiments import figures, report
+from warp_corot.experiments.claims import judged_claims
 from warp_corot.experiments.paper import OWN, PEER, REFERENCE, Settings, cases, run_experiment, work
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -77,7 +78,7 @@ def test_the_full_experiment(device):
     late = results.times > 40.0
     for name in results.runs:
         assert np.ptp(results.runs[name].path[late], axis=0).max() < 1e-5
-    named = {claim.claim: claim for claim in report.judged_claims(results)}
+    named = {claim.claim: claim for claim in judged_claims(results)}
     assert all(claim.holds for claim in list(named.values())[:3])
 
 
@@ -133,7 +134,7 @@ def test_json_holds_what_the_table_says(device, tmp_path):
         assert f"{1e3 * model['error_max_m']:.2f}" in text or model["name"] == REFERENCE
         # house rule: a CPU's absolute times are not given
         assert (model["time"]["microseconds"] is None) == (device == "cpu")
-    for claim, found in zip(read["claims"], report.judged_claims(results), strict=True):
+    for claim, found in zip(read["claims"], judged_claims(results), strict=True):
         assert claim == asdict(found)
         assert found.measured in text
 
@@ -143,7 +144,7 @@ def test_claims_that_do_not_hold_are_said_not_to(device):
     results = coarse(device)
     runs = {**results.runs, OWN: results.runs[PEER], PEER: results.runs[OWN]}
     swapped = type(results)(results.settings, results.mesh, results.device, results.times, runs)
-    assert [claim.holds for claim in report.judged_claims(swapped)][:3] == [False, False, False]
+    assert [claim.holds for claim in judged_claims(swapped)][:3] == [False, False, False]
     assert report.table(swapped).count("DOES NOT HOLD") >= 3
 
 

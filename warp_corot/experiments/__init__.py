@@ -1,4 +1,4 @@
-"""A published experiment, made again: the experiment, its timing, its report and its figures, each in one file."""
+"""A published experiment, made again: the experiment, its timing, its claims, its report and its figures."""
 
 from .paper import Results, Run, Settings, run_experiment
 

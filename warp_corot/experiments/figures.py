@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,14 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import InputError
-from ..io.preview import Camera, draw_body
-from ..mesh.surface import boundary_faces
-from .paper import CELL_SIZE, CELLS, OWN, PEER, REFERENCE, Results, Run
-from .report import PUBLISHED_COROTATED, PUBLISHED_LINEAR, VOLUME_KEPT, device_name
+from .claims import PUBLISHED_COROTATED, PUBLISHED_LINEAR
+from .paper import OWN, PEER, REFERENCE, Results, Run
+from .shapes import draw_shapes
+from .style import FAINT, INK, LINEAR, NEO, OWN_COLOR, head, new_figure, save, tidy
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 FILES = {
     5: "figure5_computation_time.png",
@@ -27,10 +25,7 @@ FILES = {
     8: "figure8_error_by_rotation_level.png",
 }
 
-DPI = 200
-_INK, _FAINT = "#2b2730", "#8a8590"
 _ROTATION, _FORCE, _REST, _FUSED = "#d95f3b", "#3b7ea1", "#b9c3c9", "#8a6f8e"
-_LINEAR, _OWN, _NEO = "#c8452f", "#1f6f8b", "#8a8590"
 #: The time after which nothing moves any more and a long run's axis is compressed [s].
 _SETTLED = 3.0
 
@@ -66,7 +61,7 @@ def draw_figures(folder: Path, results: Results) -> list[Path]:
 
 def draw_times(path: Path, results: Results) -> None:
     """Figure 5: what a time step costs, by model and by rotation level, stage by stage."""
-    figure = _figure(8.0, 4.9)
+    figure = new_figure(8.0, 4.9)
     ax = figure.add_axes((0.085, 0.235, 0.895, 0.61))
     runs = [results.runs[name] for name in (PEER, REFERENCE, "neo-hookean")]
     own, shared = results.runs[OWN], results.levels
@@ -83,16 +78,16 @@ def draw_times(path: Path, results: Results) -> None:
         for part, color in ((t.rest, _REST), (t.force, force_color), (t.rotation, _ROTATION)):
             ax.bar(x, scale * part, 0.72, bottom=scale * bottom, color=color, edgecolor="white", linewidth=0.6)
             bottom += part
-        ax.plot([x - 0.36, x + 0.36], [scale * t.step] * 2, color=_INK, linewidth=1.4, solid_capstyle="butt")
+        ax.plot([x - 0.36, x + 0.36], [scale * t.step] * 2, color=INK, linewidth=1.4, solid_capstyle="butt")
         top = scale * max(bottom, t.step)
         highest = max(highest, top)
         ax.annotate(
-            f"{scale * t.step:.1f}", (x, top), (0, 3), textcoords="offset points", ha="center", fontsize=8.5, color=_INK
+            f"{scale * t.step:.1f}", (x, top), (0, 3), textcoords="offset points", ha="center", fontsize=8.5, color=INK
         )
     ax.set_xticks(places, names)
     ax.set_xlim(-0.65, places[-1] + 0.65)
     ax.set_ylim(0.0, 1.1 * highest)
-    _tidy(ax)
+    tidy(ax)
     ax.tick_params(axis="x", length=0)
     ax.set_ylabel("time of a step [µs]" if cuda else "time of a step\n(linear's force + rest = 1)")
     middle = ax.get_xaxis_transform()
@@ -101,11 +96,11 @@ def draw_times(path: Path, results: Results) -> None:
         -0.165,
         "corotated, rotations shared at tree level",
         fontsize=9.5,
-        color=_INK,
+        color=INK,
         transform=middle,
         ha="center",
     )
-    ax.text(places[-1], -0.165, "corotated", fontsize=9.5, color=_INK, transform=middle, ha="center")
+    ax.text(places[-1], -0.165, "corotated", fontsize=9.5, color=INK, transform=middle, ha="center")
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -114,51 +109,22 @@ def draw_times(path: Path, results: Results) -> None:
         Patch(color=_FORCE, label="force"),
         Patch(color=_FUSED, label="rotation and force in one kernel"),
         Patch(color=_REST, label="rest (integration)"),
-        Line2D([], [], color=_INK, linewidth=1.4, label="whole step as run (number)"),
+        Line2D([], [], color=INK, linewidth=1.4, label="whole step as run (number)"),
     ]
     figure.legend(
         handles=marks, loc="lower left", bbox_to_anchor=(0.075, 0.005), ncols=5, frameon=False, fontsize=8.5,
         handlelength=1.2, columnspacing=1.3,
     )  # fmt: skip
-    _head(figure, "Computation time of a step by model and rotation level", results)
-    save(figure, path)
-
-
-def draw_shapes(path: Path, results: Results) -> None:
-    """Figure 6: the shapes at the end, each before its rest shape, and their outlines on one another."""
-    mesh = results.mesh
-    faces, _ = boundary_faces(mesh.tets, mesh.points)
-    named = [(PEER, "linear"), (REFERENCE, "St. Venant–Kirchhoff"), ("neo-hookean", "neo-Hookean")]
-    named += [(OWN, "corotated, own rotations"), (f"{OWN}-0", "corotated, level 0")]
-    shown = np.concatenate([mesh.points, *(results.runs[name].positions for name, _ in named)])
-    camera = Camera.fit(shown, mesh.up_axis, azimuth=68.0, elevation=12.0)
-    figure = _figure(9.6, 6.4)
-    width, height = 1.0 / 3.0, 0.335
-    corners = [(column * width, 0.46 - row * 0.445) for row in range(2) for column in range(3)]
-    window, _ = camera.project(shown)
-    low, high = window.min(axis=0), window.max(axis=0)
-    pad = 0.07 * (high - low)
-    for (left, bottom), (name, label) in zip(corners, named, strict=False):
-        run = results.runs[name]
-        ax = figure.add_axes((left, bottom, width, height))
-        draw_body(ax, run.positions, faces, rest=mesh.points, camera=camera, edges=True, ground=False)
-        ax.set_xlim(low[0] - pad[0], high[0] + pad[0])
-        ax.set_ylim(low[1] - pad[1], high[1] + pad[1])
-        growth = f"{100 * run.growth[-1]:+.1f} %".replace("-", "−")
-        strong = abs(run.growth[-1]) > VOLUME_KEPT
-        _caption(figure, left + width / 2, bottom + height + 0.036, label, f"volume {growth}", strong)
-    left, bottom = corners[-1]
-    _draw_outlines(figure.add_axes((left + 0.025, bottom, width - 0.05, height + 0.03)), results)
-    _head(figure, "Deformed shapes at the end", results)
+    head(figure, "Computation time of a step by model and rotation level", results)
     save(figure, path)
 
 
 def draw_errors_by_model(path: Path, results: Results) -> None:
     """Figure 7: how far the observed node is from where it is under StVK, over time."""
     lines = [
-        (results.runs[PEER], "linear", _LINEAR, 1.8),
-        (results.runs["neo-hookean"], "neo-Hookean", _NEO, 1.3),
-        (results.runs[OWN], "corotated, own", _OWN, 1.8),
+        (results.runs[PEER], "linear", LINEAR, 1.8),
+        (results.runs["neo-hookean"], "neo-Hookean", NEO, 1.3),
+        (results.runs[OWN], "corotated, own", OWN_COLOR, 1.8),
     ]
     marks = [(PUBLISHED_LINEAR, "published, linear: 22 mm"), (PUBLISHED_COROTATED, "published, corotated: 3.6 mm")]
     _draw_errors(path, results, lines, marks, "Displacement error of the free end against StVK, by model")
@@ -175,16 +141,6 @@ def draw_errors_by_level(path: Path, results: Results) -> None:
     _draw_errors(path, results, lines, marks, "Displacement error of the free end against StVK, by rotation level")
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, aside and renamed."""
-    part = path.with_name(f".{path.name}.part")
-    try:
-        figure.savefig(part, format="png", dpi=DPI)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
-
-
 # --- pieces --------------------------------------------------------------------------------------------------------
 
 
@@ -196,7 +152,7 @@ def _draw_errors(
     title: str,
 ) -> None:
     """Errors over time in mm: the swing on a wide panel, and whatever follows it compressed on a narrow one."""
-    figure = _figure(8.0, 4.4)
+    figure = new_figure(8.0, 4.4)
     end = float(results.times[-1])
     long = end > 2.0 * _SETTLED
     panels = [figure.add_axes((0.08, 0.13, 0.57 if long else 0.71, 0.7))]
@@ -210,12 +166,12 @@ def _draw_errors(
     for ax, (low, high) in zip(panels, limits, strict=True):
         inside = (time >= low) & (time <= high)
         for value, _ in marks:
-            ax.axhline(1e3 * value, color=_FAINT, linewidth=0.9, linestyle=(0, (4, 3)), zorder=1)
+            ax.axhline(1e3 * value, color=FAINT, linewidth=0.9, linestyle=(0, (4, 3)), zorder=1)
         for error, (_, _, color, width) in zip(errors, lines, strict=True):
             ax.plot(time[inside], error[inside], color=color, linewidth=width, solid_joinstyle="round")
         ax.set_xlim(low, high)
         ax.set_ylim(0.0, top)
-        _tidy(ax)
+        tidy(ax)
     for value, text in marks:
         panels[0].annotate(
             text,
@@ -224,7 +180,7 @@ def _draw_errors(
             textcoords="offset points",
             ha="right",
             fontsize=8.5,
-            color=_FAINT,
+            color=FAINT,
         )
     panels[0].set_ylabel("error [mm]")
     panels[0].set_xlabel("time [s]")
@@ -233,40 +189,8 @@ def _draw_errors(
         panels[1].set_xticks([20.0, 40.0, 60.0, 80.0] if round(end) == 80 else np.linspace(low, high, 3)[1:])
         panels[1].spines["left"].set_color("#d8d6dc")
     _label_ends(panels[-1], [e[-1] for e in errors], [(label, color) for _, label, color, _ in lines], top)
-    _head(figure, title, results)
+    head(figure, title, results)
     save(figure, path)
-
-
-def _draw_outlines(ax: Axes, results: Results) -> None:
-    """The beams' sides at x = 0 seen along the x axis."""
-    mesh = results.mesh
-    lines = ((None, "rest", "#c9c7ce", 1.0), (PEER, "linear", _LINEAR, 1.8), (REFERENCE, "StVK", _INK, 1.8),
-             (OWN, "corotated, own", _OWN, 1.8))  # fmt: skip
-    length, side = CELLS[2] * CELL_SIZE, CELL_SIZE
-    corners = np.array([[0.0, 0.0], [length, 0.0], [length, side], [0.0, side]])
-    near = np.flatnonzero(np.abs(mesh.points[:, 0]) < 1e-9)
-    y, z = mesh.points[near, 1], mesh.points[near, 2]
-    outline = []
-    for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        along, across = (
-            (z - a[0]) * (b - a)[0] + (y - a[1]) * (b - a)[1],
-            (z - a[0]) * (b - a)[1] - (y - a[1]) * (b - a)[0],
-        )
-        on = np.flatnonzero(np.abs(across) < 1e-9)
-        outline.append(near[on[np.argsort(along[on])]])
-    loop = np.concatenate(outline)
-    for name, label, color, width in lines:
-        x = 1e3 * (mesh.points if name is None else results.runs[name].positions)[loop]
-        style = (0, (3, 1.5)) if name == OWN else "-"
-        ax.plot(-x[:, 2], x[:, 1], color=color, linewidth=width, linestyle=style, label=label)
-    ax.plot([0, 0], [-12, 76], color=_INK, linewidth=3, solid_capstyle="butt")
-    ax.set_aspect("equal")
-    ax.set_axis_off()
-    ax.set_ylim(-108, 82)
-    ax.legend(
-        loc="lower center", bbox_to_anchor=(0.5, -0.03), ncols=4, frameon=False, fontsize=8, labelcolor=_INK,
-        handlelength=1.5, columnspacing=1.0, handletextpad=0.5,
-    )  # fmt: skip
 
 
 def _label_ends(ax: Axes, values: list[float], labels: list[tuple[str, object]], top: float) -> None:
@@ -289,39 +213,5 @@ def _label_ends(ax: Axes, values: list[float], labels: list[tuple[str, object]],
         ends = [1.0 + 0.4 * unit, 1.0 + 2.6 * unit]
         ax.plot(ends, [values[index], place], transform=across, color=color, linewidth=1.2, clip_on=False)
         text = f"{label}  {values[index]:.1f}"
-        ax.text(1.0 + 3.0 * unit, place, text, transform=across, fontsize=9, color=_INK, va="center")
-    ax.text(1.0 + 3.0 * unit, 0.96 * top, "at the end [mm]", transform=across, fontsize=8.5, color=_FAINT, va="bottom")
-
-
-def _caption(figure: Figure, x: float, y: float, label: str, note: str, strong: bool) -> None:
-    figure.text(x, y, label, fontsize=10, color=_INK, ha="center", va="bottom")
-    figure.text(x, y - 0.008, note, fontsize=9, color=_LINEAR if strong else _FAINT, ha="center", va="top")
-
-
-def _figure(width: float, height: float) -> Figure:
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), dpi=DPI, facecolor="white")
-
-
-def _head(figure: Figure, title: str, results: Results) -> None:
-    mesh = results.mesh
-    figure.text(0.012, 0.97, title, fontsize=12.5, color=_INK, va="top", weight="bold")
-    about = (
-        f"beam 64 × 64 × 192 mm under its weight, {len(mesh.points)} nodes, {len(mesh.tets)} tetrahedra, "
-        f"{results.times[-1]:.1f} s simulated · {device_name(results)}"
-    )
-    figure.text(0.012, 0.912, about, fontsize=8.5, color=_FAINT, va="top")
-
-
-def _tidy(ax: Axes) -> None:
-    for side in ("top", "right"):
-        ax.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        ax.spines[side].set_color(_FAINT)
-        ax.spines[side].set_linewidth(0.8)
-    ax.tick_params(colors=_INK, labelsize=9, width=0.8, length=3)
-    ax.yaxis.label.set_color(_INK)
-    ax.xaxis.label.set_color(_INK)
-    ax.grid(axis="y", color="#e9e8ec", linewidth=0.7)
-    ax.set_axisbelow(True)
+        ax.text(1.0 + 3.0 * unit, place, text, transform=across, fontsize=9, color=INK, va="center")
+    ax.text(1.0 + 3.0 * unit, 0.96 * top, "at the end [mm]", transform=across, fontsize=8.5, color=FAINT, va="bottom")

@@ -1,29 +1,22 @@
-"""What the paper's experiment found: a table for people, results.json for programs, and the paper's claims judged."""
+"""What the paper's experiment found: a table for people and results.json for programs."""
 
 from __future__ import annotations
 
 import json
 import os
 import platform
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import warp as wp
 
 from .. import __version__
-from .paper import CELL_SIZE, CELLS, GRAVITY, MATERIAL, OBSERVED, OWN, PEER, REFERENCE, SAMPLE_STEPS, Results, Run
+from .claims import judged_claims, speed_up
+from .paper import CELL_SIZE, CELLS, GRAVITY, MATERIAL, OBSERVED, OWN, REFERENCE, SAMPLE_STEPS, Results, Run
 from .timing import LAUNCHES, RUN_STEPS, StageTimes
 
 SCHEMA, SCHEMA_VERSION = "warp-corot/paper", 1
-
-#: Published errors of the observed node against StVK [m], and what linear FEM's must reach to be told from the others.
-PUBLISHED_COROTATED, PUBLISHED_LINEAR, LINEAR_AT_LEAST = 3.6e-3, 22e-3, 15e-3
-#: A volume that changes by less is kept; linear FEM's must grow by at least five times that.
-VOLUME_KEPT = 0.01
-#: "Much faster": the whole step takes at most half the time. "No significant error": sharing rotations moves the node
-#: by at most this share of how far it sinks.
-MUCH_FASTER, SIGNIFICANT = 2.0, 0.01
 
 MEASURED = {
     "error": "distance of the observed node from its place in the StVK run at the same simulated time",
@@ -37,85 +30,6 @@ MEASURED = {
     "relative": "in units of linear FEM's force + rest in the same round",
     "absolute": "microseconds, on CUDA devices only: a shared CPU's absolute times say little",
 }
-
-
-@dataclass(frozen=True)
-class Claim:
-    """A claim of the paper, and what was found.
-
-    Attributes:
-        claim: In words.
-        published: What the paper says.
-        measured: What was measured.
-        holds: Whether it holds here, by the bound that ``criterion`` states.
-        criterion: The bound.
-    """
-
-    claim: str
-    published: str
-    measured: str
-    holds: bool
-    criterion: str
-
-
-def judged_claims(results: Results) -> list[Claim]:
-    """The paper's claims, each with its numbers and whether it holds here."""
-    own, linear = results.error(OWN).max(), results.error(PEER).max()
-    growth = {name: run.growth[-1] for name, run in results.runs.items()}
-    linear_growth = growth.pop(PEER)
-    kept = max(growth.values(), key=abs)
-    found = [
-        Claim(
-            "corotated FEM stays near StVK",
-            f"never more than {1e3 * PUBLISHED_COROTATED:.1f} mm off",
-            f"at most {1e3 * own:.2f} mm with own rotations; {_above_published(results)}",
-            bool(own < PUBLISHED_COROTATED),
-            f"own rotations below {1e3 * PUBLISHED_COROTATED:.1f} mm at every sample",
-        ),
-        Claim(
-            "linear FEM does not",
-            f"{1e3 * PUBLISHED_LINEAR:.0f} mm off",
-            f"up to {1e3 * linear:.1f} mm",
-            bool(linear >= LINEAR_AT_LEAST),
-            f"at least {1e3 * LINEAR_AT_LEAST:.0f} mm at the worst sample",
-        ),
-        Claim(
-            "linear FEM grows in volume, the others do not (figure 6)",
-            "seen in the figure",
-            f"linear {linear_growth:+.1%}, of the others at most {kept:+.2%}",
-            bool(linear_growth > 5 * VOLUME_KEPT and abs(kept) < VOLUME_KEPT),
-            f"linear above {5 * VOLUME_KEPT:+.0%}, the others within {VOLUME_KEPT:.0%}",
-        ),
-    ]
-    good = [run for run in results.levels if _shares_well(results, run)]
-    best = max(good, key=lambda run: speed_up(results, run), default=None)
-    if best is None:
-        said = "no level gives both"
-    else:
-        moved = results.error(best.case.name, OWN).max()
-        said = (
-            f"levels {_listed(run.case.rotation_level for run in good)} give both; fastest is level "
-            f"{best.case.rotation_level}: {speed_up(results, best):.1f} times as fast, {1e3 * moved:.2f} mm moved"
-        )
-    found.append(
-        Claim(
-            "rotations of a coarser level are much faster, without significant error",
-            "in words and figures 5 and 8",
-            said,
-            best is not None,
-            f"a whole step at least {MUCH_FASTER:.0f} times as fast as with own rotations, and the node never further "
-            f"from that run than {SIGNIFICANT:.0%} of how far it sinks",
-        )
-    )
-    return found
-
-
-def speed_up(results: Results, run: Run) -> float:
-    """How many times as fast as with own rotations a whole step is."""
-    own = results.runs[OWN].times
-    assert own is not None
-    assert run.times is not None
-    return own.relative.step / run.times.relative.step
 
 
 def table(results: Results) -> str:
@@ -233,21 +147,6 @@ def processor_name() -> str:
 # --- pieces --------------------------------------------------------------------------------------------------------
 
 
-def _shares_well(results: Results, run: Run) -> bool:
-    sinks = np.linalg.norm(results.runs[OWN].path, axis=1).max()
-    moved = results.error(run.case.name, OWN).max()
-    return bool(speed_up(results, run) >= MUCH_FASTER and moved <= SIGNIFICANT * sinks)
-
-
-def _above_published(results: Results) -> str:
-    """Which levels of shared rotations are further off than published."""
-    worst = {run.case.rotation_level: results.error(run.case.name).max() for run in results.levels}
-    above = [f"{level} ({1e3 * error:.2f} mm)" for level, error in worst.items() if error >= PUBLISHED_COROTATED]
-    return (
-        f"rotations shared at level {', '.join(above)} are further off" if above else "no shared ones are further off"
-    )
-
-
 def _model_json(results: Results, name: str, run: Run) -> dict:
     error, moved = results.error(name), results.error(name, OWN)
     worst = int(error.argmax())
@@ -318,10 +217,6 @@ def _level_row(results: Results, run: Run) -> str:
         f"{level:22}{run.rotations:9d}{1e2 * run.growth[-1]:+9.2f}{1e3 * error:10.2f}{1e3 * moved:8.2f}"
         f"{speed_up(results, run):10.2f}   {_times(results, run)}"
     )
-
-
-def _listed(levels) -> str:
-    return ", ".join(str(level) for level in levels)
 
 
 def _millimetres(point: tuple[float, ...]) -> str:

@@ -1,0 +1,60 @@
+"""What the figures share: colours, headings, axes, and how they are written."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .paper import Results
+from .report import device_name
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+DPI = 200
+INK, FAINT = "#2b2730", "#8a8590"
+LINEAR, OWN_COLOR, NEO = "#c8452f", "#1f6f8b", "#8a8590"
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure of that many inches, apart from pyplot and its global state."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), dpi=DPI, facecolor="white")
+
+
+def head(figure: Figure, title: str, results: Results) -> None:
+    """Title, and under it what was simulated and where."""
+    mesh = results.mesh
+    figure.text(0.012, 0.97, title, fontsize=12.5, color=INK, va="top", weight="bold")
+    about = (
+        f"beam 64 × 64 × 192 mm under its weight, {len(mesh.points)} nodes, {len(mesh.tets)} tetrahedra, "
+        f"{results.times[-1]:.1f} s simulated · {device_name(results)}"
+    )
+    figure.text(0.012, 0.912, about, fontsize=8.5, color=FAINT, va="top")
+
+
+def tidy(ax: Axes) -> None:
+    """Two thin axes and faint lines to read values by."""
+    for side in ("top", "right"):
+        ax.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        ax.spines[side].set_color(FAINT)
+        ax.spines[side].set_linewidth(0.8)
+    ax.tick_params(colors=INK, labelsize=9, width=0.8, length=3)
+    ax.yaxis.label.set_color(INK)
+    ax.xaxis.label.set_color(INK)
+    ax.grid(axis="y", color="#e9e8ec", linewidth=0.7)
+    ax.set_axisbelow(True)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, aside and renamed."""
+    part = path.with_name(f".{path.name}.part")
+    try:
+        figure.savefig(part, format="png", dpi=DPI)
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
