@@ -1,0 +1,131 @@
+"""The command ``warp-corot``: its subcommands, one file each, and what becomes of their errors."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import re
+import signal
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import NoReturn
+
+import warp as wp
+
+from ..errors import InputError, UnstableError
+from . import paper, simulate
+from .say import complain
+
+COMMANDS = {"simulate": simulate, "paper": paper}
+
+EXIT_CODES = """exit status:
+  0    done
+  1    a file could not be written, as when the disk is full
+  2    bad input, said in one line; nothing was simulated, no file touched
+  3    the state became not finite; the frames before are kept
+  130  interrupted (Ctrl-C), 143 terminated (SIGTERM); the frames written are kept"""
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM has come."""
+
+
+class Parser(argparse.ArgumentParser):
+    """Complains in one line, and takes -1e3 for a number."""
+
+    def __init__(self, **options):
+        options.setdefault("allow_abbrev", False)
+        options.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        super().__init__(**options)
+        self._negative_number_matcher = re.compile(r"^-(\d|\.\d|inf|nan)")
+
+    def error(self, message: str) -> NoReturn:
+        complain(f"{message} (see {self.prog} --help)")
+        sys.exit(2)
+
+
+def make_parser() -> argparse.ArgumentParser:
+    from .. import __version__
+
+    parser = Parser(
+        prog="warp-corot",
+        description="Corotational finite elements for soft tissue, on CPU and CUDA.",
+        epilog="Example: warp-corot simulate warp:bear -o bear.usd\n\n" + EXIT_CODES,
+    )
+    parser.add_argument("--version", action="version", version=f"warp-corot {__version__} (warp {wp.__version__})")
+    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
+    for command in COMMANDS.values():
+        command.add_parser(subparsers)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    wp.config.log_level = wp.LOG_ERROR  # before Warp starts, so that it says nothing about itself
+    logging.basicConfig(format="warp-corot: %(levelname)s: %(message)s", level=logging.WARNING)
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+    args = make_parser().parse_args(argv)
+    _start_warp()
+    try:
+        with _terminable():
+            status = COMMANDS[args.command].run(args)
+            sys.stdout.flush()
+        return status
+    except InputError as error:
+        complain(str(error))
+        return 2
+    except UnstableError as error:
+        complain(str(error))
+        return 3
+    except KeyboardInterrupt as signalled:
+        complain("interrupted; nothing was written", kind="")
+        return interrupt_status(signalled)
+    except BrokenPipeError:
+        # Who read the output has gone, as `head` does; Python must not complain once more when it closes it.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+
+
+def interrupt_status(signalled: KeyboardInterrupt) -> int:
+    """What a shell expects of a program that a signal has ended."""
+    return 128 + (signal.SIGTERM if isinstance(signalled, Terminated) else signal.SIGINT)
+
+
+def _start_warp() -> None:
+    """Start Warp, which writes straight to the terminal; that there is no NVIDIA driver is no news to who has none."""
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as said:
+        kept = os.dup(2)
+        os.dup2(said.fileno(), 2)
+        try:
+            wp.init()
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+        said.seek(0)
+        for line in said.read().decode(errors="replace").splitlines():
+            if "Could not find or load the NVIDIA CUDA driver" not in line:
+                print(line, file=sys.stderr)
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM ends what runs as Ctrl-C does."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def terminate(*_: object) -> NoReturn:
+        raise Terminated
+
+    before = signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

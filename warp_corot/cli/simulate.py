@@ -1,0 +1,284 @@
+"""``warp-corot simulate``: a mesh in, an animation out."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..body import SoftBody, checked_device
+from ..elasticity import MODELS, Corotated, Model
+from ..errors import InputError, StabilityWarning, UnstableError
+from ..materials import Isotropic
+from ..selection import select_nodes
+from ..simulation import Simulation
+from ..solvers import SymplecticEuler
+from .say import complain
+from .subject import STIFFNESS_PER_WEIGHT, Subject, find_subject
+from .summary import summary
+
+if TYPE_CHECKING:
+    from ..io.animate import Recording
+
+FPS = 24.0
+
+#: Getting ready takes this long [s] only when kernels must be compiled.
+COMPILING_AFTER = 1.5
+
+
+def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
+    """Add the command to ``warp-corot``."""
+    from . import EXIT_CODES
+
+    parser = subparsers.add_parser(
+        "simulate",
+        help="let a soft body move and write it as a USD animation",
+        description="Lets a soft body sag and sway under gravity and writes a USD animation, coloured by stress.",
+        epilog=f"""examples:
+  warp-corot simulate warp:bear -o bear.usd
+  warp-corot simulate liver.msh --scale 0.001 --young 5000 --fix "z < zmin + 0.01" -o liver.usd --preview liver.png
+  warp-corot simulate box --model linear -o beam.usd
+
+expressions for --fix:
+  names      x y z (rest coordinates [m], after --scale), xmin xmax ymin ymax zmin zmax, pi, all, none
+  operators  + - * / // % **   < <= > >= == !=   and or not   ( )
+  functions  abs sqrt exp log sin cos tan atan2 hypot min max
+
+warp:bear and box have defaults of their own for body and motion.
+
+{EXIT_CODES}""",
+    )
+    parser.add_argument(
+        "input",
+        metavar="INPUT",
+        help="a USD file with tetrahedra (a TetMesh, or a Mesh with tetraIndices); a file that meshio reads (.msh, "
+        ".vtk, .vtu, ...); warp:bear, a toy bear; or box, the beam of Tagawa et al. 2013",
+    )
+    parser.add_argument(
+        "-o", "--output", required=True, type=Path, metavar="OUT.usd", help="animation to write (.usd, .usdc or .usda)"
+    )
+
+    body = parser.add_argument_group("the body")
+    body.add_argument("--scale", type=float, metavar="S", help="factor on the coordinates, e.g. 0.001 for a mesh in mm")
+    body.add_argument(
+        "--young",
+        type=float,
+        metavar="E",
+        help=f"Young's modulus [Pa] (default: {STIFFNESS_PER_WEIGHT:g} times density, gravity and height, with which "
+        "a body visibly sags and stands)",
+    )
+    body.add_argument("--poisson", type=float, metavar="NU", help="Poisson's ratio (default: 0.45)")
+    body.add_argument("--density", type=float, metavar="RHO", help="mass density [kg/m^3] (default: 1000)")
+    body.add_argument("--model", choices=MODELS, default="corotated", help="elastic model (default: corotated)")
+    body.add_argument(
+        "--rotation-level",
+        type=int,
+        metavar="L",
+        help="corotated box: take rotations from the tree's level L only (default: every element has its own)",
+    )
+    body.add_argument(
+        "--fix",
+        metavar="EXPR",
+        help='nodes that are held, such as "z < 0.01", or none (default: the lowest 2 %% of the height)',
+    )
+
+    motion = parser.add_argument_group("the motion")
+    motion.add_argument(
+        "--gravity", type=float, nargs=3, metavar=("X", "Y", "Z"), help="[m/s^2] (default: 9.81 down the up axis)"
+    )
+    motion.add_argument("--damping", type=float, metavar="C", help="mass-proportional damping [1/s] (default: 2)")
+    motion.add_argument("--duration", type=float, metavar="T", help="simulated time [s] (default: 4)")
+    motion.add_argument("--fps", type=float, default=FPS, metavar="F", help=f"frames per second (default: {FPS:g})")
+    motion.add_argument(
+        "--dt",
+        type=float,
+        help="time step [s], shortened so that a whole number makes a frame (default: a safe one, found)",
+    )
+
+    parser.add_argument("--device", help='"cpu", "cuda:0", ... (default: a GPU if there is one)')
+    parser.add_argument("--preview", type=Path, metavar="FILE.png", help="also draw the last frame")
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command; returns the exit status.
+
+    Raises:
+        InputError: Bad options; nothing has been simulated or written.
+    """
+    from ..io.animate import Recording, frame_count, record
+
+    if args.duration is not None:
+        frame_count(args.duration, args.fps)
+    _check_output(args.output, args.preview)
+    checked_device(args.device)
+    model = _model(args.model, args.rotation_level)
+    subject = find_subject(args.input, args.scale)
+    if subject.source and args.output.exists() and args.output.samefile(subject.source):
+        raise InputError(f"{args.output}: is the input, should be another file")
+    duration = subject.duration if args.duration is None else args.duration
+    frame_count(duration, args.fps)
+    body, fixed = _make_body(args, subject)
+    sim = _make_simulation(args, subject, body, model)
+    for note in subject.notes:
+        complain(note, kind="note")
+
+    done = Recording(args.output)
+    try:
+        with _progress_bar() as progress:
+            record(sim, args.output, duration=duration, fps=args.fps, progress=progress, recording=done)
+    except KeyboardInterrupt as signalled:
+        from . import interrupt_status
+
+        complain(f"interrupted; {_kept(done)}", kind="")
+        return interrupt_status(signalled)
+    except UnstableError as error:
+        complain(f"{error}; {_kept(done)}")
+        return 3
+    except OSError as error:
+        complain(str(error))
+        return 1
+    print(summary(subject, sim, done, fixed))
+    if args.preview:
+        try:
+            _draw(args.preview, subject, sim)
+        except OSError as error:
+            complain(str(error))
+            return 1
+        print(f"  {'preview':<14}{args.preview}")
+    return 0
+
+
+def _check_output(output: Path, preview: Path | None) -> None:
+    """Say before a long run what would stop its results from being written."""
+    from ..io.preview import check_picture_path
+    from ..io.usd_pieces import PieceStore
+
+    PieceStore(output)  # checks, and writes nothing before the first frame
+    if preview is not None:
+        if find_spec("matplotlib") is None:
+            raise InputError('--preview needs Matplotlib: pip install "warp-corot[plot]"')
+        check_picture_path(preview)
+
+
+def _model(name: str, rotation_level: int | None) -> Model:
+    if rotation_level is None:
+        return MODELS[name]()
+    if name != "corotated":
+        raise InputError(f"--rotation-level is {rotation_level}, but only --model corotated has rotations, not {name}")
+    return Corotated(rotation_level=rotation_level)
+
+
+def _make_body(args: argparse.Namespace, subject: Subject) -> tuple[SoftBody, str]:
+    """The body, and the expression that its fixed nodes come from."""
+    density = subject.density if args.density is None else args.density
+    poisson = subject.poisson if args.poisson is None else args.poisson
+    young = subject.young if args.young is None else args.young
+    if young is None:
+        Isotropic(1.0, poisson, density)  # the density must be checked before it is used
+        young = subject.young_from_weight(density, args.gravity)
+        subject.notes.append(f"Young's modulus is {young:g} Pa, chosen for its weight (--young)")
+    material = Isotropic(young, poisson, density)
+
+    used = subject.used
+    expression = subject.fix if args.fix is None else args.fix
+    chosen = expression if expression is not None else subject.lowest_part()
+    fixed = select_nodes(chosen, subject.mesh.points, bounds=subject.bounds)
+    held = int(fixed[used].sum())
+    if expression is None:
+        subject.notes.append(f'the lowest 2 % of the height is held, {held} nodes (--fix "{chosen}")')
+    if held == len(used):
+        raise InputError(f"expression {chosen!r}: holds all {held} nodes, at least one must be free to move")
+    if held == 0:
+        subject.notes.append(f"no node is held ({chosen!r}): the body falls freely")
+
+    body = SoftBody(subject.mesh, material, device=args.device)
+    body.fix(fixed)
+    return body, f"{held} nodes ({chosen})"
+
+
+def _make_simulation(args: argparse.Namespace, subject: Subject, body: SoftBody, model: Model) -> Simulation:
+    """The simulation with a whole number of steps to a frame, its kernels compiled."""
+    from ..io.animate import steps_per_frame
+
+    damping = subject.damping if args.damping is None else args.damping
+    gravity = subject.gravity if args.gravity is None else tuple(args.gravity)
+    SymplecticEuler(args.dt, damping)  # checks both, the step before it is shortened
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", StabilityWarning)
+        with _compiling_said():
+            # At rest and without weight, a safe step loads every kernel and moves nothing.
+            trial = Simulation(body, model=model, integrator=SymplecticEuler(damping=damping), gravity=(0, 0, 0))
+            wanted = trial.dt if args.dt is None else args.dt
+            dt = 1.0 / (args.fps * steps_per_frame(args.fps, wanted))
+            sim = Simulation(body, model=model, integrator=SymplecticEuler(dt, damping), gravity=gravity)
+            trial.step()
+            trial.von_mises()
+            body.displacements = body.velocities = np.zeros_like(body.mesh.points)
+    for warning in caught:
+        if issubclass(warning.category, StabilityWarning):
+            complain(str(warning.message), kind="warning")
+        else:
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+    return sim
+
+
+@contextmanager
+def _compiling_said() -> Iterator[None]:
+    """Say that kernels are being compiled if it takes long enough to wonder."""
+    text = "compiling kernels; later runs find them compiled"
+    timer = threading.Timer(COMPILING_AFTER, complain, [text, ""])
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+@contextmanager
+def _progress_bar() -> Iterator:
+    from tqdm import tqdm
+
+    form = "{desc}  {percentage:3.0f} % |{bar}| frame {n_fmt} of {total_fmt}, {remaining} left"
+    with tqdm(desc="simulating", leave=False, disable=None, file=sys.stderr, bar_format=form) as bar:
+
+        def tell(frame: int, count: int) -> None:
+            bar.total = count
+            bar.update(frame - bar.n)
+
+        yield tell
+
+
+def _kept(done: Recording) -> str:
+    if not done.frames:
+        return "no frame was written"
+    return f"{done.frames} frames, {done.simulated:.3g} s, are kept in {done.path}"
+
+
+def _draw(path: Path, subject: Subject, sim: Simulation) -> None:
+    from ..io.colors import VertexAverage
+    from ..io.preview import render_preview
+    from ..mesh.surface import boundary_faces, signed_volumes
+
+    mesh = subject.mesh
+    faces, _ = boundary_faces(mesh.tets, mesh.points)
+    weights = np.abs(signed_volumes(mesh.points, mesh.tets))
+    stress = VertexAverage(mesh.tets, weights, len(mesh.points))(sim.von_mises())
+    render_preview(
+        path,
+        sim.body.positions.numpy(),
+        faces,
+        scalars=stress,
+        rest=mesh.points,
+        up_axis=mesh.up_axis,
+        title=f"{subject.name}, {sim.time:.3g} s",
+    )

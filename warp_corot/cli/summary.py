@@ -1,0 +1,70 @@
+"""What ``warp-corot simulate`` says at the end."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+from ..elasticity import MODELS
+
+if TYPE_CHECKING:
+    from ..io.animate import Recording
+    from ..simulation import Simulation
+    from .subject import Subject
+
+
+def summary(subject: Subject, sim: Simulation, done: Recording, fixed: str) -> str:
+    """The run in a dozen lines.
+
+    Args:
+        subject: What was simulated.
+        sim: The simulation at its end.
+        done: What was recorded.
+        fixed: The fixed nodes, in words.
+    """
+    model = next(name for name, kind in MODELS.items() if type(sim.models[0]) is kind)
+    level = getattr(sim.models[0], "rotation_level", None)
+    material = sim.body.material
+    damping = asdict(sim.integrator)["damping"]  # type: ignore[call-overload]
+    stepping = max(done.stepping, 1e-9)
+    at_end = (
+        f"{length(done.final_displacement)} at the end ({done.final_displacement / subject.height:.1%} of the height)"
+    )
+    rows = [
+        ("mesh", _mesh(subject)),
+        (
+            "material",
+            f"E = {pressure(float(material.young))}, nu = {material.poisson:g}, rho = {material.density:g} kg/m^3",
+        ),
+        ("model", model if level is None else f"{model}, rotations of level {level}"),
+        ("fixed", fixed),
+        ("gravity", f"{' '.join(f'{g:g}' for g in sim.gravity)} m/s^2, damping {damping:g} /s"),
+        ("time step", f"{1e3 * sim.dt:.4g} ms, largest stable one about {1e3 * sim.stable_dt:.4g} ms"),
+        ("speed", f"{done.steps / stepping:.4g} steps/s, {done.simulated / stepping:.3g} times real time"),
+        ("wall time", f"{done.stepping:.2f} s stepping, {done.writing:.2f} s writing"),
+        ("displacement", f"{length(done.largest_displacement)} largest, {at_end}"),
+        ("device", f"{sim.device} ({sim.device.name})"),
+        ("written", f"{done.path}, {done.frames} frames, {done.simulated:.4g} s"),
+    ]
+    return "\n".join([subject.name, *(f"  {name:<14}{text}" for name, text in rows)])
+
+
+def length(metres: float) -> str:
+    """A length to three digits, in mm or m."""
+    return f"{metres:.3g} m" if metres >= 1.0 else f"{1e3 * metres:.3g} mm"
+
+
+def pressure(pascals: float) -> str:
+    """A pressure in Pa, kPa, MPa or GPa."""
+    for unit, factor in (("GPa", 1e9), ("MPa", 1e6), ("kPa", 1e3)):
+        if pascals >= factor:
+            return f"{pascals / factor:g} {unit}"
+    return f"{pascals:g} Pa"
+
+
+def _mesh(subject: Subject) -> str:
+    nodes, repaired = len(subject.mesh.points), getattr(subject.mesh, "repaired", 0)
+    unused = nodes - len(subject.used)
+    remarks = [f"{repaired} wound wrongly and repaired"] if repaired else []
+    remarks += [f"{unused} nodes in no tetrahedron"] if unused else []
+    return f"{nodes} nodes, {len(subject.mesh.tets)} tetrahedra" + (f" ({', '.join(remarks)})" if remarks else "")

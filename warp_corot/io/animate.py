@@ -1,0 +1,186 @@
+"""A simulation recorded frame by frame as a USD animation."""
+
+from __future__ import annotations
+
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import InputError
+from ..simulation import Simulation
+from .usd_writer import UsdWriter
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass
+class Recording:
+    """What has been recorded so far.
+
+    Attributes:
+        path: The stage.
+        frames: Frames written, the one at the beginning included.
+        steps: Time steps done.
+        simulated: Simulated time [s].
+        stepping: Wall time of stepping [s], without writing.
+        writing: Wall time of reading the state back and writing it [s].
+        largest_displacement: Largest displacement from rest of any node in any frame [m].
+        final_displacement: The same in the last frame [m].
+    """
+
+    path: Path
+    frames: int = 0
+    steps: int = 0
+    simulated: float = 0.0
+    stepping: float = 0.0
+    writing: float = 0.0
+    largest_displacement: float = 0.0
+    final_displacement: float = 0.0
+
+
+class _Joined:
+    """The bodies of a simulation as one mesh and one material, body after body."""
+
+    def __init__(self, sim: Simulation):
+        offsets = np.cumsum([0, *(body.node_count for body in sim.bodies)])
+        self.points = np.concatenate([body.mesh.points for body in sim.bodies])
+        self.tets = np.concatenate([b.mesh.tets + n for b, n in zip(sim.bodies, offsets[:-1], strict=True)])
+        self.tets = self.tets.astype(np.int32)
+        self.up_axis = sim.bodies[0].mesh.up_axis
+        self.fixed = np.concatenate([body.constrained for body in sim.bodies])
+        for name in ("young", "poisson", "density"):
+            setattr(self, name, self._property(sim, name))
+
+    @staticmethod
+    def _property(sim: Simulation, name: str) -> float | npt.NDArray[np.float64]:
+        values = [np.broadcast_to(getattr(b.material, name), len(b.mesh.tets)) for b in sim.bodies]
+        joined = np.concatenate(values).astype(np.float64)
+        return float(joined[0]) if (joined == joined[0]).all() else joined
+
+
+def steps_per_frame(fps: float, dt: float) -> int:
+    """The least whole number of steps, none longer than ``dt`` [s], that makes a frame."""
+    return max(math.ceil(1.0 / (fps * dt) * (1.0 - 1e-9)), 1)
+
+
+def frame_count(duration: float, fps: float) -> int:
+    """How many frames follow the first one, nearest to ``duration`` [s].
+
+    Raises:
+        InputError: Not positive and finite, or shorter than half a frame.
+    """
+    for name, value, unit in (("fps", fps, ""), ("duration", duration, " s")):
+        if not (math.isfinite(value) and value > 0):
+            raise InputError(f"{name} is {value:g}{unit}; it must be a positive number")
+    count = round(duration * fps)
+    if count < 1:
+        raise InputError(f"duration is {duration:g} s; it must be at least one frame, {1.0 / fps:.3g} s")
+    return count
+
+
+def record(
+    sim: Simulation,
+    path: str | PathLike[str],
+    *,
+    duration: float,
+    fps: float = 24.0,
+    progress: Progress | None = None,
+    recording: Recording | None = None,
+) -> Recording:
+    """Advance a simulation and write a frame of it as often as ``fps`` asks, the present state first.
+
+    Several bodies become one mesh, body after body. Frame k shows the state after the whole number of steps nearest to
+    k / fps. Whatever ends the run, the frames written stay: Ctrl-C and SIGTERM wait while one is being written.
+
+    Args:
+        sim: Goes on from where it is.
+        path: A .usd, .usdc or .usda file; what was there stays until the first frames are safe.
+        duration: Simulated time [s], rounded to whole frames.
+        fps: Frames per second of simulated time.
+        progress: Called with the frames done and their number, after each.
+        recording: Filled while running, for who wants to look at it when the run has been ended early.
+
+    Returns:
+        What was recorded.
+
+    Raises:
+        InputError: A path that cannot be written to, or a duration or frame rate out of its range; nothing has been
+            simulated or written then.
+        UnstableError: The state is not finite any more; the frames before are kept.
+        OSError: The file cannot be written, as when the disk is full; the frames up to seconds before are kept.
+    """
+    count = frame_count(duration, fps)
+    joined = _Joined(sim)
+    writer = UsdWriter(Path(path), joined, fps=fps, fixed=joined.fixed, material=joined)
+    done = Recording(writer.path) if recording is None else recording
+    first_step = sim.steps
+    with _closed_whole(writer, done):
+        for frame in range(count + 1):
+            started = time.perf_counter()
+            due = first_step + round(frame / (fps * sim.dt))
+            sim.advance_steps(due - sim.steps)
+            stepped = time.perf_counter()
+            with signals_held_back():
+                _write_frame(writer, sim, done)
+            done.stepping += stepped - started
+            done.writing += time.perf_counter() - stepped
+            done.steps = due - first_step
+            done.simulated = done.steps * sim.dt
+            if progress:
+                progress(frame, count)
+    return done
+
+
+def _write_frame(writer: UsdWriter, sim: Simulation, done: Recording) -> None:
+    positions = [body.positions.numpy() for body in sim.bodies]
+    velocities = [body.velocities.numpy() for body in sim.bodies]
+    stresses = [sim.von_mises(body) for body in sim.bodies]
+    writer.write(np.concatenate(positions), velocities=np.concatenate(velocities), von_mises=np.concatenate(stresses))
+    done.frames = writer.frames
+    lengths = [np.linalg.norm(body.displacements.numpy(), axis=1).max() for body in sim.bodies]
+    done.final_displacement = float(max(lengths))
+    done.largest_displacement = max(done.largest_displacement, done.final_displacement)
+
+
+@contextmanager
+def _closed_whole(writer: UsdWriter, done: Recording) -> Iterator[None]:
+    """The writer is closed at the end, whatever the end is, with signals held back and the time taken."""
+    try:
+        yield
+    except BaseException as error:
+        with signals_held_back():
+            writer.__exit__(type(error), error, error.__traceback__)
+        raise
+    started = time.perf_counter()
+    with signals_held_back():
+        writer.close()
+    done.writing += time.perf_counter() - started
+
+
+@contextmanager
+def signals_held_back() -> Iterator[None]:
+    """SIGINT and SIGTERM that come inside are delivered at its end (in the main thread; elsewhere there are none)."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    held: list[int] = []
+    before = {int(number): signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    ours = {number: handler for number, handler in before.items() if handler is not None}
+    for number in ours:
+        signal.signal(number, lambda n, _: held.append(n))
+    try:
+        yield
+    finally:
+        for number, handler in ours.items():
+            signal.signal(number, handler)
+        for number in held[:1]:
+            signal.raise_signal(number)
