@@ -6,6 +6,7 @@ import numpy as np
 import oracle
 import pytest
 from cases import CUBE, mixed_forest
+from sequential import Bisection
 
 import warp_corot as wc
 
@@ -28,7 +29,7 @@ def frames(forest):
 
 def leaf_set(forest):
     """Leaves as (level, vertices in Maubach order) on the oracle's lattice."""
-    lattice = np.rint((forest.points - forest.origin) / forest.cell_size * oracle.Bisection.CUBE).astype(int)
+    lattice = np.rint((forest.points - forest.origin) / forest.cell_size * Bisection.CUBE).astype(int)
     vertices = lattice[forest.tets]
     return [
         (int(level), *(tuple(int(c) for c in p) for p in tet))
@@ -69,7 +70,7 @@ def test_uniform_leaves_are_those_of_the_sequential_bisection(cells, level):
     forest = wc.TetForest.box(cells, CUBE, level, origin=(0.5, -1.0, 2.0))
     leaves = leaf_set(forest)
     assert len(leaves) == 6 * np.prod(cells) * 2**level
-    assert set(leaves) == oracle.Bisection(cells, level).leaves
+    assert set(leaves) == Bisection(cells, level).leaves
     assert len(np.unique(forest.points, axis=0)) == len(forest.points)
     assert np.array_equal(np.unique(forest.tets), np.arange(len(forest.points)))
 
@@ -78,7 +79,7 @@ def test_uniform_leaves_are_those_of_the_sequential_bisection(cells, level):
 def test_refined_leaves_are_those_of_the_sequential_bisection(seed):
     """Random leaves bisected, three times over: neither more nor fewer others follow than conformity asks for."""
     rng = np.random.default_rng(seed)
-    forest, sequential = wc.TetForest.box((2, 1, 1), CUBE, seed % 3), oracle.Bisection((2, 1, 1), seed % 3)
+    forest, sequential = wc.TetForest.box((2, 1, 1), CUBE, seed % 3), Bisection((2, 1, 1), seed % 3)
     for _ in range(3):
         chosen = rng.random(len(forest.tets)) < 0.15
         chosen[0] = True
@@ -191,13 +192,13 @@ def test_children_are_the_bisections_of_their_parent(forest):
     assert (tree.level[first + 1] == tree.level[parents] + 1).all()
     assert len(tree.tets) == 12 + 2 * len(parents)
     assert ((tree.parent < 0) == (tree.level == 0)).all()
-    points = np.rint(forest.points / CUBE * oracle.Bisection.CUBE).astype(int)
+    points = np.rint(forest.points / CUBE * Bisection.CUBE).astype(int)
 
     def leaf(t):
         return (int(tree.level[t]), *(tuple(int(c) for c in points[n]) for n in tree.tets[t]))
 
     for parent, child in zip(parents, first, strict=True):
-        assert oracle.Bisection.children(leaf(parent)) == (leaf(child), leaf(child + 1))
+        assert Bisection.children(leaf(parent)) == (leaf(child), leaf(child + 1))
 
 
 def test_leaves_are_in_tree_order(forest):

@@ -3,13 +3,14 @@
 import numpy as np
 import oracle
 import pytest
+from sequential import Bisection
 
 MU, LAM = oracle.lame(500.0, 0.4)
 
 
 def random_mesh(rng, cells=2):
     """A jittered grid of tetrahedra, every other one wound the wrong way."""
-    bisection = oracle.Bisection((cells, 1, 1), 1)
+    bisection = Bisection((cells, 1, 1), 1)
     corners = np.array([bisection.points(leaf, 0.1) for leaf in sorted(bisection.leaves)])
     points, inverse = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
     tets = inverse.reshape(-1, 4)
@@ -119,7 +120,7 @@ def test_edge_springs_equal_st_venant_kirchhoff(rng):
 @pytest.mark.parametrize("model", oracle.DENSITIES)
 def test_patch(model, rng):
     """A homogeneous deformation leaves every interior node without force."""
-    bisection = oracle.Bisection((2, 2, 2), 3)
+    bisection = Bisection((2, 2, 2), 3)
     corners = np.array([bisection.points(leaf) for leaf in bisection.leaves]).reshape(-1, 3)
     points, inverse = np.unique(corners, axis=0, return_inverse=True)
     interior = ((points > 0) & (points < 2)).all(1)
@@ -225,8 +226,8 @@ def test_equilibrium_balances_the_load(model, rng):
 
 def test_bisection_counts_and_conformity(rng):
     """Random refinement fills the box and stays conforming: no vertex lies in the middle of a leaf's edge."""
-    assert len(oracle.Bisection((1, 1, 3), 6).leaves) == 1152
-    bisection = oracle.Bisection((2, 1, 1), 2)
+    assert len(Bisection((1, 1, 3), 6).leaves) == 1152
+    bisection = Bisection((2, 1, 1), 2)
     for _ in range(40):
         leaves = sorted(bisection.leaves)
         bisection.refine(leaves[rng.integers(len(leaves))])

@@ -4,6 +4,7 @@ import numpy as np
 import oracle
 import pytest
 from cases import MATERIAL, mixed_forest, oracle_mesh, place, random_displacement, simulation
+from sequential import Bisection
 
 import warp_corot as wc
 
@@ -203,7 +204,7 @@ def ancestor_rotations(forest, u, level):
     leaf's centroid inside. All its vertices are nodes of the mesh.
     """
     cells = np.rint(forest.points.max(0) / 0.064).astype(int)
-    coarse = oracle.Bisection(cells, level)
+    coarse = Bisection(cells, level)
     corners = np.array([coarse.points(leaf, 0.064) for leaf in sorted(coarse.leaves)])
     centroids = forest.points[forest.tets].mean(1)
     node_of = {tuple(np.rint(p / 0.064 * 2**20).astype(int)): n for n, p in enumerate(forest.points)}
