@@ -18,20 +18,9 @@ import warp as wp
 
 from ..errors import InputError, UnstableError
 from . import paper, simulate
-from .say import complain
+from .say import EXIT_CODES, Terminated, complain, interrupt_status
 
 COMMANDS = {"simulate": simulate, "paper": paper}
-
-EXIT_CODES = """exit status:
-  0    done
-  1    a file could not be written, as when the disk is full
-  2    bad input, said in one line; nothing was simulated, no file touched
-  3    the state became not finite; the frames before are kept
-  130  interrupted (Ctrl-C), 143 terminated (SIGTERM); the frames written are kept"""
-
-
-class Terminated(KeyboardInterrupt):
-    """SIGTERM has come."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -90,11 +79,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Who read the output has gone, as `head` does; Python must not complain once more when it closes it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
-
-
-def interrupt_status(signalled: KeyboardInterrupt) -> int:
-    """What a shell expects of a program that a signal has ended."""
-    return 128 + (signal.SIGTERM if isinstance(signalled, Terminated) else signal.SIGINT)
 
 
 def _start_warp() -> None:

@@ -21,7 +21,7 @@ from ..materials import Isotropic
 from ..selection import select_nodes
 from ..simulation import Simulation
 from ..solvers import SymplecticEuler
-from .say import complain
+from .say import EXIT_CODES, complain, interrupt_status
 from .subject import STIFFNESS_PER_WEIGHT, Subject, find_subject
 from .summary import summary
 
@@ -36,8 +36,6 @@ COMPILING_AFTER = 1.5
 
 def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
     """Add the command to ``warp-corot``."""
-    from . import EXIT_CODES
-
     parser = subparsers.add_parser(
         "simulate",
         help="let a soft body move and write it as a USD animation",
@@ -136,8 +134,6 @@ def run(args: argparse.Namespace) -> int:
         with _progress_bar() as progress:
             record(sim, args.output, duration=duration, fps=args.fps, progress=progress, recording=done)
     except KeyboardInterrupt as signalled:
-        from . import interrupt_status
-
         complain(f"interrupted; {_kept(done)}", kind="")
         return interrupt_status(signalled)
     except UnstableError as error:
