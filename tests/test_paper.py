@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import warp_corot as wc
+from warp_corot.cli import main
 from warp_corot.cli import paper as command
 from warp_corot.experiments import figures, report
 from warp_corot.experiments.claims import judged_claims
@@ -198,18 +199,29 @@ def test_missing_matplotlib_is_said_before_the_run(tmp_path, monkeypatch):
         command.run(parsed("-o", tmp_path / "out"))
 
 
-@pytest.mark.parametrize(("raised", "status"), [(KeyboardInterrupt(), 130), (OSError(28, "No space left"), 1)])
-def test_an_interrupted_or_failed_run_is_one_line(raised, status, tmp_path, monkeypatch, capsys):
-    """And the file that was there before is still whole."""
-    (tmp_path / command.RESULTS).write_text("old")
+@pytest.mark.parametrize(
+    ("where", "raised", "status"),
+    [
+        ("paper.run_experiment", KeyboardInterrupt(), 130),
+        ("paper.run_experiment", wc.UnstableError("the state is not finite"), 3),
+        ("figures.draw_figures", KeyboardInterrupt(), 130),
+        ("report.write_json", OSError(28, "No space left"), 1),
+    ],
+)
+def test_an_interrupted_or_failed_run_is_one_line(where, raised, status, tmp_path, monkeypatch, capsys):
+    """And no status of success; a file that was there before is still whole."""
+    (tmp_path / "figure").write_text("old")
+    results = coarse("cpu")
 
     def fail(*args, **kwargs):
         raise raised
 
-    monkeypatch.setattr("warp_corot.experiments.paper.run_experiment", fail)
-    assert command.run(parsed("-o", tmp_path)) == status
-    assert capsys.readouterr().err.strip().count("\n") == 0
-    assert (tmp_path / command.RESULTS).read_text() == "old"
+    monkeypatch.setattr("warp_corot.experiments.paper.run_experiment", lambda *args, **kwargs: results)
+    monkeypatch.setattr(f"warp_corot.experiments.{where}", fail)
+    assert main(["paper", "-o", str(tmp_path)]) == status
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    assert (tmp_path / "figure").read_text() == "old"
+    assert not [f for f in tmp_path.iterdir() if f.suffix == ".part"]
 
 
 def test_a_failed_write_leaves_no_part(device, tmp_path, monkeypatch):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import InputError
+from .say import complain, interrupt_status
 
 if TYPE_CHECKING:
     from ..experiments.paper import Results, Settings
@@ -24,11 +24,15 @@ def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParse
     parser = subparsers.add_parser(
         "paper",
         help="run the paper's experiment: a table, results.json and figures 5 to 8",
-        description="Lets the beam of Tagawa, Yamada and Tanaka (IEEE EMBC 2013) fall under its own weight with "
-        "linear, corotated (rotations at every level of the tree), St. Venant-Kirchhoff and neo-Hookean elements; "
-        "compares the displacement of its free end, its volume and the computation time; puts the claims to the "
-        "test. Prints a table and writes results.json and the counterparts of figures 5 to 8 as PNG.",
-        epilog="Absolute times are given for CUDA devices only; a CPU's are relative to linear FEM in the same run.",
+        description="""\
+Lets the beam of Tagawa, Yamada and Tanaka (IEEE EMBC 2013) fall under its own
+weight with linear, corotated (rotations at every level of the tree),
+St. Venant-Kirchhoff and neo-Hookean elements; compares the displacement of its
+free end, its volume and the computation time; puts the claims to the test.
+Prints a table and writes results.json and the counterparts of figures 5 to 8 as PNG.""",
+        epilog="""\
+Absolute times are given for CUDA devices only; a CPU's are relative to linear
+FEM in the same run. Nothing is written before all models have run.""",
     )
     parser.add_argument("-o", "--output", required=True, type=Path, metavar="DIR", help="folder; made if need be")
     length = parser.add_mutually_exclusive_group()
@@ -67,19 +71,17 @@ def run(args: argparse.Namespace) -> int:
             f"the paper's {FULL_DURATION:g} s with --full.",
             flush=True,
         )
+    results = _with_progress(settings, args.device)
+    print(report.table(results), flush=True)
     try:
-        results = _with_progress(settings, args.device)
-        print(report.table(results), flush=True)
         folder.mkdir(exist_ok=True)
         report.write_json(folder / RESULTS, results)
         files = [folder / RESULTS, *figures.draw_figures(folder, results)]
-    except KeyboardInterrupt:
-        print("warp-corot: interrupted; files that were there before are whole", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        raise
+    except KeyboardInterrupt as signalled:
+        complain(f"interrupted while writing; every file in {folder} is whole", kind="")
+        return interrupt_status(signalled)
     except OSError as error:
-        print(f"warp-corot: error: {folder}: cannot be written to: {error.strerror or error}", file=sys.stderr)
+        complain(f"{folder}: cannot be written to: {error.strerror or error}")
         return 1
     print(f"\nWritten to {folder}: {', '.join(file.name for file in files)}")
     return 0
