@@ -219,7 +219,9 @@ def test_an_interrupted_or_failed_run_is_one_line(where, raised, status, tmp_pat
     monkeypatch.setattr("warp_corot.experiments.paper.run_experiment", lambda *args, **kwargs: results)
     monkeypatch.setattr(f"warp_corot.experiments.{where}", fail)
     assert main(["paper", "-o", str(tmp_path)]) == status
-    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    said = capsys.readouterr()
+    assert len(said.err.strip().splitlines()) == 1
+    assert ("The paper's claims" in said.out) == (status == 1)  # a full disk does not cost the table
     assert (tmp_path / "figure").read_text() == "old"
     assert not [f for f in tmp_path.iterdir() if f.suffix == ".part"]
 

@@ -72,7 +72,8 @@ def run(args: argparse.Namespace) -> int:
             flush=True,
         )
     results = _with_progress(settings, args.device)
-    print(report.table(results), flush=True)
+    # The table comes last: a reader that goes away, as `head` does, must not cost the files, nor a full disk the table.
+    text = report.table(results)
     try:
         folder.mkdir(exist_ok=True)
         report.write_json(folder / RESULTS, results)
@@ -81,8 +82,10 @@ def run(args: argparse.Namespace) -> int:
         complain(f"interrupted while writing; every file in {folder} is whole", kind="")
         return interrupt_status(signalled)
     except OSError as error:
+        print(text, flush=True)
         complain(f"{folder}: cannot be written to: {error.strerror or error}")
         return 1
+    print(text)
     print(f"\nWritten to {folder}: {', '.join(file.name for file in files)}")
     return 0
 
