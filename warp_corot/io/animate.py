@@ -146,7 +146,8 @@ def _write_frame(writer: UsdWriter, sim: Simulation, done: Recording) -> None:
     stresses = [sim.von_mises(body) for body in sim.bodies]
     writer.write(np.concatenate(positions), velocities=np.concatenate(velocities), von_mises=np.concatenate(stresses))
     done.frames = writer.frames
-    lengths = [np.linalg.norm(body.displacements.numpy(), axis=1).max() for body in sim.bodies]
+    # In float64: on the way to an end that is not finite, squares leave float32 first.
+    lengths = [np.linalg.norm(body.displacements.numpy().astype(np.float64), axis=1).max() for body in sim.bodies]
     done.final_displacement = float(max(lengths))
     done.largest_displacement = max(done.largest_displacement, done.final_displacement)
 
