@@ -8,6 +8,7 @@ Plain Python numbers: kernels read them through ``wp.static`` and tests read the
 """
 
 import math
+import zlib
 
 SQRT2 = math.sqrt(2.0)
 
@@ -35,6 +36,15 @@ EDGES: tuple[tuple[int, int], ...] = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2
 LEVEL_BITS = 6
 MIRROR_BIT = 6
 FRAME_SHIFT = 7
+
+
+def fingerprint(*tables: object) -> int:
+    """A number that changes with the tables a function is generated from.
+
+    Warp leaves ``wp.static`` expressions that depend on a loop variable out of a module's hash, so a function generated
+    from a table must name the table's fingerprint outside its loops, or a stale kernel may be taken from the cache.
+    """
+    return zlib.crc32(repr(tables).encode()) & 0x7FFFFFFF
 
 
 def gram(shape: int, i: int, j: int) -> float:

@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from .elements import ForestElements, GeneralElements, add_force, edge_length, frame, mirror_sign, shape_of, xyz
-from .shapes import EDGES, REST, edge_stiffness
+from .shapes import EDGES, REST, edge_stiffness, fingerprint
 
 wp.set_module_options({"enable_backward": False})
 
@@ -57,6 +57,7 @@ def _tensions(shape: int) -> wp.Function:
 
     @wp.func
     def tensions(d: vec6, mu: float, lam: float):
+        _generated_from = wp.static(fingerprint(first, second))
         t = vec6()
         for e in range(6):
             for k in range(6):

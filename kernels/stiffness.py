@@ -11,7 +11,7 @@ import functools
 
 import warp as wp
 
-from .shapes import GRADIENT, VOLUME
+from .shapes import GRADIENT, VOLUME, fingerprint
 
 wp.set_module_options({"enable_backward": False})
 
@@ -72,6 +72,7 @@ def stiffness_product(shape: int, skip_zeros: bool = True) -> wp.Function:
 
     @wp.func
     def product(z: vec12, mu: float, lam: float):
+        _generated_from = wp.static(fingerprint(distinct, table, signs))
         c = coefficients_t()
         for k in range(wp.static(count)):
             c[k] = wp.static(distinct[k][0]) * lam + wp.static(distinct[k][1]) * mu
