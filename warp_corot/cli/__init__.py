@@ -10,6 +10,7 @@ import signal
 import sys
 import tempfile
 import threading
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import NoReturn
@@ -55,14 +56,15 @@ def make_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     wp.config.log_level = wp.LOG_ERROR  # before Warp starts, so that it says nothing about itself
-    logging.basicConfig(format="warp-corot: %(levelname)s: %(message)s", level=logging.WARNING)
+    logging.basicConfig(format="warp-corot: warning: %(message)s", level=logging.WARNING)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
     args = make_parser().parse_args(argv)
     _start_warp()
     try:
-        with _terminable():
+        with _terminable(), warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_, **__: complain(str(message), kind="warning")
             status = COMMANDS[args.command].run(args)
             sys.stdout.flush()
         return status
@@ -73,7 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         complain(str(error))
         return 3
     except KeyboardInterrupt as signalled:
-        complain("interrupted; nothing was written", kind="")
+        complain("interrupted", kind="")
         return interrupt_status(signalled)
     except BrokenPipeError:
         # Who read the output has gone, as `head` does; Python must not complain once more when it closes it.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 import threading
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -16,7 +15,7 @@ import numpy as np
 
 from ..body import SoftBody, checked_device
 from ..elasticity import MODELS, Corotated, Model
-from ..errors import InputError, StabilityWarning, UnstableError
+from ..errors import InputError, UnstableError
 from ..materials import Isotropic
 from ..selection import select_nodes
 from ..simulation import Simulation
@@ -26,7 +25,7 @@ from .subject import STIFFNESS_PER_WEIGHT, Subject, find_subject
 from .summary import summary
 
 if TYPE_CHECKING:
-    from ..io.animate import Recording
+    from ..io.animate import Progress, Recording
 
 FPS = 24.0
 
@@ -123,7 +122,7 @@ def run(args: argparse.Namespace) -> int:
     if subject.source and args.output.exists() and args.output.samefile(subject.source):
         raise InputError(f"{args.output}: is the input, should be another file")
     duration = subject.duration if args.duration is None else args.duration
-    frame_count(duration, args.fps)
+    count = frame_count(duration, args.fps)
     body, fixed = _make_body(args, subject)
     sim = _make_simulation(args, subject, body, model)
     for note in subject.notes:
@@ -131,8 +130,10 @@ def run(args: argparse.Namespace) -> int:
 
     done = Recording(args.output)
     try:
-        with _progress_bar() as progress:
+        with _progress_bar(count) as progress:
             record(sim, args.output, duration=duration, fps=args.fps, progress=progress, recording=done)
+        if args.preview:
+            _draw(args.preview, subject, sim)
     except KeyboardInterrupt as signalled:
         complain(f"interrupted; {_kept(done)}", kind="")
         return interrupt_status(signalled)
@@ -142,14 +143,7 @@ def run(args: argparse.Namespace) -> int:
     except OSError as error:
         complain(str(error))
         return 1
-    print(summary(subject, sim, done, fixed))
-    if args.preview:
-        try:
-            _draw(args.preview, subject, sim)
-        except OSError as error:
-            complain(str(error))
-            return 1
-        print(f"  {'preview':<14}{args.preview}")
+    print(summary(subject, sim, done, fixed, args.preview))
     return 0
 
 
@@ -208,22 +202,15 @@ def _make_simulation(args: argparse.Namespace, subject: Subject, body: SoftBody,
     damping = subject.damping if args.damping is None else args.damping
     gravity = subject.gravity if args.gravity is None else tuple(args.gravity)
     SymplecticEuler(args.dt, damping)  # checks both, the step before it is shortened
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", StabilityWarning)
-        with _compiling_said():
-            # At rest and without weight, a safe step loads every kernel and moves nothing.
-            trial = Simulation(body, model=model, integrator=SymplecticEuler(damping=damping), gravity=(0, 0, 0))
-            wanted = trial.dt if args.dt is None else args.dt
-            dt = 1.0 / (args.fps * steps_per_frame(args.fps, wanted))
-            sim = Simulation(body, model=model, integrator=SymplecticEuler(dt, damping), gravity=gravity)
-            trial.step()
-            trial.von_mises()
-            body.displacements = body.velocities = np.zeros_like(body.mesh.points)
-    for warning in caught:
-        if issubclass(warning.category, StabilityWarning):
-            complain(str(warning.message), kind="warning")
-        else:
-            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+    with _compiling_said():
+        # At rest and without weight, a safe step loads every kernel and moves nothing.
+        trial = Simulation(body, model=model, integrator=SymplecticEuler(damping=damping), gravity=(0, 0, 0))
+        wanted = trial.dt if args.dt is None else args.dt
+        dt = 1.0 / (args.fps * steps_per_frame(args.fps, wanted))
+        sim = Simulation(body, model=model, integrator=SymplecticEuler(dt, damping), gravity=gravity)
+        trial.step()
+        trial.von_mises()
+        body.displacements = body.velocities = np.zeros_like(body.mesh.points)
     return sim
 
 
@@ -241,17 +228,12 @@ def _compiling_said() -> Iterator[None]:
 
 
 @contextmanager
-def _progress_bar() -> Iterator:
+def _progress_bar(count: int) -> Iterator[Progress]:
     from tqdm import tqdm
 
     form = "{desc}  {percentage:3.0f} % |{bar}| frame {n_fmt} of {total_fmt}, {remaining} left"
-    with tqdm(desc="simulating", leave=False, disable=None, file=sys.stderr, bar_format=form) as bar:
-
-        def tell(frame: int, count: int) -> None:
-            bar.total = count
-            bar.update(frame - bar.n)
-
-        yield tell
+    with tqdm(desc="simulating", total=count, leave=False, disable=None, file=sys.stderr, bar_format=form) as bar:
+        yield lambda frame, _: bar.update(frame - bar.n)
 
 
 def _kept(done: Recording) -> str:

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 from ..elasticity import MODELS
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from ..io.animate import Recording
     from ..simulation import Simulation
     from .subject import Subject
 
 
-def summary(subject: Subject, sim: Simulation, done: Recording, fixed: str) -> str:
+def summary(subject: Subject, sim: Simulation, done: Recording, fixed: str, preview: Path | None = None) -> str:
     """The run in a dozen lines.
 
     Args:
@@ -21,6 +23,7 @@ def summary(subject: Subject, sim: Simulation, done: Recording, fixed: str) -> s
         sim: The simulation at its end.
         done: What was recorded.
         fixed: The fixed nodes, in words.
+        preview: The picture that was drawn.
     """
     model = next(name for name, kind in MODELS.items() if type(sim.models[0]) is kind)
     level = getattr(sim.models[0], "rotation_level", None)
@@ -46,6 +49,8 @@ def summary(subject: Subject, sim: Simulation, done: Recording, fixed: str) -> s
         ("device", f"{sim.device} ({sim.device.name})"),
         ("written", f"{done.path}, {done.frames} frames, {done.simulated:.4g} s"),
     ]
+    if preview:
+        rows.append(("preview", str(preview)))
     return "\n".join([subject.name, *(f"  {name:<14}{text}" for name, text in rows)])
 
 
