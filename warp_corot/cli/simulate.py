@@ -22,7 +22,7 @@ from ..simulation import Simulation
 from ..solvers import SymplecticEuler
 from .say import EXIT_CODES, complain, interrupt_status
 from .subject import STIFFNESS_PER_WEIGHT, Subject, find_subject
-from .summary import summary
+from .summary import pressure, summary
 
 if TYPE_CHECKING:
     from ..io.animate import Progress, Recording
@@ -175,7 +175,7 @@ def _make_body(args: argparse.Namespace, subject: Subject) -> tuple[SoftBody, st
     if young is None:
         Isotropic(1.0, poisson, density)  # the density must be checked before it is used
         young = subject.young_from_weight(density, args.gravity)
-        subject.notes.append(f"Young's modulus is {young:g} Pa, chosen for its weight (--young)")
+        subject.notes.append(f"Young's modulus is {pressure(young)}, chosen for its weight (--young)")
     material = Isotropic(young, poisson, density)
 
     used = subject.used
