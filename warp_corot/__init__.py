@@ -7,6 +7,7 @@ Interactive Soft Tissue Simulation* (IEEE EMBC 2013).
 from .body import SoftBody
 from .elasticity import Corotated, EdgeStVK, Linear, MassSpring, NeoHookean, StVenantKirchhoff
 from .errors import InputError, StabilityWarning, UnstableError
+from .io.animate import record
 from .materials import Isotropic
 from .mesh import TetForest, TetMesh
 from .rotations import polar_rotation
@@ -33,4 +34,5 @@ __all__ = [
     "TetMesh",
     "UnstableError",
     "polar_rotation",
+    "record",
 ]
