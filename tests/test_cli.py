@@ -131,6 +131,27 @@ def test_bear(folder, capsys):
     np.testing.assert_array_equal(last[feet], first[feet])
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        # Near critical damping: where it ends, soon.
+        ["--damping", 20, "--duration", 1],
+        pytest.param([], marks=pytest.mark.slow),
+    ],
+    ids=["damped", "as it comes"],
+)
+def test_bear_sags_by_a_tenth_and_comes_to_rest(folder, options):
+    assert simulate("warp:bear", "-o", "bear.usd", "--device", "cpu", *options) == 0
+    first, *_, last = frames(folder / "bear.usd")
+    height = np.ptp(first[:, 1])
+    back = first[:, 1] > first[:, 1].max() - 1e-6
+    assert 0.05 < (first - last)[back, 1].mean() / height < 0.15
+    assert 0.05 < np.linalg.norm(last - first, axis=1).max() / height < 0.15
+    stage, tets = opened(folder / "bear.usd")
+    speeds = [np.linalg.norm(tets.GetVelocitiesAttr().Get(k), axis=1).max() for k in (6, stage.GetEndTimeCode())]
+    assert speeds[1] < 0.02 * speeds[0]
+
+
 def test_any_mesh_needs_no_options(folder, capsys):
     """A mesh in millimetres, wound wrongly here and there, with a stray node: said, and simulated all the same."""
     tets = CUBE.tets.copy()
@@ -218,7 +239,7 @@ REFUSED = [
     (["box", "--density", "0"], "density is 0"),
     (["good.vtk", "--density", "-1"], "density is -1"),
     (["box", "--density", "-1e3"], "density is -1000"),
-    (["box", "--fix", "z > -1"], "all 325 nodes"),
+    (["box", "--fix", "z > -1"], "expression 'z > -1': holds all 325 nodes"),
     (["box", "--fix", "all"], "all 325 nodes"),
     (["box", "--fix", "z = 0"], "'z = 0'"),
     (["box", "--fix", ""], "it is empty"),
@@ -246,6 +267,7 @@ REFUSED = [
     (["box", "--colour"], "unrecognized arguments: --colour"),
     ([], "required: INPUT"),
     (["box", "-o", "nowhere/out.usd"], "output folder nowhere is not there"),
+    (["none.usd", "-o", "nowhere/out.usd"], "output folder nowhere is not there"),  # before the mesh is read
     (["box", "-o", "out.txt"], "extension .txt"),
     (["box", "-o", "."], "extension"),
     (["out.usd"], "is the input"),
