@@ -5,10 +5,12 @@ import itertools
 import numpy as np
 import oracle
 import pytest
+import warp as wp
 from cases import CUBE, mixed_forest
 from sequential import Bisection
 
 import warp_corot as wc
+from warp_corot.elements import device_elements
 
 PAIRS = list(itertools.combinations(range(4), 2))
 
@@ -216,6 +218,20 @@ def test_leaves_are_in_tree_order(forest):
     assert np.array_equal(forest.levels, tree.level[walked])
 
 
+def test_rows_and_what_is_above(forest):
+    """Rows are those of the whole tree; so many steps up is so many times the parent, and above a root is nothing."""
+    tree = forest.tree
+    everything = np.arange(len(tree.level))
+    for chosen in (tree.leaves, everything[tree.level == 3], everything[::-3], everything[:0]):
+        tets, level = tree.rows(chosen)
+        assert np.array_equal(tets, tree.tets[chosen])
+        assert np.array_equal(level, tree.level[chosen])
+        climbed = np.array(chosen)
+        for steps in range(7):
+            assert np.array_equal(tree.above(chosen, steps), climbed)
+            climbed = np.where(climbed >= 0, tree.parent[climbed], -1)
+
+
 @pytest.mark.parametrize("level", range(9))
 def test_ancestors(forest, level):
     """The ancestor at a level has that level and the leaf's centroid inside; a leaf above that level is its own."""
@@ -239,6 +255,55 @@ def test_nodes_are_midpoints_of_their_ends(forest):
     assert len(corners) == 12
     assert np.allclose(forest.points, forest.lattice * (CUBE / 2**16))
     assert len(np.unique(forest.lattice, axis=0)) == len(forest.points)
+
+
+def test_node_ends_are_the_bisected_edges(forest):
+    tree = forest.tree
+    parents = np.flatnonzero(tree.first_child >= 0)
+    k = 3 - tree.level[parents] % 3
+    middle = tree.tets[tree.first_child[parents], k]
+    ends = np.stack([tree.tets[parents, 0], tree.tets[parents, k]], axis=1)
+    assert np.array_equal(forest.node_ends[middle], np.sort(ends, axis=1))
+    assert np.array_equal(np.unique(middle), np.flatnonzero(forest.node_ends[:, 0] >= 0))
+
+
+@pytest.mark.parametrize("level", range(14))
+def test_nodes_are_numbered_as_the_leaves_name_them(level):
+    for cells in ((1, 1, 1), (1, 2, 1)):
+        forest = wc.TetForest.box(cells, CUBE, level)
+        nodes, first = np.unique(forest.tets, return_index=True)
+        assert np.array_equal(nodes, np.arange(len(forest.points)))
+        assert (np.diff(first) > 0).all()
+
+
+@pytest.mark.parametrize("level", range(14))
+def test_a_uniform_forest_is_the_level_above_refined(level):
+    """Patch by patch from the roots, or leaf by leaf from the level above: the same tetrahedra in the same order."""
+    at_once = wc.TetForest.box((1, 2, 1), CUBE, level + 1)
+    above = wc.TetForest.box((1, 2, 1), CUBE, level)
+    refined = above.refine(np.ones(len(above.tets), bool))
+    assert np.array_equal(refined.lattice[refined.tets], at_once.lattice[at_once.tets])
+    assert np.array_equal(refined.levels, at_once.levels)
+    assert np.array_equal(refined.volumes, at_once.volumes)
+    for name in ("level", "parent", "first_child", "leaves"):
+        assert np.array_equal(getattr(refined.tree, name), getattr(at_once.tree, name))
+    assert np.array_equal(refined.lattice[refined.tree.tets], at_once.lattice[at_once.tree.tets])
+
+
+def test_frames_down_to_the_deepest_level(device):
+    """One corner bisected until the lattice is used up: local frames on the device are the table's at every level."""
+    forest = wc.TetForest.box((1, 1, 1), CUBE, 0)
+    while forest.levels.max() < 48:
+        at_corner = (forest.points[forest.tets] == 0).all(2).any(1)
+        forest = forest.refine([np.argmax(np.where(at_corner, forest.levels, -1))])
+    F, _ = frames(forest)
+    F[np.linalg.det(F) < 0, :, 2] *= -1
+    elements = device_elements(forest, wp.get_device(device))
+    code = elements.code.numpy()
+    assert np.array_equal(code & 63, forest.levels)
+    assert np.abs(elements.frames.numpy()[code >> 7] - F).max() < 1e-6
+    with pytest.raises(wc.InputError, match="deepest"):
+        forest.refine([np.argmax(forest.levels)])
 
 
 def test_neighbours_in_memory_are_neighbours_in_space():
@@ -277,6 +342,7 @@ def test_a_million_and_a_half():
         ({"level": -1}, "level"),
         ({"level": 1.5}, "level"),
         ({"level": 1000}, "level"),
+        ({"level": 29}, "level.*2147483647"),
         ({"origin": (0, np.inf, 0)}, "origin"),
         ({"origin": (0, 0)}, "origin"),
         ({"up_axis": "y"}, "up_axis"),

@@ -1,13 +1,13 @@
 """The forest of bisected tetrahedra: a grid of cubes, six path tetrahedra each, every one the root of a binary tree.
 
-A tetrahedron (x0, x1, x2, x3) of level l is bisected at the midpoint z of its refinement edge x0-xk, k = 3 - (l mod 3),
-into (x0 .. x(k-1), z, x(k+1) .. x3) and (x1 .. xk, z, x(k+1) .. x3) (Maubach 1995; Tagawa et al. 2013). Vertices
-lie on an integer lattice. The tree keeps every ancestor; the leaves are the mesh. All is built with array operations.
+Tetrahedra are bisected by Maubach's rule (``bisection``; Maubach 1995; Tagawa et al. 2013). Vertices lie on an integer
+lattice. The tree knows every ancestor; the leaves are the mesh. All is built with array operations.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,53 +16,16 @@ import numpy.typing as npt
 
 from ..errors import InputError
 from ..indices import checked_indices
+from .bisection import children, far_end
+from .tree import Tree, UniformTree
+from .uniform import halvings, uniform_leaves
 
 #: A root cube has 2**LATTICE_BITS lattice intervals a side, so levels may go to 3 * LATTICE_BITS.
 LATTICE_BITS = 16
 MAX_LEVEL = 3 * LATTICE_BITS
 
-
-@dataclass(frozen=True, eq=False)
-class Tree:
-    """Every tetrahedron of the forest, roots first, the two children of one parent next to each other.
-
-    Attributes:
-        tets: Nodes in Maubach order, int32 [M, 4].
-        level: int32 [M].
-        parent: Index of the parent, -1 for roots, int32 [M].
-        first_child: Index of the first of the two children, -1 for leaves, int32 [M].
-    """
-
-    tets: np.ndarray
-    level: np.ndarray
-    parent: np.ndarray
-    first_child: np.ndarray
-
-    @cached_property
-    def leaves(self) -> np.ndarray:
-        """Leaves in tree order (each subtree's leaves side by side, first child first), int32 [T]."""
-        leaves = np.flatnonzero(self.first_child < 0)
-        root = leaves.copy()
-        path = np.zeros(len(leaves), np.uint64)
-        climbing = np.flatnonzero(self.parent[root] >= 0)
-        while len(climbing):
-            child = root[climbing]
-            parent = self.parent[child]
-            is_second = (child - self.first_child[parent]).astype(np.uint64)
-            # The path from the root, most significant bit first.
-            path[climbing] |= is_second << (np.uint64(64) - self.level[child].astype(np.uint64))
-            root[climbing] = parent
-            climbing = climbing[self.parent[parent] >= 0]
-        return leaves[np.lexsort((path, root))].astype(np.int32)
-
-    def ancestors(self, elements: np.ndarray, level: int) -> np.ndarray:
-        """The ancestor at ``level`` of each element, or the element itself where it lies above that level; int32."""
-        found = np.array(elements, dtype=np.int32)
-        below = np.flatnonzero(self.level[found] > level)
-        while len(below):
-            found[below] = self.parent[found[below]]
-            below = below[self.level[found[below]] > level]
-        return found
+#: Leaves are numbered in 32 bits.
+MAX_LEAVES = 2**31 - 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +37,8 @@ class TetForest:
         cell_size: Edge length of a root cube [m].
         origin: Position of the lattice's point (0, 0, 0) [m].
         lattice: Lattice coordinates of the nodes, 2**16 intervals a cube edge, int32 [N, 3].
-        node_ends: The two ends of the edge whose midpoint a node is; -1, -1 for corners of cubes; int32 [N, 2].
+        node_ends: The two ends of the edge whose midpoint a node is, the lower number first; -1, -1 for corners of
+            cubes; int32 [N, 2].
         tree: All tetrahedra of all levels.
         up_axis: "X", "Y" or "Z".
     """
@@ -107,7 +71,7 @@ class TetForest:
             up_axis: Which axis points up where results are drawn.
 
         Raises:
-            InputError: An argument is out of its range.
+            InputError: An argument is out of its range, or there would be 2**31 tetrahedra or more.
         """
         cells = _checked_cells(cells)
         if not (np.isfinite(cell_size) and cell_size > 0):
@@ -119,18 +83,14 @@ class TetForest:
         corners = np.asarray(origin, dtype=float)
         if corners.shape != (3,) or not np.isfinite(corners).all():
             raise InputError(f"origin is {origin}; it must be three finite coordinates in metres")
-        growing = _Growth.of_roots(cells)
-        for _ in range(int(level)):
-            growing.bisect(growing.newest)
-        lattice, ends, tree = growing.finished()
-        order = _order_of_first_touch(tree.tets[tree.leaves], len(lattice))
-        rank = np.empty(len(order), np.int32)
-        rank[order] = np.arange(len(order), dtype=np.int32)
-        ends = ends[order]
-        ends = np.where(ends >= 0, rank[ends], -1).astype(np.int32)
-        tree = Tree(rank[tree.tets], tree.level, tree.parent, tree.first_child)
+        level = int(level)
+        count = 6 * math.prod(cells) << level
+        if count > MAX_LEAVES:
+            raise InputError(f"level is {level}: that is {count} tetrahedra; there can be {MAX_LEAVES} at most")
+        lattice, ends, tets = uniform_leaves(cells, level)
+        lattice <<= LATTICE_BITS - halvings(level)
         x, y, z = (float(c) for c in corners)
-        return cls(cells, float(cell_size), (x, y, z), lattice[order], ends, tree, up_axis)
+        return cls(cells, float(cell_size), (x, y, z), lattice, ends, UniformTree(tets, level), up_axis)
 
     @cached_property
     def points(self) -> np.ndarray:
@@ -140,18 +100,22 @@ class TetForest:
     @cached_property
     def tets(self) -> np.ndarray:
         """The leaves' nodes in Maubach order, in tree order, int32 [T, 4]."""
-        return self.tree.tets[self.tree.leaves]
+        return self.tree.leaf_tets
 
     @cached_property
     def levels(self) -> np.ndarray:
-        """Level of each leaf, int32 [T]."""
-        return self.tree.level[self.tree.leaves]
+        """Level of each leaf, int32 [T]; of uniform leaves one number seen T times, which takes no memory."""
+        return self.tree.leaf_levels
 
     @cached_property
     def volumes(self) -> np.ndarray:
-        """Rest volume of each leaf [m^3], float64 [T]."""
-        h = self.cell_size * 0.5 ** (self.levels // 3)
-        return h**3 / np.array([6.0, 12.0, 24.0])[self.levels % 3]
+        """Rest volume of each leaf [m^3], float64 [T], of uniform leaves as ``levels``."""
+        level = np.arange(MAX_LEVEL + 1)
+        h = self.cell_size * 0.5 ** (level // 3)
+        volume = h**3 / np.array([6.0, 12.0, 24.0])[level % 3]
+        if isinstance(self.tree, UniformTree):
+            return np.broadcast_to(volume[self.tree.depth], self.levels.shape)
+        return volume[self.levels]
 
     def ancestors(self, level: int) -> np.ndarray:
         """For each leaf the tetrahedron of the tree at ``level`` above it, or the leaf itself; indices int32 [T]."""
@@ -195,15 +159,6 @@ def _checked_cells(cells: tuple[int, int, int]) -> tuple[int, int, int]:
     return x, y, z
 
 
-def _order_of_first_touch(tets: np.ndarray, node_count: int) -> np.ndarray:
-    """Nodes in the order in which the elements first name them: neighbours in memory are neighbours in space."""
-    touched = tets.ravel()
-    first = np.empty(node_count, np.int64)
-    # Where a node is written more than once the last write stays: walk backwards to keep the first.
-    first[touched[::-1]] = np.arange(len(touched) - 1, -1, -1)
-    return np.argsort(first)
-
-
 class _Growth:
     """A forest being grown: lists of chunks that each bisection appends to."""
 
@@ -215,25 +170,6 @@ class _Growth:
         self._parent = [parent]
         self._first_child = first_child
         self._nodes = len(lattice)
-        self.newest = np.arange(len(tets), dtype=np.int32)
-
-    @classmethod
-    def of_roots(cls, cells: tuple[int, int, int]) -> _Growth:
-        grid = np.stack(np.meshgrid(*(np.arange(n + 1) for n in cells), indexing="ij"), -1).reshape(-1, 3)
-        strides = np.array([(cells[1] + 1) * (cells[2] + 1), cells[2] + 1, 1])
-        corners = np.stack(np.meshgrid(*(np.arange(n) for n in cells), indexing="ij"), -1).reshape(-1, 3)
-        paths = []
-        for order in itertools.permutations(range(3)):
-            walk = np.zeros((4, 3), int)
-            for step, axis in enumerate(order):
-                walk[step + 1 :, axis] = 1
-            paths.append(walk)
-        tets = ((corners[:, None, None, :] + np.array(paths)) @ strides).reshape(-1, 4).astype(np.int32)
-        count = len(tets)
-        lattice = (grid << LATTICE_BITS).astype(np.int32)
-        ends = np.full((len(grid), 2), -1, np.int32)
-        none = np.full(count, -1, np.int32)
-        return cls(lattice, ends, tets, np.zeros(count, np.int32), none, none.copy())
 
     @classmethod
     def of_forest(cls, forest: TetForest) -> _Growth:
@@ -249,7 +185,7 @@ class _Growth:
     def refinement_edges(self, elements: np.ndarray) -> np.ndarray:
         """End nodes x0, xk of the edge on which each element is bisected [n, 2]."""
         tets, level = self.tets()[elements], _merged(self._level)[elements]
-        k = 3 - level % 3
+        k = far_end(level % 3)
         return np.stack([tets[:, 0], tets[np.arange(len(tets)), k]], axis=1)
 
     @staticmethod
@@ -264,20 +200,16 @@ class _Growth:
         if len(level) and level.max() >= MAX_LEVEL:
             raise InputError(f"a tetrahedron is already at level {MAX_LEVEL}, the deepest that the lattice can hold")
         middle = self._midpoints(self.refinement_edges(elements))
-        children = np.empty((len(tets), 2, 4), np.int32)
+        both = np.empty((len(tets), 2, 4), np.int32)
         for kind in range(3):
             chosen = np.flatnonzero(level % 3 == kind)
-            x, z, k = tets[chosen], middle[chosen], 3 - kind
-            tail = [x[:, i] for i in range(k + 1, 4)]
-            children[chosen, 0] = np.stack([*(x[:, i] for i in range(k)), z, *tail], axis=1)
-            children[chosen, 1] = np.stack([*(x[:, i] for i in range(1, k + 1)), z, *tail], axis=1)
+            both[chosen] = children(tets[chosen], middle[chosen], kind)
         count = len(self._first_child)
         self._first_child[elements] = count + 2 * np.arange(len(elements), dtype=np.int32)
         self._first_child = np.concatenate([self._first_child, np.full(2 * len(elements), -1, np.int32)])
-        self._tets.append(children.reshape(-1, 4))
+        self._tets.append(both.reshape(-1, 4))
         self._level.append(np.repeat(level + 1, 2))
         self._parent.append(np.repeat(elements, 2))
-        self.newest = np.arange(count, count + 2 * len(elements), dtype=np.int32)
 
     def _midpoints(self, edges: np.ndarray) -> np.ndarray:
         """The node at the middle of each edge, made where there is none yet; int32."""
