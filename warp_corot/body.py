@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from .elements import Mesh, device_elements, element_kind
+from .elements import Mesh, device_elements, element_kind, parts
 from .errors import InputError
 from .indices import checked_indices
 from .kernels.integrate import adopt_positions, publish_positions
@@ -322,8 +322,12 @@ def vec3_view(a: wp.array) -> wp.array:
 
 def lumped_masses(mesh: Mesh, material: Isotropic) -> npt.NDArray[np.float64]:
     """A quarter of each element's mass at each of its nodes [kg], float64 [N]."""
-    quarter = mesh.volumes * material.density / 4.0
-    return np.bincount(mesh.tets.ravel(), np.repeat(quarter, 4), len(mesh.points)).astype(np.float64)
+    masses = np.zeros(len(mesh.points))
+    density = np.broadcast_to(material.density, len(mesh.tets))
+    for part in parts(len(mesh.tets)):
+        quarter = mesh.volumes[part] * density[part] / 4.0
+        np.add.at(masses, mesh.tets[part].ravel(), np.repeat(quarter, 4))
+    return masses
 
 
 def checked_device(device: str | wp.Device | None) -> wp.Device:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,13 @@ from .mesh.forest import LATTICE_BITS
 
 Mesh = TetForest | TetMesh
 
+PART = 1 << 16
+
+
+def parts(count: int) -> Iterator[slice]:
+    """The elements a part at a time: what is made on the way stays in the cache, and little memory is asked for."""
+    return (slice(start, min(start + PART, count)) for start in range(0, count, PART))
+
 
 def element_kind(mesh: Mesh) -> Any:
     """The Warp struct that holds a mesh's elements: ``ForestElements`` or ``GeneralElements``."""
@@ -23,7 +31,7 @@ def element_kind(mesh: Mesh) -> Any:
 def device_elements(mesh: Mesh, device: wp.Device) -> Any:
     """The mesh's elements as an instance of its ``element_kind`` on ``device``."""
     if isinstance(mesh, TetForest):
-        return forest_elements(mesh, mesh.tree.leaves, device)
+        return _forest_elements(mesh, mesh.tets, mesh.levels, device)
     return general_elements(mesh, device)
 
 
@@ -33,8 +41,11 @@ def forest_elements(forest: TetForest, chosen: np.ndarray, device: wp.Device) ->
     Args:
         chosen: Indices into the tree [n].
     """
-    tets, level = forest.tree.tets[chosen], forest.tree.level[chosen]
-    code, frames = shape_codes(forest.lattice[tets], level)
+    return _forest_elements(forest, *forest.tree.rows(chosen), device)
+
+
+def _forest_elements(forest: TetForest, tets: np.ndarray, level: np.ndarray, device: wp.Device) -> Any:
+    code, frames = shape_codes(forest.lattice, tets, level)
     elements = ForestElements()
     elements.nodes = wp.array(tets, dtype=wp.vec4i, device=device)
     elements.code = wp.array(code, dtype=wp.int32, device=device)
@@ -43,40 +54,49 @@ def forest_elements(forest: TetForest, chosen: np.ndarray, device: wp.Device) ->
     return elements
 
 
-def shape_codes(corners: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+# The columns of an element's frame as sums of its nodes' positions over h, by type, and as powers of three by column.
+_COLUMNS = np.array(
+    [
+        [[-1, 1, 0, 0], [0, -1, 1, 0], [0, 0, -1, 1]],
+        [[-1, 1, 0, 0], [0, -1, 1, 0], [-1, 0, -1, 2]],
+        [[2, 0, -2, 0], [0, 2, -2, 0], [0, 0, -2, 2]],  # the two diagonals without their root: entries of -1, 0, 1
+    ]
+)
+_KEYS = 3**9
+
+
+def shape_codes(lattice: np.ndarray, tets: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """What sets forest elements apart besides size and nodes: the local frame each was born with.
 
     Args:
-        corners: Lattice coordinates of the four nodes, int [n, 4, 3].
-        level: int [n].
+        lattice: Lattice coordinates of the mesh's nodes, int32 [N, 3].
+        tets: The elements' nodes, int32 [n, 4].
+        level: int32 [n].
 
     Returns:
         One integer per element (level, mirrored or not, frame), int32 [n], and the table of proper frames Q,
         float64 [n_frames, 3, 3]: columns are the axes of ``kernels.shapes.GRADIENT``, the third turned round where the
         Maubach frame is left-handed.
     """
-    shape = level % 3
-    half_edge = (1 << (LATTICE_BITS - 1 - level // 3))[:, None]
-    x0, x1, x2, x3 = (corners[:, n] for n in range(4))
-    # The columns at rest, in half edge lengths, a diagonal before its root is taken: -2, 0 or 2.
-    diagonal = (shape == 2)[:, None]
-    middle = (shape == 1)[:, None]
-    first = np.where(diagonal, 2 * (x0 - x2), x1 - x0)
-    second = np.where(diagonal, 2 * (x1 - x2), x2 - x1)
-    third = np.where(diagonal, 2 * (x3 - x2), np.where(middle, 2 * x3 - x0 - x2, x3 - x2))
-    signs = np.stack([first, second, third], axis=2) // (2 * half_edge[:, :, None])  # [n, row, column] of -1, 0, 1
-    digits = (signs + 1).reshape(-1, 9)
-    key = digits @ 3 ** np.arange(9)
-    used = np.flatnonzero(np.bincount(key, minlength=3**9))
-    index = np.zeros(3**9, np.int32)
-    index[used] = np.arange(len(used), dtype=np.int32)
+    # A frame's nine entries of -1, 0, 1 are the digits of one number, a weighted sum of one number for each node. Those
+    # wrap around in 32 bits, but their sum does not: it is at most 2**16 * 3**9 / 2.
+    place = lattice @ np.array([1, 27, 729], np.int32)
+    weights = (np.array([1, 3, 9]) @ _COLUMNS).astype(np.int32)
+    key = np.empty(len(tets), np.int32)
+    for part in parts(len(tets)):
+        kind, halvings = level[part] % 3, level[part] // 3
+        total = np.einsum("tn,tn->t", place[tets[part]], weights[kind])
+        key[part] = (total >> (LATTICE_BITS - halvings)) + _KEYS // 2
+    used = np.flatnonzero(np.bincount(key, minlength=_KEYS))
     frames = ((used[:, None] // 3 ** np.arange(9)) % 3 - 1.0).reshape(-1, 3, 3)
     frames /= np.linalg.norm(frames, axis=1, keepdims=True)
     mirrored = np.linalg.det(frames) < 0
     frames[mirrored, :, 2] *= -1.0
-    which = index[key]
-    code = level | (mirrored[which].astype(np.int32) << MIRROR_BIT) | (which << FRAME_SHIFT)
-    return code.astype(np.int32), frames
+    bits = np.zeros(_KEYS, np.int32)
+    bits[used] = (mirrored.astype(np.int32) << MIRROR_BIT) | (np.arange(len(used), dtype=np.int32) << FRAME_SHIFT)
+    for part in parts(len(tets)):
+        key[part] = bits[key[part]] | level[part]
+    return key, frames
 
 
 def general_elements(mesh: TetMesh, device: wp.Device) -> Any:
