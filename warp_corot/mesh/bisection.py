@@ -114,11 +114,12 @@ def path_tetrahedra(cells: tuple[int, int, int], points: tuple[int, int, int]) -
         points: Number of grid points along x, y, z, which nodes are numbered by with z running fastest; a multiple of
             cells, plus one.
     """
-    steps = np.array([(p - 1) // n for p, n in zip(points, cells, strict=True)])
-    corners = np.stack(np.meshgrid(*(np.arange(n) for n in cells), indexing="ij"), -1).reshape(-1, 1, 1, 3)
-    walks = np.zeros((6, 4, 3), int)
+    walks = np.zeros((6, 4, 3), np.int64)
     for walk, order in zip(walks, itertools.permutations(range(3)), strict=True):
         for step, axis in enumerate(order):
             walk[step + 1 :, axis] = 1
+    # How much a node's number grows from one cube to the next along each axis.
     strides = np.array([points[1] * points[2], points[2], 1])
-    return ((corners + walks) @ (steps * strides)).reshape(-1, 4).astype(np.int32)
+    strides *= [(p - 1) // n for p, n in zip(points, cells, strict=True)]
+    corners = np.indices(cells).reshape(3, -1).T @ strides
+    return (corners[:, None] + (walks @ strides).ravel()).reshape(-1, 4).astype(np.int32)
