@@ -315,7 +315,7 @@ def integration_case(problem: Problem) -> Case:
     """Velocities, displacements and the emptied force array, on a body of its own with random forces and velocities."""
     dt = 1e-4
     body = problem.new_body(problem.mesh)
-    body.fix(problem.mesh.points[:, 2] < 1e-9)
+    body.fix(problem.held)
     rng = np.random.default_rng(3)
     v, f = (rng.uniform(-1, 1, problem.u.shape).astype(np.float32) for _ in range(2))
     v[body.constrained] = 0
@@ -367,7 +367,7 @@ def step_case(
 ) -> Case:
     """Steps from the problem's state, always the same ones."""
     body = problem.new_body(problem.mesh)
-    body.fix(problem.mesh.points[:, 2] < 1e-9)
+    body.fix(problem.held)
     sim = wc.Simulation(body, model=model, integrator=wc.SymplecticEuler(None, DAMPING), gravity=(0.0, 0.0, -9.81))
 
     def forces() -> np.ndarray:

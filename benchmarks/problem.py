@@ -28,7 +28,7 @@ except ImportError as error:
 #: Nodal displacements are uniform in this share of the edge length, to either side along each axis.
 JITTER = 0.05
 SAMPLE_NODES = 1000
-MATERIAL = {"young": 1e4, "poisson": 0.45, "density": 1000.0}
+MATERIAL = {"young": 1e6, "poisson": 0.45, "density": 1000.0}
 
 #: Levels of the subtrees that are units of work, and of groups of eight of them.
 SUBTREE_LEVELS = 3
@@ -99,6 +99,11 @@ class Problem:
         body = wc.SoftBody(mesh, self.material, device=self.device)
         body.displacements = self.u
         return body
+
+    @cached_property
+    def held(self) -> np.ndarray:
+        """Nodes that steps hold fixed, those on the floor; bool [N]."""
+        return self.mesh.points[:, 2] < 1e-9
 
     @property
     def tet_count(self) -> int:

@@ -1,0 +1,300 @@
+#!/usr/bin/env python3
+"""Other programs on the same mesh in the same process, and how many times as long they take.
+
+    python benchmarks/peers.py [--device cuda:0] [--level 21] [--step-level 18] [--json FILE]
+
+Rotations, whole forces, and whole time steps with the largest step that stands. Peers that are not installed are left
+out, with a word. Every timed result is checked against float64 in the same run.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+import sys
+import time
+import warnings
+from collections.abc import Sequence
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import stages
+import warp as wp
+from measure import (
+    SAMPLE_SECONDS,
+    WRONG,
+    Case,
+    Result,
+    Stopwatch,
+    checked,
+    copy_bandwidth,
+    finish,
+    kind,
+    machine,
+    measure,
+    number,
+    parser,
+    percent,
+    table,
+    tell,
+)
+from problem import SUBTREE_LEVELS, Problem, oracle, relative_error
+from stable import Steppable
+from warp_corot.kernels.polar import rotate_all
+from warp_corot.kernels.rotation import byers_xu
+
+import warp_corot as wc
+from kernels import DAMPING, SVD_WRONG, force_case
+from warp_corot.elasticity import Model
+from warp_corot.rotations import rotation_function
+
+HEADER = ("stage", "variant", "ns/tet", "spread", "Gtet/s", "x ours", "error", "largest dt", "simulated s/s")
+
+PEERS = {"newton": "newton_peer", "mujoco": "mujoco_peer"}
+
+GRAVITY = (0.0, 0.0, -9.81)
+
+NOTES = """\
+x ours: time over that of the stage's first row, round by round, median. Newton: particle contacts and triangles off.
+error: largest error over largest value against float64, of the rotation, the force, or one step's displacement; of
+MuJoCo's step, of its elastic force; of VBD and XPBD, how much of the implicit step's residual their iterations leave.
+largest dt: found by trying, 100 steps from the jittered state under gravity, up to 1/60 s; simulated s/s with it."""
+
+
+def peer(package: str) -> ModuleType | None:
+    """The module for a peer; None, said in a word, where it is not installed."""
+    try:
+        return importlib.import_module(PEERS[package])
+    except ImportError as error:
+        print(f"{package}: left out ({' '.join(str(error).split())})")
+        return None
+
+
+# --- rotations and forces ---------------------------------------------------------------------------------------------
+
+
+def rotation_cases(count: int, device: wp.Device) -> list[Case]:
+    """Matrices in, rotations out."""
+    rng = np.random.default_rng(6)
+    matrices = np.eye(3, dtype=np.float32) + rng.uniform(-0.1, 0.1, (count, 3, 3)).astype(np.float32)
+    F = wp.array(matrices, dtype=wp.mat33, device=device)
+    some = rng.integers(0, count, 2000)
+    reference = oracle.polar(matrices[some].astype(float))
+
+    def case(name: str, kernel: wp.Kernel, wrong: float = WRONG) -> Case:
+        R = wp.zeros_like(F)
+
+        def run() -> None:
+            wp.launch(kernel, count, [F], [R], device=device)
+
+        def error() -> float:
+            run()
+            return relative_error(R.numpy()[some], reference)
+
+        return Case("rotation", name, run, error, count, 72.0, wrong=wrong)
+
+    return [
+        case("ours, Byers-Xu to tolerance", rotate_all(byers_xu)),
+        case("ours, Byers-Xu, 4 iterations", rotate_all(rotation_function("byers-xu", 4))),
+        case("Warp, svd3", stages.rotate_by_svd3, SVD_WRONG),
+    ]
+
+
+def force_cases(problem: Problem, newton: ModuleType | None) -> list[Case]:
+    body, general = problem.body, problem.general_body
+    shared = wc.Corotated(rotation_level=problem.level - SUBTREE_LEVELS).bind(body)
+    cases = [
+        force_case(problem, "ours, corotated, own rotations", body, wc.Corotated().bind(body), "corotated"),
+        force_case(
+            problem,
+            "ours, corotated, rotations 3 up",
+            body,
+            shared,
+            "corotated",
+            R=lambda: problem.shared_rotations(SUBTREE_LEVELS),
+        ),
+        force_case(problem, "ours, corotated, general mesh", general, wc.Corotated().bind(general), "corotated"),
+        force_case(problem, "ours, neo-Hookean", body, wc.NeoHookean().bind(body), "neo_hookean"),
+        force_case(problem, "ours, neo-Hookean, general mesh", general, wc.NeoHookean().bind(general), "neo_hookean"),
+    ]
+    if newton is not None:
+        cases.append(newton.force_case(problem))
+    return cases
+
+
+# --- steps ------------------------------------------------------------------------------------------------------------
+
+
+class OurSteps(Steppable):
+    """``Simulation`` from the problem's state."""
+
+    def __init__(self, name: str, problem: Problem, model: Model, of: str, levels_up: int | None = None):
+        self.name = f"ours, {name}"
+        self.problem = problem
+        self.model = model
+        self.of = of
+        self.levels_up = levels_up
+        self.body = problem.new_body(problem.mesh)
+        self.body.fix(problem.held)
+        self.start = wp.clone(self.body.node_displacements)
+        self.sim = self._simulation(None)
+
+    @property
+    def dt(self) -> float:
+        return self.sim.dt
+
+    @dt.setter
+    def dt(self, value: float) -> None:
+        if value != self.sim.dt:
+            self.sim = self._simulation(value)
+
+    def _simulation(self, dt: float | None) -> wc.Simulation:
+        integrator = wc.SymplecticEuler(dt, DAMPING)
+        return wc.Simulation(self.body, model=self.model, integrator=integrator, gravity=GRAVITY)
+
+    def reset(self) -> None:
+        wp.copy(self.body.node_displacements, self.start)
+        self.body.node_velocities.zero_()
+        self.body.node_forces.zero_()
+        self.body.publish_positions()
+
+    def step(self, count: int) -> None:
+        try:
+            self.sim.advance_steps(count)
+        except wc.UnstableError:
+            # It is not to be asked again, and its state shows what happened.
+            self.sim = self._simulation(self.sim.dt)
+
+    def largest_displacement(self) -> float:
+        u = self.body.displacements.numpy()
+        return float(np.abs(u).max()) if np.isfinite(u).all() else math.inf
+
+    def error(self) -> float:
+        problem, dt = self.problem, self.dt
+        sample = problem.sample
+        self.reset()
+        self.sim.advance_steps(1)
+        moved = self.body.displacements.numpy()[sample.nodes].astype(float) - problem.u[sample.nodes]
+        options = {} if self.levels_up is None else {"R": problem.shared_rotations(self.levels_up)}
+        forces = sample.forces(self.of, problem.x, problem.mu, problem.lam, **options)
+        velocity = dt * (forces / problem.body.masses[sample.nodes, None] + np.array(GRAVITY)) / (1.0 + dt * DAMPING)
+        velocity[problem.held[sample.nodes]] = 0.0
+        return relative_error(moved, dt * velocity)
+
+
+def step_cases(problem: Problem, peers: Sequence[ModuleType]) -> list[Case]:
+    """Steps at four fifths of the largest that stands."""
+    up = SUBTREE_LEVELS
+    shared = wc.Corotated(rotation_level=problem.level - up)
+    solvers: list[Steppable] = [
+        OurSteps("corotated, own rotations", problem, wc.Corotated(), "corotated"),
+        OurSteps("corotated, rotations 3 up", problem, shared, "corotated", up),
+        OurSteps("neo-Hookean", problem, wc.NeoHookean(), "neo_hookean"),
+    ]
+    for module in peers:
+        tell(f"building {module.NAME}'s model")
+        solvers += module.steps(problem)
+    guess = solvers[0].dt
+    return [_step_case(problem, solver, guess) for solver in solvers]
+
+
+def _step_case(problem: Problem, solver: Steppable, guess: float) -> Case:
+    tell(f"whole step: largest dt of {solver.name}")
+    largest = solver.largest_stable_step(guess)
+    solver.dt = 0.8 * (largest or guess)
+    solver.reset()
+    watch = Stopwatch(problem.device)
+    solver.step(2)
+    once = watch.seconds(lambda: solver.step(2)) / 2
+    # An even number, since Newton's solvers swap two states.
+    steps = 2 * max(1, min(32, math.ceil(SAMPLE_SECONDS[kind(problem.device)] / once / 2)))
+    # Newton's solvers allocate while they step, which a graph on the CPU would not keep.
+    recorded = problem.device.is_cuda and solver.recordable
+    return Case(
+        "whole step",
+        solver.name,
+        lambda: solver.step(steps),
+        solver.error,
+        problem.tet_count,
+        repeats=steps,
+        recorded=recorded,
+        reset=solver.reset,
+        wrong=solver.wrong,
+        extra={"largest_dt": largest, "dt": solver.dt},
+    )
+
+
+# --- the report -------------------------------------------------------------------------------------------------------
+
+
+def report_rows(results: Sequence[Result], copy_gb_s: float) -> list[dict[str, Any]]:
+    first: dict[str, Result] = {}
+    lines = []
+    for r in results:
+        ours = first.setdefault(r.case.stage, r)
+        line = r.as_dict(copy_gb_s) | {"times_ours": r.relative_to(ours)}
+        if "largest_dt" in line:
+            line["simulated_s_per_s"] = line["largest_dt"] / (r.ns * 1e-9 * r.case.tets)
+        lines.append(line)
+    return lines
+
+
+def printed(lines: Sequence[dict[str, Any]]) -> str:
+    def dt(line: dict[str, Any]) -> str:
+        return f"{1e3 * line['largest_dt']:.3g} ms" if "largest_dt" in line else "-"
+
+    rows = [
+        [
+            d["stage"],
+            d["variant"],
+            number(d["ns_per_tet"]),
+            percent(d["spread"]),
+            number(d["gtet_per_s"]),
+            number(d["times_ours"]),
+            f"{d['error']:.1e}",
+            dt(d),
+            number(d.get("simulated_s_per_s")),
+        ]
+        for d in lines
+    ]
+    return table(HEADER, rows, 2)
+
+
+def main() -> int:
+    of = parser(__doc__.split("\n\n")[0], "peers.py")
+    of.add_argument("--step-level", type=int, help="level for whole steps (default: 18 on CUDA, 12 on the CPU)")
+    options = of.parse_args()
+    levels = range(SUBTREE_LEVELS, 25)
+    device = checked(options, of, levels)
+    if options.step_level is None:
+        options.step_level = min(options.level, 18 if device.is_cuda else 12)
+    if options.step_level not in levels:
+        of.error(f"--step-level is {options.step_level}; it must be from {levels.start} to {levels.stop - 1}")
+    warnings.simplefilter("ignore", wc.StabilityWarning)
+    start = time.perf_counter()
+    about = machine(device)
+    newton, mujoco = peer("newton"), peer("mujoco")
+    copy = about["copy_gb_per_s"] = copy_bandwidth(device)
+    tell(f"building level {options.level}")
+    problem = Problem(options.level, device)
+    stepping = problem if options.step_level == options.level else Problem(options.step_level, device)
+    about |= {"level": options.level, "step_level": options.step_level, "rounds": options.rounds}
+    about["peers"] = {m.__name__: m.NAME for m in (newton, mujoco) if m is not None}
+    print(f"{about['name']} ({device}), Warp {about['warp']}: rotations and forces at level {options.level}, ", end="")
+    print(f"{problem.tet_count} tetrahedra, steps at level {options.step_level}, {stepping.tet_count}", flush=True)
+    results = measure(rotation_cases(problem.tet_count, device), device, options.rounds, tell)
+    results += measure(force_cases(problem, newton), device, options.rounds, tell)
+    results += measure(
+        step_cases(stepping, [m for m in (newton, mujoco) if m is not None]), device, options.rounds, tell
+    )
+    about["seconds"] = time.perf_counter() - start
+    lines = report_rows(results, copy)
+    tell("")
+    print(printed(lines))
+    print(NOTES)
+    return finish(options, {"benchmark": "peers", **about, "rows": lines}, results)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
