@@ -49,7 +49,8 @@ class Case:
         bytes: What one tetrahedron must move at the least [B]; None where nobody can say.
         flops: Additions, multiplications, divisions and roots one tetrahedron needs at the least; or None.
         repeats: How often ``run`` does the thing.
-        recorded: Whether ``run`` is recorded in a graph here; False where it replays graphs of its own or cannot be.
+        recorded: Whether ``run`` is recorded in a graph here; False where it replays graphs of its own, None where
+            that is somebody else's code and it has to be seen whether it can be.
         reset: Puts the state back before each sample, outside the measured time.
         wrong: Errors above this are failures; None where ``error`` measures something else.
         extra: More figures for the table and the JSON.
@@ -63,7 +64,7 @@ class Case:
     bytes: float | None = None
     flops: float | None = None
     repeats: int = 1
-    recorded: bool = True
+    recorded: bool | None = True
     reset: Callable[[], object] | None = None
     wrong: float | None = WRONG
     extra: dict[str, Any] = field(default_factory=dict)
@@ -169,14 +170,20 @@ def _sampler(case: Case, device: wp.Device, watch: Stopwatch) -> tuple[Callable[
     if case.reset is not None:
         case.reset()
     once = min(watch.seconds(case.run) for _ in range(2))
-    if not case.recorded:
+    if case.recorded is False:
         return case.run, 1
     launches = int(np.clip(math.ceil(SAMPLE_SECONDS[kind(device)] / max(once, 1e-9)), 1, MAX_LAUNCHES))
-    with wp.ScopedCapture(device=device) as capture:
-        for _ in range(launches):
-            case.run()
-    graph = capture.graph
-    wp.capture_launch(graph)
+    try:
+        with wp.ScopedCapture(device=device) as capture:
+            for _ in range(launches):
+                case.run()
+        graph = capture.graph
+        wp.capture_launch(graph)
+    except Exception:
+        if case.recorded:
+            raise
+        case.extra["graph"] = False
+        return case.run, 1
     return lambda: wp.capture_launch(graph), launches
 
 

@@ -14,6 +14,9 @@ import warp_corot as wc
 
 NAME = f"MuJoCo {mujoco.__version__}"
 
+#: Its model is a text, and it steps on one core.
+MOST_TETS = 50_000
+
 # It would write warnings to a file where one stands; a state that has blown up is looked for below.
 mujoco.set_mju_user_warning(lambda message: None)
 

@@ -11,16 +11,19 @@ from dataclasses import dataclass
 
 import newton
 import numpy as np
-import oracle
 import warp as wp
 from measure import Case
 from newton._src.solvers.semi_implicit.kernels_particle import eval_tetrahedra
-from problem import Problem, relative_error
+from problem import Problem, oracle, relative_error
 from stable import Steppable
 
 import warp_corot as wc
 
 NAME = f"Newton {newton.__version__}"
+
+#: Its builder keeps Python lists.
+MOST_TETS = 4_000_000
+
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
 #: float32 positions lose digits of small strains on fine meshes.

@@ -40,12 +40,13 @@ from measure import (
     tell,
 )
 from problem import SUBTREE_LEVELS, Problem, oracle, relative_error
+from solver_cases import DAMPING, force_case, put_back, step_error
 from stable import Steppable
+from stage_cases import SVD_WRONG
 from warp_corot.kernels.polar import rotate_all
 from warp_corot.kernels.rotation import byers_xu
 
 import warp_corot as wc
-from kernels import DAMPING, SVD_WRONG, force_case
 from warp_corot.elasticity import Model
 from warp_corot.rotations import rotation_function
 
@@ -154,10 +155,7 @@ class OurSteps(Steppable):
         return wc.Simulation(self.body, model=self.model, integrator=integrator, gravity=GRAVITY)
 
     def reset(self) -> None:
-        wp.copy(self.body.node_displacements, self.start)
-        self.body.node_velocities.zero_()
-        self.body.node_forces.zero_()
-        self.body.publish_positions()
+        put_back(self.body, self.start)
 
     def step(self, count: int) -> None:
         try:
@@ -171,16 +169,10 @@ class OurSteps(Steppable):
         return float(np.abs(u).max()) if np.isfinite(u).all() else math.inf
 
     def error(self) -> float:
-        problem, dt = self.problem, self.dt
-        sample = problem.sample
-        self.reset()
-        self.sim.advance_steps(1)
-        moved = self.body.displacements.numpy()[sample.nodes].astype(float) - problem.u[sample.nodes]
+        problem = self.problem
         options = {} if self.levels_up is None else {"R": problem.shared_rotations(self.levels_up)}
-        forces = sample.forces(self.of, problem.x, problem.mu, problem.lam, **options)
-        velocity = dt * (forces / problem.body.masses[sample.nodes, None] + np.array(GRAVITY)) / (1.0 + dt * DAMPING)
-        velocity[problem.held[sample.nodes]] = 0.0
-        return relative_error(moved, dt * velocity)
+        forces = problem.sample.forces(self.of, problem.x, problem.mu, problem.lam, **options)
+        return step_error(self.sim, self.start, problem.sample, forces)
 
 
 def step_cases(problem: Problem, peers: Sequence[ModuleType]) -> list[Case]:
@@ -193,6 +185,9 @@ def step_cases(problem: Problem, peers: Sequence[ModuleType]) -> list[Case]:
         OurSteps("neo-Hookean", problem, wc.NeoHookean(), "neo_hookean"),
     ]
     for module in peers:
+        if problem.tet_count > module.MOST_TETS:
+            print(f"{module.NAME}: steps left out above {module.MOST_TETS} tetrahedra; try a lower --step-level")
+            continue
         tell(f"building {module.NAME}'s model")
         solvers += module.steps(problem)
     guess = solvers[0].dt
@@ -210,7 +205,7 @@ def _step_case(problem: Problem, solver: Steppable, guess: float) -> Case:
     # An even number, since Newton's solvers swap two states.
     steps = 2 * max(1, min(32, math.ceil(SAMPLE_SECONDS[kind(problem.device)] / once / 2)))
     # Newton's solvers allocate while they step, which a graph on the CPU would not keep.
-    recorded = problem.device.is_cuda and solver.recordable
+    recorded = None if problem.device.is_cuda and solver.recordable else False
     return Case(
         "whole step",
         solver.name,

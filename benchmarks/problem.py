@@ -17,7 +17,7 @@ import warp as wp
 import warp_corot as wc
 from warp_corot.elements import forest_elements
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))
 try:
     import oracle
 except ImportError as error:
@@ -40,6 +40,11 @@ def relative_error(found: np.ndarray, reference: np.ndarray) -> float:
     if not np.isfinite(found).all():
         return float("inf")
     return float(np.abs(found - reference).max() / np.abs(reference).max())
+
+
+def padded(vectors: np.ndarray) -> np.ndarray:
+    """Nodal vectors [N, 3] as the float32 [N, 4] that the device keeps."""
+    return np.concatenate([vectors, np.zeros((len(vectors), 1), np.float32)], axis=1)
 
 
 class Sample:

@@ -1,0 +1,240 @@
+"""Whole forces, integration and whole steps, as users' simulations launch them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import warp as wp
+import work
+from measure import Case
+from problem import SUBTREE_LEVELS, Problem, Sample, oracle, padded, relative_error
+
+import warp_corot as wc
+from warp_corot.elasticity import ForceField, Model
+from warp_corot.experiments import paper
+from warp_corot.solvers.integrator import StepContext
+
+#: Steps of one sample of a whole-step row.
+STEPS = 64
+BEAM_STEPS = 1024
+DAMPING = 15.0
+
+
+# --- whole force ------------------------------------------------------------------------------------------------------
+
+
+def force_cases(problem: Problem) -> list[Case]:
+    """``Model.bind(body).add_forces(u, f)`` as a simulation launches it."""
+    shape = problem.level % 3
+    floor = work.CONNECTIVITY + (work.READ + work.ADD_TO) * problem.nodes_per_tet
+    tested, fixed = work.rotation_flops(tested=True), work.rotation_flops(tested=False)
+    shared_flops = work.model_flops("corotated", shape, tested / 8)
+    shared = wc.Corotated(rotation_level=problem.level - SUBTREE_LEVELS)
+
+    def forest(name: str, model: Model, of: str, flops: float | None, **options: Callable[[], np.ndarray]) -> Case:
+        return force_case(problem, name, problem.body, model.bind(problem.body), of, floor, flops, **options)
+
+    springs = wc.MassSpring().bind(problem.body)
+    edges_per_tet = springs.energy_count / problem.tet_count
+    spring_bytes = work.EDGE * edges_per_tet + (work.READ + work.ADD_TO) * problem.nodes_per_tet
+    general = problem.general_body
+    general_bytes = work.GENERAL_ELEMENT + (work.READ + work.ADD_TO) * problem.nodes_per_tet
+    general_flops = work.GENERAL_GRADIENT + tested + work.rotated_stress_flops() + work.GENERAL_FORCE + work.SCATTER
+    model_flops = work.model_flops
+    return [
+        forest("corotated, own rotations", wc.Corotated(), "corotated", model_flops("corotated", shape, tested)),
+        forest(
+            "corotated, own, 4 iterations",
+            wc.Corotated(iterations=4),
+            "corotated",
+            model_flops("corotated", shape, fixed),
+        ),
+        forest("corotated, rotations 3 up", shared, "corotated", shared_flops, R=lambda: problem.shared_rotations(3)),
+        force_case(
+            problem,
+            "corotated, general mesh",
+            general,
+            wc.Corotated().bind(general),
+            "corotated",
+            general_bytes,
+            general_flops,
+        ),
+        forest("linear", wc.Linear(), "linear", model_flops("linear", shape)),
+        forest("StVK", wc.StVenantKirchhoff(), "stvk", model_flops("stvk", shape)),
+        forest("neo-Hookean", wc.NeoHookean(), "neo_hookean", model_flops("neo_hookean", shape)),
+        forest("StVK on edges", wc.EdgeStVK(), "edge_stvk", model_flops("edge_stvk", shape)),
+        force_case(
+            problem,
+            "mass-spring",
+            problem.body,
+            springs,
+            "mass_spring",
+            spring_bytes,
+            work.SPRING_FLOPS * edges_per_tet,
+        ),
+    ]
+
+
+def force_case(
+    problem: Problem,
+    name: str,
+    body: wc.SoftBody,
+    field: ForceField,
+    of: str,
+    floor: float | None = None,
+    flops: float | None = None,
+    **options: Callable[[], np.ndarray],
+) -> Case:
+    """The forces of one field on a body in the problem's state; ``of`` names the oracle's model."""
+    u = body.node_displacements
+    f = wp.zeros_like(u)
+
+    def error() -> float:
+        f.zero_()
+        field.add_forces(u, f)
+        given = {key: value() for key, value in options.items()}
+        reference = problem.sample.forces(of, problem.x, problem.mu, problem.lam, **given)
+        return relative_error(f.numpy()[problem.sample.nodes, :3], reference)
+
+    return Case("whole force", name, lambda: field.add_forces(u, f), error, problem.tet_count, floor, flops)
+
+
+# --- integration and whole steps --------------------------------------------------------------------------------------
+
+
+class _NoForces(ForceField):
+    """Leaves an integrator's launches alone."""
+
+    def add_forces(self, u: wp.array, f: wp.array) -> None: ...
+
+    def write_energies(self, u: wp.array, energies: wp.array) -> None: ...
+
+    def write_von_mises(self, u: wp.array, stress: wp.array) -> None: ...
+
+
+def integration_case(problem: Problem) -> Case:
+    """Velocities, displacements and the emptied force array, on a body of its own with random forces and velocities."""
+    dt = 1e-4
+    body = problem.new_body(problem.mesh)
+    body.fix(problem.held)
+    rng = np.random.default_rng(3)
+    v, f = (rng.uniform(-1, 1, problem.u.shape).astype(np.float32) for _ in range(2))
+    v[body.constrained] = 0
+    f *= np.float32(body.masses.mean() * 10.0)
+    clock = wp.zeros(1, dtype=wp.int64, device=problem.device)
+    bad_step = wp.array([np.iinfo(np.int64).max], dtype=wp.int64, device=problem.device)
+    context = StepContext(dt, wp.vec3(0.0, 0.0, 0.0), clock, bad_step)
+    stepper = wc.SymplecticEuler(dt, DAMPING).bind(body, _NoForces(body), context)
+
+    def error() -> float:
+        body.velocities = v
+        body.node_forces.assign(padded(f))
+        stepper.step(0)
+        w = np.where(body.constrained, 0.0, 1.0 / body.masses)[:, None]
+        reference = (v + dt * (f * w)) / (1.0 + dt * DAMPING)
+        return relative_error(body.velocities.numpy(), reference)
+
+    per_tet = problem.nodes_per_tet
+    return Case(
+        "integration",
+        "symplectic Euler",
+        lambda: stepper.step(0),
+        error,
+        problem.tet_count,
+        work.INTEGRATION_BYTES * per_tet,
+        work.INTEGRATION_FLOPS * per_tet,
+    )
+
+
+def step_cases(problem: Problem) -> list[Case]:
+    """``Simulation.advance_steps`` as users call it: forces, integration, fixed nodes, damping, finiteness."""
+    floor = work.CONNECTIVITY + (work.READ + work.ADD_TO + work.INTEGRATION_BYTES) * problem.nodes_per_tet
+    shared = wc.Corotated(rotation_level=problem.level - SUBTREE_LEVELS)
+    beam = wc.TetForest.box(paper.CELLS, paper.CELL_SIZE, 6)
+    return [
+        step_case("corotated, own rotations", problem, wc.Corotated(), floor),
+        step_case("corotated, rotations 3 up", problem, shared, floor, R=lambda: problem.shared_rotations(3)),
+        _beam_case(beam, problem.device),
+    ]
+
+
+def step_case(
+    name: str,
+    problem: Problem,
+    model: Model,
+    floor: float | None,
+    steps: int = STEPS,
+    **options: Callable[[], np.ndarray],
+) -> Case:
+    """Steps from the problem's state, always the same ones."""
+    body = problem.new_body(problem.mesh)
+    body.fix(problem.held)
+    sim = wc.Simulation(body, model=model, integrator=wc.SymplecticEuler(None, DAMPING), gravity=(0.0, 0.0, -9.81))
+
+    def forces() -> np.ndarray:
+        given = {key: value() for key, value in options.items()}
+        return problem.sample.forces("corotated", problem.x, problem.mu, problem.lam, **given)
+
+    return _stepping(name, sim, problem.u, problem.sample, forces, floor, steps)
+
+
+def _beam_case(beam: wc.TetForest, device: wp.Device) -> Case:
+    """The paper's beam of 1152 tetrahedra, hanging."""
+    body = wc.SoftBody(beam, wc.Isotropic(**paper.MATERIAL), device=device)
+    body.fix(beam.points[:, 2] < 1e-9)
+    sim = wc.Simulation(body, integrator=wc.SymplecticEuler(2e-4, DAMPING), gravity=paper.GRAVITY)
+    rng = np.random.default_rng(4)
+    u = (0.05 * paper.CELL_SIZE / 4 * rng.uniform(-1, 1, beam.points.shape)).astype(np.float32)
+    sample = Sample(beam.points, beam.tets)
+    mu, lam = oracle.lame(paper.MATERIAL["young"], paper.MATERIAL["poisson"])
+
+    def forces() -> np.ndarray:
+        return sample.forces("corotated", beam.points + u.astype(float), float(mu), float(lam))
+
+    return _stepping(f"the paper's beam, {len(beam.tets)} tets", sim, u, sample, forces, None, BEAM_STEPS)
+
+
+def _stepping(
+    name: str,
+    sim: wc.Simulation,
+    u: np.ndarray,
+    sample: Sample,
+    forces: Callable[[], np.ndarray],
+    floor: float | None,
+    steps: int,
+) -> Case:
+    start = wp.array(padded(u), dtype=wp.vec4, device=sim.device)
+    return Case(
+        "whole step",
+        name,
+        lambda: sim.advance_steps(steps),
+        lambda: step_error(sim, start, sample, forces()),
+        len(sim.body.mesh.tets),
+        floor,
+        repeats=steps,
+        recorded=False,
+        reset=lambda: put_back(sim.body, start),
+        extra={"dt": sim.dt},
+    )
+
+
+def put_back(body: wc.SoftBody, start: wp.array) -> None:
+    """Displacements vec4 [N] back to ``start``, at rest."""
+    wp.copy(body.node_displacements, start)
+    body.node_velocities.zero_()
+    body.node_forces.zero_()
+    body.publish_positions()
+
+
+def step_error(sim: wc.Simulation, start: wp.array, sample: Sample, forces: np.ndarray) -> float:
+    """What one damped step from ``start`` at rest is off by, against nodal forces [n, 3] on the sample's nodes."""
+    body, integrator = sim.body, sim.integrator
+    put_back(body, start)
+    before = start.numpy()[sample.nodes, :3].astype(float)
+    sim.advance_steps(1)
+    moved = body.displacements.numpy()[sample.nodes] - before
+    mass = sample.masses(float(body.material.density))[:, None]
+    velocity = sim.dt * (forces / mass + np.asarray(sim.gravity)) / (1.0 + sim.dt * integrator.damping)
+    velocity[body.constrained[sample.nodes]] = 0.0
+    return relative_error(moved, sim.dt * velocity)
