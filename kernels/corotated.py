@@ -16,12 +16,12 @@ from .elements import (
     add_force,
     edge_length,
     frame,
+    load_node,
     local_gradient,
     mirror_sign,
     rest_volume,
     scatter_stress,
     shape_of,
-    xyz,
 )
 from .forces import von_mises
 from .rotation import identity3, warm_rotation
@@ -224,13 +224,13 @@ def scatter_matrix_product(skip_zeros: bool) -> wp.Kernel:
         mirror = wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, s)
         q = frame(elements, t) * mirror
         r = rotations[unit[t]] * q
-        origin = xyz(u[nodes[0]])
+        origin = load_node(u, nodes[0])
         turned = wp.transpose(r) * q - identity3()
         x0 = rest_shape(shape)
         z = vec12()
         for n in range(4):
             # R^T x - x0 with x = Q x0 + u, from displacements so that nothing large cancels.
-            d = turned * (x0[n] * h) + wp.transpose(r) * (xyz(u[nodes[n]]) - origin)
+            d = turned * (x0[n] * h) + wp.transpose(r) * (load_node(u, nodes[n]) - origin)
             z[3 * n] = d[0]
             z[3 * n + 1] = d[1]
             z[3 * n + 2] = d[2]

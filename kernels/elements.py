@@ -35,9 +35,30 @@ class GeneralElements:
     volume: wp.array[wp.float32]  # [T] rest volume [m^3]
 
 
-@wp.func
-def xyz(a: wp.vec4):
-    return wp.vec3(a[0], a[1], a[2])
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const float4 a = *reinterpret_cast<const float4*>(&wp::index(nodes, i));
+    return wp::vec_t<3, wp::float32>(a.x, a.y, a.z);
+#else
+    const wp::vec_t<4, wp::float32>& a = wp::index(nodes, i);
+    return wp::vec_t<3, wp::float32>(a[0], a[1], a[2]);
+#endif
+""")
+def load_node(nodes: wp.array[wp.vec4], i: int) -> wp.vec3:
+    """The vector of node i by one 16-byte load, which Warp, not knowing that vec4 arrays are aligned, does not make."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    *reinterpret_cast<float4*>(&wp::index(nodes, i)) = make_float4(value[0], value[1], value[2], 0.0f);
+#else
+    wp::index(nodes, i) = wp::vec_t<4, wp::float32>(value[0], value[1], value[2], 0.0f);
+#endif
+""")
+def store_node(nodes: wp.array[wp.vec4], i: int, value: wp.vec3):
+    """Write the vector of node i by one 16-byte store."""
+    ...
 
 
 @wp.func
@@ -85,7 +106,7 @@ def rest_volume(elements: GeneralElements, t: int):
 
 @wp.func
 def node_displacements(nodes: wp.vec4i, u: wp.array[wp.vec4]):
-    return xyz(u[nodes[0]]), xyz(u[nodes[1]]), xyz(u[nodes[2]]), xyz(u[nodes[3]])
+    return load_node(u, nodes[0]), load_node(u, nodes[1]), load_node(u, nodes[2]), load_node(u, nodes[3])
 
 
 @wp.func
@@ -113,10 +134,25 @@ def local_gradient(elements: GeneralElements, t: int, u: wp.array[wp.vec4]):
     return wp.matrix_from_cols(u1 - u0, u2 - u0, u3 - u0) * elements.rest_inverse[t]
 
 
-@wp.func
-def add_force(f: wp.array[wp.vec4], node: int, force: wp.vec3):
-    """The one place where a nodal force is added to the global vector."""
-    wp.atomic_add(f, node, wp.vec4(force[0], force[1], force[2], 0.0))
+#: Adds ``force`` to ``f[node]``: one 16-byte reduction where the card has them (a global reduction costs about the same
+#: scalar or vector), else three scalar ones; a plain sum on the CPU, which has one thread.
+ADD_FORCE = """
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
+    asm volatile("red.global.add.v4.f32 [%0], {%1, %2, %3, %4};"
+        :: "l"(&wp::index(f, node)), "f"(force[0]), "f"(force[1]), "f"(force[2]), "f"(0.0f) : "memory");
+#else
+    wp::vec_t<4, wp::float32>& sum = wp::index(f, node);
+    #if defined(__CUDA_ARCH__)
+        for (int i = 0; i < 3; ++i) atomicAdd(&sum[i], force[i]);
+    #else
+        for (int i = 0; i < 3; ++i) sum[i] += force[i];
+    #endif
+#endif
+"""
+
+
+@wp.func_native(ADD_FORCE)
+def add_force(f: wp.array[wp.vec4], node: int, force: wp.vec3): ...
 
 
 @wp.func

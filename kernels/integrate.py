@@ -6,14 +6,9 @@ for users after each run of steps, and adopted before the next where somebody ch
 
 import warp as wp
 
-from .elements import xyz
+from .elements import load_node, store_node
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.func
-def pad(a: wp.vec3):
-    return wp.vec4(a[0], a[1], a[2], 0.0)
 
 
 @wp.func
@@ -49,19 +44,19 @@ def step_symplectic_euler(
     Newton's second law: the weight, the elastic force and the load.
     """
     i = wp.tid()
-    force = xyz(f[i])
+    force = load_node(f, i)
     if has_load != 0:
-        force += xyz(load[i])
+        force += load_node(load, i)
     w = inverse_mass[i]
-    velocity = xyz(v[i])
+    velocity = load_node(v, i)
     if w > 0.0:
         velocity = (velocity + dt * (w * force + gravity)) / (1.0 + dt * damping)
-        v[i] = pad(velocity)
+        store_node(v, i, velocity)
     else:
-        reactions[i] = pad(-(force + mass[i] * gravity))
-    displacement = xyz(u[i]) + dt * velocity
-    u[i] = pad(displacement)
-    f[i] = wp.vec4()
+        store_node(reactions, i, -(force + mass[i] * gravity))
+    displacement = load_node(u, i) + dt * velocity
+    store_node(u, i, displacement)
+    store_node(f, i, wp.vec3())
     if not is_finite(displacement):
         wp.atomic_min(bad_step, 0, clock[0] + wp.int64(offset + 1))
 
@@ -99,7 +94,7 @@ def follow_trajectory(
     b = displacements[wp.min(key + 1, last), row]
     target = a + float(s) * (b - a)
     i = nodes[k]
-    v[i] = pad((target - xyz(u[i])) / dt)
+    store_node(v, i, (target - load_node(u, i)) / dt)
 
 
 @wp.kernel(enable_backward=False)
@@ -111,7 +106,7 @@ def publish_positions(
     positions: wp.array[wp.vec4],
 ):
     i = wp.tid()
-    positions[i] = pad(xyz(rest[i]) + xyz(u[i]))
+    store_node(positions, i, load_node(rest, i) + load_node(u, i))
 
 
 @wp.kernel(enable_backward=False)
@@ -124,8 +119,8 @@ def adopt_positions(
 ):
     """Take over the positions that somebody wrote since they were published; untouched ones keep their digits."""
     i = wp.tid()
-    x = xyz(rest[i])
-    p = xyz(positions[i])
-    q = x + xyz(u[i])
+    x = load_node(rest, i)
+    p = load_node(positions, i)
+    q = x + load_node(u, i)
     if p[0] != q[0] or p[1] != q[1] or p[2] != q[2]:
-        u[i] = pad(p - x)
+        store_node(u, i, p - x)

@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from .elements import ForestElements, GeneralElements, add_force, edge_length, frame, mirror_sign, shape_of, xyz
+from .elements import ForestElements, GeneralElements, add_force, edge_length, frame, load_node, mirror_sign, shape_of
 from .shapes import EDGES, REST, edge_stiffness, fingerprint
 
 wp.set_module_options({"enable_backward": False})
@@ -154,14 +154,16 @@ def scatter_edge_stvk(Elements: Any, biquadratic: bool) -> wp.Kernel:
             i = FIRST_NODE[e]
             j = SECOND_NODE[e]
             rest = q * (x[j] - x[i])
-            measure, factor = edge_stretch(rest, xyz(u[nodes[j]]) - xyz(u[nodes[i]]), wp.static(biquadratic))
+            measure, factor = edge_stretch(
+                rest, load_node(u, nodes[j]) - load_node(u, nodes[i]), wp.static(biquadratic)
+            )
             d[e] = measure
             pull[e] = factor
         tension = edge_tensions(elements, t, d, mu[t * stride], lam[t * stride])
         for e in range(6):
             i = FIRST_NODE[e]
             j = SECOND_NODE[e]
-            edge = q * (x[j] - x[i]) + (xyz(u[nodes[j]]) - xyz(u[nodes[i]]))
+            edge = q * (x[j] - x[i]) + (load_node(u, nodes[j]) - load_node(u, nodes[i]))
             force = (tension[e] * pull[e]) * edge
             add_force(f, nodes[i], force)
             add_force(f, nodes[j], -force)
@@ -193,7 +195,9 @@ def edge_stvk_energies(Elements: Any, biquadratic: bool) -> wp.Kernel:
             i = FIRST_NODE[e]
             j = SECOND_NODE[e]
             rest = q * (x[j] - x[i])
-            measure, _factor = edge_stretch(rest, xyz(u[nodes[j]]) - xyz(u[nodes[i]]), wp.static(biquadratic))
+            measure, _factor = edge_stretch(
+                rest, load_node(u, nodes[j]) - load_node(u, nodes[i]), wp.static(biquadratic)
+            )
             d[e] = measure
         tension = edge_tensions(elements, t, d, mu[t * stride], lam[t * stride])
         energies[t] = wp.float64(0.5 * wp.dot(d, tension))
@@ -214,7 +218,7 @@ def scatter_mass_spring(
     e = wp.tid()
     i = edges[e][0]
     j = edges[e][1]
-    stretch = xyz(u[j]) - xyz(u[i])
+    stretch = load_node(u, j) - load_node(u, i)
     edge = rest[e] + stretch
     length = wp.length(edge)
     rest_length = wp.length(rest[e])
@@ -236,7 +240,7 @@ def mass_spring_energies(
     energies: wp.array[wp.float64],
 ):
     e = wp.tid()
-    stretch = xyz(u[edges[e][1]]) - xyz(u[edges[e][0]])
+    stretch = load_node(u, edges[e][1]) - load_node(u, edges[e][0])
     length = wp.length(rest[e] + stretch)
     elongation = (2.0 * wp.dot(rest[e], stretch) + wp.dot(stretch, stretch)) / (length + wp.length(rest[e]))
     energies[e] = wp.float64(0.5 * stiffness[e] * elongation * elongation)

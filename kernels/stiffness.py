@@ -40,12 +40,9 @@ STIFFNESS_LAMBDA = tuple(tables[0] for tables in _TABLES)
 STIFFNESS_MU = tuple(tables[1] for tables in _TABLES)
 
 
-def entry(shape: int, row: int, col: int) -> tuple[float, float]:
-    return round(STIFFNESS_LAMBDA[shape][row][col], 12), round(STIFFNESS_MU[shape][row][col], 12)
-
-
 def is_zero(shape: int, row: int, col: int) -> bool:
-    return entry(shape, row, col) == (0.0, 0.0)
+    """Whether an entry of K_T vanishes for every isotropic material."""
+    return abs(STIFFNESS_LAMBDA[shape][row][col]) + abs(STIFFNESS_MU[shape][row][col]) < 1e-12
 
 
 def _canonical(pair: tuple[float, float]) -> tuple[tuple[float, float], float]:
@@ -54,21 +51,33 @@ def _canonical(pair: tuple[float, float]) -> tuple[tuple[float, float], float]:
     return (sign * pair[0] + 0.0, sign * pair[1] + 0.0), sign
 
 
-def values(shape: int) -> list[tuple[float, float]]:
-    """The distinct entries (lambda part, mu part) of K_T / h up to sign, zero left out."""
-    pairs = {_canonical(entry(shape, i, j))[0] for i in range(12) for j in range(12) if not is_zero(shape, i, j)}
-    return sorted(pairs)
+class Coefficients:
+    """The few values among a matrix's entries, each lambda * l + mu * m, and where they stand.
+
+    Attributes:
+        distinct: The values up to sign, (l, m) pairs.
+        table: Which of them each entry is, -1 for zero (unless zeros are kept as a value of their own).
+        signs: 1 or -1 for each entry.
+    """
+
+    def __init__(self, lam: list[list[float]], mu: list[list[float]], *, keep_zeros: bool = False):
+        rows = [
+            [_canonical((round(a, 12), round(b, 12))) for a, b in zip(p, q, strict=True)]
+            for p, q in zip(lam, mu, strict=True)
+        ]
+        kept = {pair for row in rows for pair, _ in row if keep_zeros or pair != (0.0, 0.0)}
+        self.distinct = sorted(kept)
+        self.table = [[self.distinct.index(pair) if pair in kept else -1 for pair, _ in row] for row in rows]
+        self.signs = [[sign for _, sign in row] for row in rows]
 
 
 @functools.cache
 def stiffness_product(shape: int, skip_zeros: bool = True) -> wp.Function:
     """Generate y = (K_T / h) z for one shape; with ``skip_zeros=False`` all 144 products, the dense baseline."""
-    distinct = values(shape) + ([] if skip_zeros else [(0.0, 0.0)])
+    entries = Coefficients(STIFFNESS_LAMBDA[shape], STIFFNESS_MU[shape], keep_zeros=not skip_zeros)
+    distinct, table, signs = entries.distinct, entries.table, entries.signs
     count = len(distinct)
     coefficients_t = wp.types.vector(length=count, dtype=wp.float32)
-    canonical = [[_canonical(entry(shape, i, j)) for j in range(12)] for i in range(12)]
-    table = [[distinct.index(pair) if pair in distinct else -1 for pair, _ in row] for row in canonical]
-    signs = [[sign for _, sign in row] for row in canonical]
 
     @wp.func
     def product(z: vec12, mu: float, lam: float):

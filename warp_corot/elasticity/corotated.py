@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import warp as wp
 
 from ..elements import forest_elements
 from ..errors import InputError
+from ..kernels import subtree_cpu, subtree_cuda
 from ..kernels.corotated import (
     corotated_energies,
     corotated_von_mises,
@@ -21,6 +22,7 @@ from ..kernels.corotated import (
 )
 from ..mesh import TetForest
 from ..mesh.forest import MAX_LEVEL
+from ..plan import Batch, ForcePlan, Sharing
 from ..rotations import METHODS, rotation_function
 from .model import ForceField, Model
 
@@ -36,6 +38,8 @@ class Corotated(Model):
 
     With every element's own rotation the force is the gradient of W and conserves linear and angular momentum. Shared
     rotations are cheaper; they conserve linear momentum only.
+
+    With the defaults, forests take the fast path: complete three-level subtrees as units of work.
 
     Attributes:
         rotation_level: None: every element has its own rotation. An int: the rotation of the ancestor at that level of
@@ -68,31 +72,42 @@ class Corotated(Model):
             raise InputError(f"stiffness is {self.stiffness!r}; it must be one of {', '.join(STIFFNESSES)}")
 
     def bind(self, body: SoftBody) -> CorotatedField:
-        if not isinstance(body.mesh, TetForest):
-            if self.rotation_level is not None:
-                raise InputError(f"rotation_level {self.rotation_level} needs a forest; a general mesh has no tree")
-            if self.stiffness != "factored":
-                raise InputError(f"stiffness {self.stiffness!r} needs a forest; general elements have no three shapes")
+        if isinstance(body.mesh, TetForest):
+            if self.rotation == "byers-xu" and self.iterations is None and self.stiffness == "factored":
+                return SubtreeField(body, self)
+        elif self.rotation_level is not None:
+            raise InputError(f"rotation_level {self.rotation_level} needs a forest; a general mesh has no tree")
+        elif self.stiffness != "factored":
+            raise InputError(f"stiffness {self.stiffness!r} needs a forest; general elements have no three shapes")
         return CorotatedField(body, self)
 
 
+@dataclass(frozen=True)
+class Rotations:
+    """Rotations of elements or their ancestors, and who uses which.
+
+    Attributes:
+        units: Whose rotations are found, as elements.
+        count: How many.
+        rotations: mat33 [count].
+        unit: Which of them each element of the mesh uses, int32 [T].
+    """
+
+    units: Any
+    count: int
+    rotations: wp.array
+    unit: wp.array
+
+
 class CorotatedField(ForceField):
-    """Rotations and forces, as one kernel where each element uses its own, as two stages otherwise."""
+    """Leaf by leaf: rotations and forces as one kernel where each element uses its own, as two stages otherwise."""
 
     def __init__(self, body: SoftBody, model: Corotated):
         super().__init__(body)
         self.model = model
         kind = body.element_kind
-        if isinstance(body.mesh, TetForest) and model.rotation_level is not None:
-            units, unit = np.unique(body.mesh.ancestors(model.rotation_level), return_inverse=True)
-            self._units = forest_elements(body.mesh, units, self.device)
-            self.unit_count = len(units)
-        else:
-            self._units, unit = self.elements, np.arange(self.element_count)
-            self.unit_count = self.element_count
+        self._shared: Rotations | None = None
         self._fused = model.rotation_level is None and model.rotation != "warm" and model.stiffness == "factored"
-        self._unit = wp.array(unit.ravel(), dtype=wp.int32, device=self.device)
-        self._rotations = wp.empty(self.unit_count, dtype=wp.mat33, device=self.device)
         self._state: dict[str, wp.array] = {}
         if model.rotation == "warm":
             identity = np.tile(np.array([0.0, 0.0, 0.0, 1.0], np.float32), (self.unit_count, 1))
@@ -108,16 +123,23 @@ class CorotatedField(ForceField):
             self._forces = scatter_matrix_product(model.stiffness == "sparse")
         self._energies = corotated_energies(kind)
         self._von_mises = corotated_von_mises(kind)
+        if not self._fused:
+            self._sharing()
 
     @property
     def state(self) -> dict[str, wp.array]:
         return self._state
 
+    @property
+    def unit_count(self) -> int:
+        """How many rotations are found."""
+        return self._sharing().count
+
     def extract_rotations(self, u: wp.array) -> wp.array:
         """The rotation of every unit, mat33 [units]."""
-        outputs = [*self.state.values(), self._rotations]
-        self.launch(self._extract, self.unit_count, [self._units, u], outputs)
-        return self._rotations
+        shared = self._sharing()
+        self.launch(self._extract, shared.count, [shared.units, u], [*self.state.values(), shared.rotations])
+        return shared.rotations
 
     def add_rotated_forces(self, u: wp.array, f: wp.array) -> None:
         """Forces with the rotations that were extracted last."""
@@ -138,6 +160,101 @@ class CorotatedField(ForceField):
         self.extract_rotations(u)
         self._launch_with_rotations(self._von_mises, u, stress)
 
+    def _sharing(self) -> Rotations:
+        """Who uses whose rotation; made on first use, since own rotations need none of it for their forces."""
+        if self._shared is None:
+            mesh, level = self.body.mesh, self.model.rotation_level
+            units, unit = self.elements, np.arange(self.element_count)
+            count = self.element_count
+            if isinstance(mesh, TetForest) and level is not None:
+                ancestors, unit = np.unique(mesh.ancestors(level), return_inverse=True)
+                units, count = forest_elements(mesh, ancestors, self.device), len(ancestors)
+            self._shared = Rotations(
+                units,
+                count,
+                wp.empty(count, dtype=wp.mat33, device=self.device),
+                wp.array(unit.ravel(), dtype=wp.int32, device=self.device),
+            )
+        return self._shared
+
     def _launch_with_rotations(self, kernel: wp.Kernel, u: wp.array, output: wp.array) -> None:
-        inputs = [self.elements, *self.material_inputs, u, self._rotations, self._unit]
+        shared = self._sharing()
+        inputs = [self.elements, *self.material_inputs, u, shared.rotations, shared.unit]
         self.launch(kernel, self.element_count, inputs, [output])
+
+
+class SubtreeField(CorotatedField):
+    """The fast path: complete subtrees in batches, leaf by leaf only what is left over."""
+
+    def __init__(self, body: SoftBody, model: Corotated):
+        super().__init__(body, model)
+        assert isinstance(body.mesh, TetForest)
+        self.plan = ForcePlan.of_forest(body.mesh, model.rotation_level, self.device)
+        self._uniform = body.material_stride == 0
+        self._kernels = [self._kernel(batch) for batch in self.plan.batches]
+        above = [batch.sharing is Sharing.ABOVE for batch in self.plan.batches]
+        self._needs_rotations = model.rotation_level is not None and (any(above) or len(self.plan.flat) > 0)
+        nothing = wp.empty(0, dtype=wp.int32, device=self.device)
+        no_rotations = wp.empty(0, dtype=wp.mat33, device=self.device)
+        self._rotations = self._sharing().rotations if self._needs_rotations else no_rotations
+        self._batch_units = [
+            self._units_of(batch) if is_above else nothing
+            for batch, is_above in zip(self.plan.batches, above, strict=True)
+        ]
+        if len(self.plan.flat):
+            flat = self.plan.flat
+            self._flat_elements = forest_elements(body.mesh, body.mesh.tree.leaves[flat], self.device)
+            self._flat_material = self.material_inputs
+            if not self._uniform:
+                self._flat_material = [
+                    wp.array(a.numpy()[flat], dtype=wp.float32, device=self.device) for a in (body.mu, body.lam)
+                ] + [1]
+            if self._needs_rotations:
+                unit = self._sharing().unit.numpy()[flat]
+                self._flat_unit = wp.array(unit, dtype=wp.int32, device=self.device)
+
+    def add_forces(self, u: wp.array, f: wp.array) -> None:
+        if self._needs_rotations:
+            self.extract_rotations(u)
+        for batch, kernel, unit in zip(self.plan.batches, self._kernels, self._batch_units, strict=True):
+            self._launch_batch(batch, kernel, unit, u, f)
+        if len(self.plan.flat):
+            inputs = [self._flat_elements, *self._flat_material, u]
+            if self._needs_rotations:
+                inputs += [self._rotations, self._flat_unit]
+                self.launch(self._forces, len(self.plan.flat), inputs, [f])
+            else:
+                self.launch(self._own, len(self.plan.flat), inputs, [f])
+
+    def _kernel(self, batch: Batch) -> wp.Kernel:
+        given = batch.sharing is Sharing.ABOVE
+        if self.device.is_cuda:
+            if batch.sharing is Sharing.OWN:
+                return subtree_cuda.scatter_subtrees_own(batch.shape, batch.grouped, self._uniform)
+            return subtree_cuda.scatter_subtrees_shared(batch.shape, batch.grouped, self._uniform, given)
+        if batch.sharing is Sharing.OWN:
+            return subtree_cpu.scatter_subtrees_own(batch.shape)
+        return subtree_cpu.scatter_subtrees_shared(batch.shape, given)
+
+    def _units_of(self, batch: Batch) -> wp.array:
+        """Which of the extracted rotations each subtree uses."""
+        unit = self._sharing().unit.numpy()[batch.subtrees.first.numpy()]
+        return wp.array(unit, dtype=wp.int32, device=self.device)
+
+    def _launch_batch(self, batch: Batch, kernel: wp.Kernel, unit: wp.array, u: wp.array, f: wp.array) -> None:
+        body = self.body
+        if self.device.is_cuda:
+            threads, block = batch.count, subtree_cuda.BLOCK
+            inputs = [batch.subtrees, body.mu, body.lam, u]
+        else:
+            threads, block = -(-batch.count // subtree_cpu.LANES), 256
+            inputs = [batch.subtrees, batch.count, *self.material_inputs, u]
+        if batch.sharing is not Sharing.OWN:
+            inputs += [self._rotations, unit]
+        wp.launch(kernel, dim=threads, inputs=inputs, outputs=[f, batch.flagged], device=self.device, block_dim=block)
+        if batch.sharing is Sharing.OWN:
+            repair = [batch.flagged, batch.subtrees.first, self.elements, *self.material_inputs, u]
+            self.launch(subtree_cuda.repair_own, batch.count, repair, [f])
+        elif batch.sharing is Sharing.ROOT:
+            repair = [batch.flagged, batch.subtrees.first, batch.roots, self.elements, *self.material_inputs, u]
+            self.launch(subtree_cuda.repair_shared, batch.count, repair, [f])
