@@ -86,7 +86,7 @@ def force_case(problem: Problem) -> Case:
         wp.array(elements.tets, dtype=wp.int32, device=device),
         wp.array(elements.poses, dtype=wp.mat33, device=device),
         wp.zeros(count, dtype=wp.float32, device=device),
-        wp.array(np.tile(np.float32([problem.mu, problem.lam, 0.0]), (count, 1)), dtype=wp.float32, device=device),
+        wp.array(np.tile([problem.mu, problem.lam, 0.0], (count, 1)), dtype=wp.float32, device=device),
     ]
 
     def run() -> None:

@@ -229,12 +229,12 @@ def put_back(body: wc.SoftBody, start: wp.array) -> None:
 
 def step_error(sim: wc.Simulation, start: wp.array, sample: Sample, forces: np.ndarray) -> float:
     """What one damped step from ``start`` at rest is off by, against nodal forces [n, 3] on the sample's nodes."""
-    body, integrator = sim.body, sim.integrator
+    body = sim.body
     put_back(body, start)
     before = start.numpy()[sample.nodes, :3].astype(float)
     sim.advance_steps(1)
     moved = body.displacements.numpy()[sample.nodes] - before
     mass = sample.masses(float(body.material.density))[:, None]
-    velocity = sim.dt * (forces / mass + np.asarray(sim.gravity)) / (1.0 + sim.dt * integrator.damping)
+    velocity = sim.dt * (forces / mass + np.asarray(sim.gravity)) / (1.0 + sim.dt * DAMPING)
     velocity[body.constrained[sample.nodes]] = 0.0
     return relative_error(moved, sim.dt * velocity)

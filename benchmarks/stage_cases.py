@@ -75,7 +75,7 @@ def _warm_case(problem: Problem) -> Case:
     elements = forest_elements(problem.mesh, units, problem.device)
     count = len(units)
     rotations = wp.zeros(count, dtype=wp.mat33, device=problem.device)
-    quaternions = wp.array(np.tile(np.float32([0, 0, 0, 1]), (count, 1)), dtype=wp.quat, device=problem.device)
+    quaternions = wp.array(np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), dtype=wp.quat, device=problem.device)
     kernel = extract_warm_rotations(ForestElements)
     rng = np.random.default_rng(2)
     moved = problem.u + (1e-3 * problem.edge * rng.uniform(-1, 1, problem.u.shape)).astype(np.float32)

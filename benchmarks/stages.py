@@ -18,9 +18,9 @@ from warp_corot.kernels.elements import (
     frame,
     local_gradient,
     mirror_sign,
+    node_displacements,
     rest_volume,
     shape_of,
-    xyz,
 )
 from warp_corot.kernels.rotation import identity3
 from warp_corot.kernels.stiffness import stiffness_product, vec12
@@ -88,21 +88,19 @@ def square_product_forces(skip_zeros: bool) -> wp.Kernel:
         squares: wp.array[wp.float32],
     ):
         t = wp.tid()
-        nodes = elements.nodes[t]
         code = elements.code[t]
         shape = shape_of(code)
         h = edge_length(elements, t)
         q = frame(elements, t) * wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, mirror_sign(code))
         r = rotations[unit[t]] * q
-        origin = xyz(u[nodes[0]])
         turned = wp.transpose(r) * q - identity3()
         x0 = rest_shape(shape)
-        z = vec12()
-        for n in range(4):
-            d = turned * (x0[n] * h) + wp.transpose(r) * (xyz(u[nodes[n]]) - origin)
-            z[3 * n] = d[0]
-            z[3 * n + 1] = d[1]
-            z[3 * n + 2] = d[2]
+        u0, u1, u2, u3 = node_displacements(elements.nodes[t], u)
+        d0 = turned * (x0[0] * h)
+        d1 = turned * (x0[1] * h) + wp.transpose(r) * (u1 - u0)
+        d2 = turned * (x0[2] * h) + wp.transpose(r) * (u2 - u0)
+        d3 = turned * (x0[3] * h) + wp.transpose(r) * (u3 - u0)
+        z = vec12(d0[0], d0[1], d0[2], d1[0], d1[1], d1[2], d2[0], d2[1], d2[2], d3[0], d3[1], d3[2])
         y = vec12()
         m = mu[0] * h
         k = lam[0] * h
