@@ -1,8 +1,8 @@
 """Corotated forces of complete subtrees on the CPU: eight subtrees side by side in the lanes of vector registers.
 
 What a CPU core lacks is vectorisation. So the ten nodes of eight subtrees of one type are gathered into arrays of
-lanes, one loop goes over the eight leaves, and forces are scattered once at the end. The iteration, the units and the
-flags are those of ``subtree_cuda``.
+lanes, one loop goes over the eight leaves, and forces are scattered once at the end. The iteration is
+``rotation.newton_rotation``, the units and the flags are those of ``subtree_cuda``.
 
 The lanes are the compiler's own vector type, in native code generated from the tables of ``subtree``: it compiles in
 about a second, depends on no optimiser to find the vectors, and so is right and fast whatever its flags. The same in
@@ -14,10 +14,11 @@ import functools
 import warp as wp
 
 from .elements import FRAME_SHIFT, LEVEL_MASK, MIRROR_BIT
+from .rotation import FLAT, ITERATIONS, UNCONVERGED
 from .shapes import SQRT2, VOLUME
 from .stiffness import Coefficients
 from .subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS, stiffness
-from .subtree_cuda import FLAT, ITERATIONS, UNCONVERGED, Subtrees
+from .subtree_cuda import Subtrees
 
 wp.set_module_options({"enable_backward": False})
 

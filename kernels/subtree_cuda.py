@@ -2,12 +2,11 @@
 
 Three things make it fast. Forces are summed over the eight leaves in registers, and over a group of eight subtrees in
 shared memory, by a table that tells each lane which slots to add up, so that nothing is added atomically twice. What
-leaves for global memory are 16-byte vector reductions where the card has them. And the rotation iteration runs
-unscaled on Z = s X with s doubling in every step, X <- (X + X^-T)/2 becoming Z <- Z + (s^2 / det Z) cof Z: one
-multiply-add a component.
+leaves for global memory are 16-byte vector reductions where the card has them. And rotations are found by four unscaled
+iterations (``rotation.newton_rotation``).
 
-Four iterations are enough for principal stretches between 0.45 and 2.2. A subtree with a leaf beyond that, or with one
-that is flat or inverted, adds nothing and is flagged; ``repair`` does flagged subtrees with the robust rotation.
+A subtree with a leaf that these do not turn, strongly stretched, flat or inverted, adds nothing and is flagged;
+``repair_own`` and ``repair_shared`` do flagged subtrees with the robust rotation.
 """
 
 import functools
@@ -28,7 +27,7 @@ from .elements import (
     mirror_sign,
     scatter_stress,
 )
-from .rotation import byers_xu, column
+from .rotation import ITERATIONS, byers_xu, column, newton_rotation
 from .shapes import VOLUME, fingerprint
 from .subtree import (
     FRAMES,
@@ -44,13 +43,6 @@ from .subtree import (
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 128
-ITERATIONS = 4
-
-# det F below which a leaf is handed to the robust rotation, and det X - 1 before the last iteration beyond which it has
-# not converged: the rotation's error is at most half the square of that.
-FLAT = wp.constant(0.03)
-UNCONVERGED = wp.constant(1.0e-3)
-
 mat10 = wp.types.matrix(shape=(10, 3), dtype=wp.float32)
 
 
@@ -66,18 +58,6 @@ class Subtrees:
     first: wp.array[wp.int32]  # [subtrees] its first leaf among the mesh's elements
     frames: wp.array[wp.mat33]  # as ForestElements
     size: wp.array[wp.float32]
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    float r;
-    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x));
-    return r;
-#else
-    return 1.0f / x;
-#endif
-""")
-def reciprocal(x: float) -> float: ...
 
 
 def _numbers(values: list[int]) -> str:
@@ -252,30 +232,6 @@ def _deformed(shape: int) -> wp.Function:
         return y
 
     return deformed
-
-
-@wp.func
-def newton_rotation(c0: wp.vec3, c1: wp.vec3, c2: wp.vec3, handedness: float):
-    """Z = 2^ITERATIONS R of the columns of F, and whether it may be trusted."""
-    z0 = c0
-    z1 = c1
-    z2 = c2
-    det = float(0.0)
-    trusted = bool(True)
-    for iteration in range(wp.static(ITERATIONS)):
-        a0 = wp.cross(z1, z2)
-        a1 = wp.cross(z2, z0)
-        a2 = wp.cross(z0, z1)
-        det = wp.dot(z0, a0)
-        if wp.static(iteration == 0):
-            trusted = handedness * det > FLAT
-        r = wp.static(4.0**iteration) * reciprocal(det)
-        if wp.static(iteration == ITERATIONS - 1):
-            trusted = trusted and handedness * det < (1.0 + UNCONVERGED) * wp.static(8.0**iteration)
-        z0 = z0 + r * a0
-        z1 = z1 + r * a1
-        z2 = z2 + r * a2
-    return z0, z1, z2, trusted
 
 
 @functools.cache

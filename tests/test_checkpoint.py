@@ -64,7 +64,8 @@ def test_a_resumed_run_is_the_uninterrupted_one(device, tmp_path, make, model):
         a, b = getattr(whole.body, name).numpy(), getattr(resumed.body, name).numpy()
         if whole.device.is_cpu:
             np.testing.assert_array_equal(a, b, err_msg=name)
-        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4 * np.abs(a).max(), err_msg=name)
+        # Float atomics add in any order on CUDA; 150 undamped steps let that grow.
+        np.testing.assert_allclose(a, b, rtol=0, atol=5e-3 * np.abs(a).max(), err_msg=name)
 
 
 def test_several_bodies_are_kept(tmp_path):

@@ -20,6 +20,7 @@ from ..kernels.corotated import (
     scatter_own_rotation,
     scatter_with_rotations,
 )
+from ..kernels.rotation import byers_xu, quick_rotation
 from ..mesh import TetForest
 from ..mesh.forest import MAX_LEVEL
 from ..plan import Batch, ForcePlan, Sharing
@@ -115,6 +116,8 @@ class CorotatedField(ForceField):
             self._extract = extract_warm_rotations(kind)
         else:
             rotation = rotation_function(model.rotation, model.iterations)
+            if rotation is byers_xu:
+                rotation = quick_rotation
             self._extract = extract_rotations(kind, rotation)
             self._own = scatter_own_rotation(kind, rotation)
         if model.stiffness == "factored":
