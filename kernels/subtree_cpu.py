@@ -30,6 +30,7 @@ LANES = 8
 # Vectors, triples of them, and the tables of one type. Nodes are read and written three components at 3 * node.
 _PRELUDE = """
     typedef float lanes8 __attribute__((vector_size(32), aligned(4)));
+    typedef int masks8 __attribute__((vector_size(32)));
     struct triple { lanes8 x, y, z; };
     const auto plus = [](const triple& a, const triple& b) { return triple{a.x + b.x, a.y + b.y, a.z + b.z}; };
     const auto minus = [](const triple& a, const triple& b) { return triple{a.x - b.x, a.y - b.y, a.z - b.z}; };
@@ -78,36 +79,35 @@ _GATHER = f"""
             g[3 * k + axis] = spread(0.0f);
         }}
     }}
-    lanes8 distrust = spread(-1.0f);
+    masks8 trusted = h > 0.0f;
 """
 
-# Z = 2^ITERATIONS R of the columns of F, and a number above zero in the lanes that may not be trusted.
+# Z = 2^ITERATIONS R of the columns of F, and a mask of the lanes that may be trusted: false where NaN comes in.
 _NEWTON = f"""
     const auto newton = [&](triple a, triple b, triple c, const lanes8& handedness, triple* z) {{
-        lanes8 det = spread(0.0f), doubt = spread(0.0f);
+        lanes8 det = spread(0.0f);
+        masks8 sound = det > 0.0f;
         float s2 = 1.0f;
         for (int iteration = 0; iteration < {ITERATIONS}; ++iteration) {{
             const triple p = cross(b, c), q = cross(c, a), r = cross(a, b);
             det = dot(a, p);
-            if (iteration == 0) doubt = {float(FLAT)!r}f - handedness * det;
+            if (iteration == 0) sound = handedness * det > {float(FLAT)!r}f;
             const lanes8 w = s2 / det;
             a = plus(a, scaled(w, p)); b = plus(b, scaled(w, q)); c = plus(c, scaled(w, r));
             s2 *= 4.0f;
         }}
-        const lanes8 excess = handedness * det - {8.0 ** (ITERATIONS - 1) * (1.0 + float(UNCONVERGED))!r}f;
         z[0] = a; z[1] = b; z[2] = c;
-        return doubt > excess ? doubt : excess;
+        return sound & (handedness * det < {8.0 ** (ITERATIONS - 1) * (1.0 + float(UNCONVERGED))!r}f);
     }};
 """
 
-# Add the forces of the subtrees that are to be trusted and flag the others; written so that NaN is distrusted too.
+# Add the forces of the subtrees that are to be trusted and flag the others.
 _SCATTER = """
     const int end = wp::min(8, count - first_subtree);
     for (int lane = 0; lane < end; ++lane) {
         const int s = first_subtree + lane;
-        const bool trusted = distrust[lane] <= 0.0f;
-        flagged.data[s] = trusted ? 0 : 1;
-        if (!trusted) continue;
+        flagged.data[s] = trusted[lane] ? 0 : 1;
+        if (!trusted[lane]) continue;
         const int* node = subtrees.nodes.data + 10 * s;
         for (int k = 0; k < 10; ++k) {
             wp::vec_t<4, wp::float32>& sum = f.data[node[k]];
@@ -185,8 +185,7 @@ def _own_snippet(shape: int) -> str:
     #pragma clang loop unroll(disable)
     for (int leaf = 0; leaf < 8; ++leaf) {{{_MATERIAL}{_columns(shape, "nodes_of[leaf]")}
         triple z[3];
-        const lanes8 doubt = newton(a, b, c, hand[leaf][0] * mirror, z);
-        distrust = doubt > distrust ? doubt : distrust;
+        trusted &= newton(a, b, c, hand[leaf][0] * mirror, z);
         // With a rotation, R sym(R^T F) = F: P = 2 mu (F - R) + lambda tr(R^T F - I) R.
         const lanes8 trace = {inverse!r}f * (dot(z[0], a) + dot(z[1], b) + dot(z[2], c));
         const lanes8 from_f = 2.0f * m * area;
@@ -234,7 +233,7 @@ def _shared_snippet(shape: int, given: bool) -> str:
     {{
         static const int corners[4] = {{0, 1, 2, 3}};{_columns(shape, "corners")}
         // The subtree's edge is two of a leaf's.
-        distrust = newton(scaled(spread(0.5f), a), scaled(spread(0.5f), b), scaled(spread(0.5f), c), mirror, turn);
+        trusted = newton(scaled(spread(0.5f), a), scaled(spread(0.5f), b), scaled(spread(0.5f), c), mirror, turn);
         for (int column = 0; column < 3; ++column) turn[column] = scaled(spread({0.5**ITERATIONS!r}f), turn[column]);
     }}
 """

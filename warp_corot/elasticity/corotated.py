@@ -40,7 +40,8 @@ class Corotated(Model):
     With every element's own rotation the force is the gradient of W and conserves linear and angular momentum. Shared
     rotations are cheaper; they conserve linear momentum only.
 
-    With the defaults, forests take the fast path: complete three-level subtrees as units of work.
+    With the defaults, forests take the fast path: complete three-level subtrees as units of work. Any other rotation,
+    iterations or stiffness goes leaf by leaf.
 
     Attributes:
         rotation_level: None: every element has its own rotation. An int: the rotation of the ancestor at that level of
@@ -49,6 +50,7 @@ class Corotated(Model):
         iterations: For "byers-xu": None iterates to the paper's tolerance 3.85e-5, an int 2 to 12 that often.
         stiffness: "factored" (sums and differences), "sparse" (the paper's explicit K_T by type, zeros skipped) or
             "dense" (the same with all 144 products); the last two for forests only. All agree to rounding.
+        subtrees: False: leaf by leaf also where the fast path could be taken, as the paper has it; for comparison.
 
     Raises:
         InputError: An option is none of these.
@@ -60,6 +62,7 @@ class Corotated(Model):
     rotation: str = "byers-xu"
     iterations: int | None = None
     stiffness: str = "factored"
+    subtrees: bool = True
 
     def __post_init__(self) -> None:
         level = self.rotation_level
@@ -74,7 +77,8 @@ class Corotated(Model):
 
     def bind(self, body: SoftBody) -> CorotatedField:
         if isinstance(body.mesh, TetForest):
-            if self.rotation == "byers-xu" and self.iterations is None and self.stiffness == "factored":
+            plain = self.rotation == "byers-xu" and self.iterations is None and self.stiffness == "factored"
+            if plain and self.subtrees:
                 return SubtreeField(body, self)
         elif self.rotation_level is not None:
             raise InputError(f"rotation_level {self.rotation_level} needs a forest; a general mesh has no tree")
@@ -116,7 +120,7 @@ class CorotatedField(ForceField):
             self._extract = extract_warm_rotations(kind)
         else:
             rotation = rotation_function(model.rotation, model.iterations)
-            if rotation is byers_xu:
+            if rotation is byers_xu and model.subtrees:
                 rotation = quick_rotation
             self._extract = extract_rotations(kind, rotation)
             self._own = scatter_own_rotation(kind, rotation)
