@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..io.whole import written_whole
 from .paper import Results
 from .report import device_name
 
@@ -52,9 +52,5 @@ def tidy(ax: Axes) -> None:
 
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, aside and renamed."""
-    part = path.with_name(f".{path.name}.part")
-    try:
+    with written_whole(path) as part:
         figure.savefig(part, format="png", dpi=DPI)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
-from warp_corot.errors import InputError
+from ..errors import InputError
 
 
 @dataclass(frozen=True)

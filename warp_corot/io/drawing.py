@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from warp_corot.errors import InputError
-from warp_corot.io.colors import TISSUE, color_index, round_limit, srgb_to_linear, stress_colors
+from ..errors import InputError
+from .colors import TISSUE, color_index, round_limit, srgb_to_linear, stress_colors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

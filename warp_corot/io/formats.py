@@ -3,6 +3,7 @@
 import contextlib
 import io
 import logging
+import os
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -11,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_corot.errors import InputError
-from warp_corot.io.assets import find_asset
+from ..errors import InputError
+from .assets import find_asset
+from .usd_reader import read_usd_tets
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 
@@ -73,7 +75,7 @@ def load_tets(path: str | PathLike[str], scale: float = 1.0) -> LoadedMesh:
     except OSError as error:
         raise InputError(f"{source}: cannot be read ({error.strerror})") from None
 
-    reader = _read_usd if source.suffix.lower() in USD_SUFFIXES else _read_meshio
+    reader = read_usd_tets if source.suffix.lower() in USD_SUFFIXES else _read_meshio
     points, tets, up_axis, metres = reader(source)
     if len(tets) == 0:
         raise InputError(f"{source}: has no tetrahedra")
@@ -87,13 +89,9 @@ def load_tets(path: str | PathLike[str], scale: float = 1.0) -> LoadedMesh:
     if not finite.all():
         bad = int(np.argmin(finite))
         raise InputError(f"{source}: point {bad} has coordinates {points[bad].tolist()}, should be finite")
-    return LoadedMesh(points, tets.astype(np.int32), up_axis, metres, asset.name if asset else source.stem, source)
-
-
-def _read_usd(path: Path) -> tuple[NDArray[np.float64], NDArray[Any], str, float]:
-    from warp_corot.io.usd_reader import read_usd_tets
-
-    return read_usd_tets(path)
+    # As UTF-8 whatever the locale is; what cannot be shown becomes a question mark.
+    name = asset.name if asset else os.fsencode(source.stem).decode("utf-8", "replace")
+    return LoadedMesh(points, tets.astype(np.int32), up_axis, metres, name, source)
 
 
 def _read_meshio(path: Path) -> tuple[NDArray[np.float64], NDArray[Any], str, float]:

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warp_corot.errors import InputError
-from warp_corot.io.colors import stress_colors
-from warp_corot.io.drawing import INK, Array, Camera, checked_surface, draw_body, value_limits
+from ..errors import InputError
+from .colors import stress_colors
+from .drawing import INK, Array, Camera, checked_surface, draw_body, value_limits
+from .whole import written_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -136,8 +137,8 @@ def render_strip(
         if picture.title:
             ax.set_title(picture.title, fontsize=11, color=INK, pad=4)
         all_axes.append(ax)
-    low = np.min([[ax.get_xlim()[0], ax.get_ylim()[0]] for ax in all_axes], axis=0)
-    high = np.max([[ax.get_xlim()[1], ax.get_ylim()[1]] for ax in all_axes], axis=0)
+    limits = np.array([[ax.get_xlim(), ax.get_ylim()] for ax in all_axes], dtype=np.float64)
+    low, high = limits[..., 0].min(axis=0), limits[..., 1].max(axis=0)
     if size is None:
         height = int(step * np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.3, 1.6)) + head
     figure.set_size_inches(width / 150.0, height / 150.0)
@@ -199,14 +200,10 @@ def _save(figure: "Figure", target: Path) -> None:
     """Writes aside and renames, so that a good picture is not lost to a failed one."""
     from PIL import Image
 
-    part = target.with_name(f".{target.name}.part")
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=2 * figure.dpi)  # twice as fine and averaged: smooth edges
     try:
-        drawn = io.BytesIO()
-        figure.savefig(drawn, format="png", dpi=2 * figure.dpi)  # twice as fine and averaged: smooth edges
-        with Image.open(drawn) as fine, part.open("wb") as file:
-            fine.convert("RGB").reduce(2).save(file, format="PNG")
-        os.replace(part, target)
+        with Image.open(drawn) as fine, written_whole(target) as part:
+            fine.convert("RGB").reduce(2).save(part, format="PNG")
     except OSError as error:
         raise OSError(f"{target}: cannot be written: {error.strerror or error}") from None
-    finally:
-        part.unlink(missing_ok=True)

@@ -10,7 +10,6 @@ and renamed over the final path, and the pieces are removed.
 import contextlib
 import os
 import re
-import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
@@ -19,14 +18,10 @@ from typing import IO, Any
 
 from pxr import Sdf, Tf, Vt
 
-from warp_corot.errors import InputError
+from ..errors import InputError
+from .usd_files import check_stage_path, is_locked, reason, take_lock, usd_name
+from .whole import sync
 
-try:
-    import fcntl
-except ImportError:  # Windows: two runs on one output are not told apart there
-    fcntl = None  # type: ignore[assignment]
-
-STAGE_SUFFIXES = (".usd", ".usda", ".usdc")
 # All that a run's folder ever holds; \w{6} is what OpenUSD's own temporary files end in.
 _OURS = re.compile(r"(piece|part)-\d{6}\.usdc|(part-)?(static|manifest|root|joined)\.usd[ac]?|part-\w+\.\w{6}|lock")
 _CLIP_SET = "default"
@@ -51,7 +46,7 @@ class PieceStore:
 
     def __init__(self, path: str | Path, *, flush_seconds: float = 2.0, flush_bytes: int = 256 << 20):
         self.path = Path(path)
-        _check_output(self.path)
+        check_stage_path(self.path)
         self.pieces_folder = self.path.with_name(self.path.name + ".pieces")
         self._run = self.pieces_folder / f"run-{uuid.uuid4().hex[:8]}"
         self._lock: IO[str] | None = None
@@ -190,7 +185,7 @@ class PieceStore:
         for index in range(len(self._pieces)):
             name = self._run / f"piece-{index:06d}.usdc"
             try:
-                piece = Sdf.Layer.OpenAsAnonymous(str(name))
+                piece = Sdf.Layer.OpenAsAnonymous(usd_name(name))
             except Tf.ErrorException:
                 piece = None
             if piece is None:
@@ -223,7 +218,7 @@ class PieceStore:
         """The small stage that plays the pieces; paths in it are relative, so folder and stage move together."""
         assert self._static is not None
         static = self._static
-        relative = f"./{self.pieces_folder.name}/{self._run.name}"
+        relative = f"./{usd_name(Path(self.pieces_folder.name, self._run.name))}"
         if self._root is None:
             root = self._root = Sdf.Layer.CreateAnonymous(self.path.suffix)
             for key in static.pseudoRoot.ListInfoKeys():
@@ -259,9 +254,8 @@ class PieceStore:
             self._lock = (self._run / "lock").open("w")
         except OSError as error:
             raise OSError(f"{self.path}: cannot make {self._run} ({error.strerror})") from None
-        if fcntl:
-            with contextlib.suppress(OSError):  # some network file systems have no locks
-                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with contextlib.suppress(OSError):  # some network file systems have no locks
+            take_lock(self._lock.fileno())
         self._write(self._static, self._run / "static.usdc")
         manifest = Sdf.Layer.CreateAnonymous(".usda")
         self._declare_varying(manifest)
@@ -273,13 +267,13 @@ class PieceStore:
         if part.name.startswith("part-piece-"):
             part = part.with_name(part.name.replace("part-piece-", "part-"))
         try:
-            if not layer.Export(str(part)):
+            if not layer.Export(usd_name(part)):
                 raise OSError(f"{self.path}: writing {part.name} failed")
-            _sync(part)
+            sync(part)
             os.replace(part, target)
-            _sync(target.parent)
+            sync(target.parent)
         except Tf.ErrorException as error:
-            raise OSError(f"{self.path}: cannot be written: {_reason(error)}") from None
+            raise OSError(f"{self.path}: cannot be written: {reason(error)}") from None
         except OSError as error:
             raise OSError(f"{self.path}: cannot be written: {error.strerror or error}") from None
         finally:
@@ -288,7 +282,7 @@ class PieceStore:
 
     def _refuse_second_writer(self, kind: type[Exception]) -> None:
         for run in self._other_runs():
-            if _is_locked(run / "lock"):
+            if is_locked(run / "lock"):
                 raise kind(f"{self.path}: another process is writing it (its pieces are in {run})")
 
     def _other_runs(self) -> list[Path]:
@@ -299,7 +293,7 @@ class PieceStore:
     def _remove_stale_runs(self) -> None:
         """Removes what killed runs on this path left: nothing plays it any more."""
         for run in self._other_runs():
-            if not _is_locked(run / "lock"):
+            if not is_locked(run / "lock"):
                 self._remove_run(run)
 
     def _remove_run(self, run: Path) -> None:
@@ -321,58 +315,7 @@ class PieceStore:
         self._pending, self._root = [], None
 
 
-def _check_output(path: Path) -> None:
-    """Says before the simulation begins what would stop its result from being written."""
-    if path.suffix.lower() not in STAGE_SUFFIXES:
-        raise InputError(f"{path}: extension {path.suffix or '(none)'}, should be {', '.join(STAGE_SUFFIXES)}")
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder, should be a file name")
-    folder = path.parent
-    if not folder.is_dir():
-        raise InputError(f"{path}: output folder {folder} {'is a file' if folder.exists() else 'is not there'}")
-    if path.exists() and not os.access(path, os.W_OK):
-        raise InputError(f"{path}: is write-protected")
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise InputError(f"{path}: output folder {folder} cannot be written to ({error.strerror})") from None
-
-
-def _is_locked(lock: Path) -> bool:
-    """Whether a living process holds a lock file; the system frees the locks of dead ones."""
-    if not fcntl:
-        return False
-    try:
-        with lock.open("r+") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
-    return False
-
-
 def _set_time_range(layer: Sdf.Layer, time_code: float) -> None:
     if not layer.HasStartTimeCode():
         layer.startTimeCode = time_code
     layer.endTimeCode = time_code
-
-
-def _reason(error: Tf.ErrorException) -> str:
-    """The operating system's own words out of OpenUSD's many lines."""
-    found = re.search(r"Error occurred (?:writing|opening) file: ([^'\n]+)", str(error))
-    if found:
-        return found.group(1).strip()
-    lines = [line for line in str(error).splitlines() if line.strip()]
-    return " ".join((lines or ["unknown reason"])[0].split())
-
-
-def _sync(path: Path) -> None:
-    """Has the operating system put a file, or a folder's entries where it can, on the disk."""
-    with contextlib.suppress(OSError) if path.is_dir() else contextlib.nullcontext():
-        descriptor = os.open(path, os.O_RDONLY if os.name != "nt" else os.O_RDWR)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

@@ -4,8 +4,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pxr import Tf, Usd, UsdGeom
 
-from warp_corot.errors import InputError
+from ..errors import InputError
+from .usd_files import usd_name
 
 
 def read_usd_tets(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], str, float]:
@@ -23,10 +25,8 @@ def read_usd_tets(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], s
     Raises:
         InputError: The file is no USD stage, or has no tetrahedra, or their indices are not four to a tetrahedron.
     """
-    from pxr import Tf, Usd, UsdGeom
-
     try:
-        stage = Usd.Stage.Open(str(path))
+        stage = Usd.Stage.Open(usd_name(path))
     except Tf.ErrorException:
         raise InputError(f"{path}: is not a USD file that OpenUSD can open") from None
 
@@ -58,8 +58,6 @@ def read_usd_tets(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], s
 
 def _tet_indices(prim, path: Path) -> NDArray[np.int64] | None:
     """Tetrahedra [T, 4] of a prim, or None where it has none."""
-    from pxr import Usd, UsdGeom
-
     if prim.IsA(UsdGeom.TetMesh):
         attribute = UsdGeom.TetMesh(prim).GetTetVertexIndicesAttr()
     elif prim.IsA(UsdGeom.PointBased) and prim.HasAttribute("tetraIndices"):
@@ -81,8 +79,6 @@ def _tet_indices(prim, path: Path) -> NDArray[np.int64] | None:
 
 def _rest_points(prim, path: Path) -> NDArray[np.float64]:
     """Points [N, 3] of a prim at rest, in its own space."""
-    from pxr import Usd, UsdGeom
-
     attribute = UsdGeom.PointBased(prim).GetPointsAttr()
     value = attribute.Get()
     if value is None:

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, Vt
 
-from warp_corot.errors import InputError
-from warp_corot.io.colors import (
+from ..errors import InputError
+from ..mesh.surface import boundary_faces, signed_volumes
+from .colors import (
     COLORMAP_NAME,
     TISSUE,
     VertexAverage,
@@ -19,8 +20,7 @@ from warp_corot.io.colors import (
     srgb_to_linear,
     stress_colors,
 )
-from warp_corot.io.usd_pieces import PieceStore, Samples
-from warp_corot.mesh.surface import boundary_faces, signed_volumes
+from .usd_pieces import PieceStore, Samples
 
 ROOT, TETS, SURFACE = "/SoftBody", "/SoftBody/tetrahedra", "/SoftBody/surface"
 
