@@ -142,6 +142,8 @@ def test_bad_arguments(device):
         wc.polar_rotation(np.ones((5, 3, 2)), device=device)
     with pytest.raises(wc.InputError, match="iterations"):
         wc.polar_rotation(np.eye(3)[None], iterations=0, device=device)
+    with pytest.raises(wc.InputError, match="guess has shape"):
+        wc.polar_rotation(np.eye(3)[None], method="warm", guess=np.eye(4), device=device)
     with pytest.raises(wc.InputError, match="rotation"):
         wc.Corotated(rotation="newton")
     with pytest.raises(wc.InputError, match="level"):

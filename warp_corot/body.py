@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from .checks import check_float32
+from .device import checked_device
 from .elements import Mesh, device_elements, element_kind, parts
 from .errors import InputError
 from .indices import checked_indices
 from .kernels.integrate import adopt_positions, publish_positions
 from .materials import Isotropic
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """Keyframed displacements that a set of nodes follows, on the device."""
-
-    nodes: wp.array
-    times: wp.array
-    displacements: wp.array
+from .trajectory import Trajectory
 
 
 class SoftBody:
@@ -43,7 +35,8 @@ class SoftBody:
         masses: Lumped nodal masses [kg], float64 [N]; zero at nodes that no element names.
 
     Raises:
-        InputError: The device is not there, or a material array does not have one value per element.
+        InputError: The device is not there, a material array does not have one value per element, or stiffness, mass
+            or size are beyond the range of float32.
     """
 
     def __init__(self, mesh: Mesh, material: Isotropic, *, device: str | wp.Device | None = None):
@@ -55,10 +48,13 @@ class SoftBody:
             values = np.asarray(getattr(material, name))
             if values.ndim and len(values) != count:
                 raise InputError(f"{name} has {len(values)} entries; the mesh has {count} elements")
+        check_float32(2.0 * material.mu + np.abs(material.lam), "the stiffness 2 mu + |lambda|", "Pa")
+        check_float32(mesh.volumes, "the volume of an element", "m^3")
         self.element_kind = element_kind(mesh)
         self.elements = device_elements(mesh, self.device)
         self.mu, self.lam, self.material_stride = self._material_arrays()
         self.masses = lumped_masses(mesh, material)
+        check_float32(self.masses[self.masses > 0], "the mass of a node", "kg")
 
         n = len(mesh.points)
         self.node_rest = wp.array(_padded(mesh.points), dtype=wp.vec4, device=self.device)
@@ -186,7 +182,7 @@ class SoftBody:
             self._stop_following(chosen)
             self._constrain(chosen, values)
             return
-        trajectory = self._checked_trajectory(chosen, times, displacements)
+        trajectory = Trajectory.of_keys(chosen, times, displacements, self.device)
         self._stop_following(chosen)
         self._constrain(chosen, np.zeros(3))
         if len(chosen):
@@ -240,9 +236,12 @@ class SoftBody:
         return wp.array(np.ascontiguousarray(values), dtype=wp.float32, device=self.device)
 
     def _checked_vectors(self, values: npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:
-        given = np.asarray(values, dtype=np.float64)
+        given = np.asarray(values.numpy() if isinstance(values, wp.array) else values, dtype=np.float64)
         if given.shape != (self.node_count, 3):
             raise InputError(f"{name} has shape {given.shape}; it must be [{self.node_count}, 3]")
+        bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
+        if len(bad):
+            raise InputError(f"{name} of node {bad[0]} are {given[bad[0]].tolist()}; they must be finite")
         return given
 
     def _set_displacements(self, values: npt.NDArray[np.float64]) -> None:
@@ -270,42 +269,12 @@ class SoftBody:
         inverse[free] = 1.0 / self.masses[free]
         self.node_inverse_mass.assign(inverse.astype(np.float32))
 
-    def _checked_trajectory(self, chosen: np.ndarray, times, displacements) -> Trajectory:
-        if times is None or displacements is None:
-            raise InputError("prescribe needs both times and displacements")
-        t = np.asarray(times, dtype=np.float64)
-        d = np.asarray(displacements, dtype=np.float64)
-        if t.ndim != 1 or len(t) < 2 or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
-            raise InputError(f"times of shape {t.shape} must be at least two finite, increasing numbers")
-        if d.shape not in ((len(t), 3), (len(t), len(chosen), 3)) or not np.isfinite(d).all():
-            raise InputError(
-                f"displacements has shape {d.shape}; it must be finite, [{len(t)}, 3] or [{len(t)}, {len(chosen)}, 3]"
-            )
-        return Trajectory(
-            wp.array(chosen, dtype=wp.int32, device=self.device),
-            wp.array(t, dtype=wp.float64, device=self.device),
-            wp.array(d.reshape(len(t), -1, 3), dtype=wp.vec3, device=self.device),
-        )
-
     def _stop_following(self, chosen: np.ndarray) -> None:
         """Take nodes out of the trajectories they follow."""
-        kept = []
-        for trajectory in self.trajectories:
-            stays = ~np.isin(trajectory.nodes.numpy(), chosen)
-            if stays.all():
-                kept.append(trajectory)
-                continue
+        kept = [trajectory.without(chosen) for trajectory in self.trajectories]
+        if any(now is not before for now, before in zip(kept, self.trajectories, strict=True)):
+            self.trajectories = [trajectory for trajectory in kept if trajectory]
             self.revision += 1
-            if stays.any():
-                d = trajectory.displacements.numpy()
-                rows = d[:, stays] if d.shape[1] > 1 else d
-                nodes = trajectory.nodes.numpy()[stays]
-                kept.append(self._checked_trajectory(nodes, trajectory.times.numpy(), _squeezed(rows)))
-        self.trajectories = kept
-
-
-def _squeezed(rows: np.ndarray) -> np.ndarray:
-    return rows[:, 0] if rows.shape[1] == 1 else rows
 
 
 def _padded(vectors: np.ndarray) -> npt.NDArray[np.float32]:
@@ -328,20 +297,3 @@ def lumped_masses(mesh: Mesh, material: Isotropic) -> npt.NDArray[np.float64]:
         quarter = mesh.volumes[part] * density[part] / 4.0
         np.add.at(masses, mesh.tets[part].ravel(), np.repeat(quarter, 4))
     return masses
-
-
-def checked_device(device: str | wp.Device | None) -> wp.Device:
-    """The device of that name.
-
-    Raises:
-        InputError: There is no such device; the message lists those there are.
-    """
-    wp.init()
-    try:
-        found = wp.get_device(device)
-    except Exception:
-        found = None
-    if found is None:
-        there = ", ".join(str(d) for d in wp.get_devices())
-        raise InputError(f"there is no device {str(device)!r} here; there is: {there}")
-    return found

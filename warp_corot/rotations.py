@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from .body import checked_device
+from .device import checked_device
 from .errors import InputError
 from .kernels.polar import rotate_all, turn_all
 from .kernels.rotation import byers_xu, byers_xu_fixed, mcadams_svd
@@ -76,7 +76,10 @@ def polar_rotation(
     inputs = [wp.array(flat, dtype=wp.mat33, device=where)]
     if method == "warm":
         rotation_function("byers-xu" if iterations is None else method, iterations)
-        start = np.broadcast_to(np.eye(3) if guess is None else np.asarray(guess), flat.shape).astype(np.float32)
+        given = np.asarray(np.eye(3) if guess is None else guess, dtype=np.float32)
+        if given.shape not in ((3, 3), flat.shape):
+            raise InputError(f"guess has shape {given.shape}; it must be [{len(flat)}, 3, 3]")
+        start = np.broadcast_to(given, flat.shape)
         inputs.append(wp.array(np.ascontiguousarray(start), dtype=wp.mat33, device=where))
         kernel = turn_all
     else:

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
 import warp as wp
 
 from ..elasticity import ForceField
@@ -15,6 +16,10 @@ from .integrator import Integrator, StepContext, Stepper
 
 if TYPE_CHECKING:
     from ..body import SoftBody
+
+
+#: The shortest step that float32 holds with all its digits [s].
+SHORTEST = float(np.finfo(np.float32).tiny)
 
 
 @dataclass(frozen=True)
@@ -33,8 +38,10 @@ class SymplecticEuler(Integrator):
     damping: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.dt is not None and not (math.isfinite(self.dt) and self.dt > 0):
-            raise InputError(f"dt is {self.dt}; it must be a positive number of seconds, or None")
+        if self.dt is not None and not (math.isfinite(self.dt) and self.dt >= SHORTEST):
+            raise InputError(
+                f"dt is {self.dt}; it must be a positive number of seconds, at least {SHORTEST:.2g}, or None"
+            )
         if not (math.isfinite(self.damping) and self.damping >= 0):
             raise InputError(f"damping is {self.damping}; it must be zero or a positive rate in 1/s")
 
