@@ -1,5 +1,7 @@
 """A resumed run is the run that was never interrupted; a checkpoint is whole or not there."""
 
+import contextlib
+import json
 import os
 import resource
 import subprocess
@@ -133,6 +135,41 @@ def test_other_archives_and_pickles_are_refused(tmp_path):
     for name in ("other.npz", "pickle.npz"):
         with pytest.raises(wc.InputError, match="not a whole checkpoint"):
             wc.Simulation.load(tmp_path / name)
+
+
+def test_damaged_archives_are_refused(tmp_path, rng):
+    """A bit turned anywhere, or a part left out, is found; nothing but an ``InputError`` comes of it."""
+    sim = wc.Simulation(forest_body("cpu"))
+    path, other = tmp_path / "state.npz", tmp_path / "damaged.npz"
+    sim.save(path)
+    whole = path.read_bytes()
+    for _ in range(60):
+        damaged = bytearray(whole)
+        damaged[rng.integers(len(whole))] ^= 1 << rng.integers(8)
+        other.write_bytes(damaged)
+        with contextlib.suppress(wc.InputError):  # a bit of a date does not matter
+            assert wc.Simulation.load(other).steps == 0
+    with np.load(path) as archive:
+        parts = dict(archive)
+    header = json.loads(parts["header"].tobytes())
+    variants = [{k: v for k, v in parts.items() if k != name} for name in parts if "loads" not in name]
+    for name in header:
+        less = json.dumps({k: v for k, v in header.items() if k != name}).encode()
+        variants.append(parts | {"header": np.frombuffer(less, np.uint8)})
+    for variant in variants:
+        np.savez(other, **variant)
+        with pytest.raises(wc.InputError, match="not a whole checkpoint"):
+            wc.Simulation.load(other)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="POSIX permissions")
+def test_others_may_read_what_the_umask_lets_them(tmp_path):
+    before = os.umask(0o022)
+    try:
+        wc.Simulation(forest_body("cpu")).save(tmp_path / "state.npz")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "state.npz").stat().st_mode & 0o777 == 0o644
 
 
 def test_a_missing_folder_is_named(tmp_path):

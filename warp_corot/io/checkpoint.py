@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
-import tempfile
 import warnings
 import zipfile
+import zlib
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -22,9 +21,13 @@ from ..materials import Isotropic
 from ..mesh import TetForest, TetMesh, Tree
 from ..simulation import Simulation
 from ..solvers import INTEGRATORS
+from .whole import written_whole
 
 FORMAT = "warp-corot checkpoint"
 VERSION = 1
+
+#: What reading a damaged archive raises.
+DAMAGE = (EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
 
 
 def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
@@ -70,8 +73,9 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
             arrays[prefix + "loads"] = body.node_loads.numpy()
         for k, trajectory in enumerate(body.trajectories):
             arrays[f"{prefix}trajectory{k}.nodes"] = trajectory.nodes.numpy()
-            arrays[f"{prefix}trajectory{k}.times"] = trajectory.times.numpy()
-            arrays[f"{prefix}trajectory{k}.displacements"] = trajectory.displacements.numpy()
+            times, displacements = trajectory.keys()
+            arrays[f"{prefix}trajectory{k}.times"] = times
+            arrays[f"{prefix}trajectory{k}.displacements"] = displacements
         for name, array in field.state.items():
             arrays[f"{prefix}field.{name}"] = array.numpy()
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
@@ -83,16 +87,27 @@ def load_checkpoint(path: str | PathLike[str], device: str | wp.Device | None = 
     source = Path(path)
     if not source.is_file():
         raise InputError(f"there is no checkpoint {source}")
+    what = f"{source} is not a whole checkpoint of warp_corot"
     try:
         with np.load(source, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         header = json.loads(arrays["header"].tobytes())
+        newer = header["version"] > VERSION
         if header["format"] != FORMAT:
-            raise KeyError("format")
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{source} is not a whole checkpoint of warp_corot") from error
-    if header["version"] > VERSION:
+            raise InputError(what)
+    except DAMAGE as error:
+        raise InputError(what) from error
+    if newer:
         raise InputError(f"{source} is of version {header['version']}; this warp_corot reads up to version {VERSION}")
+    try:
+        return _rebuilt_simulation(header, arrays, device)
+    except (LookupError, TypeError) as error:
+        raise InputError(f"{what}: {error} is missing or wrong") from error
+
+
+def _rebuilt_simulation(
+    header: dict[str, Any], arrays: dict[str, np.ndarray], device: str | wp.Device | None
+) -> Simulation:
     bodies, models = [], []
     for number, described in enumerate(header["bodies"]):
         prefix = f"body{number}."
@@ -102,11 +117,10 @@ def load_checkpoint(path: str | PathLike[str], device: str | wp.Device | None = 
         body.fix(arrays[prefix + "constrained"])
         for k in range(described["trajectories"]):
             motion = f"{prefix}trajectory{k}."
-            keys = arrays[motion + "displacements"]
             body.prescribe(
                 arrays[motion + "nodes"],
                 times=arrays[motion + "times"],
-                displacements=keys[:, 0] if keys.shape[1] == 1 else keys,
+                displacements=arrays[motion + "displacements"],
             )
         if prefix + "loads" in arrays:
             body.load(np.arange(body.node_count), arrays[prefix + "loads"][:, :3])
@@ -168,16 +182,7 @@ def _unpack_mesh(described: dict[str, Any], prefix: str, arrays: dict[str, np.nd
 
 def _write_whole(target: Path, arrays: dict[str, np.ndarray]) -> None:
     try:
-        handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
-    except OSError as error:
-        raise InputError(f"cannot save {target}: {error.strerror}") from error
-    try:
-        with os.fdopen(handle, "wb") as file:
+        with written_whole(target) as part, part.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(name, target)
     except OSError as error:
-        raise InputError(f"cannot save {target}: {error.strerror}") from error
-    finally:
-        Path(name).unlink(missing_ok=True)
+        raise InputError(f"cannot save {target}: {error.strerror or error}") from error
