@@ -111,6 +111,23 @@ def test_keyframes_are_followed_and_then_held(device):
     np.testing.assert_allclose(sim.body.velocities.numpy()[top], 0, atol=1e-5)
 
 
+def test_nodes_let_go_of_keyframes_leave_the_others_to_them(device):
+    sim = bar(device, gravity=(0, 0, 0), damping=20.0, dt=5e-4)
+    top = np.flatnonzero(sim.body.mesh.points[:, 2] > 0.2 - 1e-9)
+    keys = np.zeros((2, len(top), 3))
+    keys[1, :, 0] = np.linspace(0.01, 0.02, len(top))
+    sim.body.prescribe(top, times=[0.0, 0.1], displacements=keys)
+    sim.advance(0.05)
+    sim.body.release(top[::2])
+    sim.body.fix(top[1:2])
+    sim.advance(0.1)
+    moved = (sim.body.positions.numpy() - sim.body.mesh.points)[top]
+    np.testing.assert_allclose(moved[3::2], keys[1, 3::2], atol=1e-6)
+    np.testing.assert_allclose(moved[1], keys[1, 1] / 2, atol=1e-6)
+    assert (np.abs(moved[::2] - keys[1, ::2]).max(axis=1) > 1e-4).all()
+    assert not sim.body.constrained[top[::2]].any()
+
+
 def test_positions_written_by_the_user_are_where_the_next_step_starts(device):
     sim = bar(device, gravity=(0, 0, 0), fixed=False)
     moved = sim.body.mesh.points + np.array([0.3, -0.2, 0.1])
@@ -183,6 +200,37 @@ def test_hooks_are_called_after_every_nth_step(device):
     assert [steps for steps, _ in seen] == [10, 20, 30]
     assert seen[0][1] == pytest.approx(10 * 5e-4)
     assert all_steps == list(range(1, 32))
+
+
+def test_steps_that_a_hook_makes_count(device):
+    sim = bar(device, dt=5e-4)
+    seen = []
+
+    def also(s):
+        seen.append(s.steps)
+        if s.steps == 10:
+            s.advance_steps(7)
+
+    sim.on_step(also, every=5)
+    sim.advance_steps(30)
+    assert sim.steps == 30
+    assert seen == [5, 10, 15, 20, 25, 30]
+
+
+def test_an_error_in_a_hook_leaves_a_state_to_go_on_from(device):
+    sim, other = bar(device, dt=5e-4), bar(device, dt=5e-4)
+
+    def fail(s):
+        if s.steps == 7:
+            raise ZeroDivisionError
+
+    sim.on_step(fail, every=7)
+    with pytest.raises(ZeroDivisionError):
+        sim.advance_steps(20)
+    assert sim.steps == 7
+    sim.advance_steps(13)
+    other.advance_steps(20)
+    np.testing.assert_allclose(sim.body.positions.numpy(), other.body.positions.numpy(), atol=1e-6)
 
 
 def test_a_hook_may_change_loads_and_constraints(device):
@@ -265,6 +313,11 @@ BODY_MISTAKES = {
         "displacements has shape",
     ),
     "positions of the wrong shape": (lambda b: setattr(b, "positions", np.zeros((2, 3))), "positions has shape"),
+    "positions not finite": (lambda b: setattr(b, "positions", b.mesh.points * np.nan), "positions of node 0 are"),
+    "velocities not finite": (
+        lambda b: setattr(b, "velocities", np.where(np.arange(b.node_count)[:, None] == 3, np.inf, b.mesh.points)),
+        r"velocities of node 3 are \[inf, inf, inf\]",
+    ),
 }
 
 
@@ -278,6 +331,17 @@ def test_mistakes_with_a_body_are_named(mistake):
 
 SIMULATION_MISTAKES = {
     "nothing to simulate": (lambda b: wc.Simulation([]), "at least one body"),
+    "one body twice": (lambda b: wc.Simulation([b, b]), "given twice"),
+    "no body": (lambda b: wc.Simulation(b.mesh), "body is TetForest"),
+    "a model's name": (lambda b: wc.Simulation(b, model="linear"), "model is 'linear'; it must be a model such as"),
+    "a model's class": (lambda b: wc.Simulation(b, model=wc.Linear), "it must be a model such as"),
+    "an integrator's class": (lambda b: wc.Simulation(b, integrator=wc.SymplecticEuler), "it must be an integrator"),
+    "a word for gravity": (lambda b: wc.Simulation(b, gravity="down"), "gravity is 'down'"),
+    "step beyond float32": (lambda b: wc.SymplecticEuler(dt=1e-60), "dt is 1e-60"),
+    "half a step": (lambda b: wc.Simulation(b).advance_steps(0.5), "count is 0.5"),
+    "a number of steps less than none": (lambda b: wc.Simulation(b).advance_steps(-1), "count is -1"),
+    "a hook that cannot be called": (lambda b: wc.Simulation(b).on_step(None), "callback is None"),
+    "hooks every so often": (lambda b: wc.Simulation(b).on_step(print, every="often"), "every is 'often'"),
     "all nodes held": (lambda b: (b.fix(np.ones(b.node_count, bool)), wc.Simulation(b)), "nodes of the body are held"),
     "too many models": (lambda b: wc.Simulation(b, model=[wc.Linear()] * 2), "2 models for 1 bodies"),
     "gravity of two numbers": (lambda b: wc.Simulation(b, gravity=(0, 1)), "three finite accelerations"),
@@ -291,6 +355,7 @@ SIMULATION_MISTAKES = {
     "one iteration": (lambda b: wc.Corotated(iterations=1), "iterations is 1"),
     "unknown springs": (lambda b: wc.EdgeStVK(springs="cubic"), "biquadratic"),
     "no such device": (lambda b: wc.SoftBody(b.mesh, RUBBER, device="cuda:77"), "no device 'cuda:77'"),
+    "E beyond float32": (lambda b: wc.SoftBody(b.mesh, wc.Isotropic(1e60, 0.3, 1.0)), "stiffness .* float32"),
     "E = 0": (lambda b: wc.Isotropic(0.0, 0.3, 1.0), "young is 0"),
     "nu = 1/2": (lambda b: wc.Isotropic(1.0, 0.5, 1.0), "poisson is 0.5"),
     "nu = -1": (lambda b: wc.Isotropic(1.0, -1.0, 1.0), "poisson is -1"),

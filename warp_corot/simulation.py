@@ -14,6 +14,7 @@ import numpy.typing as npt
 import warp as wp
 
 from .body import SoftBody, vec3_view
+from .checks import checked_count, checked_things
 from .elasticity import Corotated, Model
 from .errors import InputError, StabilityWarning, UnstableError
 from .kernels.integrate import advance_clock
@@ -63,8 +64,9 @@ class Simulation:
         gravity: Tuple [m/s^2].
 
     Raises:
-        InputError: No body, bodies on different devices, a number of models that is not the number of bodies, a body of
-            which no node is free to move, non-finite gravity, or a model that does not go with its mesh.
+        InputError: No body, one given twice, bodies on different devices, a number of models that is not the number of
+            bodies, a body of which no node is free to move, non-finite gravity, a model that does not go with its
+            mesh, or something that is none of these.
 
     Warns:
         StabilityWarning: The given step is larger than ``stable_dt``.
@@ -78,20 +80,24 @@ class Simulation:
         integrator: Integrator | None = None,
         gravity: npt.ArrayLike | None = None,
     ):
-        self.bodies = (bodies,) if isinstance(bodies, SoftBody) else tuple(bodies)
+        self.bodies = checked_things(bodies, SoftBody, "body", "a SoftBody")
         if not self.bodies:
             raise InputError("a simulation needs at least one body")
+        if len(set(self.bodies)) < len(self.bodies):
+            raise InputError("a body is given twice; each can be stepped once only")
         self.device = self.bodies[0].device
         for body in self.bodies:
             if body.device != self.device:
                 raise InputError(f"bodies are on {self.device} and {body.device}; they must be on one device")
             if not (body.node_inverse_mass.numpy() > 0).any():
                 raise InputError(f"all {body.node_count} nodes of the body are held; at least one must be free to move")
-        given = Corotated() if model is None else model
-        self.models = (given,) * len(self.bodies) if isinstance(given, Model) else tuple(given)
+        models = checked_things(Corotated() if model is None else model, Model, "model", "a model such as Corotated()")
+        self.models = models * len(self.bodies) if isinstance(model, Model | None) else models
         if len(self.models) != len(self.bodies):
             raise InputError(f"there are {len(self.models)} models for {len(self.bodies)} bodies")
         self.integrator = SymplecticEuler() if integrator is None else integrator
+        if not isinstance(self.integrator, Integrator):
+            raise InputError(f"integrator is {integrator!r}; it must be an integrator such as SymplecticEuler()")
         self.gravity = _checked_gravity(gravity, self.bodies[0].mesh.up_axis)
 
         self.fields = tuple(m.bind(body) for m, body in zip(self.models, self.bodies, strict=True))
@@ -168,7 +174,8 @@ class Simulation:
         self.advance_steps(round(seconds / self.dt))
 
     def advance_steps(self, count: int) -> None:
-        """Advance by ``count`` time steps; as ``advance``."""
+        """Advance by ``count`` time steps; as ``advance``. Steps that a hook makes count."""
+        count = checked_count(count, "count", least=0)
         done = self.steps
         end = done + count
         while done < end:
@@ -183,19 +190,19 @@ class Simulation:
             for body in self.bodies:
                 body.publish_positions()
             self._check_finite()
-            done = due
             self._call_hooks()
+            done = self.steps
         wp.synchronize_device(self.device)
 
     def on_step(self, callback: Callable[[Simulation], None], every: int = 1) -> None:
         """Call ``callback(sim)`` after every ``every``-th step, counted from the beginning of the simulation.
 
         Raises:
-            InputError: ``every`` is not a positive whole number.
+            InputError: ``every`` is not a positive whole number, or the callback cannot be called.
         """
-        if isinstance(every, bool) or every != int(every) or every < 1:
-            raise InputError(f"every is {every}; it must be a positive whole number of steps")
-        self._hooks.append(_Hook(callback, int(every)))
+        if not callable(callback):
+            raise InputError(f"callback is {callback!r}; it must be a function of the simulation")
+        self._hooks.append(_Hook(callback, checked_count(every, "every", least=1)))
 
     # --- looking ---------------------------------------------------------------------------------------------------
 
@@ -293,7 +300,7 @@ class Simulation:
 
     def _call_hooks(self) -> None:
         steps = self.steps if self._hooks else 0
-        for hook in self._hooks:
+        for hook in tuple(self._hooks):
             if steps % hook.every == 0:
                 hook.callback(self)
 
@@ -303,8 +310,11 @@ def _checked_gravity(gravity: npt.ArrayLike | None, up_axis: str) -> tuple[float
         down = np.zeros(3)
         down["XYZ".index(up_axis)] = -9.81
     else:
-        down = np.asarray(gravity, dtype=np.float64)
+        try:
+            down = np.asarray(gravity, dtype=np.float64)
+        except (TypeError, ValueError):
+            down = np.empty(0)
         if down.shape != (3,) or not np.isfinite(down).all():
-            raise InputError(f"gravity is {gravity}; it must be three finite accelerations in m/s^2")
+            raise InputError(f"gravity is {gravity!r}; it must be three finite accelerations in m/s^2")
     x, y, z = (float(a) for a in down)
     return x, y, z
