@@ -25,6 +25,8 @@ def test_least_whole_number_of_steps(rng):
         assert n == 1 or 1.0 / (fps * (n - 1)) > dt
     assert steps_per_frame(25.0, 2e-4) == 200  # exact where it goes in exactly
     assert steps_per_frame(30.0, 1.0 / 3000.0) == 100
+    with pytest.raises(wc.InputError, match=r"a frame of 0\.04 s would take 4e\+28 steps"):
+        steps_per_frame(25.0, 1e-30)
 
 
 def test_several_bodies_are_one_mesh(device, tmp_path):

@@ -2,10 +2,6 @@
 
 import os
 import re
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -261,6 +257,14 @@ REFUSED = [
     (["box", "--fps", "0"], "fps is 0"),
     (["box", "--dt", "0"], "dt is 0"),
     (["box", "--dt", "-1e-3"], "dt is -0.001"),
+    (["box", "--dt", "1e-320"], "dt is 1e-320"),
+    (["box", "--dt", "1e-16"], "a frame of 0.0417 s would take 4.17e+14 steps"),
+    (["box", "--young", "1e30"], "a frame of 0.0417 s would take"),
+    (["box", "--young", "1e39"], "the stiffness 2 mu + |lambda| is 1.71e+40 Pa; float32"),
+    (["box", "--young", "1e-40"], "the stiffness 2 mu + |lambda| is 1.71e-39 Pa; float32"),
+    (["box", "--density", "1e300"], "the mass of a node is"),
+    (["box", "--scale", "1e-20"], "the volume of an element is 6.83e-67 m^3; float32"),
+    (["box", "-o", "out\udcff.usd"], "its name is not UTF-8"),
     (["box", "--damping", "-1"], "damping is -1"),
     (["box", "--preview", "a.jpg"], "a.jpg: extension .jpg"),
     (["box", "--preview", "nowhere/a.png"], "nowhere/a.png: output folder nowhere is not there"),
@@ -329,6 +333,15 @@ def test_nothing_fixed_falls_freely_with_a_word(folder, capsys):
     np.testing.assert_allclose(last - first, np.tile([0.0, -0.5 * 9.8 * 0.05**2, 0.0], (325, 1)), rtol=0.01, atol=1e-6)
 
 
+def test_very_many_steps_are_said_beforehand(folder, capsys, monkeypatch):
+    def end(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("warp_corot.io.animate.record", end)
+    assert simulate("box", "-o", "a.usd", *SHORT, "--dt", "1e-9") == 130
+    assert "warp-corot: note: 2.5e+07 steps of 1e-09 s make a frame" in capsys.readouterr().err
+
+
 def test_unstable_step_warns_and_keeps_frames(folder, capsys):
     assert simulate("box", "-o", "a.usd", "--dt", 2e-3, "--duration", 2, "--fps", 100, "--device", "cpu") == 3
     out, err = capsys.readouterr()
@@ -350,52 +363,6 @@ def test_failed_write_is_one_line(folder, capsys, monkeypatch):
     monkeypatch.setattr("warp_corot.io.animate.UsdWriter.write", fail)
     assert simulate("box", "-o", "a.usd", *SHORT) == 1
     assert capsys.readouterr().err == "warp-corot: error: a.usd: cannot be written: No space left on device\n"
-
-
-def started(folder: Path, *args: str, **options) -> subprocess.Popen:
-    command = [sys.executable, "-m", "warp_corot", *args]
-    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(command, cwd=folder, **(streams | options))
-
-
-@pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_signals_keep_frames(folder, number, status):
-    process = started(folder, "simulate", "box", "-o", "a.usd", "--duration", "1000", "--device", "cpu")
-    try:
-        for _ in range(600):  # until the first frames are there
-            if (folder / "a.usd").exists() or process.poll() is not None:
-                break
-            time.sleep(0.1)
-        process.send_signal(number)
-        out, err = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    assert process.returncode == status, err
-    assert out == ""
-    match = re.fullmatch(r"warp-corot: interrupted; (\d+) frames, .* s, are kept in a\.usd\n", err)
-    assert match, err
-    assert len(frames(folder / "a.usd")) == int(match[1]) > 1
-    assert [file.name for file in folder.iterdir()] == ["a.usd"]
-
-
-@pytest.mark.skipif(os.name != "posix", reason="POSIX pipes")
-def test_reader_that_leaves_is_no_error(folder):
-    read, write = os.pipe()
-    os.close(read)
-    process = started(folder, "simulate", "box", "-o", "a.usd", *SHORT, stdout=write)
-    os.close(write)
-    _, err = process.communicate(timeout=120)
-    assert err == ""
-    assert process.returncode == 141
-    assert len(frames(folder / "a.usd")) == 3
-
-
-def test_module_and_version(folder):
-    process = started(folder, "--version")
-    out, _ = process.communicate(timeout=60)
-    assert process.returncode == 0
-    assert out.startswith(f"warp-corot {wc.__version__}")
 
 
 @pytest.mark.parametrize("args", [["--help"], ["simulate", "--help"], ["paper", "--help"]])

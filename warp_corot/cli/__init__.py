@@ -19,7 +19,7 @@ import warp as wp
 
 from ..errors import InputError, UnstableError
 from . import paper, simulate
-from .say import EXIT_CODES, Terminated, complain, interrupt_status
+from .say import EXIT_CODES, Terminated, complain, interrupt_status, open_streams, silence
 
 COMMANDS = {"simulate": simulate, "paper": paper}
 
@@ -56,12 +56,20 @@ def make_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     wp.config.log_level = wp.LOG_ERROR  # before Warp starts, so that it says nothing about itself
+    open_streams()
     logging.basicConfig(format="warp-corot: warning: %(message)s", level=logging.WARNING)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
     args = make_parser().parse_args(argv)
-    _start_warp()
+    try:
+        _start_warp()
+    except OSError as error:
+        complain(
+            f"Warp's kernel cache {error.filename or ''}: {error.strerror or error}; name a folder that can be written "
+            "to in the environment variable WARP_CACHE_PATH"
+        )
+        return 1
     try:
         with _terminable(), warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: complain(str(message), kind="warning")
@@ -77,10 +85,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as signalled:
         complain("interrupted", kind="")
         return interrupt_status(signalled)
-    except BrokenPipeError:
-        # Who read the output has gone, as `head` does; Python must not complain once more when it closes it.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # who read the output has gone, as `head` does
+        silence(sys.stdout)
         return 141
+    except OSError as error:  # commands see to the files they write: stdout, or Warp's kernel cache
+        silence(sys.stdout)
+        complain(f"{error.filename or 'standard output'}: {error.strerror or error}")
+        return 1
 
 
 def _start_warp() -> None:

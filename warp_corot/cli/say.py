@@ -1,7 +1,9 @@
 """How a command ends: its exit status, and the line on stderr that says why."""
 
+import os
 import signal
 import sys
+from typing import TextIO
 
 EXIT_CODES = """exit status:
   0    done
@@ -23,4 +25,26 @@ def interrupt_status(signalled: KeyboardInterrupt) -> int:
 def complain(message: str, kind: str = "error") -> None:
     """Print ``warp-corot: KIND: MESSAGE``, in one line whatever is in it."""
     text = " ".join(message.split())
-    print(f"warp-corot: {kind}: {text}" if kind else f"warp-corot: {text}", file=sys.stderr, flush=True)
+    try:
+        print(f"warp-corot: {kind}: {text}" if kind else f"warp-corot: {text}", file=sys.stderr, flush=True)
+    except OSError:  # nobody can be told; what is simulated must not be lost to that
+        silence(sys.stderr)
+
+
+def open_streams() -> None:
+    """Give standard streams that were closed (``>&-``) to nobody, lest the next file opened takes their number, and
+    what is printed goes into it."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
+
+
+def silence(stream: TextIO) -> None:
+    """Let what is printed go to nobody, what still waits included: Python would complain again when it closes."""
+    nobody = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nobody, stream.fileno())
+    os.close(nobody)

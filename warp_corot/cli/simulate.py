@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..body import SoftBody, checked_device
+from ..body import SoftBody
+from ..device import checked_device
 from ..elasticity import MODELS, Corotated, Model
 from ..errors import InputError, UnstableError
 from ..materials import Isotropic
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
     from ..io.animate import Progress, Recording
 
 FPS = 24.0
+
+#: More steps to a frame than this are said beforehand.
+MANY_STEPS = 1e5
 
 #: Getting ready takes this long [s] only when kernels must be compiled.
 COMPILING_AFTER = 1.5
@@ -125,6 +129,9 @@ def run(args: argparse.Namespace) -> int:
     count = frame_count(duration, args.fps)
     body, fixed = _make_body(args, subject)
     sim = _make_simulation(args, subject, body, model)
+    steps = 1.0 / (args.fps * sim.dt)
+    if steps > MANY_STEPS:
+        subject.notes.append(f"{steps:.2g} steps of {sim.dt:.2g} s make a frame: this will take long")
     for note in subject.notes:
         complain(note, kind="note")
 

@@ -21,6 +21,9 @@ from .usd_writer import UsdWriter
 
 Progress = Callable[[int, int], None]
 
+#: A frame of more steps would take years.
+MOST_STEPS = 1e12
+
 
 @dataclass
 class Recording:
@@ -68,8 +71,15 @@ class _Joined:
 
 
 def steps_per_frame(fps: float, dt: float) -> int:
-    """The least whole number of steps, none longer than ``dt`` [s], that makes a frame."""
-    return max(math.ceil(1.0 / (fps * dt) * (1.0 - 1e-9)), 1)
+    """The least whole number of steps, none longer than ``dt`` [s], that makes a frame.
+
+    Raises:
+        InputError: More steps than can be counted.
+    """
+    count = 1.0 / fps / dt
+    if count > MOST_STEPS:
+        raise InputError(f"a frame of {1.0 / fps:.3g} s would take {count:.3g} steps of {dt:.3g} s")
+    return max(math.ceil(count * (1.0 - 1e-9)), 1)
 
 
 def frame_count(duration: float, fps: float) -> int:
@@ -127,7 +137,7 @@ def record(
         for frame in range(count + 1):
             started = time.perf_counter()
             due = first_step + round(frame / (fps * sim.dt))
-            sim.advance_steps(due - sim.steps)
+            sim.advance_steps(max(due - sim.steps, 0))
             stepped = time.perf_counter()
             with signals_held_back():
                 _write_frame(writer, sim, done)
