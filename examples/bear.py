@@ -9,7 +9,6 @@ import argparse
 import numpy as np
 
 import warp_corot as wc
-from warp_corot.io.animate import record
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--device", help="cpu or cuda:0")
@@ -35,5 +34,5 @@ def watch(sim):
 
 
 sim.on_step(watch, every=round(0.25 / sim.dt))
-record(sim, args.output, duration=args.duration)
+wc.record(sim, args.output, duration=args.duration)
 print(f"wrote {args.output}")

@@ -9,7 +9,6 @@ import argparse
 import numpy as np
 
 import warp_corot as wc
-from warp_corot.io.animate import record
 from warp_corot.mesh.surface import signed_volumes
 
 parser = argparse.ArgumentParser(description=__doc__)
@@ -28,7 +27,7 @@ for k in range(len(models)):
     bodies.append(body)
 
 sim = wc.Simulation(bodies, model=models, integrator=wc.SymplecticEuler(dt=2e-4, damping=15.0), gravity=(0, -9.8, 0))
-record(sim, args.output, duration=args.duration)
+wc.record(sim, args.output, duration=args.duration)
 
 for model, body in zip(models, bodies, strict=True):
     end = np.flatnonzero(body.mesh.points[:, 2] > 0.192 - 1e-9)

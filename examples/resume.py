@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 
 import warp_corot as wc
-from warp_corot.io.animate import record
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--device", help="cpu or cuda:0")
@@ -24,13 +23,13 @@ def cantilever() -> wc.Simulation:
 
 half = args.duration / 2.0
 sim = cantilever()
-record(sim, args.output, duration=half)
+wc.record(sim, args.output, duration=half)
 checkpoint = args.output.with_suffix(".npz")
 sim.save(checkpoint)
 
 resumed = wc.Simulation.load(checkpoint)
 later = args.output.with_stem(args.output.stem + "-later")
-record(resumed, later, duration=half)  # its first frame is the last one of the other file
+wc.record(resumed, later, duration=half)  # its first frame is the last one of the other file
 
 whole = cantilever()
 whole.advance_steps(resumed.steps)

@@ -10,7 +10,6 @@ import argparse
 import numpy as np
 
 import warp_corot as wc
-from warp_corot.io.animate import record
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--device", help="cpu or cuda:0")
@@ -28,7 +27,7 @@ for k in range(len(levels)):
 
 models = [wc.Corotated(rotation_level=level) for level in levels]
 sim = wc.Simulation(bodies, model=models, integrator=wc.SymplecticEuler(dt=2e-4, damping=15.0), gravity=(0, -9.8, 0))
-record(sim, args.output, duration=args.duration)
+wc.record(sim, args.output, duration=args.duration)
 
 end = np.flatnonzero(mesh.points[:, 2] > 0.192 - 1e-9)
 u = np.stack([body.displacements.numpy()[end].mean(axis=0) for body in bodies])

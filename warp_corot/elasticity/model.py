@@ -109,15 +109,14 @@ class Model(ABC):
         """
 
 
-class LawField(ForceField):
-    """Force field of a constitutive law that needs nothing but each element's deformation gradient."""
+class ElementField(ForceField):
+    """Force field of kernels that need nothing but each element's nodal displacements."""
 
-    def __init__(self, body: SoftBody, *, stress: wp.Function, energy: wp.Function, cauchy: wp.Function):
+    def __init__(self, body: SoftBody, *, forces: wp.Kernel, energies: wp.Kernel, von_mises: wp.Kernel):
         super().__init__(body)
-        kind = body.element_kind
-        self._forces = scatter_forces(kind, stress)
-        self._energies = element_energies(kind, energy)
-        self._von_mises = element_von_mises(kind, cauchy)
+        self._forces = forces
+        self._energies = energies
+        self._von_mises = von_mises
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
         self.launch(self._forces, self.element_count, [self.elements, *self.material_inputs, u], [f])
@@ -127,3 +126,16 @@ class LawField(ForceField):
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
         self.launch(self._von_mises, self.element_count, [self.elements, *self.material_inputs, u], [stress])
+
+
+class LawField(ElementField):
+    """Force field of a constitutive law in each element's deformation gradient."""
+
+    def __init__(self, body: SoftBody, *, stress: wp.Function, energy: wp.Function, cauchy: wp.Function):
+        kind = body.element_kind
+        super().__init__(
+            body,
+            forces=scatter_forces(kind, stress),
+            energies=element_energies(kind, energy),
+            von_mises=element_von_mises(kind, cauchy),
+        )
