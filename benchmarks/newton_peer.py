@@ -106,8 +106,7 @@ def force_case(problem: Problem) -> Case:
 # --- steps ------------------------------------------------------------------------------------------------------------
 
 
-def _model(problem: Problem) -> tuple[newton.Model, bool]:
-    """The problem as a Newton model, and whether its nodes could be coloured, which VBD needs."""
+def _model(problem: Problem) -> newton.Model:
     builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=tuple(GRAVITY))
     elements = _Elements.of(problem)
     masses = problem.body.masses.copy()
@@ -119,15 +118,10 @@ def _model(problem: Problem) -> tuple[newton.Model, bool]:
     builder.tet_poses.extend(elements.poses.tolist())
     builder.tet_activations.extend([0.0] * count)
     builder.tet_materials.extend([(problem.mu, problem.lam, 0.0)] * count)
-    try:
-        builder.color()  # on the CPU, for which not every Warp has a compiler
-        coloured = True
-    except Exception as error:
-        print(f"VBD: left out (no colouring: {type(error).__name__}: {error})", file=sys.stderr)
-        coloured = False
+    builder.color()
     model = builder.finalize(device=problem.device)
     model.particle_grid = None
-    return model, coloured
+    return model
 
 
 class NewtonSteps(Steppable):
@@ -183,19 +177,16 @@ class NewtonSteps(Steppable):
 
 
 def steps(problem: Problem) -> list[Steppable]:
-    model, coloured = _model(problem)
+    try:
+        model = _model(problem)
+    except AttributeError as error:
+        # Newton prepares a model with kernels on the CPU, for which not every Warp has a compiler.
+        print(f"Newton's solvers: left out ({type(error).__name__}: {error})", file=sys.stderr)
+        return []
     solvers = newton.solvers
-    found = [
-        NewtonSteps(
-            "SemiImplicit",
-            problem,
-            model,
-            solvers.SolverSemiImplicit(model, enable_tri_contact=False),
-            semi_implicit_density,
-        ),
+    semi_implicit = solvers.SolverSemiImplicit(model, enable_tri_contact=False)
+    return [
+        NewtonSteps("SemiImplicit", problem, model, semi_implicit, semi_implicit_density),
+        NewtonSteps("VBD, 10 iterations", problem, model, solvers.SolverVBD(model, iterations=10), vbd_density),
         NewtonSteps("XPBD, 2 iterations", problem, model, solvers.SolverXPBD(model, iterations=2), xpbd_density),
     ]
-    if coloured:
-        vbd = solvers.SolverVBD(model, iterations=10)
-        found.insert(1, NewtonSteps("VBD, 10 iterations", problem, model, vbd, vbd_density))
-    return found

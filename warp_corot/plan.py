@@ -42,7 +42,7 @@ class Batch:
         count: How many.
         sharing: Whose rotation their leaves use.
         subtrees: ``kernels.subtree_cuda.Subtrees``.
-        roots: Their roots as forest elements.
+        roots: Their roots as forest elements where leaves share the root's rotation, else None.
         flagged: Set by the kernel where a subtree was left out, uint8 [count].
     """
 
@@ -139,7 +139,7 @@ def _batch(
         count=count,
         sharing=sharing,
         subtrees=subtrees,
-        roots=roots,
+        roots=roots if sharing is Sharing.ROOT else None,
         flagged=wp.zeros(count, dtype=wp.uint8, device=device),
     )
 
