@@ -2,18 +2,31 @@
 
 import argparse
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import cache
 
 import numpy as np
 import pytest
+import warp as wp
 
 import warp_corot as wc
 from warp_corot.cli import main
 from warp_corot.cli import paper as command
 from warp_corot.experiments import figures, report
 from warp_corot.experiments.claims import judged_claims
-from warp_corot.experiments.paper import OWN, PEER, REFERENCE, Settings, cases, run_experiment, work
+from warp_corot.experiments.paper import (
+    CELL_SIZE,
+    CELLS,
+    OWN,
+    PEER,
+    REFERENCE,
+    Settings,
+    beam,
+    cases,
+    follow,
+    run_experiment,
+    work,
+)
 
 PNG = b"\x89PNG\r\n\x1a\n"
 LEVEL = 3
@@ -96,12 +109,30 @@ def test_samples_are_those_of_an_uninterrupted_run(device):
     assert np.abs(ended - results.runs[REFERENCE].positions).max() <= (0.0 if device == "cpu" else 1e-6)
 
 
+def test_the_shipped_path_goes_where_leaf_by_leaf_goes(device):
+    """Errors and shapes hold for the path whose stages are timed: both fall alike, to rounding."""
+    settings = Settings(duration=0.1)
+    mesh = wc.TetForest.box(CELLS, CELL_SIZE, settings.level)
+    for case in cases(settings.level):
+        if isinstance(case.model, wc.Corotated):
+            assert case.model.subtrees
+            leafwise = replace(case.model, subtrees=False)
+            ended = [
+                follow(
+                    beam(mesh, model, settings, wp.get_device(device)), case, settings.samples, lambda *_: None
+                ).positions
+                for model in (case.model, leafwise)
+            ]
+            assert np.abs(ended[0] - mesh.points).max() > 0.01
+            assert np.abs(ended[1] - ended[0]).max() < 1e-6, case.name
+
+
 def test_every_stage_is_timed(device):
     """Stages that a model does not have take no time; the others some, and a fused one says so."""
     results = coarse(device)
     for run in results.runs.values():
         for times in (run.times.seconds, run.times.relative):
-            assert min(times.force, times.rest, times.step) > 0
+            assert min(times.force, times.rest, times.step, times.shipped) > 0
             assert (times.rotation > 0) == (run.case.rotation_level is not None)
         assert run.times.fused == (run.case.name == OWN)
 
@@ -152,8 +183,10 @@ def test_claims_that_do_not_hold_are_said_not_to(device):
 def test_command(device, tmp_path, capsys):
     folder = tmp_path / "out"
     arguments = ["-o", folder, "--duration", 0.3, "--level", 2, "--device", device]
-    for _ in range(2):  # the second writes over the first
-        assert command.run(parsed(*arguments)) == 0
+    folder.mkdir()
+    (folder / command.RESULTS).write_text("of an earlier run")
+    assert command.run(parsed(*arguments)) == 0
+    assert json.loads((folder / command.RESULTS).read_text(encoding="utf-8"))["models"]
     printed = capsys.readouterr().out
     assert "The paper's claims" in printed
     assert "figure5" in printed

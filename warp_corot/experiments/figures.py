@@ -25,7 +25,7 @@ FILES = {
     8: "figure8_error_by_rotation_level.png",
 }
 
-_ROTATION, _FORCE, _REST, _FUSED = "#d95f3b", "#3b7ea1", "#b9c3c9", "#8a6f8e"
+_ROTATION, _FORCE, _REST, _FUSED, _SHIPPED = "#d95f3b", "#3b7ea1", "#b9c3c9", "#8a6f8e", "#4c8c5f"
 #: The time after which nothing moves any more and a long run's axis is compressed [s].
 _SETTLED = 3.0
 
@@ -60,30 +60,37 @@ def draw_figures(folder: Path, results: Results) -> list[Path]:
 
 
 def draw_times(path: Path, results: Results) -> None:
-    """Figure 5: what a time step costs, by model and by rotation level, stage by stage."""
+    """Figure 5: what a time step costs, by model and by rotation level: stage by stage leaf by leaf, and as shipped."""
     figure = new_figure(8.0, 4.9)
-    ax = figure.add_axes((0.085, 0.235, 0.895, 0.61))
+    ax = figure.add_axes((0.085, 0.255, 0.895, 0.59))
     runs = [results.runs[name] for name in (PEER, REFERENCE, "neo-hookean")]
     own, shared = results.runs[OWN], results.levels
     places = np.concatenate([np.arange(3.0), 3.6 + np.arange(len(shared)), [4.2 + len(shared)]])
     names = ["linear", "StVK", "neo-\nHookean", *(str(run.case.rotation_level) for run in shared), "own"]
     cuda = results.device.is_cuda
-    highest = 0.0
-    for x, run in zip(places, [*runs, *shared, own], strict=True):
+    highest, half = 0.0, 0.2
+
+    def number(x: float, top: float, seconds: float) -> None:
+        ax.annotate(f"{seconds:.1f}", (x, top), (0, 3), textcoords="offset points", ha="center", fontsize=8, color=INK)
+
+    for place, run in zip(places, [*runs, *shared, own], strict=True):
         assert run.times is not None
         scale = 1e6 if cuda else 1.0
         t = run.times.seconds if cuda else run.times.relative
         force_color = _FUSED if run.times.fused else _FORCE
+        corotated = run.case.name.startswith(OWN)
+        x = place - 0.2 if corotated else place
         bottom = 0.0
         for part, color in ((t.rest, _REST), (t.force, force_color), (t.rotation, _ROTATION)):
-            ax.bar(x, scale * part, 0.72, bottom=scale * bottom, color=color, edgecolor="white", linewidth=0.6)
+            ax.bar(x, scale * part, 2 * half, bottom=scale * bottom, color=color, edgecolor="white", linewidth=0.6)
             bottom += part
-        ax.plot([x - 0.36, x + 0.36], [scale * t.step] * 2, color=INK, linewidth=1.4, solid_capstyle="butt")
+        ax.plot([x - half, x + half], [scale * t.step] * 2, color=INK, linewidth=1.4, solid_capstyle="butt")
         top = scale * max(bottom, t.step)
-        highest = max(highest, top)
-        ax.annotate(
-            f"{scale * t.step:.1f}", (x, top), (0, 3), textcoords="offset points", ha="center", fontsize=8.5, color=INK
-        )
+        highest = max(highest, top, scale * t.shipped)
+        number(x, top, scale * t.step)
+        if corotated:
+            ax.bar(place + 0.2, scale * t.shipped, 0.24, color=_SHIPPED)
+            number(place + 0.2, scale * t.shipped, scale * t.shipped)
     ax.set_xticks(places, names)
     ax.set_xlim(-0.65, places[-1] + 0.65)
     ax.set_ylim(0.0, 1.1 * highest)
@@ -109,10 +116,11 @@ def draw_times(path: Path, results: Results) -> None:
         Patch(color=_FORCE, label="force"),
         Patch(color=_FUSED, label="rotation and force in one kernel"),
         Patch(color=_REST, label="rest (integration)"),
-        Line2D([], [], color=INK, linewidth=1.4, label="whole step as run (number)"),
+        Line2D([], [], color=INK, linewidth=1.4, label="whole step, leaf by leaf"),
+        Patch(color=_SHIPPED, label="whole step as shipped (by subtrees)"),
     ]
     figure.legend(
-        handles=marks, loc="lower left", bbox_to_anchor=(0.075, 0.005), ncols=5, frameon=False, fontsize=8.5,
+        handles=marks, loc="lower left", bbox_to_anchor=(0.075, 0.0), ncols=3, frameon=False, fontsize=8.5,
         handlelength=1.2, columnspacing=1.3,
     )  # fmt: skip
     head(figure, "Computation time of a step by model and rotation level", results)
