@@ -9,7 +9,7 @@ step, and that is what is tested here against the paper's 3.85e-5.
 is positive definite (Kugelstadt, Koschier and Bender 2018).
 
 Newton's iteration has no answer for a singular F and gives a reflection for an inverted one. Both leave through
-``robust_rotation``: scaled SVD, which orders the signs, then quaternion steps, since the SVD alone is off by up to 1e-2
+``robust_rotation``: scaled SVD, which orders the signs, then quaternion steps, since the SVD alone is off by up to 7e-2
 where singular values nearly meet.
 """
 

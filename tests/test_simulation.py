@@ -242,9 +242,12 @@ def test_a_hook_may_change_loads_and_constraints(device):
             s.body.fix([1])
 
     sim.on_step(push, every=4)
-    sim.advance_steps(16)
-    assert sim.body.constrained[1]
-    assert np.abs(sim.body.positions.numpy()).max() < 1
+    sim.advance_steps(8)
+    before = sim.body.displacements.numpy()
+    sim.advance_steps(8)
+    after = sim.body.displacements.numpy()
+    assert (after[1] == before[1]).all()
+    assert after[0, 2] > before[0, 2] > 0
 
 
 def test_a_step_is_recorded_inside_somebody_elses_capture(device):

@@ -52,7 +52,7 @@ def polar_rotation(
     Args:
         F: Matrices [n, 3, 3] (or one, [3, 3]).
         method: "byers-xu": Newton's iteration with the scaling of Byers and Xu (2008), to the paper's tolerance;
-            "svd": U V^T of Warp's 3x3 SVD (McAdams et al. 2011), the baseline, off by up to 0.05 where singular values
+            "svd": U V^T of Warp's 3x3 SVD (McAdams et al. 2011), the baseline, off by up to 0.07 where singular values
             nearly meet in an inverted F; "warm": iteration on a quaternion (Müller et al. 2016).
         iterations: For "byers-xu": this many iterations (2 to 12) in place of the tolerance.
         guess: For "warm": rotations to start from [n, 3, 3]; the identity by default.

@@ -93,7 +93,11 @@ warp:bear and box have defaults of their own for body and motion.
 
     motion = parser.add_argument_group("the motion")
     motion.add_argument(
-        "--gravity", type=float, nargs=3, metavar=("X", "Y", "Z"), help="[m/s^2] (default: 9.81 down the up axis)"
+        "--gravity",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="[m/s^2] (default: 9.81 down the up axis, z where a file names none)",
     )
     motion.add_argument("--damping", type=float, metavar="C", help="mass-proportional damping [1/s] (default: 2)")
     motion.add_argument("--duration", type=float, metavar="T", help="simulated time [s] (default: 4)")
