@@ -62,7 +62,7 @@ def table(results: Results) -> str:
         "'moved': from the run with own rotations. Times up to 'step' are leaf by leaf, as the paper has it (own",
         "rotations in one kernel with the force, under 'force'), and so is 'times as fast': whole steps, against own",
         "rotations. 'shipped': the whole step as shipped, by complete subtrees. Errors and shapes are that path's and",
-        "agree with leaf by leaf to rounding, less than a micrometre.",
+        "agree with leaf by leaf to rounding.",
         "",
         "The paper's claims",
     ]
