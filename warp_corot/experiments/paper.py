@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..body import SoftBody, checked_device
+from ..body import SoftBody
+from ..device import checked_device
 from ..elasticity import Corotated, Linear, Model, NeoHookean, StVenantKirchhoff
 from ..errors import InputError
 from ..materials import Isotropic
