@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from .. import __version__
+from ..io.whole import written_whole
 from .claims import judged_claims, speed_up
 from .paper import CELL_SIZE, CELLS, GRAVITY, MATERIAL, OBSERVED, OWN, REFERENCE, SAMPLE_STEPS, Results, Run
 from .timing import LAUNCHES, RUN_STEPS, StageTimes
@@ -121,13 +122,9 @@ def write_json(path: Path, results: Results) -> None:
     Raises:
         OSError: It could not be written; a file that was there before stays.
     """
-    part = path.with_name(f".{path.name}.part")
-    try:
-        text = json.dumps(to_json(results), indent=1, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(to_json(results), indent=1, ensure_ascii=False, allow_nan=False)
+    with written_whole(path) as part:
         part.write_text(text + "\n", encoding="utf-8")
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def device_name(results: Results) -> str:
