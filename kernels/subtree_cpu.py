@@ -4,9 +4,7 @@ What a CPU core lacks is vectorisation. So the ten nodes of eight subtrees of on
 lanes, one loop goes over the eight leaves, and forces are scattered once at the end. The iteration is
 ``rotation.newton_rotation``, the units and the flags are those of ``subtree_cuda``.
 
-The lanes are the compiler's own vector type, in native code generated from the tables of ``subtree``: it compiles in
-about a second, depends on no optimiser to find the vectors, and so is right and fast whatever its flags. The same in
-Warp's 8-lane vectors took ten times as long to compile and was as fast only where the optimiser saw through it.
+Native code generated from the tables of ``subtree``; see ``lanes`` for why.
 """
 
 import functools
@@ -14,37 +12,14 @@ import functools
 import warp as wp
 
 from .elements import FRAME_SHIFT, LEVEL_MASK, MIRROR_BIT
-from .rotation import FLAT, ITERATIONS, UNCONVERGED
+from .lanes import COMPILER_FLAGS, NEWTON, PRELUDE, on_cpu
+from .rotation import ITERATIONS
 from .shapes import SQRT2, VOLUME
 from .stiffness import Coefficients
 from .subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS, stiffness
 from .subtree_cuda import Subtrees
 
 wp.set_module_options({"enable_backward": False})
-
-#: The vectors are as wide as the machine at hand has them.
-COMPILER_FLAGS = "-march=native"
-
-LANES = 8
-
-# Vectors, triples of them, and the tables of one type. Nodes are read and written three components at 3 * node.
-_PRELUDE = """
-    typedef float lanes8 __attribute__((vector_size(32), aligned(4)));
-    typedef int masks8 __attribute__((vector_size(32)));
-    struct triple { lanes8 x, y, z; };
-    const auto plus = [](const triple& a, const triple& b) { return triple{a.x + b.x, a.y + b.y, a.z + b.z}; };
-    const auto minus = [](const triple& a, const triple& b) { return triple{a.x - b.x, a.y - b.y, a.z - b.z}; };
-    const auto scaled = [](const lanes8& w, const triple& a) { return triple{w * a.x, w * a.y, w * a.z}; };
-    const auto dot = [](const triple& a, const triple& b) { return a.x * b.x + a.y * b.y + a.z * b.z; };
-    const auto cross = [](const triple& a, const triple& b) {
-        return triple{a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
-    };
-    const auto spread = [](float a) { return lanes8{a, a, a, a, a, a, a, a}; };
-    const auto get = [](const lanes8* a, int node) { return triple{a[3 * node], a[3 * node + 1], a[3 * node + 2]}; };
-    const auto add = [](lanes8* a, int node, const triple& b) {
-        a[3 * node] += b.x; a[3 * node + 1] += b.y; a[3 * node + 2] += b.z;
-    };
-"""
 
 # Positions of the ten nodes relative to the first's displacement, in edge lengths of a leaf. Lanes past the last
 # subtree repeat it.
@@ -80,25 +55,6 @@ _GATHER = f"""
         }}
     }}
     masks8 trusted = h > 0.0f;
-"""
-
-# Z = 2^ITERATIONS R of the columns of F, and a mask of the lanes that may be trusted: false where NaN comes in.
-_NEWTON = f"""
-    const auto newton = [&](triple a, triple b, triple c, const lanes8& handedness, triple* z) {{
-        lanes8 det = spread(0.0f);
-        masks8 sound = det > 0.0f;
-        float s2 = 1.0f;
-        for (int iteration = 0; iteration < {ITERATIONS}; ++iteration) {{
-            const triple p = cross(b, c), q = cross(c, a), r = cross(a, b);
-            det = dot(a, p);
-            if (iteration == 0) sound = handedness * det > {float(FLAT)!r}f;
-            const lanes8 w = s2 / det;
-            a = plus(a, scaled(w, p)); b = plus(b, scaled(w, q)); c = plus(c, scaled(w, r));
-            s2 *= 4.0f;
-        }}
-        z[0] = a; z[1] = b; z[2] = c;
-        return sound & (handedness * det < {8.0 ** (ITERATIONS - 1) * (1.0 + float(UNCONVERGED))!r}f);
-    }};
 """
 
 # Add the forces of the subtrees that are to be trusted and flag the others.
@@ -172,14 +128,10 @@ def _add_leaf(shape: int) -> str:
     return "".join(f"        add(g, n[{i}], {force});\n" for i, force in enumerate(forces[shape]))
 
 
-def _cpu(code: str) -> str:
-    return f"#if !defined(__CUDA_ARCH__)\n{code}\n#endif\n"
-
-
 def _own_snippet(shape: int) -> str:
     inverse = 0.5**ITERATIONS
-    return _cpu(
-        f"""{_tables(shape)}{_PRELUDE}{_GATHER}{_NEWTON}
+    return on_cpu(
+        f"""{_tables(shape)}{PRELUDE}{_GATHER}{NEWTON}
     const lanes8 area = {VOLUME[shape]!r}f * h * h;
     lanes8 m = spread(mu.data[0]), k = spread(lam.data[0]);
     #pragma clang loop unroll(disable)
@@ -237,8 +189,8 @@ def _shared_snippet(shape: int, given: bool) -> str:
         for (int column = 0; column < 3; ++column) turn[column] = scaled(spread({0.5**ITERATIONS!r}f), turn[column]);
     }}
 """
-    return _cpu(
-        f"""{_tables(shape)}{_PRELUDE}{_GATHER}{_NEWTON}
+    return on_cpu(
+        f"""{_tables(shape)}{PRELUDE}{_GATHER}{NEWTON}
     triple turn[3];{rotation}
     // Displacements in the subtree's Maubach frame, where the leaves are linear elements.
     for (int node = 0; node < 10; ++node) {{

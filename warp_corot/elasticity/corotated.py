@@ -10,7 +10,7 @@ import warp as wp
 
 from ..elements import forest_elements
 from ..errors import InputError
-from ..kernels import subtree_cpu, subtree_cuda
+from ..kernels import general_cpu, subtree_cpu, subtree_cuda
 from ..kernels.corotated import (
     corotated_energies,
     corotated_von_mises,
@@ -20,6 +20,7 @@ from ..kernels.corotated import (
     scatter_own_rotation,
     scatter_with_rotations,
 )
+from ..kernels.lanes import LANES
 from ..kernels.rotation import byers_xu, quick_rotation
 from ..mesh import TetForest
 from ..mesh.forest import MAX_LEVEL
@@ -76,14 +77,17 @@ class Corotated(Model):
             raise InputError(f"stiffness is {self.stiffness!r}; it must be one of {', '.join(STIFFNESSES)}")
 
     def bind(self, body: SoftBody) -> CorotatedField:
+        fast = self.rotation == "byers-xu" and self.iterations is None and self.stiffness == "factored"
+        fast = fast and self.subtrees
         if isinstance(body.mesh, TetForest):
-            plain = self.rotation == "byers-xu" and self.iterations is None and self.stiffness == "factored"
-            if plain and self.subtrees:
+            if fast:
                 return SubtreeField(body, self)
         elif self.rotation_level is not None:
             raise InputError(f"rotation_level {self.rotation_level} needs a forest; a general mesh has no tree")
         elif self.stiffness != "factored":
             raise InputError(f"stiffness {self.stiffness!r} needs a forest; general elements have no three shapes")
+        elif fast and body.device.is_cpu:
+            return LanesField(body, self)
         return CorotatedField(body, self)
 
 
@@ -190,6 +194,21 @@ class CorotatedField(ForceField):
         self.launch(kernel, self.element_count, inputs, [output])
 
 
+class LanesField(CorotatedField):
+    """General elements on the CPU, eight at a time."""
+
+    def __init__(self, body: SoftBody, model: Corotated):
+        super().__init__(body, model)
+        self._flagged = wp.zeros(self.element_count, dtype=wp.uint8, device=self.device)
+
+    def add_forces(self, u: wp.array, f: wp.array) -> None:
+        blocks = -(-self.element_count // LANES)
+        inputs = [self.elements, self.element_count, *self.material_inputs, u]
+        self.launch(general_cpu.scatter_elements, blocks, inputs, [f, self._flagged])
+        repair = [self._flagged, self.elements, *self.material_inputs, u]
+        self.launch(general_cpu.repair_elements, self.element_count, repair, [f])
+
+
 class SubtreeField(CorotatedField):
     """The fast path: complete subtrees in batches, leaf by leaf only what is left over."""
 
@@ -254,7 +273,7 @@ class SubtreeField(CorotatedField):
             threads, block = batch.count, subtree_cuda.BLOCK
             inputs = [batch.subtrees, body.mu, body.lam, u]
         else:
-            threads, block = -(-batch.count // subtree_cpu.LANES), 256
+            threads, block = -(-batch.count // LANES), 256
             inputs = [batch.subtrees, batch.count, *self.material_inputs, u]
         if batch.sharing is not Sharing.OWN:
             inputs += [self._rotations, unit]
