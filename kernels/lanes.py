@@ -1,8 +1,8 @@
 """Eight of a thing side by side in the lanes of a CPU's vector registers: native code that the fast CPU kernels share.
 
-What a CPU core lacks is vectorisation. The lanes here are the compiler's own vector type: code on them compiles in about
-a second, depends on no optimiser to find the vectors, and so is right and fast whatever its flags. The same in Warp's
-8-lane vectors took ten times as long to compile and was as fast only where the optimiser saw through it.
+What a CPU core lacks is vectorisation. The lanes here are the compiler's own vector type: code on them compiles in
+about a second, depends on no optimiser to find the vectors, and so is right and fast whatever its flags. The same in
+Warp's 8-lane vectors took ten times as long to compile and was as fast only where the optimiser saw through it.
 """
 
 from .rotation import FLAT, ITERATIONS, UNCONVERGED
