@@ -27,6 +27,19 @@ class ForestElements:
 
 
 @wp.struct
+class Subtrees:
+    """Complete three-level subtrees of one type (see ``subtree``), in groups of eight or one by one."""
+
+    nodes: wp.array2d[
+        wp.int32
+    ]  # groups: [groups, 40], -1 past the last; one by one: [10, subtrees], CPU [subtrees, 10]
+    code: wp.array[wp.int32]  # [subtrees] shape code of the subtree's root
+    first: wp.array[wp.int32]  # [subtrees] its first leaf among the mesh's elements
+    frames: wp.array[wp.mat33]  # as ForestElements
+    size: wp.array[wp.float32]
+
+
+@wp.struct
 class GeneralElements:
     """Tetrahedra of any shape, positively oriented."""
 

@@ -11,13 +11,12 @@ import functools
 
 import warp as wp
 
-from .elements import FRAME_SHIFT, LEVEL_MASK, MIRROR_BIT
+from .elements import FRAME_SHIFT, LEVEL_MASK, MIRROR_BIT, Subtrees
 from .lanes import COMPILER_FLAGS, NEWTON, PRELUDE, on_cpu
 from .rotation import ITERATIONS
 from .shapes import SQRT2, VOLUME
 from .stiffness import Coefficients
 from .subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS, stiffness
-from .subtree_cuda import Subtrees
 
 wp.set_module_options({"enable_backward": False})
 

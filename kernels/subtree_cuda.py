@@ -20,6 +20,7 @@ from .elements import (
     LEVEL_MASK,
     ROOT2,
     ForestElements,
+    Subtrees,
     add_force,
     frame,
     load_node,
@@ -44,20 +45,6 @@ wp.set_module_options({"enable_backward": False})
 
 BLOCK = 128
 mat10 = wp.types.matrix(shape=(10, 3), dtype=wp.float32)
-
-
-@wp.struct
-class Subtrees:
-    """Complete subtrees of one type.
-
-    In groups of eight, eight lanes of a warp each, or one by one.
-    """
-
-    nodes: wp.array2d[wp.int32]  # groups: [groups, 40], -1 past the last; one by one: [10, subtrees]
-    code: wp.array[wp.int32]  # [subtrees] shape code of the subtree's root
-    first: wp.array[wp.int32]  # [subtrees] its first leaf among the mesh's elements
-    frames: wp.array[wp.mat33]  # as ForestElements
-    size: wp.array[wp.float32]
 
 
 def _numbers(values: list[int]) -> str:

@@ -16,8 +16,8 @@ import numpy.typing as npt
 import warp as wp
 
 from .elements import forest_elements
+from .kernels.elements import Subtrees
 from .kernels.subtree import GROUP_NODES, LEAVES, group_nodes
-from .kernels.subtree_cuda import Subtrees
 from .mesh import TetForest
 
 SUBTREE_LEVELS = 3
@@ -41,7 +41,7 @@ class Batch:
         grouped: Whether they come in groups of eight (CUDA).
         count: How many.
         sharing: Whose rotation their leaves use.
-        subtrees: ``kernels.subtree_cuda.Subtrees``.
+        subtrees: ``kernels.elements.Subtrees``.
         roots: Their roots as forest elements where leaves share the root's rotation, else None.
         flagged: Set by the kernel where a subtree was left out, uint8 [count].
     """
