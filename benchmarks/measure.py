@@ -23,7 +23,7 @@ import numpy as np
 import warp as wp
 
 import warp_corot as wc
-from warp_corot.body import checked_device
+from warp_corot.device import checked_device
 from warp_corot.errors import InputError
 
 #: A sample replays its graph for about this long [s].

@@ -295,6 +295,8 @@ class Simulation:
     def _check_finite(self) -> None:
         step = int(self._bad_step.numpy()[0])
         if step != _NEVER:
+            # Said once: who sets a good state again may go on.
+            self._bad_step.fill_(_NEVER)
             hint = f"dt is {self.dt:.3g} s, the largest stable step at rest about {self.stable_dt:.3g} s"
             raise UnstableError(f"the state is not finite since step {step} (t = {step * self.dt:.4g} s); {hint}")
 
