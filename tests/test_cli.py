@@ -19,6 +19,12 @@ SHORT = ["--duration", "0.05", "--fps", "40", "--device", "cpu"]
 
 
 @pytest.fixture(autouse=True)
+def nothing_said_of_compiling(monkeypatch):
+    """Whether kernels are compiled depends on what ran before, and no test here is about that."""
+    monkeypatch.setattr("warp_corot.cli.simulate.COMPILING_AFTER", 1e6)
+
+
+@pytest.fixture(autouse=True)
 def warp_settings_kept():
     before = wp.config.log_level
     yield

@@ -82,7 +82,9 @@ def test_streams_that_take_nothing_cost_no_frames(tmp_path, streams, status, sai
     shell = ["sh", "-c", f'exec "$@" {streams}', "sh", *COMMAND, *command]
     done = subprocess.run(shell, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == status, done.stderr
-    assert [line for line in done.stderr.splitlines(True) if "note:" not in line] == said.splitlines(True)
+    # Whether kernels are compiled, and that is said, depends on what ran before.
+    lines = [line for line in done.stderr.splitlines(True) if "note:" not in line and "compiling kernels" not in line]
+    assert lines == said.splitlines(True)
     assert frame_count(tmp_path / "a.usd") == 3
 
 
