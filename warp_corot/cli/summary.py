@@ -43,7 +43,7 @@ def summary(subject: Subject, sim: Simulation, done: Recording, fixed: str, prev
         ("fixed", fixed),
         ("gravity", f"{' '.join(f'{g:g}' for g in sim.gravity)} m/s^2, damping {damping:g} /s"),
         ("time step", f"{1e3 * sim.dt:.4g} ms, largest stable one about {1e3 * sim.stable_dt:.4g} ms"),
-        ("speed", f"{done.steps / stepping:.4g} steps/s, {done.simulated / stepping:.3g} times real time"),
+        ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"),
         ("wall time", f"{done.stepping:.2f} s stepping, {done.writing:.2f} s writing"),
         ("displacement", f"{length(done.largest_displacement)} largest, {at_end}"),
         ("device", f"{sim.device} ({sim.device.name})"),
