@@ -46,7 +46,8 @@ class Corotated(Model):
 
     Attributes:
         rotation_level: None: every element has its own rotation. An int: the rotation of the ancestor at that level of
-            the tree, or an element's own where it lies above (forests only).
+            the tree, or an element's own where it lies above (forests only). On the fast path three levels above the
+            leaves or more; one or two levels above go leaf by leaf and are slower than own rotations.
         rotation: "byers-xu" (the paper's), "svd" (McAdams et al. 2011) or "warm" (a quaternion kept from step to step).
         iterations: For "byers-xu": None iterates to the paper's tolerance 3.85e-5, an int 2 to 12 that often.
         stiffness: "factored" (sums and differences), "sparse" (the paper's explicit K_T by type, zeros skipped) or
