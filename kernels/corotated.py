@@ -98,6 +98,14 @@ def extract_warm_rotations(Elements: Any) -> wp.Kernel:
     return extract_warm_rotations
 
 
+@wp.kernel(enable_backward=False)
+def reset_quaternions(chosen: wp.array[wp.int32], world_unit_count: int, quaternions: wp.array[wp.quat]):
+    """Start the warm rotations of chosen worlds from the identity again."""
+    t = wp.tid()
+    if chosen[t // world_unit_count] != 0:
+        quaternions[t] = wp.quat_identity()
+
+
 @functools.cache
 def scatter_with_rotations(Elements: Any) -> wp.Kernel:
     """Corotated forces with given rotations, stiffness factored into sums and differences."""
@@ -217,6 +225,7 @@ def scatter_matrix_product(skip_zeros: bool) -> wp.Kernel:
     ):
         t = wp.tid()
         nodes = elements.nodes[t]
+        targets = elements.targets[t]
         code = elements.code[t]
         shape = shape_of(code)
         h = edge_length(elements, t)
@@ -244,6 +253,6 @@ def scatter_matrix_product(skip_zeros: bool) -> wp.Kernel:
         else:
             y = product2(z, m, k)
         for n in range(4):
-            add_force(f, nodes[n], -(r * wp.vec3(y[3 * n], y[3 * n + 1], y[3 * n + 2])))
+            add_force(f, targets[n], -(r * wp.vec3(y[3 * n], y[3 * n + 1], y[3 * n + 2])))
 
     return scatter_matrix_product

@@ -6,6 +6,8 @@ general elements): ``local_gradient`` gives G = (du/dX) Q, so that Q + G is the 
 Working from displacements keeps small strains free of the cancellation that positions would bring.
 """
 
+from typing import Any
+
 import warp as wp
 
 from .shapes import FRAME_SHIFT, LEVEL_BITS, MIRROR_BIT, SQRT2
@@ -21,6 +23,7 @@ class ForestElements:
     """Tetrahedra of the bisected forest: four nodes and one integer each."""
 
     nodes: wp.array[wp.vec4i]  # [T] in Maubach order
+    targets: wp.array[wp.vec4i]  # [T] where their forces are added: the nodes, or a slot each (see ``reproducible``)
     code: wp.array[wp.int32]  # [T] level | mirrored << 6 | frame << 7
     frames: wp.array[wp.mat33]  # [n_frames] proper local frames Q
     size: wp.array[wp.float32]  # [levels div 3] edge length h [m]
@@ -30,9 +33,9 @@ class ForestElements:
 class Subtrees:
     """Complete three-level subtrees of one type (see ``subtree``), in groups of eight or one by one."""
 
-    nodes: wp.array2d[
-        wp.int32
-    ]  # groups: [groups, 40], -1 past the last; one by one: [10, subtrees], CPU [subtrees, 10]
+    # Groups: [groups, 40], -1 past the last; one by one: [10, subtrees], CPU [subtrees, 10].
+    nodes: wp.array2d[wp.int32]
+    targets: wp.array2d[wp.int32]  # where their forces are added, as in ForestElements
     code: wp.array[wp.int32]  # [subtrees] shape code of the subtree's root
     first: wp.array[wp.int32]  # [subtrees] its first leaf among the mesh's elements
     frames: wp.array[wp.mat33]  # as ForestElements
@@ -44,6 +47,7 @@ class GeneralElements:
     """Tetrahedra of any shape, positively oriented."""
 
     nodes: wp.array[wp.vec4i]  # [T]
+    targets: wp.array[wp.vec4i]  # [T] as in ForestElements
     rest_inverse: wp.array[wp.mat33]  # [T] inverse of the matrix of rest edges (x1-x0, x2-x0, x3-x0) [1/m]
     volume: wp.array[wp.float32]  # [T] rest volume [m^3]
 
@@ -123,9 +127,8 @@ def node_displacements(nodes: wp.vec4i, u: wp.array[wp.vec4]):
 
 
 @wp.func
-def local_gradient(elements: ForestElements, t: int, u: wp.array[wp.vec4]):
-    """G = (du/dX) Q [3, 3]: sums and differences by type, divided by the edge length."""
-    u0, u1, u2, u3 = node_displacements(elements.nodes[t], u)
+def gradient_of(elements: ForestElements, t: int, u0: wp.vec3, u1: wp.vec3, u2: wp.vec3, u3: wp.vec3):
+    """G = (du/dX) Q [3, 3] of nodal displacements: sums and differences by type, divided by the edge length."""
     code = elements.code[t]
     shape = shape_of(code)
     c0 = u1 - u0
@@ -142,9 +145,15 @@ def local_gradient(elements: ForestElements, t: int, u: wp.array[wp.vec4]):
 
 
 @wp.func
-def local_gradient(elements: GeneralElements, t: int, u: wp.array[wp.vec4]):
-    u0, u1, u2, u3 = node_displacements(elements.nodes[t], u)
+def gradient_of(elements: GeneralElements, t: int, u0: wp.vec3, u1: wp.vec3, u2: wp.vec3, u3: wp.vec3):
     return wp.matrix_from_cols(u1 - u0, u2 - u0, u3 - u0) * elements.rest_inverse[t]
+
+
+@wp.func
+def local_gradient(elements: Any, t: int, u: wp.array[wp.vec4]):
+    """G of element t under nodal displacements u."""
+    u0, u1, u2, u3 = node_displacements(elements.nodes[t], u)
+    return gradient_of(elements, t, u0, u1, u2, u3)
 
 
 #: Adds ``force`` to ``f[node]``: one 16-byte reduction where the card has them (a global reduction costs about the same
@@ -169,9 +178,9 @@ def add_force(f: wp.array[wp.vec4], node: int, force: wp.vec3): ...
 
 
 @wp.func
-def scatter_stress(elements: ForestElements, t: int, p: wp.mat33, f: wp.array[wp.vec4]):
-    """Add the nodal forces -V P grad N_i, where P = P_world Q is the local-frame first Piola-Kirchhoff stress [Pa]."""
-    nodes = elements.nodes[t]
+def nodal_forces(elements: ForestElements, t: int, p: wp.mat33):
+    """The forces -V P grad N_i on the four nodes [N], where P = P_world Q is the local-frame first Piola-Kirchhoff
+    stress [Pa]."""
     code = elements.code[t]
     shape = shape_of(code)
     area = rest_volume(elements, t) / edge_length(elements, t)
@@ -190,20 +199,24 @@ def scatter_stress(elements: ForestElements, t: int, p: wp.mat33, f: wp.array[wp
         f1 = -ROOT2 * p1
         f2 = ROOT2 * (p0 + p1) + 2.0 * p2
         f3 = -2.0 * p2
-    add_force(f, nodes[0], f0)
-    add_force(f, nodes[1], f1)
-    add_force(f, nodes[2], f2)
-    add_force(f, nodes[3], f3)
+    return f0, f1, f2, f3
 
 
 @wp.func
-def scatter_stress(elements: GeneralElements, t: int, p: wp.mat33, f: wp.array[wp.vec4]):
-    nodes = elements.nodes[t]
+def nodal_forces(elements: GeneralElements, t: int, p: wp.mat33):
     h = (-elements.volume[t]) * p * wp.transpose(elements.rest_inverse[t])
     f1 = wp.vec3(h[0, 0], h[1, 0], h[2, 0])
     f2 = wp.vec3(h[0, 1], h[1, 1], h[2, 1])
     f3 = wp.vec3(h[0, 2], h[1, 2], h[2, 2])
-    add_force(f, nodes[0], -(f1 + f2 + f3))
-    add_force(f, nodes[1], f1)
-    add_force(f, nodes[2], f2)
-    add_force(f, nodes[3], f3)
+    return -(f1 + f2 + f3), f1, f2, f3
+
+
+@wp.func
+def scatter_stress(elements: Any, t: int, p: wp.mat33, f: wp.array[wp.vec4]):
+    """Add the nodal forces of a local-frame first Piola-Kirchhoff stress [Pa]."""
+    f0, f1, f2, f3 = nodal_forces(elements, t, p)
+    targets = elements.targets[t]
+    add_force(f, targets[0], f0)
+    add_force(f, targets[1], f1)
+    add_force(f, targets[2], f2)
+    add_force(f, targets[3], f3)

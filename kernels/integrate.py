@@ -17,6 +17,14 @@ def is_finite(a: wp.vec3):
     return wp.abs(a[0]) + wp.abs(a[1]) + wp.abs(a[2]) <= 3.0e38
 
 
+@wp.func
+def symplectic_euler_velocity(
+    v: wp.vec3, force: wp.vec3, inverse_mass: float, gravity: wp.vec3, dt: float, damping: float
+):
+    """(v + dt (f/m + g)) / (1 + dt damping)."""
+    return (v + dt * (inverse_mass * force + gravity)) / (1.0 + dt * damping)
+
+
 @wp.kernel(enable_backward=False)
 def step_symplectic_euler(
     # In
@@ -50,7 +58,7 @@ def step_symplectic_euler(
     w = inverse_mass[i]
     velocity = load_node(v, i)
     if w > 0.0:
-        velocity = (velocity + dt * (w * force + gravity)) / (1.0 + dt * damping)
+        velocity = symplectic_euler_velocity(velocity, force, w, gravity, dt, damping)
         store_node(v, i, velocity)
     else:
         store_node(reactions, i, -(force + mass[i] * gravity))
@@ -75,6 +83,8 @@ def follow_trajectory(
     displacements: wp.array2d[wp.vec3],
     dt: float,
     clock: wp.array[wp.int64],
+    world_starts: wp.array[wp.int64],
+    world_node_count: int,
     offset: int,
     u: wp.array[wp.vec4],
     # Out
@@ -82,7 +92,9 @@ def follow_trajectory(
 ):
     """Give prescribed nodes the velocity that takes them to their keyframed displacement at the end of the step."""
     k = wp.tid()
-    t = wp.float64(clock[0] + wp.int64(offset + 1)) * wp.float64(dt)
+    i = nodes[k]
+    start = world_starts[i // world_node_count]
+    t = wp.float64(clock[0] + wp.int64(offset + 1) - start) * wp.float64(dt)
     last = times.shape[0] - 1
     key = int(0)
     while key < last - 1 and times[key + 1] <= t:
@@ -93,7 +105,6 @@ def follow_trajectory(
     a = displacements[key, row]
     b = displacements[wp.min(key + 1, last), row]
     target = a + float(s) * (b - a)
-    i = nodes[k]
     store_node(v, i, (target - load_node(u, i)) / dt)
 
 
@@ -124,3 +135,42 @@ def adopt_positions(
     q = x + load_node(u, i)
     if p[0] != q[0] or p[1] != q[1] or p[2] != q[2]:
         store_node(u, i, p - x)
+
+
+@wp.kernel(enable_backward=False)
+def reset_nodes(
+    # In
+    chosen: wp.array[wp.int32],
+    world_node_count: int,
+    has_initial: int,
+    initial_u: wp.array[wp.vec4],
+    initial_v: wp.array[wp.vec4],
+    rest: wp.array[wp.vec4],
+    inverse_mass: wp.array[wp.float32],
+    clock: wp.array[wp.int64],
+    # Out
+    u: wp.array[wp.vec4],
+    v: wp.array[wp.vec4],
+    positions: wp.array[wp.vec4],
+    reactions: wp.array[wp.vec4],
+    world_starts: wp.array[wp.int64],
+):
+    """Put the nodes of chosen worlds back to their initial state, or to rest where there is none.
+
+    Held nodes keep the velocity they were given where there is no initial state.
+    """
+    i = wp.tid()
+    world = i // world_node_count
+    if chosen[world] == 0:
+        return
+    if i % world_node_count == 0:
+        world_starts[world] = clock[0]
+    displacement = wp.vec3()
+    if has_initial != 0:
+        displacement = load_node(initial_u, i)
+        store_node(v, i, load_node(initial_v, i))
+    elif inverse_mass[i] > 0.0:
+        store_node(v, i, wp.vec3())
+    store_node(u, i, displacement)
+    store_node(positions, i, load_node(rest, i) + displacement)
+    store_node(reactions, i, wp.vec3())

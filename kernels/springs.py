@@ -146,6 +146,7 @@ def scatter_edge_stvk(Elements: Any, biquadratic: bool) -> wp.Kernel:
     ):
         t = wp.tid()
         nodes = elements.nodes[t]
+        targets = elements.targets[t]
         q = frame(elements, t)
         x = rest_nodes(elements, t)
         d = vec6()
@@ -165,8 +166,8 @@ def scatter_edge_stvk(Elements: Any, biquadratic: bool) -> wp.Kernel:
             j = SECOND_NODE[e]
             edge = q * (x[j] - x[i]) + (load_node(u, nodes[j]) - load_node(u, nodes[i]))
             force = (tension[e] * pull[e]) * edge
-            add_force(f, nodes[i], force)
-            add_force(f, nodes[j], -force)
+            add_force(f, targets[i], force)
+            add_force(f, targets[j], -force)
 
     return scatter_edge_stvk
 
@@ -209,6 +210,7 @@ def edge_stvk_energies(Elements: Any, biquadratic: bool) -> wp.Kernel:
 def scatter_mass_spring(
     # In
     edges: wp.array[wp.vec2i],
+    targets: wp.array[wp.vec2i],
     rest: wp.array[wp.vec3],
     stiffness: wp.array[wp.float32],
     u: wp.array[wp.vec4],
@@ -225,8 +227,8 @@ def scatter_mass_spring(
     elongation = (2.0 * wp.dot(rest[e], stretch) + wp.dot(stretch, stretch)) / (length + rest_length)
     # An edge of no length has no direction to push in.
     force = (stiffness[e] * elongation / wp.max(length, 1.0e-12 * rest_length)) * edge
-    add_force(f, i, force)
-    add_force(f, j, -force)
+    add_force(f, targets[e][0], force)
+    add_force(f, targets[e][1], -force)
 
 
 @wp.kernel(enable_backward=False)

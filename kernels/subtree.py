@@ -124,6 +124,12 @@ def _busiest_first(shape: int) -> list[int]:
     return sorted(range(len(count)), key=lambda node: -count[node])
 
 
+def group_leaves(shape: int) -> list[list[int]]:
+    """The four nodes of each of a group's 64 leaves, as places in ``group_nodes``."""
+    place = {node: at for at, node in enumerate(_busiest_first(shape))}
+    return [[place[node] for node in leaf] for leaf in descendants(shape, 6)[0]]
+
+
 def group_slots(shape: int) -> list[list[int]]:
     """For each of the eight subtrees of a group its ten nodes, as places in ``group_nodes``."""
     place = {node: at for at, node in enumerate(_busiest_first(shape))}

@@ -6,14 +6,17 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from .checks import check_float32
+from .checks import check_float32, checked_count
 from .device import checked_device
-from .elements import Mesh, device_elements, element_kind, parts
+from .elements import Mesh, device_elements, element_kind, parts, repeated
 from .errors import InputError
-from .indices import checked_indices
-from .kernels.integrate import adopt_positions, publish_positions
+from .kernels.integrate import adopt_positions, publish_positions, reset_nodes
 from .materials import Isotropic
 from .trajectory import Trajectory
+from .worlds import World, chosen_nodes
+
+#: Elements, and with them nodes, are numbered in 32 bits.
+MOST_ELEMENTS = 2**31 - 1
 
 
 class SoftBody:
@@ -25,39 +28,46 @@ class SoftBody:
     origin and to 3e-5 with it one metre away. ``positions`` are published after each run of steps, and positions that
     you write are taken over before the next.
 
+    With ``worlds`` there are that many copies of the body, each with its own state, material, loads and fixed nodes,
+    stepped together; they do not meet. Nodal arrays are [worlds * N], world after world, and ``world`` is one's view.
+
     Args:
         mesh: A ``TetForest`` or ``TetMesh``.
-        material: Uniform, or with one value per element.
+        material: Uniform, or with values that broadcast to [worlds, elements]: one per element, [T]; one per world,
+            [worlds, 1]; or all, [worlds, T].
+        worlds: How many copies.
         device: "cpu", "cuda:0", …; None for Warp's default.
 
     Attributes:
-        mesh, material, device: As given.
-        masses: Lumped nodal masses [kg], float64 [N]; zero at nodes that no element names.
+        mesh, material, worlds, device: As given.
+        masses: Lumped nodal masses [kg], float64 [worlds * N]; zero at nodes that no element names.
 
     Raises:
-        InputError: The device is not there, a material array does not have one value per element, or stiffness, mass
-            or size are beyond the range of float32.
+        InputError: The device is not there, a material array does not have one value per element, stiffness, mass or
+            size are beyond the range of float32, or there are more than 2**31 elements in all.
     """
 
-    def __init__(self, mesh: Mesh, material: Isotropic, *, device: str | wp.Device | None = None):
+    def __init__(self, mesh: Mesh, material: Isotropic, *, worlds: int = 1, device: str | wp.Device | None = None):
         self.mesh = mesh
         self.material = material
+        self.worlds = checked_count(worlds, "worlds", least=1)
         self.device = checked_device(device)
-        count = len(mesh.tets)
+        if self.element_count > MOST_ELEMENTS:
+            raise InputError(
+                f"worlds is {worlds}: that is {self.element_count} elements; there can be {MOST_ELEMENTS} at most"
+            )
         for name in ("young", "poisson", "density"):
-            values = np.asarray(getattr(material, name))
-            if values.ndim and len(values) != count:
-                raise InputError(f"{name} has {len(values)} entries; the mesh has {count} elements")
+            self._check_material(name)
         check_float32(2.0 * material.mu + np.abs(material.lam), "the stiffness 2 mu + |lambda|", "Pa")
         check_float32(mesh.volumes, "the volume of an element", "m^3")
         self.element_kind = element_kind(mesh)
-        self.elements = device_elements(mesh, self.device)
+        self.elements = device_elements(mesh, self.device, self.worlds)
         self.mu, self.lam, self.material_stride = self._material_arrays()
-        self.masses = lumped_masses(mesh, material)
+        self.masses = lumped_masses(mesh, material, self.worlds)
         check_float32(self.masses[self.masses > 0], "the mass of a node", "kg")
 
-        n = len(mesh.points)
-        self.node_rest = wp.array(_padded(mesh.points), dtype=wp.vec4, device=self.device)
+        n = self.node_count
+        self.node_rest = wp.array(_padded(self.rest_positions), dtype=wp.vec4, device=self.device)
         self.node_positions = wp.clone(self.node_rest)
         self.node_displacements = wp.zeros(n, dtype=wp.vec4, device=self.device)
         self.node_velocities = wp.zeros(n, dtype=wp.vec4, device=self.device)
@@ -67,31 +77,60 @@ class SoftBody:
         self.node_mass = wp.array(self.masses, dtype=wp.float32, device=self.device)
         self.node_inverse_mass = wp.empty(n, dtype=wp.float32, device=self.device)
         self.trajectories: list[Trajectory] = []
+        #: Time steps done when each world was last reset, int64 [worlds].
+        self.world_starts = wp.zeros(self.worlds, dtype=wp.int64, device=self.device)
         #: Changes whenever the launches of a step do, so that recorded steps can be recorded anew.
         self.revision = 0
         self._constrained = np.zeros(n, bool)
+        self._initial: tuple[wp.array, wp.array] | None = None
         self._update_inverse_mass()
 
     # --- state -----------------------------------------------------------------------------------------------------
 
     @property
+    def world_node_count(self) -> int:
+        """Nodes of one world, N."""
+        return len(self.mesh.points)
+
+    @property
     def node_count(self) -> int:
-        return len(self.masses)
+        """Nodes of all worlds."""
+        return self.worlds * self.world_node_count
+
+    @property
+    def element_count(self) -> int:
+        """Elements of all worlds."""
+        return self.worlds * len(self.mesh.tets)
+
+    @property
+    def rest_positions(self) -> npt.NDArray[np.float64]:
+        """Rest positions of the nodes of all worlds [m], float64 [worlds * N, 3]."""
+        return repeated(self.mesh.points, self.worlds)
+
+    def world(self, index: int) -> World:
+        """One world's part of the arrays below.
+
+        Raises:
+            InputError: There is no such world.
+        """
+        if isinstance(index, bool) or index != int(index) or not 0 <= index < self.worlds:
+            raise InputError(f"world is {index!r}; it must be a whole number from 0 to {self.worlds - 1}")
+        return World(self, int(index))
 
     @property
     def positions(self) -> wp.array:
-        """Nodal positions [m], vec3 [N], in the mesh's order. A view of the live array: write to it between steps, or
-        set the property, and the next step starts from there."""
+        """Nodal positions [m], vec3 [worlds * N], in the mesh's order. A view of the live array: write to it
+        between steps, or set the property, and the next step starts from there."""
         return vec3_view(self.node_positions)
 
     @positions.setter
     def positions(self, values: npt.ArrayLike) -> None:
         # In float64 and by way of the displacement, so that no digit of what is given is lost.
-        self._set_displacements(self._checked_vectors(values, "positions") - self.mesh.points)
+        self._set_displacements(self._checked_vectors(values, "positions") - self.rest_positions)
 
     @property
     def displacements(self) -> wp.array:
-        """Nodal displacements from rest [m], vec3 [N]: a copy; set the property to change them."""
+        """Nodal displacements from rest [m], vec3 [worlds * N]: a copy; set the property to change them."""
         self.adopt_positions()
         return wp.clone(vec3_view(self.node_displacements))
 
@@ -101,7 +140,7 @@ class SoftBody:
 
     @property
     def velocities(self) -> wp.array:
-        """Nodal velocities [m/s], vec3 [N]: a view of the live array."""
+        """Nodal velocities [m/s], vec3 [worlds * N]: a view of the live array."""
         return vec3_view(self.node_velocities)
 
     @velocities.setter
@@ -110,7 +149,7 @@ class SoftBody:
 
     @property
     def reactions(self) -> wp.array:
-        """Forces of the supports on fixed and prescribed nodes in the last step [N], vec3 [N]; zero elsewhere.
+        """Forces of the supports on fixed and prescribed nodes in the last step [N], vec3 [worlds * N]; zero elsewhere.
 
         A support carries its node's own weight too. Inertia of a prescribed node is not included.
         """
@@ -118,7 +157,7 @@ class SoftBody:
 
     @property
     def loads(self) -> wp.array:
-        """External nodal forces [N], vec3 [N]: a view of the live array, made on first use."""
+        """External nodal forces [N], vec3 [worlds * N]: a view of the live array, made on first use."""
         self._ensure_loads()
         return vec3_view(self.node_loads)
 
@@ -130,21 +169,43 @@ class SoftBody:
         """Write positions from displacements."""
         self._launch(publish_positions, [self.node_rest, self.node_displacements], [self.node_positions])
 
+    def set_initial_state(self) -> None:
+        """Make the present state the one that ``Simulation.reset`` goes back to; at first that is rest."""
+        self.adopt_positions()
+        self._initial = (wp.clone(self.node_displacements), wp.clone(self.node_velocities))
+
+    def reset(self, chosen: wp.array, clock: wp.array) -> None:
+        """Put chosen worlds back to their initial state; ``Simulation.reset`` does more and is what to call.
+
+        Args:
+            chosen: Not zero for worlds to be reset, int32 [worlds].
+            clock: Time steps done, int64 [1].
+        """
+        kept = self._initial is not None
+        u, v = self._initial if self._initial is not None else (self.node_displacements, self.node_velocities)
+        inputs = [chosen, self.world_node_count, int(kept), u, v, self.node_rest, self.node_inverse_mass, clock]
+        outputs = [self.node_displacements, self.node_velocities, self.node_positions, self.node_reactions]
+        self._launch(reset_nodes, inputs, [*outputs, self.world_starts])
+
     # --- constraints and loads -------------------------------------------------------------------------------------
 
-    def fix(self, nodes: npt.ArrayLike) -> None:
-        """Hold nodes where they are. Mask bool [N] or indices.
+    def fix(self, nodes: npt.ArrayLike, *, worlds: npt.ArrayLike | None = None) -> None:
+        """Hold nodes where they are.
+
+        Args:
+            nodes: Mask bool [N] or indices into one world's nodes; or a mask of all worlds' nodes, bool [worlds, N].
+            worlds: In which worlds: None for all, an index, indices or a mask bool [worlds].
 
         Raises:
             InputError: Mask of the wrong length or index out of range.
         """
-        chosen = self.node_indices(nodes)
+        chosen = self.node_indices(nodes, worlds)
         self._stop_following(chosen)
         self._constrain(chosen, np.zeros(3))
 
-    def release(self, nodes: npt.ArrayLike) -> None:
-        """Let fixed or prescribed nodes go, with the velocity they have."""
-        chosen = self.node_indices(nodes)
+    def release(self, nodes: npt.ArrayLike, *, worlds: npt.ArrayLike | None = None) -> None:
+        """Let fixed or prescribed nodes go, with the velocity they have. Nodes and worlds as in ``fix``."""
+        chosen = self.node_indices(nodes, worlds)
         self._stop_following(chosen)
         self._constrained[chosen] = False
         self._update_inverse_mass()
@@ -159,29 +220,33 @@ class SoftBody:
         velocity: npt.ArrayLike | None = None,
         times: npt.ArrayLike | None = None,
         displacements: npt.ArrayLike | None = None,
+        worlds: npt.ArrayLike | None = None,
     ) -> None:
         """Move nodes as told, whatever the forces: at a velocity, or along keyframes.
 
         Args:
-            nodes: Mask bool [N] or indices [n].
-            velocity: Constant velocity [m/s], [3] or [n, 3].
-            times: Increasing times of keyframes [s], [K], at least two, in the time of the simulation.
+            nodes: n nodes of each world, as in ``fix``.
+            velocity: Constant velocity [m/s], [3], [n, 3] or [worlds, n, 3].
+            times: Increasing times of keyframes [s], [K], at least two, in the time of the simulation, from a world's
+                last reset.
             displacements: Displacements from rest at these times [m], [K, 3] for all nodes alike or [K, n, 3]; linear
                 in between, constant before and after.
+            worlds: As in ``fix``.
 
         Raises:
             InputError: Neither or both ways given, wrong shapes, times that do not increase, or non-finite values.
         """
-        chosen = self.node_indices(nodes)
+        named = chosen_nodes(nodes, self.world_node_count, self.worlds, worlds)
+        chosen = named.indices
         if (velocity is None) == (times is None and displacements is None):
             raise InputError("prescribe takes either velocity, or times and displacements")
         if velocity is not None:
-            values = np.asarray(velocity, dtype=np.float64)
-            if values.shape not in ((3,), (len(chosen), 3)) or not np.isfinite(values).all():
-                raise InputError(f"velocity has shape {values.shape}; it must be finite, [3] or [{len(chosen)}, 3]")
+            values = named.vectors(velocity, "velocity")
             self._stop_following(chosen)
             self._constrain(chosen, values)
             return
+        if displacements is not None and named.each and np.shape(displacements)[1:2] == (named.each,):
+            displacements = np.tile(displacements, (1, len(chosen) // named.each, 1))
         trajectory = Trajectory.of_keys(chosen, times, displacements, self.device)
         self._stop_following(chosen)
         self._constrain(chosen, np.zeros(3))
@@ -189,28 +254,27 @@ class SoftBody:
             self.trajectories.append(trajectory)
             self.revision += 1
 
-    def load(self, nodes: npt.ArrayLike, force: npt.ArrayLike) -> None:
+    def load(self, nodes: npt.ArrayLike, force: npt.ArrayLike, *, worlds: npt.ArrayLike | None = None) -> None:
         """Set the external force on nodes, from the next step on.
 
         Args:
-            nodes: Mask bool [N] or indices [n].
-            force: Force on each node [N], [3] or [n, 3].
+            nodes: n nodes of each world, as in ``fix``.
+            force: Force on each node [N], [3], [n, 3], [worlds, 1, 3] or [worlds, n, 3].
+            worlds: As in ``fix``.
 
         Raises:
             InputError: Wrong shape or non-finite values.
         """
-        chosen = self.node_indices(nodes)
-        values = np.asarray(force, dtype=np.float64)
-        if values.shape not in ((3,), (len(chosen), 3)) or not np.isfinite(values).all():
-            raise InputError(f"force has shape {values.shape}; it must be finite, [3] or [{len(chosen)}, 3]")
+        chosen = chosen_nodes(nodes, self.world_node_count, self.worlds, worlds)
+        values = chosen.vectors(force, "force")
         self._ensure_loads()
         loads = self.node_loads.numpy().copy()
-        loads[chosen, :3] = values
+        loads[chosen.indices, :3] = values
         self.node_loads.assign(loads)
 
     @property
     def constrained(self) -> npt.NDArray[np.bool_]:
-        """Which nodes are fixed or prescribed, bool [N] (a copy)."""
+        """Which nodes are fixed or prescribed, bool [worlds * N] (a copy)."""
         return self._constrained.copy()
 
     @property
@@ -219,24 +283,36 @@ class SoftBody:
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
-    def node_indices(self, nodes: npt.ArrayLike) -> npt.NDArray[np.intp]:
-        """Indices of the nodes that a mask or a list of indices names.
+    def node_indices(self, nodes: npt.ArrayLike, worlds: npt.ArrayLike | None = None) -> npt.NDArray[np.intp]:
+        """Indices, among the nodes of all worlds, of those named as in ``fix``.
 
         Raises:
             InputError: Mask of the wrong length, index out of range, or neither.
         """
-        return checked_indices(nodes, self.node_count, "node")
+        return chosen_nodes(nodes, self.world_node_count, self.worlds, worlds).indices
+
+    def _check_material(self, name: str) -> None:
+        shape, count = np.shape(getattr(self.material, name)), len(self.mesh.tets)
+        if len(shape) == 1 and shape[0] != count:
+            raise InputError(f"{name} has {shape[0]} entries; the mesh has {count} elements")
+        if len(shape) == 2 and (shape[0] not in (1, self.worlds) or shape[1] not in (1, count)):
+            raise InputError(f"{name} has shape {shape}; there are {self.worlds} worlds of {count} elements")
 
     def _material_arrays(self) -> tuple[wp.array, wp.array, int]:
         mu, lam = np.broadcast_arrays(np.atleast_1d(self.material.mu), np.atleast_1d(self.material.lam))
-        stride = int(len(mu) > 1)
-        return self._floats(mu), self._floats(lam), stride
+        if mu.size == 1:
+            return self._floats(mu.ravel()), self._floats(lam.ravel()), 0
+        shape = (self.worlds, len(self.mesh.tets))
+        return *(self._floats(np.broadcast_to(a, shape).ravel()) for a in (mu, lam)), 1
 
     def _floats(self, values: np.ndarray) -> wp.array:
         return wp.array(np.ascontiguousarray(values), dtype=wp.float32, device=self.device)
 
     def _checked_vectors(self, values: npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:
         given = np.asarray(values.numpy() if isinstance(values, wp.array) else values, dtype=np.float64)
+        n = self.world_node_count
+        if given.shape in ((n, 3), (self.worlds, n, 3)):
+            given = np.broadcast_to(given, (self.worlds, n, 3)).reshape(-1, 3)
         if given.shape != (self.node_count, 3):
             raise InputError(f"{name} has shape {given.shape}; it must be [{self.node_count}, 3]")
         bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
@@ -289,11 +365,12 @@ def vec3_view(a: wp.array) -> wp.array:
     return a.view(wp.float32)[:, :3].view(wp.vec3)
 
 
-def lumped_masses(mesh: Mesh, material: Isotropic) -> npt.NDArray[np.float64]:
-    """A quarter of each element's mass at each of its nodes [kg], float64 [N]."""
-    masses = np.zeros(len(mesh.points))
-    density = np.broadcast_to(material.density, len(mesh.tets))
-    for part in parts(len(mesh.tets)):
-        quarter = mesh.volumes[part] * density[part] / 4.0
-        np.add.at(masses, mesh.tets[part].ravel(), np.repeat(quarter, 4))
-    return masses
+def lumped_masses(mesh: Mesh, material: Isotropic, worlds: int = 1) -> npt.NDArray[np.float64]:
+    """A quarter of each element's mass at each of its nodes [kg], float64 [worlds * N]."""
+    density = np.atleast_2d(material.density)
+    masses = np.zeros((len(density), len(mesh.points)))
+    for of_world, row in zip(masses, np.broadcast_to(density, (len(density), len(mesh.tets))), strict=True):
+        for part in parts(len(mesh.tets)):
+            quarter = mesh.volumes[part] * row[part] / 4.0
+            np.add.at(of_world, mesh.tets[part].ravel(), np.repeat(quarter, 4))
+    return np.broadcast_to(masses, (worlds, len(mesh.points))).ravel()

@@ -28,27 +28,58 @@ def element_kind(mesh: Mesh) -> Any:
     return ForestElements if isinstance(mesh, TetForest) else GeneralElements
 
 
-def device_elements(mesh: Mesh, device: wp.Device) -> Any:
-    """The mesh's elements as an instance of its ``element_kind`` on ``device``."""
+def device_elements(mesh: Mesh, device: wp.Device, worlds: int = 1) -> Any:
+    """The mesh's elements as an instance of its ``element_kind`` on ``device``, world after world."""
     if isinstance(mesh, TetForest):
-        return _forest_elements(mesh, mesh.tets, mesh.levels, device)
-    return general_elements(mesh, device)
+        return _forest_elements(mesh, mesh.tets, mesh.levels, device, worlds)
+    return general_elements(mesh, device, worlds)
 
 
-def forest_elements(forest: TetForest, chosen: np.ndarray, device: wp.Device) -> Any:
+def forest_elements(forest: TetForest, chosen: np.ndarray, device: wp.Device, worlds: int = 1) -> Any:
     """Any tetrahedra of the tree, leaves or ancestors, as forest elements.
 
     Args:
         chosen: Indices into the tree [n].
     """
-    return _forest_elements(forest, *forest.tree.rows(chosen), device)
+    return _forest_elements(forest, *forest.tree.rows(chosen), device, worlds)
 
 
-def _forest_elements(forest: TetForest, tets: np.ndarray, level: np.ndarray, device: wp.Device) -> Any:
+def in_worlds(indices: np.ndarray, worlds: int, count: int) -> np.ndarray:
+    """Indices of one world repeated for all, each world's larger by ``count``; negative ones stay.
+
+    Args:
+        indices: int32 [n, …].
+        worlds: How many worlds.
+        count: How many things, of which these are indices, there are in one world.
+
+    Returns:
+        int32 [worlds * n, …].
+    """
+    if worlds == 1:
+        return indices
+    shift = (np.arange(worlds, dtype=np.int32) * np.int32(count)).reshape(-1, *[1] * indices.ndim)
+    return np.where(indices < 0, indices, indices + shift).reshape(-1, *indices.shape[1:]).astype(np.int32, copy=False)
+
+
+def repeated(values: np.ndarray, worlds: int) -> np.ndarray:
+    """Values of one world, [n, …], once for each: [worlds * n, …]."""
+    return values if worlds == 1 else np.tile(values, (worlds, *[1] * (values.ndim - 1)))
+
+
+def with_targets(elements: Any, targets: np.ndarray) -> Any:
+    """The same elements with their forces added elsewhere, int32 [T, 4]."""
+    other = type(elements)()
+    other.assign(elements)
+    other.targets = wp.array(targets, dtype=wp.vec4i, device=elements.nodes.device)
+    return other
+
+
+def _forest_elements(forest: TetForest, tets: np.ndarray, level: np.ndarray, device: wp.Device, worlds: int) -> Any:
     code, frames = shape_codes(forest.lattice, tets, level)
     elements = ForestElements()
-    elements.nodes = wp.array(tets, dtype=wp.vec4i, device=device)
-    elements.code = wp.array(code, dtype=wp.int32, device=device)
+    elements.nodes = wp.array(in_worlds(tets, worlds, len(forest.points)), dtype=wp.vec4i, device=device)
+    elements.targets = elements.nodes
+    elements.code = wp.array(repeated(code, worlds), dtype=wp.int32, device=device)
     elements.frames = wp.array(frames, dtype=wp.mat33, device=device)
     elements.size = wp.array(forest.cell_size * 0.5 ** np.arange(LATTICE_BITS + 1), dtype=wp.float32, device=device)
     return elements
@@ -99,12 +130,13 @@ def shape_codes(lattice: np.ndarray, tets: np.ndarray, level: np.ndarray) -> tup
     return key, frames
 
 
-def general_elements(mesh: TetMesh, device: wp.Device) -> Any:
+def general_elements(mesh: TetMesh, device: wp.Device, worlds: int = 1) -> Any:
     """Elements of a general mesh, with the inverse of their rest matrix."""
     x = mesh.points[mesh.tets]
     rest = np.swapaxes(x[:, 1:] - x[:, :1], 1, 2)
     elements = GeneralElements()
-    elements.nodes = wp.array(mesh.tets, dtype=wp.vec4i, device=device)
-    elements.rest_inverse = wp.array(np.linalg.inv(rest), dtype=wp.mat33, device=device)
-    elements.volume = wp.array(mesh.volumes, dtype=wp.float32, device=device)
+    elements.nodes = wp.array(in_worlds(mesh.tets, worlds, len(mesh.points)), dtype=wp.vec4i, device=device)
+    elements.targets = elements.nodes
+    elements.rest_inverse = wp.array(repeated(np.linalg.inv(rest), worlds), dtype=wp.mat33, device=device)
+    elements.volume = wp.array(repeated(mesh.volumes, worlds), dtype=wp.float32, device=device)
     return elements

@@ -12,15 +12,15 @@ from .errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Isotropic:
-    """An isotropic elastic material, uniform or with a value per element.
+    """An isotropic elastic material, uniform or with a value per element, per world, or both.
 
     Attributes:
-        young: Young's modulus E > 0 [Pa], a number or [T].
-        poisson: Poisson's ratio, -1 < nu < 0.5, a number or [T].
-        density: Mass per rest volume > 0 [kg/m^3], a number or [T].
+        young: Young's modulus E > 0 [Pa], a number, [T], [worlds, 1] or [worlds, T].
+        poisson: Poisson's ratio, -1 < nu < 0.5, as ``young``.
+        density: Mass per rest volume > 0 [kg/m^3], as ``young``.
 
     Raises:
-        InputError: A value out of its range, or arrays that are neither numbers nor one-dimensional.
+        InputError: A value out of its range, or arrays of more than two dimensions.
     """
 
     young: float | npt.NDArray[np.floating]
@@ -37,12 +37,14 @@ class Isotropic:
                 values = np.asarray(getattr(self, name), dtype=np.float64)
             except (TypeError, ValueError):
                 raise InputError(f"{name} is {getattr(self, name)!r}; it must be a number or an array") from None
-            if values.ndim > 1:
+            if values.ndim > 2:
                 raise InputError(f"{name} has shape {values.shape}; it must be a number or have one entry per element")
             bad = np.flatnonzero(~(np.isfinite(values) & (values > low) & (values < high)))
             if len(bad):
                 bound = f"above {low:g}" if high == np.inf else f"above {low:g} and below {high:g}"
-                where = f" of element {bad[0]}" if values.ndim else ""
+                where = f" of element {bad[0] % values.shape[-1]}" if values.ndim else ""
+                if values.ndim == 2:
+                    where = f"{where if values.shape[1] > 1 else ''} in world {bad[0] // values.shape[1]}"
                 value = values.ravel()[bad[0]]
                 raise InputError(f"{name}{where} is {value:g}{' ' + unit if unit else ''}; it must be {bound}")
             object.__setattr__(self, name, values if values.ndim else float(values))

@@ -15,10 +15,12 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from .elements import forest_elements
+from .elements import forest_elements, in_worlds
 from .kernels.elements import Subtrees
-from .kernels.subtree import GROUP_NODES, LEAVES, group_nodes
+from .kernels.subtree import GROUP_NODES, LEAVES, group_leaves, group_nodes
 from .mesh import TetForest
+from .mesh.tree import UniformTree
+from .slots import Slots
 
 SUBTREE_LEVELS = 3
 GROUP_LEVELS = 6
@@ -34,7 +36,7 @@ class Sharing(Enum):
 
 @dataclass(frozen=True)
 class Batch:
-    """Subtrees of one type that one launch goes through.
+    """Subtrees of one type that one launch goes through, world after world.
 
     Attributes:
         shape: Their type, 0, 1 or 2.
@@ -43,7 +45,7 @@ class Batch:
         sharing: Whose rotation their leaves use.
         subtrees: ``kernels.elements.Subtrees``.
         roots: Their roots as forest elements where leaves share the root's rotation, else None.
-        flagged: Set by the kernel where a subtree was left out, uint8 [count].
+        flagged: Set by the kernel where a subtree was left out, uint8 [count, rounded up to eights].
     """
 
     shape: int
@@ -54,6 +56,11 @@ class Batch:
     roots: Any
     flagged: wp.array
 
+    @property
+    def flags_by_eights(self) -> wp.array:
+        """``flagged`` as uint64, eight subtrees each."""
+        return wp.array(ptr=self.flagged.ptr, dtype=wp.uint64, shape=len(self.flagged) // 8, device=self.flagged.device)
+
 
 @dataclass(frozen=True)
 class ForcePlan:
@@ -62,86 +69,159 @@ class ForcePlan:
     Attributes:
         batches: Subtrees by type, grouped or not, and sharing.
         flat: The other leaves, indices into the mesh's elements.
+        slots: Where forces go first if their sums must have one order, else None.
+        leaf_targets: Then each leaf's slots, int32 [T, 4], of one world.
     """
 
     batches: tuple[Batch, ...]
     flat: npt.NDArray[np.int32]
+    slots: Slots | None = None
+    leaf_targets: npt.NDArray[np.int32] | None = None
 
     @classmethod
-    def of_forest(cls, forest: TetForest, rotation_level: int | None, device: wp.Device) -> ForcePlan:
-        """The plan of a forest whose rotations are shared at a level of the tree (None: not shared)."""
-        first = complete_subtrees(forest, SUBTREE_LEVELS)
-        level = forest.levels[first]
-        root = level - SUBTREE_LEVELS
-        if rotation_level is None:
-            chosen = {Sharing.OWN: np.ones(len(first), bool)}
-        else:
-            # Between root and leaves, leaves of one subtree use different rotations: those go leaf by leaf.
-            chosen = {
-                Sharing.OWN: level <= rotation_level,
-                Sharing.ROOT: root == rotation_level,
-                Sharing.ABOVE: root > rotation_level,
-            }
-        in_group = np.zeros(len(first), bool)
-        if device.is_cuda:
-            starts = complete_subtrees(forest, GROUP_LEVELS)
-            at = np.searchsorted(first, starts)
-            in_group[(at[:, None] + np.arange(8)).ravel()] = True
+    def of_forest(
+        cls,
+        forest: TetForest,
+        rotation_level: int | None,
+        device: wp.Device,
+        *,
+        worlds: int = 1,
+        grouped: bool = True,
+        deterministic: bool = False,
+    ) -> ForcePlan:
+        """The plan of a forest.
+
+        Args:
+            rotation_level: Level of the tree at which rotations are shared; None: not shared.
+            worlds: How many copies of the body there are.
+            grouped: False: subtrees one by one also on CUDA.
+            deterministic: Whether every unit has slots of its own for its forces.
+        """
+        members, flat = _members(forest, rotation_level, grouped=grouped and device.is_cuda)
+        nodes = [m.of_leaves(forest.tets) for m in members]
+        if not deterministic:
+            batches = [m.batch(forest, device, worlds, n, n) for m, n in zip(members, nodes, strict=True)]
+            return cls(tuple(batches), flat)
+        slots, targets = Slots.of_units([*nodes, forest.tets[flat]], len(forest.points), device, worlds)
+        leaf_targets = np.empty_like(forest.tets)
+        leaf_targets[flat] = targets[-1]
         batches = []
-        left = np.ones(len(forest.tets), bool)
-        for sharing, mask in chosen.items():
-            for shape in range(3):
-                for grouped in (True, False):
-                    members = first[mask & (level % 3 == shape) & (in_group == grouped)]
-                    if len(members):
-                        batches.append(_batch(forest, members, shape, grouped, sharing, device))
-                        left[(members[:, None] + np.arange(8)).ravel()] = False
-        return cls(tuple(batches), np.flatnonzero(left).astype(np.int32))
+        for m, own_nodes, own_targets in zip(members, nodes, targets[:-1], strict=True):
+            m.hand_down(own_targets, leaf_targets)
+            batches.append(m.batch(forest, device, worlds, own_nodes, own_targets, slots.per_world))
+        return cls(tuple(batches), flat, slots, leaf_targets)
+
+
+@dataclass(frozen=True)
+class _Members:
+    """The subtrees of a batch-to-be: their first leaves, in tree order."""
+
+    shape: int
+    grouped: bool
+    sharing: Sharing
+    first: npt.NDArray[np.int32]
+
+    @property
+    def unit_leaves(self) -> int:
+        return 64 if self.grouped else 8
+
+    def of_leaves(self, values: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+        """What leaves have at their nodes, int32 [T, 4], by the nodes of the units: [units, 40 or 10]."""
+        if not self.grouped:
+            places = np.array([_place(self.shape, node) for node in range(10)])
+            return values[self.first[:, None] + places[:, 0], places[:, 1]]
+        places = np.array(group_nodes(self.shape))
+        found = np.full((len(self.first) // 8, GROUP_NODES), -1, np.int32)
+        found[:, : len(places)] = values[self.first[::8, None] + places[:, 0], places[:, 1]]
+        return found
+
+    def hand_down(self, values: npt.NDArray[np.int32], leaves: npt.NDArray[np.int32]) -> None:
+        """The opposite: write what units have at their nodes to their leaves."""
+        places = np.array(group_leaves(self.shape) if self.grouped else LEAVES[self.shape])
+        starts = self.first[::8] if self.grouped else self.first
+        leaves[starts[:, None] + np.arange(self.unit_leaves)] = values[:, places]
+
+    def batch(
+        self,
+        forest: TetForest,
+        device: wp.Device,
+        worlds: int,
+        nodes: npt.NDArray[np.int32],
+        targets: npt.NDArray[np.int32],
+        target_count: int = 0,
+    ) -> Batch:
+        count = worlds * len(self.first)
+        root_indices = forest.tree.above(forest.tree.leaves[self.first], SUBTREE_LEVELS)
+        roots = forest_elements(forest, root_indices, device, worlds)
+        subtrees = Subtrees()
+        subtrees.code = roots.code
+        subtrees.frames = roots.frames
+        subtrees.size = roots.size
+        subtrees.first = wp.array(in_worlds(self.first, worlds, len(forest.tets)), dtype=wp.int32, device=device)
+        subtrees.nodes = self._on_device(in_worlds(nodes, worlds, len(forest.points)), device)
+        subtrees.targets = subtrees.nodes
+        if targets is not nodes:
+            subtrees.targets = self._on_device(in_worlds(targets, worlds, target_count), device)
+        return Batch(
+            shape=self.shape,
+            grouped=self.grouped,
+            count=count,
+            sharing=self.sharing,
+            subtrees=subtrees,
+            roots=roots if self.sharing is Sharing.ROOT else None,
+            flagged=wp.zeros(-(-count // 8) * 8, dtype=wp.uint8, device=device),
+        )
+
+    def _on_device(self, indices: npt.NDArray[np.int32], device: wp.Device) -> wp.array:
+        if device.is_cuda and not self.grouped:
+            indices = indices.T
+        return wp.array(np.ascontiguousarray(indices), dtype=wp.int32, device=device)
+
+
+def _members(
+    forest: TetForest, rotation_level: int | None, *, grouped: bool
+) -> tuple[list[_Members], npt.NDArray[np.int32]]:
+    """Batches-to-be, and the leaves that are in none."""
+    first = complete_subtrees(forest, SUBTREE_LEVELS)
+    level = forest.levels[first]
+    root = level - SUBTREE_LEVELS
+    if rotation_level is None:
+        chosen = {Sharing.OWN: np.ones(len(first), bool)}
+    else:
+        # Between root and leaves, leaves of one subtree use different rotations: those go leaf by leaf.
+        chosen = {
+            Sharing.OWN: level <= rotation_level,
+            Sharing.ROOT: root == rotation_level,
+            Sharing.ABOVE: root > rotation_level,
+        }
+    in_group = np.zeros(len(first), bool)
+    if grouped:
+        starts = complete_subtrees(forest, GROUP_LEVELS)
+        at = np.searchsorted(first, starts)
+        in_group[(at[:, None] + np.arange(8)).ravel()] = True
+    members = []
+    left = np.ones(len(forest.tets), bool)
+    for sharing, mask in chosen.items():
+        for shape in range(3):
+            for kind in (True, False):
+                found = first[mask & (level % 3 == shape) & (in_group == kind)]
+                if len(found):
+                    members.append(_Members(shape, kind, sharing, found))
+                    left[(found[:, None] + np.arange(8)).ravel()] = False
+    return members, np.flatnonzero(left).astype(np.int32)
 
 
 def complete_subtrees(forest: TetForest, depth: int) -> npt.NDArray[np.int32]:
     """First leaves of the subtrees whose 2**depth leaves all lie ``depth`` levels below their root; in tree order."""
     size = 2**depth
     levels = forest.levels
-    if levels[0] >= depth and (levels == levels[0]).all():
+    if isinstance(forest.tree, UniformTree) and forest.tree.depth >= depth:
         return np.arange(0, len(levels), size, dtype=np.int32)
     ancestor = forest.tree.above(forest.tree.leaves, depth)
     # In tree order the leaves at one depth below an ancestor follow one another unless deeper ones come between.
     change = np.flatnonzero(np.diff(ancestor, prepend=-2))
     length = np.diff(change, append=len(ancestor))
     return change[(length == size) & (ancestor[change] >= 0)].astype(np.int32)
-
-
-def _batch(
-    forest: TetForest, first: np.ndarray, shape: int, grouped: bool, sharing: Sharing, device: wp.Device
-) -> Batch:
-    count = len(first)
-    root_indices = forest.tree.above(forest.tree.leaves[first], SUBTREE_LEVELS)
-    roots = forest_elements(forest, root_indices, device)
-    subtrees = Subtrees()
-    subtrees.code = roots.code
-    subtrees.frames = roots.frames
-    subtrees.size = roots.size
-    subtrees.first = wp.array(first, dtype=wp.int32, device=device)
-    if grouped:
-        places = np.array(group_nodes(shape))
-        nodes = np.full((count // 8, GROUP_NODES), -1, np.int32)
-        nodes[:, : len(places)] = forest.tets[first[::8, None] + places[:, 0], places[:, 1]]
-    else:
-        places = np.array([_place(shape, node) for node in range(10)])
-        nodes = forest.tets[first[:, None] + places[:, 0], places[:, 1]]
-        if device.is_cuda:
-            nodes = nodes.T
-    subtrees.nodes = wp.array(np.ascontiguousarray(nodes), dtype=wp.int32, device=device)
-    return Batch(
-        shape=shape,
-        grouped=grouped,
-        count=count,
-        sharing=sharing,
-        subtrees=subtrees,
-        roots=roots if sharing is Sharing.ROOT else None,
-        flagged=wp.zeros(count, dtype=wp.uint8, device=device),
-    )
 
 
 def _place(shape: int, node: int) -> tuple[int, int]:

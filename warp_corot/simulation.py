@@ -17,6 +17,7 @@ from .body import SoftBody, vec3_view
 from .checks import checked_count, checked_things
 from .elasticity import Corotated, Model
 from .errors import InputError, StabilityWarning, UnstableError
+from .indices import checked_indices
 from .kernels.integrate import advance_clock
 from .solvers import Integrator, SymplecticEuler, largest_frequency
 from .solvers.integrator import StepContext
@@ -56,17 +57,20 @@ class Simulation:
         model: Elastic model, or one for each body.
         integrator: Time integrator; with ``dt=None`` a stable step is found.
         gravity: [m/s^2]; None for 9.81 down the up axis of the first body's mesh.
+        deterministic: Whether a run must come out the same bit by bit every time. On the CPU it always does; on CUDA
+            forces are then added up in one order, which takes time and memory (``benchmarks/README.md``).
 
     Attributes:
         bodies: Tuple of the bodies.
+        worlds: Copies of the bodies, the same number for each.
         dt: Time step [s].
         stable_dt: Largest linearly stable step at rest [s], estimated; infinite where nothing can vibrate.
         gravity: Tuple [m/s^2].
 
     Raises:
-        InputError: No body, one given twice, bodies on different devices, a number of models that is not the number of
-            bodies, a body of which no node is free to move, non-finite gravity, a model that does not go with its
-            mesh, or something that is none of these.
+        InputError: No body, one given twice, bodies on different devices or of different numbers of worlds, a number of
+            models that is not the number of bodies, a body of which no node is free to move, non-finite gravity, a
+            model that does not go with its mesh, or something that is none of these.
 
     Warns:
         StabilityWarning: The given step is larger than ``stable_dt``.
@@ -79,6 +83,7 @@ class Simulation:
         model: Model | Sequence[Model] | None = None,
         integrator: Integrator | None = None,
         gravity: npt.ArrayLike | None = None,
+        deterministic: bool = False,
     ):
         self.bodies = checked_things(bodies, SoftBody, "body", "a SoftBody")
         if not self.bodies:
@@ -86,7 +91,11 @@ class Simulation:
         if len(set(self.bodies)) < len(self.bodies):
             raise InputError("a body is given twice; each can be stepped once only")
         self.device = self.bodies[0].device
+        self.worlds = self.bodies[0].worlds
+        self.deterministic = bool(deterministic)
         for body in self.bodies:
+            if body.worlds != self.worlds:
+                raise InputError(f"bodies are in {self.worlds} and {body.worlds} worlds; they must be in as many")
             if body.device != self.device:
                 raise InputError(f"bodies are on {self.device} and {body.device}; they must be on one device")
             if not (body.node_inverse_mass.numpy() > 0).any():
@@ -100,7 +109,8 @@ class Simulation:
             raise InputError(f"integrator is {integrator!r}; it must be an integrator such as SymplecticEuler()")
         self.gravity = _checked_gravity(gravity, self.bodies[0].mesh.up_axis)
 
-        self.fields = tuple(m.bind(body) for m, body in zip(self.models, self.bodies, strict=True))
+        bound = zip(self.models, self.bodies, strict=True)
+        self.fields = tuple(m.bind(body, deterministic=self.deterministic) for m, body in bound)
         frequencies = [largest_frequency(body, f) for body, f in zip(self.bodies, self.fields, strict=True)]
         steps = [2.0 / w if w > 0 else math.inf for w in frequencies]
         self.stable_dt = min(steps)
@@ -204,6 +214,36 @@ class Simulation:
             raise InputError(f"callback is {callback!r}; it must be a function of the simulation")
         self._hooks.append(_Hook(callback, checked_count(every, "every", least=1)))
 
+    def reset(self, worlds: npt.ArrayLike | wp.array | None = None) -> None:
+        """Put worlds back to their initial state: rest, or what ``SoftBody.set_initial_state`` took as such.
+
+        Their prescribed motions begin anew; materials, loads and held nodes stay as they are. The clock goes on unless
+        all worlds are reset by ``reset()``.
+
+        Args:
+            worlds: None for all; an index, indices or a mask bool [worlds]; or a Warp array int32 [worlds] on the
+                device, not zero for worlds to be reset, for which nothing waits or comes back to the host.
+
+        Raises:
+            InputError: There is no such world, or an array of another type, length or device.
+        """
+        if isinstance(worlds, wp.array):
+            if worlds.dtype != wp.int32 or worlds.shape != (self.worlds,) or worlds.device != self.device:
+                raise InputError(
+                    f"worlds is {worlds.dtype.__name__} {list(worlds.shape)} on {worlds.device}; "
+                    f"it must be int32 [{self.worlds}] on {self.device}"
+                )
+            chosen = worlds
+        else:
+            mask = np.zeros(self.worlds, np.int32)
+            mask[slice(None) if worlds is None else checked_indices(worlds, self.worlds, "world")] = 1
+            chosen = wp.array(mask, dtype=wp.int32, device=self.device)
+        if worlds is None:
+            self.clock.zero_()
+        for body, field in zip(self.bodies, self.fields, strict=True):
+            body.reset(chosen, self.clock)
+            field.reset(chosen)
+
     # --- looking ---------------------------------------------------------------------------------------------------
 
     def energy(self) -> Energy:
@@ -215,17 +255,17 @@ class Simulation:
             u = body.node_displacements.numpy()[:, :3].astype(np.float64)
             kinetic += 0.5 * float(body.masses @ np.einsum("ni,ni->n", v, v))
             elastic += field.elastic_energy(body.node_displacements)
-            gravitational -= float(body.masses @ ((body.mesh.points + u) @ np.asarray(self.gravity)))
+            gravitational -= float(body.masses @ ((body.rest_positions + u) @ np.asarray(self.gravity)))
         return Energy(kinetic, elastic, gravitational)
 
     def forces(self, body: SoftBody | None = None) -> wp.array:
-        """Elastic nodal forces in the present state [N], vec3 [N]; of the first body unless another is named."""
+        """Elastic nodal forces in the present state [N], vec3 [worlds * N]; of the first body or the one named."""
         chosen = self._index(body)
         self.bodies[chosen].adopt_positions()
         return vec3_view(self.fields[chosen].elastic_forces(self.bodies[chosen].node_displacements))
 
     def von_mises(self, body: SoftBody | None = None) -> npt.NDArray[np.float32]:
-        """Von Mises stress of each element in the present state [Pa], float32 [T]."""
+        """Von Mises stress of each element in the present state [Pa], float32 [worlds * T]."""
         chosen = self._index(body)
         self.bodies[chosen].adopt_positions()
         return self.fields[chosen].von_mises(self.bodies[chosen].node_displacements)
@@ -271,9 +311,8 @@ class Simulation:
         if whole:
             for body in self.bodies:
                 body.adopt_positions()
-        for offset in range(count):
-            for stepper in self._steppers:
-                stepper.step(offset)
+        for stepper in self._steppers:
+            stepper.steps(count)
         wp.launch(advance_clock, dim=1, inputs=[count], outputs=[self.clock], device=self.device)
         if whole:
             for body in self.bodies:
@@ -298,7 +337,21 @@ class Simulation:
             # Said once: who sets a good state again may go on.
             self._bad_step.fill_(_NEVER)
             hint = f"dt is {self.dt:.3g} s, the largest stable step at rest about {self.stable_dt:.3g} s"
-            raise UnstableError(f"the state is not finite since step {step} (t = {step * self.dt:.4g} s); {hint}")
+            where = self._bad_worlds()
+            raise UnstableError(
+                f"the state is not finite since step {step} (t = {step * self.dt:.4g} s){where}; {hint}"
+            )
+
+    def _bad_worlds(self) -> str:
+        """In which worlds something is not finite, for a message."""
+        if self.worlds == 1:
+            return ""
+        bad = np.zeros(self.worlds, bool)
+        for body in self.bodies:
+            bad |= ~np.isfinite(body.node_displacements.numpy()).reshape(self.worlds, -1).all(axis=1)
+        which = np.flatnonzero(bad)
+        more = f" and {len(which) - 3} more" if len(which) > 3 else ""
+        return f" in world {', '.join(map(str, which[:3]))}{more}" if len(which) else ""
 
     def _call_hooks(self) -> None:
         steps = self.steps if self._hooks else 0

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import warp as wp
 
-from ..elements import forest_elements
+from ..elements import forest_elements, in_worlds, with_targets
 from ..errors import InputError
 from ..kernels import general_cpu, subtree_cpu, subtree_cuda
 from ..kernels.corotated import (
@@ -16,17 +16,19 @@ from ..kernels.corotated import (
     corotated_von_mises,
     extract_rotations,
     extract_warm_rotations,
+    reset_quaternions,
     scatter_matrix_product,
     scatter_own_rotation,
     scatter_with_rotations,
 )
 from ..kernels.lanes import LANES
+from ..kernels.repair import repair_own, repair_shared
 from ..kernels.rotation import byers_xu, quick_rotation
 from ..mesh import TetForest
 from ..mesh.forest import MAX_LEVEL
 from ..plan import Batch, ForcePlan, Sharing
 from ..rotations import METHODS, rotation_function
-from .model import ForceField, Model
+from .model import ForceField, Model, leaf_slots
 
 if TYPE_CHECKING:
     from ..body import SoftBody
@@ -77,19 +79,19 @@ class Corotated(Model):
         if self.stiffness not in STIFFNESSES:
             raise InputError(f"stiffness is {self.stiffness!r}; it must be one of {', '.join(STIFFNESSES)}")
 
-    def bind(self, body: SoftBody) -> CorotatedField:
+    def bind(self, body: SoftBody, *, deterministic: bool = False) -> CorotatedField:
         fast = self.rotation == "byers-xu" and self.iterations is None and self.stiffness == "factored"
         fast = fast and self.subtrees
         if isinstance(body.mesh, TetForest):
             if fast:
-                return SubtreeField(body, self)
+                return SubtreeField(body, self, deterministic)
         elif self.rotation_level is not None:
             raise InputError(f"rotation_level {self.rotation_level} needs a forest; a general mesh has no tree")
         elif self.stiffness != "factored":
             raise InputError(f"stiffness {self.stiffness!r} needs a forest; general elements have no three shapes")
         elif fast and body.device.is_cpu:
-            return LanesField(body, self)
-        return CorotatedField(body, self)
+            return LanesField(body, self, deterministic)
+        return LeafField(body, self, deterministic)
 
 
 @dataclass(frozen=True)
@@ -110,18 +112,18 @@ class Rotations:
 
 
 class CorotatedField(ForceField):
-    """Leaf by leaf: rotations and forces as one kernel where each element uses its own, as two stages otherwise."""
+    """Rotations and forces as one kernel where each element uses its own, as two stages otherwise."""
 
-    def __init__(self, body: SoftBody, model: Corotated):
-        super().__init__(body)
+    def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
+        super().__init__(body, deterministic)
         self.model = model
         kind = body.element_kind
         self._shared: Rotations | None = None
         self._fused = model.rotation_level is None and model.rotation != "warm" and model.stiffness == "factored"
         self._state: dict[str, wp.array] = {}
         if model.rotation == "warm":
-            identity = np.tile(np.array([0.0, 0.0, 0.0, 1.0], np.float32), (self.unit_count, 1))
-            self._state["quaternions"] = wp.array(identity, dtype=wp.quat, device=self.device)
+            self._state["quaternions"] = wp.empty(self.unit_count, dtype=wp.quat, device=self.device)
+            self.reset(wp.ones(body.worlds, dtype=wp.int32, device=self.device))
             self._extract = extract_warm_rotations(kind)
         else:
             rotation = rotation_function(model.rotation, model.iterations)
@@ -142,6 +144,11 @@ class CorotatedField(ForceField):
     def state(self) -> dict[str, wp.array]:
         return self._state
 
+    def reset(self, chosen: wp.array) -> None:
+        for quaternions in self._state.values():
+            in_world = len(quaternions) // self.body.worlds
+            self.launch(reset_quaternions, len(quaternions), [chosen, in_world], [quaternions])
+
     @property
     def unit_count(self) -> int:
         """How many rotations are found."""
@@ -157,7 +164,7 @@ class CorotatedField(ForceField):
         """Forces with the rotations that were extracted last."""
         self._launch_with_rotations(self._forces, u, f)
 
-    def add_forces(self, u: wp.array, f: wp.array) -> None:
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         if self._fused:
             self.launch(self._own, self.element_count, [self.elements, *self.material_inputs, u], [f])
         else:
@@ -175,17 +182,17 @@ class CorotatedField(ForceField):
     def _sharing(self) -> Rotations:
         """Who uses whose rotation; made on first use, since own rotations need none of it for their forces."""
         if self._shared is None:
-            mesh, level = self.body.mesh, self.model.rotation_level
-            units, unit = self.elements, np.arange(self.element_count)
-            count = self.element_count
+            body, mesh, level = self.body, self.body.mesh, self.model.rotation_level
+            units, unit = self.elements, np.arange(len(mesh.tets), dtype=np.int32)
+            count = len(mesh.tets)
             if isinstance(mesh, TetForest) and level is not None:
                 ancestors, unit = np.unique(mesh.ancestors(level), return_inverse=True)
-                units, count = forest_elements(mesh, ancestors, self.device), len(ancestors)
+                units, count = forest_elements(mesh, ancestors, self.device, body.worlds), len(ancestors)
             self._shared = Rotations(
                 units,
-                count,
-                wp.empty(count, dtype=wp.mat33, device=self.device),
-                wp.array(unit.ravel(), dtype=wp.int32, device=self.device),
+                body.worlds * count,
+                wp.empty(body.worlds * count, dtype=wp.mat33, device=self.device),
+                wp.array(in_worlds(unit.ravel(), body.worlds, count), dtype=wp.int32, device=self.device),
             )
         return self._shared
 
@@ -195,14 +202,23 @@ class CorotatedField(ForceField):
         self.launch(kernel, self.element_count, inputs, [output])
 
 
+class LeafField(CorotatedField):
+    """Leaf by leaf."""
+
+    def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
+        super().__init__(body, model, deterministic)
+        if self.deterministic:
+            self.slots, self.elements = leaf_slots(body)
+
+
 class LanesField(CorotatedField):
     """General elements on the CPU, eight at a time."""
 
-    def __init__(self, body: SoftBody, model: Corotated):
-        super().__init__(body, model)
+    def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
+        super().__init__(body, model, deterministic)
         self._flagged = wp.zeros(self.element_count, dtype=wp.uint8, device=self.device)
 
-    def add_forces(self, u: wp.array, f: wp.array) -> None:
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         blocks = -(-self.element_count // LANES)
         inputs = [self.elements, self.element_count, *self.material_inputs, u]
         self.launch(general_cpu.scatter_elements, blocks, inputs, [f, self._flagged])
@@ -213,10 +229,16 @@ class LanesField(CorotatedField):
 class SubtreeField(CorotatedField):
     """The fast path: complete subtrees in batches, leaf by leaf only what is left over."""
 
-    def __init__(self, body: SoftBody, model: Corotated):
-        super().__init__(body, model)
+    def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
+        super().__init__(body, model, deterministic)
         assert isinstance(body.mesh, TetForest)
-        self.plan = ForcePlan.of_forest(body.mesh, model.rotation_level, self.device)
+        self.plan = ForcePlan.of_forest(
+            body.mesh, model.rotation_level, self.device, worlds=body.worlds, deterministic=self.deterministic
+        )
+        self.slots = self.plan.slots
+        if self.plan.leaf_targets is not None and self.slots is not None:
+            targets = in_worlds(self.plan.leaf_targets, body.worlds, self.slots.per_world)
+            self.elements = with_targets(self.elements, targets)
         self._uniform = body.material_stride == 0
         self._kernels = [self._kernel(batch) for batch in self.plan.batches]
         above = [batch.sharing is Sharing.ABOVE for batch in self.plan.batches]
@@ -229,29 +251,35 @@ class SubtreeField(CorotatedField):
             for batch, is_above in zip(self.plan.batches, above, strict=True)
         ]
         if len(self.plan.flat):
-            flat = self.plan.flat
-            self._flat_elements = forest_elements(body.mesh, body.mesh.tree.leaves[flat], self.device)
-            self._flat_material = self.material_inputs
-            if not self._uniform:
-                self._flat_material = [
-                    wp.array(a.numpy()[flat], dtype=wp.float32, device=self.device) for a in (body.mu, body.lam)
-                ] + [1]
-            if self._needs_rotations:
-                unit = self._sharing().unit.numpy()[flat]
-                self._flat_unit = wp.array(unit, dtype=wp.int32, device=self.device)
+            self._prepare_flat(body.mesh, in_worlds(self.plan.flat, body.worlds, len(body.mesh.tets)))
 
-    def add_forces(self, u: wp.array, f: wp.array) -> None:
+    def _prepare_flat(self, mesh: TetForest, flat: np.ndarray) -> None:
+        """The leaves that are in no subtree, as elements of their own."""
+        plan, worlds = self.plan, self.body.worlds
+        self._flat_elements = forest_elements(mesh, mesh.tree.leaves[plan.flat], self.device, worlds)
+        if plan.leaf_targets is not None and plan.slots is not None:
+            targets = in_worlds(plan.leaf_targets[plan.flat], worlds, plan.slots.per_world)
+            self._flat_elements = with_targets(self._flat_elements, targets)
+        self._flat_material = self.material_inputs
+        if not self._uniform:
+            self._flat_material = [
+                wp.array(a.numpy()[flat], dtype=wp.float32, device=self.device) for a in (self.body.mu, self.body.lam)
+            ] + [1]
+        if self._needs_rotations:
+            self._flat_unit = wp.array(self._sharing().unit.numpy()[flat], dtype=wp.int32, device=self.device)
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         if self._needs_rotations:
             self.extract_rotations(u)
         for batch, kernel, unit in zip(self.plan.batches, self._kernels, self._batch_units, strict=True):
             self._launch_batch(batch, kernel, unit, u, f)
         if len(self.plan.flat):
             inputs = [self._flat_elements, *self._flat_material, u]
+            count = len(self._flat_elements.code)
             if self._needs_rotations:
-                inputs += [self._rotations, self._flat_unit]
-                self.launch(self._forces, len(self.plan.flat), inputs, [f])
+                self.launch(self._forces, count, [*inputs, self._rotations, self._flat_unit], [f])
             else:
-                self.launch(self._own, len(self.plan.flat), inputs, [f])
+                self.launch(self._own, count, inputs, [f])
 
     def _kernel(self, batch: Batch) -> wp.Kernel:
         given = batch.sharing is Sharing.ABOVE
@@ -279,9 +307,9 @@ class SubtreeField(CorotatedField):
         if batch.sharing is not Sharing.OWN:
             inputs += [self._rotations, unit]
         wp.launch(kernel, dim=threads, inputs=inputs, outputs=[f, batch.flagged], device=self.device, block_dim=block)
+        flags = batch.flags_by_eights
+        inputs = [self.elements, *self.material_inputs, u]
         if batch.sharing is Sharing.OWN:
-            repair = [batch.flagged, batch.subtrees.first, self.elements, *self.material_inputs, u]
-            self.launch(subtree_cuda.repair_own, batch.count, repair, [f])
+            self.launch(repair_own, len(flags), [flags, batch.subtrees.first, *inputs], [f])
         elif batch.sharing is Sharing.ROOT:
-            repair = [batch.flagged, batch.subtrees.first, batch.roots, self.elements, *self.material_inputs, u]
-            self.launch(subtree_cuda.repair_shared, batch.count, repair, [f])
+            self.launch(repair_shared, len(flags), [flags, batch.subtrees.first, batch.roots, *inputs], [f])

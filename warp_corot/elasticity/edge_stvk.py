@@ -30,11 +30,12 @@ class EdgeStVK(Model):
         if self.springs not in ("biquadratic", "quadratic"):
             raise InputError(f"springs is {self.springs!r}; it must be 'biquadratic' or 'quadratic'")
 
-    def bind(self, body: SoftBody) -> ForceField:
+    def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
         kind, biquadratic = body.element_kind, self.springs == "biquadratic"
         return ElementField(
             body,
             forces=scatter_edge_stvk(kind, biquadratic),
             energies=edge_stvk_energies(kind, biquadratic),
             von_mises=element_von_mises(kind, stvk_cauchy),
+            deterministic=deterministic,
         )

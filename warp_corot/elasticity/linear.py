@@ -18,5 +18,11 @@ class Linear(Model):
 
     step_safety: ClassVar[float] = 0.8
 
-    def bind(self, body: SoftBody) -> ForceField:
-        return LawField(body, stress=linear_stress, energy=linear_energy, cauchy=linear_cauchy)
+    def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
+        return LawField(
+            body,
+            stress=linear_stress,
+            energy=linear_energy,
+            cauchy=linear_cauchy,
+            deterministic=deterministic,
+        )

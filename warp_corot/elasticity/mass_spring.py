@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
+from ..elements import in_worlds, repeated
 from ..kernels.constitutive import stvk_cauchy
 from ..kernels.forces import element_von_mises
 from ..kernels.springs import mass_spring_energies, scatter_mass_spring
+from ..slots import Slots
 from .model import ForceField, Model
 
 if TYPE_CHECKING:
@@ -27,37 +29,50 @@ class MassSpring(Model):
     material's own is ignored. Von Mises stress is that of Hooke's law with E and 1/4 on the Green strain.
     """
 
-    def bind(self, body: SoftBody) -> ForceField:
-        return MassSpringField(body)
+    def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
+        return MassSpringField(body, deterministic)
 
 
 class MassSpringField(ForceField):
-    def __init__(self, body: SoftBody):
-        super().__init__(body)
-        points, tets = body.mesh.points, body.mesh.tets
+    def __init__(self, body: SoftBody, deterministic: bool = False):
+        super().__init__(body, deterministic)
+        points, tets, worlds = body.mesh.points, body.mesh.tets, body.worlds
         pairs = np.stack([tets[:, [i, j]] for i, j in itertools.combinations(range(4), 2)], axis=1)
         lengths = np.linalg.norm(points[pairs[..., 1]] - points[pairs[..., 0]], axis=-1)
-        young = np.broadcast_to(body.material.young, len(tets))
-        shares = (young * body.mesh.volumes)[:, None] / lengths**2
         key = pairs.min(axis=-1).astype(np.int64) * len(points) + pairs.max(axis=-1)
         unique, which = np.unique(key.ravel(), return_inverse=True)
-        edges = np.stack([unique // len(points), unique % len(points)], axis=1)
+        # A row for each world whose stiffness may differ.
+        young = np.atleast_2d(body.material.young)
+        stiffness = np.stack(
+            [
+                np.bincount(which.ravel(), ((row * body.mesh.volumes)[:, None] / lengths**2).ravel())
+                for row in np.broadcast_to(young, (len(young), len(tets)))
+            ]
+        )
+        edges = np.stack([unique // len(points), unique % len(points)], axis=1).astype(np.int32)
         rest = points[edges[:, 1]] - points[edges[:, 0]]
-        self._edges = wp.array(edges, dtype=wp.vec2i, device=self.device)
-        self._rest = wp.array(rest, dtype=wp.vec3, device=self.device)
-        self._stiffness = wp.array(np.bincount(which.ravel(), shares.ravel()), dtype=wp.float32, device=self.device)
+        stiffness = np.broadcast_to(stiffness, (worlds, len(edges))).ravel()
+        self._edges = wp.array(in_worlds(edges, worlds, len(points)), dtype=wp.vec2i, device=self.device)
+        self._targets = self._edges
+        if self.deterministic:
+            self.slots, (targets,) = Slots.of_units([edges], len(points), self.device, worlds)
+            own = in_worlds(targets, worlds, self.slots.per_world)
+            self._targets = wp.array(own, dtype=wp.vec2i, device=self.device)
+        self._rest = wp.array(repeated(rest, worlds), dtype=wp.vec3, device=self.device)
+        self._stiffness = wp.array(stiffness, dtype=wp.float32, device=self.device)
         # Lamé's parameters of E and nu = 1/4 are both 0.4 E.
-        lame = np.atleast_1d(0.4 * np.asarray(body.material.young))
-        self._lame = wp.array(lame, dtype=wp.float32, device=self.device)
-        self._lame_stride = int(len(lame) > 1)
+        lame = 0.4 * (young if young.size == 1 else np.broadcast_to(young, (worlds, len(tets))))
+        self._lame = wp.array(lame.ravel(), dtype=wp.float32, device=self.device)
+        self._lame_stride = int(lame.size > 1)
         self._von_mises = element_von_mises(body.element_kind, stvk_cauchy)
 
     @property
     def energy_count(self) -> int:
         return len(self._edges)
 
-    def add_forces(self, u: wp.array, f: wp.array) -> None:
-        self.launch(scatter_mass_spring, len(self._edges), [self._edges, self._rest, self._stiffness, u], [f])
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        inputs = [self._edges, self._targets, self._rest, self._stiffness, u]
+        self.launch(scatter_mass_spring, len(self._edges), inputs, [f])
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         inputs = [self._edges, self._rest, self._stiffness, u]

@@ -5,13 +5,15 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from ..elements import in_worlds, with_targets
 from ..kernels.forces import element_energies, element_von_mises, scatter_forces
+from ..slots import Slots
 
 if TYPE_CHECKING:
     from ..body import SoftBody
@@ -21,17 +23,33 @@ class ForceField(ABC):
     """An elastic model on one body: launches that read displacements and add forces.
 
     Launches only; nothing here waits for the device or comes back to the host but ``elastic_energy``.
+
+    Args:
+        body: The body.
+        deterministic: Whether forces must come out the same bit by bit every time, also on CUDA, where threads run in
+            any order; a subclass then says by ``slots`` where its kernels add them first.
     """
 
-    def __init__(self, body: SoftBody):
+    def __init__(self, body: SoftBody, deterministic: bool = False):
         self.body = body
         self.device = body.device
         self.elements = body.elements
-        self.element_count = len(body.mesh.tets)
+        self.element_count = body.element_count
+        #: On the CPU there is one thread, and nothing to settle.
+        self.deterministic = deterministic and body.device.is_cuda
+        self.slots: Slots | None = None
+
+    def add_forces(self, u: wp.array, f: wp.array) -> None:
+        """Add the elastic nodal forces [N] of displacements u to f; both vec4 [worlds * N]."""
+        if self.slots is None:
+            self.scatter_forces(u, f)
+        else:
+            self.scatter_forces(u, self.slots.values)
+            self.slots.gather(f)
 
     @abstractmethod
-    def add_forces(self, u: wp.array, f: wp.array) -> None:
-        """Add the elastic nodal forces [N] of displacements u to f; both vec4 [N]."""
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        """Launch the kernels that add the forces to the nodes, or to the slots if there are any."""
 
     @abstractmethod
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
@@ -61,8 +79,11 @@ class ForceField(ABC):
             for name, array in self.state.items():
                 wp.copy(array, kept[name])
 
+    def reset(self, chosen: wp.array) -> None:  # noqa: B027 (most have no state)
+        """Forget the state of chosen worlds; int32 [worlds], not zero for these."""
+
     def elastic_forces(self, u: wp.array) -> wp.array:
-        """Elastic nodal forces [N] of displacements u, a new vec4 [N]."""
+        """Elastic nodal forces [N] of displacements u, a new vec4 [worlds * N]."""
         f = wp.zeros_like(u)
         with self.state_kept():
             self.add_forces(u, f)
@@ -101,8 +122,11 @@ class Model(ABC):
     step_safety: ClassVar[float] = 0.5
 
     @abstractmethod
-    def bind(self, body: SoftBody) -> ForceField:
+    def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
         """The model's force field on a body.
+
+        Args:
+            deterministic: Whether forces must come out the same bit by bit every time also on CUDA.
 
         Raises:
             InputError: The model cannot be used with this body's mesh.
@@ -112,13 +136,23 @@ class Model(ABC):
 class ElementField(ForceField):
     """Force field of kernels that need nothing but each element's nodal displacements."""
 
-    def __init__(self, body: SoftBody, *, forces: wp.Kernel, energies: wp.Kernel, von_mises: wp.Kernel):
-        super().__init__(body)
+    def __init__(
+        self,
+        body: SoftBody,
+        *,
+        forces: wp.Kernel,
+        energies: wp.Kernel,
+        von_mises: wp.Kernel,
+        deterministic: bool = False,
+    ):
+        super().__init__(body, deterministic)
         self._forces = forces
         self._energies = energies
         self._von_mises = von_mises
+        if self.deterministic:
+            self.slots, self.elements = leaf_slots(body)
 
-    def add_forces(self, u: wp.array, f: wp.array) -> None:
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         self.launch(self._forces, self.element_count, [self.elements, *self.material_inputs, u], [f])
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
@@ -131,11 +165,26 @@ class ElementField(ForceField):
 class LawField(ElementField):
     """Force field of a constitutive law in each element's deformation gradient."""
 
-    def __init__(self, body: SoftBody, *, stress: wp.Function, energy: wp.Function, cauchy: wp.Function):
+    def __init__(
+        self,
+        body: SoftBody,
+        *,
+        stress: wp.Function,
+        energy: wp.Function,
+        cauchy: wp.Function,
+        deterministic: bool = False,
+    ):
         kind = body.element_kind
         super().__init__(
             body,
+            deterministic=deterministic,
             forces=scatter_forces(kind, stress),
             energies=element_energies(kind, energy),
             von_mises=element_von_mises(kind, cauchy),
         )
+
+
+def leaf_slots(body: SoftBody) -> tuple[Slots, Any]:
+    """A slot for each node of each element, and the elements that add to them."""
+    slots, (targets,) = Slots.of_units([body.mesh.tets], body.world_node_count, body.device, body.worlds)
+    return slots, with_targets(body.elements, in_worlds(targets, body.worlds, slots.per_world))

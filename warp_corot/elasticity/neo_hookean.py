@@ -21,5 +21,11 @@ class NeoHookean(Model):
     central differences, TLED (Miller et al. 2007).
     """
 
-    def bind(self, body: SoftBody) -> ForceField:
-        return LawField(body, stress=neo_hookean_stress, energy=neo_hookean_energy, cauchy=neo_hookean_cauchy)
+    def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
+        return LawField(
+            body,
+            stress=neo_hookean_stress,
+            energy=neo_hookean_energy,
+            cauchy=neo_hookean_cauchy,
+            deterministic=deterministic,
+        )

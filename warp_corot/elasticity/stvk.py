@@ -20,5 +20,11 @@ class StVenantKirchhoff(Model):
     TLED (Miller et al. 2007). Softens when compressed and lets elements invert at large strain; the paper's reference.
     """
 
-    def bind(self, body: SoftBody) -> ForceField:
-        return LawField(body, stress=stvk_stress, energy=stvk_energy, cauchy=stvk_cauchy)
+    def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
+        return LawField(
+            body,
+            stress=stvk_stress,
+            energy=stvk_energy,
+            cauchy=stvk_cauchy,
+            deterministic=deterministic,
+        )

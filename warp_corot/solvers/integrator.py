@@ -32,11 +32,11 @@ class StepContext:
 
 
 class Stepper(ABC):
-    """One body's time step as launches that can be recorded."""
+    """One body's time steps as launches that can be recorded."""
 
     @abstractmethod
-    def step(self, offset: int) -> None:
-        """Launch one step, the ``offset``-th since the clock was last advanced."""
+    def steps(self, count: int) -> None:
+        """Launch steps, the first ones since the clock was last advanced."""
 
 
 class Integrator(ABC):

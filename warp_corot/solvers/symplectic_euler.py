@@ -56,7 +56,12 @@ class SymplecticEulerStepper(Stepper):
         self.context = context
         self.damping = damping
 
-    def step(self, offset: int) -> None:
+    def steps(self, count: int) -> None:
+        for offset in range(count):
+            self._step(offset)
+
+    def _step(self, offset: int) -> None:
+        """Launch the ``offset``-th step since the clock was last advanced."""
         body, context = self.body, self.context
         for trajectory in body.trajectories:
             wp.launch(
@@ -68,6 +73,8 @@ class SymplecticEulerStepper(Stepper):
                     trajectory.displacements,
                     context.dt,
                     context.clock,
+                    body.world_starts,
+                    body.world_node_count,
                     offset,
                     body.node_displacements,
                 ],
