@@ -7,17 +7,20 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 import work
-from measure import Case
+from measure import Case, kind
 from problem import SUBTREE_LEVELS, Problem, Sample, oracle, padded, relative_error
 
 import warp_corot as wc
 from warp_corot.elasticity import ForceField, Model
 from warp_corot.experiments import paper
 from warp_corot.solvers.integrator import StepContext
+from warp_corot.worlds import World
 
 #: Steps of one sample of a whole-step row.
 STEPS = 64
 BEAM_STEPS = 1024
+#: Copies of the beam that are stepped together.
+BEAM_WORLDS = {"cuda": 1024, "cpu": 16}
 DAMPING = 15.0
 
 
@@ -32,8 +35,16 @@ def force_cases(problem: Problem) -> list[Case]:
     shared_flops = work.model_flops("corotated", shape, tested / 8)
     shared = wc.Corotated(rotation_level=problem.level - SUBTREE_LEVELS)
 
-    def forest(name: str, model: Model, of: str, flops: float | None, **options: Callable[[], np.ndarray]) -> Case:
-        return force_case(problem, name, problem.body, model.bind(problem.body), of, floor, flops, **options)
+    def forest(
+        name: str,
+        model: Model,
+        of: str,
+        flops: float | None,
+        deterministic: bool = False,
+        **options: Callable[[], np.ndarray],
+    ) -> Case:
+        field = model.bind(problem.body, deterministic=deterministic)
+        return force_case(problem, name, problem.body, field, of, floor, flops, **options)
 
     springs = wc.MassSpring().bind(problem.body)
     edges_per_tet = springs.energy_count / problem.tet_count
@@ -42,13 +53,19 @@ def force_cases(problem: Problem) -> list[Case]:
     general_bytes = work.GENERAL_ELEMENT + (work.READ + work.ADD_TO) * problem.nodes_per_tet
     general_flops = work.GENERAL_GRADIENT + tested + work.rotated_stress_flops() + work.GENERAL_FORCE + work.SCATTER
     model_flops = work.model_flops
+    own_flops = model_flops("corotated", shape, tested)
     return [
-        forest("corotated, own rotations", wc.Corotated(), "corotated", model_flops("corotated", shape, tested)),
+        forest("corotated, own rotations", wc.Corotated(), "corotated", own_flops),
         forest(
             "corotated, own, 4 iterations",
             wc.Corotated(iterations=4),
             "corotated",
             model_flops("corotated", shape, fixed),
+        ),
+        *(
+            [forest("corotated, own, deterministic", wc.Corotated(), "corotated", own_flops, True)]
+            if problem.device.is_cuda
+            else []
         ),
         forest("corotated, rotations 3 up", shared, "corotated", shared_flops, R=lambda: problem.shared_rotations(3)),
         force_case(
@@ -106,7 +123,7 @@ def force_case(
 class _NoForces(ForceField):
     """Leaves an integrator's launches alone."""
 
-    def add_forces(self, u: wp.array, f: wp.array) -> None: ...
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None: ...
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None: ...
 
@@ -130,7 +147,7 @@ def integration_case(problem: Problem) -> Case:
     def error() -> float:
         body.velocities = v
         body.node_forces.assign(padded(f))
-        stepper.step(0)
+        stepper.steps(1)
         w = np.where(body.constrained, 0.0, 1.0 / body.masses)[:, None]
         reference = (v + dt * (f * w)) / (1.0 + dt * DAMPING)
         return relative_error(body.velocities.numpy(), reference)
@@ -139,7 +156,7 @@ def integration_case(problem: Problem) -> Case:
     return Case(
         "integration",
         "symplectic Euler",
-        lambda: stepper.step(0),
+        lambda: stepper.steps(1),
         error,
         problem.tet_count,
         work.INTEGRATION_BYTES * per_tet,
@@ -154,8 +171,14 @@ def step_cases(problem: Problem) -> list[Case]:
     beam = wc.TetForest.box(paper.CELLS, paper.CELL_SIZE, 6)
     return [
         step_case("corotated, own rotations", problem, wc.Corotated(), floor),
+        *(
+            [step_case("corotated, own, deterministic", problem, wc.Corotated(), floor, deterministic=True)]
+            if problem.device.is_cuda
+            else []
+        ),
         step_case("corotated, rotations 3 up", problem, shared, floor, R=lambda: problem.shared_rotations(3)),
         _beam_case(beam, problem.device),
+        _beam_case(beam, problem.device, BEAM_WORLDS[kind(problem.device)]),
     ]
 
 
@@ -165,12 +188,19 @@ def step_case(
     model: Model,
     floor: float | None,
     steps: int = STEPS,
+    deterministic: bool = False,
     **options: Callable[[], np.ndarray],
 ) -> Case:
     """Steps from the problem's state, always the same ones."""
     body = problem.new_body(problem.mesh)
     body.fix(problem.held)
-    sim = wc.Simulation(body, model=model, integrator=wc.SymplecticEuler(None, DAMPING), gravity=(0.0, 0.0, -9.81))
+    sim = wc.Simulation(
+        body,
+        model=model,
+        integrator=wc.SymplecticEuler(None, DAMPING),
+        gravity=(0.0, 0.0, -9.81),
+        deterministic=deterministic,
+    )
 
     def forces() -> np.ndarray:
         given = {key: value() for key, value in options.items()}
@@ -179,20 +209,22 @@ def step_case(
     return _stepping(name, sim, problem.u, problem.sample, forces, floor, steps)
 
 
-def _beam_case(beam: wc.TetForest, device: wp.Device) -> Case:
-    """The paper's beam of 1152 tetrahedra, hanging."""
-    body = wc.SoftBody(beam, wc.Isotropic(**paper.MATERIAL), device=device)
+def _beam_case(beam: wc.TetForest, device: wp.Device, worlds: int = 1) -> Case:
+    """The paper's beam of 1152 tetrahedra, hanging, or many of them; the one in the middle is checked."""
+    body = wc.SoftBody(beam, wc.Isotropic(**paper.MATERIAL), worlds=worlds, device=device)
     body.fix(beam.points[:, 2] < 1e-9)
     sim = wc.Simulation(body, integrator=wc.SymplecticEuler(2e-4, DAMPING), gravity=paper.GRAVITY)
     rng = np.random.default_rng(4)
-    u = (0.05 * paper.CELL_SIZE / 4 * rng.uniform(-1, 1, beam.points.shape)).astype(np.float32)
+    u = (0.05 * paper.CELL_SIZE / 4 * rng.uniform(-1, 1, body.rest_positions.shape)).astype(np.float32)
     sample = Sample(beam.points, beam.tets)
     mu, lam = oracle.lame(paper.MATERIAL["young"], paper.MATERIAL["poisson"])
+    world = body.world(worlds // 2)
 
     def forces() -> np.ndarray:
-        return sample.forces("corotated", beam.points + u.astype(float), float(mu), float(lam))
+        return sample.forces("corotated", beam.points + u[world.nodes].astype(float), float(mu), float(lam))
 
-    return _stepping(f"the paper's beam, {len(beam.tets)} tets", sim, u, sample, forces, None, BEAM_STEPS)
+    name = f"the paper's beam, {len(beam.tets)} tets" if worlds == 1 else f"{worlds} of the paper's beams"
+    return _stepping(name, sim, u, sample, forces, None, BEAM_STEPS, world)
 
 
 def _stepping(
@@ -203,14 +235,15 @@ def _stepping(
     forces: Callable[[], np.ndarray],
     floor: float | None,
     steps: int,
+    world: World | None = None,
 ) -> Case:
     start = wp.array(padded(u), dtype=wp.vec4, device=sim.device)
     return Case(
         "whole step",
         name,
         lambda: sim.advance_steps(steps),
-        lambda: step_error(sim, start, sample, forces()),
-        len(sim.body.mesh.tets),
+        lambda: step_error(sim, start, sample, forces(), world),
+        sim.body.element_count,
         floor,
         repeats=steps,
         recorded=False,
@@ -227,14 +260,17 @@ def put_back(body: wc.SoftBody, start: wp.array) -> None:
     body.publish_positions()
 
 
-def step_error(sim: wc.Simulation, start: wp.array, sample: Sample, forces: np.ndarray) -> float:
+def step_error(
+    sim: wc.Simulation, start: wp.array, sample: Sample, forces: np.ndarray, world: World | None = None
+) -> float:
     """What one damped step from ``start`` at rest is off by, against nodal forces [n, 3] on the sample's nodes."""
     body = sim.body
+    nodes = sample.nodes + (world.nodes.start if world else 0)
     put_back(body, start)
-    before = start.numpy()[sample.nodes, :3].astype(float)
+    before = start.numpy()[nodes, :3].astype(float)
     sim.advance_steps(1)
-    moved = body.displacements.numpy()[sample.nodes] - before
+    moved = body.displacements.numpy()[nodes] - before
     mass = sample.masses(float(body.material.density))[:, None]
     velocity = sim.dt * (forces / mass + np.asarray(sim.gravity)) / (1.0 + sim.dt * DAMPING)
-    velocity[body.constrained[sample.nodes]] = 0.0
+    velocity[body.constrained[nodes]] = 0.0
     return relative_error(moved, sim.dt * velocity)

@@ -149,7 +149,7 @@ def scatter_subtrees_own(shape: int, grouped: bool, uniform: bool) -> wp.Kernel:
         h = 0.5 * subtrees.size[(code & LEVEL_MASK) // 3]
         mirror = mirror_sign(code)
         x = deformed(load(subtrees, s, u), subtrees.frames[code >> FRAME_SHIFT], 1.0 / h, mirror)
-        g, trusted = forces(x, h, mirror, mu, lam, subtrees.first[s])
+        g, trusted = forces(x, h, mirror, mu, lam, wp.where(wp.static(uniform), 0, subtrees.first[s]))
         flagged[s] = wp.where(trusted, wp.uint8(0), wp.uint8(1))
         add(subtrees, s, g, f)
 
@@ -187,7 +187,7 @@ def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: boo
         turn = wp.mat33()
         if wp.static(given):
             turn = rotations[unit[s]] * q
-        g, trusted = forces(x, h, mirror, turn, mu, lam, subtrees.first[s])
+        g, trusted = forces(x, h, mirror, turn, mu, lam, wp.where(wp.static(uniform), 0, subtrees.first[s]))
         if wp.static(not given):
             flagged[s] = wp.where(trusted, wp.uint8(0), wp.uint8(1))
         add(subtrees, s, g, f)

@@ -89,8 +89,9 @@ def deformed_of(shape: int) -> wp.Function:
 
 @functools.cache
 def own_forces(shape: int, uniform: bool) -> wp.Function:
-    """Forces with every leaf's own rotation, and whether they may be trusted; ``h`` is a leaf's edge length.
+    """Forces with every leaf's own rotation, and whether they may be trusted.
 
+    ``h`` is a leaf's edge length, ``first`` where its material stands, and that of the other leaves unless uniform.
     With a rotation, R sym(R^T F) = F, so P = 2 mu (F - R) + lambda tr(R^T F - I) R: no matrix is multiplied.
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
@@ -100,8 +101,8 @@ def own_forces(shape: int, uniform: bool) -> wp.Function:
     @wp.func
     def own_forces(x: mat10, h: float, mirror: float, mu: wp.array[wp.float32], lam: wp.array[wp.float32], first: int):
         _generated_from = wp.static(fingerprint(leaves, handed))
-        m = mu[0]
-        k = lam[0]
+        m = mu[first]
+        k = lam[first]
         # P V/h = from_f F + from_z Z with Z = 2^ITERATIONS R.
         area = wp.static(volume) * h * h
         area_z = wp.static(0.5**ITERATIONS) * area
@@ -183,8 +184,8 @@ def shared_forces(shape: int, uniform: bool, given: bool) -> wp.Function:
                 wp.dot(r1, x[n]) - wp.static(2.0 * at[n][1]),
                 wp.dot(r2, x[n]) - wp.static(2.0 * at[n][2]),
             )
-        m = mu[0]
-        k = lam[0]
+        m = mu[first]
+        k = lam[first]
         area = wp.static(volume) * h * h
         g = mat10()
         for leaf in range(8):

@@ -82,7 +82,8 @@ class SoftBody:
         #: Changes whenever the launches of a step do, so that recorded steps can be recorded anew.
         self.revision = 0
         self._constrained = np.zeros(n, bool)
-        self._initial: tuple[wp.array, wp.array] | None = None
+        #: Displacements and velocities that worlds are reset to; None for rest.
+        self.initial_state: tuple[wp.array, wp.array] | None = None
         self._update_inverse_mass()
 
     # --- state -----------------------------------------------------------------------------------------------------
@@ -172,7 +173,7 @@ class SoftBody:
     def set_initial_state(self) -> None:
         """Make the present state the one that ``Simulation.reset`` goes back to; at first that is rest."""
         self.adopt_positions()
-        self._initial = (wp.clone(self.node_displacements), wp.clone(self.node_velocities))
+        self.initial_state = (wp.clone(self.node_displacements), wp.clone(self.node_velocities))
 
     def reset(self, chosen: wp.array, clock: wp.array) -> None:
         """Put chosen worlds back to their initial state; ``Simulation.reset`` does more and is what to call.
@@ -181,8 +182,8 @@ class SoftBody:
             chosen: Not zero for worlds to be reset, int32 [worlds].
             clock: Time steps done, int64 [1].
         """
-        kept = self._initial is not None
-        u, v = self._initial if self._initial is not None else (self.node_displacements, self.node_velocities)
+        kept = self.initial_state is not None
+        u, v = self.initial_state or (self.node_displacements, self.node_velocities)
         inputs = [chosen, self.world_node_count, int(kept), u, v, self.node_rest, self.node_inverse_mass, clock]
         outputs = [self.node_displacements, self.node_velocities, self.node_positions, self.node_reactions]
         self._launch(reset_nodes, inputs, [*outputs, self.world_starts])
@@ -247,10 +248,16 @@ class SoftBody:
             return
         if displacements is not None and named.each and np.shape(displacements)[1:2] == (named.each,):
             displacements = np.tile(displacements, (1, len(chosen) // named.each, 1))
-        trajectory = Trajectory.of_keys(chosen, times, displacements, self.device)
-        self._stop_following(chosen)
-        self._constrain(chosen, np.zeros(3))
-        if len(chosen):
+        self.follow(chosen, times, displacements)
+
+    def follow(
+        self, indices: npt.NDArray[np.integer], times: npt.ArrayLike | None, displacements: npt.ArrayLike | None
+    ) -> None:
+        """``prescribe`` along keyframes for nodes by their indices among those of all worlds."""
+        trajectory = Trajectory.of_keys(indices, times, displacements, self.device)
+        self._stop_following(indices)
+        self._constrain(indices, np.zeros(3))
+        if len(indices):
             self.trajectories.append(trajectory)
             self.revision += 1
 

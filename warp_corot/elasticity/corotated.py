@@ -183,7 +183,7 @@ class CorotatedField(ForceField):
         """Who uses whose rotation; made on first use, since own rotations need none of it for their forces."""
         if self._shared is None:
             body, mesh, level = self.body, self.body.mesh, self.model.rotation_level
-            units, unit = self.elements, np.arange(len(mesh.tets), dtype=np.int32)
+            units, unit = self.elements, np.arange(len(mesh.tets))
             count = len(mesh.tets)
             if isinstance(mesh, TetForest) and level is not None:
                 ancestors, unit = np.unique(mesh.ancestors(level), return_inverse=True)

@@ -188,7 +188,7 @@ def measure_times(
 class _NoForces(ForceField):
     """Leaves an integrator's launches alone."""
 
-    def add_forces(self, u: wp.array, f: wp.array) -> None: ...
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None: ...
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         energies.zero_()
@@ -208,7 +208,7 @@ def _integration(sim: Simulation) -> tuple[wp.Graph, list]:
     assert isinstance(sim.integrator, SymplecticEuler)
     context = StepContext(sim.dt, wp.vec3(0.0, 0.0, 0.0), clock, bad_step)
     stepper = sim.integrator.bind(body, _NoForces(body), context)
-    return recorded(lambda: stepper.step(0), sim.device), [body, stepper, clock, bad_step]
+    return recorded(lambda: stepper.steps(1), sim.device), [body, stepper, clock, bad_step]
 
 
 def _replays(graph: wp.Graph, device: wp.Device) -> int:

@@ -51,21 +51,25 @@ class Recording:
 
 
 class _Joined:
-    """The bodies of a simulation as one mesh and one material, body after body."""
+    """The bodies of a simulation, one world of them, as one mesh and one material, body after body."""
 
-    def __init__(self, sim: Simulation):
-        offsets = np.cumsum([0, *(body.node_count for body in sim.bodies)])
+    def __init__(self, sim: Simulation, world: int):
+        self.worlds = [body.world(world) for body in sim.bodies]
+        offsets = np.cumsum([0, *(body.world_node_count for body in sim.bodies)])
         self.points = np.concatenate([body.mesh.points for body in sim.bodies])
         self.tets = np.concatenate([b.mesh.tets + n for b, n in zip(sim.bodies, offsets[:-1], strict=True)])
         self.tets = self.tets.astype(np.int32)
         self.up_axis = sim.bodies[0].mesh.up_axis
-        self.fixed = np.concatenate([body.constrained for body in sim.bodies])
+        self.fixed = np.concatenate([w.body.constrained[w.nodes] for w in self.worlds])
         for name in ("young", "poisson", "density"):
-            setattr(self, name, self._property(sim, name))
+            setattr(self, name, self._property(name))
 
-    @staticmethod
-    def _property(sim: Simulation, name: str) -> float | npt.NDArray[np.float64]:
-        values = [np.broadcast_to(getattr(b.material, name), len(b.mesh.tets)) for b in sim.bodies]
+    def _property(self, name: str) -> float | npt.NDArray[np.float64]:
+        values = []
+        for world in self.worlds:
+            body = world.body
+            everywhere = np.broadcast_to(getattr(body.material, name), (body.worlds, len(body.mesh.tets)))
+            values.append(everywhere[world.index])
         joined = np.concatenate(values).astype(np.float64)
         return float(joined[0]) if (joined == joined[0]).all() else joined
 
@@ -103,6 +107,7 @@ def record(
     *,
     duration: float,
     fps: float = 24.0,
+    world: int | None = None,
     progress: Progress | None = None,
     recording: Recording | None = None,
 ) -> Recording:
@@ -116,6 +121,7 @@ def record(
         path: A .usd, .usdc or .usda file; what was there stays until the first frames are safe.
         duration: Simulated time [s], rounded to whole frames.
         fps: Frames per second of simulated time.
+        world: Which of the bodies' copies is drawn; must be given where there are several.
         progress: Called with the frames done and their number, after each.
         recording: Filled while running, for who wants to look at it when the run has been ended early.
 
@@ -123,13 +129,15 @@ def record(
         What was recorded.
 
     Raises:
-        InputError: A path that cannot be written to, or a duration or frame rate out of its range; nothing has been
-            simulated or written then.
+        InputError: A path that cannot be written to, a duration or frame rate out of its range, or no such world;
+            nothing has been simulated or written then.
         UnstableError: The state is not finite any more; the frames before are kept.
         OSError: The file cannot be written, as when the disk is full; the frames up to seconds before are kept.
     """
     count = frame_count(duration, fps)
-    joined = _Joined(sim)
+    if world is None and sim.worlds > 1:
+        raise InputError(f"the simulation has {sim.worlds} worlds; say which one to draw, as in world=0")
+    joined = _Joined(sim, world or 0)
     writer = UsdWriter(Path(path), joined, fps=fps, fixed=joined.fixed, material=joined)
     done = Recording(writer.path) if recording is None else recording
     first_step = sim.steps
@@ -140,7 +148,7 @@ def record(
             sim.advance_steps(max(due - sim.steps, 0))
             stepped = time.perf_counter()
             with signals_held_back():
-                _write_frame(writer, sim, done)
+                _write_frame(writer, sim, joined, done)
             done.stepping += stepped - started
             done.writing += time.perf_counter() - stepped
             done.steps = due - first_step
@@ -150,14 +158,14 @@ def record(
     return done
 
 
-def _write_frame(writer: UsdWriter, sim: Simulation, done: Recording) -> None:
-    positions = [body.positions.numpy() for body in sim.bodies]
-    velocities = [body.velocities.numpy() for body in sim.bodies]
-    stresses = [sim.von_mises(body) for body in sim.bodies]
+def _write_frame(writer: UsdWriter, sim: Simulation, joined: _Joined, done: Recording) -> None:
+    positions = [w.positions.numpy() for w in joined.worlds]
+    velocities = [w.velocities.numpy() for w in joined.worlds]
+    stresses = [sim.von_mises(w.body)[w.elements] for w in joined.worlds]
     writer.write(np.concatenate(positions), velocities=np.concatenate(velocities), von_mises=np.concatenate(stresses))
     done.frames = writer.frames
     # In float64: on the way to an end that is not finite, squares leave float32 first.
-    lengths = [np.linalg.norm(body.displacements.numpy().astype(np.float64), axis=1).max() for body in sim.bodies]
+    lengths = [np.linalg.norm(w.displacements.numpy().astype(np.float64), axis=1).max() for w in joined.worlds]
     done.final_displacement = float(max(lengths))
     done.largest_displacement = max(done.largest_displacement, done.final_displacement)
 

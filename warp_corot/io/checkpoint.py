@@ -24,7 +24,8 @@ from ..solvers import INTEGRATORS
 from .whole import written_whole
 
 FORMAT = "warp-corot checkpoint"
-VERSION = 1
+#: 2: worlds, deterministic runs; 1 is read as one world.
+VERSION = 2
 
 #: What reading a damaged archive raises.
 DAMAGE = (EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
@@ -50,6 +51,8 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
         "steps": sim.steps,
         "gravity": sim.gravity,
         "integrator": _described(sim.integrator, INTEGRATORS),
+        "deterministic": sim.deterministic,
+        "worlds": sim.worlds,
         "bodies": [],
     }
     for number, (body, model, field) in enumerate(zip(sim.bodies, sim.models, sim.fields, strict=True)):
@@ -69,6 +72,10 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
         arrays[prefix + "velocities"] = body.node_velocities.numpy()
         arrays[prefix + "reactions"] = body.node_reactions.numpy()
         arrays[prefix + "constrained"] = body.constrained
+        arrays[prefix + "world_starts"] = body.world_starts.numpy()
+        if body.initial_state is not None:
+            for name, array in zip(("displacements", "velocities"), body.initial_state, strict=True):
+                arrays[f"{prefix}initial.{name}"] = array.numpy()
         if body.has_loads:
             arrays[prefix + "loads"] = body.node_loads.numpy()
         for k, trajectory in enumerate(body.trajectories):
@@ -100,9 +107,18 @@ def load_checkpoint(path: str | PathLike[str], device: str | wp.Device | None = 
     if newer:
         raise InputError(f"{source} is of version {header['version']}; this warp_corot reads up to version {VERSION}")
     try:
+        if header["version"] < 2:
+            _upgrade(header, arrays)
         return _rebuilt_simulation(header, arrays, device)
     except (LookupError, TypeError) as error:
         raise InputError(f"{what}: {error} is missing or wrong") from error
+
+
+def _upgrade(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    """Version 1 knew one world only."""
+    header |= {"worlds": 1, "deterministic": False}
+    for number in range(len(header["bodies"])):
+        arrays[f"body{number}.world_starts"] = np.zeros(1, np.int64)
 
 
 def _rebuilt_simulation(
@@ -113,26 +129,37 @@ def _rebuilt_simulation(
         prefix = f"body{number}."
         mesh = _unpack_mesh(described["mesh"], prefix, arrays)
         material = Isotropic(*(arrays[prefix + name][()] for name in ("young", "poisson", "density")))
-        body = SoftBody(mesh, material, device=header["device"] if device is None else device)
+        body = SoftBody(mesh, material, worlds=header["worlds"], device=header["device"] if device is None else device)
+        if prefix + "initial.displacements" in arrays:
+            body.displacements = arrays[prefix + "initial.displacements"][:, :3]
+            body.velocities = arrays[prefix + "initial.velocities"][:, :3]
+            body.set_initial_state()
         body.fix(arrays[prefix + "constrained"])
         for k in range(described["trajectories"]):
             motion = f"{prefix}trajectory{k}."
-            body.prescribe(
+            body.follow(
                 arrays[motion + "nodes"],
                 times=arrays[motion + "times"],
                 displacements=arrays[motion + "displacements"],
             )
         if prefix + "loads" in arrays:
-            body.load(np.arange(body.node_count), arrays[prefix + "loads"][:, :3])
+            wp.copy(body.loads, wp.array(arrays[prefix + "loads"][:, :3], dtype=wp.vec3, device=body.device))
         body.displacements = arrays[prefix + "displacements"][:, :3]
         body.velocities = arrays[prefix + "velocities"][:, :3]
         body.node_reactions.assign(arrays[prefix + "reactions"])
+        body.world_starts.assign(arrays[prefix + "world_starts"])
         bodies.append(body)
         models.append(_rebuilt(described["model"], MODELS))
     integrator = dataclasses.replace(_rebuilt(header["integrator"], INTEGRATORS), dt=header["dt"])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", StabilityWarning)  # it was given when the simulation was made
-        sim = Simulation(bodies, model=models, integrator=integrator, gravity=header["gravity"])
+        sim = Simulation(
+            bodies,
+            model=models,
+            integrator=integrator,
+            gravity=header["gravity"],
+            deterministic=header["deterministic"],
+        )
     sim.clock.fill_(header["steps"])
     for number, (described, field) in enumerate(zip(header["bodies"], sim.fields, strict=True)):
         for name in described["field"]:

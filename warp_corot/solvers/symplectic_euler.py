@@ -12,6 +12,7 @@ import warp as wp
 from ..elasticity import ForceField
 from ..errors import InputError
 from ..kernels.integrate import follow_trajectory, step_symplectic_euler
+from .block import BlockSteps
 from .integrator import Integrator, StepContext, Stepper
 
 if TYPE_CHECKING:
@@ -55,8 +56,12 @@ class SymplecticEulerStepper(Stepper):
         self.field = field
         self.context = context
         self.damping = damping
+        self.block = BlockSteps.of(body, field)
 
     def steps(self, count: int) -> None:
+        if self.block is not None and not self.body.trajectories:
+            self.block.launch(count, self.damping, self.context)
+            return
         for offset in range(count):
             self._step(offset)
 
