@@ -2,6 +2,7 @@
 
 import os
 import re
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ SHORT = ["--duration", "0.05", "--fps", "40", "--device", "cpu"]
 @pytest.fixture(autouse=True)
 def nothing_said_of_compiling(monkeypatch):
     """Whether kernels are compiled depends on what ran before, and no test here is about that."""
-    monkeypatch.setattr("warp_corot.cli.simulate.COMPILING_AFTER", 1e6)
+    monkeypatch.setattr("warp_corot.cli.simulate.compiling_said", lambda device: nullcontext())
 
 
 @pytest.fixture(autouse=True)
@@ -381,6 +382,16 @@ def test_help(args, capsys):
     if args[0] == "simulate":
         for name in OPTIONS:
             assert f"--{name} " in said
+
+
+@pytest.mark.parametrize("stage", ["commands", "_start_warp"])
+def test_interrupted_before_anything_runs(stage, capsys, monkeypatch):
+    def interrupt():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"warp_corot.cli.{stage}", interrupt)
+    assert simulate("box", "-o", "a.usd") == 130
+    assert capsys.readouterr() == ("", "warp-corot: interrupted\n")
 
 
 def test_no_command_is_an_error(capsys):

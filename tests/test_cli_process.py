@@ -108,6 +108,17 @@ def test_a_kernel_cache_that_cannot_be_made_is_one_line(tmp_path):
     assert re.fullmatch(r"warp-corot: error: Warp's kernel cache .*; name a folder .* WARP_CACHE_PATH\n", err), err
 
 
+def test_compiling_is_said_when_kernels_are_compiled_and_only_then(tmp_path):
+    """On stderr, once, in a line of its own; stdout does not tell whether the cache was cold."""
+    cache = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache")}
+    ran = [started(tmp_path, *BOX, "--model", "mass-spring", env=cache).communicate(timeout=120) for _ in range(2)]
+    (first, cold), (again, warm) = ran
+    assert re.fullmatch(r"warp-corot: compiling kernels for cpu, once: .*\n", cold), cold
+    assert warm == ""
+    assert [line.split()[0] for line in first.splitlines()] == [line.split()[0] for line in again.splitlines()]
+    assert "kernels" not in first
+
+
 def test_module_and_version(tmp_path):
     process = started(tmp_path, "--version")
     out, _ = process.communicate(timeout=60)

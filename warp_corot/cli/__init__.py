@@ -13,15 +13,18 @@ import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from types import ModuleType
 from typing import NoReturn
 
-import warp as wp
-
 from ..errors import InputError, UnstableError
-from . import paper, simulate
 from .say import EXIT_CODES, Terminated, complain, interrupt_status, open_streams, silence
 
-COMMANDS = {"simulate": simulate, "paper": paper}
+
+def commands() -> dict[str, ModuleType]:
+    """The subcommands by name; they need all of the package, so that importing them takes a while."""
+    from . import paper, simulate
+
+    return {"simulate": simulate, "paper": paper}
 
 
 class Parser(argparse.ArgumentParser):
@@ -39,6 +42,8 @@ class Parser(argparse.ArgumentParser):
 
 
 def make_parser() -> argparse.ArgumentParser:
+    import warp as wp
+
     from .. import __version__
 
     parser = Parser(
@@ -48,32 +53,21 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"warp-corot {__version__} (warp {wp.__version__})")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
-    for command in COMMANDS.values():
+    for command in commands().values():
         command.add_parser(subparsers)
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
-    wp.config.log_level = wp.LOG_ERROR  # before Warp starts, so that it says nothing about itself
     open_streams()
-    logging.basicConfig(format="warp-corot: warning: %(message)s", level=logging.WARNING)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
-    args = make_parser().parse_args(argv)
-    try:
-        _start_warp()
-    except OSError as error:
-        complain(
-            f"Warp's kernel cache {error.filename or ''}: {error.strerror or error}; name a folder that can be written "
-            "to in the environment variable WARP_CACHE_PATH"
-        )
-        return 1
     try:
         with _terminable(), warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: complain(str(message), kind="warning")
-            status = COMMANDS[args.command].run(args)
+            status = _run(argv)
             sys.stdout.flush()
         return status
     except InputError as error:
@@ -94,8 +88,27 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
 
 
+def _run(argv: Sequence[str] | None) -> int:
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_ERROR  # before Warp starts, so that it says nothing about itself
+    logging.basicConfig(format="warp-corot: warning: %(message)s", level=logging.WARNING)
+    args = make_parser().parse_args(argv)
+    try:
+        _start_warp()
+    except OSError as error:
+        complain(
+            f"Warp's kernel cache {error.filename or ''}: {error.strerror or error}; name a folder that can be written "
+            "to in the environment variable WARP_CACHE_PATH"
+        )
+        return 1
+    return commands()[args.command].run(args)
+
+
 def _start_warp() -> None:
     """Start Warp, which writes straight to the terminal; that there is no NVIDIA driver is no news to who has none."""
+    import warp as wp
+
     sys.stderr.flush()
     with tempfile.TemporaryFile() as said:
         kept = os.dup(2)

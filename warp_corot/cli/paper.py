@@ -112,8 +112,11 @@ def checked_folder(folder: Path, names: Iterable[str] = ()) -> Path:
 def _with_progress(settings: Settings, device: str | None) -> Results:
     from tqdm import tqdm
 
+    from ..device import checked_device
     from ..experiments.paper import run_experiment, work
+    from .compiling import compiling_said
 
+    where = checked_device(device)
     with tqdm(
         total=work(settings),
         desc="preparing",
@@ -127,4 +130,10 @@ def _with_progress(settings: Settings, device: str | None) -> Results:
             bar.set_description_str(what, refresh=not done)
             bar.update(done)
 
-        return run_experiment(settings, device=device, progress=tell)
+        def say(text: str) -> None:
+            bar.clear()
+            complain(text, kind="")
+            bar.refresh()
+
+        with compiling_said(where, say):
+            return run_experiment(settings, device=where, progress=tell)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -21,6 +20,7 @@ from ..materials import Isotropic
 from ..selection import select_nodes
 from ..simulation import Simulation
 from ..solvers import SymplecticEuler
+from .compiling import compiling_said
 from .say import EXIT_CODES, complain, interrupt_status
 from .subject import STIFFNESS_PER_WEIGHT, Subject, find_subject
 from .summary import pressure, summary
@@ -32,9 +32,6 @@ FPS = 24.0
 
 #: More steps to a frame than this are said beforehand.
 MANY_STEPS = 1e5
-
-#: Getting ready takes this long [s] only when kernels must be compiled.
-COMPILING_AFTER = 1.5
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
@@ -124,15 +121,16 @@ def run(args: argparse.Namespace) -> int:
     if args.duration is not None:
         frame_count(args.duration, args.fps)
     _check_output(args.output, args.preview)
-    checked_device(args.device)
+    device = checked_device(args.device)
     model = _model(args.model, args.rotation_level)
     subject = find_subject(args.input, args.scale)
     if subject.source and args.output.exists() and args.output.samefile(subject.source):
         raise InputError(f"{args.output}: is the input, should be another file")
     duration = subject.duration if args.duration is None else args.duration
     count = frame_count(duration, args.fps)
-    body, fixed = _make_body(args, subject)
-    sim = _make_simulation(args, subject, body, model)
+    with compiling_said(device):
+        body, fixed = _make_body(args, subject)
+        sim = _make_simulation(args, subject, body, model)
     steps = 1.0 / (args.fps * sim.dt)
     if steps > MANY_STEPS:
         subject.notes.append(f"{steps:.2g} steps of {sim.dt:.2g} s make a frame: this will take long")
@@ -213,29 +211,15 @@ def _make_simulation(args: argparse.Namespace, subject: Subject, body: SoftBody,
     damping = subject.damping if args.damping is None else args.damping
     gravity = subject.gravity if args.gravity is None else tuple(args.gravity)
     SymplecticEuler(args.dt, damping)  # checks both, the step before it is shortened
-    with _compiling_said():
-        # At rest and without weight, a safe step loads every kernel and moves nothing.
-        trial = Simulation(body, model=model, integrator=SymplecticEuler(damping=damping), gravity=(0, 0, 0))
-        wanted = trial.dt if args.dt is None else args.dt
-        dt = 1.0 / (args.fps * steps_per_frame(args.fps, wanted))
-        sim = Simulation(body, model=model, integrator=SymplecticEuler(dt, damping), gravity=gravity)
-        trial.step()
-        trial.von_mises()
-        body.displacements = body.velocities = np.zeros_like(body.mesh.points)
+    # At rest and without weight, a safe step loads every kernel and moves nothing.
+    trial = Simulation(body, model=model, integrator=SymplecticEuler(damping=damping), gravity=(0, 0, 0))
+    wanted = trial.dt if args.dt is None else args.dt
+    dt = 1.0 / (args.fps * steps_per_frame(args.fps, wanted))
+    sim = Simulation(body, model=model, integrator=SymplecticEuler(dt, damping), gravity=gravity)
+    trial.step()
+    trial.von_mises()
+    body.displacements = body.velocities = np.zeros_like(body.mesh.points)
     return sim
-
-
-@contextmanager
-def _compiling_said() -> Iterator[None]:
-    """Say that kernels are being compiled if it takes long enough to wonder."""
-    text = "compiling kernels; later runs find them compiled"
-    timer = threading.Timer(COMPILING_AFTER, complain, [text, ""])
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
 
 
 @contextmanager
