@@ -1,14 +1,15 @@
 """A small body's steps whole in one thread block: nodes and forces in shared memory, many steps a launch.
 
 A body of a thousand elements is done before the next launch has begun, so here a block stays with its world. Each
-thread is one complete subtree and writes ten nodal forces to slots; then each sums up the slots of some nodes and moves
-them. Nothing is added atomically, so runs are reproducible bit by bit, and nothing leaves the multiprocessor but
-the state at the end.
+thread takes a complete subtree, or a part of its leaves where there are too few worlds to fill the card, and writes its
+nodal forces to slots; then each thread sums up the slots of a node and moves it. Nothing is added atomically, so runs
+are reproducible bit by bit, and nothing leaves the multiprocessor but the state at the end.
 
 CUDA only. ``SHARED_BYTES`` is what a block may have without asking.
 """
 
 import functools
+from dataclasses import dataclass
 
 import warp as wp
 
@@ -27,32 +28,87 @@ from .elements import (
 )
 from .integrate import is_finite, symplectic_euler_velocity
 from .rotation import byers_xu
+from .shapes import fingerprint
 from .subtree import LEAVES
 from .subtree_forces import deformed_of, mat10, own_forces, shared_forces
 
 wp.set_module_options({"enable_backward": False})
 
 SHARED_BYTES = 48 * 1024
-#: Displacement and velocity of a node, ten forces of a subtree [B].
-NODE_BYTES, SUBTREE_BYTES = 24, 120
-#: Nodes and subtrees are rounded up to whole warps.
+VECTOR_BYTES = 12
 WARP = 32
-MAX_THREADS = 512
+MAX_THREADS = 1024
+#: Threads of a multiprocessor that the registers of a whole subtree's forces leave room for.
+BUSY_THREADS = 512
 
 LOAD, STORE = 0, 1
+
+#: Slots are numbered in 16 bits, four numbers at a time.
+CHUNK = 4
 
 mat84i = wp.types.matrix(shape=(8, 4), dtype=wp.int32)
 
 
-def rounded(count: int) -> int:
-    """Up to a multiple of a warp's threads."""
-    return -(-count // WARP) * WARP
+@dataclass(frozen=True)
+class Layout:
+    """How a body is dealt out to the threads of a block.
 
+    Attributes:
+        shape: Type of its subtrees.
+        shared: Whether leaves use their subtree root's rotation; otherwise their own.
+        uniform: Whether all of a world is of one material.
+        parts: Into how many parts the leaves of a subtree are dealt: 1, 2 or 4.
+        subtrees: Room for subtrees, whole warps of them.
+        nodes: Room for nodes.
+    """
 
-def fits(nodes: int, subtrees: int) -> bool:
-    """Whether a block can hold a body."""
-    size = NODE_BYTES * rounded(nodes) + SUBTREE_BYTES * rounded(subtrees)
-    return size <= SHARED_BYTES and subtrees <= MAX_THREADS
+    shape: int
+    shared: bool
+    uniform: bool
+    parts: int
+    subtrees: int
+    nodes: int
+
+    @property
+    def threads(self) -> int:
+        """Threads a block: the first part of each subtree, then the second of each, and so on."""
+        return self.parts * self.subtrees
+
+    @property
+    def fits(self) -> bool:
+        vectors = 2 * self.nodes + self.slot_count + 1
+        return VECTOR_BYTES * vectors <= SHARED_BYTES and self.threads <= MAX_THREADS
+
+    @property
+    def slot_count(self) -> int:
+        """Slots for forces; one more is always zero."""
+        return self.subtrees * sum(place >= 0 for places in self.places for place in places)
+
+    def leaves(self, part: int) -> range:
+        """The leaves of a part."""
+        each = 8 // self.parts
+        return range(part * each, (part + 1) * each)
+
+    @property
+    def places(self) -> list[list[int]]:
+        """For each part and each of a subtree's ten nodes, which of a subtree's slots it is, -1 if the part has none.
+
+        The slot's number is the subtree's plus this many times ``subtrees``.
+        """
+        places, count = [], 0
+        for part in range(self.parts):
+            used = {node for leaf in self.leaves(part) for node in LEAVES[self.shape][leaf]}
+            row = [-1] * 10
+            for node in sorted(used):
+                row[node] = count
+                count += 1
+            places.append(row)
+        return places
+
+    def needs(self, part: int) -> list[bool]:
+        """Which of a subtree's ten nodes a part reads: the first, from which all is measured, and the root's for a
+        shared rotation."""
+        return [place >= 0 or node == 0 or (self.shared and node < 4) for node, place in enumerate(self.places[part])]
 
 
 @wp.func_native("""
@@ -96,26 +152,24 @@ class BlockBody:
     subtree_count: int
     node_count: int
     element_count: int
-    order: wp.array[wp.int32]  # [N] node at each place, those where most subtrees meet first
-    degree: wp.array[wp.int32]  # [N] subtrees at each place
-    slots: wp.array2d[wp.int32]  # [most, N] their slots, subtree + local node * capacity
+    order: wp.array[wp.int32]  # [N] node at each place, those that have most slots first
+    chunks: wp.array[wp.int32]  # [N] how many chunks of slots each place has
+    slots: wp.array2d[wp.uint64]  # [most, N] four slots each, the zero one past the last
 
 
 @functools.cache
-def step_block(shape: int, shared: bool, uniform: bool, nodes: int, subtrees: int) -> wp.Kernel:
-    """Symplectic Euler steps of the corotated model, a block a world; launch with ``subtrees`` threads a block.
-
-    Args:
-        shape: Type of the subtrees.
-        shared: Whether leaves use their subtree root's rotation; otherwise their own.
-        uniform: Whether all of a world is of one material.
-        nodes, subtrees: Room for nodes, and for subtrees, which is the number of threads; multiples of ``WARP``.
-    """
+def step_block(layout: Layout) -> wp.Kernel:
+    """Symplectic Euler steps of the corotated model, a block a world; launch with ``layout.threads`` a block."""
+    shape, shared, uniform, parts = layout.shape, layout.shared, layout.uniform, layout.parts
+    capacity, threads, zero_slot = layout.subtrees, layout.threads, layout.slot_count
     deformed = deformed_of(shape)
-    fast_own, fast_shared = own_forces(shape, uniform), shared_forces(shape, uniform, False)
-    displacement, velocity = _memory(nodes, "displacements"), _memory(nodes, "velocities")
-    slot = _memory(10 * subtrees, "forces")
+    own = [own_forces(shape, uniform, layout.leaves(part)) for part in range(parts)]
+    turned = [shared_forces(shape, uniform, False, layout.leaves(part)) for part in range(parts)]
+    needs, places, leaves_each = [layout.needs(part) for part in range(parts)], layout.places, 8 // parts
+    displacement, velocity = _memory(layout.nodes, "displacements"), _memory(layout.nodes, "velocities")
+    slot = _memory(zero_slot + 1, "forces")
     leaf_nodes = mat84i(*(node for leaf in LEAVES[shape] for node in leaf))
+    place_of = wp.types.matrix(shape=(parts, 10), dtype=wp.int32)(*(place for row in places for place in row))
 
     @wp.func
     def node_at(body: BlockBody, s: int, local: int):
@@ -123,9 +177,15 @@ def step_block(shape: int, shared: bool, uniform: bool, nodes: int, subtrees: in
 
     @wp.func(inline=False)
     def repair(
-        body: BlockBody, s: int, material: int, mu: wp.array[wp.float32], lam: wp.array[wp.float32], stride: int
+        body: BlockBody,
+        s: int,
+        part: int,
+        material: int,
+        mu: wp.array[wp.float32],
+        lam: wp.array[wp.float32],
+        stride: int,
     ):
-        """Forces of a subtree that the fast iteration does not turn, leaf by leaf with the robust rotation."""
+        """Forces of a part that the fast iteration does not turn, leaf by leaf with the robust rotation."""
         for_all = wp.mat33()
         if wp.static(shared):
             g = gradient_of(
@@ -133,17 +193,19 @@ def step_block(shape: int, shared: bool, uniform: bool, nodes: int, subtrees: in
             )
             q = frame(body.roots, s)
             for_all = byers_xu(q + g) * wp.transpose(q)
-        places = wp.static(leaf_nodes)
-        leaf = int(0)
-        while leaf < 8:
+        of_leaf = wp.static(leaf_nodes)
+        of_part = wp.static(place_of)
+        leaf = part * wp.static(leaves_each)
+        end = leaf + wp.static(leaves_each)
+        while leaf < end:
             t = body.subtrees.first[s] + leaf
             g = gradient_of(
                 body.elements,
                 t,
-                node_at(body, s, places[leaf, 0]),
-                node_at(body, s, places[leaf, 1]),
-                node_at(body, s, places[leaf, 2]),
-                node_at(body, s, places[leaf, 3]),
+                node_at(body, s, of_leaf[leaf, 0]),
+                node_at(body, s, of_leaf[leaf, 1]),
+                node_at(body, s, of_leaf[leaf, 2]),
+                node_at(body, s, of_leaf[leaf, 3]),
             )
             q = frame(body.elements, t)
             r = for_all * q
@@ -159,11 +221,16 @@ def step_block(shape: int, shared: bool, uniform: bool, nodes: int, subtrees: in
                     force = f2
                 if n == 3:
                     force = f3
-                at = s + places[leaf, n] * wp.static(subtrees)
+                at = s + of_part[part, of_leaf[leaf, n]] * wp.static(capacity)
                 slot(wp.static(STORE), at, slot(wp.static(LOAD), at, force) + force)
             leaf += 1
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        grid_stride=False,
+        launch_bounds=(threads, max(BUSY_THREADS // threads, 1)),
+    )
     def step_block(
         # In
         body: BlockBody,
@@ -186,16 +253,21 @@ def step_block(shape: int, shared: bool, uniform: bool, nodes: int, subtrees: in
         reactions: wp.array[wp.vec4],
         bad_step: wp.array[wp.int64],
     ):
-        world = wp.tid() // wp.static(subtrees)
-        s = wp.tid() % wp.static(subtrees)
+        _generated_from = wp.static(fingerprint(needs, places))
+        world = wp.tid() // wp.static(threads)
+        thread = wp.tid() % wp.static(threads)
         base = world * body.node_count
-        place = s
+        place = thread
         while place < body.node_count:
             i = base + body.order[place]
             displacement(wp.static(STORE), place, load_node(u, i))
             velocity(wp.static(STORE), place, load_node(v, i))
-            place += wp.static(subtrees)
+            place += wp.static(threads)
+        if thread == 0:
+            slot(wp.static(STORE), wp.static(zero_slot), wp.vec3())
         synchronize_block()
+        part = thread // wp.static(capacity)
+        s = thread % wp.static(capacity)
         mine = wp.min(s, body.subtree_count - 1)
         code = body.subtrees.code[mine]
         h = 0.5 * body.subtrees.size[(code & LEVEL_MASK) // 3]
@@ -205,30 +277,40 @@ def step_block(shape: int, shared: bool, uniform: bool, nodes: int, subtrees: in
         step = int(0)
         while step < steps:
             if s < body.subtree_count:
-                x = mat10()
-                for k in range(10):
-                    x[k] = node_at(body, s, k)
-                y = deformed(x, q, 1.0 / h, mirror)
-                g = mat10()
                 trusted = bool(True)
-                if wp.static(shared):
-                    g, trusted = fast_shared(y, h, mirror, wp.mat33(), mu, lam, material)
-                else:
-                    g, trusted = fast_own(y, h, mirror, mu, lam, material)
-                for k in range(10):
-                    slot(wp.static(STORE), s + k * wp.static(subtrees), g[k])
+                for p in range(wp.static(parts)):
+                    if part == p:
+                        x = mat10()
+                        for k in range(10):
+                            if wp.static(needs[p][k]):
+                                x[k] = node_at(body, s, k)
+                        y = deformed(x, q, 1.0 / h, mirror)
+                        g = mat10()
+                        if wp.static(shared):
+                            g, trusted = wp.static(turned[p])(y, h, mirror, wp.mat33(), mu, lam, material)
+                        else:
+                            g, trusted = wp.static(own[p])(y, h, mirror, mu, lam, material)
+                        for k in range(10):
+                            if wp.static(places[p][k] >= 0):
+                                slot(wp.static(STORE), s + wp.static(places[p][k] * capacity), g[k])
                 if not trusted:
-                    repair(body, s, material, mu, lam, stride)
+                    repair(body, s, part, material, mu, lam, stride)
             synchronize_block()
-            place = s
+            place = thread
             while place < body.node_count:
                 i = base + body.order[place]
                 force = wp.vec3()
-                for m in range(body.degree[place]):
-                    force += slot(wp.static(LOAD), body.slots[m, place], force)
                 if has_load != 0:
-                    force += load_node(load, i)
+                    force = load_node(load, i)
                 w = inverse_mass[i]
+                numbers = body.slots[0, place]
+                for chunk in range(body.chunks[place]):
+                    these = numbers
+                    # The next ones are on their way while these are summed up.
+                    numbers = body.slots[wp.min(chunk + 1, body.slots.shape[0] - 1), place]
+                    for k in range(wp.static(CHUNK)):
+                        at = int((these >> wp.uint64(16 * k)) & wp.uint64(65535))
+                        force += slot(wp.static(LOAD), at, force)
                 moving = velocity(wp.static(LOAD), place, force)
                 if w > 0.0:
                     moving = symplectic_euler_velocity(moving, force, w, gravity, dt, damping)
@@ -239,14 +321,14 @@ def step_block(shape: int, shared: bool, uniform: bool, nodes: int, subtrees: in
                 displacement(wp.static(STORE), place, moved)
                 if not is_finite(moved):
                     wp.atomic_min(bad_step, 0, clock[0] + wp.int64(step + 1))
-                place += wp.static(subtrees)
+                place += wp.static(threads)
             synchronize_block()
             step += 1
-        place = s
+        place = thread
         while place < body.node_count:
             i = base + body.order[place]
             store_node(u, i, displacement(wp.static(LOAD), place, wp.vec3()))
             store_node(v, i, velocity(wp.static(LOAD), place, wp.vec3()))
-            place += wp.static(subtrees)
+            place += wp.static(threads)
 
     return step_block

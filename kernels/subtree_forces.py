@@ -88,19 +88,20 @@ def deformed_of(shape: int) -> wp.Function:
 
 
 @functools.cache
-def own_forces(shape: int, uniform: bool) -> wp.Function:
-    """Forces with every leaf's own rotation, and whether they may be trusted.
+def own_forces(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Function:
+    """Forces of the chosen leaves, each with its own rotation, and whether they may be trusted.
 
     ``h`` is a leaf's edge length, ``first`` where its material stands, and that of the other leaves unless uniform.
     With a rotation, R sym(R^T F) = F, so P = 2 mu (F - R) + lambda tr(R^T F - I) R: no matrix is multiplied.
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
     leaves, handed = LEAVES[shape], HANDEDNESS[shape]
+    begin, end = chosen.start, chosen.stop
     volume = VOLUME[shape]
 
     @wp.func
     def own_forces(x: mat10, h: float, mirror: float, mu: wp.array[wp.float32], lam: wp.array[wp.float32], first: int):
-        _generated_from = wp.static(fingerprint(leaves, handed))
+        _generated_from = wp.static(fingerprint(leaves, handed, begin, end))
         m = mu[first]
         k = lam[first]
         # P V/h = from_f F + from_z Z with Z = 2^ITERATIONS R.
@@ -108,7 +109,7 @@ def own_forces(shape: int, uniform: bool) -> wp.Function:
         area_z = wp.static(0.5**ITERATIONS) * area
         g = mat10()
         trusted = bool(True)
-        for leaf in range(8):
+        for leaf in range(wp.static(begin), wp.static(end)):
             if wp.static(not uniform):
                 m = mu[first + leaf]
                 k = lam[first + leaf]
@@ -139,14 +140,16 @@ def own_forces(shape: int, uniform: bool) -> wp.Function:
 
 
 @functools.cache
-def shared_forces(shape: int, uniform: bool, given: bool) -> wp.Function:
-    """Forces with one rotation for all leaves, the subtree root's or a given one, and whether they may be trusted.
+def shared_forces(shape: int, uniform: bool, given: bool, chosen: range = range(8)) -> wp.Function:
+    """Forces of the chosen leaves, all with one rotation, the subtree root's or a given one, and whether it may be
+    trusted.
 
     The ten positions are turned back once; in the subtree's own frame the leaves are linear elements. ``turn`` is the
     given rotation times the subtree's frame.
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
     leaves, frames, at = LEAVES[shape], FRAMES[shape], POSITIONS[shape]
+    begin, end = chosen.start, chosen.stop
     volume = VOLUME[shape]
 
     @wp.func
@@ -159,7 +162,7 @@ def shared_forces(shape: int, uniform: bool, given: bool) -> wp.Function:
         lam: wp.array[wp.float32],
         first: int,
     ):
-        _generated_from = wp.static(fingerprint(leaves, frames, at))
+        _generated_from = wp.static(fingerprint(leaves, frames, at, begin, end))
         trusted = bool(True)
         r0 = wp.vec3()
         r1 = wp.vec3()
@@ -188,7 +191,7 @@ def shared_forces(shape: int, uniform: bool, given: bool) -> wp.Function:
         k = lam[first]
         area = wp.static(volume) * h * h
         g = mat10()
-        for leaf in range(8):
+        for leaf in range(wp.static(begin), wp.static(end)):
             if wp.static(not uniform):
                 m = mu[first + leaf]
                 k = lam[first + leaf]

@@ -15,15 +15,17 @@ from .kernels.reproducible import gather_slots
 
 @dataclass(frozen=True, eq=False)
 class Slots:
-    """Slots of all nodes, node after node.
+    """Slots of all units of work, unit after unit, so that each writes to one stretch of memory.
 
     Attributes:
-        starts: Where each node's begin, and where the last one's end, int32 [worlds * N + 1].
-        values: Forces, all zero between uses, vec4 [worlds * per_world].
-        per_world: How many there are in a world.
+        starts: Where each node's entries in ``order`` begin, and where the last one's end, int32 [worlds * N + 1].
+        order: The slots that each node adds up, int32.
+        values: Forces, vec4 [worlds * per_world].
+        per_world: How many slots there are in a world.
     """
 
     starts: wp.array
+    order: wp.array
     values: wp.array
     per_world: int
 
@@ -43,19 +45,18 @@ class Slots:
         flat = np.concatenate([nodes.ravel() for nodes in units])
         there = np.flatnonzero(flat >= 0)
         order = there[np.argsort(flat[there], kind="stable")]
-        number = np.full(len(flat), -1, np.int32)
-        number[order] = np.arange(len(order), dtype=np.int32)
-        ends_of_nodes = np.cumsum(np.bincount(flat[there], minlength=node_count))
-        starts = np.concatenate([[0], in_worlds(ends_of_nodes, worlds, len(order))])
+        ends = np.cumsum(np.bincount(flat[there], minlength=node_count))
         slots = cls(
-            wp.array(starts, dtype=wp.int32, device=device),
-            wp.zeros(worlds * len(order), dtype=wp.vec4, device=device),
-            len(order),
+            wp.array(np.concatenate([[0], in_worlds(ends, worlds, len(order))]), dtype=wp.int32, device=device),
+            wp.array(in_worlds(order, worlds, len(flat)), dtype=wp.int32, device=device),
+            wp.zeros(worlds * len(flat), dtype=wp.vec4, device=device),
+            len(flat),
         )
-        ends = np.cumsum([nodes.size for nodes in units])
-        parts = np.split(number, ends[:-1])
+        number = np.where(flat < 0, -1, np.arange(len(flat))).astype(np.int32)
+        parts = np.split(number, np.cumsum([nodes.size for nodes in units])[:-1])
         return slots, [part.reshape(nodes.shape) for part, nodes in zip(parts, units, strict=True)]
 
     def gather(self, f: wp.array) -> None:
-        """Add each node's slots to its force, vec4 [N], and clear them."""
-        wp.launch(gather_slots, dim=len(f), inputs=[self.starts, self.values], outputs=[f], device=f.device)
+        """Add each node's slots to its force, vec4 [worlds * N]."""
+        inputs = [self.starts, self.order, self.values]
+        wp.launch(gather_slots, dim=len(f), inputs=inputs, outputs=[f], device=f.device)

@@ -44,6 +44,7 @@ class ForceField(ABC):
         if self.slots is None:
             self.scatter_forces(u, f)
         else:
+            self.slots.values.zero_()
             self.scatter_forces(u, self.slots.values)
             self.slots.gather(f)
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
+from ..kernels import lanczos
+
 if TYPE_CHECKING:
     from ..body import SoftBody
     from ..elasticity import ForceField
@@ -24,41 +26,63 @@ def largest_frequency(body: SoftBody, field: ForceField) -> float:
     so that whatever model and elements there are is what is measured. The Ritz value's residual is added to it. Zero if
     no node is free to move.
     """
-    weight = np.sqrt(body.node_inverse_mass.numpy().astype(np.float64))
-    free = weight > 0
-    if not free.any():
+    free = int((body.node_inverse_mass.numpy() > 0).sum())
+    if not free:
         return 0.0
-    probe = PROBE * float(np.min(body.mesh.volumes)) ** (1.0 / 3.0)
-    u = np.zeros((body.node_count, 4), np.float32)
-    u_device = wp.zeros_like(body.node_displacements)
-    f_device = wp.zeros_like(body.node_forces)
-
-    def apply(q: np.ndarray) -> np.ndarray:
-        motion = weight[:, None] * q
-        scale = probe / np.abs(motion).max()
-        u[:, :3] = scale * motion
-        u_device.assign(u)
-        f_device.zero_()
-        field.add_forces(u_device, f_device)
-        return -(weight[:, None] / scale) * f_device.numpy()[:, :3]
-
-    rng = np.random.default_rng(0)
-    q = rng.standard_normal((body.node_count, 3)) * free[:, None]
-    q /= np.linalg.norm(q)
-    before = np.zeros_like(q)
+    iteration = _Lanczos(body, field)
     diagonal: list[float] = []
     off: list[float] = [0.0]
     with field.state_kept():
-        for _ in range(min(LANCZOS_STEPS, 3 * int(free.sum()))):
-            w = apply(q) - off[-1] * before
-            diagonal.append(float(np.vdot(q, w)))
-            w -= diagonal[-1] * q
-            off.append(float(np.linalg.norm(w)))
-            if off[-1] <= 1e-6 * max(map(abs, diagonal)):
+        for _ in range(min(LANCZOS_STEPS, 3 * free)):
+            a, b = iteration.step(off[-1])
+            diagonal.append(a)
+            off.append(b)
+            if b <= 1e-6 * max(map(abs, diagonal)):
                 break
-            before, q = q, w / off[-1]
     size = len(diagonal)
     tridiagonal = np.diag(diagonal) + np.diag(off[1:size], 1) + np.diag(off[1:size], -1)
     values, vectors = np.linalg.eigh(tridiagonal)
     bound = values[-1] + off[size] * abs(vectors[-1, -1])
     return float(np.sqrt(max(bound, 0.0)))
+
+
+class _Lanczos:
+    """The iteration's vectors on the device, vec4 [N]: the present one, the one before and the next."""
+
+    def __init__(self, body: SoftBody, field: ForceField):
+        self.body = body
+        self.field = field
+        self.probe = PROBE * float(np.min(body.mesh.volumes)) ** (1.0 / 3.0)
+        self.q, self.before, self.next, self.u, self.f = (wp.zeros_like(body.node_displacements) for _ in range(5))
+        self._sums = wp.zeros(lanczos.PARTIAL_SUMS, dtype=wp.float64, device=body.device)
+        self._largest = wp.zeros(lanczos.PARTIAL_SUMS, dtype=wp.float32, device=body.device)
+        start = np.zeros((body.node_count, 4), np.float32)
+        start[:, :3] = np.random.default_rng(0).standard_normal((body.node_count, 3), np.float32)
+        start[body.node_inverse_mass.numpy() == 0] = 0.0
+        self.q.assign(start)
+        self._launch(lanczos.scale_by, [1.0 / np.sqrt(self._inner(self.q, self.q)), self.q])
+
+    def step(self, beta: float) -> tuple[float, float]:
+        """One step; the last off-diagonal entry in, the next diagonal and off-diagonal ones out [1/s^2]."""
+        inverse_mass = self.body.node_inverse_mass
+        self._launch(lanczos.largest_motions, [inverse_mass, self.q, self._largest], lanczos.PARTIAL_SUMS)
+        scale = self.probe / float(self._largest.numpy().max())
+        self._launch(lanczos.probe_motion, [scale, inverse_mass, self.q, self.u])
+        self.f.zero_()
+        self.field.add_forces(self.u, self.f)
+        self._launch(lanczos.apply_stiffness, [scale, beta, inverse_mass, self.f, self.before, self.next])
+        diagonal = self._inner(self.q, self.next)
+        self._launch(lanczos.add_scaled, [-diagonal, self.q, self.next])
+        off = float(np.sqrt(self._inner(self.next, self.next)))
+        if off > 0.0:
+            self._launch(lanczos.scale_by, [1.0 / off, self.next])
+        self.before, self.q, self.next = self.q, self.next, self.before
+        return diagonal, off
+
+    def _inner(self, a: wp.array, b: wp.array) -> float:
+        self._launch(lanczos.inner_products, [a, b, self._sums], lanczos.PARTIAL_SUMS)
+        return float(self._sums.numpy().sum())
+
+    def _launch(self, kernel: wp.Kernel, arguments: list, dim: int | None = None) -> None:
+        count = self.body.node_count if dim is None else dim
+        wp.launch(kernel, dim=count, inputs=arguments, device=self.body.device)
