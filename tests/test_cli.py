@@ -2,6 +2,7 @@
 
 import os
 import re
+import signal
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from pxr import Usd, UsdGeom
 
 import warp_corot as wc
 from warp_corot.cli import main
+from warp_corot.cli.say import interrupt_status
+from warp_corot.cli.signals import signals_waiting, terminable
 from warp_corot.elasticity import MODELS
 
 OPTIONS = ["young", "poisson", "density", "model", "rotation-level", "fix", "scale", "gravity", "duration", "fps", "dt"]
@@ -392,6 +395,17 @@ def test_interrupted_before_anything_runs(stage, capsys, monkeypatch):
     monkeypatch.setattr(f"warp_corot.cli.{stage}", interrupt)
     assert simulate("box", "-o", "a.usd") == 130
     assert capsys.readouterr() == ("", "warp-corot: interrupted\n")
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals_wait_while_modules_are_imported(number, status):
+    """An exception in the middle is swallowed by some modules; after them it is not."""
+    whole = False
+    with terminable(), pytest.raises(KeyboardInterrupt) as raised, signals_waiting():
+        signal.raise_signal(number)
+        whole = True
+    assert whole
+    assert interrupt_status(raised.value) == status
 
 
 def test_no_command_is_an_error(capsys):

@@ -6,23 +6,22 @@ import argparse
 import logging
 import os
 import re
-import signal
 import sys
 import tempfile
-import threading
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from types import ModuleType
 from typing import NoReturn
 
 from ..errors import InputError, UnstableError
-from .say import EXIT_CODES, Terminated, complain, interrupt_status, open_streams, silence
+from .say import EXIT_CODES, complain, interrupt_status, open_streams, silence
+from .signals import signals_waiting, terminable
 
 
 def commands() -> dict[str, ModuleType]:
     """The subcommands by name; they need all of the package, so that importing them takes a while."""
-    from . import paper, simulate
+    with signals_waiting():
+        from . import paper, simulate
 
     return {"simulate": simulate, "paper": paper}
 
@@ -65,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
     try:
-        with _terminable(), warnings.catch_warnings():
+        with terminable(), warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: complain(str(message), kind="warning")
             status = _run(argv)
             sys.stdout.flush()
@@ -122,20 +121,3 @@ def _start_warp() -> None:
         for line in said.read().decode(errors="replace").splitlines():
             if "Could not find or load the NVIDIA CUDA driver" not in line:
                 print(line, file=sys.stderr)
-
-
-@contextmanager
-def _terminable() -> Iterator[None]:
-    """SIGTERM ends what runs as Ctrl-C does."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def terminate(*_: object) -> NoReturn:
-        raise Terminated
-
-    before = signal.signal(signal.SIGTERM, terminate)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
