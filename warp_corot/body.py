@@ -114,9 +114,13 @@ class SoftBody:
         Raises:
             InputError: There is no such world.
         """
-        if isinstance(index, bool) or index != int(index) or not 0 <= index < self.worlds:
+        try:
+            number = -1 if isinstance(index, bool) else int(index)
+        except (TypeError, ValueError, OverflowError):
+            number = -1
+        if number != index or not 0 <= number < self.worlds:
             raise InputError(f"world is {index!r}; it must be a whole number from 0 to {self.worlds - 1}")
-        return World(self, int(index))
+        return World(self, number)
 
     @property
     def positions(self) -> wp.array:
@@ -246,9 +250,7 @@ class SoftBody:
             self._stop_following(chosen)
             self._constrain(chosen, values)
             return
-        if displacements is not None and named.each and np.shape(displacements)[1:2] == (named.each,):
-            displacements = np.tile(displacements, (1, len(chosen) // named.each, 1))
-        self.follow(chosen, times, displacements)
+        self.follow(chosen, times, None if displacements is None else named.keyframes(displacements))
 
     def follow(
         self, indices: npt.NDArray[np.integer], times: npt.ArrayLike | None, displacements: npt.ArrayLike | None

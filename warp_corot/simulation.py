@@ -132,6 +132,7 @@ class Simulation:
         self._steppers = [
             self.integrator.bind(body, f, context) for body, f in zip(self.bodies, self.fields, strict=True)
         ]
+        self._steps_before_reset = 0
         self._hooks: list[_Hook] = []
         self._graphs: dict[tuple[int, bool], wp.Graph] = {}
         self._recorded_revisions: tuple[int, ...] = ()
@@ -145,8 +146,13 @@ class Simulation:
 
     @property
     def steps(self) -> int:
-        """Time steps done."""
+        """Time steps done, since the last ``reset()`` if there was one."""
         return int(self.clock.numpy()[0])
+
+    @property
+    def total_steps(self) -> int:
+        """Time steps done, whatever has been reset since."""
+        return self._steps_before_reset + self.steps
 
     @property
     def time(self) -> float:
@@ -186,10 +192,11 @@ class Simulation:
     def advance_steps(self, count: int) -> None:
         """Advance by ``count`` time steps; as ``advance``. Steps that a hook makes count."""
         count = checked_count(count, "count", least=0)
-        done = self.steps
-        end = done + count
-        while done < end:
-            due = min([end, done + CHECK_STEPS, *((done // h.every + 1) * h.every for h in self._hooks)])
+        end = self.total_steps + count
+        # A hook may make steps itself or set the clock back.
+        while (left := end - self.total_steps) > 0:
+            done = self.steps
+            due = min([done + left, done + CHECK_STEPS, *((done // h.every + 1) * h.every for h in self._hooks)])
             for body in self.bodies:
                 body.adopt_positions()
             remaining = due - done
@@ -201,7 +208,6 @@ class Simulation:
                 body.publish_positions()
             self._check_finite()
             self._call_hooks()
-            done = self.steps
         wp.synchronize_device(self.device)
 
     def on_step(self, callback: Callable[[Simulation], None], every: int = 1) -> None:
@@ -239,7 +245,9 @@ class Simulation:
             mask[slice(None) if worlds is None else checked_indices(worlds, self.worlds, "world")] = 1
             chosen = wp.array(mask, dtype=wp.int32, device=self.device)
         if worlds is None:
+            self._steps_before_reset = self.total_steps
             self.clock.zero_()
+            self._bad_step.fill_(_NEVER)
         for body, field in zip(self.bodies, self.fields, strict=True):
             body.reset(chosen, self.clock)
             field.reset(chosen)
@@ -333,25 +341,25 @@ class Simulation:
 
     def _check_finite(self) -> None:
         step = int(self._bad_step.numpy()[0])
-        if step != _NEVER:
-            # Said once: who sets a good state again may go on.
-            self._bad_step.fill_(_NEVER)
-            hint = f"dt is {self.dt:.3g} s, the largest stable step at rest about {self.stable_dt:.3g} s"
-            where = self._bad_worlds()
-            raise UnstableError(
-                f"the state is not finite since step {step} (t = {step * self.dt:.4g} s){where}; {hint}"
-            )
+        if step == _NEVER:
+            return
+        # Said once: who sets a good state again may go on.
+        self._bad_step.fill_(_NEVER)
+        bad = self._bad_worlds()
+        if not len(bad):
+            return  # somebody has set a good state before anybody looked
+        more = f" and {len(bad) - 3} more" if len(bad) > 3 else ""
+        where = f" in world {', '.join(map(str, bad[:3]))}{more}" if self.worlds > 1 else ""
+        hint = f"dt is {self.dt:.3g} s, the largest stable step at rest about {self.stable_dt:.3g} s"
+        raise UnstableError(f"the state is not finite since step {step} (t = {step * self.dt:.4g} s){where}; {hint}")
 
-    def _bad_worlds(self) -> str:
-        """In which worlds something is not finite, for a message."""
-        if self.worlds == 1:
-            return ""
+    def _bad_worlds(self) -> npt.NDArray[np.intp]:
+        """The worlds in which something is not finite, as ``kernels.integrate.is_finite`` has it."""
         bad = np.zeros(self.worlds, bool)
         for body in self.bodies:
-            bad |= ~np.isfinite(body.node_displacements.numpy()).reshape(self.worlds, -1).all(axis=1)
-        which = np.flatnonzero(bad)
-        more = f" and {len(which) - 3} more" if len(which) > 3 else ""
-        return f" in world {', '.join(map(str, which[:3]))}{more}" if len(which) else ""
+            sizes = np.abs(body.node_displacements.numpy().astype(np.float64)).sum(axis=1)
+            bad |= ~(sizes.reshape(self.worlds, -1) <= 3e38).all(axis=1)
+        return np.flatnonzero(bad)
 
     def _call_hooks(self) -> None:
         steps = self.steps if self._hooks else 0

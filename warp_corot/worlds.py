@@ -72,30 +72,41 @@ class ChosenNodes:
 
     Attributes:
         indices: Among the nodes of all worlds [k].
+        worlds: In how many worlds.
         each: How many in each of the worlds, or None if not the same ones in each.
     """
 
     indices: npt.NDArray[np.intp]
+    worlds: int
     each: int | None
 
     def vectors(self, given: npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:
         """Vectors for the chosen nodes, [3] or [k, 3], from one for all, one for each, or one for each in each world.
 
         Raises:
-            InputError: Another shape, or values that are not finite.
+            InputError: Another shape, or values that are not finite numbers.
         """
-        values = np.asarray(given, dtype=np.float64)
+        try:
+            values = np.asarray(given, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise InputError(f"{name} is {given!r}; it must be finite numbers") from None
         count = len(self.indices)
         shapes: list[tuple[int, ...]] = [(3,), (count, 3)]
-        if self.each is not None and self.each < count:
-            shapes += [(self.each, 3), (count // self.each, 1, 3), (count // self.each, self.each, 3)]
+        if self.each is not None:
+            shapes += [(self.each, 3), (self.worlds, 1, 3), (self.worlds, self.each, 3)]
         if values.shape not in shapes or not np.isfinite(values).all():
             allowed = " or ".join(str(list(shape)) for shape in dict.fromkeys(shapes))
             raise InputError(f"{name} has shape {values.shape}; it must be finite, {allowed}")
-        if values.shape in ((3,), (count, 3)):
+        if self.each is None or values.shape in ((3,), (count, 3)):
             return values
-        each = self.each or 1
-        return np.broadcast_to(values, (count // each, each, 3)).reshape(count, 3)
+        return np.broadcast_to(values, (self.worlds, self.each, 3)).reshape(count, 3)
+
+    def keyframes(self, given: npt.ArrayLike) -> npt.ArrayLike:
+        """Keyframes of the nodes of one world, [K, n, 3], once for each of the worlds; any others as they are."""
+        shape = np.shape(given)
+        if self.each is None or len(shape) != 3 or shape[1] != self.each:
+            return given
+        return np.tile(given, (1, self.worlds, 1))
 
 
 def chosen_nodes(nodes: npt.ArrayLike, count: int, worlds: int, chosen_worlds: Any = None) -> ChosenNodes:
@@ -112,10 +123,10 @@ def chosen_nodes(nodes: npt.ArrayLike, count: int, worlds: int, chosen_worlds: A
         InputError: Mask of the wrong length, index out of range, or a mask of all worlds' nodes with chosen worlds.
     """
     given = np.asarray(nodes)
-    if given.dtype == bool and worlds > 1 and given.size == worlds * count:
+    if given.dtype == bool and given.shape in ((worlds, count), (worlds * count,)) and given.shape != (count,):
         if chosen_worlds is not None:
             raise InputError("a mask of all worlds' nodes says which worlds are meant; worlds cannot be given as well")
-        return ChosenNodes(np.flatnonzero(given), None)
+        return ChosenNodes(np.flatnonzero(given), worlds, None)
     own = checked_indices(given, count, "node")
     which = np.arange(worlds) if chosen_worlds is None else checked_indices(chosen_worlds, worlds, "world")
-    return ChosenNodes((which[:, None] * count + own).ravel(), len(own))
+    return ChosenNodes((which[:, None] * count + own).ravel(), len(which), len(own))

@@ -140,12 +140,12 @@ def record(
     joined = _Joined(sim, world or 0)
     writer = UsdWriter(Path(path), joined, fps=fps, fixed=joined.fixed, material=joined)
     done = Recording(writer.path) if recording is None else recording
-    first_step = sim.steps
+    first_step = sim.total_steps
     with _closed_whole(writer, done):
         for frame in range(count + 1):
             started = time.perf_counter()
             due = first_step + round(frame / (fps * sim.dt))
-            sim.advance_steps(max(due - sim.steps, 0))
+            sim.advance_steps(max(due - sim.total_steps, 0))
             stepped = time.perf_counter()
             with signals_held_back():
                 _write_frame(writer, sim, joined, done)
