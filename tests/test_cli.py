@@ -400,11 +400,17 @@ def test_interrupted_before_anything_runs(stage, capsys, monkeypatch):
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_signals_wait_while_modules_are_imported(number, status):
     """An exception in the middle is swallowed by some modules; after them it is not."""
-    whole = False
-    with terminable(), pytest.raises(KeyboardInterrupt) as raised, signals_waiting():
-        signal.raise_signal(number)
-        whole = True
-    assert whole
+    came_to = []
+
+    def imports():
+        with signals_waiting():
+            came_to.append("the signal")
+            signal.raise_signal(number)
+            came_to.append("the end")
+
+    with terminable(), pytest.raises(KeyboardInterrupt) as raised:
+        imports()
+    assert came_to == ["the signal", "the end"]
     assert interrupt_status(raised.value) == status
 
 
