@@ -1,0 +1,248 @@
+"""Signed functions of bodies at many points: negative inside, in metres.
+
+Each kernel evaluates one kind of domain, one thread a point; sets of domains combine what these have written.
+"""
+
+import warp as wp
+
+#: How far a closest triangle is looked for [m]: everywhere.
+FAR = 1.0e15
+
+
+@wp.kernel(enable_backward=False)
+def evaluate_sphere(
+    # In
+    points: wp.array[wp.vec3],
+    centre: wp.vec3,
+    radius: float,
+    # Out
+    phi: wp.array[wp.float32],
+):
+    i = wp.tid()
+    phi[i] = wp.length(points[i] - centre) - radius
+
+
+@wp.func
+def box_distance(p: wp.vec3, lower: wp.vec3, upper: wp.vec3):
+    """Signed distance to an axis-aligned box."""
+    beyond = wp.max(lower - p, p - upper)
+    return wp.length(wp.max(beyond, wp.vec3(0.0))) + wp.min(wp.max(beyond), 0.0)
+
+
+@wp.kernel(enable_backward=False)
+def evaluate_box(
+    # In
+    points: wp.array[wp.vec3],
+    lower: wp.vec3,
+    upper: wp.vec3,
+    # Out
+    phi: wp.array[wp.float32],
+):
+    i = wp.tid()
+    phi[i] = box_distance(points[i], lower, upper)
+
+
+@wp.kernel(enable_backward=False)
+def evaluate_torus(
+    # In
+    points: wp.array[wp.vec3],
+    centre: wp.vec3,
+    axis: wp.vec3,
+    major: float,
+    minor: float,
+    # Out
+    phi: wp.array[wp.float32],
+):
+    i = wp.tid()
+    p = points[i] - centre
+    height = wp.dot(p, axis)
+    phi[i] = wp.length(wp.vec2(wp.length(p - height * axis) - major, height)) - minor
+
+
+@wp.kernel(enable_backward=False)
+def evaluate_capsule(
+    # In
+    points: wp.array[wp.vec3],
+    start: wp.vec3,
+    end: wp.vec3,
+    radius: float,
+    # Out
+    phi: wp.array[wp.float32],
+):
+    i = wp.tid()
+    p = points[i] - start
+    along = end - start
+    phi[i] = wp.length(p - along * wp.clamp(wp.dot(p, along) / wp.dot(along, along), 0.0, 1.0)) - radius
+
+
+@wp.kernel(enable_backward=False)
+def clip_to_box(
+    # In
+    points: wp.array[wp.vec3],
+    lower: wp.vec3,
+    upper: wp.vec3,
+    slope: float,
+    # In and out
+    phi: wp.array[wp.float32],
+):
+    """Cut off what lies outside a box, with a wall of the given slope."""
+    i = wp.tid()
+    phi[i] = wp.max(phi[i], slope * box_distance(points[i], lower, upper))
+
+
+def sampler(function: wp.Function) -> wp.Kernel:
+    """A kernel that evaluates a user's device function vec3 -> float."""
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def evaluate_function(
+        # In
+        points: wp.array[wp.vec3],
+        # Out
+        phi: wp.array[wp.float32],
+    ):
+        i = wp.tid()
+        phi[i] = function(points[i])
+
+    return evaluate_function
+
+
+@wp.kernel(enable_backward=False)
+def evaluate_surface(
+    # In
+    points: wp.array[wp.vec3],
+    mesh: wp.uint64,
+    # Out
+    phi: wp.array[wp.float32],
+):
+    """Distance to the closest triangle, negative where the winding number is above one half."""
+    i = wp.tid()
+    p = points[i]
+    found = wp.mesh_query_point_sign_winding_number(mesh, p, FAR)
+    phi[i] = found.sign * wp.length(wp.mesh_eval_position(mesh, found.face, found.u, found.v) - p)
+
+
+@wp.kernel(enable_backward=False)
+def count_windings(
+    # In
+    points: wp.array[wp.vec3],
+    mesh: wp.uint64,
+    thresholds: wp.array[wp.float32],
+    # Out
+    above: wp.array[wp.int32],
+):
+    """How many of the thresholds, which ascend, the winding number at a point exceeds."""
+    i = wp.tid()
+    count = int(0)
+    for k in range(thresholds.shape[0]):
+        found = wp.mesh_query_point_sign_winding_number(mesh, points[i], FAR, 2.0, thresholds[k])
+        if found.sign < 0.0:
+            count += 1
+    above[i] = count
+
+
+@wp.kernel(enable_backward=False)
+def evaluate_voxels(
+    # In
+    points: wp.array[wp.vec3],
+    to_voxel: wp.mat33,
+    shift: wp.vec3,
+    spacing: wp.vec3,
+    values: wp.array3d[wp.float32],
+    # Out
+    phi: wp.array[wp.float32],
+):
+    """Trilinear between voxel centres. Outside the volume, where the value v at the closest point of it is positive,
+    sqrt(v^2 + d^2) with the distance d to that point: v changes only along the directions in which d does not, so
+    this is no steeper than v and d are."""
+    i = wp.tid()
+    x = to_voxel * points[i] + shift
+    top = wp.vec3(float(values.shape[0] - 1), float(values.shape[1] - 1), float(values.shape[2] - 1))
+    c = wp.min(wp.max(x, wp.vec3(0.0)), top)
+    a = wp.min(int(c[0]), values.shape[0] - 2)
+    b = wp.min(int(c[1]), values.shape[1] - 2)
+    g = wp.min(int(c[2]), values.shape[2] - 2)
+    u = c[0] - float(a)
+    v = c[1] - float(b)
+    w = c[2] - float(g)
+    near = wp.lerp(
+        wp.lerp(values[a, b, g], values[a + 1, b, g], u), wp.lerp(values[a, b + 1, g], values[a + 1, b + 1, g], u), v
+    )
+    far = wp.lerp(
+        wp.lerp(values[a, b, g + 1], values[a + 1, b, g + 1], u),
+        wp.lerp(values[a, b + 1, g + 1], values[a + 1, b + 1, g + 1], u),
+        v,
+    )
+    value = wp.lerp(near, far, w)
+    beyond = wp.length(wp.cw_mul(x - c, spacing))
+    if beyond > 0.0:
+        value = wp.length(wp.vec2(value, beyond))
+    phi[i] = value
+
+
+@wp.kernel(enable_backward=False)
+def read_voxels(
+    # In
+    points: wp.array[wp.vec3],
+    to_voxel: wp.mat33,
+    shift: wp.vec3,
+    values: wp.array3d[wp.int16],
+    # Out
+    labels: wp.array[wp.int32],
+):
+    """The value of the nearest voxel."""
+    i = wp.tid()
+    x = to_voxel * points[i] + shift
+    a = wp.clamp(int(wp.round(x[0])), 0, values.shape[0] - 1)
+    b = wp.clamp(int(wp.round(x[1])), 0, values.shape[1] - 1)
+    c = wp.clamp(int(wp.round(x[2])), 0, values.shape[2] - 1)
+    labels[i] = int(values[a, b, c])
+
+
+@wp.kernel(enable_backward=False)
+def combine(
+    # In
+    outer: float,
+    first: wp.array[wp.float32],
+    inner: float,
+    second: wp.array[wp.float32],
+    # Out
+    phi: wp.array[wp.float32],
+):
+    """The larger of two functions, times signs: union (-1, -1), intersection (1, 1), difference (1, -1)."""
+    i = wp.tid()
+    phi[i] = outer * wp.max(outer * first[i], inner * second[i])
+
+
+@wp.kernel(enable_backward=False)
+def choose_labels(
+    # In
+    first: wp.array[wp.float32],
+    second: wp.array[wp.float32],
+    first_labels: wp.array[wp.int32],
+    second_labels: wp.array[wp.int32],
+    renumbered: wp.array[wp.int32],
+    # Out
+    labels: wp.array[wp.int32],
+):
+    """The label of the first domain that holds the point and has a label there; of the nearer one where none does."""
+    i = wp.tid()
+    a = first_labels[i]
+    b = renumbered[second_labels[i]]
+    if a > 0 and first[i] <= 0.0:
+        labels[i] = a
+    elif b > 0 and second[i] <= 0.0:
+        labels[i] = b
+    else:
+        labels[i] = wp.where(first[i] < second[i], a, b)
+
+
+@wp.kernel(enable_backward=False)
+def clear_labels_outside(
+    # In
+    phi: wp.array[wp.float32],
+    # In and out
+    labels: wp.array[wp.int32],
+):
+    i = wp.tid()
+    if phi[i] > 0.0:
+        labels[i] = 0

@@ -1,0 +1,93 @@
+"""Domains of functions that users write."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from ..errors import InputError
+from ..kernels import domain as kernels
+from .domain import Domain
+from .units import length
+
+if TYPE_CHECKING:
+    from .domain import Function
+
+#: Pairs of points at which the slope is looked at.
+PAIRS = 4096
+#: What float32 may add to a slope.
+SLACK = 1.0e-2
+
+
+class FunctionDomain(Domain):
+    """See `Domain.from_function`."""
+
+    def __init__(self, function: Function, bounds: npt.ArrayLike, lipschitz: float, **options: Any):
+        box = np.asarray(bounds, dtype=np.float64)
+        if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
+            raise InputError(
+                f"bounds are {box.tolist()}; they must be the lowest and the highest corner of a box [2, 3]"
+            )
+        if not (np.isfinite(lipschitz) and lipschitz > 0.0):
+            raise InputError(f"lipschitz is {lipschitz!r}; it must be a positive number")
+        super().__init__(box, lipschitz, **options)
+        self.function = function
+        self._kernel = kernels.sampler(function) if isinstance(function, wp.Function) else None
+        self.reaches_bounds = self._check()
+
+    def _phi(self, points: wp.array) -> wp.array:
+        phi = self._values(points)
+        low, high = (wp.vec3(*corner) for corner in self.bounds)
+        wp.launch(kernels.clip_to_box, points.size, [points, low, high, self.lipschitz], [phi], device=points.device)
+        return phi
+
+    def _values(self, points: wp.array) -> wp.array:
+        """The function itself, not cut off."""
+        if self._kernel is None:
+            values = self._called(points.numpy().astype(np.float64))
+            return wp.array(values, dtype=wp.float32, device=points.device)
+        phi = wp.empty(points.size, wp.float32, device=points.device)
+        wp.launch(self._kernel, points.size, [points], [phi], device=points.device)
+        return phi
+
+    def _called(self, points: np.ndarray) -> np.ndarray:
+        values = np.asarray(self.function(points))
+        if values.shape != (len(points),) or values.dtype.kind not in "fiu":
+            raise InputError(
+                f"the function gave {values.dtype} of shape {values.shape} for points [{len(points)}, 3]; "
+                f"it must give one number a point"
+            )
+        return values.astype(np.float32)
+
+    def _check(self) -> bool:
+        """See that the function is finite and no steeper than was said; whether it is negative at the bounds."""
+        rng = np.random.default_rng(0)
+        size = np.ptp(self.bounds, axis=0)
+        points = self.bounds[0] + rng.random((PAIRS, 3)) * size
+        # At once far and near: steps from the box's whole size down to a thousandth of it.
+        steps = rng.standard_normal((PAIRS, 3)) * size * 10.0 ** rng.uniform(-3.0, 0.0, (PAIRS, 1))
+        others = np.clip(points + steps, *self.bounds)
+        a, b = (self._values(self._on_device(x)).numpy().astype(np.float64) for x in (points, others))
+        bad = np.flatnonzero(~np.isfinite(a))
+        if len(bad):
+            raise InputError(
+                f"the function is {a[bad[0]]} at {points[bad[0]].tolist()}; it must be finite in the bounds"
+            )
+        apart = np.linalg.norm(points - others, axis=1)
+        slopes = np.abs(a - b)[apart > 0] / apart[apart > 0]
+        if not slopes.max() <= self.lipschitz * (1.0 + SLACK):
+            raise InputError(
+                f"the function changes by {slopes.max():.3g} m a metre; lipschitz is {self.lipschitz:g} and must be "
+                f"at least that"
+            )
+        axes, ends = rng.integers(0, 3, PAIRS), rng.integers(0, 2, PAIRS)
+        points[np.arange(PAIRS), axes] = self.bounds[ends, axes]
+        return bool((self._values(self._on_device(points)).numpy() < -1e-6 * size.max()).any())
+
+    def _details(self) -> list[str]:
+        how = "on the device" if self._kernel is not None else "by NumPy"
+        cut = [f"the inside reaches the bounds and is cut off there (box of {length(np.ptp(self.bounds[:, 0]))} in x)"]
+        return [f"a function, evaluated {how}", *(cut if self.reaches_bounds else [])]

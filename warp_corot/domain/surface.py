@@ -1,0 +1,190 @@
+"""Domains that a triangle surface encloses."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from ..errors import InputError
+from ..io.surfaces import UP_AXES, load_surface
+from ..kernels import domain as kernels
+from .domain import Domain
+from .units import length, metres_per_unit, unlikely_size, volume
+
+if TYPE_CHECKING:
+    from .closing import ClosedSurface
+    from .domain import Surface
+
+#: Points along each side of the box at which winding numbers are looked at.
+SAMPLES = 16
+#: Space enclosed inside out, as a share of all that is enclosed, at which the surface is refused.
+LARGEST_REVERSED = 0.05
+#: Holes of this share of the area draw a warning.
+LARGE_HOLES = 0.01
+
+
+class SurfaceDomain(Domain):
+    """See `Domain.from_surface`.
+
+    Args:
+        closed: A closed surface [m].
+        notes: Lines of the report.
+    """
+
+    def __init__(self, closed: ClosedSurface, notes: Sequence[str] = (), **options: Any):
+        used = closed.points[np.unique(closed.triangles)]
+        # Triangles are kept in float32, and may stand out by its rounding.
+        rounding = 2.0**-23 * np.abs(used).max()
+        bounds = np.stack([used.min(axis=0) - rounding, used.max(axis=0) + rounding])
+        super().__init__(bounds, 1.0, **options)
+        self.closed = closed
+        self.notes = list(notes)
+        self._on: dict[str, wp.Mesh] = {}
+        self.reversed, self.overlapping, self.undecided = self._windings()
+        if self.reversed > LARGEST_REVERSED:
+            raise InputError(
+                f"the surface crosses itself so that {self.reversed:.0%} of what it encloses is inside out; it must be "
+                f"wound outwards throughout (at most {LARGEST_REVERSED:.0%})"
+            )
+
+    def _phi(self, points: wp.array) -> wp.array:
+        phi = wp.empty(points.size, wp.float32, device=points.device)
+        mesh = self._mesh(points.device)
+        wp.launch(kernels.evaluate_surface, points.size, [points, mesh.id], [phi], device=points.device)
+        return phi
+
+    def _mesh(self, device: wp.Device) -> wp.Mesh:
+        key = str(device)
+        if key not in self._on:
+            self._on[key] = surface_mesh(self.closed.points, self.closed.triangles, device)
+        return self._on[key]
+
+    def _windings(self) -> tuple[float, float, float]:
+        """Share of the enclosed space that is inside out, that counts twice, and share of all space in which the
+        surface, before its holes were closed, left open whether it is inside."""
+        rng = np.random.default_rng(0)
+        cells = np.stack(np.meshgrid(*[np.arange(SAMPLES)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        places = (cells + rng.random(cells.shape)) / SAMPLES
+        points = self._on_device(self.bounds[0] + places * np.ptp(self.bounds, axis=0))
+        above = count_windings(self._mesh(self.device), points, [-0.5, 0.5, 1.5])
+        enclosed = max(int(np.count_nonzero(above != 1)), 1)
+        backward, twice = np.count_nonzero(above == 0) / enclosed, np.count_nonzero(above == 3) / enclosed
+        if not self.closed.caps:
+            return backward, twice, 0.0
+        given = surface_mesh(self.closed.points, self.closed.triangles[: -self.closed.caps], self.device)
+        # Between 0.1 and 0.9: neither nearly 0 nor nearly 1.
+        return backward, twice, float(np.mean(count_windings(given, points, [0.1, 0.9]) == 1))
+
+    def _details(self) -> list[str]:
+        closed = self.closed
+        lines = [f"{len(closed.triangles) - closed.caps} triangles enclose {volume(closed.volume)}", *self.notes]
+        if closed.open_edges:
+            lines.append(
+                f"open: {closed.open_edges} edges in {closed.holes} hole{'s'[: closed.holes != 1]}, closed with "
+                f"{closed.cap_share:.2%} of the area; before that undecided in {self.undecided:.1%} of its box"
+            )
+        else:
+            lines.append("closed")
+        said = [
+            (closed.dropped, f"{closed.dropped} triangles without area or there twice left out"),
+            (closed.turned, f"{closed.turned} triangles wound against their neighbours turned round"),
+            (closed.inside_out, f"{closed.inside_out} parts inside out turned round"),
+            (closed.pieces > 1, f"{closed.pieces} separate parts"),
+            (closed.cavities, f"{closed.cavities} cavities"),
+            (self.overlapping, f"parts overlap in {self.overlapping:.1%} of what is enclosed"),
+            (self.reversed, f"{self.reversed:.1%} of what is enclosed is inside out and left out"),
+        ]
+        return [*lines, *(line for happened, line in said if happened)]
+
+
+def surface_domain(surface: Surface, unit: str | None, up_axis: str | None, device: Any) -> Domain:
+    """See `Domain.from_surface`."""
+    try:
+        from .closing import close_surface
+    except ImportError:
+        raise InputError('surfaces need: pip install "warp-corot[scans]"') from None
+
+    points, triangles, metres, axis, source, notes = _given(surface, unit, up_axis)
+    points, triangles = checked_triangles(points, triangles, source)
+    try:
+        closed = close_surface(points * metres, triangles)
+        domain = SurfaceDomain(closed, notes, up_axis=axis, device=device)
+    except InputError as error:
+        raise InputError(f"{source}{error}") from None
+    doubts = [unlikely_size(float(np.ptp(domain.bounds, axis=0).max()), metres)]
+    if closed.cap_share > LARGE_HOLES:
+        doubts.append(f"the surface is open: its {closed.holes} holes took {closed.cap_share:.1%} of its area to close")
+    for doubt in filter(None, doubts):
+        domain.notes.append(doubt)
+        warnings.warn(f"{source}{doubt}", UserWarning, stacklevel=3)
+    return domain
+
+
+def checked_triangles(
+    points: npt.ArrayLike, triangles: npt.ArrayLike, source: str = ""
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+    """Points float64 [N, 3] and triangles int64 [T, 3].
+
+    Raises:
+        InputError: Other shapes, not numbers, not finite, or indices out of range.
+    """
+    x, t = np.asarray(points), np.asarray(triangles)
+    if x.ndim != 2 or x.shape[1] != 3 or not len(x) or x.dtype.kind not in "fiu":
+        raise InputError(f"{source}points have shape {x.shape} and dtype {x.dtype}; they must be numbers [N, 3]")
+    if t.ndim != 2 or t.shape[1] != 3 or not len(t) or t.dtype.kind not in "iu":
+        raise InputError(f"{source}triangles have shape {t.shape} and dtype {t.dtype}; they must be indices [T, 3]")
+    bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
+    if len(bad):
+        raise InputError(f"{source}point {bad[0]} is {x[bad[0]].tolist()}; coordinates must be finite")
+    bad = np.flatnonzero(((t < 0) | (t >= len(x))).any(axis=1))
+    if len(bad):
+        raise InputError(f"{source}triangle {bad[0]} names the points {t[bad[0]].tolist()}; there are {len(x)}")
+    return x.astype(np.float64), t.astype(np.int64)
+
+
+def surface_mesh(points: np.ndarray, triangles: np.ndarray, device: wp.Device) -> wp.Mesh:
+    """A Warp mesh that can tell winding numbers."""
+    return wp.Mesh(
+        wp.array(np.ascontiguousarray(points, dtype=np.float32), dtype=wp.vec3, device=device),
+        wp.array(np.ascontiguousarray(triangles, dtype=np.int32).ravel(), dtype=wp.int32, device=device),
+        support_winding_number=True,
+    )
+
+
+def count_windings(mesh: wp.Mesh, points: wp.array, thresholds: Sequence[float]) -> np.ndarray:
+    """How many of the thresholds the winding number at each point exceeds, int32 [n]."""
+    above = wp.empty(points.size, wp.int32, device=points.device)
+    limits = wp.array(thresholds, dtype=wp.float32, device=points.device)
+    wp.launch(kernels.count_windings, points.size, [points, mesh.id, limits], [above], device=points.device)
+    return above.numpy()
+
+
+def _given(surface: Surface, unit: str | None, up_axis: str | None) -> tuple[Any, Any, float, str, str, list[str]]:
+    """Points, triangles, metres per unit, up axis, the file's name for messages, and notes."""
+    if not isinstance(surface, str | PathLike):
+        if not isinstance(surface, tuple | list) or len(surface) != 2:
+            raise InputError(f"the surface is a {type(surface).__name__}; it must be a file or (points, triangles)")
+        unit = unit or "m"
+        return *surface, metres_per_unit(unit), up_axis or "Y", "", [f"unit {unit}"]
+    loaded = load_surface(surface)
+    notes = list(loaded.notes)
+    if unit is not None:
+        metres = metres_per_unit(unit)
+        other = loaded.metres is not None and not np.isclose(loaded.metres, metres)
+        notes.append(f"unit {unit}, as asked for" + (f", though the file says {loaded.metres:g} m" if other else ""))
+    elif loaded.metres is not None:
+        metres = loaded.metres
+        notes.append(f"unit {length(metres)}, as the file says")
+    else:
+        metres = 1.0
+        notes.append("unit m: the file names none, none was given")
+    axis = up_axis or loaded.up_axis or UP_AXES[loaded.source.suffix.lower()]
+    if not (up_axis or loaded.up_axis):
+        notes.append(f"{axis} taken as up: the file names no up axis")
+    return loaded.points, loaded.triangles, metres, axis, f"{loaded.source}: ", notes

@@ -1,0 +1,59 @@
+"""Units of length, never guessed, and a word on bodies of unlikely size."""
+
+from __future__ import annotations
+
+import math
+
+from ..errors import InputError
+
+#: Metres in a unit.
+UNITS = {"m": 1.0, "cm": 1.0e-2, "mm": 1.0e-3}
+#: Bodies outside this range [m] are probably given in another unit than is said.
+SMALLEST, LARGEST = 1.0e-3, 100.0
+#: The size [m] that the likely unit brings an unlikely body closest to: an organ's.
+TYPICAL = 0.2
+
+
+def metres_per_unit(unit: str) -> float:
+    """Metres in a unit.
+
+    Raises:
+        InputError: It is not one of "m", "cm", "mm".
+    """
+    if not isinstance(unit, str) or unit not in UNITS:
+        raise InputError(f"unit is {unit!r}; it must be one of {', '.join(map(repr, UNITS))}")
+    return UNITS[unit]
+
+
+def length(metres: float) -> str:
+    """A length to three digits in the unit that suits it."""
+    if metres == 0.0 or abs(metres) >= 1.0:
+        return f"{metres:.3g} m"
+    return f"{1e3 * metres:.3g} mm" if abs(metres) >= 1e-3 else f"{1e6 * metres:.3g} um"
+
+
+def volume(cubic_metres: float) -> str:
+    """A volume to three digits, in litres, millilitres or cubic millimetres."""
+    for unit, factor in (("l", 1e3), ("ml", 1e6)):
+        if abs(cubic_metres) * factor >= 1.0:
+            return f"{cubic_metres * factor:.3g} {unit}"
+    return f"{cubic_metres * 1e9:.3g} mm^3"
+
+
+def unlikely_size(size: float, metres: float) -> str | None:
+    """What to say of a body of an unlikely size, None for a likely one.
+
+    Args:
+        size: Its longest side [m].
+        metres: Metres in the unit in which it was read.
+    """
+    if SMALLEST <= size <= LARGEST:
+        return None
+    likely = min(UNITS, key=lambda unit: abs(math.log(size / metres * UNITS[unit] / TYPICAL)))
+    factor, becomes = UNITS[likely] / metres, size / metres * UNITS[likely]
+    if math.isclose(factor, 1.0) or not SMALLEST <= becomes <= LARGEST:
+        return f"the body is {length(size)} long: is its unit right?"
+    return (
+        f"the body is {length(size)} long: if its coordinates are in {likely}, say unit={likely!r} "
+        f"(a factor of {factor:g}: {length(becomes)})"
+    )
