@@ -11,7 +11,7 @@ from .device import checked_device
 from .elements import Mesh, device_elements, element_kind, parts, repeated
 from .errors import InputError
 from .kernels.integrate import adopt_positions, publish_positions, reset_nodes
-from .materials import Isotropic
+from .materials import Material
 from .trajectory import Trajectory
 from .worlds import World, chosen_nodes
 
@@ -34,12 +34,13 @@ class SoftBody:
     Args:
         mesh: A ``TetForest`` or ``TetMesh``.
         material: Uniform, or with values that broadcast to [worlds, elements]: one per element, [T]; one per world,
-            [worlds, 1]; or all, [worlds, T].
+            [worlds, 1]; or all, [worlds, T]. Functions of the rest position are evaluated at the elements' centroids.
         worlds: How many copies.
         device: "cpu", "cuda:0", …; None for Warp's default.
 
     Attributes:
-        mesh, material, worlds, device: As given.
+        mesh, worlds, device: As given.
+        material: As given, with values in place of functions.
         masses: Lumped nodal masses [kg], float64 [worlds * N]; zero at nodes that no element names.
 
     Raises:
@@ -47,17 +48,17 @@ class SoftBody:
             size are beyond the range of float32, or there are more than 2**31 elements in all.
     """
 
-    def __init__(self, mesh: Mesh, material: Isotropic, *, worlds: int = 1, device: str | wp.Device | None = None):
+    def __init__(self, mesh: Mesh, material: Material, *, worlds: int = 1, device: str | wp.Device | None = None):
         self.mesh = mesh
-        self.material = material
+        self.material = material.at(centroids(mesh)) if material.functions else material
         self.worlds = checked_count(worlds, "worlds", least=1)
         self.device = checked_device(device)
         if self.element_count > MOST_ELEMENTS:
             raise InputError(
                 f"worlds is {worlds}: that is {self.element_count} elements; there can be {MOST_ELEMENTS} at most"
             )
-        for name in ("young", "poisson", "density"):
-            self._check_material(name)
+        material = self.material
+        material.check_shapes(self.worlds, len(mesh.tets))
         check_float32(2.0 * material.mu + np.abs(material.lam), "the stiffness 2 mu + |lambda|", "Pa")
         check_float32(mesh.volumes, "the volume of an element", "m^3")
         self.element_kind = element_kind(mesh)
@@ -300,13 +301,6 @@ class SoftBody:
         """
         return chosen_nodes(nodes, self.world_node_count, self.worlds, worlds).indices
 
-    def _check_material(self, name: str) -> None:
-        shape, count = np.shape(getattr(self.material, name)), len(self.mesh.tets)
-        if len(shape) == 1 and shape[0] != count:
-            raise InputError(f"{name} has {shape[0]} entries; the mesh has {count} elements")
-        if len(shape) == 2 and (shape[0] not in (1, self.worlds) or shape[1] not in (1, count)):
-            raise InputError(f"{name} has shape {shape}; there are {self.worlds} worlds of {count} elements")
-
     def _material_arrays(self) -> tuple[wp.array, wp.array, int]:
         mu, lam = np.broadcast_arrays(np.atleast_1d(self.material.mu), np.atleast_1d(self.material.lam))
         if mu.size == 1:
@@ -374,7 +368,15 @@ def vec3_view(a: wp.array) -> wp.array:
     return a.view(wp.float32)[:, :3].view(wp.vec3)
 
 
-def lumped_masses(mesh: Mesh, material: Isotropic, worlds: int = 1) -> npt.NDArray[np.float64]:
+def centroids(mesh: Mesh) -> npt.NDArray[np.float64]:
+    """Centroids of the elements [m], float64 [T, 3]."""
+    found = np.empty((len(mesh.tets), 3))
+    for part in parts(len(mesh.tets)):
+        found[part] = mesh.points[mesh.tets[part]].mean(axis=1)
+    return found
+
+
+def lumped_masses(mesh: Mesh, material: Material, worlds: int = 1) -> npt.NDArray[np.float64]:
     """A quarter of each element's mass at each of its nodes [kg], float64 [worlds * N]."""
     density = np.atleast_2d(material.density)
     masses = np.zeros((len(density), len(mesh.points)))
