@@ -137,6 +137,20 @@ def test_every_world_is_a_body_of_its_own(mesh, model, device, rng):
     np.testing.assert_allclose(sim.energy(), energy, rtol=1e-4)
 
 
+@pytest.mark.parametrize("model", [wc.Corotated(), wc.Corotated(rotation_level=0), wc.MassSpring()], ids=repr)
+def test_a_number_for_each_world_is_as_a_number_for_a_body(model, device):
+    """Shared rotations of one material go by another kernel than those of several: the same but for rounding."""
+    young = [2e3, 5e3, 9e3]
+    sim = simulated(beam(device, young=np.reshape(young, (3, 1))), model)
+    sim.advance_steps(100)
+    for world, own in enumerate(young):
+        single = simulated(beam(device, worlds=1, young=own), model)
+        single.advance_steps(100)
+        u = single.body.displacements.numpy()
+        off = np.abs(sim.body.world(world).displacements.numpy() - u).max()
+        assert off < 1e-5 * np.abs(u).max()
+
+
 def test_subtrees_turned_inside_out_in_one_world_leave_the_others(device, rng):
     """The fast kernels leave such subtrees out, and they are done again one by one."""
     for model in (wc.Corotated(), wc.Corotated(rotation_level=0)):
