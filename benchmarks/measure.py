@@ -292,11 +292,16 @@ def finish(options: argparse.Namespace, report: dict[str, Any], results: Sequenc
     if sys.stderr.isatty():
         print("\r\033[K", end="", file=sys.stderr)
     if options.json is not None:
-        draft = options.json.with_name(options.json.name + ".part")
-        draft.write_text(json.dumps(report, indent=1) + "\n")
-        draft.replace(options.json)
-        print(f"wrote {options.json}")
+        save(options.json, report)
     failed = [r for r in results if r.wrong]
     for r in failed:
         print(f"WRONG: {r.case.stage}, {r.case.variant}: error {r.error:.1e} against float64", file=sys.stderr)
     return 1 if failed else 0
+
+
+def save(path: Path, report: dict[str, Any]) -> None:
+    """Write a report, whole or not at all."""
+    draft = path.with_name(path.name + ".part")
+    draft.write_text(json.dumps(report, indent=1) + "\n")
+    draft.replace(path)
+    print(f"wrote {path}")

@@ -41,11 +41,22 @@ MAX_THREADS = 1024
 #: Threads of a multiprocessor that the registers of a whole subtree's forces leave room for.
 BUSY_THREADS = 512
 
-LOAD, STORE = 0, 1
+LOAD, STORE, LOAD_BYTES = 0, 1, 2
 
-#: Slots are numbered in 16 bits, four numbers at a time.
-CHUNK = 4
+#: Slots that one thread adds up, their places in bytes four to a word; more of the same node are its neighbours'.
+TASK_SLOTS = 8
+NUMBERS = 4
+#: Words of the ten nodes of a subtree.
+NODE_WORDS = 3
+#: Neighbouring threads that may add up one node, and so how many slots a node can have.
+NEIGHBOURS = 8
+MOST_SLOTS = NEIGHBOURS * TASK_SLOTS
+#: What a task is in one integer: the node, how many neighbours follow for the same node, and whether it is the
+#: first of them, who moves the node.
+FOLLOWING_SHIFT, FIRST_SHIFT = 16, 24
+NO_NODE = 0xFFFF
 
+vec3u = wp.types.vector(length=NODE_WORDS, dtype=wp.uint64)
 mat84i = wp.types.matrix(shape=(8, 4), dtype=wp.int32)
 
 
@@ -71,7 +82,10 @@ class Layout:
 
     @property
     def threads(self) -> int:
-        """Threads a block: the first part of each subtree, then the second of each, and so on."""
+        """Threads a block: warp after warp of subtrees, the parts of a subtree in neighbouring warps.
+
+        A multiprocessor's four schedulers take warps in turn, so each goes through the code of one part only.
+        """
         return self.parts * self.subtrees
 
     @property
@@ -119,8 +133,27 @@ class Layout:
 def synchronize_block(): ...
 
 
+@wp.func
+def number_in(word: wp.uint64, k: int):
+    """The k-th of the four 16-bit numbers in a word."""
+    return int((word >> wp.uint64(16 * k)) & wp.uint64(0xFFFF))
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return wp::vec_t<3, wp::float32>(
+        __shfl_down_sync(0xffffffff, value[0], distance),
+        __shfl_down_sync(0xffffffff, value[1], distance),
+        __shfl_down_sync(0xffffffff, value[2], distance));
+#else
+    return value;
+#endif
+""")
+def shuffle_down(value: wp.vec3, distance: int) -> wp.vec3: ...
+
+
 def _memory(count: int, tag: str) -> wp.Function:
-    """An array of vectors in shared memory, as one function that reads or writes it."""
+    """An array of vectors in shared memory, as one function that reads or writes it; ``LOAD_BYTES`` counts in bytes."""
 
     snippet = f"""
 #if defined(__CUDA_ARCH__)
@@ -130,7 +163,8 @@ def _memory(count: int, tag: str) -> wp.Function:
         memory[3 * i] = value[0]; memory[3 * i + 1] = value[1]; memory[3 * i + 2] = value[2];
         return value;
     }}
-    return wp::vec_t<3, wp::float32>(memory[3 * i], memory[3 * i + 1], memory[3 * i + 2]);
+    const float* at = access == {LOAD_BYTES} ? (const float*)((const char*)memory + i) : memory + 3 * i;
+    return wp::vec_t<3, wp::float32>(at[0], at[1], at[2]);
 #else
     return value;
 #endif
@@ -144,17 +178,18 @@ def _memory(count: int, tag: str) -> wp.Function:
 
 @wp.struct
 class BlockBody:
-    """A body as its block goes through it: one world's subtrees, and nodes by how many subtrees meet there."""
+    """A body as its block goes through it: one world's subtrees, and who adds up which slots."""
 
-    subtrees: Subtrees  # of one world, one by one; nodes are places in ``order``
+    subtrees: Subtrees  # of one world, one by one
     elements: ForestElements  # the leaves
     roots: ForestElements  # the subtrees' roots, where these give the rotation
     subtree_count: int
     node_count: int
     element_count: int
-    order: wp.array[wp.int32]  # [N] node at each place, those that have most slots first
-    chunks: wp.array[wp.int32]  # [N] how many chunks of slots each place has
-    slots: wp.array2d[wp.uint64]  # [most, N] four slots each, the zero one past the last
+    task_count: int  # whole warps of them
+    tasks: wp.array[wp.int32]  # [task_count] see ``FOLLOWING_SHIFT``
+    nodes: wp.array2d[wp.uint64]  # [3, subtree_count] the ten nodes of each subtree, four to a word, in bytes
+    slots: wp.array2d[wp.uint64]  # [2, task_count] four slots each, the zero one past the last, in bytes
 
 
 @functools.cache
@@ -259,21 +294,27 @@ def step_block(layout: Layout) -> wp.Kernel:
         base = world * body.node_count
         place = thread
         while place < body.node_count:
-            i = base + body.order[place]
-            displacement(wp.static(STORE), place, load_node(u, i))
-            velocity(wp.static(STORE), place, load_node(v, i))
+            displacement(wp.static(STORE), place, load_node(u, base + place))
+            velocity(wp.static(STORE), place, load_node(v, base + place))
             place += wp.static(threads)
         if thread == 0:
             slot(wp.static(STORE), wp.static(zero_slot), wp.vec3())
         synchronize_block()
-        part = thread // wp.static(capacity)
-        s = thread % wp.static(capacity)
+        warp = thread // wp.static(WARP)
+        part = warp % wp.static(parts)
+        s = (warp // wp.static(parts)) * wp.static(WARP) + thread % wp.static(WARP)
         mine = wp.min(s, body.subtree_count - 1)
         code = body.subtrees.code[mine]
         h = 0.5 * body.subtrees.size[(code & LEVEL_MASK) // 3]
         mirror = mirror_sign(code)
         q = body.subtrees.frames[code >> FRAME_SHIFT]
         material = (world * body.element_count + body.subtrees.first[mine]) * stride
+        inv_h = 1.0 / h
+        damped = 1.0 / (1.0 + dt * damping)
+        # In registers from here on, two nodes each.
+        words = vec3u()
+        for word in range(wp.static(NODE_WORDS)):
+            words[word] = body.nodes[word, mine]
         step = int(0)
         while step < steps:
             if s < body.subtree_count:
@@ -283,8 +324,12 @@ def step_block(layout: Layout) -> wp.Kernel:
                         x = mat10()
                         for k in range(10):
                             if wp.static(needs[p][k]):
-                                x[k] = node_at(body, s, k)
-                        y = deformed(x, q, 1.0 / h, mirror)
+                                x[k] = displacement(
+                                    wp.static(LOAD_BYTES),
+                                    number_in(words[k // wp.static(NUMBERS)], k % wp.static(NUMBERS)),
+                                    wp.vec3(),
+                                )
+                        y = deformed(x, q, inv_h, mirror)
                         g = mat10()
                         if wp.static(shared):
                             g, trusted = wp.static(turned[p])(y, h, mirror, wp.mat33(), mu, lam, material)
@@ -296,39 +341,44 @@ def step_block(layout: Layout) -> wp.Kernel:
                 if not trusted:
                     repair(body, s, part, material, mu, lam, stride)
             synchronize_block()
-            place = thread
-            while place < body.node_count:
-                i = base + body.order[place]
+            task = thread
+            while task < body.task_count:
+                about = body.tasks[task]
                 force = wp.vec3()
-                if has_load != 0:
-                    force = load_node(load, i)
-                w = inverse_mass[i]
-                numbers = body.slots[0, place]
-                for chunk in range(body.chunks[place]):
-                    these = numbers
-                    # The next ones are on their way while these are summed up.
-                    numbers = body.slots[wp.min(chunk + 1, body.slots.shape[0] - 1), place]
-                    for k in range(wp.static(CHUNK)):
-                        at = int((these >> wp.uint64(16 * k)) & wp.uint64(65535))
-                        force += slot(wp.static(LOAD), at, force)
-                moving = velocity(wp.static(LOAD), place, force)
-                if w > 0.0:
-                    moving = symplectic_euler_velocity(moving, force, w, gravity, dt, damping)
-                    velocity(wp.static(STORE), place, moving)
-                elif step == steps - 1:
-                    store_node(reactions, i, -(force + mass[i] * gravity))
-                moved = displacement(wp.static(LOAD), place, force) + dt * moving
-                displacement(wp.static(STORE), place, moved)
-                if not is_finite(moved):
-                    wp.atomic_min(bad_step, 0, clock[0] + wp.int64(step + 1))
-                place += wp.static(threads)
+                for word in range(wp.static(TASK_SLOTS // NUMBERS)):
+                    numbers = body.slots[word, task]
+                    for k in range(wp.static(NUMBERS)):
+                        force += slot(wp.static(LOAD_BYTES), number_in(numbers, k), force)
+                following = (about >> wp.static(FOLLOWING_SHIFT)) & 255
+                distance = int(1)
+                while distance < wp.static(NEIGHBOURS):
+                    theirs = shuffle_down(force, distance)
+                    if distance <= following:
+                        force += theirs
+                    distance *= 2
+                if (about >> wp.static(FIRST_SHIFT)) == 1:
+                    place = about & wp.static(NO_NODE)
+                    i = base + place
+                    if has_load != 0:
+                        force += load_node(load, i)
+                    w = inverse_mass[i]
+                    moving = velocity(wp.static(LOAD), place, force)
+                    if w > 0.0:
+                        moving = symplectic_euler_velocity(moving, force, w, gravity, dt, damped)
+                        velocity(wp.static(STORE), place, moving)
+                    elif step == steps - 1:
+                        store_node(reactions, i, -(force + mass[i] * gravity))
+                    moved = displacement(wp.static(LOAD), place, force) + dt * moving
+                    displacement(wp.static(STORE), place, moved)
+                    if not is_finite(moved):
+                        wp.atomic_min(bad_step, 0, clock[0] + wp.int64(step + 1))
+                task += wp.static(threads)
             synchronize_block()
             step += 1
         place = thread
         while place < body.node_count:
-            i = base + body.order[place]
-            store_node(u, i, displacement(wp.static(LOAD), place, wp.vec3()))
-            store_node(v, i, velocity(wp.static(LOAD), place, wp.vec3()))
+            store_node(u, base + place, displacement(wp.static(LOAD), place, wp.vec3()))
+            store_node(v, base + place, velocity(wp.static(LOAD), place, wp.vec3()))
             place += wp.static(threads)
 
     return step_block

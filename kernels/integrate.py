@@ -19,10 +19,10 @@ def is_finite(a: wp.vec3):
 
 @wp.func
 def symplectic_euler_velocity(
-    v: wp.vec3, force: wp.vec3, inverse_mass: float, gravity: wp.vec3, dt: float, damping: float
+    v: wp.vec3, force: wp.vec3, inverse_mass: float, gravity: wp.vec3, dt: float, damped: float
 ):
-    """(v + dt (f/m + g)) / (1 + dt damping)."""
-    return (v + dt * (inverse_mass * force + gravity)) / (1.0 + dt * damping)
+    """(v + dt (f/m + g)) damped, where damped = 1 / (1 + dt damping)."""
+    return (v + dt * (inverse_mass * force + gravity)) * damped
 
 
 @wp.kernel(enable_backward=False)
@@ -58,7 +58,7 @@ def step_symplectic_euler(
     w = inverse_mass[i]
     velocity = load_node(v, i)
     if w > 0.0:
-        velocity = symplectic_euler_velocity(velocity, force, w, gravity, dt, damping)
+        velocity = symplectic_euler_velocity(velocity, force, w, gravity, dt, 1.0 / (1.0 + dt * damping))
         store_node(v, i, velocity)
     else:
         store_node(reactions, i, -(force + mass[i] * gravity))

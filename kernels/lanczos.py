@@ -69,6 +69,10 @@ def inner_products(a: wp.array[wp.vec4], b: wp.array[wp.vec4], sums: wp.array[wp
     total = wp.float64(0.0)
     i = part
     while i < a.shape[0]:
-        total += wp.float64(wp.dot(load_node(a, i), load_node(b, i)))
+        x = load_node(a, i)
+        y = load_node(b, i)
+        for axis in range(3):
+            # What fits into float32 need not do so once multiplied.
+            total += wp.float64(x[axis]) * wp.float64(y[axis])
         i += sums.shape[0]
     sums[part] = total

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,11 +23,12 @@ from .kernels.integrate import advance_clock
 from .solvers import Integrator, SymplecticEuler, largest_frequency
 from .solvers.integrator import StepContext
 
-#: Steps recorded in one graph, so that Python is out of the loop.
+#: Steps recorded in one graph, so that Python is out of the loop; more where a launch is many steps.
 GRAPH_STEPS = 64
+BLOCK_STEPS = 1024
 
-#: Steps after which a run looks whether its state is still finite.
-CHECK_STEPS = 1024
+#: About how long a run goes on before it looks whether its state is still finite [s].
+CHECK_SECONDS = 0.1
 
 _NEVER = np.iinfo(np.int64).max
 
@@ -133,6 +135,7 @@ class Simulation:
             self.integrator.bind(body, f, context) for body, f in zip(self.bodies, self.fields, strict=True)
         ]
         self._steps_before_reset = 0
+        self._check_steps = GRAPH_STEPS
         self._hooks: list[_Hook] = []
         self._graphs: dict[tuple[int, bool], wp.Graph] = {}
         self._recorded_revisions: tuple[int, ...] = ()
@@ -193,21 +196,24 @@ class Simulation:
         """Advance by ``count`` time steps; as ``advance``. Steps that a hook makes count."""
         count = checked_count(count, "count", least=0)
         end = self.total_steps + count
-        # A hook may make steps itself or set the clock back.
-        while (left := end - self.total_steps) > 0:
-            done = self.steps
-            due = min([done + left, done + CHECK_STEPS, *((done // h.every + 1) * h.every for h in self._hooks)])
+        done, left = self.steps, count
+        while left > 0:
+            due = min([done + left, done + self._check_steps, *((done // h.every + 1) * h.every for h in self._hooks)])
+            started = time.perf_counter()
             for body in self.bodies:
                 body.adopt_positions()
-            remaining = due - done
-            while remaining:
-                run = GRAPH_STEPS if remaining >= GRAPH_STEPS else 1
-                self._run(run, whole=False)
-                remaining -= run
+            self._launch_runs(due - done)
             for body in self.bodies:
                 body.publish_positions()
             self._check_finite()
-            self._call_hooks()
+            if due - done == self._check_steps:
+                longer = CHECK_SECONDS / (time.perf_counter() - started)
+                self._check_steps = max(int(self._check_steps * min(longer, 4.0)), 1)
+            done, left = due, left - (due - done)
+            if self._hooks:
+                # A hook may make steps itself or set the clock back.
+                self._call_hooks()
+                done, left = self.steps, end - self.total_steps
         wp.synchronize_device(self.device)
 
     def on_step(self, callback: Callable[[Simulation], None], every: int = 1) -> None:
@@ -325,6 +331,14 @@ class Simulation:
         if whole:
             for body in self.bodies:
                 body.publish_positions()
+
+    def _launch_runs(self, count: int) -> None:
+        """Launch steps as few runs, which are recorded once and replayed."""
+        in_blocks = all(stepper.many_a_launch for stepper in self._steppers)
+        for size in (BLOCK_STEPS, GRAPH_STEPS, 1) if in_blocks else (GRAPH_STEPS, 1):
+            for _ in range(count // size):
+                self._run(size, whole=False)
+            count %= size
 
     def _run(self, count: int, *, whole: bool) -> None:
         """Replay recorded steps, recording them first where they are new or the bodies' launches have changed."""

@@ -24,34 +24,21 @@ class BlockSteps:
     Made by ``of``, which knows whether it does.
     """
 
-    def __init__(self, body: SoftBody, batch: Batch, layout: block.Layout):
+    def __init__(self, body: SoftBody, batch: Batch, layout: block.Layout, slots: list[list[int]]):
         self.body = body
-        nodes = batch.subtrees.nodes.numpy()
-        slots = _slots_by_node(layout, nodes, body.world_node_count)
-        chunks = np.array([-(-len(of_node) // block.CHUNK) for of_node in slots])
-        order = np.argsort(-chunks, kind="stable")
-        place = np.empty_like(order)
-        place[order] = np.arange(len(order))
-        table = np.full((max(chunks.max(), 1), len(order), block.CHUNK), layout.slot_count, np.uint16)
-        for node, of_node in enumerate(slots):
-            for k, number in enumerate(of_node):
-                table[k // block.CHUNK, place[node], k % block.CHUNK] = number
+        tasks, numbers = _tasks(layout, slots)
         device = body.device
-
-        def on_device(values: np.ndarray, dtype: type = wp.int32) -> wp.array:
-            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
-
         of_block = block.BlockBody()
         of_block.subtrees = batch.subtrees
-        of_block.subtrees.nodes = on_device(place[nodes])
         of_block.elements = body.elements
         of_block.roots = body.elements if batch.roots is None else batch.roots
         of_block.subtree_count = batch.count
         of_block.node_count = body.world_node_count
         of_block.element_count = len(body.mesh.tets)
-        of_block.order = on_device(order)
-        of_block.chunks = on_device(chunks[order])
-        of_block.slots = on_device(table.view("<u8")[..., 0], wp.uint64)
+        of_block.task_count = len(tasks)
+        of_block.tasks = wp.array(tasks, dtype=wp.int32, device=device)
+        of_block.nodes = wp.array(_packed(batch.subtrees.nodes.numpy().T), dtype=wp.uint64, device=device)
+        of_block.slots = wp.array(numbers, dtype=wp.uint64, device=device)
         self._block = of_block
         self._layout = layout
         self._kernel = block.step_block(layout)
@@ -68,7 +55,11 @@ class BlockSteps:
             return None
         batch = plan.batches[0]
         layouts = _layouts(body, batch.shape, batch.sharing is Sharing.ROOT, batch.count)
-        return cls(body, batch, next(layout for layout in layouts if layout.fits))
+        layout = next(layout for layout in layouts if layout.fits)
+        slots = _slots_by_node(layout, batch.subtrees.nodes.numpy(), body.world_node_count)
+        if max(map(len, slots)) > block.MOST_SLOTS:
+            return None
+        return cls(body, batch, layout, slots)
 
     def launch(self, count: int, damping: float, context: StepContext) -> None:
         """Launch ``count`` steps, the first ones since the clock was last advanced."""
@@ -115,6 +106,45 @@ def _layouts(body: SoftBody, shape: int, shared: bool, subtrees: int) -> list[bl
     capacity = -(-subtrees // block.WARP) * block.WARP
     uniform = _is_uniform(body)
     return [block.Layout(shape, shared, uniform, count, capacity, body.world_node_count) for count in parts]
+
+
+def _tasks(layout: block.Layout, slots: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
+    """What threads add up: up to eight slots of one node each, a node's threads next to one another in one warp.
+
+    Returns:
+        The tasks, int32 [n], and the places of their slots in bytes, uint64 [2, n]; n is a multiple of a warp's threads.
+    """
+    tasks: list[int] = []
+    numbers: list[list[int]] = []
+
+    def leave_out(count: int) -> None:
+        tasks.extend([block.NO_NODE] * count)
+        numbers.extend([[]] * count)
+
+    # Nodes of many slots first, so that warps are alike and hardly a place is left out.
+    for node in sorted(range(len(slots)), key=lambda n: -len(slots[n])):
+        of_node = [slots[node][at : at + block.TASK_SLOTS] for at in range(0, len(slots[node]), block.TASK_SLOTS)]
+        of_node = of_node or [[]]
+        left = -len(tasks) % block.WARP
+        if left < len(of_node):
+            leave_out(left)
+        for k, own in enumerate(of_node):
+            following = len(of_node) - 1 - k
+            tasks.append(node | following << block.FOLLOWING_SHIFT | int(k == 0) << block.FIRST_SHIFT)
+            numbers.append(own)
+    leave_out(-len(tasks) % block.WARP)
+    table = np.full((len(tasks), block.TASK_SLOTS), layout.slot_count)
+    for row, own in zip(table, numbers, strict=True):
+        row[: len(own)] = own
+    return np.array(tasks, np.int32), _packed(table)
+
+
+def _packed(places: np.ndarray) -> np.ndarray:
+    """Places of vectors, [n, m], in bytes and four to a word: uint64 [m / 4, n]."""
+    width = -(-places.shape[1] // block.NUMBERS) * block.NUMBERS
+    table = np.zeros((len(places), width), "<u2")
+    table[:, : places.shape[1]] = places * block.VECTOR_BYTES
+    return np.ascontiguousarray(table.view("<u8").T)
 
 
 def _slots_by_node(layout: block.Layout, nodes: np.ndarray, count: int) -> list[list[int]]:
