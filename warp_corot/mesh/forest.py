@@ -6,7 +6,6 @@ lattice. The tree knows every ancestor; the leaves are the mesh. All is built wi
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,13 +15,10 @@ import numpy.typing as npt
 
 from ..errors import InputError
 from ..indices import checked_indices
-from .bisection import children, far_end
+from .lattice import LATTICE_BITS, MAX_LEVEL
+from .refined import refined
 from .tree import Tree, UniformTree
 from .uniform import halvings, uniform_leaves
-
-#: A root cube has 2**LATTICE_BITS lattice intervals a side, so levels may go to 3 * LATTICE_BITS.
-LATTICE_BITS = 16
-MAX_LEVEL = 3 * LATTICE_BITS
 
 #: Leaves are numbered in 32 bits.
 MAX_LEAVES = 2**31 - 1
@@ -36,11 +32,18 @@ class TetForest:
         cells: Number of root cubes along x, y, z.
         cell_size: Edge length of a root cube [m].
         origin: Position of the lattice's point (0, 0, 0) [m].
-        lattice: Lattice coordinates of the nodes, 2**16 intervals a cube edge, int32 [N, 3].
+        lattice: Lattice coordinates of the nodes, 2**16 intervals a cube edge, int32 [N, 3]. Where parts of the forest
+            are void, corners of void or coarser tetrahedra that no leaf names follow the N nodes.
         node_ends: The two ends of the edge whose midpoint a node is, the lower number first; -1, -1 for corners of
-            cubes; int32 [N, 2].
+            cubes; int32, as many as there are lattice points.
         tree: All tetrahedra of all levels.
         up_axis: "X", "Y" or "Z".
+        phi: The body's signed function at all lattice points [m], negative inside, float32; None for a box.
+        fill: Share of each leaf's volume that the body takes, float64 [T]; None: all of it. Above one where a leaf has
+            taken over what a neighbour held too little of.
+        labels: Each leaf's label, its place in ``label_names`` plus one, 0 for none, int32 [T]; None: no labels.
+        node_labels: As ``labels``, at all lattice points, at points outside that of the nearest part of the body.
+        label_names: Names of the labels.
     """
 
     cells: tuple[int, int, int]
@@ -50,6 +53,11 @@ class TetForest:
     node_ends: np.ndarray
     tree: Tree
     up_axis: str = "Y"
+    phi: np.ndarray | None = None
+    fill: np.ndarray | None = None
+    labels: np.ndarray | None = None
+    node_labels: np.ndarray | None = None
+    label_names: tuple[str, ...] = ()
 
     @classmethod
     def box(
@@ -95,7 +103,17 @@ class TetForest:
     @cached_property
     def points(self) -> np.ndarray:
         """Rest positions of the nodes [m], float64 [N, 3]."""
+        return self.lattice_points[: self.node_count]
+
+    @cached_property
+    def lattice_points(self) -> np.ndarray:
+        """Rest positions of all lattice points [m], the N nodes first, float64."""
         return np.asarray(self.origin) + self.lattice * (self.cell_size / 2**LATTICE_BITS)
+
+    @cached_property
+    def node_count(self) -> int:
+        """Number of nodes N, those that leaves name."""
+        return len(self.lattice) if isinstance(self.tree, UniformTree) else int(self.tets.max()) + 1
 
     @cached_property
     def tets(self) -> np.ndarray:
@@ -118,14 +136,28 @@ class TetForest:
         return volume[self.levels]
 
     def ancestors(self, level: int) -> np.ndarray:
-        """For each leaf the tetrahedron of the tree at ``level`` above it, or the leaf itself; indices int32 [T]."""
-        return self.tree.ancestors(self.tree.leaves, level)
+        """For each leaf the highest tetrahedron above it, or the leaf itself, that is not above ``level`` and whose
+        corners are nodes; indices into the tree, int32 [T]. But for the rim of a body it is the one at ``level``."""
+        if self.node_count == len(self.lattice):
+            return self.tree.ancestors(self.tree.leaves, level)
+        tree, found = self.tree, self.tree.leaves.copy()
+        on_nodes = (tree.tets < self.node_count).all(axis=1)
+        below = np.flatnonzero(tree.level[found] > level)
+        climbed = found[below]
+        while len(below):
+            climbed = tree.parent[climbed]
+            real = on_nodes[climbed]
+            found[below[real]] = climbed[real]
+            further = tree.level[climbed] > level
+            below, climbed = below[further], climbed[further]
+        return found
 
     def refine(self, leaves: npt.ArrayLike) -> TetForest:
         """A forest in which the chosen leaves are bisected, and as many others as conformity asks for.
 
         A leaf with an active midpoint on any edge must be bisected itself, until none has (the closure of the set of
-        midpoints). Nodes keep their numbers; new ones are appended.
+        midpoints). Nodes keep their numbers; new ones are appended. What was void stays void, the surface stays where
+        it is, and both halves of a leaf have its share of the body and its label: for more detail mesh the domain anew.
 
         Args:
             leaves: Mask bool [T] or indices into the leaves.
@@ -134,20 +166,7 @@ class TetForest:
             InputError: Not a mask or indices of leaves, or a leaf already at the deepest level.
         """
         chosen = checked_indices(leaves, len(self.tets), "leaf")
-        growing = _Growth.of_forest(self)
-        wanted = np.unique(growing.edge_keys(growing.refinement_edges(self.tree.leaves[chosen])))
-        active = np.union1d(wanted, growing.edge_keys(self.node_ends[self.node_ends[:, 0] >= 0]))
-        while True:
-            current = growing.leaves()
-            tets = growing.tets()[current]
-            edges = np.stack([growing.edge_keys(tets[:, [i, j]]) for i, j in itertools.combinations(range(4), 2)], 1)
-            broken = current[np.isin(edges, active).any(axis=1)]
-            if not len(broken):
-                break
-            active = np.union1d(active, growing.edge_keys(growing.refinement_edges(broken)))
-            growing.bisect(broken)
-        lattice, ends, tree = growing.finished()
-        return TetForest(self.cells, self.cell_size, self.origin, lattice, ends, tree, self.up_axis)
+        return refined(self, chosen)
 
 
 def _checked_cells(cells: tuple[int, int, int]) -> tuple[int, int, int]:
@@ -157,88 +176,3 @@ def _checked_cells(cells: tuple[int, int, int]) -> tuple[int, int, int]:
         raise InputError(f"cells is {cells}; it must be three whole numbers from 1 to {limit}")
     x, y, z = (int(c) for c in counts)
     return x, y, z
-
-
-class _Growth:
-    """A forest being grown: lists of chunks that each bisection appends to."""
-
-    def __init__(self, lattice, ends, tets, level, parent, first_child):
-        self._lattice = [lattice]
-        self._ends = [ends]
-        self._tets = [tets]
-        self._level = [level]
-        self._parent = [parent]
-        self._first_child = first_child
-        self._nodes = len(lattice)
-
-    @classmethod
-    def of_forest(cls, forest: TetForest) -> _Growth:
-        tree = forest.tree
-        return cls(forest.lattice, forest.node_ends, tree.tets, tree.level, tree.parent, tree.first_child.copy())
-
-    def tets(self) -> np.ndarray:
-        return _merged(self._tets)
-
-    def leaves(self) -> np.ndarray:
-        return np.flatnonzero(self._first_child < 0).astype(np.int32)
-
-    def refinement_edges(self, elements: np.ndarray) -> np.ndarray:
-        """End nodes x0, xk of the edge on which each element is bisected [n, 2]."""
-        tets, level = self.tets()[elements], _merged(self._level)[elements]
-        k = far_end(level % 3)
-        return np.stack([tets[:, 0], tets[np.arange(len(tets)), k]], axis=1)
-
-    @staticmethod
-    def edge_keys(ends: np.ndarray) -> np.ndarray:
-        """One integer for each unordered pair of nodes, whatever nodes are added later."""
-        low = ends.min(axis=1).astype(np.int64)
-        return (low << 32) | ends.max(axis=1)
-
-    def bisect(self, elements: np.ndarray) -> None:
-        """Bisect the elements, making the midpoints that are not there yet."""
-        tets, level = self.tets()[elements], _merged(self._level)[elements]
-        if len(level) and level.max() >= MAX_LEVEL:
-            raise InputError(f"a tetrahedron is already at level {MAX_LEVEL}, the deepest that the lattice can hold")
-        middle = self._midpoints(self.refinement_edges(elements))
-        both = np.empty((len(tets), 2, 4), np.int32)
-        for kind in range(3):
-            chosen = np.flatnonzero(level % 3 == kind)
-            both[chosen] = children(tets[chosen], middle[chosen], kind)
-        count = len(self._first_child)
-        self._first_child[elements] = count + 2 * np.arange(len(elements), dtype=np.int32)
-        self._first_child = np.concatenate([self._first_child, np.full(2 * len(elements), -1, np.int32)])
-        self._tets.append(both.reshape(-1, 4))
-        self._level.append(np.repeat(level + 1, 2))
-        self._parent.append(np.repeat(elements, 2))
-
-    def _midpoints(self, edges: np.ndarray) -> np.ndarray:
-        """The node at the middle of each edge, made where there is none yet; int32."""
-        keys, which = np.unique(self.edge_keys(edges), return_inverse=True)
-        ends = np.stack([keys >> 32, keys & 0xFFFFFFFF], axis=1).astype(np.int32)
-        node = np.full(len(keys), -1, np.int32)
-        all_ends = _merged(self._ends)
-        inner = np.flatnonzero(all_ends[:, 0] >= 0)
-        known = self.edge_keys(all_ends[inner])
-        order = np.argsort(known)
-        if len(known):
-            at = np.minimum(np.searchsorted(known, keys, sorter=order), len(known) - 1)
-            there = known[order[at]] == keys
-            node[there] = inner[order[at[there]]]
-        new = np.flatnonzero(node < 0)
-        node[new] = self._nodes + np.arange(len(new), dtype=np.int32)
-        lattice = _merged(self._lattice)
-        self._lattice.append((lattice[ends[new, 0]] + lattice[ends[new, 1]]) // 2)
-        self._ends.append(ends[new])
-        self._nodes += len(new)
-        return node[which]
-
-    def finished(self) -> tuple[np.ndarray, np.ndarray, Tree]:
-        tree = Tree(_merged(self._tets), _merged(self._level), _merged(self._parent), self._first_child)
-        return _merged(self._lattice), _merged(self._ends), tree
-
-
-def _merged(chunks: list[np.ndarray]) -> np.ndarray:
-    """All chunks as one array, and the list shortened to it."""
-    if len(chunks) > 1:
-        chunks[:] = [np.concatenate(chunks)]
-    return chunks[0]

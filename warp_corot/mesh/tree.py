@@ -9,6 +9,10 @@ import numpy as np
 
 from .bisection import corner_leaves
 
+#: What stands in place of a first child where there is none: a leaf of the mesh, or a leaf outside the body.
+LIVE = -1
+VOID = -2
+
 
 @dataclass(frozen=True, eq=False)
 class Tree:
@@ -18,7 +22,8 @@ class Tree:
         tets: Nodes in Maubach order, int32 [M, 4].
         level: int32 [M].
         parent: Index of the parent, -1 for roots, int32 [M].
-        first_child: Index of the first of the two children, -1 for leaves, int32 [M].
+        first_child: Index of the first of the two children, ``LIVE`` (-1) for leaves, ``VOID`` (-2) for leaves that lie
+            outside the body and are no part of the mesh, int32 [M].
     """
 
     tets: np.ndarray
@@ -28,12 +33,12 @@ class Tree:
 
     @cached_property
     def leaves(self) -> np.ndarray:
-        """Leaves in tree order (each subtree's leaves side by side, first child first), int32 [T]."""
+        """Live leaves in tree order (each subtree's leaves side by side, first child first), int32 [T]."""
         inner = np.flatnonzero(self.first_child >= 0)
         inner = inner[np.argsort(self.level[inner], kind="stable")]
         by_level = np.split(inner, np.cumsum(np.bincount(self.level[inner])))
         # How many leaves there are below each element, from the bottom up; then where the first of them stands.
-        count = np.ones(len(self.level), np.int32)
+        count = (self.first_child == LIVE).astype(np.int32)
         for elements in reversed(by_level):
             first = self.first_child[elements]
             count[elements] = count[first] + count[first + 1]
@@ -44,7 +49,7 @@ class Tree:
             first = self.first_child[elements]
             place[first] = place[elements]
             place[first + 1] = place[elements] + count[first]
-        ends = np.flatnonzero(self.first_child < 0)
+        ends = np.flatnonzero(self.first_child == LIVE)
         leaves = np.empty(len(ends), np.int32)
         leaves[place[ends]] = ends
         return leaves
@@ -124,7 +129,7 @@ class UniformTree(Tree):
     @cached_property
     def first_child(self) -> np.ndarray:
         first = np.arange(self.starts[1], self.starts[-1], 2, dtype=self._index)
-        return np.concatenate([first, np.full(len(self.leaf_tets), -1, self._index)])
+        return np.concatenate([first, np.full(len(self.leaf_tets), LIVE, self._index)])
 
     @cached_property
     def leaves(self) -> np.ndarray:

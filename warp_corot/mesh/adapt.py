@@ -1,0 +1,233 @@
+"""From a domain to the forest that follows its surface: bisect where it is not flat enough, until nothing hangs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..errors import InputError
+from ..kernels import meshing as kernels
+from .bisection import path_tetrahedra
+from .growth import Growth, lattice_spacing
+from .lattice import LATTICE_BITS, MAX_LEVEL
+from .tree import LIVE, Tree
+
+if TYPE_CHECKING:
+    from ..domain import Domain
+
+Field = Callable[[np.ndarray], np.ndarray]
+
+#: Circumradius and longest edge of the three types, over h.
+CIRCUMRADIUS = np.sqrt([0.75, 0.5625, 0.3125])
+LONGEST_EDGE = np.sqrt([3.0, 2.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """How fine a mesh is to be.
+
+    Attributes:
+        surface_error: How far its surface may be from the domain's [m].
+        min_level, max_level: Between which levels.
+        refine_where: Function of points [n, 3] -> bool [n]: elements that have such a point are bisected.
+        field: Function of points [n, 3] -> numbers [n]: elements in which it varies are bisected ...
+        field_tolerance: ... by more than this.
+    """
+
+    surface_error: float
+    min_level: int
+    max_level: int
+    refine_where: Field | None = None
+    field: Field | None = None
+    field_tolerance: float = 0.0
+
+
+@dataclass(frozen=True)
+class Grown:
+    """A forest as it was grown: all lattice points that were looked at, and what was found there."""
+
+    cells: tuple[int, int, int]
+    origin: tuple[float, float, float]
+    lattice: np.ndarray
+    ends: np.ndarray
+    tree: Tree
+    phi: np.ndarray
+
+
+def grid_around(bounds: np.ndarray, cell_size: float) -> tuple[tuple[int, int, int], tuple[float, float, float]]:
+    """Root cubes along each axis and the lower corner of the grid that holds a box, the box in its middle."""
+    bounds = np.asarray(bounds, dtype=float)
+    cells = np.maximum(np.ceil((bounds[1] - bounds[0]) / cell_size - 1e-6), 1.0)
+    most = 2 ** (31 - LATTICE_BITS) - 1
+    if cells.max() > most or cells.prod() * 6 > 2**27:
+        raise InputError(
+            f"cell_size is {cell_size:g} m: that is {' x '.join(f'{c:.0f}' for c in cells)} root cubes; "
+            "make it larger and max_level higher"
+        )
+    x, y, z = (float(c) for c in bounds.mean(axis=0) - 0.5 * cells * cell_size)
+    a, b, c = (int(n) for n in cells)
+    return (a, b, c), (x, y, z)
+
+
+def grow(domain: Domain, cell_size: float, wishes: Wishes, device: wp.Device) -> Grown:
+    """Bisect the grid around a domain as wished, and as conformity asks for."""
+    cells, origin = grid_around(domain.bounds, cell_size)
+    adaptation = _Adaptation(domain, cells, origin, cell_size, wishes, device)
+    adaptation.run()
+    growth = adaptation.growth
+    lattice, ends = growth.nodes()
+    return Grown(cells, origin, lattice, ends, growth.tree(), adaptation.phi[: growth.node_count].numpy())
+
+
+class _Adaptation:
+    """A forest that grows after a domain."""
+
+    def __init__(self, domain: Domain, cells: Any, origin: Any, cell_size: float, wishes: Wishes, device: wp.Device):
+        self.domain = domain
+        self.wishes = wishes
+        self.device = device
+        points = tuple(n + 1 for n in cells)
+        lattice = np.indices(points, dtype=np.int32).reshape(3, -1).T << LATTICE_BITS
+        tets = path_tetrahedra(cells, points)
+        roots = len(tets)
+        leaf = np.full(roots, LIVE, np.int32)
+        tree = Tree(tets, np.zeros(roots, np.int32), np.full(roots, -1, np.int32), leaf)
+        self.growth = Growth(lattice, np.full((len(lattice), 2), -1, np.int32), tree, device)
+        self.top = wp.vec3i(*(n << LATTICE_BITS for n in cells))
+        self.origin = wp.vec3d(*origin)
+        self.spacing = lattice_spacing(cell_size)
+        level = np.arange(MAX_LEVEL + 1)
+        h = cell_size * 0.5 ** (level // 3)
+        self.circumradius = wp.array(h * CIRCUMRADIUS[level % 3], dtype=wp.float32, device=device)
+        self.longest = wp.array(h * LONGEST_EDGE[level % 3], dtype=wp.float32, device=device)
+        #: What float32 coordinates leave open of a value.
+        reach = float(np.abs(np.asarray(origin)).max() + max(cells) * cell_size)
+        self.noise = float(domain.lipschitz) * reach * 2.0**-22
+        self.phi = wp.empty(0, dtype=wp.float32, device=device)
+        self.evaluated = 0
+
+    def run(self) -> None:
+        self.judge(0)
+        # First from the top down, each level from the one above alone, then what conformity asks for.
+        first = 0
+        growth = self.growth
+        while len(wished := self.wished_from(first)):
+            first = growth.element_count
+            growth.bisect(wished)
+            self.judge(first)
+        growth.close(self.judge)
+        self.evaluate()
+
+    def wished_from(self, first: int) -> wp.array:
+        flags = wp.empty(self.growth.element_count - first, dtype=wp.int32, device=self.device)
+        self.launch(kernels.flag_wished, len(flags), [self.growth.wished, first], [flags])
+        return self.growth.flagged(flags, first)
+
+    def evaluate(self) -> None:
+        """Values at the nodes that are new."""
+        growth, first = self.growth, self.evaluated
+        count = growth.node_count - first
+        if not count:
+            return
+        if growth.node_count > len(self.phi):
+            old = self.phi
+            self.phi = wp.empty(max(growth.node_count, 2 * len(old)), dtype=wp.float32, device=self.device)
+            wp.copy(self.phi, old, count=len(old))
+        points = wp.empty(count, dtype=wp.vec3, device=self.device)
+        self.launch(kernels.node_points, count, [growth.lattice, first, self.origin, self.spacing], [points])
+        found = self.values(points)
+        self.launch(kernels.take_values, count, [found, growth.lattice, first, self.top, self.noise], [self.phi])
+        self.evaluated = growth.node_count
+
+    def values(self, points: wp.array) -> wp.array:
+        """phi at points."""
+        return self.domain.phi(points) if len(points) else wp.empty(0, dtype=wp.float32, device=self.device)
+
+    def judge(self, first: int) -> None:
+        """Find out of all elements from ``first`` on whether they are outside, and which are to be bisected."""
+        growth, wishes, lipschitz = self.growth, self.wishes, float(self.domain.lipschitz)
+        self.evaluate()
+        count = growth.element_count - first
+        states = wp.empty(count, dtype=wp.int32, device=self.device)
+        inputs = [first, growth.tets, growth.level, self.phi, self.circumradius, self.longest]
+        inputs += [lipschitz, wishes.min_level, wishes.max_level]
+        self.launch(kernels.judge_by_corners, count, inputs, [growth.first_child, states])
+        self.judge_surface(first, states)
+        self.judge_fields(first, states)
+        self.launch(kernels.take_wishes, count, [states, first], [growth.wished])
+
+    def judge_surface(self, first: int, states: wp.array) -> None:
+        """Where corners leave it open: compare with the linear interpolant at midpoints, then at one point more."""
+        growth, lipschitz, tolerance = self.growth, float(self.domain.lipschitz), self.wishes.surface_error
+        unsure = self.of_state(states, kernels.OPEN, first)
+        if not len(unsure):
+            return
+        slots = growth.insert_edges(unsure, of_refinement=False)
+        self.evaluate()
+        probes = wp.empty(len(unsure), dtype=wp.vec3, device=self.device)
+        expected = wp.empty(len(unsure), dtype=wp.float32, device=self.device)
+        inputs = [unsure, first, *growth.midpoints(slots), growth.tets, growth.level, self.phi, growth.lattice]
+        inputs += [self.origin, self.spacing, self.circumradius, lipschitz, tolerance]
+        self.launch(kernels.judge_by_edges, len(unsure), inputs, [growth.first_child, states, probes, expected])
+        flags = wp.empty(len(unsure), dtype=wp.int32, device=self.device)
+        self.launch(kernels.flag_open, len(unsure), [unsure, states, first], [flags])
+        chosen = growth.flagged(flags)
+        points = wp.empty(len(chosen), dtype=wp.vec3, device=self.device)
+        self.launch(kernels.gather_points, len(chosen), [chosen, probes], [points])
+        inputs = [chosen, unsure, first, self.values(points), expected, growth.tets, self.phi, growth.lattice]
+        inputs += [self.spacing, lipschitz, tolerance]
+        self.launch(kernels.judge_by_probes, len(chosen), inputs, [states])
+
+    def judge_fields(self, first: int, states: wp.array) -> None:
+        """Bisect where labels or the user's fields ask for it, seen at corners and centroids."""
+        wishes, domain = self.wishes, self.domain
+        if not (domain.label_names or wishes.refine_where or wishes.field):
+            return
+        growth = self.growth
+        state = states.numpy()
+        leaf = growth.first_child[first : growth.element_count].numpy()
+        level = growth.level[first : growth.element_count].numpy()
+        chosen = np.flatnonzero((state == kernels.DONE) & (leaf == LIVE) & (level < wishes.max_level))
+        if not len(chosen):
+            return
+        tets = growth.tets.numpy()[first + chosen]
+        nodes, corners = np.unique(tets, return_inverse=True)
+        corners = corners.reshape(-1, 4)
+        at_nodes = np.asarray(self.origin) + growth.lattice.numpy()[nodes] * self.spacing
+        at_middle = at_nodes[corners].mean(axis=1)
+
+        def sampled(function: Callable[[np.ndarray], Any]) -> np.ndarray:
+            return np.column_stack([_checked(function, at_nodes)[corners], _checked(function, at_middle)])
+
+        split = np.zeros(len(chosen), bool)
+        if domain.label_names:
+            split |= np.ptp(sampled(lambda x: domain.labels_at(x, nearest=True)), axis=1) > 0
+        if wishes.refine_where is not None:
+            split |= sampled(wishes.refine_where).astype(bool).any(axis=1)
+        if wishes.field is not None:
+            split |= np.ptp(sampled(wishes.field).astype(float), axis=1) > wishes.field_tolerance
+        state[chosen[split]] = kernels.SPLIT
+        states.assign(state)
+
+    def of_state(self, states: wp.array, state: int, first: int) -> wp.array:
+        flags = wp.empty(len(states), dtype=wp.int32, device=self.device)
+        self.launch(kernels.flag_equal, len(states), [states, state], [flags])
+        return self.growth.flagged(flags, first)
+
+    def launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
+        if count:
+            wp.launch(kernel, dim=count, inputs=inputs, outputs=outputs, device=self.device)
+
+
+def _checked(function: Callable[[np.ndarray], Any], points: np.ndarray) -> np.ndarray:
+    found = np.asarray(function(points))
+    if found.shape != (len(points),):
+        raise InputError(f"a field gave the shape {found.shape} for {len(points)} points; it must give [{len(points)}]")
+    if not np.isfinite(found).all():
+        bad = int(np.flatnonzero(~np.isfinite(found))[0])
+        raise InputError(f"a field is {found[bad]} at {points[bad].tolist()}; it must be finite")
+    return found

@@ -1,0 +1,72 @@
+"""Numbers of nodes and of tetrahedra, put in order."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .tree import LIVE, VOID, Tree
+
+
+def in_order_of_leaves(tree: Tree) -> np.ndarray:
+    """Nodes that live leaves name, in the order in which they first do, so that neighbours in space are so in memory."""
+    touched = tree.leaf_tets.ravel()
+    turn = np.arange(len(touched), dtype=np.int64)
+    first = np.empty(int(touched.max()) + 1, np.int64)
+    # Where a place is written more than once the last write stays: walk backwards to keep the first.
+    first[touched[::-1]] = turn[::-1]
+    return touched[first[touched] == turn]
+
+
+def with_virtual(real: np.ndarray, tree: Tree, count: int) -> np.ndarray:
+    """The given nodes, and behind them all others, of ``count``, that the tree names."""
+    named = np.zeros(count, bool)
+    named[tree.tets] = True
+    named[real] = False
+    return np.concatenate([real, np.flatnonzero(named)])
+
+
+def renumbered(order: np.ndarray, ends: np.ndarray, tree: Tree) -> tuple[np.ndarray, Tree]:
+    """Ends and tree when the node that was ``order[i]`` is node i, and nodes that are not in it are gone."""
+    number = np.full(len(ends), -1, np.int32)
+    number[order] = np.arange(len(order), dtype=np.int32)
+    moved = ends[order]
+    moved = np.where(moved < 0, np.int32(-1), number[moved])
+    moved.sort(axis=1)
+    return moved, Tree(number[tree.tets], tree.level, tree.parent, tree.first_child)
+
+
+def pruned(tree: Tree, empty: np.ndarray) -> tuple[Tree, np.ndarray]:
+    """The tree without what lies below tetrahedra that hold nothing.
+
+    Args:
+        tree: Its leaves are live or void.
+        empty: Which void leaves hold nothing at all, bool [M]; two of one parent become one.
+
+    Returns:
+        The tree, and which of the old tetrahedra are in it, ascending.
+    """
+    first_child, empty = tree.first_child.copy(), empty.copy()
+    inner = np.flatnonzero(first_child >= 0)
+    by_level = np.split(inner[np.argsort(tree.level[inner], kind="stable")], np.cumsum(np.bincount(tree.level[inner])))
+    for elements in reversed(by_level):
+        child = first_child[elements]
+        hollow = elements[empty[child] & empty[child + 1]]
+        empty[hollow] = True
+        first_child[hollow] = VOID
+    kept = np.ones(len(first_child), bool)
+    for elements in by_level:
+        gone = elements[~kept[elements] | (first_child[elements] < 0)]
+        child = tree.first_child[gone]
+        kept[child] = kept[child + 1] = False
+    stays = np.flatnonzero(kept)
+    number = np.cumsum(kept, dtype=np.int32) - 1
+    parent, child = tree.parent[stays], first_child[stays]
+    parent = np.where(parent < 0, np.int32(-1), number[parent])
+    child = np.where(child < 0, child, number[child])
+    return Tree(tree.tets[stays], tree.level[stays], parent, child), stays
+
+
+def live_or_void(tree: Tree, live: np.ndarray) -> Tree:
+    """The tree with those of its leaves live that are in a mask bool [M]."""
+    leaf = np.where(live, np.int32(LIVE), np.int32(VOID))
+    return Tree(tree.tets, tree.level, tree.parent, np.where(tree.first_child < 0, leaf, tree.first_child))
