@@ -4,6 +4,8 @@ After Tagawa, Yamada and Tanaka, *A Rectangular Tetrahedral Adaptive Mesh Based 
 Interactive Soft Tissue Simulation* (IEEE EMBC 2013).
 """
 
+from .activation import Activation
+from .anisotropy import Orthotropic, TransverselyIsotropic
 from .body import SoftBody
 from .elasticity import Corotated, EdgeStVK, Linear, MassSpring, NeoHookean, StVenantKirchhoff
 from .errors import InputError, StabilityWarning, UnstableError
@@ -17,6 +19,7 @@ from .solvers import SymplecticEuler
 __version__ = "0.1.0"
 
 __all__ = [
+    "Activation",
     "Corotated",
     "EdgeStVK",
     "Energy",
@@ -25,6 +28,7 @@ __all__ = [
     "Linear",
     "MassSpring",
     "NeoHookean",
+    "Orthotropic",
     "Simulation",
     "SoftBody",
     "StVenantKirchhoff",
@@ -32,6 +36,7 @@ __all__ = [
     "SymplecticEuler",
     "TetForest",
     "TetMesh",
+    "TransverselyIsotropic",
     "UnstableError",
     "polar_rotation",
     "record",

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from .activation import Activation, ElementActivation, activate
+from .anisotropy import Anisotropic
 from .checks import check_float32, checked_count
 from .device import checked_device
 from .elements import Mesh, device_elements, element_kind, parts, repeated
 from .errors import InputError
 from .kernels.integrate import adopt_positions, publish_positions, reset_nodes
-from .materials import Material
+from .materials import Isotropic, Material
 from .trajectory import Trajectory
 from .worlds import World, chosen_nodes
 
@@ -50,21 +54,21 @@ class SoftBody:
 
     def __init__(self, mesh: Mesh, material: Material, *, worlds: int = 1, device: str | wp.Device | None = None):
         self.mesh = mesh
-        self.material = material.at(centroids(mesh)) if material.functions else material
+        self.material: Any = material.at(centroids(mesh)) if material.functions else material
         self.worlds = checked_count(worlds, "worlds", least=1)
         self.device = checked_device(device)
         if self.element_count > MOST_ELEMENTS:
             raise InputError(
                 f"worlds is {worlds}: that is {self.element_count} elements; there can be {MOST_ELEMENTS} at most"
             )
-        material = self.material
-        material.check_shapes(self.worlds, len(mesh.tets))
-        check_float32(2.0 * material.mu + np.abs(material.lam), "the stiffness 2 mu + |lambda|", "Pa")
+        self.material.check_shapes(self.worlds, len(mesh.tets))
+        isotropic = self.material.isotropic
+        check_float32(2.0 * isotropic.mu + np.abs(isotropic.lam), "the stiffness 2 mu + |lambda|", "Pa")
         check_float32(mesh.volumes, "the volume of an element", "m^3")
         self.element_kind = element_kind(mesh)
         self.elements = device_elements(mesh, self.device, self.worlds)
-        self.mu, self.lam, self.material_stride = self._material_arrays()
-        self.masses = lumped_masses(mesh, material, self.worlds)
+        self.mu, self.lam, self.material_stride = self._material_arrays(isotropic)
+        self.masses = lumped_masses(mesh, self.material, self.worlds)
         check_float32(self.masses[self.masses > 0], "the mass of a node", "kg")
 
         n = self.node_count
@@ -78,6 +82,8 @@ class SoftBody:
         self.node_mass = wp.array(self.masses, dtype=wp.float32, device=self.device)
         self.node_inverse_mass = wp.empty(n, dtype=wp.float32, device=self.device)
         self.trajectories: list[Trajectory] = []
+        self.element_activation = wp.zeros(1, dtype=wp.float32, device=self.device)
+        self.activations: list[ElementActivation] = []
         #: Time steps done when each world was last reset, int64 [worlds].
         self.world_starts = wp.zeros(self.worlds, dtype=wp.int64, device=self.device)
         #: Changes whenever the launches of a step do, so that recorded steps can be recorded anew.
@@ -283,6 +289,53 @@ class SoftBody:
         self.node_loads.assign(loads)
 
     @property
+    def activation(self) -> wp.array:
+        """Active stress along the fibres [Pa], float32 [worlds * T]: the live array, made on first use.
+
+        Positive stress contracts. Write to it between steps; elements that follow an ``Activation`` have in it what
+        they had in the last step.
+
+        Raises:
+            InputError: The material has no fibres.
+        """
+        if not isinstance(self.material, Anisotropic):
+            raise InputError(
+                "activation needs a material with a direction, TransverselyIsotropic or Orthotropic; "
+                f"the body's is {type(self.material).__name__}"
+            )
+        if not self.has_activation:
+            self.element_activation = wp.zeros(self.element_count, dtype=wp.float32, device=self.device)
+            self.revision += 1
+        return self.element_activation
+
+    def activate(
+        self,
+        stress: float | npt.ArrayLike | Activation,
+        elements: npt.ArrayLike | None = None,
+        *,
+        worlds: npt.ArrayLike | None = None,
+    ) -> None:
+        """Set the active stress along the fibres, from the next step on: P = s (F d) d^T in an element of direction d.
+
+        It pulls whatever the fibre's length, so that it puts work in and has no energy. It stiffens the fibres: a
+        stress beyond Young's modulus along them can need a smaller step than was found without it.
+
+        Args:
+            stress: Positive contracts [Pa]: a number, [n], [worlds, n] or [worlds, 1], or keyframes that are followed
+                over time.
+            elements: n elements of each world, mask bool [T] or indices; None for all.
+            worlds: As in ``fix``.
+
+        Raises:
+            InputError: The material has no fibres, wrong shapes, or values that are not finite.
+        """
+        activate(self, stress, elements, worlds)
+
+    @property
+    def has_activation(self) -> bool:
+        return len(self.element_activation) == self.element_count and isinstance(self.material, Anisotropic)
+
+    @property
     def constrained(self) -> npt.NDArray[np.bool_]:
         """Which nodes are fixed or prescribed, bool [worlds * N] (a copy)."""
         return self._constrained.copy()
@@ -301,8 +354,8 @@ class SoftBody:
         """
         return chosen_nodes(nodes, self.world_node_count, self.worlds, worlds).indices
 
-    def _material_arrays(self) -> tuple[wp.array, wp.array, int]:
-        mu, lam = np.broadcast_arrays(np.atleast_1d(self.material.mu), np.atleast_1d(self.material.lam))
+    def _material_arrays(self, material: Isotropic) -> tuple[wp.array, wp.array, int]:
+        mu, lam = np.broadcast_arrays(np.atleast_1d(material.mu), np.atleast_1d(material.lam))
         if mu.size == 1:
             return self._floats(mu.ravel()), self._floats(lam.ravel()), 0
         shape = (self.worlds, len(self.mesh.tets))

@@ -27,19 +27,12 @@ class Material(ABC):
 
     components: ClassVar[dict[str, tuple[int, ...]]] = {}
 
-    young: Field
-    poisson: Field
     density: Field
 
     @property
     @abstractmethod
-    def mu(self) -> Values:
-        """Second Lamé parameter (shear modulus) [Pa]."""
-
-    @property
-    @abstractmethod
-    def lam(self) -> Values:
-        """First Lamé parameter [Pa]."""
+    def isotropic(self) -> Isotropic:
+        """The isotropic material that is nearest."""
 
     @property
     def functions(self) -> tuple[str, ...]:
@@ -111,11 +104,17 @@ class Isotropic(Material):
         set_checked(self, "density", "kg/m^3", 0.0, np.inf)
 
     @property
+    def isotropic(self) -> Isotropic:
+        return self
+
+    @property
     def mu(self) -> Values:
+        """Second Lamé parameter (shear modulus) [Pa]."""
         return self.young / (2.0 * (1.0 + self.poisson))
 
     @property
     def lam(self) -> Values:
+        """First Lamé parameter [Pa]."""
         return self.young * self.poisson / ((1.0 + self.poisson) * (1.0 - 2.0 * self.poisson))
 
 

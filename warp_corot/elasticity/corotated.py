@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import warp as wp
 
+from ..anisotropy import Anisotropic
 from ..elements import forest_elements, in_worlds, with_targets
 from ..errors import InputError
 from ..kernels import general_cpu, subtree_cpu, subtree_cuda
@@ -28,6 +29,7 @@ from ..mesh import TetForest
 from ..mesh.forest import MAX_LEVEL
 from ..plan import Batch, ForcePlan, Sharing
 from ..rotations import METHODS, rotation_function
+from .anisotropic import AnisotropicField
 from .model import ForceField, Model, leaf_slots
 
 if TYPE_CHECKING:
@@ -42,6 +44,8 @@ class Corotated(Model):
 
     With every element's own rotation the force is the gradient of W and conserves linear and angular momentum. Shared
     rotations are cheaper; they conserve linear momentum only.
+
+    Anisotropic materials keep both momenta too (see ``AnisotropicField``); they go leaf by leaf with own rotations.
 
     With the defaults, forests take the fast path: complete three-level subtrees as units of work. Any other rotation,
     iterations or stiffness goes leaf by leaf.
@@ -79,7 +83,9 @@ class Corotated(Model):
         if self.stiffness not in STIFFNESSES:
             raise InputError(f"stiffness is {self.stiffness!r}; it must be one of {', '.join(STIFFNESSES)}")
 
-    def bind(self, body: SoftBody, *, deterministic: bool = False) -> CorotatedField:
+    def bind(self, body: SoftBody, *, deterministic: bool = False) -> CorotatedField | AnisotropicField:
+        if isinstance(body.material, Anisotropic):
+            return self._bind_anisotropic(body, deterministic)
         fast = self.rotation == "byers-xu" and self.iterations is None and self.stiffness == "factored"
         fast = fast and self.subtrees
         if isinstance(body.mesh, TetForest):
@@ -92,6 +98,23 @@ class Corotated(Model):
         elif fast and body.device.is_cpu:
             return LanesField(body, self, deterministic)
         return LeafField(body, self, deterministic)
+
+    def _bind_anisotropic(self, body: SoftBody, deterministic: bool) -> AnisotropicField:
+        for name, given, wanted in (
+            ("rotation_level", self.rotation_level, None),
+            ("stiffness", self.stiffness, "factored"),
+        ):
+            if given != wanted:
+                raise InputError(f"{name} is {given!r}; with an anisotropic material it must be {wanted!r}")
+        if self.rotation == "warm":
+            raise InputError("rotation is 'warm'; with an anisotropic material it must be 'byers-xu' or 'svd'")
+        return AnisotropicField(body, self.own_rotation, deterministic)
+
+    @property
+    def own_rotation(self) -> wp.Function:
+        """The device function that finds an element's own rotation."""
+        rotation = rotation_function(self.rotation, self.iterations)
+        return quick_rotation if rotation is byers_xu and self.subtrees else rotation
 
 
 @dataclass(frozen=True)
@@ -126,11 +149,8 @@ class CorotatedField(ForceField):
             self.reset(wp.ones(body.worlds, dtype=wp.int32, device=self.device))
             self._extract = extract_warm_rotations(kind)
         else:
-            rotation = rotation_function(model.rotation, model.iterations)
-            if rotation is byers_xu and model.subtrees:
-                rotation = quick_rotation
-            self._extract = extract_rotations(kind, rotation)
-            self._own = scatter_own_rotation(kind, rotation)
+            self._extract = extract_rotations(kind, model.own_rotation)
+            self._own = scatter_own_rotation(kind, model.own_rotation)
         if model.stiffness == "factored":
             self._forces = scatter_with_rotations(kind)
         else:

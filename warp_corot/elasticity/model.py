@@ -11,7 +11,9 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from ..anisotropy import Anisotropic
 from ..elements import in_worlds, with_targets
+from ..errors import InputError
 from ..kernels.forces import element_energies, element_von_mises, scatter_forces
 from ..slots import Slots
 
@@ -28,9 +30,16 @@ class ForceField(ABC):
         body: The body.
         deterministic: Whether forces must come out the same bit by bit every time, also on CUDA, where threads run in
             any order; a subclass then says by ``slots`` where its kernels add them first.
+
+    Raises:
+        InputError: The body's material is anisotropic and the field does not know such.
     """
 
+    takes_anisotropic: ClassVar[bool] = False
+
     def __init__(self, body: SoftBody, deterministic: bool = False):
+        if isinstance(body.material, Anisotropic) and not self.takes_anisotropic:
+            raise InputError(f"the material is {type(body.material).__name__}; only the model Corotated knows such")
         self.body = body
         self.device = body.device
         self.elements = body.elements
@@ -51,6 +60,14 @@ class ForceField(ABC):
     @abstractmethod
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         """Launch the kernels that add the forces to the nodes, or to the slots if there are any."""
+
+    def begin_step(self, clock: wp.array, offset: int, dt: float) -> None:  # noqa: B027 (most do not change)
+        """Launch what sets the field for a step, where it changes with time.
+
+        Args:
+            clock: Time steps done, int64 [1]; ``offset`` more are launched already.
+            dt: Time step [s].
+        """
 
     @abstractmethod
     def write_energies(self, u: wp.array, energies: wp.array) -> None:

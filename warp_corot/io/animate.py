@@ -68,7 +68,7 @@ class _Joined:
         values = []
         for world in self.worlds:
             body = world.body
-            everywhere = np.broadcast_to(getattr(body.material, name), (body.worlds, len(body.mesh.tets)))
+            everywhere = np.broadcast_to(getattr(body.material.isotropic, name), (body.worlds, len(body.mesh.tets)))
             values.append(everywhere[world.index])
         joined = np.concatenate(values).astype(np.float64)
         return float(joined[0]) if (joined == joined[0]).all() else joined

@@ -86,6 +86,7 @@ class SymplecticEulerStepper(Stepper):
                 outputs=[body.node_velocities],
                 device=body.device,
             )
+        self.field.begin_step(context.clock, offset, context.dt)
         self.field.add_forces(body.node_displacements, body.node_forces)
         wp.launch(
             step_symplectic_euler,

@@ -1,0 +1,234 @@
+"""Corotated forces of orthotropic materials, and active stress along their first axis.
+
+All is worked out in the material's axes: with M their rotation into rest space, F M and its rotation R M take the
+place of the local frame's F Q and R Q, and the stiffness is nine numbers. With S = R^T F and s = C : (S - I), the
+energy density (S - I) : s / 2 has the derivative R (s + [a]x), where (tr(S) I - S) a is the axial vector of S s - s S.
+That a comes of R turning as F changes; an isotropic material has none, others are free of torque by it.
+
+tr(S) I - S is singular where F has no definite rotation: flat in two directions, or inverted by as much in one as is
+left in another. Near there the law goes over smoothly to the nearest isotropic one, which needs no a: the energy is
+W_iso + b (W - W_iso), where b falls from one to zero with det(tr(S) I - S) / |S|^3, and the force its derivative.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from .constitutive import corotated_strain, hooke
+from .elements import frame, local_gradient, rest_volume, scatter_stress
+from .forces import von_mises
+from .rotation import cofactor, column, identity3, largest_entry
+
+wp.set_module_options({"enable_backward": False})
+
+vec9 = wp.types.vector(length=9, dtype=wp.float32)
+
+#: det(tr(S) I - S) / |S|^3 below which a law turns isotropic; 1.54 at rest, 0.1 flattened to 5 % in two directions.
+INDEFINITE = 0.1
+
+THRESHOLD = wp.constant(INDEFINITE)
+
+
+@wp.struct
+class OrthotropicMaterial:
+    """Axes and stiffness of each element, arrays of one entry (stride 0) or one per element (stride 1)."""
+
+    axes: wp.array[wp.mat33]  # in rest space, the columns of a rotation
+    axes_stride: int
+    stiffness: wp.array[vec9]  # C_11, C_22, C_33, C_12, C_13, C_23, G_12, G_13, G_23 [Pa]
+    mu: wp.array[wp.float32]  # of the nearest isotropic material [Pa]
+    lam: wp.array[wp.float32]
+    stride: int  # of the last three
+
+
+@wp.func
+def axes_of(material: OrthotropicMaterial, t: int):
+    return material.axes[t * material.axes_stride]
+
+
+@wp.func
+def orthotropic_stress(strain: wp.mat33, c: vec9):
+    s01 = 2.0 * c[6] * strain[0, 1]
+    s02 = 2.0 * c[7] * strain[0, 2]
+    s12 = 2.0 * c[8] * strain[1, 2]
+    e0 = strain[0, 0]
+    e1 = strain[1, 1]
+    e2 = strain[2, 2]
+    return wp.mat33(
+        c[0] * e0 + c[3] * e1 + c[4] * e2, s01, s02,
+        s01, c[3] * e0 + c[1] * e1 + c[5] * e2, s12,
+        s02, s12, c[4] * e0 + c[5] * e1 + c[2] * e2,
+    )  # fmt: skip
+
+
+@wp.func
+def definite_share(s: wp.mat33, adjugate: wp.mat33, det: float):
+    """b, and its derivative with respect to S; S of order one, adjugate and determinant of tr(S) I - S."""
+    n2 = wp.max(wp.ddot(s, s), 1.0e-12)
+    n3 = n2 * wp.sqrt(n2)
+    x = det / n3
+    share = float(1.0)
+    slope = wp.mat33()
+    if x < THRESHOLD:
+        y = wp.clamp(x / THRESHOLD, 0.0, 1.0)
+        share = y * y * (3.0 - 2.0 * y)
+        of_x = (wp.trace(adjugate) * identity3() - adjugate) / n3 - (3.0 * x / n2) * s
+        slope = (6.0 * y * (1.0 - y) / THRESHOLD) * of_x
+    return share, slope
+
+
+@wp.func
+def turned_stress(strain: wp.mat33, material: OrthotropicMaterial, t: int):
+    """R^T P: its symmetric part and the axial vector of the other one."""
+    i = t * material.stride
+    stress = orthotropic_stress(strain, material.stiffness[i])
+    # Scaled to order one, so that nothing is out of range.
+    s = strain + identity3()
+    scale = 1.0 / wp.max(largest_entry(s), 1.0e-30)
+    s = s * scale
+    e = strain * scale
+    h = wp.trace(s) * identity3() - s
+    adjugate = cofactor(h)
+    det = wp.dot(column(h, 0), column(adjugate, 0))
+    share, slope = definite_share(s, adjugate, det)
+    turning = stress
+    if share < 1.0:
+        isotropic = hooke(strain, material.mu[i], material.lam[i])
+        excess = stress - isotropic
+        turning = share * excess
+        stress = isotropic + turning + (0.5 * wp.ddot(e, excess)) * slope
+    w = e * turning
+    axial = wp.vec3(w[2, 1] - w[1, 2], w[0, 2] - w[2, 0], w[1, 0] - w[0, 1])
+    return stress, adjugate * axial / wp.max(det, 1.0e-20)
+
+
+@wp.func
+def energy_density(strain: wp.mat33, material: OrthotropicMaterial, t: int):
+    i = t * material.stride
+    stress = orthotropic_stress(strain, material.stiffness[i])
+    s = strain + identity3()
+    s = s / wp.max(largest_entry(s), 1.0e-30)
+    h = wp.trace(s) * identity3() - s
+    adjugate = cofactor(h)
+    share, _slope = definite_share(s, adjugate, wp.dot(column(h, 0), column(adjugate, 0)))
+    if share < 1.0:
+        isotropic = hooke(strain, material.mu[i], material.lam[i])
+        stress = isotropic + share * (stress - isotropic)
+    return 0.5 * wp.ddot(strain, stress)
+
+
+@wp.func
+def material_gradient(elements: Any, t: int, m: wp.mat33, u: wp.array[wp.vec4]):
+    """(du/dX) M, and Q^T M, which turns the local frame's columns into the material's."""
+    turn = wp.transpose(frame(elements, t)) * m
+    return local_gradient(elements, t, u) * turn, turn
+
+
+@functools.cache
+def scatter_anisotropic(Elements: Any, rotation: wp.Function) -> wp.Kernel:
+    """Corotated forces of orthotropic elements, each with its own rotation, and of their active stress."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def scatter_anisotropic(
+        # In
+        elements: Elements,
+        material: OrthotropicMaterial,
+        is_active: int,
+        activation: wp.array[wp.float32],
+        u: wp.array[wp.vec4],
+        # Out
+        f: wp.array[wp.vec4],
+    ):
+        t = wp.tid()
+        m = axes_of(material, t)
+        g, turn = material_gradient(elements, t, m, u)
+        r = rotation(m + g)
+        stress, a = turned_stress(corotated_strain(g, m, r), material, t)
+        p = r * (stress + wp.skew(a))
+        if is_active != 0:
+            # s (F d) d^T, and d is the first axis.
+            pull = activation[t] * column(m + g, 0)
+            p += wp.outer(pull, wp.vec3(1.0, 0.0, 0.0))
+        scatter_stress(elements, t, p * wp.transpose(turn), f)
+
+    return scatter_anisotropic
+
+
+@functools.cache
+def anisotropic_energies(Elements: Any, rotation: wp.Function) -> wp.Kernel:
+    """Strain energy of each element [J]; active stress has none."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def anisotropic_energies(
+        # In
+        elements: Elements,
+        material: OrthotropicMaterial,
+        u: wp.array[wp.vec4],
+        # Out
+        energies: wp.array[wp.float64],
+    ):
+        t = wp.tid()
+        m = axes_of(material, t)
+        g, _turn = material_gradient(elements, t, m, u)
+        strain = corotated_strain(g, m, rotation(m + g))
+        density = energy_density(strain, material, t)
+        energies[t] = wp.float64(density) * wp.float64(rest_volume(elements, t))
+
+    return anisotropic_energies
+
+
+@functools.cache
+def anisotropic_von_mises(Elements: Any, rotation: wp.Function) -> wp.Kernel:
+    """Von Mises stress of each element [Pa], of elastic and active stress together, in the frame that turns with it."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def anisotropic_von_mises(
+        # In
+        elements: Elements,
+        material: OrthotropicMaterial,
+        is_active: int,
+        activation: wp.array[wp.float32],
+        u: wp.array[wp.vec4],
+        # Out
+        equivalent: wp.array[wp.float32],
+    ):
+        t = wp.tid()
+        m = axes_of(material, t)
+        g, _turn = material_gradient(elements, t, m, u)
+        strain = corotated_strain(g, m, rotation(m + g))
+        stress, _a = turned_stress(strain, material, t)
+        if is_active != 0:
+            stress[0, 0] += activation[t]
+        equivalent[t] = von_mises(stress)
+
+    return anisotropic_von_mises
+
+
+@wp.kernel(enable_backward=False)
+def follow_activation(
+    # In
+    elements: wp.array[wp.int32],
+    times: wp.array[wp.float64],
+    stress: wp.array2d[wp.float32],
+    dt: float,
+    clock: wp.array[wp.int64],
+    world_starts: wp.array[wp.int64],
+    world_element_count: int,
+    offset: int,
+    # Out
+    activation: wp.array[wp.float32],
+):
+    """Active stress by its keyframes at the beginning of a step, ``offset`` steps after the clock's last count."""
+    k = wp.tid()
+    t = elements[k]
+    start = world_starts[t // world_element_count]
+    now = wp.float64(clock[0] + wp.int64(offset) - start) * wp.float64(dt)
+    last = times.shape[0] - 1
+    key = int(0)
+    while key < last - 1 and times[key + 1] <= now:
+        key += 1
+    s = wp.clamp((now - times[key]) / (times[key + 1] - times[key]), wp.float64(0.0), wp.float64(1.0))
+    row = wp.min(k, stress.shape[1] - 1)
+    a = stress[key, row]
+    activation[t] = a + float(s) * (stress[key + 1, row] - a)

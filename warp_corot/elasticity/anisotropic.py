@@ -1,0 +1,96 @@
+"""Corotated elasticity of anisotropic materials, with active stress along the fibres."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from ..anisotropy import Anisotropic
+from ..checks import check_float32
+from ..kernels.anisotropic import (
+    OrthotropicMaterial,
+    anisotropic_energies,
+    anisotropic_von_mises,
+    follow_activation,
+    scatter_anisotropic,
+    vec9,
+)
+from .model import ForceField, leaf_slots
+
+if TYPE_CHECKING:
+    from ..body import SoftBody
+
+
+class AnisotropicField(ForceField):
+    """W = V/2 e : C : e with e = sym(R^T F) - I, R the element's own rotation, C fixed in rest space.
+
+    The force is the gradient of W, with the turning of R that isotropic materials need not account for, and conserves
+    linear and angular momentum. Where F comes near having no definite rotation (see ``kernels.anisotropic``), C goes
+    over to that of the nearest isotropic material, and the force is the gradient of that energy.
+
+    To it comes the active stress of ``SoftBody.activation``, P = s (F d) d^T along the fibres' direction d. It keeps
+    both momenta; it puts work in, so that there is no energy of it.
+
+    Args:
+        body: Of an ``Anisotropic`` material.
+        rotation: Device function that finds rotations.
+        deterministic: As for every field.
+    """
+
+    takes_anisotropic: ClassVar[bool] = True
+
+    def __init__(self, body: SoftBody, rotation: wp.Function, deterministic: bool):
+        super().__init__(body, deterministic)
+        kind = body.element_kind
+        self._forces = scatter_anisotropic(kind, rotation)
+        self._energies = anisotropic_energies(kind, rotation)
+        self._von_mises = anisotropic_von_mises(kind, rotation)
+        self.material = device_material(body)
+        if self.deterministic:
+            self.slots, self.elements = leaf_slots(body)
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        self.launch(self._forces, self.element_count, [self.elements, self.material, *self._activation, u], [f])
+
+    def write_energies(self, u: wp.array, energies: wp.array) -> None:
+        self.launch(self._energies, self.element_count, [self.elements, self.material, u], [energies])
+
+    def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
+        inputs = [self.elements, self.material, *self._activation, u]
+        self.launch(self._von_mises, self.element_count, inputs, [stress])
+
+    def begin_step(self, clock: wp.array, offset: int, dt: float) -> None:
+        body = self.body
+        for activation in body.activations:
+            inputs = [activation.elements, activation.times, activation.stress, dt, clock, body.world_starts]
+            inputs += [len(body.mesh.tets), offset]
+            self.launch(follow_activation, len(activation.elements), inputs, [body.activation])
+
+    @property
+    def _activation(self) -> list:
+        return [int(self.body.has_activation), self.body.element_activation]
+
+
+def device_material(body: SoftBody) -> OrthotropicMaterial:
+    """A body's material as the kernels read it, world after world where it is not uniform."""
+    given = body.material
+    assert isinstance(given, Anisotropic)
+    stiffness = given.stiffness()
+    check_float32(np.abs(stiffness[..., [0, 1, 2, 6, 7, 8]]).ravel(), "the stiffness", "Pa")
+    material = OrthotropicMaterial()
+    material.axes, material.axes_stride = _for_elements(given.frames(), 2, body, wp.mat33)
+    material.stiffness, material.stride = _for_elements(stiffness, 1, body, vec9)
+    material.mu, material.lam = body.mu, body.lam
+    return material
+
+
+def _for_elements(values: npt.NDArray[np.float64], rank: int, body: SoftBody, dtype: type) -> tuple[wp.array, int]:
+    """One value, or one for each element of each world; and the stride by which to go through them."""
+    head, tail = values.shape[: values.ndim - rank], values.shape[values.ndim - rank :]
+    if np.prod(head, dtype=int) == 1:
+        return wp.array(values.reshape(1, *tail), dtype=dtype, device=body.device), 0
+    everywhere = np.broadcast_to(values, (body.worlds, len(body.mesh.tets), *tail)).astype(np.float32)
+    return wp.array(everywhere.reshape(-1, *tail), dtype=dtype, device=body.device), 1
