@@ -112,7 +112,7 @@ def _tasks(layout: block.Layout, slots: list[list[int]]) -> tuple[np.ndarray, np
     """What threads add up: up to eight slots of one node each, a node's threads next to one another in one warp.
 
     Returns:
-        The tasks, int32 [n], and the places of their slots in bytes, uint64 [2, n]; n is a multiple of a warp's threads.
+        The tasks, int32 [n], and the places of their slots, uint64 [2, n]; n is a multiple of a warp's threads.
     """
     tasks: list[int] = []
     numbers: list[list[int]] = []

@@ -34,6 +34,11 @@ class StepContext:
 class Stepper(ABC):
     """One body's time steps as launches that can be recorded."""
 
+    @property
+    def many_a_launch(self) -> bool:
+        """Whether many steps are one launch."""
+        return False
+
     @abstractmethod
     def steps(self, count: int) -> None:
         """Launch steps, the first ones since the clock was last advanced."""

@@ -58,6 +58,10 @@ class SymplecticEulerStepper(Stepper):
         self.damping = damping
         self.block = BlockSteps.of(body, field)
 
+    @property
+    def many_a_launch(self) -> bool:
+        return self.block is not None and not self.body.trajectories
+
     def steps(self, count: int) -> None:
         if self.block is not None and not self.body.trajectories:
             self.block.launch(count, self.damping, self.context)
