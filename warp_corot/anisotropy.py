@@ -214,15 +214,17 @@ def _determinant(r12: Array, r13: Array, r23: Array) -> Array:
 
 
 def _unit(vectors: Array, name: str) -> Array:
-    """Vectors [..., 3] of length one; scaled first, so that no square is out of range."""
+    """Vectors [..., 3] of length one; those that have it stay as they are, so that doing it again changes nothing."""
     largest = np.abs(vectors).max(axis=-1, keepdims=True)
     zero = np.argwhere(largest[..., 0] == 0)
     if len(zero):
         rank = 1 if name == "direction" else 2
         where = place(zero[0][: largest.ndim - rank], largest.shape[: largest.ndim - rank])
         raise InputError(f"{name}{where} has length zero; it must have any other")
-    vectors = vectors / largest
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    # Scaled first, so that no square is out of range.
+    scaled = vectors / largest
+    norm = np.linalg.norm(scaled, axis=-1, keepdims=True)
+    return np.where(np.abs(largest * norm - 1.0) < 1e-14, vectors, scaled / norm)
 
 
 def _right_angled(axes: Array) -> Array:

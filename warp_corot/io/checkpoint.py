@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ..activation import Activation, ElementActivation
+from ..anisotropy import Orthotropic, TransverselyIsotropic
 from ..body import SoftBody
 from ..elasticity import MODELS
 from ..errors import InputError, StabilityWarning
@@ -24,8 +26,11 @@ from ..solvers import INTEGRATORS
 from .whole import written_whole
 
 FORMAT = "warp-corot checkpoint"
-#: 2: worlds, deterministic runs; 1 is read as one world.
-VERSION = 2
+#: 2: worlds, deterministic runs; 1 is read as one world. 3: anisotropic materials and activation; before, all were
+#: isotropic.
+VERSION = 3
+
+MATERIALS = {kind.__name__: kind for kind in (Isotropic, TransverselyIsotropic, Orthotropic)}
 
 #: What reading a damaged archive raises.
 DAMAGE = (EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
@@ -62,12 +67,14 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
             {
                 "model": _described(model, MODELS),
                 "mesh": _pack_mesh(body.mesh, prefix, arrays),
+                "material": _name_of(body.material, MATERIALS),
                 "trajectories": len(body.trajectories),
+                "activations": len(body.activations),
                 "field": sorted(field.state),
             }
         )
-        for name in ("young", "poisson", "density"):
-            arrays[prefix + name] = np.asarray(getattr(body.material, name))
+        for material_field in dataclasses.fields(body.material):
+            arrays[prefix + material_field.name] = np.asarray(getattr(body.material, material_field.name))
         arrays[prefix + "displacements"] = body.node_displacements.numpy()
         arrays[prefix + "velocities"] = body.node_velocities.numpy()
         arrays[prefix + "reactions"] = body.node_reactions.numpy()
@@ -83,6 +90,11 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
             times, displacements = trajectory.keys()
             arrays[f"{prefix}trajectory{k}.times"] = times
             arrays[f"{prefix}trajectory{k}.displacements"] = displacements
+        if body.has_activation:
+            arrays[prefix + "activation"] = body.activation.numpy()
+        for k, activation in enumerate(body.activations):
+            for name in ("elements", "times", "stress"):
+                arrays[f"{prefix}activation{k}.{name}"] = getattr(activation, name).numpy()
         for name, array in field.state.items():
             arrays[f"{prefix}field.{name}"] = array.numpy()
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
@@ -109,6 +121,9 @@ def load_checkpoint(path: str | PathLike[str], device: str | wp.Device | None = 
     try:
         if header["version"] < 2:
             _upgrade(header, arrays)
+        if header["version"] < 3:
+            for described in header["bodies"]:
+                described |= {"material": Isotropic.__name__, "activations": 0}
         return _rebuilt_simulation(header, arrays, device)
     except (LookupError, TypeError) as error:
         raise InputError(f"{what}: {error} is missing or wrong") from error
@@ -128,7 +143,8 @@ def _rebuilt_simulation(
     for number, described in enumerate(header["bodies"]):
         prefix = f"body{number}."
         mesh = _unpack_mesh(described["mesh"], prefix, arrays)
-        material = Isotropic(*(arrays[prefix + name][()] for name in ("young", "poisson", "density")))
+        material_kind = MATERIALS[described["material"]]
+        material = material_kind(*(arrays[prefix + f.name][()] for f in dataclasses.fields(material_kind)))
         body = SoftBody(mesh, material, worlds=header["worlds"], device=header["device"] if device is None else device)
         if prefix + "initial.displacements" in arrays:
             body.displacements = arrays[prefix + "initial.displacements"][:, :3]
@@ -142,6 +158,13 @@ def _rebuilt_simulation(
                 times=arrays[motion + "times"],
                 displacements=arrays[motion + "displacements"],
             )
+        if prefix + "activation" in arrays:
+            body.activation.assign(arrays[prefix + "activation"])
+        for k in range(described["activations"]):
+            elements, times, stress = (
+                arrays[f"{prefix}activation{k}.{name}"] for name in ("elements", "times", "stress")
+            )
+            body.activations.append(ElementActivation.of_keys(elements, Activation(times, stress), body.device))
         if prefix + "loads" in arrays:
             wp.copy(body.loads, wp.array(arrays[prefix + "loads"][:, :3], dtype=wp.vec3, device=body.device))
         body.displacements = arrays[prefix + "displacements"][:, :3]
@@ -169,9 +192,13 @@ def _rebuilt_simulation(
 
 def _described(thing: Any, names: dict[str, Any]) -> dict[str, Any]:
     """A listed dataclass of plain values as JSON: its name in the list and its values."""
+    return {"name": _name_of(thing, names), "values": dataclasses.asdict(thing)}
+
+
+def _name_of(thing: Any, names: dict[str, Any]) -> str:
     for name, cls in names.items():
         if type(thing) is cls:
-            return {"name": name, "values": dataclasses.asdict(thing)}
+            return name
     raise InputError(f"a {type(thing).__name__} cannot be saved; only {', '.join(c.__name__ for c in names.values())}")
 
 

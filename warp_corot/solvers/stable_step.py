@@ -33,6 +33,7 @@ def largest_frequency(body: SoftBody, field: ForceField) -> float:
     diagonal: list[float] = []
     off: list[float] = [0.0]
     with field.state_kept():
+        iteration.find_rest_forces()
         for _ in range(min(LANCZOS_STEPS, 3 * free)):
             a, b = iteration.step(off[-1])
             diagonal.append(a)
@@ -61,6 +62,12 @@ class _Lanczos:
         start[body.node_inverse_mass.numpy() == 0] = 0.0
         self.q.assign(start)
         self._launch(lanczos.scale_by, [1.0 / np.sqrt(self._inner(self.q, self.q)), self.q])
+        self._rest = wp.zeros_like(self.f)
+
+    def find_rest_forces(self) -> None:
+        """What forces there are without displacements, by active stress: of those with any, only the rest counts."""
+        self.field.add_forces(self.u, self._rest)
+        self._launch(lanczos.scale_by, [-1.0, self._rest])
 
     def step(self, beta: float) -> tuple[float, float]:
         """One step; the last off-diagonal entry in, the next diagonal and off-diagonal ones out [1/s^2]."""
@@ -68,7 +75,7 @@ class _Lanczos:
         self._launch(lanczos.largest_motions, [inverse_mass, self.q, self._largest], lanczos.PARTIAL_SUMS)
         scale = self.probe / float(self._largest.numpy().max())
         self._launch(lanczos.probe_motion, [scale, inverse_mass, self.q, self.u])
-        self.f.zero_()
+        wp.copy(self.f, self._rest)
         self.field.add_forces(self.u, self.f)
         self._launch(lanczos.apply_stiffness, [scale, beta, inverse_mass, self.f, self.before, self.next])
         diagonal = self._inner(self.q, self.next)
