@@ -18,8 +18,7 @@ from .tree import LIVE, Tree
 
 if TYPE_CHECKING:
     from ..domain import Domain
-
-Field = Callable[[np.ndarray], np.ndarray]
+    from .forest import Field
 
 #: Circumradius and longest edge of the three types, over h.
 CIRCUMRADIUS = np.sqrt([0.75, 0.5625, 0.3125])

@@ -7,18 +7,28 @@ lattice. The tree knows every ancestor; the leaves are the mesh. All is built wi
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+import warp as wp
 
 from ..errors import InputError
 from ..indices import checked_indices
-from .lattice import LATTICE_BITS, MAX_LEVEL
+from .lattice import LATTICE_BITS, MAX_LEVEL, volume_shares
 from .refined import refined
 from .tree import Tree, UniformTree
 from .uniform import halvings, uniform_leaves
+
+if TYPE_CHECKING:
+    from ..domain import Domain
+    from .bound import BoundPoints, SurfaceMesh
+
+#: A user's function of points [n, 3] -> [n].
+Field = Callable[[np.ndarray], np.ndarray]
 
 #: Leaves are numbered in 32 bits.
 MAX_LEAVES = 2**31 - 1
@@ -100,6 +110,64 @@ class TetForest:
         x, y, z = (float(c) for c in corners)
         return cls(cells, float(cell_size), (x, y, z), lattice, ends, UniformTree(tets, level), up_axis)
 
+    @classmethod
+    def from_domain(
+        cls,
+        domain: Domain,
+        cell_size: float,
+        *,
+        max_level: int = 12,
+        surface_error: float | None = None,
+        min_level: int = 0,
+        refine_where: Field | None = None,
+        field: Field | None = None,
+        field_tolerance: float = 0.0,
+        target_elements: int | None = None,
+        sliver: float = 0.02,
+        device: str | wp.Device | None = None,
+    ) -> TetForest:
+        """A forest that follows a domain: fine where its surface is curved, without what lies outside.
+
+        A tetrahedron is bisected while the surface inside it deviates from the linear interpolant by more than
+        ``surface_error``, judged at its edges' midpoints and one point more, where the domain's Lipschitz constant
+        does not rule a surface out; where labels vary in it; and where the user's functions ask for it. These and
+        labels are looked at in corners and centroids: details smaller than that need a ``min_level``.
+
+        Args:
+            domain: What to mesh.
+            cell_size: Edge length of a root cube [m].
+            max_level: How often a root is bisected at most, up to 48; three levels halve the edge length.
+            surface_error: How far the surface may be from the domain's [m]; None: all of it at ``max_level``.
+            min_level: How often everything is bisected at least.
+            refine_where: Points [n, 3] [m] -> bool [n]: tetrahedra at such points are bisected to ``max_level``.
+            field: Points [n, 3] [m] -> numbers [n]: tetrahedra in which it varies by more than ``field_tolerance`` are
+                bisected.
+            field_tolerance: In the field's unit.
+            target_elements: At most so many tetrahedra: the finest mesh within the other limits that has no more. It
+                is found by trying, which takes a few times longer.
+            sliver: Tetrahedra of which the body takes less than this share are left out, and what they hold is counted
+                to a neighbour, so that no node is left with next to no stiffness.
+            device: Where to work; None: where the domain is.
+
+        Raises:
+            InputError: An argument is out of its range, the body comes out empty, or there is no mesh so coarse.
+        """
+        from .from_domain import mesh_domain
+
+        return mesh_domain(
+            domain,
+            cell_size,
+            max_level,
+            surface_error,
+            min_level,
+            refine_where,
+            field,
+            field_tolerance,
+            target_elements,
+            sliver,
+            device,
+        )
+
     @cached_property
     def points(self) -> np.ndarray:
         """Rest positions of the nodes [m], float64 [N, 3]."""
@@ -128,12 +196,9 @@ class TetForest:
     @cached_property
     def volumes(self) -> np.ndarray:
         """Rest volume of each leaf [m^3], float64 [T], of uniform leaves as ``levels``."""
-        level = np.arange(MAX_LEVEL + 1)
-        h = self.cell_size * 0.5 ** (level // 3)
-        volume = h**3 / np.array([6.0, 12.0, 24.0])[level % 3]
         if isinstance(self.tree, UniformTree):
-            return np.broadcast_to(volume[self.tree.depth], self.levels.shape)
-        return volume[self.levels]
+            return np.broadcast_to(volume_shares(self.tree.depth) * self.cell_size**3, self.levels.shape)
+        return volume_shares(self.levels) * self.cell_size**3
 
     def ancestors(self, level: int) -> np.ndarray:
         """For each leaf the highest tetrahedron above it, or the leaf itself, that is not above ``level`` and whose
@@ -167,6 +232,79 @@ class TetForest:
         """
         chosen = checked_indices(leaves, len(self.tets), "leaf")
         return refined(self, chosen)
+
+    def embed(self, points: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """The leaf that holds each point, or the nearest one, and the point's place in it.
+
+        Args:
+            points: [n, 3] [m].
+
+        Returns:
+            Leaves int32 [n], and barycentric weights of their nodes float64 [n, 4], some negative where the point lies
+            outside the leaf.
+
+        Raises:
+            InputError: Not [n, 3], or not finite.
+        """
+        from .embedding import embed
+
+        return embed(self, np.asarray(points))
+
+    def bind(self, points: npt.ArrayLike, triangles: npt.ArrayLike | None = None) -> BoundPoints:
+        """Points, or with triangles [F, 3] a surface, of the user's own that go along with the mesh.
+
+        Raises:
+            InputError: As `embed`, or triangles of points that are not there.
+        """
+        from .bodies import bind
+
+        return bind(self, np.asarray(points), triangles)
+
+    def surface(self) -> SurfaceMesh:
+        """The marched surface of a mesh made from a domain, closed; of any other its boundary.
+
+        Points sit on edges between nodes inside and outside. Where the outer end went with an element that holds too
+        little, the point is bound to the nodes of the nearest element.
+        """
+        from .bodies import surface
+
+        return surface(self)
+
+    def separating_surface(self) -> SurfaceMesh:
+        """The surfaces between labels and around them, with ``sides``; `SurfaceMesh.of_label` gives each alone.
+
+        Raises:
+            InputError: The mesh has no labels.
+        """
+        from .bodies import separating_surface
+
+        return separating_surface(self)
+
+    def elements_of(self, label: str) -> np.ndarray:
+        """Leaves whose label this is, bool [T].
+
+        Raises:
+            InputError: No such label.
+        """
+        if label not in self.label_names or self.labels is None:
+            raise InputError(f"there is no label {label!r}; there are: {', '.join(self.label_names) or 'none'}")
+        return self.labels == self.label_names.index(label) + 1
+
+    def nodes_of(self, label: str) -> np.ndarray:
+        """Nodes of the leaves whose label this is, bool [N]; nodes on a border belong to both sides.
+
+        Raises:
+            InputError: No such label.
+        """
+        found = np.zeros(self.node_count, bool)
+        found[self.tets[self.elements_of(label)]] = True
+        return found
+
+    def summary(self) -> list[str]:
+        """What a user should know of the mesh, line by line: counts by level and type, volume, labels, pieces."""
+        from .bodies import summary
+
+        return summary(self)
 
 
 def _checked_cells(cells: tuple[int, int, int]) -> tuple[int, int, int]:

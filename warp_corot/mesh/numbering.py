@@ -8,7 +8,7 @@ from .tree import LIVE, VOID, Tree
 
 
 def in_order_of_leaves(tree: Tree) -> np.ndarray:
-    """Nodes that live leaves name, in the order in which they first do, so that neighbours in space are so in memory."""
+    """Nodes that live leaves name, in the order in which they first do: neighbours stay neighbours."""
     touched = tree.leaf_tets.ravel()
     turn = np.arange(len(touched), dtype=np.int64)
     first = np.empty(int(touched.max()) + 1, np.int64)

@@ -1,0 +1,101 @@
+"""Points bound to the nodes of a mesh: where they go, what normals they have, and which element holds them."""
+
+import warp as wp
+
+from .meshing import VOID
+
+
+@wp.kernel(enable_backward=False)
+def move_points(
+    # In
+    rest: wp.array[wp.vec3],
+    nodes: wp.array[wp.vec4i],
+    weights: wp.array[wp.vec4],
+    displacements: wp.array[wp.vec3],
+    # Out
+    positions: wp.array[wp.vec3],
+):
+    """Rest position and the weighted displacements of four nodes: at rest not a digit is lost."""
+    i = wp.tid()
+    u = wp.vec3(0.0)
+    for n in range(4):
+        u += weights[i][n] * displacements[nodes[i][n]]
+    positions[i] = rest[i] + u
+
+
+@wp.kernel(enable_backward=False)
+def add_triangle_normals(
+    # In
+    positions: wp.array[wp.vec3],
+    triangles: wp.array[wp.vec3i],
+    # Out
+    normals: wp.array[wp.vec3],
+):
+    """Each triangle's normal times twice its area, added at its corners."""
+    tri = triangles[wp.tid()]
+    p = positions[tri[0]]
+    normal = wp.cross(positions[tri[1]] - p, positions[tri[2]] - p)
+    for n in range(3):
+        wp.atomic_add(normals, tri[n], normal)
+
+
+@wp.kernel(enable_backward=False)
+def normalize_all(
+    # In and out
+    normals: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    size = wp.max(wp.max(wp.abs(normals[i])), 1.0e-37)
+    normals[i] = wp.normalize(normals[i] / size)
+
+
+@wp.kernel(enable_backward=False)
+def descend(
+    # In
+    roots: wp.array[wp.int32],
+    weights: wp.array[wp.vec4d],
+    level: wp.array[wp.int32],
+    first_child: wp.array[wp.int32],
+    # Out
+    leaves: wp.array[wp.int32],
+):
+    """The live leaf that holds a point, -1 for none, from the root that does, by barycentric coordinates alone.
+
+    With z halfway between x0 and xk, the point is in the first child if its coordinate at x0 is the larger one: there
+    z takes twice that at xk, and x0 what is left; in the second child the other way round.
+    """
+    i = wp.tid()
+    element = roots[i]
+    w = weights[i]
+    while first_child[element] >= 0:
+        k = 3 - level[element] % 3
+        child = first_child[element]
+        lower = w[0]
+        upper = w[k]
+        if lower >= upper:
+            w[0] = lower - upper
+            w[k] = wp.float64(2.0) * upper
+        else:
+            for n in range(3):
+                if n + 1 <= k:
+                    w[n] = w[n + 1]
+            w[k - 1] = upper - lower
+            w[k] = wp.float64(2.0) * lower
+            child += 1
+        element = child
+    leaves[i] = wp.where(first_child[element] == VOID, -1, element)
+
+
+@wp.kernel(enable_backward=False)
+def nearest_faces(
+    # In
+    points: wp.array[wp.vec3],
+    mesh: wp.uint64,
+    far: float,
+    # Out
+    faces: wp.array[wp.int32],
+):
+    """The triangle closest to each point, -1 where none is within ``far``."""
+    i = wp.tid()
+    found = wp.mesh_query_point_no_sign(mesh, points[i], far)
+    faces[i] = wp.where(found.result, found.face, -1)

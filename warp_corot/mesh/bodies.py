@@ -1,0 +1,114 @@
+"""What a forest made from a domain is as a body: its surfaces, what is bound to it, its pieces."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import InputError
+from ..indices import checked_indices
+from .bound import BoundPoints, SurfaceMesh
+from .marching import marched
+from .separating import separated
+from .surface import boundary_faces
+
+if TYPE_CHECKING:
+    from .forest import TetForest
+
+
+def surface(forest: TetForest) -> SurfaceMesh:
+    """See `TetForest.surface`."""
+    if forest.phi is None:
+        return _boundary(forest)
+    return _on_nodes(forest, marched(forest.lattice_points, _all_cut(forest), forest.phi))
+
+
+def separating_surface(forest: TetForest) -> SurfaceMesh:
+    """See `TetForest.separating_surface`."""
+    if forest.phi is None or forest.node_labels is None:
+        raise InputError("this mesh has no labels; they come from a domain that has")
+    return _on_nodes(forest, separated(forest.lattice_points, _all_cut(forest), forest.phi, forest.node_labels))
+
+
+def bind(forest: TetForest, points: np.ndarray, triangles: npt.ArrayLike | None) -> BoundPoints:
+    """See `TetForest.bind`."""
+    elements, weights = forest.embed(points)
+    nodes = forest.tets[elements]
+    rest = np.array(points, dtype=np.float64)
+    if triangles is None:
+        return BoundPoints(rest, nodes, weights)
+    faces = np.asarray(triangles)
+    if faces.ndim != 2 or faces.shape[1] != 3:
+        raise InputError(f"triangles has shape {faces.shape}; it must be [F, 3]")
+    checked_indices(faces.ravel(), len(rest), "point")
+    return SurfaceMesh(rest, nodes, weights, faces.astype(np.int32))
+
+
+def pieces(forest: TetForest) -> np.ndarray:
+    """Which piece of the mesh each leaf belongs to, int32 [T], numbered from the one with most leaves on.
+
+    Leaves of one piece hang together by nodes.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    tets, count = forest.tets, forest.node_count
+    rows, columns = np.repeat(tets[:, 0], 3), tets[:, 1:].ravel()
+    linked = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(count, count))
+    _, of_node = connected_components(linked, directed=False)
+    piece = of_node[tets[:, 0]]
+    rank = np.argsort(np.argsort(-np.bincount(piece), kind="stable"), kind="stable")
+    return rank[piece].astype(np.int32)
+
+
+def summary(forest: TetForest) -> list[str]:
+    """See `TetForest.summary`."""
+    x, y, z = forest.cells
+    count = len(forest.tets)
+    lines = [f"{count} tetrahedra, {forest.node_count} nodes, from {x} x {y} x {z} cubes of {forest.cell_size:g} m"]
+    for level, number in enumerate(np.bincount(forest.levels)):
+        if number:
+            lines.append(f"level {level}, type {level % 3}: {number}")
+    volume = float(np.sum(forest.volumes))
+    if forest.fill is not None:
+        inside = float(np.sum(forest.fill * forest.volumes))
+        cut = int((forest.fill != 1.0).sum())
+        lines.append(f"{inside:.6g} m^3 of body in {volume:.6g} m^3 of tetrahedra, {cut} of which are cut")
+    for number, name in enumerate(forest.label_names, start=1):
+        lines.append(f"label {name}: {int((forest.labels == number).sum())} tetrahedra")
+    sizes = np.bincount(pieces(forest))
+    if len(sizes) > 1:
+        shown = ", ".join(str(n) for n in sizes[:5]) + (", ..." if len(sizes) > 5 else "")
+        lines.append(f"{len(sizes)} separate pieces, of {shown} tetrahedra")
+    return lines
+
+
+def _all_cut(forest: TetForest) -> np.ndarray:
+    """Nodes of all leaves that hold something, also of those given up for holding too little, int32 [n, 4]."""
+    assert forest.phi is not None
+    tets = forest.tree.tets[forest.tree.first_child < 0]
+    return tets[(forest.phi[tets] < 0).any(axis=1)]
+
+
+def _on_nodes(forest: TetForest, found: SurfaceMesh) -> SurfaceMesh:
+    """The surface with points that are bound to no nodes of the mesh bound to the nearest element's."""
+    lost = np.flatnonzero(((found.nodes >= forest.node_count) & (found.weights != 0)).any(axis=1))
+    unused = found.nodes >= forest.node_count
+    nodes = np.where(unused, found.nodes.min(axis=1, keepdims=True), found.nodes)
+    weights = found.weights.copy()
+    if len(lost):
+        elements, weights[lost] = forest.embed(found.points[lost])
+        nodes[lost] = forest.tets[elements]
+    return replace(found, nodes=nodes.astype(np.int32), weights=weights)
+
+
+def _boundary(forest: TetForest) -> SurfaceMesh:
+    faces, _ = boundary_faces(forest.tets, forest.points)
+    used, triangles = np.unique(faces, return_inverse=True)
+    weights = np.zeros((len(used), 4))
+    weights[:, 0] = 1.0
+    nodes = np.repeat(used[:, None], 4, axis=1).astype(np.int32)
+    return SurfaceMesh(forest.points[used], nodes, weights, triangles.reshape(-1, 3).astype(np.int32))

@@ -1,0 +1,146 @@
+"""Elements that a surface cuts: how much of them is inside, and what becomes of those that hold next to nothing.
+
+Everything here is of the linear interpolant of the nodes' values. A node is inside where its value is negative; zero
+counts as outside, so that the surface lies in elements that hold something.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+Array = np.ndarray
+
+#: Node orders that put the inside nodes first, by which nodes are inside (bit n for node n).
+_FIRST_INSIDE = np.array([sorted(range(4), key=lambda n, code=code: not code >> n & 1) for code in range(16)])
+_COUNT = np.array([code.bit_count() for code in range(16)])
+
+
+def codes(inside: Array) -> Array:
+    """Which nodes of elements are inside, bool [n, 4], as a number from 0 to 15."""
+    return inside @ np.array([1, 2, 4, 8])
+
+
+def crossings(values: Array) -> Array:
+    """Where the surface crosses the edges of elements: t[n, i, j], as a share of the way from node i inside to node j
+    outside; meaningless for other pairs."""
+    from_, to = values[:, :, None], values[:, None, :]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where((from_ < 0) & (to >= 0), from_ / (from_ - to), 0.0)
+
+
+def shares(inside: Array, t: Array) -> Array:
+    """Share of each element's volume around its inside nodes.
+
+    Args:
+        inside: bool [n, 4].
+        t: ``crossings``, or any other places on the edges between inside and outside nodes.
+    """
+    code = codes(inside)
+    order = _FIRST_INSIDE[code]
+    rows = np.arange(len(code))
+
+    def at(i: int, j: int) -> Array:
+        return t[rows, order[:, i], order[:, j]]
+
+    one = at(0, 1) * at(0, 2) * at(0, 3)
+    # The wedge a-ac-ad, b-bc-bd in three tetrahedra.
+    ac, ad, bc, bd = at(0, 2), at(0, 3), at(1, 2), at(1, 3)
+    two = ac * ad + (1 - ad) * ac * bd + (1 - ac) * bc * bd
+    three = 1 - (1 - at(0, 3)) * (1 - at(1, 3)) * (1 - at(2, 3))
+    return np.select([_COUNT[code] == k for k in (1, 2, 3, 4)], [one, two, three, np.ones(len(code))], 0.0)
+
+
+def inside_shares(values: Array) -> Array:
+    """Share of each element's volume where the linear interpolant is negative, from its nodes' values [n, 4]."""
+    values = values.astype(np.float64)
+    found = (values < 0).all(axis=1).astype(np.float64)
+    cut = np.flatnonzero((values < 0).any(axis=1) & (values >= 0).any(axis=1))
+    found[cut] = shares(values[cut] < 0, crossings(values[cut]))
+    return found
+
+
+def label_shares(values: Array, labels: Array, count: int) -> Array:
+    """Share of each element's volume that each label takes, float64 [n, count + 1], the first column for no label.
+
+    Between nodes of two labels the border is halfway, on the surface where the interpolant is zero. Each label is cut
+    out by itself; where three meet those cuts leave a gap, which they share in proportion.
+
+    Args:
+        values: Signed function at the nodes [n, 4].
+        labels: int32 [n, 4].
+        count: How many labels there are.
+    """
+    inside = values < 0
+    t = crossings(values.astype(np.float64))
+    t[(inside[:, :, None] & inside[:, None, :])] = 0.5
+    found = np.zeros((len(values), count + 1))
+    for label in np.unique(labels[inside]):
+        found[:, label] = shares(inside & (labels == label), t)
+    total = found.sum(axis=1, keepdims=True)
+    whole = inside_shares(values)[:, None]
+    return np.divide(found * whole, total, out=np.zeros_like(found), where=total > 0)
+
+
+def merged(tets: Array, held: Array, small: Array) -> tuple[Array, Array]:
+    """Hand what small elements hold to a neighbour across a face, the one that holds most, and so on outwards.
+
+    Where small ones have no other neighbours than small ones, the one that holds most stays.
+
+    Args:
+        tets: int32 [n, 4].
+        held: Volume that each holds [n].
+        small: Which are to be given up, bool [n].
+
+    Returns:
+        Volumes after that, and which elements are given up.
+    """
+    held, small = held.copy(), small.copy()
+    pairs = _neighbours(tets, small)
+    goes_to = np.full(len(tets), -1)
+    waiting = small.copy()
+    while waiting.any():
+        # From each waiting element to settled neighbours; of several to the one that holds most.
+        usable = pairs[waiting[pairs[:, 0]] & ~waiting[pairs[:, 1]]]
+        if not len(usable):
+            waiting[_fullest_of_each_piece(pairs, waiting, held)] = False
+            continue
+        usable = usable[np.lexsort((usable[:, 1], held[usable[:, 1]]))]
+        goes_to[usable[:, 0]] = usable[:, 1]
+        waiting[usable[:, 0]] = False
+    given_up = goes_to >= 0
+    target = goes_to.copy()
+    while (on := given_up & given_up[np.maximum(target, 0)]).any():
+        target[on] = goes_to[target[on]]
+    np.add.at(held, target[given_up], held[given_up])
+    held[given_up] = 0.0
+    return held, given_up
+
+
+def _neighbours(tets: Array, small: Array) -> Array:
+    """Pairs of a small element and another across a face [m, 2]."""
+    touched = np.zeros(int(tets.max()) + 1, bool)
+    touched[tets[small]] = True
+    near = np.flatnonzero(touched[tets].sum(axis=1) >= 3)
+    faces = np.concatenate([np.sort(tets[near][:, list(f)], axis=1) for f in itertools.combinations(range(4), 3)])
+    owner = np.tile(near, 4)
+    order = np.lexsort(faces.T)
+    same = (faces[order[1:]] == faces[order[:-1]]).all(axis=1)
+    pairs = np.stack([owner[order[:-1][same]], owner[order[1:][same]]], axis=1)
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    return both[small[both[:, 0]]]
+
+
+def _fullest_of_each_piece(pairs: Array, waiting: Array, held: Array) -> Array:
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    linked = pairs[waiting[pairs].all(axis=1)]
+    n = len(waiting)
+    _, piece = connected_components(coo_array((np.ones(len(linked)), linked.T), shape=(n, n)), directed=False)
+    left = np.flatnonzero(waiting)
+    left = left[np.argsort(held[left], kind="stable")]
+    fullest = np.full(n, -1)
+    fullest[piece[left]] = left
+    return fullest[fullest >= 0]

@@ -1,0 +1,88 @@
+"""Points in a forest: which element holds each, found by walking down the tree."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from ..errors import InputError
+from ..kernels import embedding as kernels
+from .surface import boundary_faces
+
+if TYPE_CHECKING:
+    from .forest import TetForest
+
+#: The walk from one corner of a cube to the opposite one, by the axes in descending order of a point's coordinates.
+_WALKS = np.array([[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]])
+
+
+def embed(forest: TetForest, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """See `TetForest.embed`."""
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"points has shape {points.shape}; it must be [n, 3]")
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(bad):
+        raise InputError(f"point {bad[0]} is {points[bad[0]].tolist()}; its coordinates must be finite")
+    elements = _descended(forest, points)
+    outside = np.flatnonzero(elements < 0)
+    if len(outside):
+        elements[outside] = _nearest(forest, points[outside])
+    return elements, barycentric(forest, elements, points)
+
+
+def barycentric(forest: TetForest, elements: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates of points in leaves, float64 [n, 4]; outside of them some are negative."""
+    x = forest.points[forest.tets[elements]]
+    edges = np.swapaxes(x[:, 1:] - x[:, :1], 1, 2)
+    later = np.linalg.solve(edges, (points - x[:, 0])[..., None])[..., 0]
+    return np.column_stack([1 - later.sum(axis=1), later])
+
+
+def _descended(forest: TetForest, points: np.ndarray) -> np.ndarray:
+    """The live leaf that holds each point, int32 [n], -1 where none does."""
+    cells = np.array(forest.cells)
+    scaled = (points - np.asarray(forest.origin)) / forest.cell_size
+    within = np.flatnonzero(((scaled >= 0) & (scaled <= cells)).all(axis=1))
+    found = np.full(len(points), -1, np.int32)
+    if not len(within):
+        return found
+    scaled = scaled[within]
+    cube = np.minimum(scaled.astype(np.int64), cells - 1)
+    rest = scaled - cube
+    order = np.argsort(-rest, axis=1, kind="stable")
+    walk = np.argmax((order[:, None] == _WALKS).all(axis=2), axis=1)
+    down = np.take_along_axis(rest, order, axis=1)
+    weights = np.column_stack([1 - down[:, 0], down[:, 0] - down[:, 1], down[:, 1] - down[:, 2], down[:, 2]])
+    roots = 6 * np.ravel_multi_index(tuple(cube.T), forest.cells) + walk
+    tree, device = forest.tree, wp.get_device("cpu")
+    inputs = [
+        wp.array(roots, dtype=wp.int32, device=device),
+        wp.array(weights, dtype=wp.vec4d, device=device),
+        wp.array(tree.level, dtype=wp.int32, device=device),
+        wp.array(tree.first_child, dtype=wp.int32, device=device),
+    ]
+    leaves = wp.empty(len(within), dtype=wp.int32, device=device)
+    wp.launch(kernels.descend, len(within), inputs, [leaves], device=device)
+    number = np.full(len(tree.level) + 1, -1, np.int32)
+    number[tree.leaves] = np.arange(len(tree.leaves), dtype=np.int32)
+    found[within] = number[leaves.numpy()]
+    return found
+
+
+def _nearest(forest: TetForest, points: np.ndarray) -> np.ndarray:
+    """The element behind the boundary face that is closest to each point, int32 [n]."""
+    faces, parents = boundary_faces(forest.tets, forest.points)
+    device = wp.get_device("cpu")
+    # About the middle of the mesh, as float32 keeps few digits far from zero.
+    middle = forest.points.mean(axis=0)
+    mesh = wp.Mesh(
+        wp.array(forest.points - middle, dtype=wp.vec3, device=device),
+        wp.array(faces.ravel(), dtype=wp.int32, device=device),
+    )
+    moved = wp.array(points - middle, dtype=wp.vec3, device=device)
+    closest = wp.empty(len(points), dtype=wp.int32, device=device)
+    wp.launch(kernels.nearest_faces, len(points), [moved, mesh.id, 1.0e15], [closest], device=device)
+    return parents[closest.numpy()]
