@@ -71,6 +71,7 @@ class Layout:
         parts: Into how many parts the leaves of a subtree are dealt: 1, 2 or 4.
         subtrees: Room for subtrees, whole warps of them.
         nodes: Room for nodes.
+        tasks: Sums that make up the nodes' forces, whole warps of them; see ``TASK_SLOTS``.
     """
 
     shape: int
@@ -79,14 +80,16 @@ class Layout:
     parts: int
     subtrees: int
     nodes: int
+    tasks: int = 0
 
     @property
     def threads(self) -> int:
         """Threads a block: warp after warp of subtrees, the parts of a subtree in neighbouring warps.
 
-        A multiprocessor's four schedulers take warps in turn, so each goes through the code of one part only.
+        A multiprocessor's four schedulers take warps in turn, so each goes through the code of one part only. Where a
+        world is to be done soon there are as many threads as tasks.
         """
-        return self.parts * self.subtrees
+        return max(self.parts * self.subtrees, self.tasks if self.parts > 1 else 0)
 
     @property
     def fits(self) -> bool:
@@ -186,10 +189,9 @@ class BlockBody:
     subtree_count: int
     node_count: int
     element_count: int
-    task_count: int  # whole warps of them
-    tasks: wp.array[wp.int32]  # [task_count] see ``FOLLOWING_SHIFT``
+    tasks: wp.array[wp.int32]  # [tasks] see ``FOLLOWING_SHIFT``
     nodes: wp.array2d[wp.uint64]  # [3, subtree_count] the ten nodes of each subtree, four to a word, in bytes
-    slots: wp.array2d[wp.uint64]  # [2, task_count] four slots each, the zero one past the last, in bytes
+    slots: wp.array2d[wp.uint64]  # [2, tasks] four slots each, the zero one past the last, in bytes
 
 
 @functools.cache
@@ -315,6 +317,10 @@ def step_block(layout: Layout) -> wp.Kernel:
         words = vec3u()
         for word in range(wp.static(NODE_WORDS)):
             words[word] = body.nodes[word, mine]
+        task = wp.min(thread, wp.static(layout.tasks - 1))
+        about = body.tasks[task]
+        numbers0 = body.slots[0, task]
+        numbers1 = body.slots[1, task]
         step = int(0)
         while step < steps:
             if s < body.subtree_count:
@@ -342,13 +348,16 @@ def step_block(layout: Layout) -> wp.Kernel:
                     repair(body, s, part, material, mu, lam, stride)
             synchronize_block()
             task = thread
-            while task < body.task_count:
-                about = body.tasks[task]
+            while task < wp.static(layout.tasks):
+                if wp.static(layout.tasks > threads):
+                    about = body.tasks[task]
+                    numbers0 = body.slots[0, task]
+                    numbers1 = body.slots[1, task]
                 force = wp.vec3()
-                for word in range(wp.static(TASK_SLOTS // NUMBERS)):
-                    numbers = body.slots[word, task]
-                    for k in range(wp.static(NUMBERS)):
-                        force += slot(wp.static(LOAD_BYTES), number_in(numbers, k), force)
+                for k in range(wp.static(NUMBERS)):
+                    force += slot(wp.static(LOAD_BYTES), number_in(numbers0, k), force)
+                for k in range(wp.static(NUMBERS)):
+                    force += slot(wp.static(LOAD_BYTES), number_in(numbers1, k), force)
                 following = (about >> wp.static(FOLLOWING_SHIFT)) & 255
                 distance = int(1)
                 while distance < wp.static(NEIGHBOURS):

@@ -157,7 +157,7 @@ def reset_nodes(
 ):
     """Put the nodes of chosen worlds back to their initial state, or to rest where there is none.
 
-    Held nodes keep the velocity they were given where there is no initial state.
+    Held nodes keep the velocity they were given.
     """
     i = wp.tid()
     world = i // world_node_count
@@ -166,11 +166,12 @@ def reset_nodes(
     if i % world_node_count == 0:
         world_starts[world] = clock[0]
     displacement = wp.vec3()
+    velocity = wp.vec3()
     if has_initial != 0:
         displacement = load_node(initial_u, i)
-        store_node(v, i, load_node(initial_v, i))
-    elif inverse_mass[i] > 0.0:
-        store_node(v, i, wp.vec3())
+        velocity = load_node(initial_v, i)
+    if inverse_mass[i] > 0.0:
+        store_node(v, i, velocity)
     store_node(u, i, displacement)
     store_node(positions, i, load_node(rest, i) + displacement)
     store_node(reactions, i, wp.vec3())

@@ -172,7 +172,6 @@ def test_resets_are_recorded_with_the_steps(device):
     assert_same(device, states(recorded.body), states(other.body))
 
 
-@pytest.mark.xfail(strict=True, reason="a reset gives held nodes the velocities of the initial state")
 def test_nodes_that_are_held_since_the_initial_state_stay_held(device):
     body = beam(device)
     body.velocities = np.full((body.node_count, 3), 0.1) * ~body.constrained[:, None]

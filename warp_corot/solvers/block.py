@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +28,7 @@ class BlockSteps:
     def __init__(self, body: SoftBody, batch: Batch, layout: block.Layout, slots: list[list[int]]):
         self.body = body
         tasks, numbers = _tasks(layout, slots)
+        layout = dataclasses.replace(layout, tasks=len(tasks))
         device = body.device
         of_block = block.BlockBody()
         of_block.subtrees = batch.subtrees
@@ -35,7 +37,6 @@ class BlockSteps:
         of_block.subtree_count = batch.count
         of_block.node_count = body.world_node_count
         of_block.element_count = len(body.mesh.tets)
-        of_block.task_count = len(tasks)
         of_block.tasks = wp.array(tasks, dtype=wp.int32, device=device)
         of_block.nodes = wp.array(_packed(batch.subtrees.nodes.numpy().T), dtype=wp.uint64, device=device)
         of_block.slots = wp.array(numbers, dtype=wp.uint64, device=device)
