@@ -333,3 +333,75 @@ def symplectic_euler(model, mesh, x, v, mu, lam, masses, dt, steps, *, gravity=(
             v[fixed] = 0.0
         x = x + dt * v
     return x, v
+
+
+# --- anisotropic materials --------------------------------------------------------------------------------------------
+
+VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+
+
+def compliance(young, poisson, shear):
+    """6x6 compliance in the order of VOIGT, engineering shears, of E_1 E_2 E_3, nu_12 nu_13 nu_23, G_12 G_13 G_23."""
+    (e1, e2, _), (n12, n13, n23), (g12, g13, g23) = young, poisson, shear
+    S = np.diag(1 / np.array([*young, g23, g13, g12]))
+    S[0, 1] = S[1, 0] = -n12 / e1
+    S[0, 2] = S[2, 0] = -n13 / e1
+    S[1, 2] = S[2, 1] = -n23 / e2
+    return S
+
+
+def transverse(young_along, young_across, poisson_along, poisson_across, shear_along):
+    """The nine constants of ``compliance`` with fibres along axis 1."""
+    across = young_across / (2 * (1 + poisson_across))
+    ratios = (poisson_along, poisson_along, poisson_across)
+    return (young_along, young_across, young_across), ratios, (shear_along, shear_along, across)
+
+
+def elasticity(young, poisson, shear, axes=IDENTITY):
+    """C [3, 3, 3, 3] (Pa) in rest space of a material whose axes 1, 2, 3 are the rows of ``axes``."""
+    matrix = np.linalg.inv(compliance(young, poisson, shear))
+    C = np.zeros((3, 3, 3, 3))
+    for p, (i, j) in enumerate(VOIGT):
+        for q, (k, m) in enumerate(VOIGT):
+            C[i, j, k, m] = C[j, i, k, m] = C[i, j, m, k] = C[j, i, m, k] = matrix[p, q]
+    return np.einsum("abcd,ai,bj,ck,dm->ijkm", C, axes, axes, axes, axes)
+
+
+def nearest_isotropic(C):
+    """mu and lambda [...] of Voigt's average of C [..., 3, 3, 3, 3] over all directions."""
+    dilation, shear = np.einsum("...iijj->...", C), np.einsum("...ijij->...", C)
+    mu = (3 * shear - dilation) / 30
+    return mu, dilation / 9 - 2 / 3 * mu
+
+
+def anisotropic_energy(F, C):
+    """psi = 1/2 e:C:e, e = sym(R^T F) - I; near F without a definite rotation it goes over to the nearest isotropic.
+
+    With principal stretches s (the last negative in an inverted F) and x = (s1 + s2)(s2 + s3)(s3 + s1) / |s|^3, below
+    x = 0.1 it is psi_iso + b (psi - psi_iso), b = 3 y^2 - 2 y^3 of y = 10 x.
+    """
+    strain = _transpose(polar(F)) @ F
+    strain = 0.5 * (strain + _transpose(strain)) - IDENTITY
+    psi = 0.5 * np.einsum("...ij,...ijkl,...kl->...", strain, C, strain)
+    isotropic, _ = hooke(strain, *nearest_isotropic(C))
+    s = np.linalg.svd(F, compute_uv=False)
+    s[..., 2] *= np.sign(np.linalg.det(F))
+    x = np.prod(s + np.roll(s, 1, axis=-1), axis=-1) / np.linalg.norm(s, axis=-1) ** 3
+    y = np.clip(10 * x, 0, 1)
+    return isotropic + (3 * y**2 - 2 * y**3) * (psi - isotropic)
+
+
+def anisotropic(F, C, _=None):
+    """psi and its derivative P, by central differences of fourth order."""
+    P = np.empty_like(F)
+    for i, J in np.ndindex(3, 3):
+        step = np.zeros((3, 3))
+        step[i, J] = 1e-3
+        near, far = (anisotropic_energy(F + k * step, C) - anisotropic_energy(F - k * step, C) for k in (1, 2))
+        P[:, i, J] = (8 * near - far) / 12e-3
+    return anisotropic_energy(F, C), P
+
+
+def active(F, stress, direction):
+    """P = s (F d) d^T [T, 3, 3] (Pa)."""
+    return _times(stress, np.einsum("tiJ,tJ,tK->tiK", F, direction, direction))

@@ -43,15 +43,15 @@ class Anisotropic(Material):
         r12, r13, r23 = _symmetric_ratios(young, poisson)
         det = _determinant(r12, r13, r23)
         e1, e2, e3 = (np.sqrt(young[..., i]) for i in range(3))
-        normal = [
+        return _stacked(
             e1**2 * (1 - r23**2) / det,
             e2**2 * (1 - r13**2) / det,
             e3**2 * (1 - r12**2) / det,
             e1 * e2 * (r12 + r13 * r23) / det,
             e1 * e3 * (r13 + r12 * r23) / det,
             e2 * e3 * (r23 + r12 * r13) / det,
-        ]
-        return np.concatenate([np.stack(np.broadcast_arrays(*normal), axis=-1), shear], axis=-1)
+            *(shear[..., i] for i in range(3)),
+        )
 
     @property
     def isotropic(self) -> Isotropic:
@@ -126,9 +126,9 @@ class TransverselyIsotropic(Anisotropic):
     def constants(self) -> tuple[Array, Array, Array]:
         transverse = self.young_across / (2.0 * (1.0 + self.poisson_across))
         return (
-            _triple(self.young_along, self.young_across, self.young_across),
-            _triple(self.poisson_along, self.poisson_along, self.poisson_across),
-            _triple(self.shear_along, self.shear_along, transverse),
+            _stacked(self.young_along, self.young_across, self.young_across),
+            _stacked(self.poisson_along, self.poisson_along, self.poisson_across),
+            _stacked(self.shear_along, self.shear_along, transverse),
         )
 
     def _margin(self) -> Array:
@@ -197,7 +197,7 @@ class Orthotropic(Anisotropic):
         return np.stack([first, second, np.cross(first, second)], axis=-1)
 
 
-def _triple(*values: npt.ArrayLike) -> Array:
+def _stacked(*values: npt.ArrayLike) -> Array:
     return np.stack(np.broadcast_arrays(*(np.asarray(v, dtype=np.float64) for v in values)), axis=-1)
 
 
