@@ -141,10 +141,16 @@ def activate(
     # In
     slots: wp.array[wp.int32],
     values: wp.array[wp.int32],
+    ends: wp.array[wp.vec2i],
     # Out
     active: wp.array[wp.uint8],
+    touched: wp.array[wp.uint8],
 ):
-    active[values[slots[wp.tid()]]] = wp.uint8(1)
+    """Make midpoints active, and touch both ends of the edges of which they are."""
+    node = values[slots[wp.tid()]]
+    active[node] = wp.uint8(1)
+    touched[ends[node][0]] = wp.uint8(1)
+    touched[ends[node][1]] = wp.uint8(1)
 
 
 @wp.kernel(enable_backward=False)
@@ -207,10 +213,16 @@ def flag_hanging(
     keys: wp.array[wp.int64],
     values: wp.array[wp.int32],
     active: wp.array[wp.uint8],
+    touched: wp.array[wp.uint8],
+    first_new: int,
     # Out
     flags: wp.array[wp.int32],
 ):
-    """Leaves that are wished to be bisected or have an active midpoint on an edge. Void ones only where bound to."""
+    """Leaves that are wished to be bisected or have an active midpoint on an edge. Void ones only where bound to.
+
+    Only elements from ``first_new`` on, and those that share an edge that was bisected of late, of which both ends are
+    touched, need to be looked at closely.
+    """
     i = wp.tid()
     flag = int(0)
     if first_child[i] == LIVE or (first_child[i] == VOID and bound[i] != wp.uint8(0)):
@@ -218,12 +230,13 @@ def flag_hanging(
             flag = 1
         else:
             tet = tets[i]
-            for a in range(3):
-                for b in range(a + 1, 4):
-                    if flag == 0:
-                        node = find_midpoint(tet[a], tet[b], keys, values)
-                        if node >= 0:
-                            flag = int(active[node])
+            for e in range(6):
+                a = tet[FIRST_NODE[e]]
+                b = tet[SECOND_NODE[e]]
+                if flag == 0 and (i >= first_new or int(touched[a]) * int(touched[b]) == 1):
+                    node = find_midpoint(a, b, keys, values)
+                    if node >= 0:
+                        flag = int(active[node])
     flags[i] = flag
 
 

@@ -75,7 +75,7 @@ def summary(forest: TetForest) -> list[str]:
     volume = float(np.sum(forest.volumes))
     if forest.fill is not None:
         inside = float(np.sum(forest.fill * forest.volumes))
-        cut = int((forest.fill != 1.0).sum())
+        cut = np.count_nonzero(forest.fill != 1.0)
         lines.append(f"{inside:.6g} m^3 of body in {volume:.6g} m^3 of tetrahedra, {cut} of which are cut")
     for number, name in enumerate(forest.label_names, start=1):
         lines.append(f"label {name}: {int((forest.labels == number).sum())} tetrahedra")

@@ -7,13 +7,14 @@ counts as outside, so that the surface lies in elements that hold something.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 
 Array = np.ndarray
 
-#: Node orders that put the inside nodes first, by which nodes are inside (bit n for node n).
-_FIRST_INSIDE = np.array([sorted(range(4), key=lambda n, code=code: not code >> n & 1) for code in range(16)])
+#: Node orders that put the inside nodes first, by which nodes are inside (bit n for node n), and how many those are.
+_INSIDE_FIRST = np.array([sorted(range(4), key=lambda n: 1 - (code >> n & 1)) for code in range(16)])
 _COUNT = np.array([code.bit_count() for code in range(16)])
 
 
@@ -22,50 +23,56 @@ def codes(inside: Array) -> Array:
     return inside @ np.array([1, 2, 4, 8])
 
 
-def crossings(values: Array) -> Array:
-    """Where the surface crosses the edges of elements: t[n, i, j], as a share of the way from node i inside to node j
-    outside; meaningless for other pairs."""
-    from_, to = values[:, :, None], values[:, None, :]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where((from_ < 0) & (to >= 0), from_ / (from_ - to), 0.0)
-
-
-def shares(inside: Array, t: Array) -> Array:
-    """Share of each element's volume around its inside nodes.
+def shares(inside: Array, crossing: Callable[[Array, Array], Array]) -> Array:
+    """Share of each element's volume around its inside nodes, float64 [n].
 
     Args:
         inside: bool [n, 4].
-        t: ``crossings``, or any other places on the edges between inside and outside nodes.
+        crossing: Of a node inside and one outside of each element, int [n] each: where on the edge between them the
+            border is, as a share of the way from the inside, [n].
     """
     code = codes(inside)
-    order = _FIRST_INSIDE[code]
-    rows = np.arange(len(code))
+    found = (code == 15).astype(np.float64)
+    for count, share in ((1, _share_of_one), (2, _share_of_two), (3, _share_of_three)):
+        chosen = np.flatnonzero(_COUNT[code] == count)
+        nodes = _INSIDE_FIRST[code[chosen]]
 
-    def at(i: int, j: int) -> Array:
-        return t[rows, order[:, i], order[:, j]]
+        def at(i: int, j: int, chosen: Array = chosen, nodes: Array = nodes) -> Array:
+            return crossing(chosen, nodes[:, [i, j]])
 
-    one = at(0, 1) * at(0, 2) * at(0, 3)
-    # The wedge a-ac-ad, b-bc-bd in three tetrahedra.
-    ac, ad, bc, bd = at(0, 2), at(0, 3), at(1, 2), at(1, 3)
-    two = ac * ad + (1 - ad) * ac * bd + (1 - ac) * bc * bd
-    three = 1 - (1 - at(0, 3)) * (1 - at(1, 3)) * (1 - at(2, 3))
-    return np.select([_COUNT[code] == k for k in (1, 2, 3, 4)], [one, two, three, np.ones(len(code))], 0.0)
+        found[chosen] = share(at)
+    return found
+
+
+def _share_of_one(t: Callable[[int, int], Array]) -> Array:
+    return t(0, 1) * t(0, 2) * t(0, 3)
+
+
+def _share_of_two(t: Callable[[int, int], Array]) -> Array:
+    """The wedge from a-ac-ad to b-bc-bd, in three tetrahedra."""
+    ac, ad, bc, bd = t(0, 2), t(0, 3), t(1, 2), t(1, 3)
+    return ac * ad + (1 - ad) * ac * bd + (1 - ac) * bc * bd
+
+
+def _share_of_three(t: Callable[[int, int], Array]) -> Array:
+    return 1 - (1 - t(0, 3)) * (1 - t(1, 3)) * (1 - t(2, 3))
 
 
 def inside_shares(values: Array) -> Array:
     """Share of each element's volume where the linear interpolant is negative, from its nodes' values [n, 4]."""
-    values = values.astype(np.float64)
-    found = (values < 0).all(axis=1).astype(np.float64)
-    cut = np.flatnonzero((values < 0).any(axis=1) & (values >= 0).any(axis=1))
-    found[cut] = shares(values[cut] < 0, crossings(values[cut]))
-    return found
+
+    def crossing(elements: Array, ends: Array) -> Array:
+        inner, outer = values[elements[:, None], ends].T.astype(np.float64)
+        return inner / (inner - outer)
+
+    return shares(values < 0, crossing)
 
 
 def label_shares(values: Array, labels: Array, count: int) -> Array:
     """Share of each element's volume that each label takes, float64 [n, count + 1], the first column for no label.
 
-    Between nodes of two labels the border is halfway, on the surface where the interpolant is zero. Each label is cut
-    out by itself; where three meet those cuts leave a gap, which they share in proportion.
+    Between nodes of two labels the border is halfway, towards the outside it is where the interpolant is zero. Each
+    label is cut out by itself; where three meet those cuts leave a gap, which they share in proportion.
 
     Args:
         values: Signed function at the nodes [n, 4].
@@ -73,14 +80,16 @@ def label_shares(values: Array, labels: Array, count: int) -> Array:
         count: How many labels there are.
     """
     inside = values < 0
-    t = crossings(values.astype(np.float64))
-    t[(inside[:, :, None] & inside[:, None, :])] = 0.5
+
+    def crossing(elements: Array, ends: Array) -> Array:
+        own, other = values[elements[:, None], ends].T.astype(np.float64)
+        return np.divide(own, own - other, out=np.full(len(own), 0.5), where=other >= 0)
+
     found = np.zeros((len(values), count + 1))
     for label in np.unique(labels[inside]):
-        found[:, label] = shares(inside & (labels == label), t)
+        found[:, label] = shares(inside & (labels == label), crossing)
     total = found.sum(axis=1, keepdims=True)
-    whole = inside_shares(values)[:, None]
-    return np.divide(found * whole, total, out=np.zeros_like(found), where=total > 0)
+    return np.divide(found * inside_shares(values)[:, None], total, out=np.zeros_like(found), where=total > 0)
 
 
 def merged(tets: Array, held: Array, small: Array) -> tuple[Array, Array]:

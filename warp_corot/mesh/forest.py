@@ -288,7 +288,7 @@ class TetForest:
         """
         if label not in self.label_names or self.labels is None:
             raise InputError(f"there is no label {label!r}; there are: {', '.join(self.label_names) or 'none'}")
-        return self.labels == self.label_names.index(label) + 1
+        return np.equal(self.labels, self.label_names.index(label) + 1)
 
     def nodes_of(self, label: str) -> np.ndarray:
         """Nodes of the leaves whose label this is, bool [N]; nodes on a border belong to both sides.

@@ -42,6 +42,7 @@ class Growth:
         self.lattice = self._on_device(lattice, wp.vec3i)
         self.ends = self._on_device(ends, wp.vec2i)
         self.active = self._on_device(ends[:, 0] >= 0, wp.uint8)
+        self.touched = wp.zeros(self.node_count, dtype=wp.uint8, device=device)
         self._counter = self._on_device([self.node_count], wp.int32)
         self._make_table()
 
@@ -57,7 +58,7 @@ class Growth:
             return
         self._check_levels(elements)
         slots = self.insert_edges(elements, of_refinement=True)
-        self._launch(kernels.activate, len(slots), [slots, self._values], [self.active])
+        self._launch(kernels.activate, len(slots), [slots, self._values, self.ends], [self.active, self.touched])
         base, count = self.element_count, self.element_count + 2 * len(elements)
         for name in ("tets", "level", "parent", "first_child", "wished", "bound"):
             self._make_room(name, count)
@@ -90,11 +91,15 @@ class Growth:
         """What kernels need to read the midpoints of slots."""
         return [slots, self._values]
 
-    def hanging(self) -> wp.array:
-        """Leaves that must be bisected: wished, or with an active midpoint on an edge; ascending."""
+    def hanging(self, first_new: int = 0) -> wp.array:
+        """Leaves that must be bisected: wished, or with an active midpoint on an edge; ascending.
+
+        Of those before ``first_new`` only such as got an active midpoint since this was last asked.
+        """
         flags = wp.empty(self.element_count, dtype=wp.int32, device=self.device)
         inputs = [self.tets, self.first_child, self.wished, self.bound, self._keys, self._values, self.active]
-        self._launch(kernels.flag_hanging, self.element_count, inputs, [flags])
+        self._launch(kernels.flag_hanging, self.element_count, [*inputs, self.touched, first_new], [flags])
+        self.touched.zero_()
         return self.flagged(flags)
 
     def flagged(self, flags: wp.array, first: int = 0) -> wp.array:
@@ -113,7 +118,8 @@ class Growth:
         Args:
             judge: Called with the number of the first new element after each round; it may wish for more.
         """
-        while len(broken := self.hanging()):
+        first = 0
+        while len(broken := self.hanging(first)):
             first = self.element_count
             self.bisect(broken)
             if judge is not None:
@@ -134,7 +140,7 @@ class Growth:
     def _reserve_nodes(self, more: int) -> bool:
         """Room for more nodes; whether the table's slots are other ones now."""
         count = self.node_count + more
-        for name in ("lattice", "ends", "active"):
+        for name in ("lattice", "ends", "active", "touched"):
             self._make_room(name, count)
         if ROOM * count <= len(self._keys):
             return False

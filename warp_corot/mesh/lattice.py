@@ -7,7 +7,7 @@ LATTICE_BITS = 16
 MAX_LEVEL = 3 * LATTICE_BITS
 
 
-def volume_shares(level: np.ndarray) -> np.ndarray:
+def volume_shares(level: np.ndarray | int) -> np.ndarray:
     """Volume of tetrahedra of these levels over that of a root cube."""
     all_levels = np.arange(MAX_LEVEL + 1)
     return (0.125 ** (all_levels // 3) / np.array([6.0, 12.0, 24.0])[all_levels % 3])[level]
