@@ -68,7 +68,7 @@ class Layout:
         shape: Type of its subtrees.
         shared: Whether leaves use their subtree root's rotation; otherwise their own.
         uniform: Whether all of a world is of one material.
-        parts: Into how many parts the leaves of a subtree are dealt: 1, 2 or 4.
+        parts: Into how many parts the leaves of a subtree are dealt: 1 or 2 (4 was slower).
         subtrees: Room for subtrees, whole warps of them.
         nodes: Room for nodes.
         tasks: Sums that make up the nodes' forces, whole warps of them; see ``TASK_SLOTS``.

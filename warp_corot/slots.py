@@ -10,7 +10,12 @@ import numpy.typing as npt
 import warp as wp
 
 from .elements import in_worlds
+from .errors import InputError
 from .kernels.reproducible import gather_slots
+
+
+#: Slots are numbered in 32 bits.
+MOST_SLOTS = 2**31 - 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +46,16 @@ class Slots:
 
         Returns:
             The slots, and for each kind their numbers in the same places, int32 [n, m], of one world.
+
+        Raises:
+            InputError: More slots than can be numbered.
         """
         flat = np.concatenate([nodes.ravel() for nodes in units])
+        if worlds * len(flat) > MOST_SLOTS:
+            raise InputError(
+                f"a deterministic run of this body needs {worlds * len(flat)} slots for forces; "
+                f"there can be {MOST_SLOTS} at most"
+            )
         there = np.flatnonzero(flat >= 0)
         order = there[np.argsort(flat[there], kind="stable")]
         ends = np.cumsum(np.bincount(flat[there], minlength=node_count))

@@ -100,10 +100,10 @@ def _is_uniform(body: SoftBody) -> bool:
 def _layouts(body: SoftBody, shape: int, shared: bool, subtrees: int) -> list[block.Layout]:
     """The ways to deal a body out, the fastest first.
 
-    A world is soonest done with the leaves of a subtree dealt to several threads; where there are more worlds than
+    A world is soonest done with the leaves of a subtree dealt to two threads; where there are more worlds than
     multiprocessors, whole subtrees take less work.
     """
-    parts = (4, 2, 1) if body.worlds <= body.device.sm_count else (1,)
+    parts = (2, 1) if body.worlds <= body.device.sm_count else (1,)
     capacity = -(-subtrees // block.WARP) * block.WARP
     uniform = _is_uniform(body)
     return [block.Layout(shape, shared, uniform, count, capacity, body.world_node_count) for count in parts]
