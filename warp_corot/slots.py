@@ -13,7 +13,6 @@ from .elements import in_worlds
 from .errors import InputError
 from .kernels.reproducible import gather_slots
 
-
 #: Slots are numbered in 32 bits.
 MOST_SLOTS = 2**31 - 1
 
