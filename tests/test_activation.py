@@ -78,8 +78,8 @@ def test_von_mises_stress(device, rng):
 
 
 def test_stable_step(device):
-    """Found about the rest shape with the activation that there is: a weak one makes no difference, one that adds fifteen
-    times Young's modulus along the fibres makes the step some three times shorter."""
+    """Found about the rest shape with the activation that there is: a weak one makes no difference, one that
+    adds fifteen times Young's modulus along the fibres makes the step some three times shorter."""
     steps = []
     for stress in (0.0, 10.0, 15 * E_ALONG):
         body = wc.SoftBody(MESHES["level 4"](), muscle([0, 0, 1]), device=device)
