@@ -18,6 +18,8 @@ WELD = 1.0e-6
 LARGEST_HOLES = 1.0 / 3.0
 #: A body thinner than this share of its size is no body.
 THINNEST = 1.0e-5
+#: About how many corners of a part are looked at to see whether it lies within another.
+CORNERS = 16
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,8 @@ def close_surface(points: np.ndarray, triangles: np.ndarray) -> ClosedSurface:
     size = float(np.ptp(points[closed.ravel()], axis=0).max())
     if not volume > 0.5 * THINNEST * size * area:
         raise InputError(
-            f"the surface has zero thickness: it encloses {max(volume, 0.0) / size**3:.2g} of the cube of its length"
+            f"the surface encloses no volume ({volume / size**3:.2g} of its length cubed): it has zero thickness, "
+            f"or as much of it is inside out as not"
         )
     pieces = int(all_parts.max()) + 1 - cavities
     return ClosedSurface(
@@ -277,15 +280,22 @@ def wind_outwards(points: np.ndarray, triangles: np.ndarray, parts: np.ndarray) 
     inward = volumes * np.where(flip, -1.0, 1.0) < 0.0
     cavities = 0
     for part in np.flatnonzero(inward):
-        corner = points[triangles[np.argmax(parts == part), 0]]
-        around = np.abs(windings_by_part(points, triangles, parts, corner)) > 0.5
-        around[part] = False
-        if around.any():
+        mine = np.flatnonzero(parts == part)
+        corners = points[triangles[mine[:: max(1, len(mine) // CORNERS)], 0]]
+        if all(_is_within_another(points, triangles, parts, part, corner) for corner in corners):
             cavities += 1
         else:
             flip[part] = not flip[part]
     turned = flip[parts]
     return np.where(turned[:, None], triangles[:, ::-1], triangles), int(flip.sum()), cavities
+
+
+def _is_within_another(
+    points: np.ndarray, triangles: np.ndarray, parts: np.ndarray, part: int, corner: np.ndarray
+) -> bool:
+    around = np.abs(windings_by_part(points, triangles, parts, corner)) > 0.5
+    around[part] = False
+    return bool(around.any())
 
 
 def part_volumes(points: np.ndarray, triangles: np.ndarray, parts: np.ndarray) -> np.ndarray:

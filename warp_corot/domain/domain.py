@@ -208,7 +208,7 @@ class Domain:
 
         phi is, at voxel centres, the Euclidean distance to the nearest centre on the other side less half a step, and
         trilinear between them: the surface lies halfway between neighbours inside and outside. Beyond the volume is
-        outside.
+        outside; more than two voxels outside the body's box, phi is a lower bound of the distance.
 
         Args:
             volume: Whole numbers [nx, ny, nz], or a file: .nii, .nii.gz (nibabel), .mha, .mhd, .nrrd (SimpleITK),

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 #: Voxels of background around the body: the interpolant is positive beyond.
 MARGIN = 2
+#: Smoothing beyond this share of the body's length takes more than the steps of voxels off.
+LARGEST_SMOOTHING = 0.1
 #: Voxel axes whose directions' inner products are below this are at right angles.
 SQUARE = 1.0e-4
 #: Labels are kept in 16 bits.
@@ -62,6 +64,12 @@ class LabelDomain(Domain):
         **options: Any,
     ):
         box = _extent(numbers > 0)
+        longest = float((np.ptp(box, axis=0) * np.linalg.norm(affine[:3, :3], axis=0)).max())
+        if smoothing > LARGEST_SMOOTHING * longest:
+            raise InputError(
+                f"smoothing is {length(smoothing)} and the body {length(longest)} long; it must be at most "
+                f"{LARGEST_SMOOTHING:g} of that"
+            )
         margin = MARGIN + np.ceil(4.0 * smoothing / np.linalg.norm(affine[:3, :3], axis=0)).astype(int)
         wide = np.stack([box[0] - margin, box[1] + margin])
         self.numbers = _crop(numbers, wide)
@@ -82,7 +90,7 @@ class LabelDomain(Domain):
         if smoothing:
             phi = gaussian(phi, smoothing, self.spacing)
             if not (phi < 0.0).any():
-                raise InputError(f"smoothing by {length(smoothing)} leaves nothing of the body; it must be smaller")
+                raise InputError(f"smoothing by {length(smoothing)} leaves nothing of the body; it must be less")
             change = np.count_nonzero(phi < 0.0) / np.count_nonzero(inside) - 1.0
             self.notes.append(f"smoothed by {length(smoothing)}, which changes the volume by {change:+.2%}")
         self.values = phi

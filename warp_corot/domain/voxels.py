@@ -29,9 +29,11 @@ def signed_distance(inside: np.ndarray, spacing: np.ndarray) -> tuple[np.ndarray
         (a voxel's own, inside).
     """
     ndimage = import_ndimage()
+    # Of several nearest voxels the one taken should not hang on the last digits of the spacing.
+    ratios = np.round(spacing / spacing.min(), 5)
 
     def nearest_zero(values: np.ndarray) -> np.ndarray:
-        return ndimage.distance_transform_edt(values, sampling=spacing, return_distances=False, return_indices=True)
+        return ndimage.distance_transform_edt(values, sampling=ratios, return_distances=False, return_indices=True)
 
     # SciPy lets go of the interpreter meanwhile.
     with ThreadPoolExecutor(2) as pool:
@@ -53,7 +55,7 @@ def steepest_slope(phi: np.ndarray, spacing: np.ndarray) -> float:
     steepest = 0.0
     for slab in _slabs(len(phi) - 1):
         values = phi[slab.start : slab.stop + 1]
-        squares = np.zeros(1, np.float32)
+        squares: np.ndarray = np.zeros(1, np.float32)
         for axis in range(3):
             edges = np.abs(np.diff(values, axis=axis)) / np.float32(spacing[axis])
             for across in {0, 1, 2} - {axis}:

@@ -1,0 +1,383 @@
+"""Signed functions of bodies: against closed forms, brute force in float64 and the laws that meshing rests on."""
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+from pxr import Gf, Usd, UsdGeom, Vt
+
+from warp_corot.domain import Domain
+from warp_corot.errors import InputError
+
+#: float32 on coordinates of about one.
+ROUNDING = 3e-6
+
+
+def arrays(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+    return np.array(mesh.vertices), np.array(mesh.faces)
+
+
+def directions(rng, count: int) -> np.ndarray:
+    d = rng.standard_normal((count, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def around(domain: Domain, rng, count: int = 2000, reach: float = 0.5) -> np.ndarray:
+    """Random points in the bounds and beyond."""
+    size = np.ptp(domain.bounds, axis=0)
+    return domain.bounds[0] - reach * size + rng.random((count, 3)) * (1.0 + 2.0 * reach) * size
+
+
+@wp.func
+def wavy(p: wp.vec3):
+    return wp.length(p) - 0.8 - 0.1 * wp.sin(4.0 * p[0])
+
+
+def wavy_numpy(p):
+    return np.linalg.norm(p, axis=1) - 0.8 - 0.1 * np.sin(4.0 * p[:, 0])
+
+
+KINDS = {
+    "sphere": lambda device: Domain.sphere(0.7, (0.1, 0.2, -0.3), device=device),
+    "box": lambda device: Domain.box((-0.5, -1.0, 0.0), (0.5, 0.2, 0.3), device=device),
+    "torus": lambda device: Domain.torus(0.8, 0.3, (0.0, 0.1, 0.0), axis="X", device=device),
+    "capsule": lambda device: Domain.capsule((0, 0, 0), (0.5, 0.5, 1.0), 0.2, device=device),
+    "numpy function": lambda device: Domain.from_function(wavy_numpy, [[-0.7] * 3, [1.0] * 3], 1.4, device=device),
+    "device function": lambda device: Domain.from_function(wavy, [[-0.7] * 3, [1.0] * 3], 1.4, device=device),
+    "surface": lambda device: Domain.from_surface(arrays(trimesh.creation.torus(0.8, 0.3, 20, 9)), device=device),
+    "open surface": lambda device: Domain.from_surface(with_hole(), device=device),
+    "union": lambda device: Domain.sphere(0.7, device=device) | Domain.box((0, 0, 0), (1, 1, 1), device=device),
+    "intersection": lambda device: Domain.sphere(0.7, device=device) & Domain.box((0, 0, 0), (1, 1, 1), device=device),
+    "difference": lambda device: Domain.sphere(0.7, device=device) - Domain.box((0, 0, 0), (1, 1, 1), device=device),
+}
+
+
+def with_hole() -> tuple[np.ndarray, np.ndarray]:
+    """A sphere without the triangles around one of its corners."""
+    points, triangles = arrays(trimesh.creation.icosphere(2))
+    return points, triangles[(triangles != 0).all(axis=1)]
+
+
+@pytest.mark.filterwarnings("ignore:the surface is open")
+@pytest.mark.parametrize("kind", KINDS)
+def test_phi_is_no_steeper_than_said_and_the_bounds_hold_the_inside(kind, device, rng):
+    domain = KINDS[kind](device)
+    a = around(domain, rng)
+    b = a + directions(rng, len(a)) * 10.0 ** rng.uniform(-4, 0, (len(a), 1))
+    change = np.abs(domain.phi(a) - domain.phi(b))
+    assert (change <= domain.lipschitz * np.linalg.norm(a - b, axis=1) + ROUNDING).all()
+    inside = domain.phi(a) < -ROUNDING
+    assert inside.any()
+    assert ((a[inside] >= domain.bounds[0]) & (a[inside] <= domain.bounds[1])).all()
+
+
+@pytest.mark.parametrize("kind", ["sphere", "surface", "device function", "difference"])
+def test_warp_arrays_are_answered_where_they_are(kind, device, rng):
+    domain = KINDS[kind]("cpu")
+    points = around(domain, rng).astype(np.float32)
+    there = domain.phi(wp.array(points, dtype=wp.vec3, device=device))
+    assert there.device == wp.get_device(device)
+    assert np.allclose(there.numpy(), domain.phi(points), atol=ROUNDING)
+
+
+def test_shapes_along_their_normals(device, rng):
+    """At x = s + t n, with n the normal at a point s of the surface, phi is t up to the shape's reach."""
+    n = directions(rng, 500)
+    t = rng.uniform(-0.2, 1.0, (500, 1))
+    centre = np.array([0.3, -0.2, 0.1])
+    assert np.allclose(Domain.sphere(0.5, centre, device=device).phi(centre + (0.5 + t) * n), t[:, 0], atol=ROUNDING)
+
+    angle = rng.uniform(0, 2 * np.pi, 500)
+    ring = np.stack([np.zeros(500), np.cos(angle), np.sin(angle)], axis=1)
+    tube = np.sign(rng.standard_normal((500, 1))) * np.eye(3)[0] * np.sqrt(0.5) + ring * np.sqrt(0.5)
+    torus = Domain.torus(0.8, 0.25, centre, axis="X", device=device)
+    assert np.allclose(torus.phi(centre + 0.8 * ring + (0.25 + t) * tube), t[:, 0], atol=ROUNDING)
+
+    start, end = np.array([0.1, 0.0, 0.2]), np.array([0.5, 1.0, -0.3])
+    along = end - start
+    across = np.cross(n, along)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    middle = start + rng.random((500, 1)) * along
+    capsule = Domain.capsule(start, end, 0.25, device=device)
+    assert np.allclose(capsule.phi(middle + (0.25 + t) * across), t[:, 0], atol=ROUNDING)
+    cap = n * np.where(n @ along > 0, 1.0, -1.0)[:, None]
+    assert np.allclose(capsule.phi(end + (0.25 + t) * cap), t[:, 0], atol=ROUNDING)
+
+    low, high = np.array([-0.5, -1.0, 0.0]), np.array([0.5, 0.2, 0.6])
+    box = Domain.box(low, high, device=device)
+    outward = np.abs(n)
+    assert np.allclose(box.phi(high + np.abs(t) * outward), np.abs(t[:, 0]), atol=ROUNDING)
+    face = low + rng.uniform(0.4, 0.6, (500, 3)) * (high - low)
+    face[:, 0] = high[0]
+    assert np.allclose(box.phi(face + t * np.eye(3)[0]), t[:, 0], atol=ROUNDING)
+
+
+def test_sets_hold_what_set_theory_says(device, rng):
+    a, b = Domain.sphere(0.7, device=device), Domain.torus(0.6, 0.3, device=device)
+    points = around(a | b, rng)
+    in_a, in_b = a.phi(points) < 0, b.phi(points) < 0
+    assert np.array_equal((a | b).phi(points) < 0, in_a | in_b)
+    assert np.array_equal((a & b).phi(points) < 0, in_a & in_b)
+    assert np.array_equal((a - b).phi(points) < 0, in_a & ~in_b)
+    with pytest.raises(InputError, match="do not meet"):
+        a & Domain.sphere(0.1, (5, 0, 0))
+
+
+def test_labels_of_sets(device, rng):
+    liver, tumour = Domain.sphere(1.0, device=device).named("liver"), Domain.sphere(0.4, (0.8, 0, 0), device=device)
+    both = tumour.named("tumour") | liver
+    points = around(both, rng)
+    in_liver, in_tumour = liver.phi(points) < 0, tumour.phi(points) < 0
+    expected = np.where(in_tumour, 1, np.where(in_liver, 2, 0))
+    assert both.label_names == ("tumour", "liver")
+    assert np.array_equal(both.labels_at(points), expected)
+    assert (both.labels_at(points, nearest=True) > 0).all()
+    for place, name in enumerate(both.label_names, start=1):
+        assert np.array_equal(both.part(name).phi(points) < 0, expected == place)
+    cut = both - Domain.box((-2, -2, -2), (2, 2, 0), device=device)
+    assert np.array_equal(cut.labels_at(points), np.where(points[:, 2] > 0, expected, 0))
+    assert np.array_equal(cut.part("liver").phi(points) < 0, (expected == 2) & (points[:, 2] > 0))
+    # A body without labels leaves the other's where they meet, and has none elsewhere.
+    plain = tumour | liver
+    assert np.array_equal(plain.labels_at(points), np.where(in_liver, 1, 0))
+    with pytest.raises(InputError, match=r"no label 'spleen'.*tumour, liver"):
+        both.part("spleen")
+
+
+def test_functions_of_numpy_and_of_warp_agree_and_end_at_the_bounds(device, rng):
+    bounds = np.array([[-0.7] * 3, [1.0] * 3])
+    domains = [Domain.from_function(f, bounds, 1.4, device=device) for f in (wavy, wavy_numpy)]
+    points = rng.uniform(-0.7, 1.0, (2000, 3))
+    assert np.allclose(domains[0].phi(points), domains[1].phi(points), atol=ROUNDING)
+    deep = (points > -0.4).all(axis=1) & (points < 0.7).all(axis=1)
+    assert np.allclose(domains[0].phi(points)[deep], wavy_numpy(points)[deep], atol=ROUNDING)
+    assert (domains[0].phi([[-0.75, 0, 0], [0, -0.71, 0]]) > 0).all()
+    assert any("cut off" in line for line in domains[0].report())
+
+
+@pytest.mark.parametrize("shape", ["torus", "box"])
+def test_surfaces_against_brute_force(shape, device, rng):
+    """Distances by trimesh's closest points of every triangle, signs by the sum of solid angles, in float64."""
+    made = {"torus": trimesh.creation.torus(0.8, 0.3, 16, 8), "box": trimesh.creation.box((1.0, 0.01, 0.6))}
+    points, triangles = arrays(made[shape])
+    domain = Domain.from_surface((100 * points, triangles), unit="cm", device=device)
+    at = around(domain, rng, 300)
+    corners = points[triangles]
+    for x, phi in zip(at, domain.phi(at), strict=True):
+        nearest = trimesh.triangles.closest_point(corners, np.tile(x, (len(corners), 1)))
+        distance = np.linalg.norm(nearest - x, axis=1).min()
+        a, b, c = (corners - x).transpose(1, 0, 2)
+        la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+        below = la * lb * lc + (a * b).sum(1) * lc + (b * c).sum(1) * la + (c * a).sum(1) * lb
+        winding = np.arctan2((a * np.cross(b, c)).sum(1), below).sum() / (2 * np.pi)
+        assert np.isclose(phi, -distance if winding > 0.5 else distance, atol=ROUNDING)
+
+
+def same(domain: Domain, other: Domain, rng, atol: float = ROUNDING) -> None:
+    points = around(other, rng)
+    assert np.allclose(domain.phi(points), other.phi(points), atol=atol)
+
+
+def test_disorder_makes_no_difference(device, rng):
+    points, triangles = arrays(trimesh.creation.torus(0.8, 0.3, 20, 9))
+    right = Domain.from_surface((points, triangles), device=device)
+    assert "closed" in right.report()
+    inside_out = Domain.from_surface((points, triangles[:, ::-1]), device=device)
+    same(inside_out, right, rng)
+    assert any("inside out turned round" in line for line in inside_out.report())
+    mixed = np.where((rng.random(len(triangles)) < 0.4)[:, None], triangles[:, ::-1], triangles)
+    same(Domain.from_surface((points, mixed), device=device), right, rng)
+    # Triangles that share no points, as in .stl files, their corners off by less than the weld, one there twice.
+    soup = points[triangles].reshape(-1, 3) + 1e-8 * rng.standard_normal((3 * len(triangles), 3))
+    rows = np.arange(len(soup)).reshape(-1, 3)
+    loose = Domain.from_surface((soup, np.concatenate([rows, rows[:1]])), device=device)
+    same(loose, right, rng)
+    assert "closed" in loose.report()
+    # Every triangle there twice, facing both ways.
+    same(Domain.from_surface((points, np.concatenate([triangles, triangles[:, ::-1]])), device=device), right, rng)
+
+
+def test_two_boxes_with_a_wall_between_are_one(device, rng):
+    box = trimesh.creation.box((1.0, 1.0, 1.0))
+    # Mirrored, so that the diagonals of the wall meet.
+    other = box.copy().apply_transform(np.diag([-1.0, 1.0, 1.0, 1.0])).apply_translation([1.0, 0, 0])
+    domain = Domain.from_surface(arrays(trimesh.util.concatenate([box, other])), device=device)
+    same(domain, Domain.box((-0.5, -0.5, -0.5), (1.5, 0.5, 0.5), device=device), rng)
+
+
+@pytest.mark.parametrize("inward", [False, True])
+def test_a_cavity_stays_hollow(inward, device, rng):
+    outer, inner = trimesh.creation.icosphere(2), trimesh.creation.icosphere(2, radius=0.5)
+    inner.invert()
+    points, triangles = arrays(trimesh.util.concatenate([outer, inner]))
+    domain = Domain.from_surface((points, triangles[:, ::-1] if inward else triangles), device=device)
+    assert np.array_equal(domain.phi([[0, 0, 0], [0.7, 0, 0], [1.2, 0, 0]]) < 0, [False, True, False])
+    assert "1 cavities" in domain.report()
+
+
+def test_overlapping_parts_are_one_body(device, rng):
+    first, second = trimesh.creation.icosphere(3), trimesh.creation.icosphere(3)
+    second.apply_translation([0.8, 0, 0]).invert()
+    domain = Domain.from_surface(arrays(trimesh.util.concatenate([first, second])), device=device)
+    points = around(domain, rng)
+    # Icospheres of level 3 are within 0.01 of the sphere.
+    exact = (Domain.sphere(1.0) | Domain.sphere(1.0, (0.8, 0, 0))).phi(points)
+    sure = np.abs(exact) > 0.01
+    assert np.array_equal((domain.phi(points) < 0)[sure], (exact < 0)[sure])
+    assert any("overlap" in line for line in domain.report())
+
+
+def test_holes_are_closed_and_counted(device, rng):
+    points, triangles = with_hole()
+    with pytest.warns(UserWarning, match=r"open: its 1 holes took 1\.\d% of its area"):
+        domain = Domain.from_surface((points, triangles), device=device)
+    assert len(triangles) == 320 - 5
+    assert any("open: 5 edges in 1 hole," in line for line in domain.report())
+    # The cap is flatter than the sphere by the sagitta of its radius, which is at most 0.325.
+    same(domain, Domain.sphere(1.0, device=device), rng, atol=1.0 - np.sqrt(1.0 - 0.325**2))
+
+
+def test_a_sphere_with_a_tenth_of_its_triangles_gone(device, rng):
+    points, triangles = arrays(trimesh.creation.icosphere(4))
+    kept = triangles[rng.random(len(triangles)) > 0.1]
+    with pytest.warns(UserWarning, match="open"):
+        domain = Domain.from_surface((points, kept), device=device)
+    at = around(domain, rng)
+    exact = Domain.sphere(1.0).phi(at)
+    assert np.array_equal(domain.phi(at)[np.abs(exact) > 0.05] < 0, exact[np.abs(exact) > 0.05] < 0)
+
+
+def half(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+    points, triangles = arrays(mesh)
+    return points, triangles[points[triangles].mean(axis=1)[:, 2] > 0]
+
+
+def bow_tie() -> tuple[np.ndarray, np.ndarray]:
+    """A prism over a polygon that crosses itself: a third of it is wound the other way."""
+    corners = np.array([[0, 0], [2, 2], [2, 0], [1, 0.6], [0, 1.2]], float)
+    n = len(corners)
+    points = np.concatenate([np.pad(corners, ((0, 0), (0, 1)), constant_values=z) for z in (0.0, 1.0)])
+    side = [[k, (k + 1) % n, n + k] for k in range(n)] + [[(k + 1) % n, n + (k + 1) % n, n + k] for k in range(n)]
+    lids = [[0, k + 1, k] for k in range(1, n - 1)] + [[n, n + k, n + k + 1] for k in range(1, n - 1)]
+    return points, np.array(side + lids)
+
+
+SQUARE = (np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float), np.array([[0, 1, 2], [0, 2, 3]]))
+CUBE = arrays(trimesh.creation.box((1.0, 1.0, 1.0)))
+
+REFUSED = {
+    "a sheet": (SQUARE, "is open: 4 edges in 1 hole, and closing takes 100%"),
+    "a sheet of two sides": ((SQUARE[0], np.concatenate([SQUARE[1], SQUARE[1][:, ::-1]])), "zero thickness"),
+    "a flattened cube": ((CUBE[0] * [1, 1, 0], CUBE[1]), "zero thickness"),
+    "a cube flattened to less than a hair": ((CUBE[0] * [1, 1, 1e-6], CUBE[1]), "zero thickness"),
+    "a bowl": (half(trimesh.creation.icosphere(3)), r"is open: .* closing takes \d\d%"),
+    "a bow tie": (bow_tie(), "inside out"),
+    "a line": ((CUBE[0] * [1, 0, 0], CUBE[1]), "zero thickness|degenerate|no volume"),
+    "a point": ((CUBE[0] * 0, CUBE[1]), "degenerate"),
+    "NaN": ((np.where(CUBE[0] > 0, np.nan, CUBE[0]), CUBE[1]), "point . is .*nan"),
+    "indices out of range": ((CUBE[0], CUBE[1] + 1), "names the points .*there are 8"),
+    "indices that are no whole numbers": ((CUBE[0], CUBE[1].astype(float)), "dtype float64; they must be indices"),
+    "no triangles": ((CUBE[0], CUBE[1][:0]), r"shape \(0, 3\)"),
+    "flat points": ((CUBE[0][:, :2], CUBE[1]), r"shape \(8, 2\)"),
+    "words": ((np.array([["a", "b", "c"]]), CUBE[1]), "must be numbers"),
+    "one array": (CUBE[0], "must be a file or"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_encloses_no_body_is_refused_in_one_line(what):
+    surface, message = REFUSED[what]
+    with pytest.raises(InputError, match=message) as raised:
+        Domain.from_surface(surface)
+    assert "\n" not in str(raised.value)
+
+
+def test_units_and_unlikely_sizes():
+    metres = Domain.from_surface(CUBE).bounds
+    assert np.allclose(Domain.from_surface(CUBE, unit="cm").bounds, 0.01 * metres)
+    assert np.allclose(Domain.from_surface((250 * CUBE[0], CUBE[1]), unit="mm").bounds, 0.25 * metres)
+    with pytest.warns(UserWarning, match=r"300 m long.*in mm, say unit='mm'.*0\.001: 300 mm"):
+        Domain.from_surface((300 * CUBE[0], CUBE[1]))
+    with pytest.warns(UserWarning, match=r"300 um long.*in m, say unit='m'.*1000: 300 mm"):
+        Domain.from_surface((0.3 * CUBE[0], CUBE[1]), unit="mm")
+    with pytest.raises(InputError, match="unit is 'inch'; it must be one of 'm', 'cm', 'mm'"):
+        Domain.from_surface(CUBE, unit="inch")
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".stl", ".ply", ".off", ".glb"])
+def test_surface_files(suffix, tmp_path, rng):
+    mesh = trimesh.creation.torus(0.8, 0.3, 20, 9)
+    path = tmp_path / f"ring{suffix}"
+    mesh.export(path)
+    domain = Domain.from_surface(path)
+    same(domain, Domain.from_surface(arrays(mesh)), rng, atol=1e-5)
+    assert domain.up_axis == ("Y" if suffix in (".obj", ".glb") else "Z")
+    said = " ".join(domain.report())
+    assert ("as the file says" in said) == (suffix == ".glb")
+    assert ("names no up axis" in said) == (suffix != ".glb")
+    path.write_bytes(bytes(range(255, 0, -1)) * 9)
+    with pytest.raises(InputError, match=r"is not a|has no triangles|ring"):
+        Domain.from_surface(path)
+
+
+def test_usd_meshes_come_in_metres_placed_and_wound_as_the_stage_says(tmp_path, rng):
+    stage = Usd.Stage.CreateNew(str(tmp_path / "boxes.usda"))
+    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    UsdGeom.SetStageUpAxis(stage, "Z")
+    x, y, z = np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5], indexing="ij")
+    corners = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+    quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    for k, (mirrored, left) in enumerate([(False, False), (True, False), (False, True)]):
+        mesh = UsdGeom.Mesh.Define(stage, f"/box{k}")
+        mesh.AddTransformOp().Set(Gf.Matrix4d().SetTranslate(Gf.Vec3d(20.0 * k, 0, 0)))
+        mesh.AddScaleOp().Set(Gf.Vec3f(-10.0 if mirrored else 10.0, 10.0, 10.0))
+        mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(corners.astype(np.float32)))
+        mesh.CreateFaceVertexCountsAttr([4] * 6)
+        mesh.CreateFaceVertexIndicesAttr((quads[:, ::-1] if left else quads).ravel().tolist())
+        mesh.CreateSubdivisionSchemeAttr("none")
+        if left:
+            mesh.CreateOrientationAttr("leftHanded")
+    stage.GetRootLayer().Save()
+    domain = Domain.from_surface(tmp_path / "boxes.usda")
+    boxes = [Domain.box(np.array([0.2 * k, 0, 0]) - 0.05, np.array([0.2 * k, 0, 0]) + 0.05) for k in range(3)]
+    same(domain, boxes[0] | boxes[1] | boxes[2], rng)
+    assert domain.up_axis == "Z"
+    assert not any("turned" in line for line in domain.report())
+    assert "3 separate parts" in domain.report()
+
+
+def test_the_bunny_is_closed():
+    bunny = Domain.from_surface("warp:bunny")
+    assert "closed" in bunny.report()
+    assert bunny.up_axis == "Y"
+    assert np.allclose(np.ptp(bunny.bounds, axis=0), [0.161, 0.162, 0.123], atol=1e-3)
+    with pytest.raises(InputError, match="warp:lion: no such asset, should be warp:bunny"):
+        Domain.from_surface("warp:lion")
+
+
+def test_bad_arguments_are_refused_in_one_line(tmp_path):
+    box = [[-1.0] * 3, [1.0] * 3]
+    for make, message in [
+        (lambda: Domain.sphere(-1.0), "radius is -1.0"),
+        (lambda: Domain.sphere(np.nan), "radius is nan"),
+        (lambda: Domain.box((0, 0, 0), (1, 0, 1)), "is empty"),
+        (lambda: Domain.torus(0.3, 0.5), "minor must be smaller"),
+        (lambda: Domain.torus(0.5, 0.3, axis="z"), "axis is 'z'"),
+        (lambda: Domain.capsule((0, 0, 0), (0, 0, 0), 1.0), "ends must differ"),
+        (lambda: Domain.sphere(1.0, up_axis="up"), "up_axis is 'up'"),
+        (lambda: Domain.sphere(1.0, device="cuda:99"), "no device 'cuda:99'"),
+        (lambda: Domain.from_function(lambda x: 3.0 * x[:, 0], box), "changes by 3 m a metre; lipschitz is 1"),
+        (lambda: Domain.from_function(lambda x: x[:, 0] * np.nan, box), "must be finite"),
+        (lambda: Domain.from_function(lambda x: x, box), r"shape \(4096, 3\)"),
+        (lambda: Domain.from_function(lambda x: x[:, 0], box[::-1]), "bounds are"),
+        (lambda: Domain.from_function(lambda x: x[:, 0], box, lipschitz=0.0), "lipschitz is 0.0"),
+        (lambda: Domain.sphere(1.0).phi([1.0, 2.0, 3.0]), r"shape \(3,\)"),
+        (lambda: Domain.sphere(1.0).phi([[1.0, np.nan, 3.0]]), "point 0 is"),
+        (lambda: Domain.sphere(1.0).named(""), "label name"),
+        (lambda: Domain.from_surface(tmp_path), "is a folder"),
+        (lambda: Domain.from_surface(tmp_path / "none.obj"), "no such file"),
+        (lambda: Domain.from_surface(__file__), "unknown format .py"),
+    ]:
+        with pytest.raises(InputError, match=message) as raised:
+            make()
+        assert "\n" not in str(raised.value)

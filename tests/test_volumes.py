@@ -1,0 +1,386 @@
+"""Label volumes and scans: against closed forms, brute force, and the same volume placed or written otherwise."""
+
+import os
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from warp_corot.domain import Domain, labels_from_probabilities
+from warp_corot.domain.voxels import signed_distance, steepest_slope
+from warp_corot.errors import InputError
+
+ROUNDING = 3e-6
+#: In no simple ratio, so that few voxels are equally near.
+SPACING = np.array([0.0100, 0.0143, 0.0237])
+
+
+def ball(radius: float, spacing=SPACING, half: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
+    """Voxels whose centres are in a ball about the middle, and the place of the first voxel's."""
+    count = (2 * half / np.asarray(spacing)).astype(int)
+    axes = [(np.arange(n) - (n - 1) / 2) * s for n, s in zip(count, spacing, strict=True)]
+    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    return (np.linalg.norm(x, axis=-1) < radius).astype(np.uint8), np.array([a[0] for a in axes])
+
+
+def blobs(rng, shape=(20, 16, 12)) -> np.ndarray:
+    """Two labels in smooth shapes without any symmetry."""
+    smooth = gaussian_filter(rng.standard_normal(shape), 2.5)
+    volume = np.digitize(smooth, np.quantile(smooth, [0.6, 0.8])).astype(np.int16)
+    return np.where(volume == 2, 7, volume)
+
+
+def turned(rng) -> np.ndarray:
+    """A random rotation."""
+    q, r = np.linalg.qr(rng.standard_normal((3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q * np.linalg.det(q)
+
+
+def affine_of(directions: np.ndarray, spacing=SPACING, origin=(0.0, 0.0, 0.0)) -> np.ndarray:
+    affine = np.eye(4)
+    affine[:3, :3] = directions * spacing
+    affine[:3, 3] = origin
+    return affine
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_flat_face_lies_halfway_between_voxel_centres(axis, device, rng):
+    volume = np.zeros((12, 12, 12), int)
+    volume[(slice(None),) * axis + (slice(0, 7),)] = 3
+    volume = np.pad(volume, 20, mode="edge")  # far from the volume's ends, where the body is cut off
+    domain = Domain.from_labels(volume, SPACING, origin=-20 * SPACING, device=device)
+    points = SPACING * rng.uniform(3.0, 7.9, (500, 3))
+    assert np.allclose(domain.phi(points), points[:, axis] - 6.5 * SPACING[axis], atol=ROUNDING)
+
+
+def test_a_block_of_voxels_is_a_box_inside_and_straight_out_of_its_faces(device, rng):
+    volume = np.zeros((20, 18, 16), bool)
+    volume[4:15, 3:12, 5:11] = True
+    domain = Domain.from_labels(volume, (0.01,) * 3, origin=(1.0, 2.0, 3.0), device=device)
+    low, high = np.array([[3.5, 2.5, 4.5], [14.5, 11.5, 10.5]]) * 0.01 + [1, 2, 3]
+    box = Domain.box(low, high, device=device)
+    centres = np.argwhere(volume) * 0.01 + [1, 2, 3]
+    assert np.allclose(domain.phi(centres), box.phi(centres), atol=ROUNDING)
+    out = low + rng.uniform(0.2, 0.8, (300, 3)) * (high - low)
+    axis = rng.integers(0, 3, 300)
+    out[np.arange(300), axis] = high[axis] + rng.uniform(0.0, 0.015, 300)
+    assert np.allclose(domain.phi(out), box.phi(out), atol=ROUNDING)
+    assert (domain.bounds[0] <= low).all()
+    assert (domain.bounds[1] >= high).all()
+    assert (np.abs(domain.bounds - [low, high]) < 0.0100001).all()
+
+
+def test_distances_are_exact(rng):
+    """Against all pairs of voxels: the distance, less half of one of the n steps to a nearest voxel."""
+    inside = rng.random((8, 7, 6)) < 0.3
+    phi, nearest = signed_distance(inside, SPACING)
+    index = np.argwhere(np.ones_like(inside))
+    for voxel in index:
+        others = np.argwhere(inside != inside[tuple(voxel)])
+        distance = np.linalg.norm((others - voxel) * SPACING, axis=1)
+        steps = np.abs(others - voxel)[np.isclose(distance, distance.min())].max(axis=1)
+        possible = distance.min() * (1.0 - 0.5 / steps)
+        assert np.isclose(np.abs(phi[tuple(voxel)]), possible, rtol=1e-5).any()
+        assert (phi[tuple(voxel)] < 0) == inside[tuple(voxel)]
+        assert inside[tuple(nearest[:, voxel[0], voxel[1], voxel[2]])]
+
+
+def test_a_ball_converges_with_the_voxels(device, rng):
+    """The volume within phi < 0 and the distance, as the voxels shrink."""
+    points = rng.uniform(-0.28, 0.28, (20000, 3))
+    exact = np.linalg.norm(points, axis=1) - 0.2
+    errors = []
+    for fine in (1, 2, 4):
+        volume, origin = ball(0.2, SPACING / fine)
+        domain = Domain.from_labels(volume, SPACING / fine, origin=origin, device=device)
+        near = ((points > domain.bounds[0]) & (points < domain.bounds[1])).all(axis=1)
+        error = np.abs(domain.phi(points) - exact)[near]
+        # A centre on the other side is never further beyond the sphere than the diagonal of a voxel.
+        assert error.max() < np.linalg.norm(SPACING) / fine
+        errors.append(error.mean())
+        # Further out a lower bound, by no more than the root of two.
+        phi, far = domain.phi(points)[~near], exact[~near]
+        slack = np.linalg.norm(SPACING) / fine
+        assert ((phi > np.sqrt(0.5) * far - slack) & (phi < far + slack)).all()
+    assert errors[2] < 0.35 * errors[0]
+    assert np.mean(domain.phi(points) < 0) == pytest.approx(np.mean(exact < 0), rel=0.02)
+
+
+@pytest.mark.parametrize("how", ["straight", "turned", "sheared", "smoothed"])
+def test_phi_is_no_steeper_than_said_and_the_bounds_hold_the_inside(how, device, rng):
+    directions = np.eye(3) if how == "straight" else turned(rng)
+    if how == "sheared":
+        directions = directions @ np.array([[1, 0.3, 0.1], [0, 0.9, 0.2], [0, 0, 1]])
+    smoothing = 0.015 if how == "smoothed" else 0.0
+    domain = Domain.from_labels(blobs(rng), affine=affine_of(directions), smoothing=smoothing, device=device)
+    size = np.ptp(domain.bounds, axis=0)
+    a = domain.bounds[0] - size + 3.0 * rng.random((20000, 3)) * size
+    step = rng.standard_normal(a.shape)
+    step /= np.linalg.norm(step, axis=1, keepdims=True)
+    b = a + step * 10.0 ** rng.uniform(-4, 0, (len(a), 1)) * 0.3
+    apart = np.linalg.norm(a - b, axis=1)
+    change = np.abs(domain.phi(a) - domain.phi(b))
+    assert (change <= domain.lipschitz * apart + ROUNDING).all()
+    # The bound is not far from what happens.
+    far = apart > 1e-3
+    assert (change / apart)[far].max() > 0.4 * domain.lipschitz
+    inside = domain.phi(a) < 0
+    assert inside.any()
+    assert ((a[inside] >= domain.bounds[0]) & (a[inside] <= domain.bounds[1])).all()
+
+
+def test_steepest_slope_of_a_linear_function_is_its_gradient(rng):
+    """By hand: on a linear function the bound is the gradient's length, on one raised voxel the root of three."""
+    gradient = rng.standard_normal(3)
+    x = np.stack(np.meshgrid(*[np.arange(70) * s for s in SPACING], indexing="ij"), axis=-1)
+    assert np.isclose(steepest_slope((x @ gradient).astype(np.float32), SPACING), np.linalg.norm(gradient), rtol=1e-3)
+    raised = np.zeros((50, 5, 5), np.float32)
+    raised[40, 2, 2] = 1.0
+    assert np.isclose(steepest_slope(raised, np.ones(3)), np.sqrt(3.0))
+
+
+def test_a_turned_volume_is_the_same_body_turned(device, rng):
+    volume = blobs(rng)
+    straight = Domain.from_labels(volume, SPACING, origin=(0.1, -0.2, 0.3), device=device)
+    rotation = turned(rng)
+    affine = affine_of(np.eye(3), origin=(0.1, -0.2, 0.3))
+    affine[:3] = rotation @ affine[:3]
+    other = Domain.from_labels(volume, affine=affine, device=device)
+    points = straight.bounds[0] + rng.uniform(-0.5, 1.5, (2000, 3)) * np.ptp(straight.bounds, axis=0)
+    assert np.allclose(other.phi(points @ rotation.T), straight.phi(points), atol=ROUNDING)
+    agree = other.labels_at(points @ rotation.T) == straight.labels_at(points)
+    assert agree.mean() > 0.999  # but for points halfway between two voxels
+    # Axes in another order and one the other way round, as scanners write them.
+    mixed = np.ascontiguousarray(np.moveaxis(volume, (1, 2, 0), (0, 1, 2))[::-1])
+    flipped = affine_of(np.eye(3), origin=(0.1, -0.2, 0.3)) @ np.array(
+        [[0, 0, 1, 0], [-1, 0, 0, volume.shape[1] - 1], [0, 1, 0, 0], [0, 0, 0, 1]]
+    )
+    same = Domain.from_labels(mixed, affine=flipped, device=device)
+    assert np.allclose(same.phi(points), straight.phi(points), atol=ROUNDING)
+
+
+def test_labels_are_those_of_the_voxels(device, rng):
+    volume = blobs(rng)
+    domain = Domain.from_labels(volume, SPACING, labels={"wall": 7, "rest": [1]}, device=device)
+    assert domain.label_names == ("wall", "rest")
+    index = np.argwhere(volume >= 0)
+    expected = np.select([volume == 7, volume == 1], [1, 2], 0)[tuple(index.T)]
+    assert np.array_equal(domain.labels_at(index * SPACING), expected)
+    # Outside, the nearest of them: of all voxels inside, in brute force.
+    inside = np.argwhere(volume > 0)
+    outside = index[expected == 0]
+    distance = np.linalg.norm((outside[:, None] - inside[None]) * SPACING, axis=2)
+    labels = domain.labels_at(outside * SPACING, nearest=True)
+    for row, label in zip(distance, labels, strict=True):
+        nearest = inside[np.isclose(row, row.min())]
+        assert label in np.where(volume[tuple(nearest.T)] == 7, 1, 2)
+    # Each label by itself is what a volume of it alone gives.
+    alone = Domain.from_labels(volume == 7, SPACING, device=device)
+    points = domain.bounds[0] + rng.random((2000, 3)) * np.ptp(domain.bounds, axis=0)
+    assert np.allclose(domain.part("wall").phi(points), alone.phi(points), atol=ROUNDING)
+    assert Domain.from_labels(volume, SPACING).label_names == ("1", "7")
+    one = Domain.from_labels(volume, SPACING, labels={"all": (1, 7)})
+    assert np.array_equal(one.labels_at(index * SPACING), expected > 0)
+    assert Domain.from_labels(volume.astype(np.float32), SPACING).label_names == ("1", "7")
+
+
+def test_smoothing_takes_the_steps_off(device):
+    volume, origin = ball(0.2, (0.01,) * 3)
+    rough = Domain.from_labels(volume, (0.01,) * 3, origin=origin, device=device)
+    smooth = Domain.from_labels(volume, (0.01,) * 3, origin=origin, smoothing=0.01, device=device)
+    rng = np.random.default_rng(1)
+    n = rng.standard_normal((2000, 3))
+    points = 0.2 * n / np.linalg.norm(n, axis=1, keepdims=True)
+    assert smooth.phi(points).std() < 0.5 * rough.phi(points).std()
+    assert 1.0 <= smooth.lipschitz < 1.1 < rough.lipschitz <= np.sqrt(3.0) * (1 + 1e-5)
+    assert any("smoothed by 10 mm, which changes the volume by" in line for line in smooth.report())
+    with pytest.raises(InputError, match=r"smoothing is 50 mm and the body 400 mm long"):
+        Domain.from_labels(volume, (0.01,) * 3, smoothing=0.05)
+    with pytest.raises(InputError, match="leaves nothing of the body"):
+        Domain.from_labels(np.ones((40, 1, 1), int), (0.01,) * 3, smoothing=0.03)
+
+
+def test_the_likeliest_label_wins(rng):
+    shares = rng.dirichlet([1.0, 1.0, 1.0], (6, 5, 4))
+    maps = {"grey": shares[..., 1], "white": shares[..., 2]}
+    labels = labels_from_probabilities(maps)
+    assert labels.dtype == np.int32
+    assert np.array_equal(labels, np.argmax(shares, axis=-1))
+    bytes_ = {name: np.round(255 * values).astype(np.uint8) for name, values in maps.items()}
+    clear = np.sort(shares, axis=-1)[..., 2] - np.sort(shares, axis=-1)[..., 1] > 0.02
+    assert np.array_equal(labels_from_probabilities(bytes_, certain=255)[clear], labels[clear])
+    domain = Domain.from_probabilities(maps, (0.01,) * 3)
+    assert domain.label_names == ("grey", "white")
+    index = np.argwhere(labels >= 0)
+    assert np.array_equal(domain.labels_at(0.01 * index), labels[tuple(index.T)])
+    half = np.full((2, 2, 2), 0.5)
+    assert (labels_from_probabilities({"a": half}) == 0).all()
+    assert (labels_from_probabilities({"a": half, "b": half}) == 1).all()
+
+
+def test_nifti_in_its_own_unit_and_place(tmp_path, device, rng):
+    nibabel = pytest.importorskip("nibabel")
+    volume = blobs(rng)
+    affine = affine_of(turned(rng), 1e3 * SPACING, (10.0, 20.0, -30.0))
+    for name, unit, factor in (("a.nii", "mm", 1e-3), ("b.nii.gz", "meter", 1.0), ("c.nii", "unknown", None)):
+        image = nibabel.Nifti1Image(volume, np.diag([1e-3 / factor if factor else 1.0] * 3 + [1.0]) @ affine)
+        image.header.set_xyzt_units(unit)
+        nibabel.save(image, tmp_path / name)
+    expected = Domain.from_labels(volume, affine=affine, unit="mm", device=device)
+    points = expected.bounds[0] + rng.uniform(-0.5, 1.5, (1000, 3)) * np.ptp(expected.bounds, axis=0)
+    for name in ("a.nii", "b.nii.gz"):
+        domain = Domain.from_labels(tmp_path / name, device=device)
+        # The format keeps its matrix in float32.
+        assert np.allclose(domain.phi(points), expected.phi(points), atol=1e-5)
+        assert any("as the file says" in line for line in domain.report())
+    with pytest.raises(InputError, match=r"c\.nii: the file names no unit of length; say unit='mm'"):
+        Domain.from_labels(tmp_path / "c.nii")
+    domain = Domain.from_labels(tmp_path / "c.nii", unit="mm", device=device)
+    assert np.allclose(domain.phi(points), expected.phi(points), atol=1e-5)
+
+
+def test_the_same_scan_in_four_formats(tmp_path, rng):
+    """Written by ITK, which turns its left-posterior-superior into NIfTI's directions itself."""
+    sitk = pytest.importorskip("SimpleITK")
+    pytest.importorskip("nibabel")
+    volume = blobs(rng)
+    image = sitk.GetImageFromArray(volume.transpose(2, 1, 0))
+    image.SetSpacing((1e3 * SPACING).tolist())
+    image.SetDirection(turned(rng).ravel().tolist())
+    image.SetOrigin((10.0, 20.0, -30.0))
+    domains = []
+    for suffix in (".nii.gz", ".mha", ".mhd", ".nrrd"):
+        sitk.WriteImage(image, str(tmp_path / f"scan{suffix}"))
+        domains.append(Domain.from_labels(tmp_path / f"scan{suffix}", unit="mm"))
+    size = np.ptp(domains[0].bounds, axis=0)
+    points = domains[0].bounds[0] + rng.uniform(-0.5, 1.5, (1000, 3)) * size
+    for domain in domains[1:]:
+        assert np.allclose(domain.phi(points), domains[0].phi(points), atol=1e-5)
+        assert domain.label_names == ("1", "7")
+    with pytest.raises(InputError, match=r"scan\.mha: the file names no unit"):
+        Domain.from_labels(tmp_path / "scan.mha")
+
+
+@pytest.mark.parametrize("where", ["points", "cells"])
+def test_vtk_images(where, tmp_path, rng):
+    pytest.importorskip("vtkmodules")
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonDataModel import vtkImageData
+    from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
+
+    volume = blobs(rng)
+    grid = vtkImageData()
+    first, more = (3, -2, 5), 0 if where == "points" else 1
+    grid.SetExtent(*np.ravel([[a, a + n - 1 + more] for a, n in zip(first, volume.shape, strict=True)]).tolist())
+    grid.SetSpacing(*(1e3 * SPACING).tolist())
+    grid.SetOrigin(10.0, 20.0, -30.0)
+    array = numpy_to_vtk(volume.ravel(order="F"), deep=True)
+    array.SetName("tissue")
+    (grid.GetPointData() if where == "points" else grid.GetCellData()).SetScalars(array)
+    writer = vtkXMLImageDataWriter()
+    writer.SetFileName(str(tmp_path / "scan.vti"))
+    writer.SetInputData(grid)
+    writer.Write()
+    origin = np.array([0.01, 0.02, -0.03]) + SPACING * (np.array(first) + 0.5 * more)
+    expected = Domain.from_labels(volume, SPACING, origin=origin)
+    domain = Domain.from_labels(tmp_path / "scan.vti", unit="mm")
+    points = expected.bounds[0] + rng.random((1000, 3)) * np.ptp(expected.bounds, axis=0)
+    assert np.allclose(domain.phi(points), expected.phi(points), atol=1e-5)
+    whole = (tmp_path / "scan.vti").read_bytes()
+    for bad in (whole[: len(whole) // 2], b"words", b"<VTKFile></VTKFile>", b""):
+        (tmp_path / "bad.vti").write_bytes(bad)
+        with pytest.raises(InputError, match=r"bad\.vti: is not a \.vti file"):
+            Domain.from_labels(tmp_path / "bad.vti", unit="mm")
+
+
+def test_a_body_cut_off_by_the_scan_and_in_pieces_is_said(rng):
+    volume = np.zeros((9, 8, 7), int)
+    volume[0:3, 2:4, 2:4] = 1
+    volume[5:7, 2:4, 2:4] = 1
+    said = " ".join(Domain.from_labels(volume, SPACING).report())
+    assert "20 in 2 pieces, the largest has 60.00%" in said
+    assert "end of the volume along voxel axis x" in said
+
+
+def test_a_unit_taken_wrongly_draws_a_warning():
+    volume, _ = ball(0.1)
+    with pytest.warns(UserWarning, match=r"say unit='mm'"):
+        Domain.from_labels(volume, 1e3 * SPACING)
+    with pytest.warns(UserWarning, match=r"say unit='m'"):
+        Domain.from_labels(volume, SPACING, unit="mm")
+
+
+VOLUME = np.pad(np.ones((2, 2, 2), int), 1)
+NAN = np.where(VOLUME > 0, np.nan, 0.0)
+SHARES = {"a": 0.9 * VOLUME}
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Domain.from_labels(VOLUME), r"has no spacing; give spacing=\(dx, dy, dz\)"),
+        (lambda: Domain.from_labels(VOLUME, (1, 1, 0)), r"spacing is \(1, 1, 0\)"),
+        (lambda: Domain.from_labels(VOLUME, (1, 1)), r"spacing is \(1, 1\)"),
+        (lambda: Domain.from_labels(VOLUME, SPACING, origin=(0, np.nan, 0)), "origin is"),
+        (lambda: Domain.from_labels(VOLUME, SPACING, affine=np.eye(4)), "both affine and spacing"),
+        (lambda: Domain.from_labels(VOLUME, affine=np.zeros((4, 4))), "last row"),
+        (lambda: Domain.from_labels(VOLUME, affine=np.diag([1, 1, 0, 1])), "has no spacing"),
+        (lambda: Domain.from_labels(VOLUME, affine=[[1, 1, 0, 0], [1, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "plane"),
+        (lambda: Domain.from_labels(VOLUME, SPACING, unit="km"), "unit is 'km'"),
+        (lambda: Domain.from_labels(VOLUME, SPACING, labels={"liver": 3}), r"label 3 \('liver'\) .*there are 0, 1"),
+        (lambda: Domain.from_labels(VOLUME, SPACING, labels={"a": 1, "b": 1}), "given both to 'a' and 'b'"),
+        (lambda: Domain.from_labels(VOLUME, SPACING, labels={"a": []}), "'a' has no numbers"),
+        (lambda: Domain.from_labels(VOLUME, SPACING, labels=[1]), "must give numbers by name"),
+        (lambda: Domain.from_labels(VOLUME, SPACING, smoothing=-1.0), "smoothing is -1.0"),
+        (lambda: Domain.from_labels(VOLUME, SPACING, up_axis="S"), "up_axis is 'S'"),
+        (lambda: Domain.from_labels(0 * VOLUME, SPACING), "labels is {}|empty"),
+        (lambda: Domain.from_labels(VOLUME[:0], SPACING), r"shape \(0, 4, 4\)"),
+        (lambda: Domain.from_labels(VOLUME[0], SPACING), r"shape \(4, 4\)"),
+        (lambda: Domain.from_labels(VOLUME.astype(str), SPACING), "labels are whole numbers"),
+        (lambda: Domain.from_labels(VOLUME * 1j, SPACING), "complex128; labels are whole numbers"),
+        (lambda: Domain.from_labels(NAN, SPACING), r"voxel \(1, 1, 1\) of the volume is nan"),
+        (lambda: Domain.from_labels(0.3 * VOLUME, SPACING), "is 0.3; labels are whole.*from_probabilities"),
+        (lambda: Domain.from_probabilities({}, SPACING), "maps is empty"),
+        (lambda: Domain.from_probabilities(SHARES), "has no spacing"),
+        (lambda: Domain.from_probabilities({"a": 255 * VOLUME}, SPACING), "'a' runs from 0 to 255; it must"),
+        (lambda: Domain.from_probabilities({"a": NAN}, SPACING), "'a' runs from nan"),
+        (lambda: Domain.from_probabilities({**SHARES, "b": VOLUME[1:]}, SPACING), r"'b' has shape \(3, 4, 4\)"),
+        (lambda: Domain.from_probabilities({"a": 0.4 * VOLUME}, SPACING), "likelier inside"),
+        (lambda: Domain.from_probabilities(SHARES, SPACING, certain=0), "certain is 0"),
+    ],
+)  # fmt: skip
+def test_bad_volumes_are_refused_in_one_line(make, message):
+    with pytest.raises(InputError, match=message) as raised:
+        make()
+    assert "\n" not in str(raised.value)
+
+
+def test_bad_files_are_refused_in_one_line(tmp_path):
+    for name in ("a.nii", "a.nii.gz", "a.mha", "a.nrrd", "a.vti"):
+        path = tmp_path / name
+        with pytest.raises(InputError, match=f"{name}: no such file"):
+            Domain.from_labels(path)
+        path.write_bytes(bytes(range(256)) * 9)
+        with pytest.raises(InputError, match=f"{name}: (is not a|reading)") as raised:
+            Domain.from_labels(path, unit="mm")
+        assert "\n" not in str(raised.value)
+    with pytest.raises(InputError, match="is a folder"):
+        Domain.from_labels(tmp_path)
+    with pytest.raises(InputError, match=r"unknown format \.py, should be \.nii\.gz"):
+        Domain.from_labels(__file__)
+
+
+@pytest.mark.slow
+def test_the_brain_of_nilearn():
+    """MNI ICBM 152: 1 mm voxels, a brain of about 1.7 l, its middle plane at x = 0 and mirror-like there."""
+    nilearn = pytest.importorskip("nilearn")
+    maps = os.path.join(os.path.dirname(nilearn.__file__), "datasets/data/mni_icbm152_%s_tal_nlin_sym_09a_converted")
+    files = {"grey": (maps % "gm") + ".nii.gz", "white": (maps % "wm") + ".nii.gz"}
+    brain = Domain.from_probabilities(files, certain=255, unit="mm", smoothing=0.5e-3)
+    points = np.random.default_rng(0).uniform(*brain.bounds, (200_000, 3))
+    inside = brain.phi(points) < 0
+    assert 1.2e-3 < inside.mean() * np.prod(np.ptp(brain.bounds, axis=0)) < 2.0e-3
+    mirrored = brain.phi(points * [-1, 1, 1])
+    assert np.abs(mirrored - brain.phi(points)).mean() < 1e-3
+    assert set(np.unique(brain.labels_at(points))) == {0, 1, 2}
