@@ -155,8 +155,8 @@ def evaluate_voxels(
     # Out
     phi: wp.array[wp.float32],
 ):
-    """Trilinear between voxel centres. Outside the volume sqrt(v^2 + d^2), with the distance d to the closest point c of
-    it and the value v > 0 there: v changes only along the directions in which d does not, so this is no steeper than v
+    """Trilinear between voxel centres; outside the volume sqrt(v^2 + d^2), with the distance d to its closest point c
+    and the value v > 0 there. v changes only along the directions in which d does not, so this is no steeper than v
     and d are; and it is no more than the distance to any point q of the body, since c - q leads away from p."""
     i = wp.tid()
     x = to_voxel * points[i] + shift

@@ -187,6 +187,11 @@ def test_disorder_makes_no_difference(device, rng):
     assert any("inside out turned round" in line for line in inside_out.report())
     mixed = np.where((rng.random(len(triangles)) < 0.4)[:, None], triangles[:, ::-1], triangles)
     same(Domain.from_surface((points, mixed), device=device), right, rng)
+    one = triangles.copy()
+    one[0] = one[0, ::-1]
+    one = Domain.from_surface((points, one), device=device)
+    same(one, right, rng)
+    assert "1 triangles wound against their neighbours turned round" in one.report()
     # Triangles that share no points, as in .stl files, their corners off by less than the weld, one there twice.
     soup = points[triangles].reshape(-1, 3) + 1e-8 * rng.standard_normal((3 * len(triangles), 3))
     rows = np.arange(len(soup)).reshape(-1, 3)

@@ -4,6 +4,7 @@ import os
 
 import numpy as np
 import pytest
+from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
 
 from warp_corot.domain import Domain, labels_from_probabilities
@@ -140,6 +141,33 @@ def test_steepest_slope_of_a_linear_function_is_its_gradient(rng):
     assert np.isclose(steepest_slope(raised, np.ones(3)), np.sqrt(3.0))
 
 
+def test_no_gradient_is_steeper_than_the_steepest_slope(rng):
+    """Against SciPy's own trilinear interpolation of noise, and of one raised voxel at every place of a cell."""
+    for place in (None, *np.ndindex(2, 2, 2)):
+        values = np.zeros((2, 2, 2)) if place else rng.standard_normal((5, 4, 4))
+        if place:
+            values[place] = 1.0
+        at = RegularGridInterpolator([np.arange(n) * s for n, s in zip(values.shape, SPACING, strict=True)], values)
+        x = rng.random((2000, 3)) * 0.99 * SPACING * (np.array(values.shape) - 1)
+        gradient = np.stack([(at(x + 1e-6 * e) - at(x)) / 1e-6 for e in np.eye(3)], axis=1)
+        steepest = np.linalg.norm(gradient, axis=1).max()
+        assert steepest <= steepest_slope(values.astype(np.float32), SPACING) * (1 + 1e-5)
+
+
+def test_a_sheared_volume_is_as_steep_as_said(device):
+    """Planes of voxels 25 degrees apart: across them phi changes by the distance along the axis, 1/sin(25 degrees) as
+    long as the distance of the planes."""
+    lean = np.radians(25.0)
+    directions = np.array([[np.cos(lean), 1.0, 0.0], [np.sin(lean), 0.0, 0.0], [0.0, 0.0, 1.0]])
+    volume = np.zeros((12, 60, 60), int)
+    volume[:6] = 1
+    domain = Domain.from_labels(volume, affine=affine_of(directions, (0.01,) * 3), device=device)
+    middle = affine_of(directions, (0.01,) * 3) @ [5.0, 30.0, 30.0, 1.0]
+    ends = domain.phi(middle[:3] + np.array([[0.0, 0.0, 0.0], [0.0, 0.004, 0.0]]))
+    assert (ends[1] - ends[0]) / 0.004 == pytest.approx(1.0 / np.sin(lean), rel=1e-3)
+    assert domain.lipschitz >= 1.0 / np.sin(lean)
+
+
 def test_a_turned_volume_is_the_same_body_turned(device, rng):
     volume = blobs(rng)
     straight = Domain.from_labels(volume, SPACING, origin=(0.1, -0.2, 0.3), device=device)
@@ -195,6 +223,12 @@ def test_smoothing_takes_the_steps_off(device):
     assert smooth.phi(points).std() < 0.5 * rough.phi(points).std()
     assert 1.0 <= smooth.lipschitz < 1.1 < rough.lipschitz <= np.sqrt(3.0) * (1 + 1e-5)
     assert any("smoothed by 10 mm, which changes the volume by" in line for line in smooth.report())
+    # What it is to be, with so much space around that its end does not matter.
+    wide, _ = signed_distance(np.pad(volume, 20) > 0, np.full(3, 0.01))
+    centres = np.argwhere(volume)
+    assert np.allclose(
+        smooth.phi(origin + 0.01 * centres), gaussian_filter(wide, 1.0)[tuple(centres.T + 20)], atol=1e-6
+    )
     with pytest.raises(InputError, match=r"smoothing is 50 mm and the body 400 mm long"):
         Domain.from_labels(volume, (0.01,) * 3, smoothing=0.05)
     with pytest.raises(InputError, match="leaves nothing of the body"):

@@ -282,7 +282,7 @@ def wind_outwards(points: np.ndarray, triangles: np.ndarray, parts: np.ndarray) 
     for part in np.flatnonzero(inward):
         mine = np.flatnonzero(parts == part)
         corners = points[triangles[mine[:: max(1, len(mine) // CORNERS)], 0]]
-        if all(_is_within_another(points, triangles, parts, part, corner) for corner in corners):
+        if all(_is_within_another(points, triangles, parts, int(part), corner) for corner in corners):
             cavities += 1
         else:
             flip[part] = not flip[part]
