@@ -126,8 +126,37 @@ def material_gradient(elements: Any, t: int, m: wp.mat33, u: wp.array[wp.vec4]):
 
 
 @functools.cache
+def element_forces(rotation: wp.Function) -> wp.Function:
+    """What adds the forces of element t."""
+
+    @wp.func
+    def element_forces(
+        elements: Any,
+        material: OrthotropicMaterial,
+        is_active: int,
+        activation: wp.array[wp.float32],
+        t: int,
+        u: wp.array[wp.vec4],
+        f: wp.array[wp.vec4],
+    ):
+        m = axes_of(material, t)
+        g, turn = material_gradient(elements, t, m, u)
+        r = rotation(m + g)
+        stress, a = turned_stress(corotated_strain(g, m, r), material, t)
+        p = r * (stress + wp.skew(a))
+        if is_active != 0:
+            # s (F d) d^T, and d is the first axis.
+            pull = activation[t] * column(m + g, 0)
+            p += wp.outer(pull, wp.vec3(1.0, 0.0, 0.0))
+        scatter_stress(elements, t, p * wp.transpose(turn), f)
+
+    return element_forces
+
+
+@functools.cache
 def scatter_anisotropic(Elements: Any, rotation: wp.Function) -> wp.Kernel:
     """Corotated forces of orthotropic elements, each with its own rotation, and of their active stress."""
+    forces = element_forces(rotation)
 
     @wp.kernel(module="unique", enable_backward=False)
     def scatter_anisotropic(
@@ -140,17 +169,7 @@ def scatter_anisotropic(Elements: Any, rotation: wp.Function) -> wp.Kernel:
         # Out
         f: wp.array[wp.vec4],
     ):
-        t = wp.tid()
-        m = axes_of(material, t)
-        g, turn = material_gradient(elements, t, m, u)
-        r = rotation(m + g)
-        stress, a = turned_stress(corotated_strain(g, m, r), material, t)
-        p = r * (stress + wp.skew(a))
-        if is_active != 0:
-            # s (F d) d^T, and d is the first axis.
-            pull = activation[t] * column(m + g, 0)
-            p += wp.outer(pull, wp.vec3(1.0, 0.0, 0.0))
-        scatter_stress(elements, t, p * wp.transpose(turn), f)
+        forces(elements, material, is_active, activation, wp.tid(), u, f)
 
     return scatter_anisotropic
 

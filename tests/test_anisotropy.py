@@ -74,6 +74,28 @@ def test_crushed_and_inverted_elements_equal_the_oracle(name, device, rng):
     assert sim.energy().elastic == pytest.approx(energies.sum(), rel=TOLERANCE)
 
 
+@pytest.mark.parametrize("kind", ["muscle field", "wood"])
+@pytest.mark.parametrize("general", [False, True])
+def test_thousands_of_elements_node_by_node(general, kind, device, rng):
+    """Every tenth node far displaced, so that elements that the fast kernel leaves to the second lie in lanes between
+    those that it does, and a number of elements that eight lanes do not divide: a wrong lane or register shows."""
+    mesh = wc.TetForest.box((1, 1, 1), 0.1, 9)
+    if general:
+        mesh = jittered(cells=(1, 1, 1), level=9)
+        mesh = wc.TetMesh(mesh.points, mesh.tets[:-3])
+    material, tensor = made(kind, mesh, rng)
+    sim, body = simulated(mesh, material, device)
+    chosen = rng.random((len(mesh.points), 1)) < 0.1
+    u = np.where(chosen, 15, 1) * random_displacement(mesh, rng, 0.08)
+    place(body, u)
+    x = mesh.points + u.astype(float)
+    assert 0.01 < (np.linalg.det(oracle_mesh(mesh).deformation_gradients(x)) < 0).mean() < 0.2
+    energies, forces = oracle.continuum(oracle.anisotropic, oracle_mesh(mesh), x, everywhere(tensor, mesh), None)
+    wrong = np.abs(sim.forces().numpy() - forces).max(axis=1) > TOLERANCE * np.abs(forces).max()
+    assert not wrong.any(), f"{wrong.sum()} of {wrong.size} nodes"
+    assert sim.energy().elastic == pytest.approx(energies.sum(), rel=TOLERANCE)
+
+
 @pytest.mark.parametrize("amount", [0.1, 0.9])
 @pytest.mark.parametrize("kind", KINDS)
 def test_force_is_minus_energy_gradient(kind, amount, device, rng):

@@ -29,7 +29,7 @@ from ..mesh import TetForest
 from ..mesh.forest import MAX_LEVEL
 from ..plan import Batch, ForcePlan, Sharing
 from ..rotations import METHODS, rotation_function
-from .anisotropic import AnisotropicField
+from .anisotropic import AnisotropicField, AnisotropicLanesField
 from .model import ForceField, Model, leaf_slots
 
 if TYPE_CHECKING:
@@ -108,7 +108,8 @@ class Corotated(Model):
                 raise InputError(f"{name} is {given!r}; with an anisotropic material it must be {wanted!r}")
         if self.rotation == "warm":
             raise InputError("rotation is 'warm'; with an anisotropic material it must be 'byers-xu' or 'svd'")
-        return AnisotropicField(body, self.own_rotation, deterministic)
+        lanes = body.device.is_cpu and self.own_rotation is quick_rotation
+        return (AnisotropicLanesField if lanes else AnisotropicField)(body, self.own_rotation, deterministic)
 
     @property
     def own_rotation(self) -> wp.Function:

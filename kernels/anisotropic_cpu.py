@@ -1,0 +1,159 @@
+"""Corotated forces of orthotropic elements on the CPU, eight to the lanes of vector registers; see ``lanes``.
+
+Both kinds of elements come as general ones, with M multiplied into their rest matrix: F M = M + (d1 d2 d3) B. An
+element that the unscaled iteration does not turn, or that is near having no definite rotation (see ``anisotropic``),
+adds nothing and is flagged; ``repair_anisotropic`` does those.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from .anisotropic import INDEFINITE, OrthotropicMaterial, element_forces
+from .elements import GeneralElements
+from .lanes import COMPILER_FLAGS, NEWTON, PRELUDE, on_cpu
+from .rotation import ITERATIONS, byers_xu
+
+wp.set_module_options({"enable_backward": False})
+
+_FORCES = f"""{PRELUDE}{NEWTON}
+    lanes8 d[9], b[9], m[9], k[9], volume, active = spread(0.0f);
+    const int first_element = 8 * block;
+    for (int lane = 0; lane < 8; ++lane) {{
+        const int t = wp::min(first_element + lane, count - 1);
+        const wp::vec_t<4, wp::int32> node = elements.nodes.data[t];
+        const wp::vec_t<4, wp::float32> origin = u.data[node[0]];
+        for (int n = 0; n < 3; ++n) {{
+            const wp::vec_t<4, wp::float32>& a = u.data[node[n + 1]];
+            for (int axis = 0; axis < 3; ++axis) d[3 * n + axis][lane] = a[axis] - origin[axis];
+        }}
+        const wp::mat_t<3, 3, wp::float32>& inverse = elements.rest_inverse.data[t];
+        const wp::mat_t<3, 3, wp::float32>& axes = material.axes.data[material.axes_stride * t];
+        const wp::vec_t<9, wp::float32>& stiffness = material.stiffness.data[material.stride * t];
+        for (int i = 0; i < 9; ++i) {{
+            b[i][lane] = inverse.data[i / 3][i % 3];
+            m[i][lane] = axes.data[i / 3][i % 3];
+            k[i][lane] = stiffness[i];
+        }}
+        volume[lane] = elements.volume.data[t];
+        if (is_active) active[lane] = activation.data[t];
+    }}
+    // Columns of F M and of its rotation.
+    triple c[3], r[3];
+    const triple d1 = get(d, 0), d2 = get(d, 1), d3 = get(d, 2);
+    for (int j = 0; j < 3; ++j) {{
+        const triple axis = {{m[j], m[3 + j], m[6 + j]}};
+        c[j] = plus(plus(axis, scaled(b[j], d1)), plus(scaled(b[3 + j], d2), scaled(b[6 + j], d3)));
+    }}
+    masks8 sound = newton(c[0], c[1], c[2], spread(1.0f), r);
+    for (int j = 0; j < 3; ++j) r[j] = scaled(spread({0.5**ITERATIONS!r}f), r[j]);
+    const lanes8 e0 = dot(r[0], c[0]) - 1.0f, e1 = dot(r[1], c[1]) - 1.0f, e2 = dot(r[2], c[2]) - 1.0f;
+    const lanes8 e01 = 0.5f * (dot(r[0], c[1]) + dot(r[1], c[0]));
+    const lanes8 e02 = 0.5f * (dot(r[0], c[2]) + dot(r[2], c[0]));
+    const lanes8 e12 = 0.5f * (dot(r[1], c[2]) + dot(r[2], c[1]));
+    const lanes8 s0 = k[0] * e0 + k[3] * e1 + k[4] * e2;
+    const lanes8 s1 = k[3] * e0 + k[1] * e1 + k[5] * e2;
+    const lanes8 s2 = k[4] * e0 + k[5] * e1 + k[2] * e2;
+    const lanes8 s01 = 2.0f * k[6] * e01, s02 = 2.0f * k[7] * e02, s12 = 2.0f * k[8] * e12;
+    // tr(S) I - S has the diagonal h and the other entries -e; its adjugate and determinant.
+    const lanes8 h0 = 2.0f + e1 + e2, h1 = 2.0f + e0 + e2, h2 = 2.0f + e0 + e1;
+    const lanes8 a0 = h1 * h2 - e12 * e12, a1 = h0 * h2 - e02 * e02, a2 = h0 * h1 - e01 * e01;
+    const lanes8 a01 = e02 * e12 + e01 * h2, a02 = e01 * e12 + e02 * h1, a12 = e01 * e02 + h0 * e12;
+    const lanes8 det = h0 * a0 - e01 * a01 - e02 * a02;
+    const lanes8 n2 = (e0 + 1.0f) * (e0 + 1.0f) + (e1 + 1.0f) * (e1 + 1.0f) + (e2 + 1.0f) * (e2 + 1.0f)
+        + 2.0f * (e01 * e01 + e02 * e02 + e12 * e12);
+    sound = sound & (det > 0.0f) & (det * det >= {INDEFINITE**2!r}f * n2 * n2 * n2);
+    // Axial vector of e s - s e.
+    const lanes8 w0 = e02 * s01 + e12 * s1 + e2 * s12 - (e01 * s02 + e1 * s12 + e12 * s2);
+    const lanes8 w1 = e0 * s02 + e01 * s12 + e02 * s2 - (e02 * s0 + e12 * s01 + e2 * s02);
+    const lanes8 w2 = e01 * s0 + e1 * s01 + e12 * s02 - (e0 * s01 + e01 * s1 + e02 * s12);
+    const lanes8 over = 1.0f / det;
+    const lanes8 t0 = over * (a0 * w0 + a01 * w1 + a02 * w2);
+    const lanes8 t1 = over * (a01 * w0 + a1 * w1 + a12 * w2);
+    const lanes8 t2 = over * (a02 * w0 + a12 * w1 + a2 * w2);
+    triple p[3];
+    p[0] = plus(scaled(s0, r[0]), plus(scaled(s01 + t2, r[1]), scaled(s02 - t1, r[2])));
+    p[1] = plus(scaled(s01 - t2, r[0]), plus(scaled(s1, r[1]), scaled(s12 + t0, r[2])));
+    p[2] = plus(scaled(s02 + t1, r[0]), plus(scaled(s12 - t0, r[1]), scaled(s2, r[2])));
+    p[0] = plus(p[0], scaled(active, c[0]));
+    for (int j = 0; j < 3; ++j) p[j] = scaled(-volume, p[j]);
+    lanes8 g[12];
+    triple rest = triple{{spread(0.0f), spread(0.0f), spread(0.0f)}};
+    for (int n = 1; n < 4; ++n) {{
+        const lanes8* row = b + 3 * (n - 1);
+        const triple force = plus(scaled(row[0], p[0]), plus(scaled(row[1], p[1]), scaled(row[2], p[2])));
+        g[3 * n] = force.x; g[3 * n + 1] = force.y; g[3 * n + 2] = force.z;
+        rest = minus(rest, force);
+    }}
+    g[0] = rest.x; g[1] = rest.y; g[2] = rest.z;
+    const int end = wp::min(8, count - first_element);
+    for (int lane = 0; lane < end; ++lane) {{
+        const int t = first_element + lane;
+        flagged.data[t] = sound[lane] ? 0 : 1;
+        if (!sound[lane]) continue;
+        const wp::vec_t<4, wp::int32> node = elements.nodes.data[t];
+        for (int n = 0; n < 4; ++n) {{
+            wp::vec_t<4, wp::float32>& sum = f.data[node[n]];
+            for (int axis = 0; axis < 3; ++axis) sum[axis] += g[3 * n + axis][lane];
+        }}
+    }}
+"""
+
+
+@wp.func_native(on_cpu(_FORCES))
+def eight_anisotropic(
+    elements: GeneralElements,
+    material: OrthotropicMaterial,
+    is_active: int,
+    activation: wp.array[wp.float32],
+    block: int,
+    count: int,
+    u: wp.array[wp.vec4],
+    f: wp.array[wp.vec4],
+    flagged: wp.array[wp.uint8],
+): ...
+
+
+@wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": COMPILER_FLAGS})
+def scatter_anisotropic_lanes(
+    # In
+    elements: GeneralElements,
+    material: OrthotropicMaterial,
+    is_active: int,
+    activation: wp.array[wp.float32],
+    count: int,
+    u: wp.array[wp.vec4],
+    # Out
+    f: wp.array[wp.vec4],
+    flagged: wp.array[wp.uint8],
+):
+    """Corotated forces of orthotropic elements and of their active stress; a thread is eight elements.
+
+    ``elements`` have Dm^-1 M in place of their rest matrix' inverse.
+    """
+    eight_anisotropic(elements, material, is_active, activation, wp.tid(), count, u, f, flagged)
+
+
+@functools.cache
+def repair_anisotropic(Elements: Any) -> wp.Kernel:
+    """Forces of flagged elements, in a way that is right for every F."""
+    forces = element_forces(byers_xu)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def repair_anisotropic(
+        # In
+        flagged: wp.array[wp.uint8],
+        elements: Elements,
+        material: OrthotropicMaterial,
+        is_active: int,
+        activation: wp.array[wp.float32],
+        u: wp.array[wp.vec4],
+        # Out
+        f: wp.array[wp.vec4],
+    ):
+        t = wp.tid()
+        if flagged[t] != wp.uint8(0):
+            forces(elements, material, is_active, activation, t, u, f)
+
+    return repair_anisotropic
