@@ -388,13 +388,15 @@ def judge_by_edges(
     # Out
     probes: wp.array[wp.vec3],
     expected: wp.array[wp.float32],
+    deviations: wp.array[wp.float32],
 ):
     """Compare the midpoints of the six edges with the linear interpolant.
 
     Corners and midpoints are the ten nodes of the eight elements three levels below, of half the size: so every point
     is within half the circumradius of one of them. Of a quadratic function the six deviations e tell all: it deviates
     by sum 4 l_i l_j e_ij at barycentric coordinates l, so by their mean times 4/3 at a face's centre and 3/2 at the
-    centroid. What passes is looked at once more, in the middle of its piece of the surface or at its centroid.
+    centroid. What passes is looked at once more, in the middle of its piece of the surface or at its centroid: what
+    the quadratic function has there is ``expected``.
     """
     i = wp.tid()
     element = elements[i]
@@ -440,7 +442,6 @@ def judge_by_edges(
     states[element - first] = state
 
     place = wp.vec4(0.25)
-    value = 0.25 * (phi[tet[0]] + phi[tet[1]] + phi[tet[2]] + phi[tet[3]])
     if crossed:
         place = wp.vec4(0.0)
         count = float(0.0)
@@ -453,14 +454,18 @@ def judge_by_edges(
                 place[b] = place[b] + t
                 count += 1.0
         place = place / count
-        value = 0.0
+    value = float(0.0)
+    for e in range(6):
+        value += 4.0 * place[FIRST_NODE[e]] * place[SECOND_NODE[e]] * deviation[e]
     at = origin
     for n in range(4):
         p = lattice[tet[n]]
+        value += place[n] * phi[tet[n]]
         weight = wp.float64(place[n]) * spacing
         at += wp.vec3d(wp.float64(p[0]) * weight, wp.float64(p[1]) * weight, wp.float64(p[2]) * weight)
     probes[i] = wp.vec3(float(at[0]), float(at[1]), float(at[2]))
     expected[i] = value
+    deviations[i] = worst
 
 
 @wp.kernel(enable_backward=False)
@@ -471,6 +476,7 @@ def judge_by_probes(
     first: int,
     found: wp.array[wp.float32],
     expected: wp.array[wp.float32],
+    deviations: wp.array[wp.float32],
     tets: wp.array[wp.vec4i],
     phi: wp.array[wp.float32],
     lattice: wp.array[wp.vec3i],
@@ -480,6 +486,8 @@ def judge_by_probes(
     # Out
     states: wp.array[wp.int32],
 ):
+    """The last look. Where the function is not the quadratic one of its ten values, as at a crease, it deviates between
+    the points looked at by more than at them: by half as much again where three faces meet."""
     i = wp.tid()
     element = elements[chosen[i]]
     tet = tets[element]
@@ -487,13 +495,16 @@ def judge_by_probes(
     for n in range(4):
         if phi[tet[n]] < 0.0:
             inside += 1
-    deviation = wp.abs(found[i] - expected[chosen[i]])
+    surprise = wp.abs(found[i] - expected[chosen[i]])
+    deviation = deviations[chosen[i]]
+    if surprise > 0.1 * deviation:
+        deviation = 1.5 * deviation + surprise
     state = DONE
     if inside > 0 and inside < 4:
         if deviation > tolerance * gradient_size(tet, phi, lattice, spacing, lipschitz):
             state = SPLIT
     elif (found[i] < 0.0) != (inside == 4):
-        if wp.abs(found[i]) > tolerance:
+        if wp.max(wp.abs(found[i]), deviation) > tolerance:
             state = SPLIT
     elif deviation > tolerance and wp.abs(found[i]) <= 2.0 * deviation:
         state = SPLIT

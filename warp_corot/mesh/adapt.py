@@ -169,15 +169,28 @@ class _Adaptation:
         self.evaluate()
         probes = wp.empty(len(unsure), dtype=wp.vec3, device=self.device)
         expected = wp.empty(len(unsure), dtype=wp.float32, device=self.device)
+        deviations = wp.empty(len(unsure), dtype=wp.float32, device=self.device)
         inputs = [unsure, first, *growth.midpoints(slots), growth.tets, growth.level, self.phi, growth.lattice]
         inputs += [self.origin, self.spacing, self.circumradius, lipschitz, tolerance]
-        self.launch(kernels.judge_by_edges, len(unsure), inputs, [growth.first_child, states, probes, expected])
+        self.launch(
+            kernels.judge_by_edges, len(unsure), inputs, [growth.first_child, states, probes, expected, deviations]
+        )
         flags = wp.empty(len(unsure), dtype=wp.int32, device=self.device)
         self.launch(kernels.flag_open, len(unsure), [unsure, states, first], [flags])
         chosen = growth.flagged(flags)
         points = wp.empty(len(chosen), dtype=wp.vec3, device=self.device)
         self.launch(kernels.gather_points, len(chosen), [chosen, probes], [points])
-        inputs = [chosen, unsure, first, self.values(points), expected, growth.tets, self.phi, growth.lattice]
+        inputs = [
+            chosen,
+            unsure,
+            first,
+            self.values(points),
+            expected,
+            deviations,
+            growth.tets,
+            self.phi,
+            growth.lattice,
+        ]
         inputs += [self.spacing, lipschitz, tolerance]
         self.launch(kernels.judge_by_probes, len(chosen), inputs, [states])
 

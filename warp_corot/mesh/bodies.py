@@ -77,8 +77,7 @@ def summary(forest: TetForest) -> list[str]:
         inside = float(np.sum(forest.fill * forest.volumes))
         cut = np.count_nonzero(forest.fill != 1.0)
         lines.append(f"{inside:.6g} m^3 of body in {volume:.6g} m^3 of tetrahedra, {cut} of which are cut")
-    for number, name in enumerate(forest.label_names, start=1):
-        lines.append(f"label {name}: {int((forest.labels == number).sum())} tetrahedra")
+    lines += [f"label {name}: {np.count_nonzero(forest.elements_of(name))} tetrahedra" for name in forest.label_names]
     sizes = np.bincount(pieces(forest))
     if len(sizes) > 1:
         shown = ", ".join(str(n) for n in sizes[:5]) + (", ..." if len(sizes) > 5 else "")
