@@ -10,8 +10,8 @@ from typing import Any
 
 import warp as wp
 
-from .anisotropic import INDEFINITE, OrthotropicMaterial, element_forces
-from .elements import GeneralElements
+from .anisotropic import INDEFINITE, OrthotropicMaterial, axes_of, element_forces
+from .elements import GeneralElements, frame, gradient_of, rest_volume
 from .lanes import COMPILER_FLAGS, NEWTON, PRELUDE, on_cpu
 from .rotation import ITERATIONS, byers_xu
 
@@ -133,6 +133,34 @@ def scatter_anisotropic_lanes(
     ``elements`` have Dm^-1 M in place of their rest matrix' inverse.
     """
     eight_anisotropic(elements, material, is_active, activation, wp.tid(), count, u, f, flagged)
+
+
+@functools.cache
+def turn_elements(Elements: Any) -> wp.Kernel:
+    """Elements of either kind as ``scatter_anisotropic_lanes`` wants them: Dm^-1 M, and the volume."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def turn_elements(
+        # In
+        elements: Elements,
+        material: OrthotropicMaterial,
+        # Out
+        rest_inverse: wp.array[wp.mat33],
+        volume: wp.array[wp.float32],
+    ):
+        t = wp.tid()
+        turn = wp.transpose(frame(elements, t)) * axes_of(material, t)
+        # (du/dX) M is linear in the displacements of the last three nodes; they enter by their rows, one at a time.
+        o = wp.vec3(0.0, 0.0, 0.0)
+        x = wp.vec3(1.0, 0.0, 0.0)
+        rows = wp.mat33()
+        rows[0] = (gradient_of(elements, t, o, x, o, o) * turn)[0]
+        rows[1] = (gradient_of(elements, t, o, o, x, o) * turn)[0]
+        rows[2] = (gradient_of(elements, t, o, o, o, x) * turn)[0]
+        rest_inverse[t] = rows
+        volume[t] = rest_volume(elements, t)
+
+    return turn_elements
 
 
 @functools.cache

@@ -38,7 +38,7 @@ def test_isotropic_functions_of_the_rest_position(make, model, device, rng):
         place(body, u)
         forces.append(sim.forces().numpy())
         masses.append(body.masses)
-    assert np.abs(forces[0] - forces[1]).max() < 1e-6 * np.abs(forces[1]).max()
+    assert np.abs(forces[0] - forces[1]).max() < 1e-5 * np.abs(forces[1]).max()
     np.testing.assert_array_equal(*masses)
     assert np.ptp(by_element.young) > 0.3 * np.min(by_element.young)
 
@@ -62,7 +62,7 @@ def test_directions_and_constants_as_functions(device, rng):
             sim, body = simulated(mesh, material, device)
             place(body, u)
             forces.append(sim.forces().numpy())
-        assert np.abs(forces[0] - forces[1]).max() < 1e-6 * np.abs(forces[1]).max()
+        assert np.abs(forces[0] - forces[1]).max() < 1e-5 * np.abs(forces[1]).max()
 
 
 @pytest.mark.parametrize("name", ["level 3", "general"])
@@ -84,7 +84,7 @@ def test_worlds_of_different_materials(name, device, rng):
         alone.advance_steps(20)
         energy += alone.energy().elastic
         expected = one.displacements.numpy()
-        atol = 0 if alone.device.is_cpu else 1e-5 * np.abs(expected).max()
+        atol = 0 if alone.device.is_cpu else 1e-4 * np.abs(expected).max()
         np.testing.assert_allclose(together[world], expected, rtol=0, atol=atol)
     assert sim.energy().elastic == pytest.approx(energy, rel=1e-5)
 

@@ -130,8 +130,8 @@ def shape_codes(lattice: np.ndarray, tets: np.ndarray, level: np.ndarray) -> tup
     return key, frames
 
 
-def general_elements(mesh: Mesh, device: wp.Device, worlds: int = 1) -> Any:
-    """Elements of any mesh as general ones, with the inverse of their rest matrix."""
+def general_elements(mesh: TetMesh, device: wp.Device, worlds: int = 1) -> Any:
+    """Elements of a general mesh, with the inverse of their rest matrix."""
     x = mesh.points[mesh.tets]
     rest = np.swapaxes(x[:, 1:] - x[:, :1], 1, 2)
     elements = GeneralElements()

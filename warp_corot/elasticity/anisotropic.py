@@ -10,7 +10,6 @@ import warp as wp
 
 from ..anisotropy import Anisotropic
 from ..checks import check_float32
-from ..elements import general_elements
 from ..kernels.anisotropic import (
     OrthotropicMaterial,
     anisotropic_energies,
@@ -19,7 +18,7 @@ from ..kernels.anisotropic import (
     scatter_anisotropic,
     vec9,
 )
-from ..kernels.anisotropic_cpu import repair_anisotropic, scatter_anisotropic_lanes
+from ..kernels.anisotropic_cpu import repair_anisotropic, scatter_anisotropic_lanes, turn_elements
 from ..kernels.elements import GeneralElements
 from ..kernels.lanes import LANES
 from .model import ForceField, leaf_slots
@@ -84,7 +83,7 @@ class AnisotropicLanesField(AnisotropicField):
     def __init__(self, body: SoftBody, rotation: wp.Function, deterministic: bool):
         super().__init__(body, rotation, deterministic)
         self._repair = repair_anisotropic(body.element_kind)
-        self._turned = _turned_elements(body)
+        self._turned = self._turned_elements()
         self._flagged = wp.zeros(self.element_count, dtype=wp.uint8, device=self.device)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
@@ -93,15 +92,15 @@ class AnisotropicLanesField(AnisotropicField):
         self.launch(scatter_anisotropic_lanes, -(-count // LANES), inputs, [f, self._flagged])
         self.launch(self._repair, count, [self._flagged, self.elements, *material, u], [f])
 
-
-def _turned_elements(body: SoftBody) -> GeneralElements:
-    """All elements as general ones, their rest matrix' inverse times the material's axes."""
-    given = body.material
-    assert isinstance(given, Anisotropic)
-    elements = general_elements(body.mesh, body.device, body.worlds)
-    inverse = elements.rest_inverse.numpy().reshape(body.worlds, -1, 3, 3)
-    elements.rest_inverse = wp.array((inverse @ given.frames()).reshape(-1, 3, 3), dtype=wp.mat33, device=body.device)
-    return elements
+    def _turned_elements(self) -> GeneralElements:
+        """All elements as general ones, their rest matrix' inverse times the material's axes."""
+        count, elements = self.element_count, GeneralElements()
+        elements.nodes = elements.targets = self.elements.nodes
+        elements.rest_inverse = wp.empty(count, dtype=wp.mat33, device=self.device)
+        elements.volume = wp.empty(count, dtype=wp.float32, device=self.device)
+        outputs = [elements.rest_inverse, elements.volume]
+        self.launch(turn_elements(self.body.element_kind), count, [self.elements, self.material], outputs)
+        return elements
 
 
 def device_material(body: SoftBody) -> OrthotropicMaterial:
