@@ -7,6 +7,7 @@ Interactive Soft Tissue Simulation* (IEEE EMBC 2013).
 from .activation import Activation
 from .anisotropy import Orthotropic, TransverselyIsotropic
 from .body import SoftBody
+from .domain import Domain
 from .elasticity import Corotated, EdgeStVK, Linear, MassSpring, NeoHookean, StVenantKirchhoff
 from .errors import InputError, StabilityWarning, UnstableError
 from .io.animate import record
@@ -21,6 +22,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Activation",
     "Corotated",
+    "Domain",
     "EdgeStVK",
     "Energy",
     "InputError",

@@ -67,7 +67,10 @@ class SoftBody:
         check_float32(mesh.volumes, "the volume of an element", "m^3")
         self.element_kind = element_kind(mesh)
         self.elements = device_elements(mesh, self.device, self.worlds)
-        self.mu, self.lam, self.material_stride = self._material_arrays(isotropic)
+        self.fill = getattr(mesh, "fill", None)
+        #: Lamé's parameters [Pa] and their stride, 0 or 1; then the same times the filled share, for the forces.
+        self.lame = self._lame_arrays(isotropic, None)
+        self.mu, self.lam, self.material_stride = self._lame_arrays(isotropic, self.fill)
         self.masses = lumped_masses(mesh, self.material, self.worlds)
         check_float32(self.masses[self.masses > 0], "the mass of a node", "kg")
 
@@ -109,6 +112,13 @@ class SoftBody:
     def element_count(self) -> int:
         """Elements of all worlds."""
         return self.worlds * len(self.mesh.tets)
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether the elements of a world are all alike in what forces are made of."""
+        isotropic = self.material.isotropic
+        shapes = [np.shape(value) for value in (isotropic.young, isotropic.poisson)]
+        return self.fill is None and all(not shape or shape[-1] == 1 for shape in shapes)
 
     @property
     def rest_positions(self) -> npt.NDArray[np.float64]:
@@ -354,12 +364,14 @@ class SoftBody:
         """
         return chosen_nodes(nodes, self.world_node_count, self.worlds, worlds).indices
 
-    def _material_arrays(self, material: Isotropic) -> tuple[wp.array, wp.array, int]:
+    def _lame_arrays(self, material: Isotropic, fill: npt.NDArray[np.float64] | None) -> tuple[wp.array, wp.array, int]:
         mu, lam = np.broadcast_arrays(np.atleast_1d(material.mu), np.atleast_1d(material.lam))
-        if mu.size == 1:
+        if fill is None and mu.size == 1:
             return self._floats(mu.ravel()), self._floats(lam.ravel()), 0
         shape = (self.worlds, len(self.mesh.tets))
-        return *(self._floats(np.broadcast_to(a, shape).ravel()) for a in (mu, lam)), 1
+        share = 1.0 if fill is None else fill
+        mu, lam = (np.broadcast_to(a, shape) * share for a in (mu, lam))
+        return self._floats(mu.ravel()), self._floats(lam.ravel()), 1
 
     def _floats(self, values: np.ndarray) -> wp.array:
         return wp.array(np.ascontiguousarray(values), dtype=wp.float32, device=self.device)
@@ -430,11 +442,14 @@ def centroids(mesh: Mesh) -> npt.NDArray[np.float64]:
 
 
 def lumped_masses(mesh: Mesh, material: Material, worlds: int = 1) -> npt.NDArray[np.float64]:
-    """A quarter of each element's mass at each of its nodes [kg], float64 [worlds * N]."""
+    """A quarter of the mass that each element holds, at each of its nodes [kg], float64 [worlds * N]."""
+    fill = getattr(mesh, "fill", None)
     density = np.atleast_2d(material.density)
     masses = np.zeros((len(density), len(mesh.points)))
     for of_world, row in zip(masses, np.broadcast_to(density, (len(density), len(mesh.tets))), strict=True):
         for part in parts(len(mesh.tets)):
             quarter = mesh.volumes[part] * row[part] / 4.0
+            if fill is not None:
+                quarter = quarter * fill[part]
             np.add.at(of_world, mesh.tets[part].ravel(), np.repeat(quarter, 4))
     return np.broadcast_to(masses, (worlds, len(mesh.points))).ravel()

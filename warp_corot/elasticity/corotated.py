@@ -183,7 +183,7 @@ class CorotatedField(ForceField):
 
     def add_rotated_forces(self, u: wp.array, f: wp.array) -> None:
         """Forces with the rotations that were extracted last."""
-        self._launch_with_rotations(self._forces, u, f)
+        self._launch_with_rotations(self._forces, self.material_inputs, u, f)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         if self._fused:
@@ -194,11 +194,11 @@ class CorotatedField(ForceField):
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         self.extract_rotations(u)
-        self._launch_with_rotations(self._energies, u, energies)
+        self._launch_with_rotations(self._energies, self.material_inputs, u, energies)
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
         self.extract_rotations(u)
-        self._launch_with_rotations(self._von_mises, u, stress)
+        self._launch_with_rotations(self._von_mises, self.stress_inputs, u, stress)
 
     def _sharing(self) -> Rotations:
         """Who uses whose rotation; made on first use, since own rotations need none of it for their forces."""
@@ -217,9 +217,9 @@ class CorotatedField(ForceField):
             )
         return self._shared
 
-    def _launch_with_rotations(self, kernel: wp.Kernel, u: wp.array, output: wp.array) -> None:
+    def _launch_with_rotations(self, kernel: wp.Kernel, material: list, u: wp.array, output: wp.array) -> None:
         shared = self._sharing()
-        inputs = [self.elements, *self.material_inputs, u, shared.rotations, shared.unit]
+        inputs = [self.elements, *material, u, shared.rotations, shared.unit]
         self.launch(kernel, self.element_count, inputs, [output])
 
 

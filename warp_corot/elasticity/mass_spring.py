@@ -43,9 +43,10 @@ class MassSpringField(ForceField):
         unique, which = np.unique(key.ravel(), return_inverse=True)
         # A row for each world whose stiffness may differ.
         young = np.atleast_2d(body.material.young)
+        held = body.mesh.volumes if body.fill is None else body.mesh.volumes * body.fill
         stiffness = np.stack(
             [
-                np.bincount(which.ravel(), ((row * body.mesh.volumes)[:, None] / lengths**2).ravel())
+                np.bincount(which.ravel(), ((row * held)[:, None] / lengths**2).ravel())
                 for row in np.broadcast_to(young, (len(young), len(tets)))
             ]
         )

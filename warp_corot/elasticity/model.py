@@ -126,8 +126,13 @@ class ForceField(ABC):
 
     @property
     def material_inputs(self) -> list:
-        """The kernel arguments mu, lam and stride."""
+        """The kernel arguments mu, lam and stride for forces and energies: those of what elements hold of the body."""
         return [self.body.mu, self.body.lam, self.body.material_stride]
+
+    @property
+    def stress_inputs(self) -> list:
+        """The same for stresses: those of the material."""
+        return list(self.body.lame)
 
 
 class Model(ABC):
@@ -177,7 +182,7 @@ class ElementField(ForceField):
         self.launch(self._energies, self.element_count, [self.elements, *self.material_inputs, u], [energies])
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
-        self.launch(self._von_mises, self.element_count, [self.elements, *self.material_inputs, u], [stress])
+        self.launch(self._von_mises, self.element_count, [self.elements, *self.stress_inputs, u], [stress])
 
 
 class LawField(ElementField):

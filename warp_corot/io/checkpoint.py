@@ -32,6 +32,9 @@ VERSION = 3
 
 MATERIALS = {kind.__name__: kind for kind in (Isotropic, TransverselyIsotropic, Orthotropic)}
 
+#: What forests have that were made from a domain.
+OF_DOMAIN = ("phi", "fill", "labels", "node_labels")
+
 #: What reading a damaged archive raises.
 DAMAGE = (EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
 
@@ -130,10 +133,13 @@ def load_checkpoint(path: str | PathLike[str], device: str | wp.Device | None = 
 
 
 def _upgrade(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
-    """Version 1 knew one world only."""
+    """Version 1 knew one world and one material only, and no domains."""
     header |= {"worlds": 1, "deterministic": False}
     for number in range(len(header["bodies"])):
         arrays[f"body{number}.world_starts"] = np.zeros(1, np.int64)
+    for described in header["bodies"]:
+        described.setdefault("material", "Isotropic")
+        described["mesh"] |= {"of_domain": [], "label_names": []}
 
 
 def _rebuilt_simulation(
@@ -213,8 +219,13 @@ def _pack_mesh(mesh: TetForest | TetMesh, prefix: str, arrays: dict[str, np.ndar
     arrays[prefix + "lattice"], arrays[prefix + "node_ends"] = mesh.lattice, mesh.node_ends
     for field in dataclasses.fields(Tree):
         arrays[f"{prefix}tree.{field.name}"] = getattr(mesh.tree, field.name)
+    of_domain = [name for name in OF_DOMAIN if getattr(mesh, name) is not None]
+    for name in of_domain:
+        arrays[f"{prefix}domain.{name}"] = getattr(mesh, name)
     return {
         "kind": "forest",
+        "of_domain": of_domain,
+        "label_names": mesh.label_names,
         "up_axis": mesh.up_axis,
         "cells": mesh.cells,
         "cell_size": mesh.cell_size,
@@ -231,7 +242,12 @@ def _unpack_mesh(described: dict[str, Any], prefix: str, arrays: dict[str, np.nd
     x, y, z = described["cells"]
     a, b, c = described["origin"]
     lattice, ends = arrays[prefix + "lattice"], arrays[prefix + "node_ends"]
-    return TetForest((x, y, z), described["cell_size"], (a, b, c), lattice, ends, tree, described["up_axis"])
+    of_domain = {name: arrays[f"{prefix}domain.{name}"] for name in described["of_domain"]}
+    names = tuple(described["label_names"])
+    up_axis = described["up_axis"]
+    return TetForest(
+        (x, y, z), described["cell_size"], (a, b, c), lattice, ends, tree, up_axis, label_names=names, **of_domain
+    )
 
 
 def _write_whole(target: Path, arrays: dict[str, np.ndarray]) -> None:

@@ -91,12 +91,6 @@ class BlockSteps:
         )
 
 
-def _is_uniform(body: SoftBody) -> bool:
-    """Whether the elements of a world are all of one material."""
-    shapes = [np.shape(value) for value in (body.material.young, body.material.poisson)]
-    return all(not shape or shape[-1] == 1 for shape in shapes)
-
-
 def _layouts(body: SoftBody, shape: int, shared: bool, subtrees: int) -> list[block.Layout]:
     """The ways to deal a body out, the fastest first.
 
@@ -105,7 +99,7 @@ def _layouts(body: SoftBody, shape: int, shared: bool, subtrees: int) -> list[bl
     """
     parts = (2, 1) if body.worlds <= body.device.sm_count else (1,)
     capacity = -(-subtrees // block.WARP) * block.WARP
-    uniform = _is_uniform(body)
+    uniform = body.is_uniform
     return [block.Layout(shape, shared, uniform, count, capacity, body.world_node_count) for count in parts]
 
 
