@@ -378,7 +378,7 @@ def anisotropic_energy(F, C):
     """psi = 1/2 e:C:e, e = sym(R^T F) - I; near F without a definite rotation it goes over to the nearest isotropic.
 
     With principal stretches s (the last negative in an inverted F) and x = (s1 + s2)(s2 + s3)(s3 + s1) / |s|^3, below
-    x = 0.1 it is psi_iso + b (psi - psi_iso), b = 3 y^2 - 2 y^3 of y = 10 x.
+    x = 0.4 it is psi_iso + b (psi - psi_iso), b = 3 y^2 - 2 y^3 of y = x / 0.4.
     """
     strain = _transpose(polar(F)) @ F
     strain = 0.5 * (strain + _transpose(strain)) - IDENTITY
@@ -387,7 +387,7 @@ def anisotropic_energy(F, C):
     s = np.linalg.svd(F, compute_uv=False)
     s[..., 2] *= np.sign(np.linalg.det(F))
     x = np.prod(s + np.roll(s, 1, axis=-1), axis=-1) / np.linalg.norm(s, axis=-1) ** 3
-    y = np.clip(10 * x, 0, 1)
+    y = np.clip(x / 0.4, 0, 1)
     return isotropic + (3 * y**2 - 2 * y**3) * (psi - isotropic)
 
 
