@@ -220,6 +220,20 @@ def test_a_cavity_stays_hollow(inward, device, rng):
     assert "1 cavities" in domain.report()
 
 
+def test_many_parts_each_turned_as_it_should(device, rng):
+    """Balls inside a ball are cavities, balls beside it bodies that were inside out; all are wound inwards."""
+    ball = trimesh.creation.icosphere(1, radius=0.3)
+    ball.invert()
+    places = [np.array(k) - 1.0 for k in np.ndindex(3, 3, 3)]
+    parts = [trimesh.creation.icosphere(4, radius=3.0), *(ball.copy().apply_translation(p) for p in places)]
+    beside = [place + np.array([6.0, 0, 0]) for place in places]
+    parts += [ball.copy().apply_translation(p) for p in beside]
+    domain = Domain.from_surface(arrays(trimesh.util.concatenate(parts)), device=device)
+    assert (domain.phi(places) > 0).all()
+    assert (domain.phi(beside) < 0).all()
+    assert {"27 cavities", "27 parts inside out turned round", "28 separate parts"} <= set(domain.report())
+
+
 def test_overlapping_parts_are_one_body(device, rng):
     first, second = trimesh.creation.icosphere(3), trimesh.creation.icosphere(3)
     second.apply_translation([0.8, 0, 0]).invert()
@@ -284,6 +298,9 @@ REFUSED = {
     "indices that are no whole numbers": ((CUBE[0], CUBE[1].astype(float)), "dtype float64; they must be indices"),
     "no triangles": ((CUBE[0], CUBE[1][:0]), r"shape \(0, 3\)"),
     "flat points": ((CUBE[0][:, :2], CUBE[1]), r"shape \(8, 2\)"),
+    "a body of 1e30 m": ((1e30 * CUBE[0], CUBE[1]), r"1e\+30 m long; float32"),
+    "a body of 1e-12 m": ((1e-12 * CUBE[0], CUBE[1]), "1e-12 m long; float32"),
+    "a body far away": ((1e5 + CUBE[0], CUBE[1]), r"1\.02 m long and reaches 1e\+05 m from the origin"),
     "words": ((np.array([["a", "b", "c"]]), CUBE[1]), "must be numbers"),
     "one array": (CUBE[0], "must be a file or"),
 }

@@ -241,19 +241,16 @@ def cones(
     Returns:
         Points with the centres appended, caps [C, 3], the part of each, number of open edges, number of holes.
     """
-    rims, times, rim_parts = [], [], []
-    for part in np.unique(parts[_touches(triangles, net_edges(triangles)[0])]):
-        edges, often = net_edges(triangles[parts == part])
-        rims.append(edges)
-        times.append(often)
-        rim_parts.append(np.full(len(edges), part))
-    if not rims or not sum(map(len, rims)):
+    # A rim runs through points of one part: a point that several parts share counts once for each.
+    count = len(points)
+    places, nodes = np.unique(parts[:, None] * count + triangles, return_inverse=True)
+    edges, often = net_edges(nodes.reshape(-1, 3))
+    if not len(edges):
         return points, np.empty((0, 3), np.int64), np.empty(0, np.int64), 0, 0
-    edges, often, owner = np.concatenate(rims), np.concatenate(times), np.concatenate(rim_parts)
-    # A rim is connected through points of the same part.
-    places, node = np.unique(np.stack([np.repeat(owner, 2), edges.ravel()], axis=1), axis=0, return_inverse=True)
-    a, b = node.reshape(-1, 2).T
-    links = coo_array((np.ones(len(a)), (a, b)), shape=(len(places), len(places)))
+    rim = np.unique(edges)
+    a, b = np.searchsorted(rim, edges).T
+    owner, edges = places[edges[:, 0]] // count, places[edges] % count
+    links = coo_array((np.ones(len(a)), (a, b)), shape=(len(rim), len(rim)))
     holes, hole = connected_components(links, directed=False)
     hole = hole[a]
     lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
@@ -264,25 +261,17 @@ def cones(
     return np.concatenate([points, centres]), np.repeat(caps, often, axis=0), np.repeat(owner, often), len(edges), holes
 
 
-def _touches(triangles: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Triangles with a corner on one of the edges."""
-    on = np.zeros(int(triangles.max()) + 1, bool)
-    on[edges.ravel()] = True
-    return on[triangles].any(axis=1)
-
-
 def wind_outwards(points: np.ndarray, triangles: np.ndarray, parts: np.ndarray) -> tuple[np.ndarray, int, int]:
     """Turn what is inside out; how many parts were, and how many are cavities: wound inwards, within another part."""
     volumes = part_volumes(points, triangles, parts)
     flip = np.zeros(len(volumes), bool)
     if volumes.sum() < 0.0:
         flip[:] = True
-    inward = volumes * np.where(flip, -1.0, 1.0) < 0.0
+    inward = np.flatnonzero(volumes * np.where(flip, -1.0, 1.0) < 0.0)
+    groups = Parts(points, triangles, parts)
     cavities = 0
-    for part in np.flatnonzero(inward):
-        mine = np.flatnonzero(parts == part)
-        corners = points[triangles[mine[:: max(1, len(mine) // CORNERS)], 0]]
-        if all(_is_within_another(points, triangles, parts, int(part), corner) for corner in corners):
+    for part in inward:
+        if groups.is_within_others(int(part)):
             cavities += 1
         else:
             flip[part] = not flip[part]
@@ -290,12 +279,26 @@ def wind_outwards(points: np.ndarray, triangles: np.ndarray, parts: np.ndarray) 
     return np.where(turned[:, None], triangles[:, ::-1], triangles), int(flip.sum()), cavities
 
 
-def _is_within_another(
-    points: np.ndarray, triangles: np.ndarray, parts: np.ndarray, part: int, corner: np.ndarray
-) -> bool:
-    around = np.abs(windings_by_part(points, triangles, parts, corner)) > 0.5
-    around[part] = False
-    return bool(around.any())
+class Parts:
+    """Closed parts, each with its triangles and its box."""
+
+    def __init__(self, points: np.ndarray, triangles: np.ndarray, parts: np.ndarray):
+        order = np.argsort(parts, kind="stable")
+        starts = np.flatnonzero(np.diff(parts[order], prepend=-1))
+        self.corners = points[triangles[order]]
+        self.slices = [slice(a, b) for a, b in zip(starts, [*starts[1:], len(order)], strict=True)]
+        self.lows = np.minimum.reduceat(self.corners.min(axis=1), starts, axis=0)
+        self.highs = np.maximum.reduceat(self.corners.max(axis=1), starts, axis=0)
+
+    def is_within_others(self, part: int) -> bool:
+        """Whether some corners of a part, spread over it, all lie within other parts."""
+        own = self.corners[self.slices[part], 0]
+        return all(self._holds(corner, part) for corner in own[:: max(1, len(own) // CORNERS)])
+
+    def _holds(self, at: np.ndarray, but: int) -> bool:
+        """Whether some part but one holds a point."""
+        near = np.flatnonzero(((self.lows <= at) & (at <= self.highs)).all(axis=1))
+        return any(abs(winding(self.corners[self.slices[part]], at)) > 0.5 for part in near if part != but)
 
 
 def part_volumes(points: np.ndarray, triangles: np.ndarray, parts: np.ndarray) -> np.ndarray:
@@ -304,14 +307,13 @@ def part_volumes(points: np.ndarray, triangles: np.ndarray, parts: np.ndarray) -
     return np.bincount(parts, weights=np.einsum("ij,ij->i", a, np.cross(b, c))) / 6.0
 
 
-def windings_by_part(points: np.ndarray, triangles: np.ndarray, parts: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Winding number of each part around a point, by solid angles (Van Oosterom and Strackee 1983)."""
-    a, b, c = (points[triangles] - at).transpose(1, 0, 2)
+def winding(corners: np.ndarray, at: np.ndarray) -> float:
+    """Winding number of triangles [T, 3, 3] around a point, by solid angles (Van Oosterom and Strackee 1983)."""
+    a, b, c = (corners - at).transpose(1, 0, 2)
     x, y, z = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     dot = np.einsum
     below = x * y * z + dot("ij,ij->i", a, b) * z + dot("ij,ij->i", b, c) * x + dot("ij,ij->i", c, a) * y
-    angles = 2.0 * np.arctan2(dot("ij,ij->i", a, np.cross(b, c)), below)
-    return np.bincount(parts, weights=angles) / (4.0 * np.pi)
+    return float(np.arctan2(dot("ij,ij->i", a, np.cross(b, c)), below).sum()) / (2.0 * np.pi)
 
 
 def areas(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ import warp as wp
 from ..device import checked_device
 from ..errors import InputError
 from ..kernels import domain as kernels
-from .units import length
+from .units import check_float32, length
 
 if TYPE_CHECKING:
     Surface = str | PathLike[str] | tuple[npt.ArrayLike, npt.ArrayLike]
@@ -49,6 +49,7 @@ class Domain:
         if up_axis not in ("X", "Y", "Z"):
             raise InputError(f"up_axis is {up_axis!r}; it must be 'X', 'Y' or 'Z'")
         self.bounds = np.array(bounds, dtype=np.float64)
+        check_float32(self.bounds)
         self.lipschitz = float(lipschitz)
         self.up_axis = up_axis
         self.label_names = tuple(label_names)

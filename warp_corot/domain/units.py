@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from ..errors import InputError
 
 #: Metres in a unit.
 UNITS = {"m": 1.0, "cm": 1.0e-2, "mm": 1.0e-3}
 #: Bodies outside this range [m] are probably given in another unit than is said.
 SMALLEST, LARGEST = 1.0e-3, 100.0
+#: Lengths [m], and distances from the origin in lengths, that float32 computes with.
+FLOAT32_SIZES = 1.0e-6, 1.0e6
+FLOAT32_DISTANCE = 1.0e4
 #: The size [m] that the likely unit brings an unlikely body closest to: an organ's.
 TYPICAL = 0.2
 
@@ -33,11 +38,33 @@ def length(metres: float) -> str:
 
 
 def volume(cubic_metres: float) -> str:
-    """A volume to three digits, in litres, millilitres or cubic millimetres."""
-    for unit, factor in (("l", 1e3), ("ml", 1e6)):
+    """A volume to three digits, in cubic metres, litres, millilitres or cubic millimetres."""
+    for unit, factor in (("m^3", 1.0), ("l", 1e3), ("ml", 1e6)):
         if abs(cubic_metres) * factor >= 1.0:
             return f"{cubic_metres * factor:.3g} {unit}"
     return f"{cubic_metres * 1e9:.3g} mm^3"
+
+
+def check_float32(bounds: np.ndarray) -> None:
+    """See that float32 can tell the points of a body from one another.
+
+    Args:
+        bounds: Its box [2, 3] [m].
+
+    Raises:
+        InputError: It is too large, too small, or too far from the origin.
+    """
+    size, far = float(np.ptp(bounds, axis=0).max()), float(np.abs(bounds).max())
+    least, most = FLOAT32_SIZES
+    if not least <= size <= most:
+        raise InputError(
+            f"the body is {size:.3g} m long; float32, in which all is computed, wants {least:g} to {most:g} m"
+        )
+    if far > FLOAT32_DISTANCE * size:
+        raise InputError(
+            f"the body is {length(size)} long and reaches {length(far)} from the origin; float32, in which all is "
+            f"computed, wants it within {FLOAT32_DISTANCE:g} times its length: move it nearer"
+        )
 
 
 def unlikely_size(size: float, metres: float) -> str | None:

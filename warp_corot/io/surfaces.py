@@ -152,9 +152,7 @@ def _read_usd(path: Path) -> tuple[NDArray[np.float64], NDArray[Any], float, str
         mirrored = np.linalg.det(world[:3, :3]) < 0.0
         if mirrored != (mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded):
             triangles = triangles[:, ::-1]
-        if mesh.GetSubdivisionSchemeAttr().Get() != UsdGeom.Tokens.none and prim.HasAuthoredAttribute(
-            "subdivisionScheme"
-        ):
+        if mesh.GetSubdivisionSchemeAttr().Get() != UsdGeom.Tokens.none:
             notes.append(f"{prim.GetPath()} is a subdivision surface, taken as its control mesh")
         all_points.append(points @ world[:3, :3] + world[3, :3])
         all_triangles.append(triangles + offset)
