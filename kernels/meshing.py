@@ -317,7 +317,7 @@ def judge_by_corners(
     level: wp.array[wp.int32],
     phi: wp.array[wp.float32],
     circumradius: wp.array[wp.float32],
-    longest: wp.array[wp.float32],
+    edges: wp.array2d[wp.float32],
     lipschitz: float,
     min_level: int,
     max_level: int,
@@ -326,24 +326,36 @@ def judge_by_corners(
     # Out
     states: wp.array[wp.int32],
 ):
-    """Every point of an element is within its circumradius of some corner, and within its longest edge of each: so
-    values beyond what the function can change over that distance settle the matter."""
+    """No surface is where values are beyond what the function can change over the distance from them.
+
+    Every point of an element is within its circumradius of some corner, within the longest edge of each, and within
+    half the circumradius of some corner or midpoint of an edge: these ten are the nodes of the eight elements three
+    levels below, of half the size. Midpoints' values are bounded from those of the ends.
+    """
     i = wp.tid()
     tet = tets[first + i]
     own_level = level[first + i]
-    lowest = phi[tet[0]]
-    highest = lowest
-    for n in range(1, 4):
-        lowest = wp.min(lowest, phi[tet[n]])
-        highest = wp.max(highest, phi[tet[n]])
+    p = wp.vec4(phi[tet[0]], phi[tet[1]], phi[tet[2]], phi[tet[3]])
     near = lipschitz * circumradius[own_level]
-    far = lipschitz * longest[own_level]
+    lowest = wp.min(p)
+    highest = wp.max(p)
+    longest = float(0.0)
+    for e in range(6):
+        longest = wp.max(longest, edges[own_level, e])
+    outside = lowest > near or highest > lipschitz * longest
+    inside = highest < -near or lowest < -lipschitz * longest
+    for e in range(6):
+        change = 0.5 * lipschitz * edges[own_level, e]
+        a = p[FIRST_NODE[e]]
+        b = p[SECOND_NODE[e]]
+        lowest = wp.min(lowest, wp.max(a, b) - change)
+        highest = wp.max(highest, wp.min(a, b) + change)
     state = DONE
-    if lowest > near or highest > far:
+    if outside or lowest > 0.5 * near:
         first_child[first + i] = VOID
     elif own_level < min_level:
         state = SPLIT
-    elif highest >= -near and lowest >= -far and own_level < max_level:
+    elif own_level < max_level and not (inside or highest < -0.5 * near):
         state = OPEN
     states[i] = state
 
@@ -392,11 +404,9 @@ def judge_by_edges(
 ):
     """Compare the midpoints of the six edges with the linear interpolant.
 
-    Corners and midpoints are the ten nodes of the eight elements three levels below, of half the size: so every point
-    is within half the circumradius of one of them. Of a quadratic function the six deviations e tell all: it deviates
-    by sum 4 l_i l_j e_ij at barycentric coordinates l, so by their mean times 4/3 at a face's centre and 3/2 at the
-    centroid. What passes is looked at once more, in the middle of its piece of the surface or at its centroid: what
-    the quadratic function has there is ``expected``.
+    Of a quadratic function the six deviations e tell all: it deviates by sum 4 l_i l_j e_ij at barycentric coordinates
+    l, so by their mean times 4/3 at a face's centre and 3/2 at the centroid. What barely passes is looked at once more,
+    in the middle of its piece of the surface or at its centroid: what the quadratic function has there is ``expected``.
     """
     i = wp.tid()
     element = elements[i]
@@ -435,10 +445,13 @@ def judge_by_edges(
     elif highest < -near:
         state = DONE
     elif crossed:
-        if worst > tolerance * gradient_size(tet, phi, lattice, float(spacing), lipschitz):
+        tolerance *= gradient_size(tet, phi, lattice, float(spacing), lipschitz)
+        if worst > tolerance:
             state = SPLIT
     elif worst > tolerance and wp.max(lowest, -highest) <= 2.0 * worst:
         state = SPLIT
+    if state == OPEN and (worst < 0.25 * tolerance or wp.max(lowest, -highest) > 4.0 * worst):
+        state = DONE
     states[element - first] = state
 
     place = wp.vec4(0.25)

@@ -1,6 +1,7 @@
-"""Meshes: the forest of bisected tetrahedra, and tetrahedra of any shape."""
+"""Meshes: the forest of bisected tetrahedra, tetrahedra of any shape, and surfaces that go along with them."""
 
+from .bound import BoundPoints, SurfaceMesh
 from .forest import TetForest, Tree
 from .tetmesh import TetMesh
 
-__all__ = ["TetForest", "TetMesh", "Tree"]
+__all__ = ["BoundPoints", "SurfaceMesh", "TetForest", "TetMesh", "Tree"]

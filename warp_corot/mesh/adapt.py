@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ import warp as wp
 
 from ..errors import InputError
 from ..kernels import meshing as kernels
+from ..kernels.shapes import EDGES, REST
 from .bisection import path_tetrahedra
 from .growth import Growth, lattice_spacing
 from .lattice import LATTICE_BITS, MAX_LEVEL
@@ -20,9 +22,9 @@ if TYPE_CHECKING:
     from ..domain import Domain
     from .forest import Field
 
-#: Circumradius and longest edge of the three types, over h.
+#: Circumradius and lengths of the edges of the three types, over h.
 CIRCUMRADIUS = np.sqrt([0.75, 0.5625, 0.3125])
-LONGEST_EDGE = np.sqrt([3.0, 2.0, 1.0])
+EDGE_LENGTHS = np.array([[math.dist(corners[i], corners[j]) for i, j in EDGES] for corners in REST])
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ class _Adaptation:
         level = np.arange(MAX_LEVEL + 1)
         h = cell_size * 0.5 ** (level // 3)
         self.circumradius = wp.array(h * CIRCUMRADIUS[level % 3], dtype=wp.float32, device=device)
-        self.longest = wp.array(h * LONGEST_EDGE[level % 3], dtype=wp.float32, device=device)
+        self.edges = wp.array(h[:, None] * EDGE_LENGTHS[level % 3], dtype=wp.float32, device=device)
         #: What float32 coordinates leave open of a value.
         reach = float(np.abs(np.asarray(origin)).max() + max(cells) * cell_size)
         self.noise = float(domain.lipschitz) * reach * 2.0**-22
@@ -152,7 +154,7 @@ class _Adaptation:
         self.evaluate()
         count = growth.element_count - first
         states = wp.empty(count, dtype=wp.int32, device=self.device)
-        inputs = [first, growth.tets, growth.level, self.phi, self.circumradius, self.longest]
+        inputs = [first, growth.tets, growth.level, self.phi, self.circumradius, self.edges]
         inputs += [lipschitz, wishes.min_level, wishes.max_level]
         self.launch(kernels.judge_by_corners, count, inputs, [growth.first_child, states])
         self.judge_surface(first, states)

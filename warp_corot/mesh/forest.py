@@ -206,7 +206,7 @@ class TetForest:
         if self.node_count == len(self.lattice):
             return self.tree.ancestors(self.tree.leaves, level)
         tree, found = self.tree, self.tree.leaves.copy()
-        on_nodes = (tree.tets < self.node_count).all(axis=1)
+        on_nodes = np.less(tree.tets.max(axis=1), self.node_count)
         below = np.flatnonzero(tree.level[found] > level)
         climbed = found[below]
         while len(below):
