@@ -42,11 +42,18 @@ class OrthotropicMaterial:
     mu: wp.array[wp.float32]  # of the nearest isotropic material [Pa]
     lam: wp.array[wp.float32]
     stride: int  # of the last three
+    fill: wp.array[wp.float32]  # share of an element's volume that the body takes
+    fill_stride: int
 
 
 @wp.func
 def axes_of(material: OrthotropicMaterial, t: int):
     return material.axes[t * material.axes_stride]
+
+
+@wp.func
+def filled(material: OrthotropicMaterial, t: int):
+    return material.fill[t * material.fill_stride]
 
 
 @wp.func
@@ -150,7 +157,7 @@ def element_forces(rotation: wp.Function) -> wp.Function:
             # s (F d) d^T, and d is the first axis.
             pull = activation[t] * column(m + g, 0)
             p += wp.outer(pull, wp.vec3(1.0, 0.0, 0.0))
-        scatter_stress(elements, t, p * wp.transpose(turn), f)
+        scatter_stress(elements, t, (filled(material, t) * p) * wp.transpose(turn), f)
 
     return element_forces
 
@@ -193,7 +200,7 @@ def anisotropic_energies(Elements: Any, rotation: wp.Function) -> wp.Kernel:
         m = axes_of(material, t)
         g, _turn = material_gradient(elements, t, m, u)
         strain = corotated_strain(g, m, rotation(m + g))
-        density = energy_density(strain, material, t)
+        density = filled(material, t) * energy_density(strain, material, t)
         energies[t] = wp.float64(density) * wp.float64(rest_volume(elements, t))
 
     return anisotropic_energies

@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from .anisotropic import INDEFINITE, OrthotropicMaterial, axes_of, element_forces
+from .anisotropic import INDEFINITE, OrthotropicMaterial, axes_of, element_forces, filled
 from .elements import GeneralElements, frame, gradient_of, rest_volume
 from .lanes import COMPILER_FLAGS, NEWTON, PRELUDE, on_cpu
 from .rotation import ITERATIONS, byers_xu
@@ -137,7 +137,7 @@ def scatter_anisotropic_lanes(
 
 @functools.cache
 def turn_elements(Elements: Any) -> wp.Kernel:
-    """Elements of either kind as ``scatter_anisotropic_lanes`` wants them: Dm^-1 M, and the volume."""
+    """Elements of either kind as ``scatter_anisotropic_lanes`` wants them: Dm^-1 M, and the filled volume."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def turn_elements(
@@ -158,7 +158,7 @@ def turn_elements(Elements: Any) -> wp.Kernel:
         rows[1] = (gradient_of(elements, t, o, o, x, o) * turn)[0]
         rows[2] = (gradient_of(elements, t, o, o, o, x) * turn)[0]
         rest_inverse[t] = rows
-        volume[t] = rest_volume(elements, t)
+        volume[t] = filled(material, t) * rest_volume(elements, t)
 
     return turn_elements
 

@@ -113,7 +113,9 @@ def device_material(body: SoftBody) -> OrthotropicMaterial:
     material = OrthotropicMaterial()
     material.axes, material.axes_stride = _for_elements(given.frames(), 2, body, wp.mat33)
     material.stiffness, material.stride = _for_elements(stiffness, 1, body, vec9)
-    material.mu, material.lam = body.mu, body.lam
+    material.mu, material.lam, _stride = body.lame
+    fill = np.ones(()) if body.fill is None else body.fill
+    material.fill, material.fill_stride = _for_elements(fill, 0, body, wp.float32)
     return material
 
 
