@@ -130,7 +130,7 @@ def _finished(grown: Grown, domain: Domain, cell_size: float, sliver: float) -> 
             "with bounds " + " to ".join(str(np.round(b, 6).tolist()) for b in np.asarray(domain.bounds))
         )
     tree, fill = _without_slivers(tree, grown.phi, sliver)
-    order = with_virtual(in_order_of_leaves(tree), tree, len(grown.phi))
+    order = with_virtual(in_order_of_leaves(tree), tree, grown.lattice)
     ends, tree = renumbered(order, grown.ends, tree)
     phi = grown.phi[order]
     forest = TetForest(

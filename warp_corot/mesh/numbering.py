@@ -17,12 +17,13 @@ def in_order_of_leaves(tree: Tree) -> np.ndarray:
     return touched[first[touched] == turn]
 
 
-def with_virtual(real: np.ndarray, tree: Tree, count: int) -> np.ndarray:
-    """The given nodes, and behind them all others, of ``count``, that the tree names."""
-    named = np.zeros(count, bool)
+def with_virtual(real: np.ndarray, tree: Tree, lattice: np.ndarray) -> np.ndarray:
+    """The given nodes, and behind them all others that the tree names, in the order of their lattice points."""
+    named = np.zeros(len(lattice), bool)
     named[tree.tets] = True
     named[real] = False
-    return np.concatenate([real, np.flatnonzero(named)])
+    others = np.flatnonzero(named)
+    return np.concatenate([real, others[np.lexsort(lattice[others].T)]])
 
 
 def renumbered(order: np.ndarray, ends: np.ndarray, tree: Tree) -> tuple[np.ndarray, Tree]:

@@ -33,7 +33,7 @@ def refined(forest: TetForest, leaves: np.ndarray) -> TetForest:
     named[grown.leaf_tets] = True
     named[: forest.node_count] = False
     real = np.concatenate([np.arange(forest.node_count), np.flatnonzero(named)])
-    order = with_virtual(real, grown, len(lattice))
+    order = with_virtual(real, grown, lattice)
     new_ends, new_tree = renumbered(order, ends, grown)
     whose = _leaves_before(forest.tree, grown)
     return replace(
