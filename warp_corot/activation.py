@@ -13,7 +13,7 @@ from .errors import InputError
 from .indices import checked_indices
 
 if TYPE_CHECKING:
-    from .body import SoftBody
+    from .controls import Controls
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,7 @@ class ElementActivation:
 
 
 def activate(
-    body: SoftBody,
+    body: Controls,
     stress: float | npt.ArrayLike | Activation,
     elements: npt.ArrayLike | None,
     worlds: npt.ArrayLike | None,

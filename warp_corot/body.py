@@ -8,22 +8,23 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from .activation import Activation, ElementActivation, activate
-from .anisotropy import Anisotropic
+from .activation import ElementActivation
 from .checks import check_float32, checked_count
+from .controls import Controls
 from .device import checked_device
 from .elements import Mesh, device_elements, element_kind, parts, repeated
 from .errors import InputError
 from .kernels.integrate import adopt_positions, publish_positions, reset_nodes
 from .materials import Isotropic, Material
+from .nodal import padded, vec3_view
 from .trajectory import Trajectory
-from .worlds import World, chosen_nodes
+from .worlds import World
 
 #: Elements, and with them nodes, are numbered in 32 bits.
 MOST_ELEMENTS = 2**31 - 1
 
 
-class SoftBody:
+class SoftBody(Controls):
     """The state of one body: displacements, velocities, masses, constraints and loads of its nodes.
 
     Nodal vectors live in 16-byte vec4 arrays, the fourth lane unused, so that a node is one load and, where the card
@@ -75,7 +76,7 @@ class SoftBody:
         check_float32(self.masses[self.masses > 0], "the mass of a node", "kg")
 
         n = self.node_count
-        self.node_rest = wp.array(_padded(self.rest_positions), dtype=wp.vec4, device=self.device)
+        self.node_rest = wp.array(padded(self.rest_positions), dtype=wp.vec4, device=self.device)
         self.node_positions = wp.clone(self.node_rest)
         self.node_displacements = wp.zeros(n, dtype=wp.vec4, device=self.device)
         self.node_velocities = wp.zeros(n, dtype=wp.vec4, device=self.device)
@@ -97,21 +98,6 @@ class SoftBody:
         self._update_inverse_mass()
 
     # --- state -----------------------------------------------------------------------------------------------------
-
-    @property
-    def world_node_count(self) -> int:
-        """Nodes of one world, N."""
-        return len(self.mesh.points)
-
-    @property
-    def node_count(self) -> int:
-        """Nodes of all worlds."""
-        return self.worlds * self.world_node_count
-
-    @property
-    def element_count(self) -> int:
-        """Elements of all worlds."""
-        return self.worlds * len(self.mesh.tets)
 
     @property
     def is_uniform(self) -> bool:
@@ -167,7 +153,7 @@ class SoftBody:
 
     @velocities.setter
     def velocities(self, values: npt.ArrayLike) -> None:
-        self.node_velocities.assign(_padded(self._checked_vectors(values, "velocities")))
+        self.node_velocities.assign(padded(self._checked_vectors(values, "velocities")))
 
     @property
     def reactions(self) -> wp.array:
@@ -176,12 +162,6 @@ class SoftBody:
         A support carries its node's own weight too. Inertia of a prescribed node is not included.
         """
         return vec3_view(self.node_reactions)
-
-    @property
-    def loads(self) -> wp.array:
-        """External nodal forces [N], vec3 [worlds * N]: a view of the live array, made on first use."""
-        self._ensure_loads()
-        return vec3_view(self.node_loads)
 
     def adopt_positions(self) -> None:
         """Take over positions that somebody wrote since they were last published."""
@@ -209,160 +189,7 @@ class SoftBody:
         outputs = [self.node_displacements, self.node_velocities, self.node_positions, self.node_reactions]
         self._launch(reset_nodes, inputs, [*outputs, self.world_starts])
 
-    # --- constraints and loads -------------------------------------------------------------------------------------
-
-    def fix(self, nodes: npt.ArrayLike, *, worlds: npt.ArrayLike | None = None) -> None:
-        """Hold nodes where they are.
-
-        Args:
-            nodes: Mask bool [N] or indices into one world's nodes; or a mask of all worlds' nodes, bool [worlds, N].
-            worlds: In which worlds: None for all, an index, indices or a mask bool [worlds].
-
-        Raises:
-            InputError: Mask of the wrong length or index out of range.
-        """
-        chosen = self.node_indices(nodes, worlds)
-        self._stop_following(chosen)
-        self._constrain(chosen, np.zeros(3))
-
-    def release(self, nodes: npt.ArrayLike, *, worlds: npt.ArrayLike | None = None) -> None:
-        """Let fixed or prescribed nodes go, with the velocity they have. Nodes and worlds as in ``fix``."""
-        chosen = self.node_indices(nodes, worlds)
-        self._stop_following(chosen)
-        self._constrained[chosen] = False
-        self._update_inverse_mass()
-        reactions = self.node_reactions.numpy().copy()
-        reactions[chosen] = 0.0
-        self.node_reactions.assign(reactions)
-
-    def prescribe(
-        self,
-        nodes: npt.ArrayLike,
-        *,
-        velocity: npt.ArrayLike | None = None,
-        times: npt.ArrayLike | None = None,
-        displacements: npt.ArrayLike | None = None,
-        worlds: npt.ArrayLike | None = None,
-    ) -> None:
-        """Move nodes as told, whatever the forces: at a velocity, or along keyframes.
-
-        Args:
-            nodes: n nodes of each world, as in ``fix``.
-            velocity: Constant velocity [m/s], [3], [n, 3] or [worlds, n, 3].
-            times: Increasing times of keyframes [s], [K], at least two, in the time of the simulation, from a world's
-                last reset.
-            displacements: Displacements from rest at these times [m], [K, 3] for all nodes alike or [K, n, 3]; linear
-                in between, constant before and after.
-            worlds: As in ``fix``.
-
-        Raises:
-            InputError: Neither or both ways given, wrong shapes, times that do not increase, or non-finite values.
-        """
-        named = chosen_nodes(nodes, self.world_node_count, self.worlds, worlds)
-        chosen = named.indices
-        if (velocity is None) == (times is None and displacements is None):
-            raise InputError("prescribe takes either velocity, or times and displacements")
-        if velocity is not None:
-            values = named.vectors(velocity, "velocity")
-            self._stop_following(chosen)
-            self._constrain(chosen, values)
-            return
-        self.follow(chosen, times, None if displacements is None else named.keyframes(displacements))
-
-    def follow(
-        self, indices: npt.NDArray[np.integer], times: npt.ArrayLike | None, displacements: npt.ArrayLike | None
-    ) -> None:
-        """``prescribe`` along keyframes for nodes by their indices among those of all worlds."""
-        trajectory = Trajectory.of_keys(indices, times, displacements, self.device)
-        self._stop_following(indices)
-        self._constrain(indices, np.zeros(3))
-        if len(indices):
-            self.trajectories.append(trajectory)
-            self.revision += 1
-
-    def load(self, nodes: npt.ArrayLike, force: npt.ArrayLike, *, worlds: npt.ArrayLike | None = None) -> None:
-        """Set the external force on nodes, from the next step on.
-
-        Args:
-            nodes: n nodes of each world, as in ``fix``.
-            force: Force on each node [N], [3], [n, 3], [worlds, 1, 3] or [worlds, n, 3].
-            worlds: As in ``fix``.
-
-        Raises:
-            InputError: Wrong shape or non-finite values.
-        """
-        chosen = chosen_nodes(nodes, self.world_node_count, self.worlds, worlds)
-        values = chosen.vectors(force, "force")
-        self._ensure_loads()
-        loads = self.node_loads.numpy().copy()
-        loads[chosen.indices, :3] = values
-        self.node_loads.assign(loads)
-
-    @property
-    def activation(self) -> wp.array:
-        """Active stress along the fibres [Pa], float32 [worlds * T]: the live array, made on first use.
-
-        Positive stress contracts. Write to it between steps; elements that follow an ``Activation`` have in it what
-        they had in the last step.
-
-        Raises:
-            InputError: The material has no fibres.
-        """
-        if not isinstance(self.material, Anisotropic):
-            raise InputError(
-                "activation needs a material with a direction, TransverselyIsotropic or Orthotropic; "
-                f"the body's is {type(self.material).__name__}"
-            )
-        if not self.has_activation:
-            self.element_activation = wp.zeros(self.element_count, dtype=wp.float32, device=self.device)
-            self.revision += 1
-        return self.element_activation
-
-    def activate(
-        self,
-        stress: float | npt.ArrayLike | Activation,
-        elements: npt.ArrayLike | None = None,
-        *,
-        worlds: npt.ArrayLike | None = None,
-    ) -> None:
-        """Set the active stress along the fibres, from the next step on: P = s (F d) d^T in an element of direction d.
-
-        It pulls whatever the fibre's length, so that it puts work in and has no energy. It stiffens the fibres: a
-        stress beyond Young's modulus along them can need a smaller step than was found without it.
-
-        Args:
-            stress: Positive contracts [Pa]: a number, [n], [worlds, n] or [worlds, 1], or keyframes that are followed
-                over time.
-            elements: n elements of each world, mask bool [T] or indices; None for all.
-            worlds: As in ``fix``.
-
-        Raises:
-            InputError: The material has no fibres, wrong shapes, or values that are not finite.
-        """
-        activate(self, stress, elements, worlds)
-
-    @property
-    def has_activation(self) -> bool:
-        return len(self.element_activation) == self.element_count and isinstance(self.material, Anisotropic)
-
-    @property
-    def constrained(self) -> npt.NDArray[np.bool_]:
-        """Which nodes are fixed or prescribed, bool [worlds * N] (a copy)."""
-        return self._constrained.copy()
-
-    @property
-    def has_loads(self) -> bool:
-        return len(self.node_loads) == self.node_count
-
     # --- pieces ----------------------------------------------------------------------------------------------------
-
-    def node_indices(self, nodes: npt.ArrayLike, worlds: npt.ArrayLike | None = None) -> npt.NDArray[np.intp]:
-        """Indices, among the nodes of all worlds, of those named as in ``fix``.
-
-        Raises:
-            InputError: Mask of the wrong length, index out of range, or neither.
-        """
-        return chosen_nodes(nodes, self.world_node_count, self.worlds, worlds).indices
 
     def _lame_arrays(self, material: Isotropic, fill: npt.NDArray[np.float64] | None) -> tuple[wp.array, wp.array, int]:
         mu, lam = np.broadcast_arrays(np.atleast_1d(material.mu), np.atleast_1d(material.lam))
@@ -389,48 +216,11 @@ class SoftBody:
         return given
 
     def _set_displacements(self, values: npt.NDArray[np.float64]) -> None:
-        self.node_displacements.assign(_padded(values))
+        self.node_displacements.assign(padded(values))
         self.publish_positions()
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=self.node_count, inputs=inputs, outputs=outputs, device=self.device)
-
-    def _ensure_loads(self) -> None:
-        if not self.has_loads:
-            self.node_loads = wp.zeros(self.node_count, dtype=wp.vec4, device=self.device)
-            self.revision += 1
-
-    def _constrain(self, chosen: np.ndarray, velocity: np.ndarray) -> None:
-        self._constrained[chosen] = True
-        self._update_inverse_mass()
-        velocities = self.node_velocities.numpy().copy()
-        velocities[chosen, :3] = velocity
-        self.node_velocities.assign(velocities)
-
-    def _update_inverse_mass(self) -> None:
-        inverse = np.zeros(self.node_count)
-        free = ~self._constrained & (self.masses > 0)
-        inverse[free] = 1.0 / self.masses[free]
-        self.node_inverse_mass.assign(inverse.astype(np.float32))
-
-    def _stop_following(self, chosen: np.ndarray) -> None:
-        """Take nodes out of the trajectories they follow."""
-        kept = [trajectory.without(chosen) for trajectory in self.trajectories]
-        if any(now is not before for now, before in zip(kept, self.trajectories, strict=True)):
-            self.trajectories = [trajectory for trajectory in kept if trajectory]
-            self.revision += 1
-
-
-def _padded(vectors: np.ndarray) -> npt.NDArray[np.float32]:
-    """[N, 3] as the float32 [N, 4] that nodal arrays hold."""
-    padded = np.zeros((len(vectors), 4), np.float32)
-    padded[:, :3] = vectors
-    return padded
-
-
-def vec3_view(a: wp.array) -> wp.array:
-    """The first three lanes of a vec4 array as a live (strided) vec3 array."""
-    return a.view(wp.float32)[:, :3].view(wp.vec3)
 
 
 def centroids(mesh: Mesh) -> npt.NDArray[np.float64]:

@@ -14,12 +14,13 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from .body import SoftBody, vec3_view
+from .body import SoftBody
 from .checks import checked_count, checked_things
 from .elasticity import Corotated, Model
 from .errors import InputError, StabilityWarning, UnstableError
 from .indices import checked_indices
 from .kernels.integrate import advance_clock
+from .nodal import vec3_view
 from .solvers import Integrator, SymplecticEuler, largest_frequency
 from .solvers.integrator import StepContext
 

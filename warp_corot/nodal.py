@@ -1,0 +1,19 @@
+"""Nodal vectors as the device keeps them: four floats a node, the last one unused."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+
+def padded(vectors: np.ndarray) -> npt.NDArray[np.float32]:
+    """[N, 3] as the float32 [N, 4] that nodal arrays hold."""
+    padded = np.zeros((len(vectors), 4), np.float32)
+    padded[:, :3] = vectors
+    return padded
+
+
+def vec3_view(a: wp.array) -> wp.array:
+    """The first three lanes of a vec4 array as a live (strided) vec3 array."""
+    return a.view(wp.float32)[:, :3].view(wp.vec3)
