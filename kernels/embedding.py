@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .meshing import VOID
+from .growth import VOID
 
 
 @wp.kernel(enable_backward=False)

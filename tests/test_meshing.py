@@ -441,6 +441,22 @@ def test_forces_by_subtrees_are_those_of_the_leaves(forest, rotation_level, devi
     assert np.abs(found[0] - found[1]).max() < 1e-5 * np.abs(found[1]).max()
 
 
+def test_the_largest_piece_alone():
+    pair = united(ball(0.2, (-0.3, 0, 0)), ball(0.1, (0.3, 0.1, 0)))
+    both = wc.TetForest.from_domain(pair, 0.25, max_level=9)
+    piece = both.pieces()
+    assert np.array_equal(piece, np.where(both.points[both.tets].mean(axis=1)[:, 0] > 0.05, 1, 0))
+    one = both.largest_piece()
+    assert len(one.tets) == (piece == 0).sum()
+    assert held(one) == pytest.approx((both.fill * both.volumes)[piece == 0].sum(), rel=1e-12)
+    surface = one.surface()
+    assert surface.euler_characteristic == 2
+    assert surface.volume == pytest.approx(held(one), rel=1e-11)
+    assert_conforming(one)
+    assert one.largest_piece() is one
+    assert wc.TetForest.box().largest_piece().pieces().tolist() == [0] * 6
+
+
 # --- regions ---------------------------------------------------------------------------------------------------------
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from ..errors import InputError
+from ..kernels import growth as growing
 from ..kernels import meshing as kernels
 from ..kernels.shapes import EDGES, REST
 from .bisection import path_tetrahedra
@@ -125,7 +126,7 @@ class _Adaptation:
 
     def wished_from(self, first: int) -> wp.array:
         flags = wp.empty(self.growth.element_count - first, dtype=wp.int32, device=self.device)
-        self.launch(kernels.flag_wished, len(flags), [self.growth.wished, first], [flags])
+        self.launch(growing.flag_wished, len(flags), [self.growth.wished, first], [flags])
         return self.growth.flagged(flags, first)
 
     def evaluate(self) -> None:

@@ -12,6 +12,7 @@ from ..errors import InputError
 from ..indices import checked_indices
 from .bound import BoundPoints, SurfaceMesh
 from .marching import marched
+from .numbering import in_order_of_leaves, live_or_void, renumbered, with_virtual
 from .separating import separated
 from .surface import boundary_faces
 
@@ -48,10 +49,7 @@ def bind(forest: TetForest, points: np.ndarray, triangles: npt.ArrayLike | None)
 
 
 def pieces(forest: TetForest) -> np.ndarray:
-    """Which piece of the mesh each leaf belongs to, int32 [T], numbered from the one with most leaves on.
-
-    Leaves of one piece hang together by nodes.
-    """
+    """See `TetForest.pieces`."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -62,6 +60,33 @@ def pieces(forest: TetForest) -> np.ndarray:
     piece = of_node[tets[:, 0]]
     rank = np.argsort(np.argsort(-np.bincount(piece), kind="stable"), kind="stable")
     return rank[piece].astype(np.int32)
+
+
+def largest_piece(forest: TetForest) -> TetForest:
+    """See `TetForest.largest_piece`."""
+    kept = pieces(forest) == 0
+    if kept.all():
+        return forest
+    live = np.zeros(len(forest.tree.level), bool)
+    live[forest.tree.leaves[kept]] = True
+    tree = live_or_void(forest.tree, live)
+    order = with_virtual(in_order_of_leaves(tree), tree, forest.lattice)
+    ends, tree = renumbered(order, forest.node_ends, tree)
+    phi = None
+    if forest.phi is not None:
+        phi = forest.phi.copy()
+        gone = np.unique(forest.tets[~kept])
+        phi[gone] = np.abs(phi[gone])
+    return replace(
+        forest,
+        lattice=forest.lattice[order],
+        node_ends=ends,
+        tree=tree,
+        phi=None if phi is None else phi[order],
+        node_labels=None if forest.node_labels is None else forest.node_labels[order],
+        fill=None if forest.fill is None else forest.fill[kept],
+        labels=None if forest.labels is None else forest.labels[kept],
+    )
 
 
 def summary(forest: TetForest) -> list[str]:

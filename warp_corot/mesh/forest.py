@@ -300,6 +300,18 @@ class TetForest:
         found[self.tets[self.elements_of(label)]] = True
         return found
 
+    def pieces(self) -> np.ndarray:
+        """Which piece each leaf is in, int32 [T]: leaves that hang together by nodes; the largest piece is 0."""
+        from .bodies import pieces
+
+        return pieces(self)
+
+    def largest_piece(self) -> TetForest:
+        """The mesh without what hangs together with its largest piece by no node, surface and all."""
+        from .bodies import largest_piece
+
+        return largest_piece(self)
+
     def summary(self) -> list[str]:
         """What a user should know of the mesh, line by line: counts by level and type, volume, labels, pieces."""
         from .bodies import summary

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from ..errors import InputError
-from ..kernels import meshing as kernels
+from ..kernels import growth as kernels
 from .lattice import LATTICE_BITS, MAX_LEVEL
 from .tree import Tree
 
