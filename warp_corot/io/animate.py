@@ -6,18 +6,23 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
 from ..simulation import Simulation
+from .skins import Skin, has_domain, skins_of
 from .usd_writer import UsdWriter
+
+if TYPE_CHECKING:
+    from .skins import Surface
 
 Progress = Callable[[int, int], None]
 
@@ -64,6 +69,13 @@ class _Joined:
         for name in ("young", "poisson", "density"):
             setattr(self, name, self._property(name))
 
+    def skins(self, surface: Surface | Sequence[Surface | None] | None, tets: bool | None, labels: bool) -> list[Skin]:
+        """What is drawn in place of the boundary of the tetrahedra; none where nothing but tetrahedra is known."""
+        meshes = [world.body.mesh for world in self.worlds]
+        if surface is None and not labels and tets is not False and not any(map(has_domain, meshes)):
+            return []
+        return skins_of(meshes, surface, labels)
+
     def _property(self, name: str) -> float | npt.NDArray[np.float64]:
         values = []
         for world in self.worlds:
@@ -108,13 +120,18 @@ def record(
     duration: float,
     fps: float = 24.0,
     world: int | None = None,
+    surface: Surface | Sequence[Surface | None] | None = None,
+    tets: bool | None = None,
+    labels: bool = False,
     progress: Progress | None = None,
     recording: Recording | None = None,
 ) -> Recording:
     """Advance a simulation and write a frame of it as often as ``fps`` asks, the present state first.
 
-    Several bodies become one mesh, body after body. Frame k shows the state after the whole number of steps nearest to
-    k / fps. Whatever ends the run, the frames written stay: Ctrl-C and SIGTERM wait while one is being written.
+    Several bodies become one mesh, body after body. Of a mesh made from a domain the smooth marched surface is written
+    and not the tetrahedra; of any other mesh the tetrahedra and their boundary. Frame k shows the state after the whole
+    number of steps nearest to k / fps. Whatever ends the run, the frames written stay: Ctrl-C and SIGTERM wait while
+    one is being written.
 
     Args:
         sim: Goes on from where it is.
@@ -122,6 +139,11 @@ def record(
         duration: Simulated time [s], rounded to whole frames.
         fps: Frames per second of simulated time.
         world: Which of the bodies' copies is drawn; must be given where there are several.
+        surface: Drawn in place of the mesh's own surface, for several bodies one each (None for the mesh's own): a
+            surface from ``mesh.bind(points, triangles)``; or a USD file with Mesh prims in the mesh's coordinates,
+            which are bound to it and keep their faces, texture coordinates and materials.
+        tets: Whether the TetMesh prim is written; None: unless a smooth surface is.
+        labels: Draw each label of the mesh as a closed surface of its own, in place of one around all.
         progress: Called with the frames done and their number, after each.
         recording: Filled while running, for who wants to look at it when the run has been ended early.
 
@@ -129,8 +151,8 @@ def record(
         What was recorded.
 
     Raises:
-        InputError: A path that cannot be written to, a duration or frame rate out of its range, or no such world;
-            nothing has been simulated or written then.
+        InputError: A path that cannot be written to, a duration or frame rate out of its range, no such world, or a
+            surface that does not fit; nothing has been simulated or written then.
         UnstableError: The state is not finite any more; the frames before are kept.
         OSError: The file cannot be written, as when the disk is full; the frames up to seconds before are kept.
     """
@@ -138,7 +160,8 @@ def record(
     if world is None and sim.worlds > 1:
         raise InputError(f"the simulation has {sim.worlds} worlds; say which one to draw, as in world=0")
     joined = _Joined(sim, world or 0)
-    writer = UsdWriter(Path(path), joined, fps=fps, fixed=joined.fixed, material=joined)
+    skins = joined.skins(surface, tets, labels)
+    writer = UsdWriter(Path(path), joined, fps=fps, fixed=joined.fixed, material=joined, skins=skins, tets=tets)
     done = Recording(writer.path) if recording is None else recording
     first_step = sim.total_steps
     with _closed_whole(writer, done):

@@ -75,7 +75,9 @@ class PieceStore:
 
         def visit(path: Sdf.Path) -> None:
             spec = static.GetAttributeAtPath(path) if path.IsPropertyPath() else None
-            if spec and not spec.HasInfo("default") and not spec.HasInfo("connectionPaths"):
+            # Outputs of shaders have neither a value nor always a connection.
+            shading = spec and spec.name.startswith(("inputs:", "outputs:"))
+            if spec and not shading and not spec.HasInfo("default") and not spec.HasInfo("connectionPaths"):
                 self._varying[str(path)] = spec.typeName
 
         static.Traverse(Sdf.Path.absoluteRootPath, visit)

@@ -1,28 +1,23 @@
-"""Simulated frames as a USD stage: the tetrahedra, and their surface for viewers that draw none."""
+"""Simulated frames as a USD stage: the tetrahedra and their surface, or smooth surfaces in place of it."""
 
 import logging
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pxr import Gf, Kind, Sdf, Usd, UsdGeom, Vt
+from pxr import Kind, Sdf, Usd, UsdGeom
 
 from ..errors import InputError
-from ..mesh.surface import boundary_faces, signed_volumes
-from .colors import (
-    COLORMAP_NAME,
-    TISSUE,
-    VertexAverage,
-    color_index,
-    round_limit,
-    srgb_to_linear,
-    stress_colors,
-)
+from ..mesh.surface import signed_volumes
+from .colors import COLORMAP_NAME, VertexAverage, round_limit
+from .skins import Skin
 from .usd_pieces import PieceStore, Samples
+from .usd_prims import ROOT, SURFACE, TETS, Frame, SkinPrim, Statics, TetPrims, floats, skin_paths
 
-ROOT, TETS, SURFACE = "/SoftBody", "/SoftBody/tetrahedra", "/SoftBody/surface"
+__all__ = ["ROOT", "SURFACE", "TETS", "Mesh", "UsdWriter"]
 
 
 class Mesh(Protocol):
@@ -52,6 +47,11 @@ class UsdWriter:
 
     Mirrored tetrahedra are written with two indices swapped, so that all are right-handed as the schema wants.
 
+    With ``skins`` these surfaces take the place of ``surface``, and the TetMesh is left out unless ``tets`` is set.
+    Each is a Mesh under its own name with ``points``, ``normals``, ``extent`` and the primvar ``vonMises`` (vertex
+    [Pa]) a frame, and coloured likewise. One that keeps a prim's look has that prim's faces, primvars, subsets and
+    materials (copied to ``/SoftBody/materials``) and colours instead, and normals, now of its vertices, if it had any.
+
     Args:
         path: Where to: .usd or .usdc (binary) or .usda (text). A file there stays until the first frames are safe.
         mesh: The body's mesh at rest.
@@ -61,6 +61,8 @@ class UsdWriter:
         up_axis: "X", "Y" or "Z"; None: the mesh's own, else "Y".
         stress_range: Lowest and highest stress of the colour map [Pa].
         flush_seconds: About the most wall time [s] whose frames a sudden end may lose.
+        skins: Surfaces bound to the mesh's nodes.
+        tets: Whether the TetMesh is written; None: if there are no skins.
 
     Raises:
         InputError: A path that cannot be written to (said now, not after the simulation), or arguments that do not fit.
@@ -77,6 +79,8 @@ class UsdWriter:
         up_axis: str | None = None,
         stress_range: tuple[float, float] | None = None,
         flush_seconds: float = 2.0,
+        skins: Sequence[Skin] = (),
+        tets: bool | None = None,
     ):
         up_axis = up_axis or getattr(mesh, "up_axis", "Y")
         if up_axis not in ("X", "Y", "Z"):
@@ -93,13 +97,15 @@ class UsdWriter:
         self._fixed = fixed
         self._material = material
 
-        self._rest = np.ascontiguousarray(mesh.points, dtype=np.float32)
+        self._node_count = len(mesh.points)
         volumes = signed_volumes(mesh.points, mesh.tets)
-        self._tets = _right_handed(np.asarray(mesh.tets, dtype=np.int32), volumes < 0.0)
-        self._faces, _ = boundary_faces(self._tets)
-        self._surface_nodes, compact = np.unique(self._faces, return_inverse=True)
-        self._surface_faces = compact.reshape(-1, 3).astype(np.int32)
-        self._average = VertexAverage(self._tets, np.abs(volumes), len(self._rest))
+        right_handed = _right_handed(np.asarray(mesh.tets, dtype=np.int32), volumes < 0.0)
+        self._tet_count = len(right_handed)
+        self._average = VertexAverage(right_handed, np.abs(volumes), self._node_count)
+        self._prims: list[TetPrims | SkinPrim] = []
+        if tets or not skins:
+            self._prims.append(TetPrims(mesh, right_handed, self._average, boundary=not skins))
+        self._prims += [SkinPrim(skin, path, mesh) for skin, path in zip(skins, skin_paths(skins), strict=True)]
         self._range_given = stress_range is not None
         self._stress_range = stress_range or (0.0, 0.0)
         self._ranges_used: set[tuple[float, float]] = set()
@@ -134,27 +140,23 @@ class UsdWriter:
         elif given != self._given:
             raise InputError("velocities and von_mises must be given either for every frame or for none")
 
-        x = _floats(positions, (len(self._rest), 3), "positions")
-        surface = x[self._surface_nodes]
-        samples: Samples = {
-            f"{TETS}.points": Vt.Vec3fArray.FromNumpy(x),
-            f"{TETS}.extent": _extent(x),
-            f"{SURFACE}.points": Vt.Vec3fArray.FromNumpy(surface),
-            f"{SURFACE}.extent": _extent(surface),
-        }
-        nbytes = x.nbytes + surface.nbytes
-        if velocities is not None:
-            v = _floats(velocities, x.shape, "velocities")
-            samples[f"{TETS}.velocities"] = Vt.Vec3fArray.FromNumpy(v)
-            nbytes += v.nbytes
+        x = floats(positions, (self._node_count, 3), "positions")
+        v = None if velocities is None else floats(velocities, x.shape, "velocities")
+        stress = nodal = None
         if von_mises is not None:
-            stress = _floats(von_mises, (len(self._tets),), "von_mises")
-            samples[f"{TETS}.primvars:vonMises"] = Vt.FloatArray.FromNumpy(stress)
+            stress = floats(von_mises, (self._tet_count,), "von_mises")
+            nodal = self._average(stress)
             self._widen_range(stress)
-            samples |= self._color(stress)
-            nbytes += stress.nbytes + 4 * (len(x) + len(surface))
+            self._ranges_used.add(self._stress_range)
             self._store.custom_data["stressColors"] = self._color_legend()
-        self._store.add(float(self.frames), samples, nbytes)
+        frame = Frame(x, v, stress, nodal)
+        samples: Samples = {}
+        for prim in self._prims:
+            own = prim.samples(frame)
+            samples |= own
+            if stress is not None:
+                samples |= prim.colors(own, self._stress_range, nodal)
+        self._store.add(float(self.frames), samples, sum(_nbytes(value) for value in samples.values()))
         self.frames += 1
 
     def flush(self) -> None:
@@ -196,14 +198,6 @@ class UsdWriter:
         if top > self._stress_range[1]:
             self._stress_range = (0.0, top)
 
-    def _color(self, stress: NDArray[np.float32]) -> Samples:
-        self._ranges_used.add(self._stress_range)
-        indices = color_index(self._average(stress), *self._stress_range)
-        return {
-            f"{TETS}.primvars:displayColor:indices": Vt.IntArray.FromNumpy(indices),
-            f"{SURFACE}.primvars:displayColor:indices": Vt.IntArray.FromNumpy(indices[self._surface_nodes]),
-        }
-
     def _color_legend(self) -> dict[str, Any]:
         lowest, highest = self._stress_range
         return {
@@ -215,12 +209,14 @@ class UsdWriter:
         }
 
     def _recolor(self, samples: Samples) -> Samples:
-        return self._color(np.asarray(samples[f"{TETS}.primvars:vonMises"]))
+        colors: Samples = {}
+        for prim in self._prims:
+            colors |= prim.colors(samples, self._stress_range)
+        return colors
 
     def _static_layer(self) -> Sdf.Layer:
         """Everything that does not change, and the attributes that do, without values."""
         assert self._given is not None
-        with_velocities, with_stress = self._given
         layer = Sdf.Layer.CreateAnonymous(".usdc")
         stage = Usd.Stage.Open(layer)
         UsdGeom.SetStageUpAxis(stage, self._up_axis)
@@ -230,64 +226,10 @@ class UsdWriter:
         root = UsdGeom.Xform.Define(stage, ROOT).GetPrim()
         stage.SetDefaultPrim(root)
         Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
-
-        tets = UsdGeom.TetMesh.Define(stage, TETS)
-        tets.CreateTetVertexIndicesAttr(Vt.Vec4iArray.FromNumpy(self._tets))
-        tets.CreateSurfaceFaceVertexIndicesAttr(Vt.Vec3iArray.FromNumpy(self._faces))
-        tets.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
-        # Drawn beside its surface it would show twice, and Hydra takes its uniform primvars for values per face.
-        tets.CreatePurposeAttr(UsdGeom.Tokens.guide)
-        if with_velocities:
-            tets.CreateVelocitiesAttr()
-
-        surface = UsdGeom.Mesh.Define(stage, SURFACE)
-        surface.CreateFaceVertexCountsAttr(Vt.IntArray(len(self._surface_faces), 3))
-        surface.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(self._surface_faces.reshape(-1)))
-        surface.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-        surface.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
-        for body in (tets, surface):
-            body.CreatePointsAttr()
-            body.CreateExtentAttr()
-            self._declare_color(body, with_stress)
-
-        primvars = UsdGeom.PrimvarsAPI(tets)
-        rest = Vt.Vec3fArray.FromNumpy(self._rest)
-        primvars.CreatePrimvar("rest", Sdf.ValueTypeNames.Point3fArray, UsdGeom.Tokens.vertex).Set(rest)
-        if with_stress:
-            stress = primvars.CreatePrimvar("vonMises", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.uniform)
-            stress.GetAttr().SetDocumentation("Von Mises stress of each tetrahedron [Pa]")
-        if self._fixed is not None:
-            held = np.zeros(len(self._rest), np.int32)
-            held[np.asarray(self._fixed)] = 1
-            fixed = primvars.CreatePrimvar("fixed", Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.vertex)
-            fixed.Set(Vt.IntArray.FromNumpy(held))
-            fixed.GetAttr().SetDocumentation("1 where the node is held")
-        for name, unit in (("young", " [Pa]"), ("poisson", ""), ("density", " [kg/m³]")):
-            value = getattr(self._material, name, None)
-            if value is not None:
-                self._declare_property(primvars, name, np.asarray(value, dtype=np.float32), unit)
+        statics = Statics(self._fixed, self._material, *self._given)
+        for prim in self._prims:
+            prim.declare(stage, statics)
         return layer
-
-    def _declare_color(self, body: UsdGeom.Gprim, with_stress: bool) -> None:
-        if not with_stress:
-            color = body.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant)
-            color.Set(Vt.Vec3fArray([Gf.Vec3f(*srgb_to_linear(TISSUE))]))
-            return
-        color = body.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
-        color.Set(Vt.Vec3fArray.FromNumpy(srgb_to_linear(stress_colors()).astype(np.float32)))
-        color.CreateIndicesAttr()
-
-    def _declare_property(
-        self, primvars: UsdGeom.PrimvarsAPI, name: str, value: NDArray[np.float32], unit: str
-    ) -> None:
-        if value.size == 1:
-            primvar = primvars.CreatePrimvar(name, Sdf.ValueTypeNames.Float, UsdGeom.Tokens.constant)
-            primvar.Set(float(value.reshape(())))
-        else:
-            values = _floats(value, (len(self._tets),), f"material.{name}")
-            primvar = primvars.CreatePrimvar(name, Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.uniform)
-            primvar.Set(Vt.FloatArray.FromNumpy(values))
-        primvar.GetAttr().SetDocumentation(f"Material: {name}{unit}")
 
 
 def _right_handed(tets: NDArray[np.int32], mirrored: NDArray[np.bool_]) -> NDArray[np.int32]:
@@ -296,12 +238,5 @@ def _right_handed(tets: NDArray[np.int32], mirrored: NDArray[np.bool_]) -> NDArr
     return turned
 
 
-def _floats(values: Any, shape: tuple[int, ...], name: str) -> NDArray[np.float32]:
-    array = np.ascontiguousarray(values.numpy() if hasattr(values, "numpy") else values, dtype=np.float32)
-    if array.shape != shape:
-        raise InputError(f"{name} has shape {list(array.shape)}, should be {list(shape)}")
-    return array
-
-
-def _extent(points: NDArray[np.float32]) -> Vt.Vec3fArray:
-    return Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)]))
+def _nbytes(values: Any) -> int:
+    return memoryview(values).nbytes

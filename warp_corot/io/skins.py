@@ -1,0 +1,171 @@
+"""What is drawn of a body in place of the boundary of its tetrahedra: surfaces bound to its nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import InputError
+from ..mesh.bound import SurfaceMesh
+from ..mesh.surface import boundary_faces
+
+if TYPE_CHECKING:
+    from .usd_look import Look
+
+    Surface = SurfaceMesh | str | PathLike[str]
+
+#: A surface this many times longer or shorter than its body is in another unit, most likely.
+UNLIKELY = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """A surface to be drawn.
+
+    Attributes:
+        name: What it is called: "surface", or a label's name.
+        surface: Bound to the nodes of the mesh that is drawn.
+        look: The USD prim whose faces, texture coordinates and materials it keeps.
+    """
+
+    name: str
+    surface: SurfaceMesh
+    look: Look | None = None
+
+    def values(self, nodal: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
+        """Nodal values [N] at the points of the surface, float32 [V]."""
+        return np.einsum("vn,vn->v", self.surface.weights, nodal[self.surface.nodes]).astype(np.float32)
+
+
+def has_domain(mesh: Any) -> bool:
+    """Whether a mesh was made from a domain, so that the body ends within its tetrahedra."""
+    return getattr(mesh, "phi", None) is not None
+
+
+def has_labels(mesh: Any) -> bool:
+    """Whether a mesh was made from a domain with labels."""
+    return bool(getattr(mesh, "label_names", ()))
+
+
+def skins_of(
+    meshes: Sequence[Any], surface: Surface | Sequence[Surface | None] | None = None, labels: bool = False
+) -> list[Skin]:
+    """The skins of meshes whose nodes are numbered one mesh after the other; those of one name are joined.
+
+    Args:
+        meshes: Forests or tetrahedral meshes.
+        surface: Drawn instead of the mesh's own: a bound surface, or a USD file whose Mesh prims are bound; for several
+            meshes one each, None for the mesh's own.
+        labels: Draw each label of a mesh by itself, closed all round.
+
+    Raises:
+        InputError: Surfaces that do not fit, or labels where no mesh has any.
+    """
+    given = _one_each(surface, len(meshes))
+    if labels and not any(map(has_labels, meshes)):
+        raise InputError("labels is True, but there are none in the mesh; they come from a domain that has")
+    found, offset = [], 0
+    for mesh, own in zip(meshes, given, strict=True):
+        found += [_shifted(skin, offset) for skin in _skins_of_one(mesh, own, labels)]
+        offset += len(mesh.points)
+    return _joined(found)
+
+
+def _one_each(surface: Any, count: int) -> list[Any]:
+    if surface is None:
+        return [None] * count
+    several = isinstance(surface, Sequence) and not isinstance(surface, str | SurfaceMesh)
+    given = list(surface) if several else [surface]
+    if len(given) != count:
+        raise InputError(f"surface names {len(given)} surfaces; there must be one for each of the {count} bodies")
+    return given
+
+
+def _skins_of_one(mesh: Any, surface: Any, labels: bool) -> list[Skin]:
+    if isinstance(surface, SurfaceMesh):
+        _check_nodes(surface, len(mesh.points))
+        return [Skin("surface", surface)]
+    if isinstance(surface, str | PathLike):
+        return _bound_prims(mesh, surface)
+    if surface is not None:
+        raise InputError(f"surface is a {type(surface).__name__}; it must be a SurfaceMesh or a USD file")
+    if labels and has_labels(mesh):
+        between = mesh.separating_surface()
+        there = np.unique(between.sides)
+        names = enumerate(mesh.label_names, start=1)
+        return [Skin(name, between.of_label(number)) for number, name in names if number in there]
+    return [Skin("surface", mesh.surface() if has_domain(mesh) else boundary_surface(mesh))]
+
+
+def boundary_surface(mesh: Any) -> SurfaceMesh:
+    """The boundary of any tetrahedral mesh, its points bound to the nodes that they are."""
+    faces, _ = boundary_faces(mesh.tets, mesh.points)
+    used, triangles = np.unique(faces, return_inverse=True)
+    weights = np.tile([1.0, 0.0, 0.0, 0.0], (len(used), 1))
+    nodes = np.repeat(used[:, None], 4, axis=1).astype(np.int32)
+    return SurfaceMesh(mesh.points[used], nodes, weights, triangles.reshape(-1, 3).astype(np.int32))
+
+
+def _check_nodes(surface: SurfaceMesh, count: int) -> None:
+    lowest, highest = int(surface.nodes.min(initial=0)), int(surface.nodes.max(initial=-1))
+    if lowest < 0 or not 0 <= highest < count:
+        raise InputError(
+            f"the surface is bound to nodes {lowest} to {highest}, the mesh has nodes 0 to {count - 1}; it must be "
+            "bound to this mesh"
+        )
+
+
+def _bound_prims(mesh: Any, path: str | PathLike[str]) -> list[Skin]:
+    from .usd_look import read_looks
+
+    if not hasattr(mesh, "bind"):
+        raise InputError(f"{path}: only a TetForest can have a surface bound to it, not a {type(mesh).__name__}")
+    skins = []
+    for look in read_looks(path):
+        _check_size(look, mesh.points)
+        skins.append(Skin(look.name, mesh.bind(look.points, look.triangles), look))
+    return skins
+
+
+def _check_size(look: Look, nodes: np.ndarray) -> None:
+    low, high = nodes.min(axis=0), nodes.max(axis=0)
+    size, body = float(np.ptp(look.points, axis=0).max()), float((high - low).max())
+    apart = (look.points.min(axis=0) > high).any() or (look.points.max(axis=0) < low).any()
+    if apart or size > UNLIKELY * body:
+        raise InputError(
+            f"{look.source}: {look.path} is {size:.3g} m long and {'apart from' if apart else 'bound to'} the body, "
+            f"which is {body:.3g} m long; is its metersPerUnit right?"
+        )
+
+
+def _shifted(skin: Skin, offset: int) -> Skin:
+    nodes = (skin.surface.nodes + offset).astype(np.int32)
+    return replace(skin, surface=replace(skin.surface, nodes=nodes)) if offset else skin
+
+
+def _joined(skins: Sequence[Skin]) -> list[Skin]:
+    """Skins of one name as one, those that keep a prim's look by themselves."""
+    plain: dict[str, list[SurfaceMesh]] = {}
+    for skin in skins:
+        if skin.look is None:
+            plain.setdefault(skin.name, []).append(skin.surface)
+    whole = [Skin(name, _one_surface(parts)) for name, parts in plain.items()]
+    return whole + [skin for skin in skins if skin.look is not None]
+
+
+def _one_surface(parts: Sequence[SurfaceMesh]) -> SurfaceMesh:
+    if len(parts) == 1:
+        return parts[0]
+    firsts = np.cumsum([0, *(len(part.points) for part in parts[:-1])])
+    triangles = [part.triangles + first for part, first in zip(parts, firsts, strict=True)]
+    return SurfaceMesh(
+        np.concatenate([part.points for part in parts]),
+        np.concatenate([part.nodes for part in parts]),
+        np.concatenate([part.weights for part in parts]),
+        np.concatenate(triangles).astype(np.int32),
+    )
