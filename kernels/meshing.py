@@ -299,26 +299,6 @@ def gather_points(
 
 
 @wp.kernel(enable_backward=False)
-def centroids(
-    # In
-    first: int,
-    tets: wp.array[wp.vec4i],
-    lattice: wp.array[wp.vec3i],
-    origin: wp.vec3d,
-    spacing: wp.float64,
-    # Out
-    points: wp.array[wp.vec3],
-):
-    i = wp.tid()
-    tet = tets[first + i]
-    at = origin
-    for n in range(4):
-        p = lattice[tet[n]]
-        at += wp.float64(0.25) * spacing * wp.vec3d(wp.float64(p[0]), wp.float64(p[1]), wp.float64(p[2]))
-    points[i] = wp.vec3(float(at[0]), float(at[1]), float(at[2]))
-
-
-@wp.kernel(enable_backward=False)
 def flag_open(
     # In
     elements: wp.array[wp.int32],

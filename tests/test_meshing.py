@@ -368,6 +368,31 @@ def test_a_number_of_elements_can_be_asked_for(target):
     assert 0.5 * target < len(forest.tets) <= target
 
 
+@pytest.mark.parametrize(("scale", "shift"), [(1e-3, 0.0), (1e3, 0.0), (1.0, 30.0)])
+def test_size_and_place_do_not_matter(scale, shift):
+    """The same ring in millimetres, in kilometres and far from the origin: as many elements within one in a hundred,
+    where float32 coordinates decide otherwise."""
+    body, other = ring(), ring()
+    other.function = lambda x: scale * body.function((x - shift) / scale)
+    other.bounds = scale * body.bounds + shift
+    one = wc.TetForest.from_domain(body, 0.3, max_level=12, surface_error=4e-3)
+    two = wc.TetForest.from_domain(other, 0.3 * scale, max_level=12, surface_error=4e-3 * scale)
+    assert len(two.tets) == pytest.approx(len(one.tets), rel=0.01)
+    assert held(two) == pytest.approx(held(one) * scale**3, rel=1e-3)
+    assert as_trimesh(two.surface()).is_watertight
+
+
+@pytest.mark.slow
+def test_a_million():
+    forest = wc.TetForest.from_domain(ball(), 1.0, max_level=23)
+    assert len(forest.tets) > 1_000_000
+    assert_conforming(forest)
+    surface = forest.surface()
+    assert held(forest) == pytest.approx(surface.volume, rel=1e-10)
+    assert surface.volume == pytest.approx(4 / 3 * np.pi * 0.064, rel=1e-3)
+    assert as_trimesh(surface).is_watertight
+
+
 def test_the_same_mesh_comes_out_twice():
     one, two = (wc.TetForest.from_domain(ring(), 0.3, max_level=12, surface_error=2e-3) for _ in range(2))
     assert np.array_equal(one.lattice, two.lattice)

@@ -9,7 +9,9 @@ import warp as wp
 
 from ..errors import InputError
 from ..kernels import embedding as kernels
+from .lattice import LATTICE_BITS
 from .surface import boundary_faces
+from .tree import VOID
 
 if TYPE_CHECKING:
     from .forest import TetForest
@@ -74,7 +76,7 @@ def _descended(forest: TetForest, points: np.ndarray) -> np.ndarray:
 
 def _nearest(forest: TetForest, points: np.ndarray) -> np.ndarray:
     """The element behind the boundary face that is closest to each point, int32 [n]."""
-    faces, parents = boundary_faces(forest.tets, forest.points)
+    faces, parents = _boundary_faces(forest)
     device = wp.get_device("cpu")
     # About the middle of the mesh, as float32 keeps few digits far from zero.
     middle = forest.points.mean(axis=0)
@@ -86,3 +88,21 @@ def _nearest(forest: TetForest, points: np.ndarray) -> np.ndarray:
     closest = wp.empty(len(points), dtype=wp.int32, device=device)
     wp.launch(kernels.nearest_faces, len(points), [moved, mesh.id, 1.0e15], [closest], device=device)
     return parents[closest.numpy()]
+
+
+def _boundary_faces(forest: TetForest) -> tuple[np.ndarray, np.ndarray]:
+    """Boundary faces and the leaves they belong to, sought where all nodes are on void or on the grid's end."""
+    tree = forest.tree
+    lattice = forest.lattice[: forest.node_count]
+    on_rim = ((lattice == 0) | (lattice == np.array(forest.cells) << LATTICE_BITS)).any(axis=1)
+    if forest.phi is not None:
+        # Void that is wholly outside need not be conforming, but then no node on its faces is inside.
+        on_rim |= forest.phi[: forest.node_count] >= 0
+        of_void = tree.tets[tree.first_child == VOID]
+        of_void = of_void[(forest.phi[of_void] < 0).any(axis=1)]
+        on_rim[of_void[of_void < forest.node_count]] = True
+    near = np.flatnonzero(on_rim[forest.tets].sum(axis=1) >= 3)
+    faces, parents = boundary_faces(forest.tets[near], forest.points)
+    # Between near ones and others there are faces that only look like it.
+    real = on_rim[faces].all(axis=1)
+    return faces[real], near[parents[real]].astype(np.int32)
