@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -17,10 +18,13 @@ from ..device import checked_device
 from ..elasticity import MODELS, Corotated, Model
 from ..errors import InputError, UnstableError
 from ..materials import Isotropic
+from ..mesh import TetForest
 from ..selection import select_nodes
 from ..simulation import Simulation
 from ..solvers import SymplecticEuler
 from .compiling import compiling_said
+from .label_materials import FORM, label_material
+from .organs import MAX_LEVEL, TETS, find_organ, kind_of, refuse_options
 from .say import EXIT_CODES, complain, interrupt_status
 from .subject import STIFFNESS_PER_WEIGHT, Subject, find_subject
 from .summary import pressure, summary
@@ -43,6 +47,8 @@ def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParse
         epilog=f"""examples:
   warp-corot simulate warp:bear -o bear.usd
   warp-corot simulate liver.msh --scale 0.001 --young 5000 --fix "z < zmin + 0.01" -o liver.usd --preview liver.png
+  warp-corot simulate liver.stl --unit mm --tets 50000 -o liver.usd
+  warp-corot simulate scan.nii.gz --labels liver=3kPa:0.45,vessel=30kPa:0.45 -o scan.usd
   warp-corot simulate box --model linear -o beam.usd
 
 expressions for --fix:
@@ -50,15 +56,20 @@ expressions for --fix:
   operators  + - * / // % **   < <= > >= == !=   and or not   ( )
   functions  abs sqrt exp log sin cos tan atan2 hypot min max
 
-warp:bear and box have defaults of their own for body and motion.
+a label in --labels is {FORM}: a name and the numbers of its voxels,
+or a number for both; names alone are the volume's labels in ascending order.
+
+warp:bear, warp:bunny and box have defaults of their own for body and motion.
 
 {EXIT_CODES}""",
     )
     parser.add_argument(
         "input",
         metavar="INPUT",
-        help="a USD file with tetrahedra (a TetMesh, or a Mesh with tetraIndices); a file that meshio reads (.msh, "
-        ".vtk, .vtu, ...); warp:bear, a toy bear; or box, the beam of Tagawa et al. 2013",
+        help="tetrahedra: a USD file with a TetMesh, or a Mesh with tetraIndices; a file that meshio reads (.msh, "
+        ".vtk, .vtu, ...); warp:bear, a toy bear; or box, the beam of Tagawa et al. 2013. A closed surface: .obj, "
+        ".stl, .ply, .off, .glb, a USD file with Mesh prims alone; or warp:bunny. A segmented scan: .nii, .nii.gz, "
+        ".mha, .mhd, .nrrd or .vti",
     )
     parser.add_argument(
         "-o", "--output", required=True, type=Path, metavar="OUT.usd", help="animation to write (.usd, .usdc or .usda)"
@@ -88,6 +99,8 @@ warp:bear and box have defaults of their own for body and motion.
         help='nodes that are held, such as "z < 0.01", or none (default: the lowest 2 %% of the height)',
     )
 
+    _add_organ_options(parser.add_argument_group("a body from a surface or a scan"))
+
     motion = parser.add_argument_group("the motion")
     motion.add_argument(
         "--gravity",
@@ -110,6 +123,45 @@ warp:bear and box have defaults of their own for body and motion.
     return parser
 
 
+def _add_organ_options(organ: argparse._ArgumentGroup) -> None:
+    organ.add_argument(
+        "--unit", choices=("mm", "cm", "m"), help="of the coordinates (default: what the file says, or m)"
+    )
+    organ.add_argument(
+        "--tets",
+        type=int,
+        metavar="N",
+        help=f"at most so many tetrahedra, and nearly as many (default: {TETS}, unless --max-level or --surface-error "
+        "is given)",
+    )
+    organ.add_argument(
+        "--cell-size", type=float, metavar="M", help="edge of the coarsest cubes [m] (default: by --tets)"
+    )
+    organ.add_argument(
+        "--max-level",
+        type=int,
+        metavar="L",
+        help=f"how often cubes are bisected at most, three times halve the edge (default: {MAX_LEVEL})",
+    )
+    organ.add_argument(
+        "--surface-error",
+        type=float,
+        metavar="M",
+        help="how far the surface may be from the given one [m] (default: as near as the rest allows)",
+    )
+    organ.add_argument(
+        "--labels",
+        metavar="LIST",
+        help="of a scan: the labels that make the body and their materials, as in liver=3kPa:0.45,vessel@4=30kPa:0.45 "
+        "(default: all, of one material)",
+    )
+    organ.add_argument(
+        "--smoothing", type=float, metavar="M", help="take the steps of voxels off, over this length [m]"
+    )
+    organ.add_argument("--draw-tets", action="store_true", help="write the tetrahedra too, not the surface alone")
+    organ.add_argument("--draw-labels", action="store_true", help="write a closed surface for each label")
+
+
 def run(args: argparse.Namespace) -> int:
     """Run the command; returns the exit status.
 
@@ -123,14 +175,19 @@ def run(args: argparse.Namespace) -> int:
     _check_output(args.output, args.preview)
     device = checked_device(args.device)
     model = _model(args.model, args.rotation_level)
-    subject = find_subject(args.input, args.scale)
+    kind = kind_of(args.input)
+    refuse_options(args, kind)
+    with compiling_said(device):
+        subject = find_subject(args.input, args.scale) if kind == "tets" else find_organ(args, kind)
     if subject.source and args.output.exists() and args.output.samefile(subject.source):
         raise InputError(f"{args.output}: is the input, should be another file")
     duration = subject.duration if args.duration is None else args.duration
     count = frame_count(duration, args.fps)
+    started = time.perf_counter()
     with compiling_said(device):
         body, fixed = _make_body(args, subject)
         sim = _make_simulation(args, subject, body, model)
+    subject.times["body"] = time.perf_counter() - started
     steps = 1.0 / (args.fps * sim.dt)
     if steps > MANY_STEPS:
         subject.notes.append(f"{steps:.2g} steps of {sim.dt:.2g} s make a frame: this will take long")
@@ -140,7 +197,17 @@ def run(args: argparse.Namespace) -> int:
     done = Recording(args.output)
     try:
         with _progress_bar(count) as progress:
-            record(sim, args.output, duration=duration, fps=args.fps, progress=progress, recording=done)
+            record(
+                sim,
+                args.output,
+                duration=duration,
+                fps=args.fps,
+                surface=None if args.draw_labels else subject.surface,
+                tets=args.draw_tets or None,
+                labels=args.draw_labels,
+                progress=progress,
+                recording=done,
+            )
         if args.preview:
             _draw(args.preview, subject, sim)
     except KeyboardInterrupt as signalled:
@@ -178,15 +245,7 @@ def _model(name: str, rotation_level: int | None) -> Model:
 
 def _make_body(args: argparse.Namespace, subject: Subject) -> tuple[SoftBody, str]:
     """The body, and the expression that its fixed nodes come from."""
-    density = subject.density if args.density is None else args.density
-    poisson = subject.poisson if args.poisson is None else args.poisson
-    young = subject.young if args.young is None else args.young
-    if young is None:
-        Isotropic(1.0, poisson, density)  # the density must be checked before it is used
-        young = subject.young_from_weight(density, args.gravity)
-        subject.notes.append(f"Young's modulus is {pressure(young)}, chosen for its weight (--young)")
-    material = Isotropic(young, poisson, density)
-
+    material = _material(args, subject)
     used = subject.used
     expression = subject.fix if args.fix is None else args.fix
     chosen = expression if expression is not None else subject.lowest_part()
@@ -202,6 +261,20 @@ def _make_body(args: argparse.Namespace, subject: Subject) -> tuple[SoftBody, st
     body = SoftBody(subject.mesh, material, device=args.device)
     body.fix(fixed)
     return body, f"{held} nodes ({chosen})"
+
+
+def _material(args: argparse.Namespace, subject: Subject) -> Isotropic:
+    density = subject.density if args.density is None else args.density
+    poisson = subject.poisson if args.poisson is None else args.poisson
+    Isotropic(1.0, poisson, density)  # both must be checked before they are used
+    if subject.labels:
+        assert isinstance(subject.mesh, TetForest)
+        return label_material(subject.mesh, subject.labels, poisson, density)
+    young = subject.young if args.young is None else args.young
+    if young is None:
+        young = subject.young_from_weight(density, args.gravity)
+        subject.notes.append(f"Young's modulus is {pressure(young)}, chosen for its weight (--young)")
+    return Isotropic(young, poisson, density)
 
 
 def _make_simulation(args: argparse.Namespace, subject: Subject, body: SoftBody, model: Model) -> Simulation:
@@ -240,18 +313,18 @@ def _kept(done: Recording) -> str:
 def _draw(path: Path, subject: Subject, sim: Simulation) -> None:
     from ..io.colors import VertexAverage
     from ..io.preview import render_preview
-    from ..mesh.surface import boundary_faces, signed_volumes
+    from ..io.skins import Skin, boundary_surface
+    from ..mesh.surface import signed_volumes
 
     mesh = subject.mesh
-    faces, _ = boundary_faces(mesh.tets, mesh.points)
-    weights = np.abs(signed_volumes(mesh.points, mesh.tets))
-    stress = VertexAverage(mesh.tets, weights, len(mesh.points))(sim.von_mises())
+    skin = Skin("surface", subject.surface or boundary_surface(mesh))
+    average = VertexAverage(mesh.tets, np.abs(signed_volumes(mesh.points, mesh.tets)), len(mesh.points))
     render_preview(
         path,
-        sim.body.positions.numpy(),
-        faces,
-        scalars=stress,
-        rest=mesh.points,
+        skin.surface.moved(sim.body.displacements.numpy()),
+        skin.surface.triangles,
+        scalars=skin.values(average(sim.von_mises())),
+        rest=skin.surface.points,
         up_axis=mesh.up_axis,
         title=f"{subject.name}, {sim.time:.3g} s",
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +13,11 @@ from ..experiments import paper
 from ..io.assets import find_asset
 from ..io.formats import load_tets
 from ..mesh import TetForest, TetMesh
+
+if TYPE_CHECKING:
+    from ..domain import Domain
+    from ..mesh.bound import SurfaceMesh
+    from .label_materials import LabelMaterial
 
 #: Young's modulus over the weight of a column as high as the body: such bodies sag by roughly a tenth of their height.
 STIFFNESS_PER_WEIGHT = 20.0
@@ -35,6 +41,10 @@ class Subject:
         gravity: [m/s^2]; None: down the mesh's up axis.
         damping: [1/s].
         duration: [s].
+        domain: What the mesh was made from, if from a surface or a scan.
+        surface: The smooth surface of such a mesh.
+        labels: Materials of its labels, if they were given.
+        times: Seconds that its stages took.
         notes: What the user should know, a line each.
     """
 
@@ -48,6 +58,10 @@ class Subject:
     gravity: tuple[float, float, float] | None = None
     damping: float = 2.0
     duration: float = 4.0
+    domain: Domain | None = None
+    surface: SurfaceMesh | None = None
+    labels: list[LabelMaterial] = field(default_factory=list)
+    times: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -58,7 +72,7 @@ class Subject:
     @property
     def bounds(self) -> np.ndarray:
         """Lowest and highest coordinates of the body [m], [2, 3]."""
-        points = self.mesh.points[self.used]
+        points = self.mesh.points[self.used] if self.surface is None else self.surface.points
         return np.stack([points.min(axis=0), points.max(axis=0)])
 
     @property

@@ -5,12 +5,16 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ..elasticity import MODELS
+from ..mesh import TetForest
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from ..io.animate import Recording
+    from ..materials import Isotropic
     from ..simulation import Simulation
     from .subject import Subject
 
@@ -34,11 +38,8 @@ def summary(subject: Subject, sim: Simulation, done: Recording, fixed: str, prev
         f"{length(done.final_displacement)} at the end ({done.final_displacement / subject.height:.1%} of the height)"
     )
     rows = [
-        ("mesh", _mesh(subject)),
-        (
-            "material",
-            f"E = {pressure(float(material.young))}, nu = {material.poisson:g}, rho = {material.density:g} kg/m^3",
-        ),
+        *_body(subject),
+        *_materials(subject, material),
         ("model", model if level is None else f"{model}, rotations of level {level}"),
         ("fixed", fixed),
         ("gravity", f"{' '.join(f'{g:g}' for g in sim.gravity)} m/s^2, damping {damping:g} /s"),
@@ -52,6 +53,41 @@ def summary(subject: Subject, sim: Simulation, done: Recording, fixed: str, prev
     if preview:
         rows.append(("preview", str(preview)))
     return "\n".join([subject.name, *(f"  {name:<14}{text}" for name, text in rows)])
+
+
+def _body(subject: Subject) -> list[tuple[str, str]]:
+    """Of a body from a surface or a scan, all that its domain and its mesh have to say, and the time that it took."""
+    if subject.domain is None:
+        return [("mesh", _mesh(subject))]
+    assert isinstance(subject.mesh, TetForest)
+    took = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in subject.times.items())
+    rows = [*_block("domain", subject.domain.report()), *_block("mesh", subject.mesh.summary())]
+    if subject.surface is not None:
+        rows.append(("surface", f"{len(subject.surface.points)} points, {len(subject.surface.triangles)} triangles"))
+    return [*rows, ("ready in", f"{sum(subject.times.values()):.2f} s: {took}")]
+
+
+def _block(name: str, lines: list[str]) -> list[tuple[str, str]]:
+    return [(name if first else "", line) for first, line in zip([True] + len(lines) * [False], lines, strict=False)]
+
+
+def _materials(subject: Subject, material: Isotropic) -> list[tuple[str, str]]:
+    if not subject.labels:
+        return [("material", _values(material.young, material.poisson, material.density))]
+    assert isinstance(subject.mesh, TetForest)
+    lines = []
+    for label in subject.labels:
+        of_label = np.flatnonzero(subject.mesh.elements_of(label.name))
+        if len(of_label):
+            one = (getattr(material, name)[of_label[0]] for name in ("young", "poisson", "density"))
+            lines.append(f"{label.name}: {_values(*one)}")
+        else:
+            lines.append(f"{label.name}: in no tetrahedron")
+    return _block("material", lines)
+
+
+def _values(young: float, poisson: float, density: float) -> str:
+    return f"E = {pressure(float(young))}, nu = {poisson:g}, rho = {density:g} kg/m^3"
 
 
 def length(metres: float) -> str:
