@@ -18,7 +18,8 @@ from warp_corot.cli.signals import signals_waiting, terminable
 from warp_corot.elasticity import MODELS
 
 OPTIONS = ["young", "poisson", "density", "model", "rotation-level", "fix", "scale", "gravity", "duration", "fps", "dt"]
-OPTIONS += ["damping", "device", "preview"]
+OPTIONS += ["damping", "device", "preview", "unit", "tets", "cell-size", "max-level", "surface-error", "labels"]
+OPTIONS += ["smoothing", "draw-tets", "draw-labels"]
 SHORT = ["--duration", "0.05", "--fps", "40", "--device", "cpu"]
 
 

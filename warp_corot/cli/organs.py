@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -34,20 +35,29 @@ MAX_LEVEL = 8
 #: Root cubes reach beyond the body by this share of its length.
 MARGIN = 1.0e-3
 #: What share of the number of tetrahedra asked for is aimed at, which is enough, and after how many meshes any is.
-NEAR, NEAR_ENOUGH = 0.96, 0.9
+NEAR, NEAR_ENOUGH = 0.96, 0.85
 MOST_MESHES = 8
 
-#: Options that only such bodies take, and what the same is called in Python.
-OPTIONS = {
-    "unit": "unit",
-    "cell_size": "cell_size",
-    "max_level": "max_level",
-    "surface_error": "surface_error",
-    "tets": "target_elements",
-    "labels": "labels",
-    "smoothing": "smoothing",
-    "draw_tets": "tets",
-    "draw_labels": "labels",
+#: Options that only such bodies take.
+OPTIONS = (
+    "unit",
+    "cell_size",
+    "max_level",
+    "surface_error",
+    "tets",
+    "labels",
+    "smoothing",
+    "draw_tets",
+    "draw_labels",
+)
+#: What Python's arguments are called on the command line.
+ARGUMENTS = {
+    "unit": "--unit",
+    "cell_size": "--cell-size",
+    "max_level": "--max-level",
+    "surface_error": "--surface-error",
+    "target_elements": "--tets",
+    "smoothing": "--smoothing",
 }
 FOR_SCANS = ("labels", "smoothing", "draw_labels")
 
@@ -169,7 +179,14 @@ def _mesh(args: argparse.Namespace, domain: Domain) -> TetForest:
         return meshed(args.surface_error)
     if args.surface_error is not None or count < 1:
         return meshed(args.surface_error, count)
-    return _of_size(meshed, count, size) or meshed(None, count)
+    try:
+        found = _of_size(meshed, count, size)
+    except InputError:  # so coarse that nothing is seen of the body, or an option out of its range
+        found = None
+    try:
+        return found or meshed(None, count)
+    except InputError as error:
+        raise InputError(f"with --tets {count}, {error}") from None
 
 
 def _of_size(meshed: Callable[[float], TetForest], count: int, size: float) -> TetForest | None:
@@ -226,7 +243,7 @@ def _as_options() -> Iterator[None]:
 
 
 def _with_options(text: str) -> str:
-    for option, name in OPTIONS.items():
-        said = f"--{option.replace('_', '-')}"
-        text = text.replace(f"{name}=", f"{said} ").replace(f"{name} is ", f"{said} is ")
+    for name, option in ARGUMENTS.items():
+        text = re.sub(rf"(?<![-\w]){name}(?= is )", option, text)
+        text = re.sub(rf"(?<![-\w]){name}=", f"{option} ", text)
     return text

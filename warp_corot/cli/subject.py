@@ -81,10 +81,15 @@ class Subject:
         lowest, highest = self.bounds[:, "XYZ".index(self.mesh.up_axis)]
         return float(highest - lowest)
 
+    @property
+    def held_share(self) -> float:
+        """Share of the height that is held by default: round bodies, as organs are, would stand on a point."""
+        return 0.02 if self.domain is None else 0.1
+
     def lowest_part(self) -> str:
-        """An expression for the lowest 2 % of the height."""
+        """An expression for the lowest part of the height."""
         up = self.mesh.up_axis.lower()
-        return f"{up} <= {up}min + 0.02 * ({up}max - {up}min)"
+        return f"{up} <= {up}min + {self.held_share:g} * ({up}max - {up}min)"
 
     def young_from_weight(self, density: float, gravity: tuple[float, float, float] | None) -> float:
         """Young's modulus [Pa] with which the body sags visibly and stands, to two digits."""

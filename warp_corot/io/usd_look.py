@@ -91,8 +91,8 @@ def has_mesh(path: Path) -> bool:
     Raises:
         InputError: Not a stage.
     """
-    meshes = False
-    for prim in _opened(path).Traverse(Usd.TraverseInstanceProxies()):
+    stage, meshes = _opened(path), False
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
         if prim.IsA(UsdGeom.TetMesh) or prim.HasAttribute("tetraIndices"):
             return False
         meshes = meshes or prim.IsA(UsdGeom.Mesh)
