@@ -12,7 +12,7 @@ from .elasticity import Corotated, EdgeStVK, Linear, MassSpring, NeoHookean, StV
 from .errors import InputError, StabilityWarning, UnstableError
 from .io.animate import record
 from .materials import Isotropic
-from .mesh import TetForest, TetMesh
+from .mesh import SurfaceMesh, TetForest, TetMesh
 from .rotations import polar_rotation
 from .simulation import Energy, Simulation
 from .solvers import SymplecticEuler
@@ -35,6 +35,7 @@ __all__ = [
     "SoftBody",
     "StVenantKirchhoff",
     "StabilityWarning",
+    "SurfaceMesh",
     "SymplecticEuler",
     "TetForest",
     "TetMesh",

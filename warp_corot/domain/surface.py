@@ -105,10 +105,7 @@ class SurfaceDomain(Domain):
 
 def surface_domain(surface: Surface, unit: str | None, up_axis: str | None, device: Any) -> Domain:
     """See `Domain.from_surface`."""
-    try:
-        from .closing import close_surface
-    except ImportError:
-        raise InputError('surfaces need: pip install "warp-corot[scans]"') from None
+    from .closing import close_surface
 
     points, triangles, metres, axis, source, notes = _given(surface, unit, up_axis)
     points, triangles = checked_triangles(points, triangles, source)

@@ -6,8 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import numpy as np
-
-from ..errors import InputError
+import scipy.ndimage
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -28,12 +27,13 @@ def signed_distance(inside: np.ndarray, spacing: np.ndarray) -> tuple[np.ndarray
         ``phi`` float32 [nx, ny, nz] [m], and ``nearest`` int32 [3, nx, ny, nz], the indices of the nearest voxel inside
         (a voxel's own, inside).
     """
-    ndimage = import_ndimage()
     # Of several nearest voxels the one taken should not hang on the last digits of the spacing.
     ratios = np.round(spacing / spacing.min(), 5)
 
     def nearest_zero(values: np.ndarray) -> np.ndarray:
-        return ndimage.distance_transform_edt(values, sampling=ratios, return_distances=False, return_indices=True)
+        return scipy.ndimage.distance_transform_edt(
+            values, sampling=ratios, return_distances=False, return_indices=True
+        )
 
     # SciPy lets go of the interpreter meanwhile.
     with ThreadPoolExecutor(2) as pool:
@@ -69,26 +69,13 @@ def steepest_slope(phi: np.ndarray, spacing: np.ndarray) -> float:
 
 def gaussian(phi: np.ndarray, sigma: float, spacing: np.ndarray) -> np.ndarray:
     """phi smoothed by a Gaussian of standard deviation ``sigma`` [m]: a mean of shifted copies, so no steeper."""
-    return import_ndimage().gaussian_filter(phi, sigma / spacing, mode="nearest")
+    return scipy.ndimage.gaussian_filter(phi, sigma / spacing, mode="nearest")
 
 
 def pieces(inside: np.ndarray) -> np.ndarray:
     """Voxels in each connected piece (neighbours share a face), the largest first."""
-    numbers, _ = import_ndimage().label(inside)
+    numbers, _ = scipy.ndimage.label(inside)
     return np.sort(np.bincount(numbers.ravel())[1:])[::-1]
-
-
-def import_ndimage():
-    """`scipy.ndimage`.
-
-    Raises:
-        InputError: SciPy is not installed.
-    """
-    try:
-        import scipy.ndimage
-    except ImportError:
-        raise InputError('label volumes need: pip install "warp-corot[scans]"') from None
-    return scipy.ndimage
 
 
 def _less_half_a_step(nearest: np.ndarray, slab: slice, spacing: np.ndarray) -> np.ndarray:

@@ -117,7 +117,7 @@ def _read_trimesh(path: Path) -> tuple[NDArray[np.float64], NDArray[Any], list[s
     try:
         import trimesh
     except ImportError:
-        raise InputError(f'{path}: reading {path.suffix} files needs: pip install "warp-corot[scans]"') from None
+        raise InputError(f'{path}: reading {path.suffix} files needs: pip install "warp-corot[surface]"') from None
     try:
         scene = trimesh.load_scene(path, process=False)
         mesh = scene.to_mesh()

@@ -60,7 +60,8 @@ def load_volume(path: str | PathLike[str]) -> LoadedVolume:
     try:
         values, affine, unit, notes = READERS[suffix](source)
     except ImportError:
-        raise InputError(f'{source}: reading {suffix} files needs: pip install "warp-corot[scans]"') from None
+        extra = "vti" if suffix == ".vti" else "scans"
+        raise InputError(f'{source}: reading {suffix} files needs: pip install "warp-corot[{extra}]"') from None
     while values.ndim > 3 and values.shape[-1] == 1:
         values = values[..., 0]
     if values.ndim != 3:
