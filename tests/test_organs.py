@@ -387,10 +387,13 @@ def test_options_of_the_mesh_reach_it(folder, capsys):
     assert "from 2 x 2 x 2 cubes of 0.05 m" in said
     assert "level 4, type 1" in said
     assert "level 5" not in said
-    assert simulate("organ.glb", "-o", "a.usd", "--surface-error", 2e-3, *SHORT) == 0
-    expected = wc.TetForest.from_domain(Domain.from_surface("organ.glb"), 0.05, surface_error=2e-3, max_level=8)
-    assert tetrahedra_in(capsys.readouterr().out) < 20_000
-    assert len(expected.tets) < 20_000
+    assert simulate("organ.glb", "-o", "a.usd", "--cell-size", 0.05, "--surface-error", 1e-3, *SHORT) == 0
+    count = tetrahedra_in(capsys.readouterr().out)
+    domain = Domain.from_surface("organ.glb")
+    assert count == len(wc.TetForest.from_domain(domain, 0.05, surface_error=1e-3).tets)
+    assert np.abs(domain.phi(drawn(Usd.Stage.Open("a.usd")).vertices)).max() < 1e-3
+    assert simulate("organ.glb", "-o", "a.usd", "--surface-error", 1e-5, "--tets", 2000, *SHORT) == 0
+    assert 1000 < tetrahedra_in(capsys.readouterr().out) <= 2000
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ..elasticity import MODELS
 from .label_materials import FORM
-from .organs import MAX_LEVEL, TETS
+from .organs import MAX_LEVEL_FOR_ERROR, TETS
 from .say import EXIT_CODES
 from .subject import STIFFNESS_PER_WEIGHT
 
@@ -118,7 +118,8 @@ def _add_organ_options(organ: argparse._ArgumentGroup) -> None:
         "--max-level",
         type=int,
         metavar="L",
-        help=f"how often cubes are bisected at most, three times halve the edge (default: {MAX_LEVEL})",
+        help="how often cubes are bisected at most, three times halve the edge (default: as suits --tets; "
+        f"{MAX_LEVEL_FOR_ERROR} with --surface-error)",
     )
     organ.add_argument(
         "--surface-error",

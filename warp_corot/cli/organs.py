@@ -29,9 +29,13 @@ if TYPE_CHECKING:
 TETS = 20_000
 #: So many tetrahedra make a root cube of a length's cube worthwhile: most of them go to the surface.
 TETS_PER_CUBE = 30
-#: How often cubes are bisected at most: elements where the surface is most curved are a sixth of a cube long, and the
-#: time step, which goes with the smallest, stays within a factor of that of a uniform mesh of as many.
-MAX_LEVEL = 8
+#: How often cubes are bisected at most. Where the surface is most curved elements are a fifth of a cube long; finer
+#: ones would bring the rest of the surface little, and make the time step smaller.
+MAX_LEVEL = 7
+#: From so many on there are too few elements at the surface for that.
+MANY_TETS = 300_000
+#: The same where a surface error is to be kept.
+MAX_LEVEL_FOR_ERROR = 12
 #: Root cubes reach beyond the body by this share of its length.
 MARGIN = 1.0e-3
 #: What share of the number of tetrahedra asked for is aimed at, which is enough, and after how many meshes any is.
@@ -168,7 +172,9 @@ def _mesh(args: argparse.Namespace, domain: Domain) -> TetForest:
     if size is None:
         cubes = max(1, round((max(count or TETS, 1) / TETS_PER_CUBE) ** (1.0 / 3.0)))
         size = float(np.ptp(domain.bounds, axis=0).max()) * (1.0 + MARGIN) / cubes
-    level = MAX_LEVEL if args.max_level is None else args.max_level
+    level = args.max_level
+    if level is None:
+        level = MAX_LEVEL_FOR_ERROR if args.surface_error is not None else MAX_LEVEL + (count > MANY_TETS)
 
     def meshed(error: float | None, target: int | None = None) -> TetForest:
         return TetForest.from_domain(
