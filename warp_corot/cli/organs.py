@@ -39,7 +39,7 @@ MAX_LEVEL_FOR_ERROR = 12
 #: Root cubes reach beyond the body by this share of its length.
 MARGIN = 1.0e-3
 #: What share of the number of tetrahedra asked for is aimed at, which is enough, and after how many meshes any is.
-NEAR, NEAR_ENOUGH = 0.96, 0.85
+NEAR, NEAR_ENOUGH = 0.95, 0.8
 MOST_MESHES = 8
 
 #: Options that only such bodies take.
