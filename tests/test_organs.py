@@ -202,6 +202,7 @@ def textured_cube(path: Path, mirrored: bool) -> np.ndarray:
     parent.AddTranslateOp().Set(Gf.Vec3d(1, 0, 0))
     parent.AddScaleOp().Set(Gf.Vec3f(-1 if mirrored else 1, 1, 1))
     mesh = UsdGeom.Mesh.Define(stage, "/World/Cube")
+    mesh.AddTranslateOp().Set(Gf.Vec3d(0, 0.5, 0))
     quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
     points = np.array([[x, y, z] for x in (-2, 2) for y in (-2, 2) for z in (-2, 2)], float)
     assert np.isclose(trimesh.Trimesh(points, [[q[0], q[i], q[i + 1]] for q in quads for i in (1, 2)]).volume, 64)
@@ -227,7 +228,7 @@ def textured_cube(path: Path, mirrored: bool) -> np.ndarray:
     subset = UsdShade.MaterialBindingAPI(mesh.GetPrim()).CreateMaterialBindSubset("top", [3])
     UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(red)
     stage.Save()
-    return 0.01 * (points * [-1 if mirrored else 1, 1, 1] + [1, 0, 0])
+    return 0.01 * (points * [-1 if mirrored else 1, 1, 1] + [1, 0.5, 0])
 
 
 @pytest.mark.parametrize("mirrored", [False, True])

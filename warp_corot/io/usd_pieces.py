@@ -75,9 +75,7 @@ class PieceStore:
 
         def visit(path: Sdf.Path) -> None:
             spec = static.GetAttributeAtPath(path) if path.IsPropertyPath() else None
-            # Outputs of shaders have neither a value nor always a connection.
-            shading = spec and spec.name.startswith(("inputs:", "outputs:"))
-            if spec and not shading and not spec.HasInfo("default") and not spec.HasInfo("connectionPaths"):
+            if spec and not spec.HasInfo("default") and not spec.HasInfo("connectionPaths"):
                 self._varying[str(path)] = spec.typeName
 
         static.Traverse(Sdf.Path.absoluteRootPath, visit)
