@@ -87,6 +87,8 @@ def test_the_smooth_surface_follows_the_body(device, tmp_path):
         assert prims(stage) == [SURFACE]
         surface = drawn(stage)
         np.testing.assert_allclose(surface.vertices, rest.points @ motion.T, atol=2e-8)
+        extent = UsdGeom.Mesh.Get(stage, SURFACE).GetExtentAttr().Get(0)
+        np.testing.assert_allclose(extent, surface.bounds, atol=1e-8)
         assert surface.is_watertight
         assert surface.is_winding_consistent
         assert surface.volume == pytest.approx(np.linalg.det(motion) * mesh_volume(mesh), rel=1e-4)
