@@ -1,0 +1,59 @@
+"""A frog of ten tissues, picked up by its back, hangs limp (pip install pyvista matplotlib).
+
+Its segmentation, by the Whole Frog Project, comes with PyVista. It has no skin and no muscle: flesh is filled in between
+the tissues and laid four voxels thick around them. It has no unit: the frog is taken to be 9 cm long. Moduli are those of soft tissues but for bone, which is gristle here: real bone would take steps hundreds of times shorter.
+"""
+
+import argparse
+import time
+from importlib.util import find_spec
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.ndimage import binary_dilation, binary_erosion
+
+import warp_corot as wc
+from warp_corot.io.preview import draw_body
+from warp_corot.io.sections import Section
+from warp_corot.io.volumes import load_volume
+
+parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("--device", help="cpu or cuda:0")
+parser.add_argument("-o", "--output", default="frog.usd")
+parser.add_argument("--duration", type=float, default=1.0, help="seconds simulated")
+args = parser.parse_args()
+if not (pyvista := find_spec("pyvista")):
+    raise SystemExit("the frog comes with PyVista: pip install pyvista")
+
+# Tissue: numbers in the file (99 is the filling), Young's modulus [kPa], colour.
+flesh, bone = ((99, 1, 12, 14, 16), 3.0, "#e9b8a0"), (13, 40.0, "#f3ecd8")
+liver, stomach, heart = (10, 2.0, "#8c3b2e"), (15, 4.0, "#d98a6a"), (6, 10.0, "#c4202e")
+lungs, kidneys, gut = (11, 1.0, "#8fb4cc"), (8, 4.0, "#7d2f5a"), ((3, 7, 9), 2.0, "#c9a24a")
+tissues = {"flesh": flesh, "bone": bone, "liver": liver, "stomach": stomach, "heart": heart, "lungs": lungs}
+tissues |= {"kidneys": kidneys, "gut": gut, "eyes": ((4, 5), 10.0, "#4a7c59"), "brain": (2, 1.0, "#8d7fb5")}
+voxels = load_volume(pyvista.submodule_search_locations[0] + "/examples/frog_tissues.vti").values[::2, ::2, ::2]
+voxels = np.pad(voxels, 12)
+voxels[binary_erosion(binary_dilation(voxels > 0, iterations=12), iterations=8) & (voxels == 0)] = 99
+labels = {name: numbers for name, (numbers, _, _) in tissues.items()}
+frog = wc.Domain.from_labels(voxels, affine=np.diag([0.4, -0.4, -0.6, 1]), unit="mm", labels=labels, smoothing=4e-4)
+mesh = wc.TetForest.from_domain(frog, 0.012, max_level=8, surface_error=6e-4)
+print(*frog.report(), *mesh.summary(), f"meshed after {time.process_time():.1f} s", sep="\n")
+
+x, middle = mesh.points, frog.bounds.mean(axis=0)[1]
+young = 1e3 * np.array([modulus for _, modulus, _ in tissues.values()])[mesh.labels - 1]
+body = wc.SoftBody(mesh, wc.Isotropic(young, poisson=0.45, density=1050.0), device=args.device)
+back = (np.abs(x - [0.045, middle, -0.012]) < [0.013, 0.012, 0.01]).all(axis=1)
+body.fix(mesh.nodes_of("bone") & back)
+sim = wc.Simulation(body, integrator=wc.SymplecticEuler(damping=4.0))
+done = wc.record(sim, args.output, duration=args.duration, tets=True)
+print(f"{done.steps} steps in {done.stepping:.1f} s; it hangs down by up to {100 * done.final_displacement:.1f} cm")
+
+u, look = body.displacements.numpy(), mesh.surface()
+section = Section(mesh, frog, [0, middle, 0], [1, 0, 0], [0, 0, 1], [[0.0, 0.105], [-0.055, 0.0]], 4e-4)
+axes = (figure := Figure(figsize=(12, 3.8), layout="constrained")).subplots(1, 3)
+for ax, moved in ((axes[0], None), (axes[1], u)):
+    section.draw(ax, moved, {name: colour for name, (_, _, colour) in tissues.items()})
+    ax.set_ylim(-0.09, 0.0)
+draw_body(axes[2], look.moved(u), look.triangles, rest=look.points, up_axis="Z", ground=False)
+figure.savefig(args.output.rpartition(".")[0] + ".png", dpi=150)
+print(f"wrote {args.output}")
