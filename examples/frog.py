@@ -1,7 +1,8 @@
 """A frog of ten tissues, picked up by its back, hangs limp (pip install pyvista matplotlib).
 
-Its segmentation, by the Whole Frog Project, comes with PyVista. It has no skin and no muscle: flesh is filled in between
-the tissues and laid four voxels thick around them. It has no unit: the frog is taken to be 9 cm long. Moduli are those of soft tissues but for bone, which is gristle here: real bone would take steps hundreds of times shorter.
+Its segmentation, by the Whole Frog Project, comes with PyVista. It has no skin and no muscle: flesh is filled in
+between the tissues and laid four voxels thick around them. It has no unit: the frog is taken to be 9 cm long. Moduli
+are those of soft tissues but for bone, which is gristle: real bone would take steps hundreds of times shorter.
 """
 
 import argparse
