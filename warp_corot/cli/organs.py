@@ -6,7 +6,7 @@ import argparse
 import re
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,10 +38,6 @@ MANY_TETS = 300_000
 MAX_LEVEL_FOR_ERROR = 12
 #: Root cubes reach beyond the body by this share of its length.
 MARGIN = 1.0e-3
-#: What share of the number of tetrahedra asked for is aimed at, which is enough, and after how many meshes any is.
-NEAR, NEAR_ENOUGH = 0.95, 0.8
-MOST_MESHES = 8
-
 #: Options that only such bodies take.
 OPTIONS = (
     "unit",
@@ -176,57 +172,13 @@ def _mesh(args: argparse.Namespace, domain: Domain) -> TetForest:
     if level is None:
         level = MAX_LEVEL_FOR_ERROR if args.surface_error is not None else MAX_LEVEL + (count > MANY_TETS)
 
-    def meshed(error: float | None, target: int | None = None) -> TetForest:
+    try:
         return TetForest.from_domain(
-            domain, size, max_level=level, surface_error=error, target_elements=target, device=args.device
+            domain, size, max_level=level, surface_error=args.surface_error, target_elements=count, device=args.device
         )
-
-    if count is None:
-        return meshed(args.surface_error)
-    if args.surface_error is not None or count < 1:
-        return meshed(args.surface_error, count)
-    try:
-        found = _of_size(meshed, count, size)
-    except InputError:  # so coarse that nothing is seen of the body, or an option out of its range
-        found = None
-    try:
-        return found or meshed(None, count)
     except InputError as error:
-        raise InputError(f"with --tets {count}, {error}") from None
-
-
-def _of_size(meshed: Callable[[float], TetForest], count: int, size: float) -> TetForest | None:
-    """The mesh whose surface is off by no more than need be for so many tetrahedra, None if all have more.
-
-    Begins with few, for which a mesh takes no time, and goes on by the secant of the logarithms: the number goes about
-    inversely with the surface error, and less where the levels end.
-    """
-    best: TetForest | None = None
-    tried: list[tuple[float, float]] = []  # logarithms of the error and of the number over the one asked for
-    low, high = -np.inf, np.log(0.5 * size)
-    slope, error = -1.0, high
-    for _ in range(MOST_MESHES):
-        mesh = meshed(float(np.exp(error)))
-        found = len(mesh.tets)
-        if found <= count:
-            high = error
-            best = mesh if best is None or found > len(best.tets) else best
-            if found >= NEAR_ENOUGH * count:
-                break
-        else:
-            low = error
-        if best is None:
-            return None
-        tried.append((error, float(np.log(found / (NEAR * count)))))
-        if len(tried) > 1:
-            (e0, n0), (e1, n1) = tried[-2:]
-            if e1 < e0 and abs(n1 - n0) < 0.01:  # all of the surface is at the last level
-                break
-            slope = float(np.clip((n1 - n0) / (e1 - e0), -2.0, -0.25))
-        error = error - tried[-1][1] / slope
-        if not low < error < high:
-            error = 0.5 * (low + high) if np.isfinite(low) else high - 1.0
-    return best
+        with_tets = f"with --tets {count}, " if count is not None and args.surface_error is None and count >= 1 else ""
+        raise InputError(f"{with_tets}{error}") from None
 
 
 def _title(source: Path) -> str:

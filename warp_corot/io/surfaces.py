@@ -26,13 +26,13 @@ SURFACE_ASSETS: dict[str, Asset] = {
         name="bunny",
         file="examples/assets/bunny.usd",
         scale=0.1,
-        young=1.0e4,
+        young=3.0e4,
         poisson=0.45,
         density=1000.0,
         fix="y < 0.01",
         damping=2.0,
         duration=4.0,
-        note="the Stanford bunny, 16 cm long, of soft silicone gel",
+        note="the Stanford bunny, 16 cm long, of silicone gel",
     )
 }
 
@@ -145,7 +145,7 @@ def _read_usd(path: Path) -> tuple[NDArray[np.float64], NDArray[Any], float, str
         mesh = UsdGeom.Mesh(prim)
         if mesh.ComputePurpose() in ("guide", "proxy"):
             continue
-        points, triangles = _triangles(mesh, path, time)
+        points, triangles = mesh_triangles(mesh, path, time)
         if not len(triangles):
             continue
         world = np.array(cache.GetLocalToWorldTransform(prim), dtype=np.float64)
@@ -160,7 +160,7 @@ def _read_usd(path: Path) -> tuple[NDArray[np.float64], NDArray[Any], float, str
     return np.concatenate(all_points), np.concatenate(all_triangles), metres, str(UsdGeom.GetStageUpAxis(stage)), notes
 
 
-def _triangles(mesh: UsdGeom.Mesh, path: Path, time: Usd.TimeCode) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def mesh_triangles(mesh: UsdGeom.Mesh, path: Path, time: Usd.TimeCode) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Points and the fans of a mesh's polygons, less its holes."""
     points = np.asarray(_earliest(mesh.GetPointsAttr(), time), dtype=np.float64).reshape(-1, 3)
     counts = np.asarray(_earliest(mesh.GetFaceVertexCountsAttr(), time), dtype=np.int64)

@@ -105,7 +105,7 @@ def read_looks(path: str | PathLike[str]) -> list[Look]:
     Raises:
         InputError: No such file, not a USD stage, or no Mesh prim with faces in it.
     """
-    from .surfaces import _triangles
+    from .surfaces import mesh_triangles
 
     source = Path(path)
     if source.suffix.lower() not in USD_SUFFIXES:
@@ -121,7 +121,7 @@ def read_looks(path: str | PathLike[str]) -> list[Look]:
         mesh = UsdGeom.Mesh(prim)
         if not mesh or mesh.ComputePurpose() in ("guide", "proxy"):
             continue
-        points, triangles = _triangles(mesh, source, time)
+        points, triangles = mesh_triangles(mesh, source, time)
         if not len(triangles):
             continue
         world = np.array(cache.GetLocalToWorldTransform(prim), dtype=np.float64)

@@ -21,9 +21,9 @@ from .tree import Tree
 if TYPE_CHECKING:
     from ..domain import Domain
 
-#: How near to the number of tetrahedra that was asked for is near enough.
-NEAR_ENOUGH = 0.9
-SEARCH_STEPS = 6
+#: What share of the number of tetrahedra asked for is aimed at, which is enough, and after how many meshes any is.
+NEAR, NEAR_ENOUGH = 0.95, 0.8
+MOST_MESHES = 8
 
 
 def mesh_domain(
@@ -62,7 +62,57 @@ def _of_size(
     error: float,
     cell_size: float,
 ) -> TetForest:
-    """The finest mesh that has at most so many tetrahedra: by levels, then by the surface error that fits."""
+    """The mesh of at most so many tetrahedra whose surface is off by no more than need be."""
+    found = _by_error(lambda surface_error: meshed(max_level, surface_error), target, error, cell_size)
+    return _by_level(meshed, target, min_level, max_level, error, cell_size) if found is None else found
+
+
+def _by_error(meshed: Callable[[float], TetForest], target: int, least: float, cell_size: float) -> TetForest | None:
+    """The same among meshes of one greatest level; None if all have more.
+
+    Begins with few, for which a mesh takes no time, and goes on by the secant of the logarithms: the number goes about
+    inversely with the surface error, and less where the levels end.
+    """
+    best: TetForest | None = None
+    tried: list[tuple[float, float]] = []  # logarithms of the error and of the number over the one asked for
+    low, high = np.log(least) if least > 0 else -np.inf, np.log(0.5 * cell_size)
+    slope, error = -1.0, max(high, low)
+    for _ in range(MOST_MESHES):
+        try:
+            mesh = meshed(float(np.exp(error)))
+        except _EmptyError:
+            return None
+        count = len(mesh.tets)
+        if count <= target:
+            high = error
+            best = mesh if best is None or count > len(best.tets) else best
+            if count >= NEAR_ENOUGH * target or error <= low:
+                break
+        else:
+            low = error
+        if best is None:
+            return None
+        tried.append((error, float(np.log(count / (NEAR * target)))))
+        if len(tried) > 1:
+            (e0, n0), (e1, n1) = tried[-2:]
+            if e1 < e0 and abs(n1 - n0) < 0.01:  # all of the surface is at the last level
+                break
+            slope = float(np.clip((n1 - n0) / (e1 - e0), -2.0, -0.25))
+        error = max(error - tried[-1][1] / slope, low)
+        if not low <= error < high:
+            error = 0.5 * (low + high) if np.isfinite(low) else high - 1.0
+    return best
+
+
+def _by_level(
+    meshed: Callable[[int, float], TetForest],
+    target: int,
+    min_level: int,
+    max_level: int,
+    error: float,
+    cell_size: float,
+) -> TetForest:
+    """The finest of meshes of fewer levels, for numbers so small that curvature says nothing yet."""
     found: TetForest | None = None
     for level in range(min_level, max_level + 1):
         try:
@@ -74,22 +124,6 @@ def _of_size(
         if len(finer.tets) > target:
             break
         found = finer
-    else:
-        assert found is not None
-        return found
-    # One level more is too much with this error: with which is it not?
-    low, high = np.log(max(error, 1e-4 * cell_size)), np.log(cell_size)
-    for _ in range(SEARCH_STEPS):
-        if found is not None and len(found.tets) >= NEAR_ENOUGH * target:
-            break
-        middle = 0.5 * (low + high)
-        between = meshed(level, float(np.exp(middle)))
-        if len(between.tets) > target:
-            low = middle
-        else:
-            high = middle
-            if found is None or len(between.tets) > len(found.tets):
-                found = between
     if found is None:
         raise InputError(
             f"target_elements is {target}; at the coarsest, level {level} of cells of {cell_size:g} m, there are "
