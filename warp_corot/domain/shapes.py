@@ -11,6 +11,7 @@ import warp as wp
 from ..errors import InputError
 from ..kernels import domain as kernels
 from .domain import Domain
+from .units import length
 
 
 class Shape(Domain):
@@ -25,6 +26,10 @@ class Shape(Domain):
         phi = wp.empty(points.size, wp.float32, device=points.device)
         wp.launch(self.kernel, points.size, [points, *self.numbers], [phi], device=points.device)
         return phi
+
+    def _details(self) -> list[str]:
+        size = " x ".join(length(edge) for edge in np.ptp(self.bounds, axis=0))
+        return [f"a {type(self).__name__.lower()}, {size}"]
 
 
 class Sphere(Shape):
