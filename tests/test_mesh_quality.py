@@ -1,0 +1,73 @@
+"""Meshes of scans, sets and surfaces: conforming and well shaped like those of formulas; what adaptivity saves."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.ndimage import gaussian_filter
+from test_meshing import assert_conforming, assert_well_shaped
+
+import warp_corot as wc
+from warp_corot.experiments.meshes import draw, ratios_by_error, ratios_by_level, study, table
+
+
+def scan():
+    """Blobs of two labels at random, on an oblique lattice."""
+    noise = gaussian_filter(np.random.default_rng(7).standard_normal((2, 24, 28, 20)), (0, 3, 3, 3))
+    voxels = np.where(noise[0] > 0.01, np.where(noise[1] > 0, 2, 1), 0)
+    affine = np.eye(4)
+    affine[:3, :3] = 1e-3 * np.array([[1.8, 0.5, 0.0], [-0.6, 2.1, 0.0], [0.0, 0.1, 2.5]])
+    return wc.Domain.from_labels(voxels, affine=affine, labels={"a": 1, "b": 2}, smoothing=1e-3)
+
+
+def knobs():
+    """A torus less a capsule, with a ball on it."""
+    ring = wc.Domain.torus(0.03, 0.01) - wc.Domain.capsule((-0.06, 0, 0), (0.06, 0, 0), 0.004)
+    return ring | wc.Domain.sphere(0.006, (0.0, 0.04, 0.0))
+
+
+def star():
+    """A surface with sharp edges and thin tips."""
+    solid = trimesh.creation.icosphere(subdivisions=1, radius=0.02)
+    solid.vertices[::3] *= 2.0
+    return wc.Domain.from_surface((solid.vertices, solid.faces))
+
+
+@pytest.mark.parametrize("make", [scan, knobs, star])
+@pytest.mark.parametrize("sliver", [0.02, 0.3])
+def test_every_mesh_is_conforming_and_well_shaped(make, sliver):
+    mesh = wc.TetForest.from_domain(make(), 0.02, max_level=11, surface_error=5e-4, sliver=sliver)
+    assert len(set(mesh.levels)) >= 3
+    assert_conforming(mesh)
+    assert_well_shaped(mesh)
+    surface = mesh.surface()
+    edges = np.concatenate([surface.triangles[:, [i, j]] for i, j in ((0, 1), (1, 2), (2, 0))])
+    assert np.array_equal(np.sort(edges @ [10**6, 1]), np.sort(edges @ [1, 10**6]))
+
+
+@pytest.fixture(scope="module")
+def points():
+    return study(levels=(9, 12, 15, 18), errors=(16e-3, 8e-3))
+
+
+def test_adaptive_meshes_are_as_near_as_uniform_ones(points):
+    """Of the ball, at the same level: to the Hausdorff distance, a quarter for edges halved."""
+    error = {(p.kind, p.level): p.error for p in points if p.name == "ball"}
+    for level in (9, 12, 15, 18):
+        assert error["adaptive", level] == pytest.approx(error["uniform", level], rel=0.05)
+    assert error["uniform", 12] / error["uniform", 18] == pytest.approx(16.0, rel=0.3)
+
+
+def test_adaptive_meshes_need_fewer_tetrahedra(points):
+    """A surface has tetrahedra by 1/h^2, a volume by 1/h^3: the ratio halves every three levels, in the end."""
+    ratio = ratios_by_level(points)
+    assert 0.4 < ratio[15] < 0.5
+    assert ratio[18] / ratio[15] == pytest.approx(0.55, abs=0.06)
+    spiny = ratios_by_error(points)
+    assert spiny
+    assert max(spiny.values()) < 0.1
+
+
+def test_study_is_written(points, tmp_path):
+    assert len(table(points)) == len(points) + 3
+    draw(points, tmp_path / "lod.png")
+    assert (tmp_path / "lod.png").read_bytes().startswith(b"\x89PNG")
