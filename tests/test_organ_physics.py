@@ -82,13 +82,17 @@ def test_two_layer_beam_on_adaptive_and_uniform_meshes(device):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("body", "tolerance", "error"), [(dome, 0.025, 2e-4), (beam, 0.05, 1e-3)])
-def test_meshes_twice_as_fine(body, tolerance, error, device):
+@pytest.mark.parametrize(("body", "level", "error"), [(dome, 15, 5e-5), (beam, 12, 1e-3)])
+def test_meshes_twice_as_fine(body, level, error, device):
+    """Measured by a uniform mesh of level 12, an adaptive one is as good as the uniform one of the level that it has
+    within, 9, or better: what is finer at surfaces and borders spoils nothing. It need not gain much: a beam's bending
+    errs by the edges within (2.8 % both), a ball's lean by its surface too."""
     finest = body(device, min_level=12, max_level=12)
     uniform = body(device, min_level=9, max_level=9)
-    adaptive = body(device, min_level=6, max_level=12 if body is dome else 9, surface_error=error)
-    assert apart(uniform[1], finest[1]) < tolerance
-    assert apart(adaptive[1], finest[1]) < tolerance
+    adaptive = body(device, min_level=9, max_level=level, surface_error=error)
+    assert uniform[0] < adaptive[0] < 0.7 * finest[0]
+    assert apart(uniform[1], finest[1]) < 0.03
+    assert apart(adaptive[1], finest[1]) < 1.05 * apart(uniform[1], finest[1])
 
 
 def test_two_layer_beam_bends_as_theory_says(device):
