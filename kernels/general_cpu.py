@@ -1,4 +1,6 @@
-"""Corotated forces of general tetrahedra on the CPU, eight to the lanes of vector registers; see ``lanes``.
+"""Corotated forces of tetrahedra one by one on the CPU, eight to the lanes of vector registers; see ``lanes``.
+
+General tetrahedra, and those of a forest that are in no complete subtree, for which a rest matrix is worked out once.
 
 An element that the unscaled iteration does not turn adds nothing and is flagged; ``repair_elements`` does those.
 """
@@ -6,7 +8,15 @@ An element that the unscaled iteration does not turn adds nothing and is flagged
 import warp as wp
 
 from .constitutive import corotated_strain, hooke
-from .elements import GeneralElements, frame, local_gradient, scatter_stress
+from .elements import (
+    ForestElements,
+    GeneralElements,
+    frame,
+    gradient_of,
+    local_gradient,
+    rest_volume,
+    scatter_stress,
+)
 from .lanes import COMPILER_FLAGS, NEWTON, PRELUDE, on_cpu
 from .rotation import ITERATIONS, byers_xu
 
@@ -115,3 +125,25 @@ def repair_elements(
     q = frame(elements, t)
     r = byers_xu(q + g)
     scatter_stress(elements, t, r * hooke(corotated_strain(g, q, r), mu[t * stride], lam[t * stride]), f)
+
+
+@wp.kernel(enable_backward=False)
+def rest_matrices(
+    # In
+    elements: ForestElements,
+    # Out
+    rest_inverse: wp.array[wp.mat33],
+    volume: wp.array[wp.float32],
+):
+    """What general elements keep, of elements of a forest."""
+    t = wp.tid()
+    turn = wp.transpose(frame(elements, t))
+    # du/dX is linear in the displacements of the last three nodes; they enter by their rows, one at a time.
+    o = wp.vec3(0.0, 0.0, 0.0)
+    x = wp.vec3(1.0, 0.0, 0.0)
+    rows = wp.mat33()
+    rows[0] = (gradient_of(elements, t, o, x, o, o) * turn)[0]
+    rows[1] = (gradient_of(elements, t, o, o, x, o) * turn)[0]
+    rows[2] = (gradient_of(elements, t, o, o, o, x) * turn)[0]
+    rest_inverse[t] = rows
+    volume[t] = rest_volume(elements, t)

@@ -22,6 +22,7 @@ from ..kernels.corotated import (
     scatter_own_rotation,
     scatter_with_rotations,
 )
+from ..kernels.elements import GeneralElements
 from ..kernels.lanes import LANES
 from ..kernels.repair import repair_own, repair_shared
 from ..kernels.rotation import byers_xu, quick_rotation
@@ -232,19 +233,43 @@ class LeafField(CorotatedField):
             self.slots, self.elements = leaf_slots(body)
 
 
+class Lanes:
+    """Elements with rotations of their own on the CPU, eight at a time."""
+
+    def __init__(self, elements: Any, material: list):
+        self.elements = elements
+        self.count = len(elements.nodes)
+        self.material = material
+        self._flagged = wp.zeros(self.count, dtype=wp.uint8, device="cpu")
+
+    @classmethod
+    def of_forest(cls, elements: Any, material: list) -> Lanes:
+        """From elements of a forest."""
+        count, general = len(elements.nodes), GeneralElements()
+        general.nodes = general.targets = elements.nodes
+        general.rest_inverse = wp.empty(count, dtype=wp.mat33, device="cpu")
+        general.volume = wp.empty(count, dtype=wp.float32, device="cpu")
+        outputs = [general.rest_inverse, general.volume]
+        wp.launch(general_cpu.rest_matrices, dim=count, inputs=[elements], outputs=outputs, device="cpu")
+        return cls(general, material)
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        inputs = [self.elements, self.count, *self.material, u]
+        blocks = -(-self.count // LANES)
+        wp.launch(general_cpu.scatter_elements, blocks, inputs, [f, self._flagged], device="cpu")
+        repair = [self._flagged, self.elements, *self.material, u]
+        wp.launch(general_cpu.repair_elements, self.count, repair, [f], device="cpu")
+
+
 class LanesField(CorotatedField):
-    """General elements on the CPU, eight at a time."""
+    """General elements on the CPU."""
 
     def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
         super().__init__(body, model, deterministic)
-        self._flagged = wp.zeros(self.element_count, dtype=wp.uint8, device=self.device)
+        self._lanes = Lanes(self.elements, self.material_inputs)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        blocks = -(-self.element_count // LANES)
-        inputs = [self.elements, self.element_count, *self.material_inputs, u]
-        self.launch(general_cpu.scatter_elements, blocks, inputs, [f, self._flagged])
-        repair = [self._flagged, self.elements, *self.material_inputs, u]
-        self.launch(general_cpu.repair_elements, self.element_count, repair, [f])
+        self._lanes.scatter_forces(u, f)
 
 
 class SubtreeField(CorotatedField):
@@ -286,6 +311,9 @@ class SubtreeField(CorotatedField):
             self._flat_material = [
                 wp.array(a.numpy()[flat], dtype=wp.float32, device=self.device) for a in (self.body.mu, self.body.lam)
             ] + [1]
+        self._flat_lanes: Lanes | None = None
+        if self.device.is_cpu and not self._needs_rotations:
+            self._flat_lanes = Lanes.of_forest(self._flat_elements, self._flat_material)
         if self._needs_rotations:
             self._flat_unit = wp.array(self._sharing().unit.numpy()[flat], dtype=wp.int32, device=self.device)
 
@@ -297,7 +325,9 @@ class SubtreeField(CorotatedField):
         if len(self.plan.flat):
             inputs = [self._flat_elements, *self._flat_material, u]
             count = len(self._flat_elements.code)
-            if self._needs_rotations:
+            if self._flat_lanes is not None:
+                self._flat_lanes.scatter_forces(u, f)
+            elif self._needs_rotations:
                 self.launch(self._forces, count, [*inputs, self._rotations, self._flat_unit], [f])
             else:
                 self.launch(self._own, count, inputs, [f])
