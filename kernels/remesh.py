@@ -1,0 +1,128 @@
+"""The device's pools of a forest that changes while it is used, and what every kernel of a pass shares.
+
+Tetrahedra stand in a pool: roots first, then pairs of children, so that the two children of one parent are neighbours;
+nodes stand in another. Each pool has a list of what is free. The leaves are a list in tree order. All counts are on the
+device: a kernel goes through as many things as there are with as many threads as it was launched with, so that a
+recorded pass fits a mesh of any size and its work follows the leaves, not the capacity.
+"""
+
+import warp as wp
+
+# Places in ``Pools.counts``.
+LEAVES = wp.constant(0)
+FREE_NODES = wp.constant(1)
+FREE_PAIRS = wp.constant(2)
+STAMP = wp.constant(3)  # rounds so far, over all passes
+PASS_STAMP = wp.constant(4)  # the round in which the present pass began
+WANTED = wp.constant(5)  # edges wanted in this pass
+BIRTHS = wp.constant(6)  # of them those of this round ...
+LAST_BIRTHS = wp.constant(7)  # ... and of the one before
+FRESH = wp.constant(8)  # pairs made in this pass
+FRESH_SEEN = wp.constant(9)  # of them those that an earlier round has looked at
+FRESH_NEW = wp.constant(10)  # where this round's begin
+NODES_TAKEN = wp.constant(11)
+PAIRS_TAKEN = wp.constant(12)
+CANDIDATES = wp.constant(13)  # nodes that some leaf would give up
+NODES_GIVEN = wp.constant(14)
+PAIRS_GIVEN = wp.constant(15)
+GAINERS = wp.constant(16)  # ends to which mass came back
+ADDED = wp.constant(17)  # nodes made in this pass
+REMOVED = wp.constant(18)  # nodes removed in this pass
+FULL = wp.constant(19)  # some refinement had to be left out for want of room
+NODE_TOP = wp.constant(20)  # all nodes in use have lower numbers
+NEW_LEAVES = wp.constant(21)
+COUNTS = 22
+
+# Level of a tetrahedron that is not in use.
+UNUSED = wp.constant(-1)
+
+# Marks of leaves.
+SIMPLIFY = wp.constant(wp.int8(-1))
+REFINE = wp.constant(wp.int8(1))
+
+
+@wp.struct
+class Pools:
+    """Tetrahedra, nodes and leaves, each with as many places as there may ever be."""
+
+    counts: wp.array[wp.int32]
+    roots: int
+    # Tetrahedra.
+    tets: wp.array[wp.vec4i]  # nodes in Maubach order
+    level: wp.array[wp.int32]  # UNUSED where there is none
+    parent: wp.array[wp.int32]
+    first_child: wp.array[wp.int32]  # LIVE or VOID where there is none
+    next: wp.array[wp.int32]  # the next tetrahedron around the same edge, while it is bisected or merged
+    free_pairs: wp.array[wp.int32]  # first children
+    fresh: wp.array[wp.int32]  # first children made in this pass
+    # Nodes.
+    lattice: wp.array[wp.vec3i]
+    ends: wp.array[wp.vec2i]  # of the edge whose midpoint a node is
+    valence: wp.array[wp.int32]  # leaves, live or void, that name a node; 0: it is free
+    touched: wp.array[wp.int32]  # the last round in which an edge of this node came to be wanted
+    free_nodes: wp.array[wp.int32]
+    # Leaves, in tree order.
+    leaves: wp.array[wp.int32]
+    leaf_tets: wp.array[wp.vec4i]
+    new_leaves: wp.array[wp.int32]
+    marks: wp.array[wp.int8]
+
+
+@wp.func
+def refinement_end(level: int):
+    """k of the refinement edge x0-xk."""
+    return 3 - level % 3
+
+
+@wp.func
+def first_half(x: wp.vec4i, z: int, level: int):
+    """The first child of a tetrahedron that is bisected at z (Maubach 1995)."""
+    child = wp.vec4i(x[0], x[1], x[2], z)
+    if level % 3 == 1:
+        child = wp.vec4i(x[0], x[1], z, x[3])
+    elif level % 3 == 2:
+        child = wp.vec4i(x[0], z, x[2], x[3])
+    return child
+
+
+@wp.func
+def second_half(x: wp.vec4i, z: int, level: int):
+    child = wp.vec4i(x[1], x[2], x[3], z)
+    if level % 3 == 1:
+        child = wp.vec4i(x[1], x[2], z, x[3])
+    elif level % 3 == 2:
+        child = wp.vec4i(x[1], z, x[2], x[3])
+    return child
+
+
+@wp.kernel(enable_backward=False)
+def begin_pass(
+    # In and out
+    pools: Pools,
+):
+    counts = pools.counts
+    counts[STAMP] = counts[STAMP] + 1
+    counts[PASS_STAMP] = counts[STAMP]
+    counts[WANTED] = 0
+    counts[BIRTHS] = 0
+    counts[FRESH] = 0
+    counts[FRESH_SEEN] = 0
+    counts[FRESH_NEW] = 0
+    counts[CANDIDATES] = 0
+    counts[NODES_GIVEN] = 0
+    counts[PAIRS_GIVEN] = 0
+    counts[GAINERS] = 0
+    counts[ADDED] = 0
+    counts[REMOVED] = 0
+
+
+@wp.kernel(enable_backward=False)
+def give_back(
+    # In and out
+    pools: Pools,
+):
+    """Count what was removed to what is free."""
+    counts = pools.counts
+    counts[FREE_NODES] = counts[FREE_NODES] + counts[NODES_GIVEN]
+    counts[FREE_PAIRS] = counts[FREE_PAIRS] + counts[PAIRS_GIVEN]
+    counts[REMOVED] = counts[NODES_GIVEN]

@@ -1,0 +1,82 @@
+"""Which leaves are to be refined or simplified: a criterion of the element's state against two thresholds."""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from .elements import load_node
+from .remesh import LEAVES, REFINE, SIMPLIFY, Pools, refinement_end
+
+mat43 = wp.types.matrix(shape=(4, 3), dtype=wp.float32)
+
+
+@wp.struct
+class ElementState:
+    """What a criterion sees of an element, its nodes in Maubach order."""
+
+    level: int
+    corner: wp.vec3  # rest position of node 0 [m]
+    rest: mat43  # rest positions from there, a row a node [m]
+    moved: mat43  # displacements, a row a node [m]
+
+
+@wp.func
+def elongation(element: ElementState, parameters: wp.array[wp.float32]):
+    """Deformed over rest length of the longest edge, which is the refinement edge (Tagawa et al. 2013)."""
+    k = refinement_end(element.level)
+    edge = element.rest[k]
+    change = element.moved[k] - element.moved[0]
+    return wp.length(edge + change) / wp.length(edge)
+
+
+@wp.func
+def load_state(i: int, origin: wp.vec3d, spacing: wp.float64, pools: Pools, u: wp.array[wp.vec4]):
+    state = ElementState()
+    tet = pools.leaf_tets[i]
+    p = pools.lattice[tet[0]]
+    state.level = pools.level[pools.leaves[i]]
+    state.corner = wp.vec3(
+        float(origin[0] + wp.float64(p[0]) * spacing),
+        float(origin[1] + wp.float64(p[1]) * spacing),
+        float(origin[2] + wp.float64(p[2]) * spacing),
+    )
+    size = float(spacing)
+    rest = mat43()
+    moved = mat43()
+    for n in range(4):
+        q = pools.lattice[tet[n]] - p
+        rest[n] = size * wp.vec3(float(q[0]), float(q[1]), float(q[2]))
+        moved[n] = load_node(u, tet[n])
+    state.rest = rest
+    state.moved = moved
+    return state
+
+
+@functools.cache
+def marking_kernel(criterion: Any) -> wp.Kernel:
+    """The kernel that marks leaves by a criterion: a Warp function of an ``ElementState`` and an array of numbers."""
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def mark_leaves(
+        # In
+        threads: int,
+        refine_above: float,
+        simplify_below: float,
+        origin: wp.vec3d,
+        spacing: wp.float64,
+        u: wp.array[wp.vec4],
+        parameters: wp.array[wp.float32],
+        # In and out
+        pools: Pools,
+    ):
+        for i in range(wp.tid(), pools.counts[LEAVES], threads):
+            value = criterion(load_state(i, origin, spacing, pools, u), parameters)
+            mark = wp.int8(0)
+            if value > refine_above:
+                mark = REFINE
+            elif value < simplify_below:
+                mark = SIMPLIFY
+            pools.marks[i] = mark
+
+    return mark_leaves

@@ -1,0 +1,168 @@
+"""What nodes and tetrahedra carry, handed on when the mesh changes.
+
+A new node takes from each end of its edge the mass that this end loses, with the momentum of that mass; a node that is
+removed gives back to each end what it then gains, moving as the end does and, on top, as the node moved against both
+together. So mass and linear momentum stay, and bisection and removal undo each other.
+"""
+
+import warp as wp
+
+from .elements import load_node, store_node
+from .remesh import ADDED, GAINERS, NODE_TOP, REMOVED, Pools
+
+
+@wp.struct
+class Carried:
+    """Of nodes: displacement, velocity, mass and load. Of tetrahedra: density and other values per full volume."""
+
+    volume: wp.array[wp.float64]  # rest volume by level [m^3]
+    u: wp.array[wp.vec4]
+    v: wp.array[wp.vec4]
+    load: wp.array[wp.vec4]
+    mass: wp.array[wp.float64]
+    held: wp.array[wp.uint8]
+    mass32: wp.array[wp.float32]  # what stepping reads
+    inverse_mass: wp.array[wp.float32]
+    # Tetrahedra, by their places in the pool.
+    density: wp.array[wp.float64]  # mass per rest volume, what is not filled counted in
+    label: wp.array[wp.int32]
+    values: wp.array2d[wp.float32]
+    # While nodes are removed.
+    gained_mass: wp.array[wp.float64]
+    gained_momentum: wp.array[wp.vec3d]  # beyond what the mass has that moves as the end does
+    gain_count: wp.array[wp.int32]
+    gainers: wp.array[wp.int32]
+    impulse: wp.array[wp.vec3d]  # [1] that supports have given, in all passes [N s]
+
+
+@wp.func
+def doubled(a: wp.vec3):
+    return wp.vec3d(wp.float64(a[0]), wp.float64(a[1]), wp.float64(a[2]))
+
+
+@wp.func
+def quarter_mass(e: int, level: int, carried: Carried):
+    return wp.float64(0.25) * carried.density[e] * carried.volume[level]
+
+
+@wp.func
+def copy_to_children(e: int, child: int, carried: Carried):
+    for n in range(2):
+        carried.density[child + n] = carried.density[e]
+        carried.label[child + n] = carried.label[e]
+        for c in range(carried.values.shape[1]):
+            carried.values[child + n, c] = carried.values[e, c]
+
+
+@wp.func
+def average_children(e: int, child: int, carried: Carried):
+    """Children are of one volume, so that means keep what the values are densities of."""
+    carried.density[e] = wp.float64(0.5) * (carried.density[child] + carried.density[child + 1])
+    carried.label[e] = carried.label[child]
+    for c in range(carried.values.shape[1]):
+        carried.values[e, c] = 0.5 * (carried.values[child, c] + carried.values[child + 1, c])
+
+
+@wp.func
+def make_node(z: int, a: int, b: int, loss_a: wp.float64, loss_b: wp.float64, carried: Carried):
+    """The midpoint of the deformed edge a-b, with what both ends lose."""
+    store_node(carried.u, z, 0.5 * (load_node(carried.u, a) + load_node(carried.u, b)))
+    store_node(carried.load, z, wp.vec3())
+    va = load_node(carried.v, a)
+    vb = load_node(carried.v, b)
+    velocity = 0.5 * (va + vb)
+    mass = loss_a + loss_b
+    both_held = carried.held[a] != wp.uint8(0) and carried.held[b] != wp.uint8(0)
+    carried.held[z] = wp.where(both_held, wp.uint8(1), wp.uint8(0))
+    momentum = loss_a * doubled(va) + loss_b * doubled(vb)
+    if both_held:
+        wp.atomic_add(carried.impulse, 0, mass * doubled(velocity) - momentum)
+    elif mass > wp.float64(0.0):
+        mean = momentum / mass
+        velocity = wp.vec3(float(mean[0]), float(mean[1]), float(mean[2]))
+    store_node(carried.v, z, velocity)
+    carried.mass[z] = mass
+    wp.atomic_add(carried.mass, a, -loss_a)
+    wp.atomic_add(carried.mass, b, -loss_b)
+
+
+@wp.func
+def give_to_end(
+    end: int,
+    mass: wp.float64,
+    deviation: wp.vec3d,
+    load: wp.vec3,
+    pools: Pools,
+    carried: Carried,
+):
+    if wp.atomic_add(carried.gain_count, end, 1) == 0:
+        carried.gainers[wp.atomic_add(pools.counts, GAINERS, 1)] = end
+    wp.atomic_add(carried.gained_mass, end, mass)
+    wp.atomic_add(carried.gained_momentum, end, mass * deviation)
+    if wp.length_sq(load) > 0.0:
+        wp.atomic_add(carried.load, end, wp.vec4(load[0], load[1], load[2], 0.0))
+
+
+@wp.func
+def unmake_node(z: int, a: int, b: int, gain_a: wp.float64, gain_b: wp.float64, pools: Pools, carried: Carried):
+    """Give back to both ends; ``settle_ends`` puts it to account."""
+    mass = gain_a + gain_b
+    deviation = wp.vec3d()
+    if mass > wp.float64(0.0):
+        mean = (gain_a * doubled(load_node(carried.v, a)) + gain_b * doubled(load_node(carried.v, b))) / mass
+        deviation = doubled(load_node(carried.v, z)) - mean
+    load = 0.5 * load_node(carried.load, z)
+    give_to_end(a, gain_a, deviation, load, pools, carried)
+    give_to_end(b, gain_b, deviation, load, pools, carried)
+    carried.mass[z] = wp.float64(0.0)
+    carried.mass32[z] = 0.0
+    carried.inverse_mass[z] = 0.0
+    carried.held[z] = wp.uint8(0)
+    store_node(carried.u, z, wp.vec3())
+    store_node(carried.v, z, wp.vec3())
+    store_node(carried.load, z, wp.vec3())
+
+
+@wp.kernel(enable_backward=False)
+def settle_ends(
+    # In
+    threads: int,
+    pools: Pools,
+    # In and out
+    carried: Carried,
+):
+    """Velocities of nodes that got mass back. What a held one cannot take up its support does."""
+    for i in range(wp.tid(), pools.counts[GAINERS], threads):
+        end = carried.gainers[i]
+        momentum = carried.gained_momentum[end]
+        mass = carried.mass[end] + carried.gained_mass[end]
+        if carried.held[end] != wp.uint8(0):
+            wp.atomic_add(carried.impulse, 0, -momentum)
+        elif mass > wp.float64(0.0):
+            v = doubled(load_node(carried.v, end)) + momentum / mass
+            store_node(carried.v, end, wp.vec3(float(v[0]), float(v[1]), float(v[2])))
+        carried.mass[end] = mass
+        carried.gained_mass[end] = wp.float64(0.0)
+        carried.gained_momentum[end] = wp.vec3d()
+        carried.gain_count[end] = 0
+
+
+@wp.kernel(enable_backward=False)
+def refresh_masses(
+    # In
+    threads: int,
+    pools: Pools,
+    # In and out
+    carried: Carried,
+):
+    """What stepping reads, if anything has changed."""
+    count = pools.counts[NODE_TOP]
+    if pools.counts[ADDED] + pools.counts[REMOVED] == 0:
+        count = 0
+    for i in range(wp.tid(), count, threads):
+        mass = carried.mass[i]
+        carried.mass32[i] = float(mass)
+        inverse = float(0.0)
+        if carried.held[i] == wp.uint8(0) and mass > wp.float64(0.0):
+            inverse = float(wp.float64(1.0) / mass)
+        carried.inverse_mass[i] = inverse
