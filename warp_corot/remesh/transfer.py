@@ -1,0 +1,141 @@
+"""What nodes and tetrahedra of a changing forest carry, as the host sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from ..errors import InputError
+from ..kernels.remesh_state import Carried
+from ..mesh.lattice import MAX_LEVEL, volume_shares
+from ..nodal import padded
+
+if TYPE_CHECKING:
+    from .pools import DeviceForest
+
+
+class Carriage:
+    """State of nodes and material of tetrahedra, in arrays as large as the pools.
+
+    A new node is the midpoint of its deformed edge, so that children have their parent's deformation gradient. Mass is
+    lumped, a quarter of each leaf's at its nodes, and moves with its momentum; what a held node cannot take up of it is
+    counted in ``support_impulse``. A node between two held ones is held. A load stays where it is; that of a removed
+    node goes to both ends by halves.
+
+    Attributes:
+        arrays: ``kernels.remesh_state.Carried``; nodal arrays by the nodes' places in the pool, others by those of the
+            tetrahedra. ``u``, ``v``, ``load``, ``mass32`` and ``inverse_mass`` are what stepping reads and writes.
+        names: Names of the columns of ``arrays.values``.
+    """
+
+    def __init__(self, forest: DeviceForest, density: npt.ArrayLike, values: Mapping[str, npt.ArrayLike]):
+        self.device = forest.device
+        self._nodes = forest.node_capacity
+        self._first_nodes = len(forest.source.points)
+        source, elements = forest.source, forest.tree_capacity
+        leaves = source.tree.leaves
+        fill = 1.0 if source.fill is None else source.fill
+        given = {name: _of_leaves(name, value, len(leaves)) for name, value in values.items()}
+        if source.fill is not None:
+            given["fill"] = np.asarray(source.fill)
+        self.names = tuple(given)
+        per_leaf = _of_leaves("density", density, len(leaves)) * fill
+        arrays = Carried()
+        volume = volume_shares(np.arange(MAX_LEVEL + 1)) * source.cell_size**3
+        arrays.volume = wp.array(volume, dtype=wp.float64, device=self.device)
+        arrays.density = self._of_elements(leaves, per_leaf, elements, wp.float64)
+        labels = np.zeros(len(leaves)) if source.labels is None else source.labels
+        arrays.label = self._of_elements(leaves, labels, elements, wp.int32)
+        columns = np.zeros((elements, len(given)), np.float32)
+        for column, value in zip(columns.T, given.values(), strict=True):
+            column[leaves] = value
+        arrays.values = wp.array(columns, dtype=wp.float32, device=self.device, ndim=2)
+        masses = np.zeros(self._nodes)
+        np.add.at(masses, source.tets, (0.25 * per_leaf * volume[source.levels])[:, None])
+        arrays.mass = wp.array(masses, dtype=wp.float64, device=self.device)
+        arrays.mass32 = wp.array(masses, dtype=wp.float32, device=self.device)
+        arrays.inverse_mass = wp.zeros(self._nodes, dtype=wp.float32, device=self.device)
+        for name in ("u", "v", "load"):
+            setattr(arrays, name, wp.zeros(self._nodes, dtype=wp.vec4, device=self.device))
+        arrays.held = wp.zeros(self._nodes, dtype=wp.uint8, device=self.device)
+        arrays.gained_mass = wp.zeros(self._nodes, dtype=wp.float64, device=self.device)
+        arrays.gained_momentum = wp.zeros(self._nodes, dtype=wp.vec3d, device=self.device)
+        arrays.gain_count = wp.zeros(self._nodes, dtype=wp.int32, device=self.device)
+        arrays.gainers = wp.empty(self._nodes, dtype=wp.int32, device=self.device)
+        arrays.impulse = wp.zeros(1, dtype=wp.vec3d, device=self.device)
+        self.arrays = arrays
+        self._update_inverse_mass()
+
+    def set_nodes(
+        self,
+        *,
+        displacements: npt.ArrayLike | None = None,
+        velocities: npt.ArrayLike | None = None,
+        loads: npt.ArrayLike | None = None,
+        held: npt.ArrayLike | None = None,
+        nodes: npt.ArrayLike | None = None,
+    ) -> None:
+        """Set the state of nodes.
+
+        Args:
+            displacements, velocities, loads: [n, 3] [m], [m/s], [N].
+            held: Which are fixed or prescribed, bool [n].
+            nodes: Places in the pool [n]; None: those of the forest that this began as, before any pass.
+
+        Raises:
+            InputError: Wrong shapes.
+        """
+        places = np.arange(self._first_nodes) if nodes is None else np.asarray(nodes)
+        for name, given in (("u", displacements), ("v", velocities), ("load", loads)):
+            if given is not None:
+                found = np.asarray(given, dtype=np.float64)
+                if found.shape != (len(places), 3):
+                    raise InputError(f"the state has shape {found.shape}; it must be [{len(places)}, 3]")
+                array = getattr(self.arrays, name)
+                whole = array.numpy().copy()
+                whole[places] = padded(found)
+                array.assign(whole)
+        if held is not None:
+            mask = np.asarray(held)
+            if mask.shape != (len(places),):
+                raise InputError(f"held has shape {mask.shape}; it must be [{len(places)}]")
+            whole = self.arrays.held.numpy().copy()
+            whole[places] = mask
+            self.arrays.held.assign(whole)
+            self._update_inverse_mass()
+
+    def values(self, name: str) -> npt.NDArray[np.float32]:
+        """A quantity of all places for tetrahedra; those of leaves count."""
+        return self.arrays.values.numpy()[:, self.names.index(name)]
+
+    @property
+    def support_impulse(self) -> npt.NDArray[np.float64]:
+        """What supports have given in all passes, as mass came to and from held nodes [N s], float64 [3]."""
+        return self.arrays.impulse.numpy()[0]
+
+    def _update_inverse_mass(self) -> None:
+        masses, held = self.arrays.mass.numpy(), self.arrays.held.numpy() != 0
+        free = ~held & (masses > 0)
+        inverse = np.zeros(len(masses))
+        inverse[free] = 1.0 / masses[free]
+        self.arrays.inverse_mass.assign(inverse.astype(np.float32))
+
+    def _of_elements(self, leaves: np.ndarray, values: np.ndarray, count: int, dtype: Any) -> wp.array:
+        spread = np.zeros(count, wp.dtype_to_numpy(dtype))
+        spread[leaves] = values
+        return wp.array(spread, dtype=dtype, device=self.device)
+
+
+def _of_leaves(name: str, given: npt.ArrayLike, count: int) -> npt.NDArray[np.float64]:
+    values = np.asarray(given, dtype=np.float64)
+    if values.shape not in ((), (count,)):
+        raise InputError(
+            f"{name} has shape {values.shape}; it must be a number or have one entry for each of {count} leaves"
+        )
+    if not np.isfinite(values).all():
+        raise InputError(f"{name} must be finite")
+    return np.broadcast_to(values, count)
