@@ -12,6 +12,7 @@ import warp as wp
 
 from .anisotropic import INDEFINITE, OrthotropicMaterial, axes_of, element_forces, filled
 from .elements import GeneralElements, frame, gradient_of, rest_volume
+from .general_cpu import ADD_FORCES
 from .lanes import COMPILER_FLAGS, NEWTON, PRELUDE, on_cpu
 from .rotation import ITERATIONS, byers_xu
 
@@ -46,7 +47,7 @@ _FORCES = f"""{PRELUDE}{NEWTON}
         const triple axis = {{m[j], m[3 + j], m[6 + j]}};
         c[j] = plus(plus(axis, scaled(b[j], d1)), plus(scaled(b[3 + j], d2), scaled(b[6 + j], d3)));
     }}
-    masks8 sound = newton(c[0], c[1], c[2], spread(1.0f), r);
+    masks8 trusted = newton(c[0], c[1], c[2], spread(1.0f), r);
     for (int j = 0; j < 3; ++j) r[j] = scaled(spread({0.5**ITERATIONS!r}f), r[j]);
     const lanes8 e0 = dot(r[0], c[0]) - 1.0f, e1 = dot(r[1], c[1]) - 1.0f, e2 = dot(r[2], c[2]) - 1.0f;
     const lanes8 e01 = 0.5f * (dot(r[0], c[1]) + dot(r[1], c[0]));
@@ -63,7 +64,7 @@ _FORCES = f"""{PRELUDE}{NEWTON}
     const lanes8 det = h0 * a0 - e01 * a01 - e02 * a02;
     const lanes8 n2 = (e0 + 1.0f) * (e0 + 1.0f) + (e1 + 1.0f) * (e1 + 1.0f) + (e2 + 1.0f) * (e2 + 1.0f)
         + 2.0f * (e01 * e01 + e02 * e02 + e12 * e12);
-    sound = sound & (det > 0.0f) & (det * det >= {INDEFINITE**2!r}f * n2 * n2 * n2);
+    trusted = trusted & (det > 0.0f) & (det * det >= {INDEFINITE**2!r}f * n2 * n2 * n2);
     // Axial vector of e s - s e.
     const lanes8 w0 = e02 * s01 + e12 * s1 + e2 * s12 - (e01 * s02 + e1 * s12 + e12 * s2);
     const lanes8 w1 = e0 * s02 + e01 * s12 + e02 * s2 - (e02 * s0 + e12 * s01 + e2 * s02);
@@ -78,27 +79,7 @@ _FORCES = f"""{PRELUDE}{NEWTON}
     p[2] = plus(scaled(s02 + t1, r[0]), plus(scaled(s12 - t0, r[1]), scaled(s2, r[2])));
     p[0] = plus(p[0], scaled(active, c[0]));
     for (int j = 0; j < 3; ++j) p[j] = scaled(-volume, p[j]);
-    lanes8 g[12];
-    triple rest = triple{{spread(0.0f), spread(0.0f), spread(0.0f)}};
-    for (int n = 1; n < 4; ++n) {{
-        const lanes8* row = b + 3 * (n - 1);
-        const triple force = plus(scaled(row[0], p[0]), plus(scaled(row[1], p[1]), scaled(row[2], p[2])));
-        g[3 * n] = force.x; g[3 * n + 1] = force.y; g[3 * n + 2] = force.z;
-        rest = minus(rest, force);
-    }}
-    g[0] = rest.x; g[1] = rest.y; g[2] = rest.z;
-    const int end = wp::min(8, count - first_element);
-    for (int lane = 0; lane < end; ++lane) {{
-        const int t = first_element + lane;
-        flagged.data[t] = sound[lane] ? 0 : 1;
-        if (!sound[lane]) continue;
-        const wp::vec_t<4, wp::int32> node = elements.nodes.data[t];
-        for (int n = 0; n < 4; ++n) {{
-            wp::vec_t<4, wp::float32>& sum = f.data[node[n]];
-            for (int axis = 0; axis < 3; ++axis) sum[axis] += g[3 * n + axis][lane];
-        }}
-    }}
-"""
+{ADD_FORCES}"""
 
 
 @wp.func_native(on_cpu(_FORCES))

@@ -22,6 +22,30 @@ from .rotation import ITERATIONS, byers_xu
 
 wp.set_module_options({"enable_backward": False})
 
+#: Adds the forces of eight elements from their stresses p times -V, columns, and flags those that are not ``trusted``.
+ADD_FORCES = """
+    lanes8 g[12];
+    triple rest = triple{spread(0.0f), spread(0.0f), spread(0.0f)};
+    for (int n = 1; n < 4; ++n) {
+        const lanes8* row = b + 3 * (n - 1);
+        const triple force = plus(scaled(row[0], p[0]), plus(scaled(row[1], p[1]), scaled(row[2], p[2])));
+        g[3 * n] = force.x; g[3 * n + 1] = force.y; g[3 * n + 2] = force.z;
+        rest = minus(rest, force);
+    }
+    g[0] = rest.x; g[1] = rest.y; g[2] = rest.z;
+    const int end = wp::min(8, count - first_element);
+    for (int lane = 0; lane < end; ++lane) {
+        const int t = first_element + lane;
+        flagged.data[t] = trusted[lane] ? 0 : 1;
+        if (!trusted[lane]) continue;
+        const wp::vec_t<4, wp::int32> node = elements.nodes.data[t];
+        for (int n = 0; n < 4; ++n) {
+            wp::vec_t<4, wp::float32>& sum = f.data[node[n]];
+            for (int axis = 0; axis < 3; ++axis) sum[axis] += g[3 * n + axis][lane];
+        }
+    }
+"""
+
 _FORCES = f"""{PRELUDE}{NEWTON}
     lanes8 d[9], b[9], volume, m, k;
     const int first_element = 8 * block;
@@ -51,27 +75,7 @@ _FORCES = f"""{PRELUDE}{NEWTON}
     const lanes8 from_z = (k * (trace - 3.0f) - 2.0f * m) * (-{0.5**ITERATIONS!r}f * volume);
     triple p[3];
     for (int j = 0; j < 3; ++j) p[j] = plus(scaled(from_f, c[j]), scaled(from_z, z[j]));
-    lanes8 g[12];
-    triple rest = triple{{spread(0.0f), spread(0.0f), spread(0.0f)}};
-    for (int n = 1; n < 4; ++n) {{
-        const lanes8* row = b + 3 * (n - 1);
-        const triple force = plus(scaled(row[0], p[0]), plus(scaled(row[1], p[1]), scaled(row[2], p[2])));
-        g[3 * n] = force.x; g[3 * n + 1] = force.y; g[3 * n + 2] = force.z;
-        rest = minus(rest, force);
-    }}
-    g[0] = rest.x; g[1] = rest.y; g[2] = rest.z;
-    const int end = wp::min(8, count - first_element);
-    for (int lane = 0; lane < end; ++lane) {{
-        const int t = first_element + lane;
-        flagged.data[t] = trusted[lane] ? 0 : 1;
-        if (!trusted[lane]) continue;
-        const wp::vec_t<4, wp::int32> node = elements.nodes.data[t];
-        for (int n = 0; n < 4; ++n) {{
-            wp::vec_t<4, wp::float32>& sum = f.data[node[n]];
-            for (int axis = 0; axis < 3; ++axis) sum[axis] += g[3 * n + axis][lane];
-        }}
-    }}
-"""
+{ADD_FORCES}"""
 
 
 @wp.func_native(on_cpu(_FORCES))
