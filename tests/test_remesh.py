@@ -278,6 +278,31 @@ def test_refinement_stops_cleanly_where_there_is_no_room(short_of, device, rng):
     assert len(assert_sound(adaptive).tets) > fewer
 
 
+@pytest.mark.parametrize("passes", [40, pytest.param(1000, marks=pytest.mark.slow)])
+def test_random_passes_in_pools_that_are_often_full(passes, device, rng):
+    """Mass and the momentum that supports account for stay, and all else is sound; compacted now and then."""
+    forest = wc.TetForest.box((2, 1, 1), CUBE, 2)
+    held = rng.random(len(forest.points)) < 0.2
+    adaptive = moving(forest, device, rng, capacity=700, held=held)
+    remesh = RemeshPass(adaptive, max_level=15)
+    mass = adaptive.carriage.arrays.mass.numpy().sum()
+    full = 0
+    for n in range(passes):
+        before, size = momentum(adaptive)
+        impulse = adaptive.carriage.support_impulse.copy()
+        remesh.apply(random_marks(adaptive, rng, 0.3, 0.95 if n % 10 == 9 else 0.2))
+        mesh = assert_sound(adaptive)
+        given = adaptive.carriage.support_impulse - impulse
+        assert np.allclose(momentum(adaptive)[0] - before, given, atol=2e-6 * size)
+        full += adaptive.free_leaves < 12
+        if n % 13 == 12:
+            adaptive.compact()
+    assert adaptive.carriage.arrays.mass.numpy().sum() == pytest.approx(mass, rel=1e-12)
+    assert adaptive.is_full
+    assert full > passes / 8
+    assert mesh.levels.max() > 6
+
+
 # --- state ------------------------------------------------------------------------------------------------------------
 
 
