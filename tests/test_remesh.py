@@ -232,6 +232,20 @@ def test_compaction_changes_numbers_alone(device, rng):
         assert leaf_list(assert_sound(adaptive)) == leaf_list(twin.to_forest())
 
 
+@pytest.mark.parametrize("threads", [2, 7, 5000])
+def test_any_number_of_threads_comes_to_the_same_leaves(threads, device, rng):
+    forest = wc.TetForest.box((2, 1, 1), CUBE, 2)
+    found = [DeviceForest(forest, 20000, device=device) for _ in range(2)]
+    found[1].threads = threads
+    passes = [RemeshPass(adaptive) for adaptive in found]
+    for _ in range(10):
+        marks = random_marks(found[0], rng, 0.15, 0.4)
+        for remesh in passes:
+            remesh.apply(marks)
+        one, other = (leaf_list(assert_sound(adaptive)) for adaptive in found)
+        assert one == other
+
+
 def test_a_pass_can_be_recorded_within_other_launches(device, rng):
     forest = wc.TetForest.box((1, 1, 1), CUBE, 2)
     marks = rng.choice([-1, 0, 1], len(forest.tets))
