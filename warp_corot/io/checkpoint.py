@@ -26,8 +26,7 @@ from ..solvers import INTEGRATORS
 from .whole import written_whole
 
 FORMAT = "warp-corot checkpoint"
-#: 2: worlds, deterministic runs; 1 is read as one world. 3: anisotropic materials and activation; before, all were
-#: isotropic.
+#: 2: worlds, deterministic runs. 3: anisotropic materials, activation, forests made from domains. All are read.
 VERSION = 3
 
 MATERIALS = {kind.__name__: kind for kind in (Isotropic, TransverselyIsotropic, Orthotropic)}
@@ -122,23 +121,21 @@ def load_checkpoint(path: str | PathLike[str], device: str | wp.Device | None = 
     if newer:
         raise InputError(f"{source} is of version {header['version']}; this warp_corot reads up to version {VERSION}")
     try:
-        if header["version"] < 2:
+        if header["version"] < VERSION:
             _upgrade(header, arrays)
-        if header["version"] < 3:
-            for described in header["bodies"]:
-                described |= {"material": Isotropic.__name__, "activations": 0}
         return _rebuilt_simulation(header, arrays, device)
     except (LookupError, TypeError) as error:
         raise InputError(f"{what}: {error} is missing or wrong") from error
 
 
 def _upgrade(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
-    """Version 1 knew one world and one material only, and no domains."""
-    header |= {"worlds": 1, "deterministic": False}
-    for number in range(len(header["bodies"])):
-        arrays[f"body{number}.world_starts"] = np.zeros(1, np.int64)
+    """Add what an older version did not know, each in the only form that there was."""
+    if header["version"] < 2:
+        header |= {"worlds": 1, "deterministic": False}
+        for number in range(len(header["bodies"])):
+            arrays[f"body{number}.world_starts"] = np.zeros(1, np.int64)
     for described in header["bodies"]:
-        described.setdefault("material", "Isotropic")
+        described |= {"material": Isotropic.__name__, "activations": 0}
         described["mesh"] |= {"of_domain": [], "label_names": []}
 
 
