@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from .bisection import refinement_end
 from .growth import VOID
 
 
@@ -68,7 +69,7 @@ def descend(
     element = roots[i]
     w = weights[i]
     while first_child[element] >= 0:
-        k = 3 - level[element] % 3
+        k = refinement_end(level[element])
         child = first_child[element]
         lower = w[0]
         upper = w[k]

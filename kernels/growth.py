@@ -7,6 +7,7 @@ and must be bisected too. Midpoints that are not active are places at which the 
 
 import warp as wp
 
+from .bisection import first_half, halfway, refinement_end, second_half
 from .springs import FIRST_NODE, SECOND_NODE
 
 EMPTY = wp.constant(wp.int64(-1))
@@ -92,10 +93,7 @@ def insert_midpoints(
         node = wp.atomic_add(node_count, 0, 1)
         values[slot] = node
         ends[node] = wp.vec2i(wp.min(a, b), wp.max(a, b))
-        p = lattice[a]
-        q = lattice[b]
-        # Half the difference, as the sum of two numbers may not fit.
-        lattice[node] = wp.vec3i(p[0] + (q[0] - p[0]) / 2, p[1] + (q[1] - p[1]) / 2, p[2] + (q[2] - p[2]) / 2)
+        lattice[node] = halfway(lattice[a], lattice[b])
     slots[i] = slot
 
 
@@ -110,7 +108,7 @@ def refinement_edges(
 ):
     i = wp.tid()
     tet = tets[elements[i]]
-    pairs[i] = wp.vec2i(tet[0], tet[3 - level[elements[i]] % 3])
+    pairs[i] = wp.vec2i(tet[0], tet[refinement_end(level[elements[i]])])
 
 
 @wp.kernel(enable_backward=False)
@@ -159,23 +157,14 @@ def bisect(
     first_child: wp.array[wp.int32],
     bound: wp.array[wp.uint8],
 ):
-    """Maubach's rule; children stand behind one another from ``base`` on and are live or void as their parent was."""
+    """Children stand behind one another from ``base`` on and are live or void as their parent was."""
     i = wp.tid()
     element = elements[i]
-    x = tets[element]
+    tet = tets[element]
     z = values[slots[i]]
-    kind = level[element] % 3
-    one = wp.vec4i(x[0], x[1], x[2], z)
-    two = wp.vec4i(x[1], x[2], x[3], z)
-    if kind == 1:
-        one = wp.vec4i(x[0], x[1], z, x[3])
-        two = wp.vec4i(x[1], x[2], z, x[3])
-    elif kind == 2:
-        one = wp.vec4i(x[0], z, x[2], x[3])
-        two = wp.vec4i(x[1], z, x[2], x[3])
     child = base + 2 * i
-    tets[child] = one
-    tets[child + 1] = two
+    tets[child] = first_half(tet, z, level[element])
+    tets[child + 1] = second_half(tet, z, level[element])
     for n in range(2):
         level[child + n] = level[element] + 1
         parent[child + n] = element

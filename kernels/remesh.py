@@ -68,33 +68,6 @@ class Pools:
     marks: wp.array[wp.int8]
 
 
-@wp.func
-def refinement_end(level: int):
-    """k of the refinement edge x0-xk."""
-    return 3 - level % 3
-
-
-@wp.func
-def first_half(x: wp.vec4i, z: int, level: int):
-    """The first child of a tetrahedron that is bisected at z (Maubach 1995)."""
-    child = wp.vec4i(x[0], x[1], x[2], z)
-    if level % 3 == 1:
-        child = wp.vec4i(x[0], x[1], z, x[3])
-    elif level % 3 == 2:
-        child = wp.vec4i(x[0], z, x[2], x[3])
-    return child
-
-
-@wp.func
-def second_half(x: wp.vec4i, z: int, level: int):
-    child = wp.vec4i(x[1], x[2], x[3], z)
-    if level % 3 == 1:
-        child = wp.vec4i(x[1], x[2], z, x[3])
-    elif level % 3 == 2:
-        child = wp.vec4i(x[1], z, x[2], x[3])
-    return child
-
-
 @wp.kernel(enable_backward=False)
 def begin_pass(
     # In and out

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from .bisection import first_half, halfway, refinement_end, second_half
 from .growth import LIVE
 from .remesh import (
     ADDED,
@@ -17,9 +18,6 @@ from .remesh import (
     STAMP,
     WANTED,
     Pools,
-    first_half,
-    refinement_end,
-    second_half,
 )
 from .remesh_edges import LOW_HALF, WantedEdges, find_slot
 from .remesh_state import Carried, copy_to_children, make_node, quarter_mass
@@ -122,10 +120,7 @@ def bisect_edge(slot: int, pools: Pools, edges: WantedEdges, carried: Carried):
         pools.fresh[place + i] = child
         e = following
     pools.ends[z] = wp.vec2i(wp.min(a, b), wp.max(a, b))
-    p = pools.lattice[a]
-    q = pools.lattice[b]
-    # Half the difference, as the sum of two numbers may not fit.
-    pools.lattice[z] = wp.vec3i(p[0] + (q[0] - p[0]) / 2, p[1] + (q[1] - p[1]) / 2, p[2] + (q[2] - p[2]) / 2)
+    pools.lattice[z] = halfway(pools.lattice[a], pools.lattice[b])
     pools.valence[z] = 2 * ring
     make_node(z, a, b, loss_a, loss_b, carried)
     # Its ring is bisected: nobody counts at it any more.

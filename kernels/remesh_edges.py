@@ -7,6 +7,7 @@ inwards, and each single bisection leaves the mesh conforming: it may stop at an
 
 import warp as wp
 
+from .bisection import refinement_end
 from .growth import EMPTY, LIVE, claim_slot, edge_key, home_slot
 from .remesh import (
     BIRTHS,
@@ -23,7 +24,6 @@ from .remesh import (
     STAMP,
     WANTED,
     Pools,
-    refinement_end,
 )
 from .remesh_blocks import STRETCH, Blocks, heat_blocks, is_hot
 from .springs import FIRST_NODE, SECOND_NODE

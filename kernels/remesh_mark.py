@@ -5,8 +5,9 @@ from typing import Any
 
 import warp as wp
 
+from .bisection import refinement_end
 from .elements import load_node
-from .remesh import LEAVES, REFINE, SIMPLIFY, Pools, refinement_end
+from .remesh import LEAVES, REFINE, SIMPLIFY, Pools
 
 mat43 = wp.types.matrix(shape=(4, 3), dtype=wp.float32)
 

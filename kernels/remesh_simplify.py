@@ -6,6 +6,7 @@ simplified: then their parents become leaves. Two children of which only one is 
 
 import warp as wp
 
+from .bisection import refinement_end
 from .growth import LIVE
 from .remesh import (
     CANDIDATES,
@@ -17,7 +18,6 @@ from .remesh import (
     SIMPLIFY,
     UNUSED,
     Pools,
-    refinement_end,
 )
 from .remesh_state import Carried, average_children, quarter_mass, unmake_node
 
