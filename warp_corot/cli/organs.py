@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import InputError
-from ..io.assets import ASSETS
+from ..io.assets import find_asset
 from ..io.formats import USD_SUFFIXES
-from ..io.surfaces import SURFACE_ASSETS, UP_AXES, find_surface_asset
+from ..io.surfaces import UP_AXES
 from ..io.volumes import READERS
 from ..mesh import TetForest
 from .label_materials import numbers_by_name, parse_labels
@@ -66,13 +66,11 @@ def kind_of(name: str) -> str:
     """What INPUT is: "surface", "scan" or "tets".
 
     Raises:
-        InputError: A USD file that cannot be opened.
+        InputError: A USD file that cannot be opened, or no such asset.
     """
-    prefix, colon, rest = name.partition(":")
-    if prefix == "warp" and colon:
-        if rest not in ASSETS:
-            find_surface_asset(name)  # complains of one that is not there
-        return "surface" if rest in SURFACE_ASSETS else "tets"
+    asset = find_asset(name)
+    if asset:
+        return "surface" if asset.is_surface else "tets"
     path = Path(name)
     if any(path.name.lower().endswith(suffix) for suffix in READERS):
         return "scan"
@@ -125,7 +123,7 @@ def find_organ(args: argparse.Namespace, kind: str) -> Subject:
         mesh = _mesh(args, domain)
         surface = mesh.surface()
         done = time.perf_counter()
-    asset = find_surface_asset(args.input)
+    asset = find_asset(args.input)
     source = asset.path if asset else Path(args.input)
     subject = Subject(
         mesh,

@@ -23,6 +23,7 @@ class Asset:
         damping: Mass-proportional damping [1/s].
         duration: Simulated time [s] after which it is about at rest.
         note: Why these numbers.
+        is_surface: Whether it is a closed surface; tetrahedra otherwise.
     """
 
     name: str
@@ -35,6 +36,7 @@ class Asset:
     damping: float
     duration: float
     note: str
+    is_surface: bool = False
 
     @property
     def path(self) -> Path:
@@ -55,6 +57,19 @@ class Asset:
 ASSETS: dict[str, Asset] = {
     asset.name: asset
     for asset in [
+        Asset(
+            name="bunny",
+            file="examples/assets/bunny.usd",
+            scale=0.1,
+            young=3.0e4,
+            poisson=0.45,
+            density=1000.0,
+            fix="y < 0.01",
+            damping=2.0,
+            duration=4.0,
+            note="the Stanford bunny, 16 cm long, of silicone gel",
+            is_surface=True,
+        ),
         Asset(
             name="bear",
             file="examples/assets/bear.usd",

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .assets import find_asset
-from .usd_reader import read_usd_tets
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 
@@ -75,8 +74,12 @@ def load_tets(path: str | PathLike[str], scale: float = 1.0) -> LoadedMesh:
     except OSError as error:
         raise InputError(f"{source}: cannot be read ({error.strerror})") from None
 
-    reader = read_usd_tets if source.suffix.lower() in USD_SUFFIXES else _read_meshio
-    points, tets, up_axis, metres = reader(source)
+    if source.suffix.lower() in USD_SUFFIXES:
+        from .usd_reader import read_usd_tets
+
+        points, tets, up_axis, metres = read_usd_tets(source)
+    else:
+        points, tets, up_axis, metres = _read_meshio(source)
     if len(tets) == 0:
         raise InputError(f"{source}: has no tetrahedra")
     if tets.min() < 0 or tets.max() >= len(points):

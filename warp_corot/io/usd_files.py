@@ -1,11 +1,13 @@
 """Files as OpenUSD takes them: their names, whether one may be written, who is writing it, and what went wrong."""
 
+import math
 import os
 import re
 import tempfile
 from pathlib import Path
+from typing import Any
 
-from pxr import Tf
+from pxr import Tf, Usd, UsdGeom
 
 from ..errors import InputError
 
@@ -27,6 +29,30 @@ def usd_name(path: Path) -> str:
         return os.fsencode(path).decode("utf-8")
     except UnicodeDecodeError:
         raise InputError(f"{path}: its name is not UTF-8, which OpenUSD files must have") from None
+
+
+def open_stage(path: Path) -> Any:
+    """The stage of a file.
+
+    Raises:
+        InputError: Not one.
+    """
+    try:
+        return Usd.Stage.Open(usd_name(path))
+    except Tf.ErrorException:
+        raise InputError(f"{path}: is not a USD file that OpenUSD can open") from None
+
+
+def metres_per_unit(stage: Any, path: Path) -> float:
+    """Length of a stage's unit [m].
+
+    Raises:
+        InputError: Not a positive number.
+    """
+    metres = float(UsdGeom.GetStageMetersPerUnit(stage))
+    if not (math.isfinite(metres) and metres > 0.0):
+        raise InputError(f"{path}: metersPerUnit is {metres}, should be a positive number")
+    return metres
 
 
 def check_stage_path(path: Path) -> None:

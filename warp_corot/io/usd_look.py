@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Sdf, Tf, Usd, UsdGeom, UsdShade
+from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from ..errors import InputError
 from .formats import USD_SUFFIXES
-from .usd_files import usd_name
+from .usd_files import metres_per_unit, open_stage
+from .usd_surfaces import DrawnMesh, drawn_meshes
 
 #: What frames give anew, or what no longer holds of a prim once its points are in the world's coordinates.
 STALE = ("points", "extent", "normals", "velocities", "accelerations", "primvars:normals", "tetraIndices")
@@ -91,7 +92,7 @@ def has_mesh(path: Path) -> bool:
     Raises:
         InputError: Not a stage.
     """
-    stage, meshes = _opened(path), False
+    stage, meshes = open_stage(path), False
     for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
         if prim.IsA(UsdGeom.TetMesh) or prim.HasAttribute("tetraIndices"):
             return False
@@ -103,53 +104,35 @@ def read_looks(path: str | PathLike[str]) -> list[Look]:
     """All Mesh prims of a stage that are drawn, at its first time.
 
     Raises:
-        InputError: No such file, not a USD stage, or no Mesh prim with faces in it.
+        InputError: No such file, not a USD stage, one that is wrong, or no Mesh prim with faces in it.
     """
-    from .surfaces import mesh_triangles
-
     source = Path(path)
     if source.suffix.lower() not in USD_SUFFIXES:
         raise InputError(f"{source}: extension {source.suffix or '(none)'}, should be {', '.join(USD_SUFFIXES)}")
     if not source.is_file():
         raise InputError(f"{source}: no such file")
-    stage = _flattened(_opened(source))
-    metres = float(UsdGeom.GetStageMetersPerUnit(stage))
-    time = Usd.TimeCode.EarliestTime()
-    cache = UsdGeom.XformCache(time)
-    looks = []
-    for prim in stage.Traverse():
-        mesh = UsdGeom.Mesh(prim)
-        if not mesh or mesh.ComputePurpose() in ("guide", "proxy"):
-            continue
-        points, triangles = mesh_triangles(mesh, source, time)
-        if not len(triangles):
-            continue
-        world = np.array(cache.GetLocalToWorldTransform(prim), dtype=np.float64)
-        left_handed = mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
-        left_handed ^= bool(np.linalg.det(world[:3, :3]) < 0.0)
-        looks.append(
-            Look(
-                prim.GetName(),
-                str(prim.GetPath()),
-                source,
-                metres * (points @ world[:3, :3] + world[3, :3]),
-                (triangles[:, ::-1] if left_handed else triangles).astype(np.int32),
-                left_handed,
-                bool(mesh.GetNormalsAttr().HasAuthoredValue() or prim.GetAttribute("primvars:normals").HasValue()),
-                mesh.GetSubdivisionSchemeAttr().Get() != UsdGeom.Tokens.none,
-                stage,
-            )
-        )
+    stage = _flattened(open_stage(source))
+    metres = metres_per_unit(stage, source)
+    looks = [_look(drawn, stage, source, metres) for drawn in drawn_meshes(stage, source)]
     if not looks:
         raise InputError(f"{source}: has no Mesh prim with faces")
     return looks
 
 
-def _opened(path: Path) -> Any:
-    try:
-        return Usd.Stage.Open(usd_name(path))
-    except Tf.ErrorException:
-        raise InputError(f"{path}: is not a USD file that OpenUSD can open") from None
+def _look(drawn: DrawnMesh, stage: Any, source: Path, metres: float) -> Look:
+    prim = drawn.mesh.GetPrim()
+    normals = drawn.mesh.GetNormalsAttr().HasAuthoredValue() or prim.GetAttribute("primvars:normals").HasValue()
+    return Look(
+        prim.GetName(),
+        str(prim.GetPath()),
+        source,
+        metres * drawn.points,
+        drawn.triangles.astype(np.int32),
+        drawn.left_handed,
+        bool(normals),
+        drawn.smooth,
+        stage,
+    )
 
 
 def _flattened(stage: Any) -> Any:

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Tf, Usd, UsdGeom
+from pxr import Usd, UsdGeom
 
 from ..errors import InputError
-from .usd_files import usd_name
+from .usd_files import metres_per_unit, open_stage
 
 
 def read_usd_tets(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], str, float]:
@@ -25,14 +25,8 @@ def read_usd_tets(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], s
     Raises:
         InputError: The file is no USD stage, or has no tetrahedra, or their indices are not four to a tetrahedron.
     """
-    try:
-        stage = Usd.Stage.Open(usd_name(path))
-    except Tf.ErrorException:
-        raise InputError(f"{path}: is not a USD file that OpenUSD can open") from None
-
-    metres = float(UsdGeom.GetStageMetersPerUnit(stage))
-    if not (np.isfinite(metres) and metres > 0.0):
-        raise InputError(f"{path}: metersPerUnit is {metres}, should be a positive number")
+    stage = open_stage(path)
+    metres = metres_per_unit(stage, path)
     up_axis = str(UsdGeom.GetStageUpAxis(stage))
     cache = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
 
