@@ -371,7 +371,7 @@ def test_failed_write_is_one_line(folder, capsys, monkeypatch):
     def fail(*_, **__):
         raise OSError("a.usd: cannot be written: No space left on device")
 
-    monkeypatch.setattr("warp_corot.io.animate.UsdWriter.write", fail)
+    monkeypatch.setattr("warp_corot.io.usd_writer.UsdWriter.write", fail)
     assert simulate("box", "-o", "a.usd", *SHORT) == 1
     assert capsys.readouterr().err == "warp-corot: error: a.usd: cannot be written: No space left on device\n"
 

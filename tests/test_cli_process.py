@@ -53,6 +53,30 @@ def test_signals_keep_frames(tmp_path, number, status):
     assert [file.name for file in tmp_path.iterdir()] == ["a.usd"]
 
 
+@pytest.mark.parametrize("module", ["warp", "warp_corot.body", "pxr"])
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_while_modules_are_imported_is_one_line(tmp_path, module, number, status):
+    """Python tells of each module that it begins to import; the signal comes at the first import of this one."""
+    (tmp_path / "interrupted.py").write_text(f"""
+import runpy, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+came = []
+def heard(event, args):
+    if event == "import" and args[0] == {module!r} and not came:
+        came.append(event)
+        signal.raise_signal({int(number)})
+sys.addaudithook(heard)
+sys.argv = ["warp-corot", *{BOX!r}]
+runpy.run_module("warp_corot", run_name="__main__")
+""")
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    command = [sys.executable, str(tmp_path / "interrupted.py")]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout, done.stderr) == (status, "", "warp-corot: interrupted\n")
+    assert list(folder.iterdir()) == []
+
+
 def test_reader_that_leaves_is_no_error(tmp_path):
     read, write = os.pipe()
     os.close(read)

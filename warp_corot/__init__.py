@@ -4,43 +4,26 @@ After Tagawa, Yamada and Tanaka, *A Rectangular Tetrahedral Adaptive Mesh Based 
 Interactive Soft Tissue Simulation* (IEEE EMBC 2013).
 """
 
-from .activation import Activation
-from .anisotropy import Orthotropic, TransverselyIsotropic
-from .body import SoftBody
-from .domain import Domain
-from .elasticity import Corotated, EdgeStVK, Linear, MassSpring, NeoHookean, StVenantKirchhoff
-from .errors import InputError, StabilityWarning, UnstableError
-from .io.animate import record
-from .materials import Isotropic
-from .mesh import SurfaceMesh, TetForest, TetMesh
-from .rotations import polar_rotation
-from .simulation import Energy, Simulation
-from .solvers import SymplecticEuler
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .api import *  # noqa: F403
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "Activation",
-    "Corotated",
-    "Domain",
-    "EdgeStVK",
-    "Energy",
-    "InputError",
-    "Isotropic",
-    "Linear",
-    "MassSpring",
-    "NeoHookean",
-    "Orthotropic",
-    "Simulation",
-    "SoftBody",
-    "StVenantKirchhoff",
-    "StabilityWarning",
-    "SurfaceMesh",
-    "SymplecticEuler",
-    "TetForest",
-    "TetMesh",
-    "TransverselyIsotropic",
-    "UnstableError",
-    "polar_rotation",
-    "record",
-]
+
+def __getattr__(name: str) -> Any:
+    """The first name asked for imports all: so that the command line is ready for Ctrl-C before that."""
+    if name.startswith("__") and name != "__all__":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    api = import_module(".api", __name__)
+    globals().update({"__all__": api.__all__} | {each: getattr(api, each) for each in api.__all__})
+    if name not in globals():
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return globals()[name]
+
+
+def __dir__() -> list[str]:
+    __getattr__("__all__")
+    return sorted(globals())

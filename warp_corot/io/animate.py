@@ -19,10 +19,10 @@ import numpy.typing as npt
 from ..errors import InputError
 from ..simulation import Simulation
 from .skins import Skin, has_domain, skins_of
-from .usd_writer import UsdWriter
 
 if TYPE_CHECKING:
     from .skins import Surface
+    from .usd_writer import UsdWriter
 
 Progress = Callable[[int, int], None]
 
@@ -156,6 +156,8 @@ def record(
         UnstableError: The state is not finite any more; the frames before are kept.
         OSError: The file cannot be written, as when the disk is full; the frames up to seconds before are kept.
     """
+    from .usd_writer import UsdWriter
+
     count = frame_count(duration, fps)
     if world is None and sim.worlds > 1:
         raise InputError(f"the simulation has {sim.worlds} worlds; say which one to draw, as in world=0")

@@ -1,0 +1,40 @@
+"""The names that ``import warp_corot`` gives."""
+
+from .activation import Activation
+from .anisotropy import Orthotropic, TransverselyIsotropic
+from .body import SoftBody
+from .domain import Domain
+from .elasticity import Corotated, EdgeStVK, Linear, MassSpring, NeoHookean, StVenantKirchhoff
+from .errors import InputError, StabilityWarning, UnstableError
+from .io.animate import record
+from .materials import Isotropic
+from .mesh import SurfaceMesh, TetForest, TetMesh
+from .rotations import polar_rotation
+from .simulation import Energy, Simulation
+from .solvers import SymplecticEuler
+
+__all__ = [
+    "Activation",
+    "Corotated",
+    "Domain",
+    "EdgeStVK",
+    "Energy",
+    "InputError",
+    "Isotropic",
+    "Linear",
+    "MassSpring",
+    "NeoHookean",
+    "Orthotropic",
+    "Simulation",
+    "SoftBody",
+    "StVenantKirchhoff",
+    "StabilityWarning",
+    "SurfaceMesh",
+    "SymplecticEuler",
+    "TetForest",
+    "TetMesh",
+    "TransverselyIsotropic",
+    "UnstableError",
+    "polar_rotation",
+    "record",
+]
