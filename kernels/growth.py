@@ -14,6 +14,10 @@ EMPTY = wp.constant(wp.int64(-1))
 LIVE = wp.constant(-1)
 VOID = wp.constant(-2)
 
+# Places in ``counts``.
+NODES = wp.constant(0)
+DEEPEST = wp.constant(1)  # the deepest level that was to be bisected
+
 
 @wp.func
 def edge_key(a: int, b: int):
@@ -79,7 +83,7 @@ def insert_midpoints(
     ends: wp.array[wp.vec2i],
     keys: wp.array[wp.int64],
     values: wp.array[wp.int32],
-    node_count: wp.array[wp.int32],
+    counts: wp.array[wp.int32],
     # Out
     slots: wp.array[wp.int32],
 ):
@@ -90,7 +94,7 @@ def insert_midpoints(
     slot = claim_slot(edge_key(a, b), keys)
     if slot < 0:
         slot = -slot - 1
-        node = wp.atomic_add(node_count, 0, 1)
+        node = wp.atomic_add(counts, NODES, 1)
         values[slot] = node
         ends[node] = wp.vec2i(wp.min(a, b), wp.max(a, b))
         lattice[node] = halfway(lattice[a], lattice[b])
@@ -103,12 +107,16 @@ def refinement_edges(
     elements: wp.array[wp.int32],
     tets: wp.array[wp.vec4i],
     level: wp.array[wp.int32],
+    # In and out
+    counts: wp.array[wp.int32],
     # Out
     pairs: wp.array[wp.vec2i],
 ):
     i = wp.tid()
     tet = tets[elements[i]]
-    pairs[i] = wp.vec2i(tet[0], tet[refinement_end(level[elements[i]])])
+    depth = level[elements[i]]
+    wp.atomic_max(counts, DEEPEST, depth)
+    pairs[i] = wp.vec2i(tet[0], tet[refinement_end(depth)])
 
 
 @wp.kernel(enable_backward=False)
@@ -174,17 +182,6 @@ def bisect(
 
 
 @wp.kernel(enable_backward=False)
-def deepest_level(
-    # In
-    elements: wp.array[wp.int32],
-    level: wp.array[wp.int32],
-    # Out
-    deepest: wp.array[wp.int32],
-):
-    wp.atomic_max(deepest, 0, level[elements[wp.tid()]])
-
-
-@wp.kernel(enable_backward=False)
 def flag_hanging(
     # In
     tets: wp.array[wp.vec4i],
@@ -230,19 +227,7 @@ def gather_flagged(
     # Out
     chosen: wp.array[wp.int32],
 ):
-    """Numbers, from ``first`` on, of what is flagged, in order."""
+    """Numbers, from ``first`` on, of what is flagged, in order; ``places`` is the inclusive sum of the flags."""
     i = wp.tid()
     if flags[i] != 0:
-        chosen[places[i]] = first + i
-
-
-@wp.kernel(enable_backward=False)
-def flag_wished(
-    # In
-    wished: wp.array[wp.uint8],
-    first: int,
-    # Out
-    flags: wp.array[wp.int32],
-):
-    i = wp.tid()
-    flags[i] = int(wished[first + i])
+        chosen[places[i] - 1] = first + i

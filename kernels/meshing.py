@@ -16,6 +16,8 @@ OPEN = wp.constant(2)
 #: A gradient below this share of the steepest possible is taken for that much.
 FLATTEST = wp.constant(0.1)
 
+vec6 = wp.types.vector(length=6, dtype=wp.float32)
+
 
 @wp.kernel(enable_backward=False)
 def flag_equal(
@@ -140,6 +142,43 @@ def gradient_size(
     return wp.max(wp.length(gradient), FLATTEST * lipschitz)
 
 
+@wp.func
+def worst_deviation(deviation: vec6):
+    """The largest deviation of a quadratic function from the linear interpolant, from those at the midpoints.
+
+    At barycentric coordinates l it is the sum of 4 l_i l_j e_ij: the mean of the e times 4/3 at a face's centre, times
+    3/2 at the centroid.
+    """
+    faces = wp.static(4.0 / 9.0) * wp.vec4(
+        deviation[0] + deviation[1] + deviation[3],
+        deviation[0] + deviation[2] + deviation[4],
+        deviation[1] + deviation[2] + deviation[5],
+        deviation[3] + deviation[4] + deviation[5],
+    )
+    worst = wp.max(wp.max(faces), -wp.min(faces))
+    total = float(0.0)
+    for e in range(6):
+        total += deviation[e]
+        worst = wp.max(worst, wp.abs(deviation[e]))
+    return wp.max(worst, 0.25 * wp.abs(total))
+
+
+@wp.func
+def middle_of_piece(tet: wp.vec4i, phi: wp.array[wp.float32]):
+    """Barycentric coordinates of the mean of the points at which the surface cuts a crossed element's edges."""
+    place = wp.vec4(0.0)
+    count = float(0.0)
+    for e in range(6):
+        a = FIRST_NODE[e]
+        b = SECOND_NODE[e]
+        if (phi[tet[a]] < 0.0) != (phi[tet[b]] < 0.0):
+            t = phi[tet[a]] / (phi[tet[a]] - phi[tet[b]])
+            place[a] = place[a] + 1.0 - t
+            place[b] = place[b] + t
+            count += 1.0
+    return place / count
+
+
 @wp.kernel(enable_backward=False)
 def judge_by_edges(
     # In
@@ -160,44 +199,32 @@ def judge_by_edges(
     first_child: wp.array[wp.int32],
     states: wp.array[wp.int32],
     # Out
+    unsure: wp.array[wp.int32],
     probes: wp.array[wp.vec3],
     expected: wp.array[wp.float32],
     deviations: wp.array[wp.float32],
 ):
-    """Compare the midpoints of the six edges with the linear interpolant.
+    """Compare the midpoints of the six edges with the linear interpolant: of a quadratic function they tell all.
 
-    Of a quadratic function the six deviations e tell all: it deviates by sum 4 l_i l_j e_ij at barycentric coordinates
-    l, so by their mean times 4/3 at a face's centre and 3/2 at the centroid. What barely passes is looked at once more,
-    in the middle of its piece of the surface or at its centroid: what the quadratic function has there is ``expected``.
+    What barely passes is unsure, and looked at once more, in the middle of its piece of the surface or at its centroid:
+    what the quadratic function has there is ``expected``.
     """
     i = wp.tid()
     element = elements[i]
     tet = tets[element]
-    deviation = wp.vector(dtype=wp.float32, length=6)
+    deviation = vec6()
     lowest = phi[tet[0]]
     highest = phi[tet[0]]
     for n in range(1, 4):
         lowest = wp.min(lowest, phi[tet[n]])
         highest = wp.max(highest, phi[tet[n]])
     crossed = lowest < 0.0 and highest >= 0.0
-    total = float(0.0)
-    worst = float(0.0)
     for e in range(6):
         middle = phi[values[slots[6 * i + e]]]
         lowest = wp.min(lowest, middle)
         highest = wp.max(highest, middle)
-        ends = 0.5 * (phi[tet[FIRST_NODE[e]]] + phi[tet[SECOND_NODE[e]]])
-        deviation[e] = middle - ends
-        total += deviation[e]
-        worst = wp.max(worst, wp.abs(deviation[e]))
-    faces = wp.static(4.0 / 9.0) * wp.vec4(
-        deviation[0] + deviation[1] + deviation[3],
-        deviation[0] + deviation[2] + deviation[4],
-        deviation[1] + deviation[2] + deviation[5],
-        deviation[3] + deviation[4] + deviation[5],
-    )
-    worst = wp.max(worst, wp.max(wp.max(faces), -wp.min(faces)))
-    worst = wp.max(worst, 0.25 * wp.abs(total))
+        deviation[e] = middle - 0.5 * (phi[tet[FIRST_NODE[e]]] + phi[tet[SECOND_NODE[e]]])
+    worst = worst_deviation(deviation)
 
     state = OPEN
     near = 0.5 * lipschitz * circumradius[level[element]]
@@ -215,20 +242,11 @@ def judge_by_edges(
     if state == OPEN and (worst < 0.25 * tolerance or wp.max(lowest, -highest) > 4.0 * worst):
         state = DONE
     states[element - first] = state
+    unsure[i] = wp.where(state == OPEN, 1, 0)
 
     place = wp.vec4(0.25)
     if crossed:
-        place = wp.vec4(0.0)
-        count = float(0.0)
-        for e in range(6):
-            a = FIRST_NODE[e]
-            b = SECOND_NODE[e]
-            if (phi[tet[a]] < 0.0) != (phi[tet[b]] < 0.0):
-                t = phi[tet[a]] / (phi[tet[a]] - phi[tet[b]])
-                place[a] = place[a] + 1.0 - t
-                place[b] = place[b] + t
-                count += 1.0
-        place = place / count
+        place = middle_of_piece(tet, phi)
     value = float(0.0)
     for e in range(6):
         value += 4.0 * place[FIRST_NODE[e]] * place[SECOND_NODE[e]] * deviation[e]
@@ -284,31 +302,6 @@ def judge_by_probes(
     elif deviation > tolerance and wp.abs(found[i]) <= 2.0 * deviation:
         state = SPLIT
     states[element - first] = state
-
-
-@wp.kernel(enable_backward=False)
-def gather_points(
-    # In
-    chosen: wp.array[wp.int32],
-    points: wp.array[wp.vec3],
-    # Out
-    gathered: wp.array[wp.vec3],
-):
-    i = wp.tid()
-    gathered[i] = points[chosen[i]]
-
-
-@wp.kernel(enable_backward=False)
-def flag_open(
-    # In
-    elements: wp.array[wp.int32],
-    states: wp.array[wp.int32],
-    first: int,
-    # Out
-    flags: wp.array[wp.int32],
-):
-    i = wp.tid()
-    flags[i] = wp.where(states[elements[i] - first] == OPEN, 1, 0)
 
 
 @wp.kernel(enable_backward=False)

@@ -11,11 +11,10 @@ import numpy as np
 import warp as wp
 
 from ..errors import InputError
-from ..kernels import growth as growing
 from ..kernels import meshing as kernels
 from ..kernels.shapes import EDGES, REST
 from .bisection import path_tetrahedra
-from .growth import Growth, lattice_spacing
+from .growth import Growth, lattice_spacing, with_room
 from .lattice import LATTICE_BITS, MAX_LEVEL
 from .tree import LIVE, Tree
 
@@ -113,21 +112,13 @@ class _Adaptation:
         self.evaluated = 0
 
     def run(self) -> None:
-        self.judge(0)
         # First from the top down, each level from the one above alone, then what conformity asks for.
-        first = 0
-        growth = self.growth
-        while len(wished := self.wished_from(first)):
+        growth, first = self.growth, 0
+        while len(wished := self.of_state(self.judge(first), kernels.SPLIT, first)):
             first = growth.element_count
             growth.bisect(wished)
-            self.judge(first)
         growth.close(self.judge)
         self.evaluate()
-
-    def wished_from(self, first: int) -> wp.array:
-        flags = wp.empty(self.growth.element_count - first, dtype=wp.int32, device=self.device)
-        self.launch(growing.flag_wished, len(flags), [self.growth.wished, first], [flags])
-        return self.growth.flagged(flags, first)
 
     def evaluate(self) -> None:
         """Values at the nodes that are new."""
@@ -135,67 +126,53 @@ class _Adaptation:
         count = growth.node_count - first
         if not count:
             return
-        if growth.node_count > len(self.phi):
-            old = self.phi
-            self.phi = wp.empty(max(growth.node_count, 2 * len(old)), dtype=wp.float32, device=self.device)
-            wp.copy(self.phi, old, count=len(old))
+        self.phi = with_room(self.phi, growth.node_count)
         points = wp.empty(count, dtype=wp.vec3, device=self.device)
-        self.launch(kernels.node_points, count, [growth.lattice, first, self.origin, self.spacing], [points])
-        found = self.values(points)
-        self.launch(kernels.take_values, count, [found, growth.lattice, first, self.top, self.noise], [self.phi])
+        self.growth.launch(kernels.node_points, count, [growth.lattice, first, self.origin, self.spacing], [points])
+        found = self.domain.phi(points)
+        self.growth.launch(kernels.take_values, count, [found, growth.lattice, first, self.top, self.noise], [self.phi])
         self.evaluated = growth.node_count
 
-    def values(self, points: wp.array) -> wp.array:
-        """phi at points."""
-        return self.domain.phi(points) if len(points) else wp.empty(0, dtype=wp.float32, device=self.device)
+    def judge(self, first: int) -> wp.array:
+        """Find out of all elements from ``first`` on whether they are outside, and which are to be bisected.
 
-    def judge(self, first: int) -> None:
-        """Find out of all elements from ``first`` on whether they are outside, and which are to be bisected."""
+        Returns:
+            Their states, int32, SPLIT where they are.
+        """
         growth, wishes, lipschitz = self.growth, self.wishes, float(self.domain.lipschitz)
         self.evaluate()
         count = growth.element_count - first
         states = wp.empty(count, dtype=wp.int32, device=self.device)
         inputs = [first, growth.tets, growth.level, self.phi, self.circumradius, self.edges]
         inputs += [lipschitz, wishes.min_level, wishes.max_level]
-        self.launch(kernels.judge_by_corners, count, inputs, [growth.first_child, states])
+        growth.launch(kernels.judge_by_corners, count, inputs, [growth.first_child, states])
         self.judge_surface(first, states)
         self.judge_fields(first, states)
-        self.launch(kernels.take_wishes, count, [states, first], [growth.wished])
+        growth.launch(kernels.take_wishes, count, [states, first], [growth.wished])
+        return states
 
     def judge_surface(self, first: int, states: wp.array) -> None:
         """Where corners leave it open: compare with the linear interpolant at midpoints, then at one point more."""
         growth, lipschitz, tolerance = self.growth, float(self.domain.lipschitz), self.wishes.surface_error
-        unsure = self.of_state(states, kernels.OPEN, first)
-        if not len(unsure):
+        elements = self.of_state(states, kernels.OPEN, first)
+        count = len(elements)
+        if not count:
             return
-        slots = growth.insert_edges(unsure, of_refinement=False)
+        slots = growth.insert_edges(elements, of_refinement=False)
         self.evaluate()
-        probes = wp.empty(len(unsure), dtype=wp.vec3, device=self.device)
-        expected = wp.empty(len(unsure), dtype=wp.float32, device=self.device)
-        deviations = wp.empty(len(unsure), dtype=wp.float32, device=self.device)
-        inputs = [unsure, first, *growth.midpoints(slots), growth.tets, growth.level, self.phi, growth.lattice]
+        unsure = wp.empty(count, dtype=wp.int32, device=self.device)
+        probes = wp.empty(count, dtype=wp.vec3, device=self.device)
+        expected, deviations = (wp.empty(count, dtype=wp.float32, device=self.device) for _ in range(2))
+        inputs = [elements, first, *growth.midpoints(slots), growth.tets, growth.level, self.phi, growth.lattice]
         inputs += [self.origin, self.spacing, self.circumradius, lipschitz, tolerance]
-        self.launch(
-            kernels.judge_by_edges, len(unsure), inputs, [growth.first_child, states, probes, expected, deviations]
-        )
-        flags = wp.empty(len(unsure), dtype=wp.int32, device=self.device)
-        self.launch(kernels.flag_open, len(unsure), [unsure, states, first], [flags])
-        chosen = growth.flagged(flags)
-        points = wp.empty(len(chosen), dtype=wp.vec3, device=self.device)
-        self.launch(kernels.gather_points, len(chosen), [chosen, probes], [points])
-        inputs = [
-            chosen,
-            unsure,
-            first,
-            self.values(points),
-            expected,
-            deviations,
-            growth.tets,
-            self.phi,
-            growth.lattice,
-        ]
-        inputs += [self.spacing, lipschitz, tolerance]
-        self.launch(kernels.judge_by_probes, len(chosen), inputs, [states])
+        outputs = [growth.first_child, states, unsure, probes, expected, deviations]
+        growth.launch(kernels.judge_by_edges, count, inputs, outputs)
+        chosen = growth.flagged(unsure)
+        if len(chosen):
+            found = self.domain.phi(probes[chosen].contiguous())
+            inputs = [chosen, elements, first, found, expected, deviations, growth.tets, self.phi, growth.lattice]
+            inputs += [self.spacing, lipschitz, tolerance]
+            growth.launch(kernels.judge_by_probes, len(chosen), inputs, [states])
 
     def judge_fields(self, first: int, states: wp.array) -> None:
         """Bisect where labels or the user's fields ask for it, seen at corners and centroids."""
@@ -209,10 +186,10 @@ class _Adaptation:
         chosen = np.flatnonzero((state == kernels.DONE) & (leaf == LIVE) & (level < wishes.max_level))
         if not len(chosen):
             return
-        tets = growth.tets.numpy()[first + chosen]
+        tets = growth.tets[first : growth.element_count].numpy()[chosen]
         nodes, corners = np.unique(tets, return_inverse=True)
         corners = corners.reshape(-1, 4)
-        at_nodes = np.asarray(self.origin) + growth.lattice.numpy()[nodes] * self.spacing
+        at_nodes = np.asarray(self.origin) + growth.lattice[: growth.node_count].numpy()[nodes] * self.spacing
         at_middle = at_nodes[corners].mean(axis=1)
 
         def sampled(function: Callable[[np.ndarray], Any]) -> np.ndarray:
@@ -230,12 +207,8 @@ class _Adaptation:
 
     def of_state(self, states: wp.array, state: int, first: int) -> wp.array:
         flags = wp.empty(len(states), dtype=wp.int32, device=self.device)
-        self.launch(kernels.flag_equal, len(states), [states, state], [flags])
+        self.growth.launch(kernels.flag_equal, len(states), [states, state], [flags])
         return self.growth.flagged(flags, first)
-
-    def launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
-        if count:
-            wp.launch(kernel, dim=count, inputs=inputs, outputs=outputs, device=self.device)
 
 
 def _checked(function: Callable[[np.ndarray], Any], points: np.ndarray) -> np.ndarray:

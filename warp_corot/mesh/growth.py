@@ -43,7 +43,7 @@ class Growth:
         self.ends = self._on_device(ends, wp.vec2i)
         self.active = self._on_device(ends[:, 0] >= 0, wp.uint8)
         self.touched = wp.zeros(self.node_count, dtype=wp.uint8, device=device)
-        self._counter = self._on_device([self.node_count], wp.int32)
+        self._counts = self._on_device([self.node_count, 0], wp.int32)
         self._make_table()
 
     # --- rounds ------------------------------------------------------------------------------------------------------
@@ -52,18 +52,16 @@ class Growth:
         """Bisect elements [n]: their children are the last 2n elements, in the same order.
 
         Raises:
-            InputError: One of them is at the deepest level.
+            InputError: One of them is at the deepest level; what was grown is of no use then.
         """
         if not len(elements):
             return
-        self._check_levels(elements)
         slots = self.insert_edges(elements, of_refinement=True)
-        self._launch(kernels.activate, len(slots), [slots, self._values, self.ends], [self.active, self.touched])
+        self.launch(kernels.activate, len(slots), [slots, self._values, self.ends], [self.active, self.touched])
         base, count = self.element_count, self.element_count + 2 * len(elements)
-        for name in ("tets", "level", "parent", "first_child", "wished", "bound"):
-            self._make_room(name, count)
+        self._make_room(count, "tets", "level", "parent", "first_child", "wished", "bound")
         outputs = [self.tets, self.level, self.parent, self.first_child, self.bound]
-        self._launch(kernels.bisect, len(elements), [elements, slots, self._values, base], outputs)
+        self.launch(kernels.bisect, len(elements), [elements, slots, self._values, base], outputs)
         self.element_count = count
 
     def insert_edges(self, elements: wp.array, *, of_refinement: bool) -> wp.array:
@@ -71,9 +69,11 @@ class Growth:
         count = len(elements) * (1 if of_refinement else 6)
         pairs = wp.empty(count, dtype=wp.vec2i, device=self.device)
         if of_refinement:
-            self._launch(kernels.refinement_edges, len(elements), [elements, self.tets, self.level], [pairs])
+            self.launch(
+                kernels.refinement_edges, len(elements), [elements, self.tets, self.level], [self._counts, pairs]
+            )
         else:
-            self._launch(kernels.all_edges, len(elements), [elements, self.tets], [pairs])
+            self.launch(kernels.all_edges, len(elements), [elements, self.tets], [pairs])
         slots = wp.empty(count, dtype=wp.int32, device=self.device)
         # An edge is shared by five elements or so: a part at a time needs less room than the worst case of all at once.
         part = max(self.node_count, 1 << 16)
@@ -82,9 +82,9 @@ class Growth:
             moved = self._reserve_nodes(stop - start)
             if moved and start:
                 return self.insert_edges(elements, of_refinement=of_refinement)
-            table = [self.lattice, self.ends, self._keys, self._values, self._counter]
-            self._launch(kernels.insert_midpoints, stop - start, [pairs[start:stop], *table], [slots[start:stop]])
-            self.node_count = int(self._counter.numpy()[0])
+            table = [self.lattice, self.ends, self._keys, self._values, self._counts]
+            self.launch(kernels.insert_midpoints, stop - start, [pairs[start:stop], *table], [slots[start:stop]])
+            self._read_counts()
         return slots
 
     def midpoints(self, slots: wp.array) -> list[wp.array]:
@@ -98,7 +98,7 @@ class Growth:
         """
         flags = wp.empty(self.element_count, dtype=wp.int32, device=self.device)
         inputs = [self.tets, self.first_child, self.wished, self.bound, self._keys, self._values, self.active]
-        self._launch(kernels.flag_hanging, self.element_count, [*inputs, self.touched, first_new], [flags])
+        self.launch(kernels.flag_hanging, self.element_count, [*inputs, self.touched, first_new], [flags])
         self.touched.zero_()
         return self.flagged(flags)
 
@@ -107,9 +107,8 @@ class Growth:
         places = wp.empty(len(flags), dtype=wp.int32, device=self.device)
         wp.utils.array_scan(flags, places, inclusive=True)
         count = int(places[-1:].numpy()[0]) if len(flags) else 0
-        wp.utils.array_scan(flags, places, inclusive=False)
         chosen = wp.empty(count, dtype=wp.int32, device=self.device)
-        self._launch(kernels.gather_flagged, len(flags), [flags, places, first], [chosen])
+        self.launch(kernels.gather_flagged, len(flags), [flags, places, first], [chosen])
         return chosen
 
     def close(self, judge: Any = None) -> None:
@@ -135,13 +134,15 @@ class Growth:
         count = self.element_count
         return Tree(*(a[:count].numpy() for a in (self.tets, self.level, self.parent, self.first_child)))
 
+    def launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, dim=count, inputs=inputs, outputs=outputs, device=self.device)
+
     # --- room ------------------------------------------------------------------------------------------------------
 
     def _reserve_nodes(self, more: int) -> bool:
         """Room for more nodes; whether the table's slots are other ones now."""
         count = self.node_count + more
-        for name in ("lattice", "ends", "active", "touched"):
-            self._make_room(name, count)
+        self._make_room(count, "lattice", "ends", "active", "touched")
         if ROOM * count <= len(self._keys):
             return False
         self._make_table(count)
@@ -151,28 +152,30 @@ class Growth:
         size = 1 << max(int(2 * ROOM * max(count, self.node_count)).bit_length(), 10)
         self._keys = wp.full(size, wp.int64(-1), dtype=wp.int64, device=self.device)
         self._values = wp.full(size, -1, dtype=wp.int32, device=self.device)
-        self._launch(kernels.fill_table, self.node_count, [self.ends], [self._keys, self._values])
+        self.launch(kernels.fill_table, self.node_count, [self.ends], [self._keys, self._values])
 
-    def _make_room(self, name: str, count: int) -> None:
-        old = getattr(self, name)
-        if count > len(old):
-            new = wp.zeros(max(count, 3 * len(old) // 2), dtype=old.dtype, device=self.device)
-            wp.copy(new, old, count=len(old))
-            setattr(self, name, new)
+    def _make_room(self, count: int, *names: str) -> None:
+        for name in names:
+            setattr(self, name, with_room(getattr(self, name), count))
 
-    def _check_levels(self, elements: wp.array) -> None:
-        deepest = wp.zeros(1, dtype=wp.int32, device=self.device)
-        self._launch(kernels.deepest_level, len(elements), [elements, self.level], [deepest])
-        if deepest.numpy()[0] >= MAX_LEVEL:
+    def _read_counts(self) -> None:
+        counts = self._counts.numpy()
+        self.node_count = int(counts[kernels.NODES])
+        if counts[kernels.DEEPEST] >= MAX_LEVEL:
             raise InputError(f"a tetrahedron is already at level {MAX_LEVEL}, the deepest that the lattice can hold")
 
     def _on_device(self, values: Any, dtype: Any) -> wp.array:
         kind = np.uint8 if dtype is wp.uint8 else np.int32
         return wp.array(np.asarray(values, kind), dtype=dtype, device=self.device, copy=True)
 
-    def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
-        if count:
-            wp.launch(kernel, dim=count, inputs=inputs, outputs=outputs, device=self.device)
+
+def with_room(array: wp.array, count: int) -> wp.array:
+    """The array, or where it is shorter than ``count`` a longer one that begins with it and goes on with zeros."""
+    if count <= len(array):
+        return array
+    longer = wp.zeros(max(count, 3 * len(array) // 2), dtype=array.dtype, device=array.device)
+    wp.copy(longer, array, count=len(array))
+    return longer
 
 
 def lattice_spacing(cell_size: float) -> float:
