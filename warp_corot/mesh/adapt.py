@@ -15,7 +15,7 @@ from ..kernels import meshing as kernels
 from ..kernels.shapes import EDGES, REST
 from .bisection import path_tetrahedra
 from .growth import Growth, lattice_spacing, with_room
-from .lattice import LATTICE_BITS, MAX_LEVEL
+from .lattice import LATTICE_BITS, MAX_CELLS, MAX_LEVEL
 from .tree import LIVE, Tree
 
 if TYPE_CHECKING:
@@ -63,8 +63,7 @@ def grid_around(bounds: np.ndarray, cell_size: float) -> tuple[tuple[int, int, i
     """Root cubes along each axis and the lower corner of the grid that holds a box, the box in its middle."""
     bounds = np.asarray(bounds, dtype=float)
     cells = np.maximum(np.ceil((bounds[1] - bounds[0]) / cell_size - 1e-6), 1.0)
-    most = 2 ** (31 - LATTICE_BITS) - 1
-    if cells.max() > most or cells.prod() * 6 > 2**27:
+    if cells.max() > MAX_CELLS or cells.prod() * 6 > 2**27:
         raise InputError(
             f"cell_size is {cell_size:g} m: that is {' x '.join(f'{c:.0f}' for c in cells)} root cubes; "
             "make it larger and max_level higher"

@@ -18,7 +18,8 @@ import warp as wp
 
 from ..errors import InputError
 from ..indices import checked_indices
-from .lattice import LATTICE_BITS, MAX_LEVEL, volume_shares
+from .lattice import LATTICE_BITS, checked_cell_size, checked_cells, checked_level, volume_shares
+from .lattice import MAX_LEVEL as MAX_LEVEL
 from .refined import refined
 from .tree import Tree, UniformTree
 from .uniform import halvings, uniform_leaves
@@ -91,24 +92,19 @@ class TetForest:
         Raises:
             InputError: An argument is out of its range, or there would be 2**31 tetrahedra or more.
         """
-        cells = _checked_cells(cells)
-        if not (np.isfinite(cell_size) and cell_size > 0):
-            raise InputError(f"cell_size is {cell_size}; it must be a positive length in metres")
-        if level != int(level) or not 0 <= level <= MAX_LEVEL:
-            raise InputError(f"level is {level}; it must be a whole number from 0 to {MAX_LEVEL}")
+        cells, cell_size, level = checked_cells(cells), checked_cell_size(cell_size), checked_level(level, "level")
         if up_axis not in ("X", "Y", "Z"):
             raise InputError(f"up_axis is {up_axis!r}; it must be 'X', 'Y' or 'Z'")
         corners = np.asarray(origin, dtype=float)
         if corners.shape != (3,) or not np.isfinite(corners).all():
             raise InputError(f"origin is {origin}; it must be three finite coordinates in metres")
-        level = int(level)
         count = 6 * math.prod(cells) << level
         if count > MAX_LEAVES:
             raise InputError(f"level is {level}: that is {count} tetrahedra; there can be {MAX_LEAVES} at most")
         lattice, ends, tets = uniform_leaves(cells, level)
         lattice <<= LATTICE_BITS - halvings(level)
         x, y, z = (float(c) for c in corners)
-        return cls(cells, float(cell_size), (x, y, z), lattice, ends, UniformTree(tets, level), up_axis)
+        return cls(cells, cell_size, (x, y, z), lattice, ends, UniformTree(tets, level), up_axis)
 
     @classmethod
     def from_domain(
@@ -317,12 +313,3 @@ class TetForest:
         from .bodies import summary
 
         return summary(self)
-
-
-def _checked_cells(cells: tuple[int, int, int]) -> tuple[int, int, int]:
-    counts = np.asarray(cells)
-    limit = 2 ** (31 - LATTICE_BITS) - 1
-    if counts.shape != (3,) or not np.issubdtype(counts.dtype, np.integer) or counts.min() < 1 or counts.max() > limit:
-        raise InputError(f"cells is {cells}; it must be three whole numbers from 1 to {limit}")
-    x, y, z = (int(c) for c in counts)
-    return x, y, z

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
+from ..checks import checked_count
 from ..device import checked_device
 from ..errors import InputError
 from .adapt import Grown, Wishes, grow
 from .cut import inside_shares, label_shares, merged
 from .forest import Field, TetForest
-from .lattice import MAX_LEVEL, volume_shares
+from .lattice import checked_cell_size, checked_level, volume_shares
 from .numbering import in_order_of_leaves, live_or_void, pruned, renumbered, with_virtual
 from .tree import Tree
 
@@ -137,19 +138,17 @@ class _EmptyError(InputError):
 
 
 def _check(cell_size, min_level, max_level, surface_error, field_tolerance, target, sliver) -> None:
-    if not (np.isfinite(cell_size) and cell_size > 0):
-        raise InputError(f"cell_size is {cell_size}; it must be a positive length in metres")
-    for name, level in (("min_level", min_level), ("max_level", max_level)):
-        if isinstance(level, bool) or level != int(level) or not 0 <= level <= MAX_LEVEL:
-            raise InputError(f"{name} is {level}; it must be a whole number from 0 to {MAX_LEVEL}")
+    checked_cell_size(cell_size)
+    checked_level(min_level, "min_level")
+    checked_level(max_level, "max_level")
     if min_level > max_level:
         raise InputError(f"min_level is {min_level}, above max_level, which is {max_level}")
     if surface_error is not None and not (np.isfinite(surface_error) and surface_error > 0):
         raise InputError(f"surface_error is {surface_error}; it must be a positive length in metres, or None")
     if not field_tolerance >= 0:
         raise InputError(f"field_tolerance is {field_tolerance}; it must not be negative")
-    if target is not None and (isinstance(target, bool) or target != int(target) or target < 1):
-        raise InputError(f"target_elements is {target}; it must be a positive whole number")
+    if target is not None:
+        checked_count(target, "target_elements", 1)
     if not 0 <= sliver < 1:
         raise InputError(f"sliver is {sliver}; it must be a share of an element's volume, from 0 to below 1")
 

@@ -1,13 +1,60 @@
-"""The integer lattice that vertices of a forest lie on."""
+"""The integer lattice that vertices of a forest lie on, and the cubes and levels that it has room for."""
+
+from typing import Any
 
 import numpy as np
+
+from ..errors import InputError
 
 #: A root cube has 2**LATTICE_BITS lattice intervals a side, so levels may go to 3 * LATTICE_BITS.
 LATTICE_BITS = 16
 MAX_LEVEL = 3 * LATTICE_BITS
+
+#: Root cubes along an axis: lattice coordinates are int32.
+MAX_CELLS = 2 ** (31 - LATTICE_BITS) - 1
 
 
 def volume_shares(level: np.ndarray | int) -> np.ndarray:
     """Volume of tetrahedra of these levels over that of a root cube."""
     all_levels = np.arange(MAX_LEVEL + 1)
     return (0.125 ** (all_levels // 3) / np.array([6.0, 12.0, 24.0])[all_levels % 3])[level]
+
+
+def checked_level(level: Any, name: str) -> int:
+    """A level that the lattice has room for.
+
+    Raises:
+        InputError: It is none.
+    """
+    try:
+        found = int(level)
+    except (TypeError, ValueError, OverflowError):
+        found = -1
+    if isinstance(level, bool) or found != level or not 0 <= found <= MAX_LEVEL:
+        raise InputError(f"{name} is {level}; it must be a whole number from 0 to {MAX_LEVEL}")
+    return found
+
+
+def checked_cells(cells: Any) -> tuple[int, int, int]:
+    """Numbers of root cubes along x, y, z.
+
+    Raises:
+        InputError: They are not three that the lattice has room for.
+    """
+    counts = np.asarray(cells)
+    whole = counts.shape == (3,) and np.issubdtype(counts.dtype, np.integer)
+    if not (whole and counts.min() >= 1 and counts.max() <= MAX_CELLS):
+        raise InputError(f"cells is {cells}; it must be three whole numbers from 1 to {MAX_CELLS}")
+    x, y, z = (int(c) for c in counts)
+    return x, y, z
+
+
+def checked_cell_size(cell_size: float) -> float:
+    """The edge length of a root cube [m].
+
+    Raises:
+        InputError: It is not positive and finite.
+    """
+    if not (np.isfinite(cell_size) and cell_size > 0):
+        raise InputError(f"cell_size is {cell_size}; it must be a positive length in metres")
+    return float(cell_size)
