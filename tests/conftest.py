@@ -17,3 +17,10 @@ def rng():
     import numpy as np
 
     return np.random.default_rng(20130705)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A new folder, and the working one."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path

@@ -175,7 +175,8 @@ def _mesh(args: argparse.Namespace, domain: Domain) -> TetForest:
             domain, size, max_level=level, surface_error=args.surface_error, target_elements=count, device=args.device
         )
     except InputError as error:
-        with_tets = f"with --tets {count}, " if count is not None and args.surface_error is None and count >= 1 else ""
+        unsaid = count is not None and count >= 1 and args.surface_error is None and "target_elements" not in str(error)
+        with_tets = f"with --tets {count}, " if unsaid else ""
         raise InputError(f"{with_tets}{error}") from None
 
 

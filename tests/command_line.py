@@ -1,0 +1,37 @@
+"""The command line as tests call it."""
+
+from pathlib import Path
+
+import warp as wp
+
+from warp_corot.cli import main
+
+SHORT = ["--duration", "0.05", "--fps", "40", "--device", "cpu"]
+
+
+def run(*args: object) -> int:
+    """The exit status of a command; Warp's settings stay."""
+    before = wp.config.log_level
+    try:
+        return main([*map(str, args)])
+    except SystemExit as left:  # argparse's way
+        return left.code
+    finally:
+        wp.config.log_level = before
+
+
+def simulate(*args: object) -> int:
+    return run("simulate", *args)
+
+
+def assert_refused(folder: Path, capsys, said: str, *args: object) -> None:
+    """It is one line on stderr and status 2, and no file is touched."""
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    assert simulate(*args) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    # Whether kernels are compiled, and that is said, depends on what ran before.
+    (error,) = [line for line in err.splitlines() if "compiling kernels" not in line]
+    assert error.startswith("warp-corot: error: ")
+    assert said in error
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before

@@ -1,0 +1,141 @@
+"""``warp-corot simulate`` of surfaces and scans."""
+
+import numpy as np
+import pytest
+import trimesh
+from command_line import SHORT, simulate
+from input_files import write_scan, write_surface
+from pxr import Usd, UsdGeom
+from stages import SURFACE, TETS, drawn, prims
+
+import warp_corot as wc
+from warp_corot.domain import Domain
+
+
+def tetrahedra_in(said: str) -> int:
+    return int(said.split(" tetrahedra,")[0].split()[-1])
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".stl", ".ply", ".off", ".glb", ".usda"])
+def test_surfaces_of_every_format(folder, suffix, capsys):
+    mm = suffix in (".obj", ".stl", ".usda")
+    write_surface(folder / f"organ{suffix}", mm)
+    unit = ["--unit", "mm"] if mm and suffix != ".usda" else []
+    assert simulate(f"organ{suffix}", "-o", "a.usd", "--tets", 1500, *unit, *SHORT) == 0
+    out, err = capsys.readouterr()
+    assert "bounds 60 mm x 80 mm x 100 mm" in out
+    assert "closed" in out
+    assert "ready in" in out
+    assert 0.8 * 1500 < tetrahedra_in(out) <= 1500
+    assert "the lowest 10 % of the height is held" in err
+    stage = Usd.Stage.Open(str(folder / "a.usd"))
+    assert prims(stage) == [SURFACE]
+    first, last = drawn(stage), drawn(stage, frame=stage.GetEndTimeCode())
+    assert first.is_watertight
+    assert first.volume == pytest.approx(4 / 3 * np.pi * 0.03 * 0.04 * 0.05, rel=0.05)
+    up = {"X": 0, "Y": 1, "Z": 2}[str(UsdGeom.GetStageUpAxis(stage))]
+    assert up == (1 if suffix in (".obj", ".glb") else 2)
+    heights, sunk = first.vertices[:, up], (last.vertices - first.vertices)[:, up]
+    assert sunk[heights > 0].max() < 0
+    lowest = heights.min() + 0.05 * np.ptp(heights)
+    np.testing.assert_allclose(sunk[heights < lowest], 0.0, atol=0.1 * np.abs(sunk).max())
+
+
+def test_the_bunny_sags_and_stands(folder, capsys):
+    """Near critical damping it comes to rest, upright: ears and back below where they were, above the ground."""
+    args = ["--tets", 1500, "--young", 3e4, "--damping", 25, "--duration", 0.6, "--fps", 5, "--device", "cpu"]
+    assert simulate("warp:bunny", "-o", "a.usd", *args) == 0
+    assert "12200 triangles enclose 876 ml" in capsys.readouterr().out
+    stage = Usd.Stage.Open(str(folder / "a.usd"))
+    first, last = drawn(stage), drawn(stage, frame=stage.GetEndTimeCode())
+    assert 0.02 < -(last.vertices - first.vertices)[:, 1].min() / np.ptp(first.vertices[:, 1]) < 0.4
+    assert last.vertices[:, 1].min() > 0.0
+    assert last.volume == pytest.approx(first.volume, rel=0.05)
+
+
+def test_the_level_of_detail_is_kept(folder, capsys):
+    """More tetrahedra, and a surface that is nearer: its volume comes to that of the ellipsoid from below."""
+    write_surface(folder / "organ.glb", False)
+    errors = []
+    for count in (500, 2000, 8000):
+        assert simulate("organ.glb", "-o", f"{count}.usd", "--tets", count, *SHORT) == 0
+        assert 0.8 * count < tetrahedra_in(capsys.readouterr().out) <= count
+        exact = trimesh.load_mesh(folder / "organ.glb").volume
+        errors.append(1 - drawn(Usd.Stage.Open(str(folder / f"{count}.usd"))).volume / exact)
+    assert errors[0] > 2.0 * errors[1] > 4.0 * errors[2] > 0.0
+
+
+def test_options_of_the_mesh_reach_it(folder, capsys):
+    write_surface(folder / "organ.glb", False)
+    assert simulate("organ.glb", "-o", "a.usd", "--cell-size", 0.05, "--max-level", 4, *SHORT) == 0
+    said = capsys.readouterr().out
+    assert "from 2 x 2 x 2 cubes of 0.05 m" in said
+    assert "level 4, type 1" in said
+    assert "level 5" not in said
+    assert simulate("organ.glb", "-o", "a.usd", "--cell-size", 0.05, "--surface-error", 1e-3, *SHORT) == 0
+    count = tetrahedra_in(capsys.readouterr().out)
+    domain = Domain.from_surface("organ.glb")
+    assert count == len(wc.TetForest.from_domain(domain, 0.05, surface_error=1e-3).tets)
+    assert np.abs(domain.phi(drawn(Usd.Stage.Open("a.usd")).vertices)).max() < 1e-3
+    assert simulate("organ.glb", "-o", "a.usd", "--surface-error", 1e-5, "--tets", 2000, *SHORT) == 0
+    assert 1000 < tetrahedra_in(capsys.readouterr().out) <= 2000
+
+
+@pytest.mark.parametrize(
+    ("labels", "noted"),
+    [
+        ("soft=3kPa:0.45,hard=30kPa:0.4:1060", True),
+        ("hard@7=0.03MPa:0.4:1060,soft@2=3000", False),
+        ("2=3 kPa,7=30kPa:0.4:1.06e3", False),
+    ],
+)
+def test_material_follows_the_labels(folder, labels, noted, capsys):
+    write_scan(folder / "scan.nii.gz")
+    assert simulate("scan.nii.gz", "--labels", labels, "-o", "a.usd", "--tets", 4000, "--draw-tets", *SHORT) == 0
+    out, err = capsys.readouterr()
+    assert ("in ascending order: soft is 2, hard is 7" in err) == noted
+    assert "E = 3 kPa, nu = 0.45, rho = 1000 kg/m^3" in out
+    assert "E = 30 kPa, nu = 0.4, rho = 1060 kg/m^3" in out
+    assert "unit mm, as the file says" in out
+    stage = Usd.Stage.Open(str(folder / "a.usd"))
+    assert prims(stage) == [TETS, SURFACE]
+    tets = UsdGeom.TetMesh.Get(stage, TETS)
+    primvars = UsdGeom.PrimvarsAPI(tets)
+    rest = np.array(primvars.GetPrimvar("rest").Get(), float)
+    away = np.linalg.norm(rest[np.array(tets.GetTetVertexIndicesAttr().Get())].mean(axis=1), axis=1)
+    for name, inside, outside in (("young", 3e4, 3e3), ("poisson", 0.4, 0.45), ("density", 1060, 1000)):
+        values = np.array(primvars.GetPrimvar(name).Get())
+        np.testing.assert_allclose(values[away < 0.013], inside)
+        np.testing.assert_allclose(values[away > 0.029], outside)
+
+
+def test_labels_are_drawn_and_left_out(folder, capsys):
+    write_scan(folder / "scan.nii.gz")
+    args = ["--tets", 3000, "--smoothing", 0.004, *SHORT]
+    assert simulate("scan.nii.gz", "--labels", "soft=3kPa,hard=30kPa", "-o", "a.usd", "--draw-labels", *args) == 0
+    assert prims(Usd.Stage.Open("a.usd")) == ["/SoftBody/soft", "/SoftBody/hard"]
+    assert simulate("scan.nii.gz", "--labels", "core@7=30kPa", "-o", "b.usd", *args) == 0
+    core_alone = drawn(Usd.Stage.Open("b.usd"))
+    assert core_alone.volume == pytest.approx(4 / 3 * np.pi * 0.02**3, rel=0.15)
+    capsys.readouterr()
+    assert simulate("scan.nii.gz", "-o", "c.usd", *args) == 0  # all labels, of one material
+    assert "labels: 2, 7" in capsys.readouterr().out
+    assert drawn(Usd.Stage.Open("c.usd")).volume == pytest.approx(4 / 3 * np.pi * 0.04**3, rel=0.1)
+
+
+def test_the_preview_shows_the_surface(folder):
+    pytest.importorskip("matplotlib")
+    write_surface(folder / "organ.glb", False)
+    assert simulate("organ.glb", "-o", "a.usd", "--preview", "a.png", "--tets", 500, *SHORT) == 0
+    assert (folder / "a.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_unlikely_units_are_warned_of(folder, capsys):
+    trimesh.creation.icosphere(2, 75.0).export(folder / "organ.obj")
+    assert simulate("organ.obj", "-o", "a.usd", "--tets", 300, "--duration", 0.05, "--fps", 20) == 0
+    err = capsys.readouterr().err
+    assert "warning: organ.obj: the body is 150 m long: if its coordinates are in mm, say --unit 'mm' (a factor" in err
+    assert simulate("organ.obj", "-o", "a.usd", "--tets", 300, "--unit", "mm", *SHORT) == 0
+    out, err = capsys.readouterr()
+    assert "warning" not in err
+    assert "bounds 150 mm x 150 mm x 150 mm" in out

@@ -1,0 +1,96 @@
+"""What ``warp-corot simulate`` refuses of surfaces, scans and their options."""
+
+from pathlib import Path
+
+import pytest
+import trimesh
+from command_line import assert_refused
+from input_files import write_scan, write_surface
+
+from warp_corot.cli.label_materials import parse_labels, parse_pressure
+
+
+def refused_files(folder: Path) -> None:
+    write_surface(folder / "organ.obj", False)
+    write_scan(folder / "scan.nii.gz")
+    write_scan(folder / "nameless.nii", unit="unknown")
+    half = trimesh.creation.icosphere(2, 0.05)
+    half.update_faces(half.triangles_center[:, 2] > 0)
+    half.export(folder / "half.ply")
+    trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 1]], process=False).export(
+        folder / "flat.off"
+    )
+    (folder / "text.stl").write_text("not a surface")
+    (folder / "text.nii.gz").write_text("not a scan")
+    (folder / "empty.glb").write_bytes(b"")
+    write_surface(folder / "out.usda", False)
+
+
+REFUSED = [
+    (["none.obj"], "none.obj: no such file"),
+    (["none.nii.gz"], "none.nii.gz: no such file"),
+    (["text.stl"], "text.stl: has no triangles"),
+    (["text.nii.gz"], "text.nii.gz: is not a NIfTI file"),
+    (["empty.glb"], "empty.glb: is empty"),
+    (["half.ply"], "half.ply: the surface is open"),
+    (["flat.off"], "flat.off: the surface has zero thickness"),
+    (["nameless.nii"], "the file names no unit of length; say --unit 'mm'"),
+    (["warp:hare"], "warp:hare: no such asset, should be warp:bunny, warp:bear"),
+    (["organ.obj", "--unit", "inch"], "invalid choice: 'inch'"),
+    (["organ.obj", "--scale", "0.1"], "--scale is for meshes of tetrahedra; of organ.obj say --unit"),
+    (["organ.obj", "--labels", "liver=3kPa"], "--labels is for scans, and organ.obj is not one"),
+    (["organ.obj", "--draw-labels"], "--draw-labels is for scans"),
+    (["box", "--unit", "mm"], "--unit is for surfaces and scans, and box is not one; say --scale"),
+    (["warp:bear", "--tets", "1000"], "--tets is for surfaces and scans"),
+    (["box", "--draw-tets"], "--draw-tets is for surfaces and scans"),
+    (["organ.obj", "--tets", "0"], "--tets is 0; it must be a positive whole number"),
+    (["organ.obj", "--tets", "1"], "error: --tets is 1; at the coarsest"),
+    (["organ.obj", "--tets", "many"], "argument --tets: invalid int value: 'many'"),
+    (["organ.obj", "--cell-size", "0"], "--cell-size is 0.0; it must be a positive length"),
+    (["organ.obj", "--cell-size", "nan"], "--cell-size is nan"),
+    (["organ.obj", "--max-level", "-1"], "--max-level is -1"),
+    (["organ.obj", "--max-level", "99"], "--max-level is 99"),
+    (["organ.obj", "--surface-error", "-1"], "--surface-error is -1"),
+    (["organ.obj", "--fix", "all", "--tets", "500"], "expression 'all': holds all"),
+    (["organ.obj", "--rotation-level", "-1"], "rotation_level is -1"),
+    (["scan.nii.gz", "--labels", "liver"], "--labels 'liver': it must be NAME"),
+    (["scan.nii.gz", "--labels", ""], "--labels '': it must be NAME"),
+    (["scan.nii.gz", "--labels", "a=3kPa:0.45:1000:2,b=3kPa"], "it must be NAME"),
+    (["scan.nii.gz", "--labels", "a=soft,b=3kPa"], "'soft' is no Young's modulus"),
+    (["scan.nii.gz", "--labels", "a=3psi,b=3kPa"], "'3psi' is no Young's modulus"),
+    (["scan.nii.gz", "--labels", "a=3kPa:half,b=3kPa"], "'half' is no Poisson's ratio"),
+    (["scan.nii.gz", "--labels", "a=3kPa:nan,b=3kPa"], "'nan' is no Poisson's ratio"),
+    (["scan.nii.gz", "--labels", "a=3kPa:0.5,b=3kPa"], "--labels 'a=3kPa:0.5': poisson is 0.5"),
+    (["scan.nii.gz", "--labels", "a=-3kPa,b=3kPa"], "young is -3000 Pa"),
+    (["scan.nii.gz", "--labels", "a=3kPa:0.4:0,b=3kPa"], "density is 0"),
+    (["scan.nii.gz", "--labels", "a=3kPa,a=4kPa"], "the label a is given twice"),
+    (["scan.nii.gz", "--labels", "a@2=3kPa,b@2+7=4kPa"], "the number 2 is given twice"),
+    (["scan.nii.gz", "--labels", "a=3kPa"], "which label 'a' is, is not known; say its number, as in a@1=3kPa; "),
+    (["scan.nii.gz", "--labels", "a=3kPa,b=3kPa,c=3kPa"], "the volume's labels: 2, 7"),
+    (["scan.nii.gz", "--labels", "a@2=3kPa,b=3kPa"], "which label 'b' is"),
+    (["scan.nii.gz", "--labels", "2=3kPa,3=3kPa"], "label 3 ('3') is not in the volume"),
+    (["scan.nii.gz", "--labels", "2=3kPa", "--young", "500"], "--young is given, but --labels gives each"),
+    (["scan.nii.gz", "--draw-labels"], "--draw-labels draws the labels that --labels names"),
+    (["scan.nii.gz", "--smoothing", "-1"], "--smoothing is -1"),
+    (["scan.nii.gz", "--smoothing", "1"], "--smoothing is 1 m and the body"),
+    (["out.usda"], "is the input"),
+]
+
+
+@pytest.mark.parametrize(("args", "said"), REFUSED, ids=[" ".join(args)[:60] for args, _ in REFUSED])
+def test_bad_input_is_one_line_and_touches_nothing(folder, args, said, capsys):
+    refused_files(folder)
+    assert_refused(folder, capsys, said, *args, "-o", "out.usda")
+
+
+def test_pressures():
+    for text, pascals in (("500", 500), ("3kPa", 3e3), (" 3.5 kPa", 3.5e3), ("1e-3GPa", 1e6), (".1MPa", 1e5)):
+        assert parse_pressure(text) == pytest.approx(pascals)
+    (entry,) = parse_labels("grey matter@3+4 = 2kPa:0.49")
+    assert (entry.name, entry.numbers, entry.young, entry.poisson, entry.density) == (
+        "grey matter",
+        (3, 4),
+        2e3,
+        0.49,
+        None,
+    )
