@@ -67,8 +67,12 @@ def test_it_is_drawn_in_the_labels_colours(ball, tmp_path):
         ({"up": [0.6, 0.0, 0.9]}, "unit vectors"),
         ({"reach": [[0.0, 0.0], [-1.0, 1.0]]}, "squares"),
         ({"step": 0.0}, "squares"),
-        ({"step": 1e-6}, "at most|1 to"),
+        ({"step": 1e-6}, "1 to 2000 each way"),
         ({"step": np.nan}, "squares"),
+        ({"reach": [0.0, 1.0]}, r"reach is .* \[2, 2\]"),
+        ({"reach": [[0.0, np.inf], [0.0, 1.0]]}, "reach is"),
+        ({"centre": [0.0, 0.0]}, r"centre is \[0.0, 0.0\]; it must be finite numbers \[3\]"),
+        ({"across": [1.0, [0.0], 0.0]}, "across is"),
     ],
 )
 def test_bad_planes(ball, given, named):

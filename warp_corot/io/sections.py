@@ -39,7 +39,8 @@ class Section:
             [rows - 1, columns - 1].
 
     Raises:
-        InputError: Directions that are not unit vectors at right angles, an empty rectangle, or too many squares.
+        InputError: Numbers that are not finite or of another shape, directions that are not unit vectors at right
+            angles, an empty rectangle, or too many squares.
     """
 
     def __init__(
@@ -52,10 +53,11 @@ class Section:
         reach: npt.ArrayLike,
         step: float,
     ):
-        self.centre, self.directions = np.asarray(centre, dtype=float), np.asarray([across, up], dtype=float)
-        if self.directions.shape != (2, 3) or np.abs(self.directions @ self.directions.T - np.eye(2)).max() > 1e-6:
+        self.centre = _numbers("centre", centre, (3,))
+        self.directions = np.stack([_numbers("across", across, (3,)), _numbers("up", up, (3,))])
+        if np.abs(self.directions @ self.directions.T - np.eye(2)).max() > 1e-6:
             raise InputError(f"across and up are {self.directions.tolist()}; they must be unit vectors at right angles")
-        low, high = np.asarray(reach, dtype=float).reshape(2, 2).T
+        low, high = _numbers("reach", reach, (2, 2)).T
         counts = np.ceil((high - low) / step - 1e-9) if step > 0 else np.zeros(2)
         if not ((counts >= 1) & (counts <= MOST_SQUARES)).all():
             raise InputError(
@@ -109,3 +111,13 @@ class Section:
 
     def _placed(self, right: np.ndarray, above: np.ndarray) -> np.ndarray:
         return self.centre + np.stack([right.ravel(), above.ravel()], axis=1) @ self.directions
+
+
+def _numbers(name: str, given: npt.ArrayLike, shape: tuple[int, ...]) -> npt.NDArray[np.float64]:
+    try:
+        numbers = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    if numbers.shape != shape or not np.isfinite(numbers).all():
+        raise InputError(f"{name} is {given!r}; it must be finite numbers {list(shape)}")
+    return numbers
