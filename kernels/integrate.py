@@ -83,7 +83,7 @@ def follow_trajectory(
     displacements: wp.array2d[wp.vec3],
     dt: float,
     clock: wp.array[wp.int64],
-    world_starts: wp.array[wp.int64],
+    world_starts: wp.array[wp.float64],
     world_node_count: int,
     offset: int,
     u: wp.array[wp.vec4],
@@ -94,7 +94,7 @@ def follow_trajectory(
     k = wp.tid()
     i = nodes[k]
     start = world_starts[i // world_node_count]
-    t = wp.float64(clock[0] + wp.int64(offset + 1) - start) * wp.float64(dt)
+    t = (wp.float64(clock[0] + wp.int64(offset + 1)) - start) * wp.float64(dt)
     last = times.shape[0] - 1
     key = int(0)
     while key < last - 1 and times[key + 1] <= t:
@@ -153,7 +153,7 @@ def reset_nodes(
     v: wp.array[wp.vec4],
     positions: wp.array[wp.vec4],
     reactions: wp.array[wp.vec4],
-    world_starts: wp.array[wp.int64],
+    world_starts: wp.array[wp.float64],
 ):
     """Put the nodes of chosen worlds back to their initial state, or to rest where there is none.
 
@@ -164,7 +164,7 @@ def reset_nodes(
     if chosen[world] == 0:
         return
     if i % world_node_count == 0:
-        world_starts[world] = clock[0]
+        world_starts[world] = wp.float64(clock[0])
     displacement = wp.vec3()
     velocity = wp.vec3()
     if has_initial != 0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +18,11 @@ from .kernels.integrate import adopt_positions, publish_positions, reset_nodes
 from .materials import Isotropic, Material
 from .nodal import padded, vec3_view
 from .trajectory import Trajectory
+from .views import Views
 from .worlds import World
+
+if TYPE_CHECKING:
+    from .remesh.changing import Changing
 
 #: Elements, and with them nodes, are numbered in 32 bits.
 MOST_ELEMENTS = 2**31 - 1
@@ -43,10 +47,11 @@ class SoftBody(Controls):
         worlds: How many copies.
         device: "cpu", "cuda:0", …; None for Warp's default.
 
+    A body that is remeshed (``Simulation(…, remesh=…)``) has other nodes after a pass: ``node_count`` and all arrays are
+    then asked for anew, and views from before raise ``StaleViewError``.
+
     Attributes:
-        mesh, worlds, device: As given.
-        material: As given, with values in place of functions.
-        masses: Lumped nodal masses [kg], float64 [worlds * N]; zero at nodes that no element names.
+        worlds, device: As given.
 
     Raises:
         InputError: The device is not there, a material array does not have one value per element, stiffness, mass or
@@ -54,10 +59,15 @@ class SoftBody(Controls):
     """
 
     def __init__(self, mesh: Mesh, material: Material, *, worlds: int = 1, device: str | wp.Device | None = None):
-        self.mesh = mesh
-        self.material: Any = material.at(centroids(mesh)) if material.functions else material
+        #: What remeshes the body, if anything does; then the present mesh and what is known of it on the host are
+        #: looked up when they are asked for.
+        self.changing: Changing | None = None
+        self._mesh: Mesh | None = mesh
+        self._material: Any = material.at(centroids(mesh)) if material.functions else material
         self.worlds = checked_count(worlds, "worlds", least=1)
         self.device = checked_device(device)
+        self.world_node_count, self.world_element_count = len(mesh.points), len(mesh.tets)
+        self.smallest_volume = float(np.min(mesh.volumes))
         if self.element_count > MOST_ELEMENTS:
             raise InputError(
                 f"worlds is {worlds}: that is {self.element_count} elements; there can be {MOST_ELEMENTS} at most"
@@ -72,10 +82,12 @@ class SoftBody(Controls):
         #: Lamé's parameters [Pa] and their stride, 0 or 1; then the same times the filled share, for the forces.
         self.lame = self._lame_arrays(isotropic, None)
         self.mu, self.lam, self.material_stride = self._lame_arrays(isotropic, self.fill)
-        self.masses = lumped_masses(mesh, self.material, self.worlds)
-        check_float32(self.masses[self.masses > 0], "the mass of a node", "kg")
+        self._masses: npt.NDArray[np.float64] | None = lumped_masses(mesh, self.material, self.worlds)
+        check_float32(self._masses[self._masses > 0], "the mass of a node", "kg")
 
         n = self.node_count
+        #: How many of the nodes and elements launches go through; those beyond the counts do nothing.
+        self.launch_nodes, self.launch_elements = n, self.element_count
         self.node_rest = wp.array(padded(self.rest_positions), dtype=wp.vec4, device=self.device)
         self.node_positions = wp.clone(self.node_rest)
         self.node_displacements = wp.zeros(n, dtype=wp.vec4, device=self.device)
@@ -83,19 +95,72 @@ class SoftBody(Controls):
         self.node_forces = wp.zeros(n, dtype=wp.vec4, device=self.device)
         self.node_reactions = wp.zeros(n, dtype=wp.vec4, device=self.device)
         self.node_loads = wp.zeros(1, dtype=wp.vec4, device=self.device)
+        self.has_loads = False
         self.node_mass = wp.array(self.masses, dtype=wp.float32, device=self.device)
         self.node_inverse_mass = wp.empty(n, dtype=wp.float32, device=self.device)
         self.trajectories: list[Trajectory] = []
         self.element_activation = wp.zeros(1, dtype=wp.float32, device=self.device)
         self.activations: list[ElementActivation] = []
-        #: Time steps done when each world was last reset, int64 [worlds].
-        self.world_starts = wp.zeros(self.worlds, dtype=wp.int64, device=self.device)
+        #: Time steps done when each world was last reset, float64 [worlds]; where steps were of other lengths before,
+        #: as many of the present ones as would have taken as long.
+        self.world_starts = wp.zeros(self.worlds, dtype=wp.float64, device=self.device)
         #: Changes whenever the launches of a step do, so that recorded steps can be recorded anew.
         self.revision = 0
-        self._constrained = np.zeros(n, bool)
+        self._held: npt.NDArray[np.bool_] | None = np.zeros(n, bool)
+        self._views = Views()
         #: Displacements and velocities that worlds are reset to; None for rest.
         self.initial_state: tuple[wp.array, wp.array] | None = None
-        self._update_inverse_mass()
+        self.update_inverse_mass()
+
+    # --- what it is made of ----------------------------------------------------------------------------------------
+
+    @property
+    def mesh(self) -> Mesh:
+        """The mesh; of a body that is remeshed the present one."""
+        if self._mesh is None:
+            assert self.changing is not None
+            self._mesh = self.changing.mesh()
+        return self._mesh
+
+    @property
+    def material(self) -> Any:
+        """The material as given, with values in place of functions; of a body that is remeshed that of the present
+        elements."""
+        if self._material is None:
+            assert self.changing is not None
+            self._material = self.changing.material()
+        return self._material
+
+    @property
+    def masses(self) -> npt.NDArray[np.float64]:
+        """Lumped nodal masses [kg], float64 [worlds * N]; zero at nodes that no element names."""
+        if self._masses is None:
+            assert self.changing is not None
+            self._masses = self.changing.masses()
+        return self._masses
+
+    @property
+    def held(self) -> npt.NDArray[np.bool_]:
+        """Which nodes are fixed or prescribed, bool [worlds * N], as the host keeps it; ``constrained`` is a copy."""
+        if self._held is None:
+            assert self.changing is not None
+            self._held = self.changing.held()
+        return self._held
+
+    def update_inverse_mass(self) -> None:
+        super().update_inverse_mass()
+        if self.changing is not None:
+            self.changing.hold(self.held)
+
+    def mesh_changed(self, nodes: int, elements: int) -> None:
+        """The device has changed the mesh: what the host knows of it is out of date.
+
+        Args:
+            nodes, elements: How many there are now.
+        """
+        self.world_node_count, self.world_element_count = nodes, elements
+        self._mesh = self._material = self._masses = self._held = None
+        self._views.expire()
 
     # --- state -----------------------------------------------------------------------------------------------------
 
@@ -129,7 +194,7 @@ class SoftBody(Controls):
     def positions(self) -> wp.array:
         """Nodal positions [m], vec3 [worlds * N], in the mesh's order. A view of the live array: write to it
         between steps, or set the property, and the next step starts from there."""
-        return vec3_view(self.node_positions)
+        return self.nodal_view(self.node_positions)
 
     @positions.setter
     def positions(self, values: npt.ArrayLike) -> None:
@@ -140,7 +205,7 @@ class SoftBody(Controls):
     def displacements(self) -> wp.array:
         """Nodal displacements from rest [m], vec3 [worlds * N]: a copy; set the property to change them."""
         self.adopt_positions()
-        return wp.clone(vec3_view(self.node_displacements))
+        return wp.clone(vec3_view(self.node_displacements[: self.node_count]))
 
     @displacements.setter
     def displacements(self, values: npt.ArrayLike) -> None:
@@ -149,11 +214,11 @@ class SoftBody(Controls):
     @property
     def velocities(self) -> wp.array:
         """Nodal velocities [m/s], vec3 [worlds * N]: a view of the live array."""
-        return vec3_view(self.node_velocities)
+        return self.nodal_view(self.node_velocities)
 
     @velocities.setter
     def velocities(self, values: npt.ArrayLike) -> None:
-        self.node_velocities.assign(padded(self._checked_vectors(values, "velocities")))
+        self.node_velocities[: self.node_count].assign(padded(self._checked_vectors(values, "velocities")))
 
     @property
     def reactions(self) -> wp.array:
@@ -161,7 +226,11 @@ class SoftBody(Controls):
 
         A support carries its node's own weight too. Inertia of a prescribed node is not included.
         """
-        return vec3_view(self.node_reactions)
+        return self.nodal_view(self.node_reactions)
+
+    def nodal_view(self, array: wp.array) -> wp.array:
+        """One of the nodal arrays as vec3 [worlds * N], live, until the mesh changes."""
+        return self._views.hand_out(vec3_view(array[: self.node_count]))
 
     def adopt_positions(self) -> None:
         """Take over positions that somebody wrote since they were last published."""
@@ -174,6 +243,9 @@ class SoftBody(Controls):
     def set_initial_state(self) -> None:
         """Make the present state the one that ``Simulation.reset`` goes back to; at first that is rest."""
         self.adopt_positions()
+        if self.changing is not None:
+            self.changing.remember()
+            return
         self.initial_state = (wp.clone(self.node_displacements), wp.clone(self.node_velocities))
 
     def reset(self, chosen: wp.array, clock: wp.array) -> None:
@@ -183,6 +255,9 @@ class SoftBody(Controls):
             chosen: Not zero for worlds to be reset, int32 [worlds].
             clock: Time steps done, int64 [1].
         """
+        if self.changing is not None:
+            self.changing.reset(chosen, clock)
+            return
         kept = self.initial_state is not None
         u, v = self.initial_state or (self.node_displacements, self.node_velocities)
         inputs = [chosen, self.world_node_count, int(kept), u, v, self.node_rest, self.node_inverse_mass, clock]
@@ -216,11 +291,11 @@ class SoftBody(Controls):
         return given
 
     def _set_displacements(self, values: npt.NDArray[np.float64]) -> None:
-        self.node_displacements.assign(padded(values))
+        self.node_displacements[: self.node_count].assign(padded(values))
         self.publish_positions()
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim=self.node_count, inputs=inputs, outputs=outputs, device=self.device)
+        wp.launch(kernel, dim=self.launch_nodes, inputs=inputs, outputs=outputs, device=self.device)
 
 
 def centroids(mesh: Mesh) -> npt.NDArray[np.float64]:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
+
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from .activation import Activation, ElementActivation, activate
 from .anisotropy import Anisotropic
-from .elements import Mesh
 from .errors import InputError
 from .materials import Material
 from .nodal import vec3_view
 from .trajectory import Trajectory
+from .views import Views
 from .worlds import chosen_nodes
 
 
@@ -22,11 +24,11 @@ class Controls:
     Nodes and elements are named within a world and meant in all of them, unless ``worlds`` says otherwise.
     """
 
-    mesh: Mesh
     device: wp.Device
-    material: Material
     worlds: int
-    masses: npt.NDArray[np.float64]
+    #: Nodes and elements of one world.
+    world_node_count: int
+    world_element_count: int
     node_velocities: wp.array
     node_inverse_mass: wp.array
     node_reactions: wp.array
@@ -35,12 +37,23 @@ class Controls:
     trajectories: list[Trajectory]
     activations: list[ElementActivation]
     revision: int
-    _constrained: npt.NDArray[np.bool_]
+    has_loads: bool
+    _views: Views
 
     @property
-    def world_node_count(self) -> int:
-        """Nodes of one world, N."""
-        return len(self.mesh.points)
+    @abstractmethod
+    def material(self) -> Material:
+        """What the body is made of."""
+
+    @property
+    @abstractmethod
+    def masses(self) -> npt.NDArray[np.float64]:
+        """Lumped nodal masses [kg], float64 [worlds * N]."""
+
+    @property
+    @abstractmethod
+    def held(self) -> npt.NDArray[np.bool_]:
+        """Which nodes are fixed or prescribed, bool [worlds * N]."""
 
     @property
     def node_count(self) -> int:
@@ -50,7 +63,7 @@ class Controls:
     @property
     def element_count(self) -> int:
         """Elements of all worlds."""
-        return self.worlds * len(self.mesh.tets)
+        return self.worlds * self.world_element_count
 
     def fix(self, nodes: npt.ArrayLike, *, worlds: npt.ArrayLike | None = None) -> None:
         """Hold nodes where they are.
@@ -70,8 +83,8 @@ class Controls:
         """Let fixed or prescribed nodes go, with the velocity they have. Nodes and worlds as in ``fix``."""
         chosen = self.node_indices(nodes, worlds)
         self._stop_following(chosen)
-        self._constrained[chosen] = False
-        self._update_inverse_mass()
+        self.held[chosen] = False
+        self.update_inverse_mass()
         reactions = self.node_reactions.numpy().copy()
         reactions[chosen] = 0.0
         self.node_reactions.assign(reactions)
@@ -189,17 +202,13 @@ class Controls:
     @property
     def constrained(self) -> npt.NDArray[np.bool_]:
         """Which nodes are fixed or prescribed, bool [worlds * N] (a copy)."""
-        return self._constrained.copy()
-
-    @property
-    def has_loads(self) -> bool:
-        return len(self.node_loads) == self.node_count
+        return self.held.copy()
 
     @property
     def loads(self) -> wp.array:
         """External nodal forces [N], vec3 [worlds * N]: a view of the live array, made on first use."""
         self._ensure_loads()
-        return vec3_view(self.node_loads)
+        return self._views.hand_out(vec3_view(self.node_loads[: self.node_count]))
 
     def node_indices(self, nodes: npt.ArrayLike, worlds: npt.ArrayLike | None = None) -> npt.NDArray[np.intp]:
         """Indices, among the nodes of all worlds, of those named as in ``fix``.
@@ -213,21 +222,24 @@ class Controls:
 
     def _ensure_loads(self) -> None:
         if not self.has_loads:
-            self.node_loads = wp.zeros(self.node_count, dtype=wp.vec4, device=self.device)
+            self.has_loads = True
+            if len(self.node_loads) < self.node_count:
+                self.node_loads = wp.zeros(self.node_count, dtype=wp.vec4, device=self.device)
             self.revision += 1
 
     def _constrain(self, chosen: np.ndarray, velocity: np.ndarray) -> None:
-        self._constrained[chosen] = True
-        self._update_inverse_mass()
+        self.held[chosen] = True
+        self.update_inverse_mass()
         velocities = self.node_velocities.numpy().copy()
         velocities[chosen, :3] = velocity
         self.node_velocities.assign(velocities)
 
-    def _update_inverse_mass(self) -> None:
-        inverse = np.zeros(self.node_count)
-        free = ~self._constrained & (self.masses > 0)
-        inverse[free] = 1.0 / self.masses[free]
-        self.node_inverse_mass.assign(inverse.astype(np.float32))
+    def update_inverse_mass(self) -> None:
+        """Tell the device which nodes are free to move."""
+        masses, inverse = self.masses, np.zeros(self.node_count)
+        free = ~self.held & (masses > 0)
+        inverse[free] = 1.0 / masses[free]
+        self.node_inverse_mass[: self.node_count].assign(inverse.astype(np.float32))
 
     def _stop_following(self, chosen: np.ndarray) -> None:
         """Take nodes out of the trajectories they follow."""

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from os import PathLike
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,12 +17,16 @@ import warp as wp
 from .body import SoftBody
 from .checks import checked_count, checked_things
 from .elasticity import Corotated, Model
-from .errors import InputError, StabilityWarning, UnstableError
+from .errors import CapacityWarning, InputError, StabilityWarning, UnstableError
 from .indices import checked_indices
 from .kernels.integrate import advance_clock
 from .nodal import vec3_view
+from .remesh.online import OnlineRemesh
 from .solvers import Integrator, SymplecticEuler, largest_frequency
 from .solvers.integrator import StepContext
+
+if TYPE_CHECKING:
+    from .remesh.changing import Changing
 
 #: Steps recorded in one graph, so that Python is out of the loop; more where a launch is many steps.
 GRAPH_STEPS = 64
@@ -62,21 +66,25 @@ class Simulation:
         gravity: [m/s^2]; None for 9.81 down the up axis of the first body's mesh.
         deterministic: Whether a run must come out the same bit by bit every time. On the CPU it always does; on CUDA
             forces are then added up in one order, which takes time and memory (``benchmarks/README.md``).
+        remesh: How the bodies' meshes follow their motion; for several bodies also one each, None for those that stay
+            as they are.
 
     Attributes:
         bodies: Tuple of the bodies.
         worlds: Copies of the bodies, the same number for each.
-        dt: Time step [s].
+        dt: Time step [s]; with ``remesh`` and no step given it follows what the finest elements hold.
         stable_dt: Largest linearly stable step at rest [s], estimated; infinite where nothing can vibrate.
         gravity: Tuple [m/s^2].
 
     Raises:
         InputError: No body, one given twice, bodies on different devices or of different numbers of worlds, a number of
             models that is not the number of bodies, a body of which no node is free to move, non-finite gravity, a
-            model that does not go with its mesh, or something that is none of these.
+            model that does not go with its mesh, something that is none of these, or bodies that cannot be remeshed as
+            asked (see ``OnlineRemesh``).
 
     Warns:
         StabilityWarning: The given step is larger than ``stable_dt``.
+        CapacityWarning: A mesh has no room left for what should be refined; once.
     """
 
     def __init__(
@@ -87,6 +95,7 @@ class Simulation:
         integrator: Integrator | None = None,
         gravity: npt.ArrayLike | None = None,
         deterministic: bool = False,
+        remesh: OnlineRemesh | Sequence[OnlineRemesh | None] | None = None,
     ):
         self.bodies = checked_things(bodies, SoftBody, "body", "a SoftBody")
         if not self.bodies:
@@ -112,34 +121,23 @@ class Simulation:
             raise InputError(f"integrator is {integrator!r}; it must be an integrator such as SymplecticEuler()")
         self.gravity = _checked_gravity(gravity, self.bodies[0].mesh.up_axis)
 
+        #: What remeshes each body, None for those that stay as they are.
+        self.changing = self._changing_bodies(remesh)
         bound = zip(self.models, self.bodies, strict=True)
         self.fields = tuple(m.bind(body, deterministic=self.deterministic) for m, body in bound)
-        frequencies = [largest_frequency(body, f) for body, f in zip(self.bodies, self.fields, strict=True)]
-        steps = [2.0 / w if w > 0 else math.inf for w in frequencies]
-        self.stable_dt = min(steps)
-        if self.integrator.dt is not None:
-            self.dt = float(self.integrator.dt)
-            if self.dt > self.stable_dt:
-                warnings.warn(
-                    f"the time step {self.dt:.3g} s is beyond the largest stable one, about {self.stable_dt:.3g} s",
-                    StabilityWarning,
-                    stacklevel=2,
-                )
-        else:
-            safe = min(m.step_safety * dt for m, dt in zip(self.models, steps, strict=True))
-            self.dt = safe if math.isfinite(safe) else 1e-3
-
+        for changing, field in zip(self.changing, self.fields, strict=True):
+            if changing is not None:
+                changing.serve(field)
         self.clock = wp.zeros(1, dtype=wp.int64, device=self.device)
         self._bad_step = wp.array([_NEVER], dtype=wp.int64, device=self.device)
-        context = StepContext(self.dt, wp.vec3(*self.gravity), self.clock, self._bad_step)
-        self._steppers = [
-            self.integrator.bind(body, f, context) for body, f in zip(self.bodies, self.fields, strict=True)
-        ]
+        #: Steps that would have taken as long as the time before the first one of the present length.
+        self._epoch = 0.0
+        self.dt = self._found_step(stacklevel=3)
+        self._bind_steppers()
         self._steps_before_reset = 0
+        self._time_before_reset = 0.0
         self._check_steps = GRAPH_STEPS
         self._hooks: list[_Hook] = []
-        self._graphs: dict[tuple[int, bool], wp.Graph] = {}
-        self._recorded_revisions: tuple[int, ...] = ()
 
     # --- stepping --------------------------------------------------------------------------------------------------
 
@@ -160,24 +158,36 @@ class Simulation:
 
     @property
     def time(self) -> float:
-        """Simulated time [s]."""
-        return self.steps * self.dt
+        """Simulated time [s], since the last ``reset()`` if there was one."""
+        return (self.steps - self._epoch) * self.dt
+
+    @property
+    def total_time(self) -> float:
+        """Simulated time [s], whatever has been reset since."""
+        return self._time_before_reset + self.time
 
     def step(self) -> None:
         """Advance by one time step.
 
         Inside somebody else's capture on this device the step's launches are recorded, nothing else: no hooks are
-        called and nothing is checked. On CUDA the call does not wait for the device unless hooks are set.
+        called and nothing is checked. On CUDA the call does not wait for the device unless hooks are set or a body is
+        due to be remeshed.
 
         Raises:
+            InputError: Somebody is capturing, and there are bodies to be remeshed.
             UnstableError: On the CPU: the state is not finite any more.
         """
         if self.device.is_capturing:
+            if self._passes:
+                raise InputError("a simulation with remesh cannot be recorded by others: launches change with the mesh")
             self._launch_steps(1, whole=True)
             return
         self._run(1, whole=True)
-        if self.device.is_cpu or self._hooks:
+        due = self._passes and self.steps % self._passes == 0
+        if self.device.is_cpu or self._hooks or due:
             self._check_finite()
+            if due:
+                self._remesh()
             self._call_hooks()
 
     def advance(self, seconds: float) -> None:
@@ -191,7 +201,21 @@ class Simulation:
             raise InputError(f"cannot advance by {seconds} s; it must be zero or a positive time")
         if self.device.is_capturing:
             raise InputError("advance cannot be called while its device is capturing; call step, which records")
-        self.advance_steps(round(seconds / self.dt))
+        if self._passes:
+            self.advance_until(self.total_time + seconds)
+        else:
+            self.advance_steps(round(seconds / self.dt))
+
+    def advance_until(self, total_time: float) -> None:
+        """Advance until ``total_time`` [s] is as near as whole steps bring it; as ``advance``."""
+        count = max(round((total_time - self.total_time) / self.dt), 0)
+        if not self._passes:
+            self.advance_steps(count)
+            return
+        # A pass may change the step.
+        while count > 0:
+            self.advance_steps(min(count, self._passes - self.steps % self._passes))
+            count = max(round((total_time - self.total_time) / self.dt), 0)
 
     def advance_steps(self, count: int) -> None:
         """Advance by ``count`` time steps; as ``advance``. Steps that a hook makes count."""
@@ -199,7 +223,8 @@ class Simulation:
         end = self.total_steps + count
         done, left = self.steps, count
         while left > 0:
-            due = min([done + left, done + self._check_steps, *((done // h.every + 1) * h.every for h in self._hooks)])
+            rests = [h.every for h in self._hooks] + ([self._passes] if self._passes else [])
+            due = min([done + left, done + self._check_steps, *((done // every + 1) * every for every in rests)])
             started = time.perf_counter()
             for body in self.bodies:
                 body.adopt_positions()
@@ -207,6 +232,8 @@ class Simulation:
             for body in self.bodies:
                 body.publish_positions()
             self._check_finite()
+            if self._passes and due % self._passes == 0:
+                self._remesh()
             if due - done == self._check_steps:
                 longer = CHECK_SECONDS / (time.perf_counter() - started)
                 self._check_steps = max(int(self._check_steps * min(longer, 4.0)), 1)
@@ -252,12 +279,15 @@ class Simulation:
             mask[slice(None) if worlds is None else checked_indices(worlds, self.worlds, "world")] = 1
             chosen = wp.array(mask, dtype=wp.int32, device=self.device)
         if worlds is None:
-            self._steps_before_reset = self.total_steps
+            self._steps_before_reset, self._time_before_reset = self.total_steps, self.total_time
+            self._epoch = 0.0
             self.clock.zero_()
             self._bad_step.fill_(_NEVER)
         for body, field in zip(self.bodies, self.fields, strict=True):
             body.reset(chosen, self.clock)
             field.reset(chosen)
+        if any(self.changing):
+            self._control_step()
 
     # --- looking ---------------------------------------------------------------------------------------------------
 
@@ -267,7 +297,7 @@ class Simulation:
         for body, field in zip(self.bodies, self.fields, strict=True):
             body.adopt_positions()
             v = body.velocities.numpy().astype(np.float64)
-            u = body.node_displacements.numpy()[:, :3].astype(np.float64)
+            u = body.node_displacements[: body.node_count].numpy()[:, :3].astype(np.float64)
             kinetic += 0.5 * float(body.masses @ np.einsum("ni,ni->n", v, v))
             elastic += field.elastic_energy(body.node_displacements)
             gravitational -= float(body.masses @ ((body.rest_positions + u) @ np.asarray(self.gravity)))
@@ -277,7 +307,8 @@ class Simulation:
         """Elastic nodal forces in the present state [N], vec3 [worlds * N]; of the first body or the one named."""
         chosen = self._index(body)
         self.bodies[chosen].adopt_positions()
-        return vec3_view(self.fields[chosen].elastic_forces(self.bodies[chosen].node_displacements))
+        forces = self.fields[chosen].elastic_forces(self.bodies[chosen].node_displacements)
+        return vec3_view(forces[: self.bodies[chosen].node_count])
 
     def von_mises(self, body: SoftBody | None = None) -> npt.NDArray[np.float32]:
         """Von Mises stress of each element in the present state [Pa], float32 [worlds * T]."""
@@ -313,6 +344,84 @@ class Simulation:
         return load_checkpoint(path, device)
 
     # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _changing_bodies(
+        self, remesh: OnlineRemesh | Sequence[OnlineRemesh | None] | None
+    ) -> tuple[Changing | None, ...]:
+        asked = [remesh] * len(self.bodies) if isinstance(remesh, OnlineRemesh | None) else list(remesh)
+        if len(asked) != len(self.bodies) or not all(isinstance(each, OnlineRemesh | None) for each in asked):
+            raise InputError(
+                f"remesh is {remesh!r}; it must be an OnlineRemesh, or one or None for each of {len(self.bodies)} bodies"
+            )
+        if not any(asked):
+            self._passes = 0
+            return (None,) * len(self.bodies)
+        if self.deterministic and self.device.is_cuda:
+            raise InputError("deterministic runs cannot be remeshed on CUDA: new nodes are numbered as threads come")
+        for each, model in zip(asked, self.models, strict=True):
+            if each is not None:
+                model.check_remeshable()
+        from .remesh.changing import Changing
+
+        self._passes = math.gcd(*(each.every for each in asked if each is not None))
+        return tuple(
+            None if each is None else Changing(body, each) for body, each in zip(self.bodies, asked, strict=True)
+        )
+
+    def _found_step(self, stacklevel: int) -> float:
+        """The time step that was given, or one that is stable; ``stable_dt`` is found anew."""
+        frequencies = [largest_frequency(body, f) for body, f in zip(self.bodies, self.fields, strict=True)]
+        steps = [2.0 / w if w > 0 else math.inf for w in frequencies]
+        self.stable_dt = min(steps)
+        if self.integrator.dt is not None:
+            given = float(self.integrator.dt)
+            if given > self.stable_dt:
+                warnings.warn(
+                    f"the time step {given:.3g} s is beyond the largest stable one, about {self.stable_dt:.3g} s",
+                    StabilityWarning,
+                    stacklevel=stacklevel,
+                )
+            return given
+        safe = min(m.step_safety * dt for m, dt in zip(self.models, steps, strict=True))
+        return safe if math.isfinite(safe) else 1e-3
+
+    def _bind_steppers(self) -> None:
+        context = StepContext(self.dt, wp.vec3(*self.gravity), self.clock, self._bad_step)
+        bound = zip(self.bodies, self.fields, strict=True)
+        self._steppers = [self.integrator.bind(body, field, context) for body, field in bound]
+        self._graphs: dict[tuple[int, bool], wp.Graph] = {}
+        self._recorded_revisions: tuple[int, ...] = ()
+
+    def _remesh(self) -> None:
+        """Let the meshes follow the motion, and the step the meshes."""
+        steps = self.steps
+        due = [c for c in self.changing if c is not None and steps % c.options.every == 0]
+        changed = [c.run() for c in due]
+        for changing in due:
+            if changing.is_full and not changing.said_full:
+                changing.said_full = True
+                warnings.warn(
+                    f"the mesh has no room for more than {changing.options.capacity} elements: it is refined no further",
+                    CapacityWarning,
+                    stacklevel=3,
+                )
+        if any(changed):
+            self._control_step()
+
+    def _control_step(self) -> None:
+        """Find the stable step anew where the stiffest elements are others now."""
+        if not any([c.stiffness_changed() for c in self.changing if c is not None]):
+            return
+        before, self.dt = self.dt, self._found_step(stacklevel=5)
+        if self.dt == before:
+            return
+        # What has been simulated, and how long ago worlds were reset, in steps of the new length.
+        ratio, steps = before / self.dt, self.steps
+        self._epoch = steps - (steps - self._epoch) * ratio
+        for body in self.bodies:
+            starts = body.world_starts.numpy()
+            body.world_starts.assign(steps - (steps - starts) * ratio)
+        self._bind_steppers()
 
     def _index(self, body: SoftBody | None) -> int:
         if body is None:

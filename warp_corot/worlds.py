@@ -37,33 +37,36 @@ class World:
     @property
     def elements(self) -> slice:
         """Where the copy's elements are among the body's."""
-        count = len(self.body.mesh.tets)
+        count = self.body.world_element_count
         return slice(self.index * count, (self.index + 1) * count)
 
     @property
     def positions(self) -> wp.array:
         """As ``SoftBody.positions`` [m], vec3 [N] of one copy."""
-        return self.body.positions[self.nodes]
+        return self._own(self.body.positions)
 
     @property
     def displacements(self) -> wp.array:
         """As ``SoftBody.displacements`` [m], vec3 [N] of one copy: itself a copy, not a view."""
-        return self.body.displacements[self.nodes]
+        return self._own(self.body.displacements)
 
     @property
     def velocities(self) -> wp.array:
         """As ``SoftBody.velocities`` [m/s], vec3 [N] of one copy."""
-        return self.body.velocities[self.nodes]
+        return self._own(self.body.velocities)
 
     @property
     def reactions(self) -> wp.array:
         """As ``SoftBody.reactions`` [N], vec3 [N] of one copy."""
-        return self.body.reactions[self.nodes]
+        return self._own(self.body.reactions)
 
     @property
     def loads(self) -> wp.array:
         """As ``SoftBody.loads`` [N], vec3 [N] of one copy."""
-        return self.body.loads[self.nodes]
+        return self._own(self.body.loads)
+
+    def _own(self, array: wp.array) -> wp.array:
+        return array if self.body.worlds == 1 else array[self.nodes]
 
 
 @dataclass(frozen=True)

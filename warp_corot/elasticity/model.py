@@ -43,7 +43,6 @@ class ForceField(ABC):
         self.body = body
         self.device = body.device
         self.elements = body.elements
-        self.element_count = body.element_count
         #: On the CPU there is one thread, and nothing to settle.
         self.deterministic = deterministic and body.device.is_cuda
         self.slots: Slots | None = None
@@ -76,6 +75,11 @@ class ForceField(ABC):
     @abstractmethod
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
         """Write the von Mises stress of each element [Pa], float32 [T]."""
+
+    @property
+    def element_count(self) -> int:
+        """How many elements launches go through; those beyond the body's do nothing."""
+        return self.body.launch_elements
 
     @property
     def energy_count(self) -> int:
@@ -119,7 +123,7 @@ class ForceField(ABC):
         stress = wp.zeros(self.element_count, dtype=wp.float32, device=self.device)
         with self.state_kept():
             self.write_von_mises(u, stress)
-        return stress.numpy()
+        return stress.numpy()[: self.body.element_count]
 
     def launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

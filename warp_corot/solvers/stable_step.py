@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from ..kernels import lanczos
+from ..nodal import padded
 
 if TYPE_CHECKING:
     from ..body import SoftBody
@@ -26,7 +27,7 @@ def largest_frequency(body: SoftBody, field: ForceField) -> float:
     so that whatever model and elements there are is what is measured. The Ritz value's residual is added to it. Zero if
     no node is free to move.
     """
-    free = int((body.node_inverse_mass.numpy() > 0).sum())
+    free = int((body.node_inverse_mass[: body.node_count].numpy() > 0).sum())
     if not free:
         return 0.0
     iteration = _Lanczos(body, field)
@@ -53,14 +54,13 @@ class _Lanczos:
     def __init__(self, body: SoftBody, field: ForceField):
         self.body = body
         self.field = field
-        self.probe = PROBE * float(np.min(body.mesh.volumes)) ** (1.0 / 3.0)
+        self.probe = PROBE * body.smallest_volume ** (1.0 / 3.0)
         self.q, self.before, self.next, self.u, self.f = (wp.zeros_like(body.node_displacements) for _ in range(5))
         self._sums = wp.zeros(lanczos.PARTIAL_SUMS, dtype=wp.float64, device=body.device)
         self._largest = wp.zeros(lanczos.PARTIAL_SUMS, dtype=wp.float32, device=body.device)
-        start = np.zeros((body.node_count, 4), np.float32)
-        start[:, :3] = np.random.default_rng(0).standard_normal((body.node_count, 3), np.float32)
-        start[body.node_inverse_mass.numpy() == 0] = 0.0
-        self.q.assign(start)
+        start = padded(np.random.default_rng(0).standard_normal((body.node_count, 3), np.float32))
+        start[body.node_inverse_mass[: body.node_count].numpy() == 0] = 0.0
+        self.q[: body.node_count].assign(start)
         self._launch(lanczos.scale_by, [1.0 / np.sqrt(self._inner(self.q, self.q)), self.q])
         self._rest = wp.zeros_like(self.f)
 
@@ -91,5 +91,5 @@ class _Lanczos:
         return float(self._sums.numpy().sum())
 
     def _launch(self, kernel: wp.Kernel, arguments: list, dim: int | None = None) -> None:
-        count = self.body.node_count if dim is None else dim
+        count = self.body.launch_nodes if dim is None else dim
         wp.launch(kernel, dim=count, inputs=arguments, device=self.body.device)

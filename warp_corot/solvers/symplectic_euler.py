@@ -94,7 +94,7 @@ class SymplecticEulerStepper(Stepper):
         self.field.add_forces(body.node_displacements, body.node_forces)
         wp.launch(
             step_symplectic_euler,
-            dim=body.node_count,
+            dim=body.launch_nodes,
             inputs=[
                 context.dt,
                 self.damping,

@@ -1,0 +1,101 @@
+"""What a user asks for: how a mesh is to follow the motion."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..checks import checked_count
+from ..errors import InputError
+from ..mesh import TetForest
+from ..mesh.lattice import MAX_LEVEL
+
+
+@dataclass(frozen=True, eq=False)
+class OnlineRemesh:
+    """Refinement and simplification while a simulation runs; see ``warp_corot.remesh``.
+
+    Every ``every`` steps a pass looks at all elements: an element is bisected where the criterion is above
+    ``refine_above``, and given up with its sibling where both are below ``simplify_below``. Between the two nothing
+    happens. An element is bisected once a pass, and again where its neighbours ask for it.
+
+    Attributes:
+        refine_above, simplify_below: Thresholds in the criterion's unit; the first is the larger one. By default of the
+            elongation of an element's longest edge, deformed over rest (Tagawa et al. 2013).
+        min_level, max_level: Elements of these levels are not simplified and not refined, 0 to 48; three levels halve
+            the edge length. None: the coarsest level of the mesh, and three beyond its finest.
+        every: Steps between passes.
+        capacity: How many elements there may be; None: four times those of the mesh, at least 100,000. When it is
+            reached refinement stops, with one warning, and the simulation goes on.
+        criterion: A Warp function (``@wp.func``) of a ``kernels.remesh_mark.ElementState`` and an array of numbers, in
+            place of the elongation.
+        parameters: Those numbers, float32 [n] on the simulation's device, which may be written to between steps.
+
+    Raises:
+        InputError: Thresholds that cannot both hold, levels out of order or beyond the lattice's depth, a criterion
+            that is no Warp function, or a number of steps or elements that is not positive.
+    """
+
+    refine_above: float = 1.25
+    simplify_below: float = 1.08
+    min_level: int | None = None
+    max_level: int | None = None
+    every: int = 10
+    capacity: int | None = None
+    criterion: Any = None
+    parameters: wp.array | None = None
+
+    def __post_init__(self) -> None:
+        above, below = self.refine_above, self.simplify_below
+        if not (_is_finite(above) and _is_finite(below) and below < above):
+            raise InputError(
+                f"simplify_below is {below} and refine_above {above}; "
+                "the first must be smaller, or a leaf would be refined and simplified at once"
+            )
+        for name in ("min_level", "max_level"):
+            level = getattr(self, name)
+            if level is not None and not _is_level(level):
+                raise InputError(f"{name} is {level!r}; it must be a whole number from 0 to {MAX_LEVEL}")
+        if self.min_level is not None and self.max_level is not None and self.min_level > self.max_level:
+            raise InputError(f"min_level is {self.min_level} and max_level {self.max_level}; the first is the smaller")
+        if self.criterion is not None and not isinstance(self.criterion, wp.Function):
+            raise InputError(
+                f"criterion is {self.criterion!r}; it must be a Warp function (@wp.func) of an ElementState"
+            )
+        checked_count(self.every, "every", least=1)
+        if self.capacity is not None:
+            checked_count(self.capacity, "capacity", least=1)
+        numbers = self.parameters
+        if numbers is not None and not (
+            isinstance(numbers, wp.array) and numbers.dtype == wp.float32 and numbers.ndim == 1
+        ):
+            raise InputError(f"parameters is {numbers!r}; it must be a Warp array of float32, [n]")
+
+    def on(self, mesh: TetForest) -> OnlineRemesh:
+        """The same with numbers in place of what is found from a mesh.
+
+        Raises:
+            InputError: The mesh has more elements than ``capacity``.
+        """
+        levels, count = mesh.levels, len(mesh.tets)
+        low, high = self.min_level, self.max_level
+        if high is None:
+            high = min(max(int(levels.max()) + 3, low or 0), MAX_LEVEL)
+        if low is None:
+            low = min(int(levels.min()), high)
+        capacity = max(4 * count, 100_000) if self.capacity is None else self.capacity
+        if capacity < count:
+            raise InputError(f"capacity is {capacity}; the mesh has {count} elements already")
+        return replace(self, min_level=low, max_level=high, capacity=capacity)
+
+
+def _is_finite(given: Any) -> bool:
+    return isinstance(given, int | float | np.number) and math.isfinite(given)
+
+
+def _is_level(given: Any) -> bool:
+    return isinstance(given, int | np.integer) and not isinstance(given, bool) and bool(0 <= given <= MAX_LEVEL)
