@@ -1,0 +1,161 @@
+"""How the triangles of a surface are wound: against neighbours, inwards or outwards, around a point."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+
+#: About how many corners of a part are looked at to see whether it lies within another.
+CORNERS = 16
+
+
+def walked_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """The three edges of each triangle.
+
+    Returns:
+        A number for each edge [3 T], low * count + high of its two points, whether it is walked from the low one to the
+        high one, bool [3 T], and that count.
+    """
+    edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    count = int(triangles.max()) + 1
+    return edges.min(axis=1) * count + edges.max(axis=1), edges[:, 0] < edges[:, 1], count
+
+
+def net_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Edges that are not walked as often one way as the other: the boundary of the surface.
+
+    Returns:
+        Edges [E, 2], walked the way of the triangles beside them, and how often more, [E].
+    """
+    keys, forward, count = walked_edges(triangles)
+    unique, place = np.unique(keys, return_inverse=True)
+    net = np.bincount(place.ravel(), weights=np.where(forward, 1, -1)).astype(np.int64)
+    found = net != 0
+    low, high = unique[found] // count, unique[found] % count
+    turned = net[found] < 0
+    return np.stack([np.where(turned, high, low), np.where(turned, low, high)], axis=1), np.abs(net[found])
+
+
+def edge_pairs(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs of triangles that share an edge, chained where more than two do.
+
+    Returns:
+        ``pairs`` [P, 2], ``against`` bool [P] (both walk the edge the same way: one must be turned), ``alone`` bool [P]
+        (no third shares the edge).
+    """
+    keys, forward, _ = walked_edges(triangles)
+    order = np.argsort(keys, kind="stable")
+    ordered = keys[order]
+    same = np.flatnonzero(ordered[1:] == ordered[:-1])
+    sharers = np.unique(ordered, return_inverse=True, return_counts=True)
+    alone = sharers[2][sharers[1].ravel()[same]] == 2
+    a, b = order[same], order[same + 1]
+    return np.stack([a // 3, b // 3], axis=1), forward[a] == forward[b], alone
+
+
+def edge_parts(triangles: np.ndarray) -> np.ndarray:
+    """Which connected part each triangle belongs to; those that share an edge are connected."""
+    a, b = edge_pairs(triangles)[0].T
+    return linked(a, b, len(triangles))[1]
+
+
+def linked(a: np.ndarray, b: np.ndarray, count: int) -> tuple[int, np.ndarray]:
+    """Groups of things, of ``count`` in all, that hang together by links a[i]-b[i]: how many, and which each is in."""
+    return connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(count, count)), directed=False)
+
+
+def wind_alike(triangles: np.ndarray) -> tuple[np.ndarray, int]:
+    """Turn triangles that walk an edge the same way as the neighbour across it; how many (the fewer of each part).
+
+    Edges of three or more triangles bind nothing. On a surface with one side only, some edges stay as they are.
+    """
+    pairs, against, alone = edge_pairs(triangles)
+    if not (against & alone).any():
+        return triangles, 0
+    (a, b), against = pairs[alone].T, against[alone]
+    count = len(triangles)
+    parts = linked(a, b, count)[1]
+    # One node more, tied to one triangle of each part, makes a single search of all parts.
+    heads = np.unique(parts, return_index=True)[1]
+    rows, columns = np.append(a, np.full(len(heads), count)), np.append(b, heads)
+    links = coo_array((np.ones(len(rows)), (rows, columns)), shape=(count + 1, count + 1)).tocsr()
+    order, parent = breadth_first_order(links, count, directed=False)
+    keys = np.minimum(a, b) * (count + 1) + np.maximum(a, b)
+    sort = np.argsort(keys)
+    here, above = order[1:], parent[order[1:]]
+    wanted = np.minimum(here, above) * (count + 1) + np.maximum(here, above)
+    found = sort[np.minimum(np.searchsorted(keys[sort], wanted), len(keys) - 1)]
+    differs = np.zeros(count + 1, bool)
+    differs[here] = against[found] & (above != count)
+    turned = _along(order, parent, differs)[:count]
+    majority = np.bincount(parts, weights=np.where(turned, 1, -1))[parts] > 0
+    turned ^= majority
+    triangles = np.where(turned[:, None], triangles[:, ::-1], triangles)
+    return triangles, int(turned.sum())
+
+
+def _along(order: np.ndarray, parent: np.ndarray, differs: np.ndarray) -> np.ndarray:
+    """Parity of the differences on the way from the root of a tree, by doubling the step up."""
+    up = np.where(np.arange(len(parent)) == order[0], order[0], parent)
+    parity = differs.copy()
+    while True:
+        further = parity ^ parity[up]
+        if (up == order[0]).all():
+            return parity
+        parity, up = further, up[up]
+
+
+def wind_outwards(points: np.ndarray, triangles: np.ndarray, parts: np.ndarray) -> tuple[np.ndarray, int, int]:
+    """Turn what is inside out; how many parts were, and how many are cavities: wound inwards, within another part."""
+    volumes = part_volumes(points, triangles, parts)
+    flip = np.zeros(len(volumes), bool)
+    if volumes.sum() < 0.0:
+        flip[:] = True
+    inward = np.flatnonzero(volumes * np.where(flip, -1.0, 1.0) < 0.0)
+    groups = Parts(points, triangles, parts)
+    cavities = 0
+    for part in inward:
+        if groups.is_within_others(int(part)):
+            cavities += 1
+        else:
+            flip[part] = not flip[part]
+    turned = flip[parts]
+    return np.where(turned[:, None], triangles[:, ::-1], triangles), int(flip.sum()), cavities
+
+
+class Parts:
+    """Closed parts, each with its triangles and its box."""
+
+    def __init__(self, points: np.ndarray, triangles: np.ndarray, parts: np.ndarray):
+        order = np.argsort(parts, kind="stable")
+        starts = np.flatnonzero(np.diff(parts[order], prepend=-1))
+        self.corners = points[triangles[order]]
+        self.slices = [slice(a, b) for a, b in zip(starts, [*starts[1:], len(order)], strict=True)]
+        self.lows = np.minimum.reduceat(self.corners.min(axis=1), starts, axis=0)
+        self.highs = np.maximum.reduceat(self.corners.max(axis=1), starts, axis=0)
+
+    def is_within_others(self, part: int) -> bool:
+        """Whether some corners of a part, spread over it, all lie within other parts."""
+        own = self.corners[self.slices[part], 0]
+        return all(self._holds(corner, part) for corner in own[:: max(1, len(own) // CORNERS)])
+
+    def _holds(self, at: np.ndarray, but: int) -> bool:
+        """Whether some part but one holds a point."""
+        near = np.flatnonzero(((self.lows <= at) & (at <= self.highs)).all(axis=1))
+        return any(abs(winding_number(self.corners[self.slices[part]], at)) > 0.5 for part in near if part != but)
+
+
+def part_volumes(points: np.ndarray, triangles: np.ndarray, parts: np.ndarray) -> np.ndarray:
+    """Signed volume that each closed part encloses, positive where it is wound outwards."""
+    a, b, c = (points - points.mean(axis=0))[triangles].transpose(1, 0, 2)
+    return np.bincount(parts, weights=np.einsum("ij,ij->i", a, np.cross(b, c))) / 6.0
+
+
+def winding_number(corners: np.ndarray, at: np.ndarray) -> float:
+    """Winding number of triangles [T, 3, 3] around a point, by solid angles (Van Oosterom and Strackee 1983)."""
+    a, b, c = (corners - at).transpose(1, 0, 2)
+    x, y, z = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    dot = np.einsum
+    below = x * y * z + dot("ij,ij->i", a, b) * z + dot("ij,ij->i", b, c) * x + dot("ij,ij->i", c, a) * y
+    return float(np.arctan2(dot("ij,ij->i", a, np.cross(b, c)), below).sum()) / (2.0 * np.pi)
