@@ -27,9 +27,7 @@ vec9 = wp.types.vector(length=9, dtype=wp.float32)
 #: det(tr(S) I - S) / |S|^3 below which a law turns isotropic: 1.54 at rest, 0.4 flattened to 16 % in two directions, as
 #: fibres are that stretch 3.4 times, or inverted to -0.22 in one. With less, the transition is so steep that crushed
 #: bodies gain energy in explicit steps.
-INDEFINITE = 0.4
-
-THRESHOLD = wp.constant(INDEFINITE)
+INDEFINITE = wp.constant(0.4)
 
 
 @wp.struct
@@ -72,19 +70,29 @@ def orthotropic_stress(strain: wp.mat33, c: vec9):
 
 
 @wp.func
-def definite_share(s: wp.mat33, adjugate: wp.mat33, det: float):
-    """b, and its derivative with respect to S; S of order one, adjugate and determinant of tr(S) I - S."""
+def definiteness(strain: wp.mat33):
+    """How definite the rotation is, of S scaled to order one, so that nothing is out of range.
+
+    Returns:
+        b, its derivative with respect to the scaled S, the scale, and adjugate and determinant of tr(S) I - S.
+    """
+    s = strain + identity3()
+    scale = 1.0 / wp.max(largest_entry(s), 1.0e-30)
+    s = s * scale
+    h = wp.trace(s) * identity3() - s
+    adjugate = cofactor(h)
+    det = wp.dot(column(h, 0), column(adjugate, 0))
     n2 = wp.max(wp.ddot(s, s), 1.0e-12)
     n3 = n2 * wp.sqrt(n2)
     x = det / n3
     share = float(1.0)
     slope = wp.mat33()
-    if x < THRESHOLD:
-        y = wp.clamp(x / THRESHOLD, 0.0, 1.0)
+    if x < INDEFINITE:
+        y = wp.clamp(x / INDEFINITE, 0.0, 1.0)
         share = y * y * (3.0 - 2.0 * y)
         of_x = (wp.trace(adjugate) * identity3() - adjugate) / n3 - (3.0 * x / n2) * s
-        slope = (6.0 * y * (1.0 - y) / THRESHOLD) * of_x
-    return share, slope
+        slope = (6.0 * y * (1.0 - y) / INDEFINITE) * of_x
+    return share, slope, scale, adjugate, det
 
 
 @wp.func
@@ -92,15 +100,8 @@ def turned_stress(strain: wp.mat33, material: OrthotropicMaterial, t: int):
     """R^T P: its symmetric part and the axial vector of the other one."""
     i = t * material.stride
     stress = orthotropic_stress(strain, material.stiffness[i])
-    # Scaled to order one, so that nothing is out of range.
-    s = strain + identity3()
-    scale = 1.0 / wp.max(largest_entry(s), 1.0e-30)
-    s = s * scale
+    share, slope, scale, adjugate, det = definiteness(strain)
     e = strain * scale
-    h = wp.trace(s) * identity3() - s
-    adjugate = cofactor(h)
-    det = wp.dot(column(h, 0), column(adjugate, 0))
-    share, slope = definite_share(s, adjugate, det)
     turning = stress
     if share < 1.0:
         isotropic = hooke(strain, material.mu[i], material.lam[i])
@@ -116,11 +117,7 @@ def turned_stress(strain: wp.mat33, material: OrthotropicMaterial, t: int):
 def energy_density(strain: wp.mat33, material: OrthotropicMaterial, t: int):
     i = t * material.stride
     stress = orthotropic_stress(strain, material.stiffness[i])
-    s = strain + identity3()
-    s = s / wp.max(largest_entry(s), 1.0e-30)
-    h = wp.trace(s) * identity3() - s
-    adjugate = cofactor(h)
-    share, _slope = definite_share(s, adjugate, wp.dot(column(h, 0), column(adjugate, 0)))
+    share, _slope, _scale, _adjugate, _det = definiteness(strain)
     if share < 1.0:
         isotropic = hooke(strain, material.mu[i], material.lam[i])
         stress = isotropic + share * (stress - isotropic)
@@ -231,32 +228,3 @@ def anisotropic_von_mises(Elements: Any, rotation: wp.Function) -> wp.Kernel:
         equivalent[t] = von_mises(stress)
 
     return anisotropic_von_mises
-
-
-@wp.kernel(enable_backward=False)
-def follow_activation(
-    # In
-    elements: wp.array[wp.int32],
-    times: wp.array[wp.float64],
-    stress: wp.array2d[wp.float32],
-    dt: float,
-    clock: wp.array[wp.int64],
-    world_starts: wp.array[wp.int64],
-    world_element_count: int,
-    offset: int,
-    # Out
-    activation: wp.array[wp.float32],
-):
-    """Active stress by its keyframes at the beginning of a step, ``offset`` steps after the clock's last count."""
-    k = wp.tid()
-    t = elements[k]
-    start = world_starts[t // world_element_count]
-    now = wp.float64(clock[0] + wp.int64(offset) - start) * wp.float64(dt)
-    last = times.shape[0] - 1
-    key = int(0)
-    while key < last - 1 and times[key + 1] <= now:
-        key += 1
-    s = wp.clamp((now - times[key]) / (times[key + 1] - times[key]), wp.float64(0.0), wp.float64(1.0))
-    row = wp.min(k, stress.shape[1] - 1)
-    a = stress[key, row]
-    activation[t] = a + float(s) * (stress[key + 1, row] - a)

@@ -11,38 +11,28 @@ from typing import Any
 import warp as wp
 
 from .anisotropic import INDEFINITE, OrthotropicMaterial, axes_of, element_forces, filled
-from .elements import GeneralElements, frame, gradient_of, rest_volume
-from .general_cpu import ADD_FORCES
+from .elements import GeneralElements, frame, rest_volume
+from .general_cpu import ADD_FORCES, gather_elements, rest_inverse_of
 from .lanes import COMPILER_FLAGS, NEWTON, PRELUDE, on_cpu
 from .rotation import ITERATIONS, byers_xu
 
 wp.set_module_options({"enable_backward": False})
 
-_FORCES = f"""{PRELUDE}{NEWTON}
-    lanes8 d[9], b[9], m[9], k[9], volume, active = spread(0.0f);
-    const int first_element = 8 * block;
-    for (int lane = 0; lane < 8; ++lane) {{
-        const int t = wp::min(first_element + lane, count - 1);
-        const wp::vec_t<4, wp::int32> node = elements.nodes.data[t];
-        const wp::vec_t<4, wp::float32> origin = u.data[node[0]];
-        for (int n = 0; n < 3; ++n) {{
-            const wp::vec_t<4, wp::float32>& a = u.data[node[n + 1]];
-            for (int axis = 0; axis < 3; ++axis) d[3 * n + axis][lane] = a[axis] - origin[axis];
-        }}
-        const wp::mat_t<3, 3, wp::float32>& inverse = elements.rest_inverse.data[t];
+_GATHER = gather_elements("""
         const wp::mat_t<3, 3, wp::float32>& axes = material.axes.data[material.axes_stride * t];
         const wp::vec_t<9, wp::float32>& stiffness = material.stiffness.data[material.stride * t];
-        for (int i = 0; i < 9; ++i) {{
-            b[i][lane] = inverse.data[i / 3][i % 3];
+        for (int i = 0; i < 9; ++i) {
             m[i][lane] = axes.data[i / 3][i % 3];
             k[i][lane] = stiffness[i];
-        }}
-        volume[lane] = elements.volume.data[t];
+        }
         if (is_active) active[lane] = activation.data[t];
-    }}
+""")
+
+_FORCES = f"""{PRELUDE}{NEWTON}
+    lanes8 m[9], k[9], active = spread(0.0f);
+{_GATHER}
     // Columns of F M and of its rotation.
     triple c[3], r[3];
-    const triple d1 = get(d, 0), d2 = get(d, 1), d3 = get(d, 2);
     for (int j = 0; j < 3; ++j) {{
         const triple axis = {{m[j], m[3 + j], m[6 + j]}};
         c[j] = plus(plus(axis, scaled(b[j], d1)), plus(scaled(b[3 + j], d2), scaled(b[6 + j], d3)));
@@ -130,15 +120,7 @@ def turn_elements(Elements: Any) -> wp.Kernel:
         volume: wp.array[wp.float32],
     ):
         t = wp.tid()
-        turn = wp.transpose(frame(elements, t)) * axes_of(material, t)
-        # (du/dX) M is linear in the displacements of the last three nodes; they enter by their rows, one at a time.
-        o = wp.vec3(0.0, 0.0, 0.0)
-        x = wp.vec3(1.0, 0.0, 0.0)
-        rows = wp.mat33()
-        rows[0] = (gradient_of(elements, t, o, x, o, o) * turn)[0]
-        rows[1] = (gradient_of(elements, t, o, o, x, o) * turn)[0]
-        rows[2] = (gradient_of(elements, t, o, o, o, x) * turn)[0]
-        rest_inverse[t] = rows
+        rest_inverse[t] = rest_inverse_of(elements, t, wp.transpose(frame(elements, t)) * axes_of(material, t))
         volume[t] = filled(material, t) * rest_volume(elements, t)
 
     return turn_elements

@@ -5,6 +5,8 @@ General tetrahedra, and those of a forest that are in no complete subtree, for w
 An element that the unscaled iteration does not turn adds nothing and is flagged; ``repair_elements`` does those.
 """
 
+from typing import Any
+
 import warp as wp
 
 from .constitutive import corotated_strain, hooke
@@ -21,6 +23,30 @@ from .lanes import COMPILER_FLAGS, NEWTON, PRELUDE, on_cpu
 from .rotation import ITERATIONS, byers_xu
 
 wp.set_module_options({"enable_backward": False})
+
+
+def gather_elements(reads: str) -> str:
+    """Fill the lanes with eight elements, the last one again where there are no more: displacements d of the last three
+    nodes from the first, rest matrices b and volumes, and what ``reads`` reads of element t into ``lane``."""
+    return f"""
+    lanes8 d[9], b[9], volume;
+    const int first_element = 8 * block;
+    for (int lane = 0; lane < 8; ++lane) {{
+        const int t = wp::min(first_element + lane, count - 1);
+        const wp::vec_t<4, wp::int32> node = elements.nodes.data[t];
+        const wp::vec_t<4, wp::float32> origin = u.data[node[0]];
+        for (int n = 0; n < 3; ++n) {{
+            const wp::vec_t<4, wp::float32>& a = u.data[node[n + 1]];
+            for (int axis = 0; axis < 3; ++axis) d[3 * n + axis][lane] = a[axis] - origin[axis];
+        }}
+        {reads}
+        const wp::mat_t<3, 3, wp::float32>& inverse = elements.rest_inverse.data[t];
+        for (int i = 0; i < 9; ++i) b[i][lane] = inverse.data[i / 3][i % 3];
+        volume[lane] = elements.volume.data[t];
+    }}
+    const triple d1 = get(d, 0), d2 = get(d, 1), d3 = get(d, 2);
+"""
+
 
 #: Adds the forces of eight elements from their stresses p times -V, columns, and flags those that are not ``trusted``.
 ADD_FORCES = """
@@ -46,26 +72,13 @@ ADD_FORCES = """
     }
 """
 
+_GATHER = gather_elements("m[lane] = mu.data[stride * t]; k[lane] = lam.data[stride * t];")
+
 _FORCES = f"""{PRELUDE}{NEWTON}
-    lanes8 d[9], b[9], volume, m, k;
-    const int first_element = 8 * block;
-    for (int lane = 0; lane < 8; ++lane) {{
-        const int t = wp::min(first_element + lane, count - 1);
-        const wp::vec_t<4, wp::int32> node = elements.nodes.data[t];
-        const wp::vec_t<4, wp::float32> origin = u.data[node[0]];
-        for (int n = 0; n < 3; ++n) {{
-            const wp::vec_t<4, wp::float32>& a = u.data[node[n + 1]];
-            for (int axis = 0; axis < 3; ++axis) d[3 * n + axis][lane] = a[axis] - origin[axis];
-        }}
-        const wp::mat_t<3, 3, wp::float32>& inverse = elements.rest_inverse.data[t];
-        for (int i = 0; i < 9; ++i) b[i][lane] = inverse.data[i / 3][i % 3];
-        volume[lane] = elements.volume.data[t];
-        m[lane] = mu.data[stride * t];
-        k[lane] = lam.data[stride * t];
-    }}
+    lanes8 m, k;
+{_GATHER}
     // Columns of F = I + (d1 d2 d3) B.
     triple c[3], z[3];
-    const triple d1 = get(d, 0), d2 = get(d, 1), d3 = get(d, 2);
     for (int j = 0; j < 3; ++j) c[j] = plus(scaled(b[j], d1), plus(scaled(b[3 + j], d2), scaled(b[6 + j], d3)));
     c[0].x += 1.0f; c[1].y += 1.0f; c[2].z += 1.0f;
     const masks8 trusted = newton(c[0], c[1], c[2], spread(1.0f), z);
@@ -96,10 +109,10 @@ def eight_elements(
 def scatter_elements(
     # In
     elements: GeneralElements,
-    count: int,
     mu: wp.array[wp.float32],
     lam: wp.array[wp.float32],
     stride: int,
+    count: int,
     u: wp.array[wp.vec4],
     # Out
     f: wp.array[wp.vec4],
@@ -131,6 +144,19 @@ def repair_elements(
     scatter_stress(elements, t, r * hooke(corotated_strain(g, q, r), mu[t * stride], lam[t * stride]), f)
 
 
+@wp.func
+def rest_inverse_of(elements: Any, t: int, turn: wp.mat33):
+    """B [3, 3] with G turn = (d1 d2 d3) B, where d are the displacements of the last three nodes from the first."""
+    # Linear in them: they enter by their rows, one at a time.
+    o = wp.vec3(0.0, 0.0, 0.0)
+    x = wp.vec3(1.0, 0.0, 0.0)
+    rows = wp.mat33()
+    rows[0] = (gradient_of(elements, t, o, x, o, o) * turn)[0]
+    rows[1] = (gradient_of(elements, t, o, o, x, o) * turn)[0]
+    rows[2] = (gradient_of(elements, t, o, o, o, x) * turn)[0]
+    return rows
+
+
 @wp.kernel(enable_backward=False)
 def rest_matrices(
     # In
@@ -141,13 +167,5 @@ def rest_matrices(
 ):
     """What general elements keep, of elements of a forest."""
     t = wp.tid()
-    turn = wp.transpose(frame(elements, t))
-    # du/dX is linear in the displacements of the last three nodes; they enter by their rows, one at a time.
-    o = wp.vec3(0.0, 0.0, 0.0)
-    x = wp.vec3(1.0, 0.0, 0.0)
-    rows = wp.mat33()
-    rows[0] = (gradient_of(elements, t, o, x, o, o) * turn)[0]
-    rows[1] = (gradient_of(elements, t, o, o, x, o) * turn)[0]
-    rows[2] = (gradient_of(elements, t, o, o, o, x) * turn)[0]
-    rest_inverse[t] = rows
+    rest_inverse[t] = rest_inverse_of(elements, t, wp.transpose(frame(elements, t)))
     volume[t] = rest_volume(elements, t)

@@ -10,17 +10,16 @@ import warp as wp
 
 from ..anisotropy import Anisotropic
 from ..checks import check_float32
+from ..kernels.activation import follow_activation
 from ..kernels.anisotropic import (
     OrthotropicMaterial,
     anisotropic_energies,
     anisotropic_von_mises,
-    follow_activation,
     scatter_anisotropic,
     vec9,
 )
 from ..kernels.anisotropic_cpu import repair_anisotropic, scatter_anisotropic_lanes, turn_elements
-from ..kernels.elements import GeneralElements
-from ..kernels.lanes import LANES
+from .lanes import Lanes, as_general
 from .model import ForceField, leaf_slots
 
 if TYPE_CHECKING:
@@ -83,25 +82,14 @@ class AnisotropicLanesField(AnisotropicField):
 
     def __init__(self, body: SoftBody, rotation: wp.Function, deterministic: bool):
         super().__init__(body, rotation, deterministic)
-        self._repair = repair_anisotropic(body.element_kind)
-        self._turned = self._turned_elements()
-        self._flagged = wp.zeros(self.element_count, dtype=wp.uint8, device=self.device)
+        kind = body.element_kind
+        # Their rest matrices turned into the material's axes.
+        general = as_general(self.elements, turn_elements(kind), [self.elements, self.material])
+        repair = repair_anisotropic(kind)
+        self._lanes = Lanes(self.elements, general, scatter=scatter_anisotropic_lanes, repair=repair)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        material, count = [self.material, *self._activation], self.element_count
-        inputs = [self._turned, *material, count, u]
-        self.launch(scatter_anisotropic_lanes, -(-count // LANES), inputs, [f, self._flagged])
-        self.launch(self._repair, count, [self._flagged, self.elements, *material, u], [f])
-
-    def _turned_elements(self) -> GeneralElements:
-        """All elements as general ones, their rest matrix' inverse times the material's axes."""
-        count, elements = self.element_count, GeneralElements()
-        elements.nodes = elements.targets = self.elements.nodes
-        elements.rest_inverse = wp.empty(count, dtype=wp.mat33, device=self.device)
-        elements.volume = wp.empty(count, dtype=wp.float32, device=self.device)
-        outputs = [elements.rest_inverse, elements.volume]
-        self.launch(turn_elements(self.body.element_kind), count, [self.elements, self.material], outputs)
-        return elements
+        self._lanes.scatter_forces([self.material, *self._activation], u, f)
 
 
 def device_material(body: SoftBody) -> OrthotropicMaterial:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from ..elasticity.corotated import SubtreeField
+from ..elasticity.subtree_field import SubtreeField
 from ..kernels import block
 from ..mesh import TetForest
 from ..plan import Batch, ForcePlan, Sharing

@@ -1,0 +1,154 @@
+"""Force fields of the corotated model that go element by element."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ..elements import forest_elements, in_worlds
+from ..kernels.corotated import (
+    corotated_energies,
+    corotated_von_mises,
+    extract_rotations,
+    extract_warm_rotations,
+    reset_quaternions,
+    scatter_matrix_product,
+    scatter_own_rotation,
+    scatter_with_rotations,
+)
+from ..kernels.general_cpu import repair_elements, scatter_elements
+from ..mesh import TetForest
+from .lanes import Lanes
+from .model import ForceField, leaf_slots
+
+if TYPE_CHECKING:
+    from ..body import SoftBody
+    from .corotated import Corotated
+
+
+@dataclass(frozen=True)
+class Rotations:
+    """Rotations of elements or their ancestors, and who uses which.
+
+    Attributes:
+        units: Whose rotations are found, as elements.
+        count: How many.
+        rotations: mat33 [count].
+        unit: Which of them each element of the mesh uses, int32 [T].
+    """
+
+    units: Any
+    count: int
+    rotations: wp.array
+    unit: wp.array
+
+
+class CorotatedField(ForceField):
+    """Rotations and forces as one kernel where each element uses its own, as two stages otherwise."""
+
+    def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
+        super().__init__(body, deterministic)
+        self.model = model
+        kind = body.element_kind
+        self._shared: Rotations | None = None
+        self._fused = model.rotation_level is None and model.rotation != "warm" and model.stiffness == "factored"
+        self._state: dict[str, wp.array] = {}
+        if model.rotation == "warm":
+            self._state["quaternions"] = wp.empty(self.unit_count, dtype=wp.quat, device=self.device)
+            self.reset(wp.ones(body.worlds, dtype=wp.int32, device=self.device))
+            self._extract = extract_warm_rotations(kind)
+        else:
+            self._extract = extract_rotations(kind, model.own_rotation)
+            self._own = scatter_own_rotation(kind, model.own_rotation)
+        if model.stiffness == "factored":
+            self._forces = scatter_with_rotations(kind)
+        else:
+            self._forces = scatter_matrix_product(model.stiffness == "sparse")
+        self._energies = corotated_energies(kind)
+        self._von_mises = corotated_von_mises(kind)
+        if not self._fused:
+            self._sharing()
+
+    @property
+    def state(self) -> dict[str, wp.array]:
+        return self._state
+
+    def reset(self, chosen: wp.array) -> None:
+        for quaternions in self._state.values():
+            in_world = len(quaternions) // self.body.worlds
+            self.launch(reset_quaternions, len(quaternions), [chosen, in_world], [quaternions])
+
+    @property
+    def unit_count(self) -> int:
+        """How many rotations are found."""
+        return self._sharing().count
+
+    def extract_rotations(self, u: wp.array) -> wp.array:
+        """The rotation of every unit, mat33 [units]."""
+        shared = self._sharing()
+        self.launch(self._extract, shared.count, [shared.units, u], [*self.state.values(), shared.rotations])
+        return shared.rotations
+
+    def add_rotated_forces(self, u: wp.array, f: wp.array) -> None:
+        """Forces with the rotations that were extracted last."""
+        self._launch_with_rotations(self._forces, self.material_inputs, u, f)
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        if self._fused:
+            self.launch(self._own, self.element_count, [self.elements, *self.material_inputs, u], [f])
+        else:
+            self.extract_rotations(u)
+            self.add_rotated_forces(u, f)
+
+    def write_energies(self, u: wp.array, energies: wp.array) -> None:
+        self.extract_rotations(u)
+        self._launch_with_rotations(self._energies, self.material_inputs, u, energies)
+
+    def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
+        self.extract_rotations(u)
+        self._launch_with_rotations(self._von_mises, self.stress_inputs, u, stress)
+
+    def _sharing(self) -> Rotations:
+        """Who uses whose rotation; made on first use, since own rotations need none of it for their forces."""
+        if self._shared is None:
+            body, mesh, level = self.body, self.body.mesh, self.model.rotation_level
+            units, unit = self.elements, np.arange(len(mesh.tets))
+            count = len(mesh.tets)
+            if isinstance(mesh, TetForest) and level is not None:
+                ancestors, unit = np.unique(mesh.ancestors(level), return_inverse=True)
+                units, count = forest_elements(mesh, ancestors, self.device, body.worlds), len(ancestors)
+            self._shared = Rotations(
+                units,
+                body.worlds * count,
+                wp.empty(body.worlds * count, dtype=wp.mat33, device=self.device),
+                wp.array(in_worlds(unit.ravel(), body.worlds, count), dtype=wp.int32, device=self.device),
+            )
+        return self._shared
+
+    def _launch_with_rotations(self, kernel: wp.Kernel, material: list, u: wp.array, output: wp.array) -> None:
+        shared = self._sharing()
+        inputs = [self.elements, *material, u, shared.rotations, shared.unit]
+        self.launch(kernel, self.element_count, inputs, [output])
+
+
+class LeafField(CorotatedField):
+    """Leaf by leaf."""
+
+    def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
+        super().__init__(body, model, deterministic)
+        if self.deterministic:
+            self.slots, self.elements = leaf_slots(body)
+
+
+class LanesField(CorotatedField):
+    """General elements on the CPU."""
+
+    def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
+        super().__init__(body, model, deterministic)
+        self._lanes = Lanes(self.elements, self.elements, scatter=scatter_elements, repair=repair_elements)
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        self._lanes.scatter_forces(self.material_inputs, u, f)

@@ -1,0 +1,47 @@
+"""Elements on the CPU, eight at a time in the lanes of its vector registers; see ``kernels.lanes``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from ..kernels.elements import GeneralElements
+from ..kernels.lanes import LANES
+
+
+class Lanes:
+    """Two launches that add the forces of elements: eight at a time, then one by one those that were left out.
+
+    Args:
+        elements: The elements, of either kind.
+        general: The same as general ones.
+        scatter: Kernel that goes through the general ones eight at a time and flags those that it leaves out.
+        repair: Kernel that does the flagged ones among ``elements``.
+    """
+
+    def __init__(self, elements: Any, general: GeneralElements, *, scatter: wp.Kernel, repair: wp.Kernel):
+        self.count = len(elements.nodes)
+        self._elements = elements
+        self._general = general
+        self._scatter = scatter
+        self._repair = repair
+        # Bytes one by one: looking at eight in one go was slower.
+        self._flagged = wp.zeros(self.count, dtype=wp.uint8, device="cpu")
+
+    def scatter_forces(self, material: list, u: wp.array, f: wp.array) -> None:
+        """Add the forces of displacements u to f, both vec4 [N]; ``material`` are kernel arguments."""
+        inputs = [self._general, *material, self.count, u]
+        wp.launch(self._scatter, -(-self.count // LANES), inputs, [f, self._flagged], device="cpu")
+        inputs = [self._flagged, self._elements, *material, u]
+        wp.launch(self._repair, self.count, inputs, [f], device="cpu")
+
+
+def as_general(elements: Any, kernel: wp.Kernel, inputs: list) -> GeneralElements:
+    """Elements of either kind as general ones; ``kernel`` finds their rest matrices and volumes from ``inputs``."""
+    count, general = len(elements.nodes), GeneralElements()
+    general.nodes = general.targets = elements.nodes
+    general.rest_inverse = wp.empty(count, dtype=wp.mat33, device="cpu")
+    general.volume = wp.empty(count, dtype=wp.float32, device="cpu")
+    wp.launch(kernel, count, inputs, [general.rest_inverse, general.volume], device="cpu")
+    return general
