@@ -1,14 +1,19 @@
 """``warp-corot simulate`` of surfaces and scans."""
 
+import os
+import sys
+
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 from command_line import SHORT, simulate
 from input_files import write_scan, write_surface
 from pxr import Usd, UsdGeom
 from stages import SURFACE, TETS, drawn, prims
 
 import warp_corot as wc
+import warp_corot.cli.simulate as command
 from warp_corot.domain import Domain
 
 
@@ -139,3 +144,20 @@ def test_unlikely_units_are_warned_of(folder, capsys):
     out, err = capsys.readouterr()
     assert "warning" not in err
     assert "bounds 150 mm x 150 mm x 150 mm" in out
+
+
+def test_compiling_is_said_once_for_mesh_and_body(folder, capsys, monkeypatch):
+    """Python tells of folders made in Warp's cache (PEP 578): here one before the mesh, one before the body."""
+
+    def compiled_before(function):
+        def compiled(*args):
+            sys.audit("os.mkdir", os.path.join(wp.config.kernel_cache_dir, "module"), 511, -1)
+            return function(*args)
+
+        return compiled
+
+    for name in ("find_organ", "_make_body"):
+        monkeypatch.setattr(command, name, compiled_before(getattr(command, name)))
+    write_surface(folder / "organ.glb", False)
+    assert simulate("organ.glb", "-o", "a.usd", "--tets", 500, *SHORT) == 0
+    assert capsys.readouterr().err.count("compiling kernels for cpu, once") == 1

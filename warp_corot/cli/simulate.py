@@ -56,12 +56,11 @@ def run(args: argparse.Namespace) -> int:
     refuse_options(args, kind)
     with compiling_said(device):
         subject = find_subject(args.input, args.scale) if kind == "tets" else find_organ(args, kind)
-    if subject.source and args.output.exists() and args.output.samefile(subject.source):
-        raise InputError(f"{args.output}: is the input, should be another file")
-    duration = subject.duration if args.duration is None else args.duration
-    count = frame_count(duration, args.fps)
-    started = time.perf_counter()
-    with compiling_said(device):
+        if subject.source and args.output.exists() and args.output.samefile(subject.source):
+            raise InputError(f"{args.output}: is the input, should be another file")
+        duration = subject.duration if args.duration is None else args.duration
+        count = frame_count(duration, args.fps)
+        started = time.perf_counter()
         body, fixed = _make_body(args, subject)
         sim = _make_simulation(args, subject, body, model)
     subject.times["body"] = time.perf_counter() - started
