@@ -13,7 +13,7 @@ def follow_activation(
     stress: wp.array2d[wp.float32],
     dt: float,
     clock: wp.array[wp.int64],
-    world_starts: wp.array[wp.int64],
+    world_starts: wp.array[wp.float64],
     world_element_count: int,
     offset: int,
     # Out
@@ -23,7 +23,7 @@ def follow_activation(
     k = wp.tid()
     t = elements[k]
     start = world_starts[t // world_element_count]
-    now = wp.float64(clock[0] + wp.int64(offset) - start) * wp.float64(dt)
+    now = (wp.float64(clock[0] + wp.int64(offset)) - start) * wp.float64(dt)
     last = times.shape[0] - 1
     key = int(0)
     while key < last - 1 and times[key + 1] <= now:

@@ -1,0 +1,121 @@
+"""Keyframed nodes of a changing mesh: which keyframes each follows, and what new nodes between them follow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from ..trajectory import Trajectory
+
+#: What ``Carried.row`` says of nodes that follow no keyframes, and of new ones between nodes that follow different ones.
+NONE = -1
+BETWEEN = -2
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """Keyframes of one node: times [s], [K], and displacements [m], [K, 3]."""
+
+    times: npt.NDArray[np.float64]
+    displacements: npt.NDArray[np.float64]
+
+    def at(self, times: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Displacements at other times, [n, 3]."""
+        return np.stack([np.interp(times, self.times, self.displacements[:, axis]) for axis in range(3)], axis=1)
+
+
+class Keyframes:
+    """The rows of keyframes that nodes follow; ``Carried.row`` has each node's number."""
+
+    def __init__(self) -> None:
+        self._rows: list[Row] = []
+        self._between: dict[tuple[int, int], int] = {}
+        self._trajectories: list[Trajectory] = []
+
+    def are(self, trajectories: Sequence[Trajectory]) -> bool:
+        """Whether these are the trajectories that were made or taken over last."""
+        return len(trajectories) == len(self._trajectories) and all(
+            a is b for a, b in zip(trajectories, self._trajectories, strict=True)
+        )
+
+    def adopt(self, trajectories: Sequence[Trajectory], node_count: int) -> npt.NDArray[np.int32]:
+        """Take trajectories over, and say which row each node follows, int32 [N]."""
+        found = np.full(node_count, NONE, np.int32)
+        for trajectory in trajectories:
+            times, displacements = trajectory.keys()
+            first, nodes = len(self._rows), trajectory.nodes.numpy()
+            if displacements.ndim == 2:
+                self._rows.append(Row(times, displacements))
+                found[nodes] = first
+            else:
+                self._rows += [Row(times, column) for column in np.moveaxis(displacements, 1, 0)]
+                found[nodes] = first + np.arange(len(nodes))
+        self._trajectories = list(trajectories)
+        return found
+
+    def settle(
+        self, rows: npt.NDArray[np.int32], ends: npt.NDArray[np.int32], displacements: npt.NDArray[np.floating]
+    ) -> npt.NDArray[np.int32]:
+        """Give a row to each new node between nodes that follow different ones: the mean of theirs.
+
+        Args:
+            rows: As the nodes have them, int32 [N].
+            ends: Whose midpoint each node is, int32 [N, 2].
+            displacements: The nodes' present ones [m], [N, 3]: where an end that follows nothing stays.
+        """
+        settled = rows.copy()
+        left = np.flatnonzero(settled == BETWEEN)
+        while len(left):
+            known = (settled[ends[left]] != BETWEEN).all(axis=1)
+            for node in left[known]:
+                settled[node] = self._mean_row(ends[node], settled, displacements)
+            left = left[~known]
+        return settled
+
+    def trajectories(self, rows: npt.NDArray[np.int32], device: wp.Device) -> list[Trajectory]:
+        """What the nodes follow, as trajectories; those made last if they are still right."""
+        made = []
+        of_times: dict[bytes, list[int]] = {}
+        nodes = np.flatnonzero(rows >= 0)
+        for row in np.unique(rows[nodes]):
+            of_times.setdefault(self._rows[row].times.tobytes(), []).append(int(row))
+        for same_times in of_times.values():
+            own = nodes[np.isin(rows[nodes], same_times)]
+            times = self._rows[same_times[0]].times
+            if len(same_times) == 1:
+                displacements = self._rows[same_times[0]].displacements
+            else:
+                displacements = np.stack([self._rows[row].displacements for row in rows[own]], axis=1)
+            made.append(Trajectory.of_keys(own, times, displacements, device))
+        if not _alike(made, self._trajectories):
+            self._trajectories = made
+        return self._trajectories
+
+    def _mean_row(
+        self, ends: npt.NDArray[np.int32], rows: npt.NDArray[np.int32], displacements: npt.NDArray[np.floating]
+    ) -> int:
+        a, b = sorted(int(row) for row in rows[ends])
+        if a >= 0 and (a, b) in self._between:
+            return self._between[a, b]
+        followed = [self._rows[row] for row in (a, b) if row >= 0]
+        times = np.unique(np.concatenate([row.times for row in followed]))
+        stays = [np.tile(displacements[end], (len(times), 1)) for end in ends if rows[end] < 0]
+        mean = np.mean([row.at(times) for row in followed] + stays, axis=0)
+        self._rows.append(Row(times, mean))
+        if a >= 0:
+            self._between[a, b] = len(self._rows) - 1
+        return len(self._rows) - 1
+
+
+def _alike(ones: Sequence[Trajectory], others: Sequence[Trajectory]) -> bool:
+    """Whether trajectories have the same nodes on the same keyframes, in the same order."""
+    return len(ones) == len(others) and all(
+        np.array_equal(a.nodes.numpy(), b.nodes.numpy())
+        and np.array_equal(a.times.numpy(), b.times.numpy())
+        and np.array_equal(a.displacements.numpy(), b.displacements.numpy())
+        for a, b in zip(ones, others, strict=True)
+    )
