@@ -5,14 +5,14 @@ thread takes a complete subtree, or a part of its leaves where there are too few
 nodal forces to slots; then each thread sums up the slots of a node and moves it. Nothing is added atomically, so runs
 are reproducible bit by bit, and nothing leaves the multiprocessor but the state at the end.
 
-CUDA only. ``SHARED_BYTES`` is what a block may have without asking.
+CUDA only. ``block_layout`` says which thread does what.
 """
 
 import functools
-from dataclasses import dataclass
 
 import warp as wp
 
+from .block_layout import FIRST_SHIFT, FOLLOWING_SHIFT, NEIGHBOURS, NO_NODE, NODE_WORDS, NUMBERS, WARP, Layout
 from .constitutive import corotated_strain, hooke
 from .elements import (
     FRAME_SHIFT,
@@ -34,98 +34,13 @@ from .subtree_forces import deformed_of, mat10, own_forces, shared_forces
 
 wp.set_module_options({"enable_backward": False})
 
-SHARED_BYTES = 48 * 1024
-VECTOR_BYTES = 12
-WARP = 32
-MAX_THREADS = 1024
 #: Threads of a multiprocessor that the registers of a whole subtree's forces leave room for.
 BUSY_THREADS = 512
 
 LOAD, STORE, LOAD_BYTES = 0, 1, 2
 
-#: Slots that one thread adds up, their places in bytes four to a word; more of the same node are its neighbours'.
-TASK_SLOTS = 8
-NUMBERS = 4
-#: Words of the ten nodes of a subtree.
-NODE_WORDS = 3
-#: Neighbouring threads that may add up one node, and so how many slots a node can have.
-NEIGHBOURS = 8
-MOST_SLOTS = NEIGHBOURS * TASK_SLOTS
-#: What a task is in one integer: the node, how many neighbours follow for the same node, and whether it is the
-#: first of them, who moves the node.
-FOLLOWING_SHIFT, FIRST_SHIFT = 16, 24
-NO_NODE = 0xFFFF
-
 vec3u = wp.types.vector(length=NODE_WORDS, dtype=wp.uint64)
 mat84i = wp.types.matrix(shape=(8, 4), dtype=wp.int32)
-
-
-@dataclass(frozen=True)
-class Layout:
-    """How a body is dealt out to the threads of a block.
-
-    Attributes:
-        shape: Type of its subtrees.
-        shared: Whether leaves use their subtree root's rotation; otherwise their own.
-        uniform: Whether all of a world is of one material.
-        parts: Into how many parts the leaves of a subtree are dealt: 1 or 2 (4 was slower).
-        subtrees: Room for subtrees, whole warps of them.
-        nodes: Room for nodes.
-        tasks: Sums that make up the nodes' forces, whole warps of them; see ``TASK_SLOTS``.
-    """
-
-    shape: int
-    shared: bool
-    uniform: bool
-    parts: int
-    subtrees: int
-    nodes: int
-    tasks: int = 0
-
-    @property
-    def threads(self) -> int:
-        """Threads a block: warp after warp of subtrees, the parts of a subtree in neighbouring warps.
-
-        A multiprocessor's four schedulers take warps in turn, so each goes through the code of one part only. Where a
-        world is to be done soon there are as many threads as tasks.
-        """
-        return max(self.parts * self.subtrees, self.tasks if self.parts > 1 else 0)
-
-    @property
-    def fits(self) -> bool:
-        vectors = 2 * self.nodes + self.slot_count + 1
-        return VECTOR_BYTES * vectors <= SHARED_BYTES and self.threads <= MAX_THREADS
-
-    @property
-    def slot_count(self) -> int:
-        """Slots for forces; one more is always zero."""
-        return self.subtrees * sum(place >= 0 for places in self.places for place in places)
-
-    def leaves(self, part: int) -> range:
-        """The leaves of a part."""
-        each = 8 // self.parts
-        return range(part * each, (part + 1) * each)
-
-    @property
-    def places(self) -> list[list[int]]:
-        """For each part and each of a subtree's ten nodes, which of a subtree's slots it is, -1 if the part has none.
-
-        The slot's number is the subtree's plus this many times ``subtrees``.
-        """
-        places, count = [], 0
-        for part in range(self.parts):
-            used = {node for leaf in self.leaves(part) for node in LEAVES[self.shape][leaf]}
-            row = [-1] * 10
-            for node in sorted(used):
-                row[node] = count
-                count += 1
-            places.append(row)
-        return places
-
-    def needs(self, part: int) -> list[bool]:
-        """Which of a subtree's ten nodes a part reads: the first, from which all is measured, and the root's for a
-        shared rotation."""
-        return [place >= 0 or node == 0 or (self.shared and node < 4) for node, place in enumerate(self.places[part])]
 
 
 @wp.func_native("""
@@ -194,19 +109,12 @@ class BlockBody:
     slots: wp.array2d[wp.uint64]  # [2, tasks] four slots each, the zero one past the last, in bytes
 
 
-@functools.cache
-def step_block(layout: Layout) -> wp.Kernel:
-    """Symplectic Euler steps of the corotated model, a block a world; launch with ``layout.threads`` a block."""
-    shape, shared, uniform, parts = layout.shape, layout.shared, layout.uniform, layout.parts
-    capacity, threads, zero_slot = layout.subtrees, layout.threads, layout.slot_count
-    deformed = deformed_of(shape)
-    own = [own_forces(shape, uniform, layout.leaves(part)) for part in range(parts)]
-    turned = [shared_forces(shape, uniform, False, layout.leaves(part)) for part in range(parts)]
-    needs, places, leaves_each = [layout.needs(part) for part in range(parts)], layout.places, 8 // parts
-    displacement, velocity = _memory(layout.nodes, "displacements"), _memory(layout.nodes, "velocities")
-    slot = _memory(zero_slot + 1, "forces")
-    leaf_nodes = mat84i(*(node for leaf in LEAVES[shape] for node in leaf))
-    place_of = wp.types.matrix(shape=(parts, 10), dtype=wp.int32)(*(place for row in places for place in row))
+def _repair_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -> wp.Function:
+    """What does a part again that the fast iteration does not turn."""
+    leaves_each = 8 // layout.parts
+    leaf_nodes = mat84i(*(node for leaf in LEAVES[layout.shape] for node in leaf))
+    places = wp.types.matrix(shape=(layout.parts, 10), dtype=wp.int32)
+    place_of = places(*(place for row in layout.places for place in row))
 
     @wp.func
     def node_at(body: BlockBody, s: int, local: int):
@@ -224,7 +132,7 @@ def step_block(layout: Layout) -> wp.Kernel:
     ):
         """Forces of a part that the fast iteration does not turn, leaf by leaf with the robust rotation."""
         for_all = wp.mat33()
-        if wp.static(shared):
+        if wp.static(layout.shared):
             g = gradient_of(
                 body.roots, s, node_at(body, s, 0), node_at(body, s, 1), node_at(body, s, 2), node_at(body, s, 3)
             )
@@ -246,7 +154,7 @@ def step_block(layout: Layout) -> wp.Kernel:
             )
             q = frame(body.elements, t)
             r = for_all * q
-            if wp.static(not shared):
+            if wp.static(not layout.shared):
                 r = byers_xu(q + g)
             i = material + leaf * stride
             f0, f1, f2, f3 = nodal_forces(body.elements, t, r * hooke(corotated_strain(g, q, r), mu[i], lam[i]))
@@ -258,9 +166,25 @@ def step_block(layout: Layout) -> wp.Kernel:
                     force = f2
                 if n == 3:
                     force = f3
-                at = s + of_part[part, of_leaf[leaf, n]] * wp.static(capacity)
+                at = s + of_part[part, of_leaf[leaf, n]] * wp.static(layout.subtrees)
                 slot(wp.static(STORE), at, slot(wp.static(LOAD), at, force) + force)
             leaf += 1
+
+    return repair
+
+
+@functools.cache
+def step_block(layout: Layout) -> wp.Kernel:
+    """Symplectic Euler steps of the corotated model, a block a world; launch with ``layout.threads`` a block."""
+    shape, shared, uniform, parts = layout.shape, layout.shared, layout.uniform, layout.parts
+    capacity, threads, zero_slot = layout.subtrees, layout.threads, layout.slot_count
+    deformed = deformed_of(shape)
+    own = [own_forces(shape, uniform, layout.leaves(part)) for part in range(parts)]
+    turned = [shared_forces(shape, uniform, False, layout.leaves(part)) for part in range(parts)]
+    needs, places = [layout.needs(part) for part in range(parts)], layout.places
+    displacement, velocity = _memory(layout.nodes, "displacements"), _memory(layout.nodes, "velocities")
+    slot = _memory(zero_slot + 1, "forces")
+    repair = _repair_of(layout, displacement, slot)
 
     @wp.kernel(
         module="unique",

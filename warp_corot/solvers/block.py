@@ -9,7 +9,18 @@ import numpy as np
 import warp as wp
 
 from ..elasticity.subtree_field import SubtreeField
-from ..kernels import block
+from ..kernels.block import BlockBody, step_block
+from ..kernels.block_layout import (
+    FIRST_SHIFT,
+    FOLLOWING_SHIFT,
+    MOST_SLOTS,
+    NO_NODE,
+    NUMBERS,
+    TASK_SLOTS,
+    VECTOR_BYTES,
+    WARP,
+    Layout,
+)
 from ..mesh import TetForest
 from ..plan import Batch, ForcePlan, Sharing
 
@@ -25,12 +36,12 @@ class BlockSteps:
     Made by ``of``, which knows whether it does.
     """
 
-    def __init__(self, body: SoftBody, batch: Batch, layout: block.Layout, slots: list[list[int]]):
+    def __init__(self, body: SoftBody, batch: Batch, layout: Layout, slots: list[list[int]]):
         self.body = body
         tasks, numbers = _tasks(layout, slots)
         layout = dataclasses.replace(layout, tasks=len(tasks))
         device = body.device
-        of_block = block.BlockBody()
+        of_block = BlockBody()
         of_block.subtrees = batch.subtrees
         of_block.elements = body.elements
         of_block.roots = body.elements if batch.roots is None else batch.roots
@@ -42,7 +53,7 @@ class BlockSteps:
         of_block.slots = wp.array(numbers, dtype=wp.uint64, device=device)
         self._block = of_block
         self._layout = layout
-        self._kernel = block.step_block(layout)
+        self._kernel = step_block(layout)
 
     @classmethod
     def of(cls, body: SoftBody, field: ForceField) -> BlockSteps | None:
@@ -58,7 +69,7 @@ class BlockSteps:
         layouts = _layouts(body, batch.shape, batch.sharing is Sharing.ROOT, batch.count)
         layout = next(layout for layout in layouts if layout.fits)
         slots = _slots_by_node(layout, batch.subtrees.nodes.numpy(), body.world_node_count)
-        if max(map(len, slots)) > block.MOST_SLOTS:
+        if max(map(len, slots)) > MOST_SLOTS:
             return None
         return cls(body, batch, layout, slots)
 
@@ -91,19 +102,19 @@ class BlockSteps:
         )
 
 
-def _layouts(body: SoftBody, shape: int, shared: bool, subtrees: int) -> list[block.Layout]:
+def _layouts(body: SoftBody, shape: int, shared: bool, subtrees: int) -> list[Layout]:
     """The ways to deal a body out, the fastest first.
 
     A world is soonest done with the leaves of a subtree dealt to two threads; where there are more worlds than
     multiprocessors, whole subtrees take less work.
     """
     parts = (2, 1) if body.worlds <= body.device.sm_count else (1,)
-    capacity = -(-subtrees // block.WARP) * block.WARP
+    capacity = -(-subtrees // WARP) * WARP
     uniform = body.is_uniform
-    return [block.Layout(shape, shared, uniform, count, capacity, body.world_node_count) for count in parts]
+    return [Layout(shape, shared, uniform, count, capacity, body.world_node_count) for count in parts]
 
 
-def _tasks(layout: block.Layout, slots: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
+def _tasks(layout: Layout, slots: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
     """What threads add up: up to eight slots of one node each, a node's threads next to one another in one warp.
 
     Returns:
@@ -113,22 +124,22 @@ def _tasks(layout: block.Layout, slots: list[list[int]]) -> tuple[np.ndarray, np
     numbers: list[list[int]] = []
 
     def leave_out(count: int) -> None:
-        tasks.extend([block.NO_NODE] * count)
+        tasks.extend([NO_NODE] * count)
         numbers.extend([[]] * count)
 
     # Nodes of many slots first, so that warps are alike and hardly a place is left out.
     for node in sorted(range(len(slots)), key=lambda n: -len(slots[n])):
-        of_node = [slots[node][at : at + block.TASK_SLOTS] for at in range(0, len(slots[node]), block.TASK_SLOTS)]
+        of_node = [slots[node][at : at + TASK_SLOTS] for at in range(0, len(slots[node]), TASK_SLOTS)]
         of_node = of_node or [[]]
-        left = -len(tasks) % block.WARP
+        left = -len(tasks) % WARP
         if left < len(of_node):
             leave_out(left)
         for k, own in enumerate(of_node):
             following = len(of_node) - 1 - k
-            tasks.append(node | following << block.FOLLOWING_SHIFT | int(k == 0) << block.FIRST_SHIFT)
+            tasks.append(node | following << FOLLOWING_SHIFT | int(k == 0) << FIRST_SHIFT)
             numbers.append(own)
-    leave_out(-len(tasks) % block.WARP)
-    table = np.full((len(tasks), block.TASK_SLOTS), layout.slot_count)
+    leave_out(-len(tasks) % WARP)
+    table = np.full((len(tasks), TASK_SLOTS), layout.slot_count)
     for row, own in zip(table, numbers, strict=True):
         row[: len(own)] = own
     return np.array(tasks, np.int32), _packed(table)
@@ -136,13 +147,13 @@ def _tasks(layout: block.Layout, slots: list[list[int]]) -> tuple[np.ndarray, np
 
 def _packed(places: np.ndarray) -> np.ndarray:
     """Places of vectors, [n, m], in bytes and four to a word: uint64 [m / 4, n]."""
-    width = -(-places.shape[1] // block.NUMBERS) * block.NUMBERS
+    width = -(-places.shape[1] // NUMBERS) * NUMBERS
     table = np.zeros((len(places), width), "<u2")
-    table[:, : places.shape[1]] = places * block.VECTOR_BYTES
+    table[:, : places.shape[1]] = places * VECTOR_BYTES
     return np.ascontiguousarray(table.view("<u8").T)
 
 
-def _slots_by_node(layout: block.Layout, nodes: np.ndarray, count: int) -> list[list[int]]:
+def _slots_by_node(layout: Layout, nodes: np.ndarray, count: int) -> list[list[int]]:
     """The slots that each node adds up, in order of subtrees and parts.
 
     Args:
@@ -150,8 +161,9 @@ def _slots_by_node(layout: block.Layout, nodes: np.ndarray, count: int) -> list[
         count: Number of nodes.
     """
     slots: list[list[int]] = [[] for _ in range(count)]
+    places_by_part = layout.places
     for subtree, ten in enumerate(nodes.T):
-        for places in layout.places:
+        for places in places_by_part:
             for node, place in zip(ten, places, strict=True):
                 if place >= 0:
                     slots[node].append(subtree + place * layout.subtrees)
