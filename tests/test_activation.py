@@ -137,6 +137,24 @@ def test_written_between_recorded_steps(device):
         assert body.reactions.numpy()[top, 2].sum() == pytest.approx((stress or 0.0) * 0.1**2, abs=1e-3)
 
 
+def test_another_number_needs_no_new_recording(device):
+    """What steps launch changes with the keyframes that there are, not with the stress that is set."""
+    _, body, _ = held_bar(muscle([0, 0, 1]), device)
+    body.activate(1.0)
+    recorded = [body.revision]
+    for stress, elements, changes in (
+        (2.0, None, False),
+        (wc.Activation(TIMES, STRESS), [3, 4], True),
+        (5.0, [0, 1], False),
+        (5.0, [1, 3], True),
+        (6.0, None, True),
+        (7.0, None, False),
+    ):
+        body.activate(stress, elements)
+        recorded.append(body.revision)
+        assert (recorded[-1] != recorded[-2]) == changes
+
+
 def test_reset_begins_anew(device):
     """A world that is reset follows its keyframes from their beginning, the others go on."""
     sim, body, _ = held_bar(muscle([0, 0, 1]), device, dt=1e-4, worlds=2)

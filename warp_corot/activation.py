@@ -108,8 +108,11 @@ def activate(
         values[chosen] = _constant(stress, len(which), len(own)).ravel()
         live.assign(values)
         added = []
-    body.activations = [kept for a in body.activations if (kept := a.without(chosen))] + added
-    body.revision += 1
+    kept = [left for a in body.activations if (left := a.without(chosen))]
+    # Other numbers in the same array are no other launches.
+    if added or kept != body.activations:
+        body.activations = kept + added
+        body.revision += 1
 
 
 def _constant(stress: float | npt.ArrayLike, worlds: int, count: int) -> npt.NDArray[np.float64]:
