@@ -47,6 +47,14 @@ def assert_balanced(surface):
     assert np.array_equal(np.sort(edges @ [count, 1]), np.sort(edges @ [1, count]))
 
 
+def assert_bound(surface, forest):
+    """Each point is the mean of the nodes it is bound to, by weights that sum to one, and so moves along with them."""
+    assert surface.nodes.max() < len(forest.points)
+    assert np.allclose(surface.weights.sum(axis=1), 1)
+    at = np.einsum("vn,vnc->vc", surface.weights, forest.points[surface.nodes])
+    assert np.allclose(at, surface.points, rtol=0, atol=1e-12)
+
+
 def as_trimesh(surface):
     return trimesh.Trimesh(surface.points, surface.triangles, process=False)
 

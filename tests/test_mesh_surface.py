@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bodies import Body, ball, turned_box, united, without
+from bodies import Body, ball, box_distance, turned_box, united, without
 from meshes import HALF, SHAPES, TURN, as_trimesh, assert_balanced, farthest, off_surface, on_ball, on_box
 
 import warp_corot as wc
@@ -95,19 +95,33 @@ def test_a_small_ball_in_one_root_cube_is_found(seed):
     assert surface.volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.2)
 
 
-def test_a_body_on_the_lattice_is_exact():
-    """A box whose faces are faces of cubes: no cut elements, no flat triangles, nothing outside."""
-    half = np.array([0.5, 0.25, 0.25])
+@pytest.mark.parametrize(("scale", "shift"), [(1.0, 0.0), (0.3, 0.1), (0.007, -0.23)])
+def test_a_body_on_the_lattice_is_exact(scale, shift):
+    """A box whose faces are faces of cubes, also where float32 cannot hold their coordinates: no cut elements, no flat
+    triangles, nothing outside."""
+    half = scale * np.array([0.5, 0.25, 0.25])
     body = turned_box(half, np.eye(3))
-    forest = wc.TetForest.from_domain(body, 0.25, max_level=9, surface_error=1e-3)
+    body.function = lambda x: box_distance(x - shift, half)
+    body.bounds = body.bounds + shift
+    forest = wc.TetForest.from_domain(body, 0.25 * scale, max_level=9, surface_error=1e-3 * scale)
     assert (forest.fill == 1).all()
     assert len(forest.points) == len(forest.lattice)
     surface = forest.surface()
     solid = as_trimesh(surface)
     assert solid.is_watertight
     assert surface.volume == pytest.approx(8 * half.prod(), rel=1e-12)
-    assert surface.area == pytest.approx(2.5, rel=1e-12)
-    assert solid.area_faces.min() > 1e-3
+    assert surface.area == pytest.approx(2.5 * scale**2, rel=1e-12)
+    assert solid.area_faces.min() > 1e-3 * scale**2
+
+
+def test_a_body_that_sticks_out_of_its_bounds_ends_there(device):
+    """And is closed there. Beyond z = 0.3 a cap is gone: of pi h^2 (3 r - h) / 3, with h = 0.1."""
+    body = ball(0.4)
+    body.bounds[1, 2] = 0.3
+    surface = wc.TetForest.from_domain(body, 0.1, max_level=6, device=device).surface()
+    assert as_trimesh(surface).is_watertight
+    assert surface.points[:, 2].max() == pytest.approx(0.3)
+    assert surface.volume == pytest.approx(np.pi * (4 / 3 * 0.4**3 - 0.1**2 * (3 * 0.4 - 0.1) / 3), rel=0.02)
 
 
 @pytest.mark.parametrize("seed", range(4))
