@@ -7,7 +7,6 @@ from .growth import LIVE
 from .remesh import (
     ADDED,
     BIRTHS,
-    FREE_NODES,
     FREE_PAIRS,
     FRESH,
     FULL,
@@ -21,6 +20,7 @@ from .remesh import (
 )
 from .remesh_edges import LOW_HALF, WantedEdges, find_slot
 from .remesh_state import Carried, copy_to_children, make_node, quarter_mass
+from .shapes import FRAME_SHIFT
 from .springs import FIRST_NODE, SECOND_NODE
 
 # Nodes are counted in the upper half of ``demand``, pairs in the lower.
@@ -48,12 +48,11 @@ def admit_edges(
             before = wp.atomic_add(demand, 0, ONE_NODE + wp.int64(ring))
             nodes = int(before >> wp.int64(32))
             pairs = int(before & LOW_HALF)
-            if nodes < pools.counts[FREE_NODES] and pairs + ring <= pools.counts[FREE_PAIRS]:
-                edges.node[slot] = pools.free_nodes[pools.counts[FREE_NODES] - 1 - nodes]
+            if pools.counts[NODE_TOP] + nodes < pools.node_limit and pairs + ring <= pools.counts[FREE_PAIRS]:
+                edges.node[slot] = pools.counts[NODE_TOP] + nodes
                 edges.pairs[slot] = pools.counts[FREE_PAIRS] - 1 - pairs
                 wp.atomic_max(pools.counts, NODES_TAKEN, nodes + 1)
                 wp.atomic_max(pools.counts, PAIRS_TAKEN, pairs + ring)
-                wp.atomic_max(pools.counts, NODE_TOP, edges.node[slot] + 1)
             else:
                 wp.atomic_max(pools.counts, FULL, 1)
 
@@ -79,7 +78,9 @@ def bisect_leaf(e: int, child: int, z: int, pools: Pools, edges: WantedEdges):
     leave_edges(tet, end, pools, edges)
     pools.tets[child] = first_half(tet, z, level)
     pools.tets[child + 1] = second_half(tet, z, level)
+    frame = pools.code[e] >> FRAME_SHIFT
     for n in range(2):
+        pools.code[child + n] = pools.child_code[frame, level % 3, n] | (level + 1)
         pools.level[child + n] = level + 1
         pools.parent[child + n] = e
         pools.first_child[child + n] = LIVE
@@ -122,7 +123,7 @@ def bisect_edge(slot: int, pools: Pools, edges: WantedEdges, carried: Carried):
     pools.ends[z] = wp.vec2i(wp.min(a, b), wp.max(a, b))
     pools.lattice[z] = halfway(pools.lattice[a], pools.lattice[b])
     pools.valence[z] = 2 * ring
-    make_node(z, a, b, loss_a, loss_b, carried)
+    make_node(z, a, b, pools.lattice[z], loss_a, loss_b, carried)
     # Its ring is bisected: nobody counts at it any more.
     edges.ring[slot] = 0
     edges.agreed[slot] = 0
@@ -151,7 +152,7 @@ def end_round(
     goes_on: wp.array[wp.int32],
 ):
     counts = pools.counts
-    counts[FREE_NODES] = counts[FREE_NODES] - counts[NODES_TAKEN]
+    counts[NODE_TOP] = counts[NODE_TOP] + counts[NODES_TAKEN]
     counts[FREE_PAIRS] = counts[FREE_PAIRS] - counts[PAIRS_TAKEN]
     counts[ADDED] = counts[ADDED] + counts[NODES_TAKEN]
     goes_on[0] = wp.where(counts[BIRTHS] + counts[NODES_TAKEN] > 0, 1, 0)

@@ -76,8 +76,10 @@ def list_blocks(
 
 
 @wp.func
-def heat_blocks(a: int, b: int, stamp: int, blocks: Blocks):
+def heat_blocks(a: int, b: int, stamp: int, first_new: int, blocks: Blocks):
     """Mark the blocks that name both ends of an edge; nodes that are new in this pass are in none."""
+    if a >= first_new or b >= first_new:
+        return
     more_a = blocks.of_node[a, LAST] == MORE
     more_b = blocks.of_node[b, LAST] == MORE
     if more_a and more_b:

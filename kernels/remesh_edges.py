@@ -11,6 +11,7 @@ from .bisection import refinement_end
 from .growth import EMPTY, LIVE, claim_slot, edge_key, home_slot
 from .remesh import (
     BIRTHS,
+    FIRST_NEW,
     FRESH,
     FRESH_NEW,
     FRESH_SEEN,
@@ -108,7 +109,9 @@ def heat_wanted(
     """Look for what is wanted at first, once it is known which blocks name which nodes."""
     for i in range(wp.tid(), pools.counts[WANTED], threads):
         key = edges.keys[edges.wanted[i]]
-        heat_blocks(int(key >> wp.int64(32)), int(key & LOW_HALF), pools.counts[STAMP], blocks)
+        a = int(key >> wp.int64(32))
+        b = int(key & LOW_HALF)
+        heat_blocks(a, b, pools.counts[STAMP], pools.counts[FIRST_NEW], blocks)
 
 
 @wp.kernel(enable_backward=False)
@@ -152,7 +155,7 @@ def count_at_edges(e: int, tet: wp.vec4i, is_new: bool, pools: Pools, edges: Wan
                     else:
                         hangs = 1
     if hangs == 1 and want_edge(tet[0], tet[end], pools, edges):
-        heat_blocks(tet[0], tet[end], stamp, blocks)
+        heat_blocks(tet[0], tet[end], stamp, pools.counts[FIRST_NEW], blocks)
 
 
 @wp.func

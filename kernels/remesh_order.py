@@ -6,7 +6,8 @@ was merged its parent does. A sum over the threads tells each where to begin.
 
 import warp as wp
 
-from .remesh import ADDED, LEAVES, NEW_LEAVES, REMOVED, UNUSED, Pools
+from .remesh import ADDED, LEAVES, NEW_LEAVES, REMOVED, UNUSED, Pools, padding
+from .remesh_dense import Moves, rename_upwards
 
 
 @wp.func
@@ -95,16 +96,22 @@ def list_leaves(
 def adopt_list(
     # In
     threads: int,
+    moves: Moves,
     # In and out
     pools: Pools,
 ):
-    count = pools.counts[NEW_LEAVES]
+    """The new list takes the old one's place; nodes that have moved are named anew on the way."""
+    new = pools.counts[NEW_LEAVES]
+    count = wp.max(new, pools.counts[LEAVES])
     if pools.counts[ADDED] + pools.counts[REMOVED] == 0:
         count = 0
     for i in range(wp.tid(), count, threads):
-        e = pools.new_leaves[i]
-        pools.leaves[i] = e
-        pools.leaf_tets[i] = pools.tets[e]
+        if i < new:
+            e = pools.new_leaves[i]
+            pools.leaves[i] = e
+            pools.leaf_tets[i] = rename_upwards(e, pools, moves)
+        else:
+            pools.leaf_tets[i] = padding(i, pools)
 
 
 @wp.kernel(enable_backward=False)

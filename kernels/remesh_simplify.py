@@ -10,7 +10,6 @@ from .bisection import refinement_end
 from .growth import LIVE
 from .remesh import (
     CANDIDATES,
-    FREE_NODES,
     FREE_PAIRS,
     LEAVES,
     NODES_GIVEN,
@@ -100,7 +99,7 @@ def remove_node(z: int, pools: Pools, carried: Carried, removal: Removal):
         place += 1
         e = pools.next[e]
     pools.valence[z] = 0
-    pools.free_nodes[pools.counts[FREE_NODES] + wp.atomic_add(pools.counts, NODES_GIVEN, 1)] = z
+    wp.atomic_add(pools.counts, NODES_GIVEN, 1)
     unmake_node(z, ends[0], ends[1], gain_a, gain_b, pools, carried)
 
 

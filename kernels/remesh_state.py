@@ -2,7 +2,9 @@
 
 A new node takes from each end of its edge the mass that this end loses, with the momentum of that mass; a node that is
 removed gives back to each end what it then gains, moving as the end does and, on top, as the node moved against both
-together. So mass and linear momentum stay, and bisection and removal undo each other.
+together. So mass and linear momentum stay, and bisection and removal undo each other. Children have their parent's
+density. What ends lose and gain is summed leaf by leaf, so that densities around an edge may differ by any factor, and
+children that are merged may, too.
 """
 
 import warp as wp
@@ -10,17 +12,27 @@ import warp as wp
 from .elements import load_node, store_node
 from .remesh import ADDED, GAINERS, NODE_TOP, REMOVED, Pools
 
+# Rows of keyframes for nodes that follow none, and for held nodes between such as follow different ones.
+NO_ROW = wp.constant(-1)
+MIXED_ROWS = wp.constant(-2)
+
 
 @wp.struct
 class Carried:
     """Of nodes: displacement, velocity, mass and load. Of tetrahedra: density and other values per full volume."""
 
+    origin: wp.vec3d  # of the lattice [m]
+    spacing: wp.float64  # of its points [m]
     volume: wp.array[wp.float64]  # rest volume by level [m^3]
+    # Nodes; these arrays have places for padding, too.
+    rest: wp.array[wp.vec4]  # rest position [m]
     u: wp.array[wp.vec4]
     v: wp.array[wp.vec4]
     load: wp.array[wp.vec4]
+    reaction: wp.array[wp.vec4]  # force of the support on a held node [N]
     mass: wp.array[wp.float64]
     held: wp.array[wp.uint8]
+    row: wp.array[wp.int32]  # which row of keyframes a held node follows, NO_ROW, or MIXED_ROWS
     mass32: wp.array[wp.float32]  # what stepping reads
     inverse_mass: wp.array[wp.float32]
     # Tetrahedra, by their places in the pool.
@@ -64,8 +76,36 @@ def average_children(e: int, child: int, carried: Carried):
 
 
 @wp.func
-def make_node(z: int, a: int, b: int, loss_a: wp.float64, loss_b: wp.float64, carried: Carried):
+def rest_position(point: wp.vec3i, carried: Carried):
+    return wp.vec3(
+        float(carried.origin[0] + wp.float64(point[0]) * carried.spacing),
+        float(carried.origin[1] + wp.float64(point[1]) * carried.spacing),
+        float(carried.origin[2] + wp.float64(point[2]) * carried.spacing),
+    )
+
+
+@wp.func
+def row_between(a: int, b: int):
+    """The row of a node between two held ones that follow rows a and b."""
+    row = wp.where(a == b, a, NO_ROW)
+    if a != b and (a != NO_ROW or b != NO_ROW):
+        row = MIXED_ROWS
+    return row
+
+
+@wp.func
+def make_node(
+    z: int,
+    a: int,
+    b: int,
+    point: wp.vec3i,
+    loss_a: wp.float64,
+    loss_b: wp.float64,
+    carried: Carried,
+):
     """The midpoint of the deformed edge a-b, with what both ends lose."""
+    store_node(carried.rest, z, rest_position(point, carried))
+    store_node(carried.reaction, z, wp.vec3())
     store_node(carried.u, z, 0.5 * (load_node(carried.u, a) + load_node(carried.u, b)))
     store_node(carried.load, z, wp.vec3())
     va = load_node(carried.v, a)
@@ -74,6 +114,7 @@ def make_node(z: int, a: int, b: int, loss_a: wp.float64, loss_b: wp.float64, ca
     mass = loss_a + loss_b
     both_held = carried.held[a] != wp.uint8(0) and carried.held[b] != wp.uint8(0)
     carried.held[z] = wp.where(both_held, wp.uint8(1), wp.uint8(0))
+    carried.row[z] = wp.where(both_held, row_between(carried.row[a], carried.row[b]), NO_ROW)
     momentum = loss_a * doubled(va) + loss_b * doubled(vb)
     if both_held:
         wp.atomic_add(carried.impulse, 0, mass * doubled(velocity) - momentum)
@@ -104,6 +145,37 @@ def give_to_end(
 
 
 @wp.func
+def wipe_node(z: int, carried: Carried):
+    """Leave nothing behind where there is no node any more."""
+    carried.mass[z] = wp.float64(0.0)
+    carried.mass32[z] = 0.0
+    carried.inverse_mass[z] = 0.0
+    carried.held[z] = wp.uint8(0)
+    carried.row[z] = NO_ROW
+    store_node(carried.rest, z, wp.vec3())
+    store_node(carried.u, z, wp.vec3())
+    store_node(carried.v, z, wp.vec3())
+    store_node(carried.load, z, wp.vec3())
+    store_node(carried.reaction, z, wp.vec3())
+
+
+@wp.func
+def move_node(z: int, place: int, carried: Carried):
+    """Put all that a node has at another place, where there was none."""
+    carried.mass[place] = carried.mass[z]
+    carried.mass32[place] = carried.mass32[z]
+    carried.inverse_mass[place] = carried.inverse_mass[z]
+    carried.held[place] = carried.held[z]
+    carried.row[place] = carried.row[z]
+    store_node(carried.rest, place, load_node(carried.rest, z))
+    store_node(carried.u, place, load_node(carried.u, z))
+    store_node(carried.v, place, load_node(carried.v, z))
+    store_node(carried.load, place, load_node(carried.load, z))
+    store_node(carried.reaction, place, load_node(carried.reaction, z))
+    wipe_node(z, carried)
+
+
+@wp.func
 def unmake_node(z: int, a: int, b: int, gain_a: wp.float64, gain_b: wp.float64, pools: Pools, carried: Carried):
     """Give back to both ends; ``settle_ends`` puts it to account."""
     mass = gain_a + gain_b
@@ -114,13 +186,7 @@ def unmake_node(z: int, a: int, b: int, gain_a: wp.float64, gain_b: wp.float64, 
     load = 0.5 * load_node(carried.load, z)
     give_to_end(a, gain_a, deviation, load, pools, carried)
     give_to_end(b, gain_b, deviation, load, pools, carried)
-    carried.mass[z] = wp.float64(0.0)
-    carried.mass32[z] = 0.0
-    carried.inverse_mass[z] = 0.0
-    carried.held[z] = wp.uint8(0)
-    store_node(carried.u, z, wp.vec3())
-    store_node(carried.v, z, wp.vec3())
-    store_node(carried.load, z, wp.vec3())
+    wipe_node(z, carried)
 
 
 @wp.kernel(enable_backward=False)

@@ -109,6 +109,15 @@ def shape_codes(lattice: np.ndarray, tets: np.ndarray, level: np.ndarray) -> tup
         float64 [n_frames, 3, 3]: columns are the axes of ``kernels.shapes.GRADIENT``, the third turned round where the
         Maubach frame is left-handed.
     """
+    key = frame_keys(lattice, tets, level)
+    bits, frames = frame_table(np.flatnonzero(np.bincount(key, minlength=_KEYS)))
+    for part in parts(len(tets)):
+        key[part] = bits[key[part]] | level[part]
+    return key, frames
+
+
+def frame_keys(lattice: np.ndarray, tets: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """A number for the Maubach frame of each element, int32 [n]. Arguments as in ``shape_codes``."""
     # A frame's nine entries of -1, 0, 1 are the digits of one number, a weighted sum of one number for each node. Those
     # wrap around in 32 bits, but their sum does not: it is at most 2**16 * 3**9 / 2.
     place = lattice @ np.array([1, 27, 729], np.int32)
@@ -118,16 +127,18 @@ def shape_codes(lattice: np.ndarray, tets: np.ndarray, level: np.ndarray) -> tup
         kind, halvings = level[part] % 3, level[part] // 3
         total = np.einsum("tn,tn->t", place[tets[part]], weights[kind])
         key[part] = (total >> (LATTICE_BITS - halvings)) + _KEYS // 2
-    used = np.flatnonzero(np.bincount(key, minlength=_KEYS))
+    return key
+
+
+def frame_table(used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Frames of these keys, ascending: what each puts into a shape code, by key, int32; and the proper frames Q."""
     frames = ((used[:, None] // 3 ** np.arange(9)) % 3 - 1.0).reshape(-1, 3, 3)
     frames /= np.linalg.norm(frames, axis=1, keepdims=True)
     mirrored = np.linalg.det(frames) < 0
     frames[mirrored, :, 2] *= -1.0
     bits = np.zeros(_KEYS, np.int32)
     bits[used] = (mirrored.astype(np.int32) << MIRROR_BIT) | (np.arange(len(used), dtype=np.int32) << FRAME_SHIFT)
-    for part in parts(len(tets)):
-        key[part] = bits[key[part]] | level[part]
-    return key, frames
+    return bits, frames
 
 
 def general_elements(mesh: TetMesh, device: wp.Device, worlds: int = 1) -> Any:

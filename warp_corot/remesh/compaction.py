@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from ..kernels import remesh as kernels
+from .fields import CARRIED_BY_NODES, CARRIED_BY_TETRAHEDRA, OF_NODES, OF_TETRAHEDRA
 
 if TYPE_CHECKING:
     from .pools import DeviceForest
@@ -21,41 +22,33 @@ def compact(forest: DeviceForest) -> None:
     pools, arrays = forest.pools, forest.carriage.arrays
     nodes, node_number = _numbering(_nodes_in_order(forest))
     elements, element_number = _numbering(_elements_in_order(forest))
-    for name in ("lattice", "valence"):
-        _permute(getattr(pools, name), nodes)
-    for name in ("u", "v", "load", "mass", "held", "mass32", "inverse_mass"):
-        _permute(getattr(arrays, name), nodes)
-    for name in ("level", "parent", "first_child", "tets"):
-        _permute(getattr(pools, name), elements)
-    for name in ("density", "label", "values"):
-        _permute(getattr(arrays, name), elements)
-    _rename(pools.ends, node_number, nodes)
-    _rename(pools.tets, node_number)
-    _rename(pools.leaf_tets, node_number)
-    _rename(pools.parent, element_number)
-    _rename(pools.first_child, element_number)
-    _rename(pools.leaves, element_number)
+    for struct, names, order in (
+        (pools, OF_NODES, nodes),
+        (arrays, CARRIED_BY_NODES, nodes),
+        (pools, OF_TETRAHEDRA, elements),
+        (arrays, CARRIED_BY_TETRAHEDRA, elements),
+    ):
+        for name in names:
+            _permute(getattr(struct, name), order)
+    leaves = forest.leaf_count
+    for array in (pools.ends, pools.tets, pools.leaf_tets[:leaves]):
+        _rename(array, node_number)
+    for array in (pools.parent, pools.first_child, pools.leaves[:leaves], pools.void_leaves):
+        _rename(array, element_number)
     # What is free are the last places now, and the lowest of them are taken first.
-    free_nodes, free_pairs = forest.free_nodes, forest.free_leaves
-    _write(pools.free_nodes, np.arange(free_nodes)[::-1] + forest.node_capacity - free_nodes)
-    _write(pools.free_pairs, 2 * np.arange(free_pairs)[::-1] + forest.tree_capacity - 2 * free_pairs)
+    free_pairs = forest.free_leaves
+    if free_pairs:
+        first = forest.tree_capacity - 2 * free_pairs
+        pools.free_pairs[:free_pairs].assign(np.arange(free_pairs, dtype=np.int32)[::-1] * 2 + first)
     # Rounds compare with what nodes were touched in; none of it counts after a pass.
     pools.touched.zero_()
-    counts = pools.counts.numpy().copy()
-    counts[kernels.NODE_TOP] = forest.node_capacity - free_nodes
-    pools.counts.assign(counts)
 
 
 def _nodes_in_order(forest: DeviceForest) -> Index:
-    """All places for nodes: those that leaves name as they first do, then other ones in use, then free ones."""
-    touched = forest.leaf_tets.ravel()
-    nodes, first = np.unique(touched, return_index=True)
-    named = nodes[np.argsort(first)]
-    rest = np.ones(forest.node_capacity, bool)
-    rest[named] = False
-    others = np.flatnonzero(rest)
-    used = forest.pools.valence.numpy()[others] > 0
-    return np.concatenate([named, others[used], others[~used]]).astype(np.int32)
+    """All places for nodes: those that leaves name as they first do; the others stay where they are."""
+    nodes, first = np.unique(forest.leaf_tets.ravel(), return_index=True)
+    others = np.arange(len(nodes), forest.node_capacity)
+    return np.concatenate([nodes[np.argsort(first)], others]).astype(np.int32)
 
 
 def _elements_in_order(forest: DeviceForest) -> Index:
@@ -85,15 +78,11 @@ def _numbering(order: Index) -> tuple[Index, Index]:
 
 
 def _permute(array: wp.array, order: Index) -> None:
-    array.assign(array.numpy()[order])
+    values = array.numpy()
+    values[: len(order)] = values[order]
+    array.assign(values)
 
 
-def _rename(array: wp.array, number: Index, order: Any = slice(None)) -> None:
+def _rename(array: wp.array, number: Index) -> None:
     """Replace indices, negative ones but for themselves."""
-    array.assign(number[array.numpy()[order]])
-
-
-def _write(array: wp.array, values: np.ndarray) -> None:
-    whole = array.numpy().copy()
-    whole[: len(values)] = values
-    array.assign(whole)
+    array.assign(number[array.numpy()])

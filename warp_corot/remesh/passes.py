@@ -11,7 +11,15 @@ import warp as wp
 
 from ..errors import InputError
 from ..kernels import remesh as pool_kernels
-from ..kernels import remesh_bisect, remesh_blocks, remesh_edges, remesh_order, remesh_simplify, remesh_state
+from ..kernels import (
+    remesh_bisect,
+    remesh_blocks,
+    remesh_dense,
+    remesh_edges,
+    remesh_order,
+    remesh_simplify,
+    remesh_state,
+)
 from ..kernels.remesh_mark import elongation, marking_kernel
 from ..mesh.growth import lattice_spacing
 from ..mesh.lattice import MAX_LEVEL
@@ -70,6 +78,7 @@ class RemeshPass:
         self._edges = self._make_edges()
         self._blocks = self._make_blocks()
         self._removal = self._make_removal()
+        self._moves = self._make_moves()
         self._demand = wp.zeros(1, dtype=wp.int64, device=self.device)
         self._goes_on = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._sums, self._ends = (wp.zeros(forest.threads, dtype=wp.int32, device=self.device) for _ in range(2))
@@ -116,11 +125,13 @@ class RemeshPass:
         self._many(remesh_simplify.remove_nodes, pools, carried, removal)
         self._once(pool_kernels.give_back, pools)
         self._many(remesh_state.settle_ends, pools, carried)
+        self._launch_moves()
         self._many(remesh_state.refresh_masses, pools, carried)
         self._many(remesh_order.count_leaves, pools, self._sums)
         wp.utils.array_scan(self._sums, self._ends, inclusive=True)
         self._many(remesh_order.list_leaves, self._ends, pools)
-        self._many(remesh_order.adopt_list, pools)
+        self._many(remesh_order.adopt_list, self._moves, pools)
+        self._many(remesh_dense.rename_void, self._moves, pools)
         self._once(remesh_order.adopt_count, pools)
         self._many(remesh_edges.clear_edges, pools, edges)
 
@@ -134,6 +145,15 @@ class RemeshPass:
         self._many(remesh_bisect.admit_edges, pools, edges, self._demand)
         self._many(remesh_bisect.bisect_edges, pools, edges, carried)
         self._once(remesh_bisect.end_round, pools, self._goes_on)
+
+    def _launch_moves(self) -> None:
+        pools, moves = self.forest.pools, self._moves
+        self._many(remesh_dense.count_moves, pools, moves)
+        wp.utils.array_scan(moves.sums, moves.ends, inclusive=True)
+        self._many(remesh_dense.list_moves, pools, moves)
+        self._once(remesh_dense.lower_top, pools)
+        self._many(remesh_dense.move_nodes, pools, self.forest.carriage.arrays, moves)
+        self._many(remesh_dense.rename_ends, moves, pools)
 
     def _replay(self, *, marked: bool) -> None:
         if self.device.is_cuda and not wp.is_conditional_graph_supported():
@@ -181,6 +201,15 @@ class RemeshPass:
         removal.head = wp.full(count, -1, dtype=wp.int32, device=self.device)
         removal.candidates = wp.empty(count, dtype=wp.int32, device=self.device)
         return removal
+
+    def _make_moves(self) -> Any:
+        moves = remesh_dense.Moves()
+        nodes, threads = self.forest.node_capacity, self.forest.threads
+        moves.sums, moves.ends = (wp.zeros(2 * threads, dtype=wp.int32, device=self.device) for _ in range(2))
+        moves.holes, moves.movers, moves.forward = (
+            wp.empty(nodes, dtype=wp.int32, device=self.device) for _ in range(3)
+        )
+        return moves
 
 
 def _is_level(given: Any) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,18 +14,45 @@ from ..device import checked_device
 from ..errors import InputError
 from ..kernels import remesh as kernels
 from ..mesh import TetForest
-from ..mesh.tree import LIVE, Tree
+from ..mesh.tree import LIVE, VOID, Tree
+from .frames import all_frames
+from .snapshot import Snapshot
 from .transfer import Carriage
 
 #: Threads of a launch on CUDA for each multiprocessor.
 THREADS_PER_PROCESSOR = 1024
 
 
+class PassCounts(NamedTuple):
+    """What the host asks for after a pass.
+
+    Attributes:
+        leaves, nodes: How many there are; nodes that only void tetrahedra name are not counted.
+        added, removed: Nodes made and removed in the last pass. If both are zero the mesh is what it was.
+        full: Whether a refinement ever had to be left out for want of room.
+    """
+
+    leaves: int
+    nodes: int
+    added: int
+    removed: int
+    full: bool
+
+    @classmethod
+    def of(cls, counts: npt.NDArray[np.int32]) -> PassCounts:
+        """From a copy of ``pools.counts``."""
+        named = (kernels.LEAVES, kernels.NODE_TOP, kernels.ADDED, kernels.REMOVED)
+        return cls(*(int(counts[which]) for which in named), bool(counts[kernels.FULL]))
+
+
 class DeviceForest:
     """A forest in pools of fixed capacity.
 
-    Numbers of nodes and of tetrahedra in the pools stay theirs as long as they are in use. Nothing is said of the
-    places that are not in use, but that nodes there have no mass, displacement, velocity or load.
+    The N nodes that leaves name are 0 … N - 1 after every pass. Those that only void tetrahedra name stand at the end
+    of the pool and stay there. Numbers of nodes stay theirs but in passes that remove some, where the last ones move
+    into the gaps; numbers of tetrahedra stay theirs as long as they are in use. Beyond N nodal arrays are zero, and
+    beyond the count ``pools.leaf_tets`` names sinks, places past the last node, so that a launch may go through more
+    nodes, up to ``node_capacity``, and more leaves, up to ``capacity + LEAF_PADDING``, than there are.
 
     Args:
         forest: The mesh to begin with. Its void tetrahedra stay as they are.
@@ -42,6 +69,7 @@ class DeviceForest:
         carriage: What nodes and tetrahedra carry.
         source: The forest that this began as.
         capacity, node_capacity, tree_capacity: Places for leaves, nodes, and tetrahedra of all levels.
+        virtual_count: Nodes that only void tetrahedra name.
         threads: Threads of a launch.
 
     Raises:
@@ -69,12 +97,14 @@ class DeviceForest:
         self.node_capacity = (
             nodes + (more + 1) // 2 if node_capacity is None else checked_count(node_capacity, "node_capacity", nodes)
         )
+        self.virtual_count = nodes - forest.node_count
         self.tree_capacity = elements + 2 * more
         if self.tree_capacity >= 2**31:
             raise InputError(f"capacity is {capacity}: that is {self.tree_capacity} tetrahedra; there can be 2**31 - 1")
         self.threads = 1 if self.device.is_cpu else self.device.sm_count * THREADS_PER_PROCESSOR
         self.pools = self._make_pools(tree)
         self.carriage = Carriage(self, density, values or {})
+        self.remember()
 
     def __repr__(self) -> str:
         return f"DeviceForest({self.leaf_count} of {self.capacity} leaves on {self.device})"
@@ -87,12 +117,12 @@ class DeviceForest:
 
     @property
     def node_count(self) -> int:
-        """Nodes in use."""
-        return self.node_capacity - self.count(kernels.FREE_NODES)
+        """Nodes that leaves name."""
+        return self.count(kernels.NODE_TOP)
 
     @property
     def free_nodes(self) -> int:
-        return self.count(kernels.FREE_NODES)
+        return self.node_capacity - self.virtual_count - self.node_count
 
     @property
     def free_leaves(self) -> int:
@@ -104,17 +134,19 @@ class DeviceForest:
         """Whether a refinement ever had to be left out for want of room."""
         return bool(self.count(kernels.FULL))
 
+    def counts(self) -> PassCounts:
+        """What the last pass came to, by one readback."""
+        return PassCounts.of(self.pools.counts.numpy())
+
     def count(self, which: int) -> int:
         """One of the counts of ``kernels.remesh``."""
         return int(self.pools.counts.numpy()[which])
 
     @property
     def nodes_in_use(self) -> npt.NDArray[np.intp]:
-        """Numbers of the nodes in use, those of the leaves first, as they come in ``to_forest``; ascending in each."""
-        used = np.flatnonzero(self.pools.valence.numpy() > 0)
-        real = np.zeros(self.node_capacity, bool)
-        real[self.leaf_tets] = True
-        return np.concatenate([used[real[used]], used[~real[used]]])
+        """Places of the nodes in the order of ``to_forest``: those of the leaves, 0 … N - 1, then the others."""
+        limit = self.node_capacity - self.virtual_count
+        return np.concatenate([np.arange(self.node_count), np.arange(limit, self.node_capacity)])
 
     @property
     def leaf_elements(self) -> npt.NDArray[np.int32]:
@@ -141,7 +173,7 @@ class DeviceForest:
     def to_forest(self) -> TetForest:
         """The present mesh on the host, its leaves as here in tree order.
 
-        Node i is ``nodes_in_use[i]`` for all that leaves name. Of a domain's mesh the function's values at new nodes
+        Node i is node i here for all that leaves name. Of a domain's mesh the function's values at new nodes
         are means, as in ``TetForest.refine``; ``fill`` and ``labels`` are what the leaves carry.
         """
         from .export import exported
@@ -157,45 +189,80 @@ class DeviceForest:
 
         compact(self)
 
+    def remember(self) -> None:
+        """Keep the present mesh and all that it carries, for ``restart``; it is done once when this is made."""
+        self._remembered = Snapshot(self)
+
+    def restart(self) -> None:
+        """Go back to what was kept last. Arrays stay the same, so that recorded passes and steps stay valid."""
+        self._remembered.restore(self)
+
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _make_pools(self, tree: Tree) -> Any:
-        forest = self.source
-        elements, nodes = len(tree.level), len(forest.lattice)
-        leaves = tree.leaves
+        forest, device = self.source, self.device
+        leaves, elements = tree.leaves, len(tree.level)
+        number = self._numbers()
+        tets, frames = number[tree.tets], all_frames()
         pools = kernels.Pools()
         pools.roots = int(np.count_nonzero(tree.parent < 0))
-        pools.tets = self._filled(tree.tets, self.tree_capacity, wp.vec4i)
+        pools.node_limit = self.node_capacity - self.virtual_count
+        pools.sink = self.node_capacity
+        pools.tets = self._filled(tets, self.tree_capacity, wp.vec4i)
         pools.level = self._filled(tree.level, self.tree_capacity, wp.int32, kernels.UNUSED)
         pools.parent = self._filled(tree.parent, self.tree_capacity, wp.int32, -1)
         pools.first_child = self._filled(tree.first_child, self.tree_capacity, wp.int32, LIVE)
-        pools.next = wp.empty(self.tree_capacity, dtype=wp.int32, device=self.device)
+        codes = frames.codes(forest.lattice, tree.tets, tree.level)
+        pools.code = self._filled(codes, self.tree_capacity, wp.int32)
+        pools.frames = wp.array(frames.frames, dtype=wp.mat33, device=device)
+        pools.child_code = wp.array(frames.of_children, dtype=wp.int32, device=device)
+        pools.next = wp.empty(self.tree_capacity, dtype=wp.int32, device=device)
         free_pairs = np.arange(self.tree_capacity - 2, elements - 1, -2, dtype=np.int32)
         most_pairs = (self.tree_capacity - pools.roots) // 2
         pools.free_pairs = self._filled(free_pairs, most_pairs, wp.int32)
-        pools.fresh = wp.empty(max(most_pairs, 1), dtype=wp.int32, device=self.device)
-        pools.lattice = self._filled(forest.lattice, self.node_capacity, wp.vec3i)
-        pools.ends = self._filled(forest.node_ends, self.node_capacity, wp.vec2i)
-        named = tree.tets[tree.first_child < 0]
-        valence = np.bincount(named.ravel(), minlength=nodes)
+        pools.fresh = wp.empty(max(most_pairs, 1), dtype=wp.int32, device=device)
+        void = np.flatnonzero((tree.first_child == VOID) & (tree.tets.min(axis=1) < forest.node_count))
+        pools.void_leaves = self._filled(void, len(void), wp.int32)
+        pools.void_count = len(void)
+        pools.lattice = self._filled(forest.lattice, self.node_capacity, wp.vec3i, places=number)
+        ends = np.where(forest.node_ends < 0, np.int32(-1), number[forest.node_ends])
+        pools.ends = self._filled(ends, self.node_capacity, wp.vec2i, -1, places=number)
+        valence = np.bincount(tets[tree.first_child < 0].ravel(), minlength=self.node_capacity)
         pools.valence = self._filled(valence, self.node_capacity, wp.int32)
-        pools.touched = wp.zeros(self.node_capacity, dtype=wp.int32, device=self.device)
-        free_nodes = np.flatnonzero(np.bincount(named.ravel(), minlength=self.node_capacity) == 0)[::-1]
-        pools.free_nodes = self._filled(free_nodes, self.node_capacity, wp.int32)
+        pools.touched = wp.zeros(self.node_capacity, dtype=wp.int32, device=device)
         pools.leaves = self._filled(leaves, self.capacity, wp.int32)
-        pools.leaf_tets = self._filled(forest.tets, self.capacity, wp.vec4i)
-        pools.new_leaves = wp.empty(self.capacity, dtype=wp.int32, device=self.device)
-        pools.marks = wp.zeros(self.capacity, dtype=wp.int8, device=self.device)
+        padding = self.padding(len(leaves), self.capacity + kernels.LEAF_PADDING)
+        pools.leaf_tets = wp.array(np.concatenate([tets[leaves], padding]), dtype=wp.vec4i, device=device)
+        pools.new_leaves = wp.empty(self.capacity, dtype=wp.int32, device=device)
+        pools.marks = wp.zeros(self.capacity, dtype=wp.int8, device=device)
         counts = np.zeros(kernels.COUNTS, np.int32)
         counts[kernels.LEAVES] = len(leaves)
-        counts[kernels.FREE_NODES] = len(free_nodes)
         counts[kernels.FREE_PAIRS] = len(free_pairs)
-        counts[kernels.NODE_TOP] = nodes
-        pools.counts = wp.array(counts, dtype=wp.int32, device=self.device)
+        counts[kernels.NODE_TOP] = counts[kernels.OLD_TOP] = forest.node_count
+        pools.counts = wp.array(counts, dtype=wp.int32, device=device)
         return pools
 
-    def _filled(self, values: npt.NDArray[Any], size: int, dtype: Any, rest: int = 0) -> wp.array:
-        """Values at the beginning of an array of a size."""
+    def padding(self, start: int, stop: int) -> npt.NDArray[np.int32]:
+        """What ``pools.leaf_tets`` holds in these places if there are no leaves, int32 [stop - start, 4]."""
+        sinks = self.node_capacity + np.arange(start, stop, dtype=np.int32) % int(kernels.SINKS)
+        return np.repeat(sinks[:, None], 4, axis=1)
+
+    def _numbers(self) -> npt.NDArray[np.int32]:
+        """Places of the source's nodes: those that leaves name first, the others at the end."""
+        real = self.source.node_count
+        number = np.arange(len(self.source.lattice), dtype=np.int32)
+        number[real:] += self.node_capacity - len(number)
+        return number
+
+    def _filled(
+        self,
+        values: npt.NDArray[Any],
+        size: int,
+        dtype: Any,
+        rest: int = 0,
+        places: npt.NDArray[np.int32] | slice | None = None,
+    ) -> wp.array:
+        """Values at these places of an array of a size, or at its beginning."""
         padded = np.full((max(size, 1), *values.shape[1:]), rest, np.int32)
-        padded[: len(values)] = values
+        padded[slice(len(values)) if places is None else places] = values
         return wp.array(padded, dtype=dtype, device=self.device)

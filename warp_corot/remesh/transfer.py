@@ -10,7 +10,9 @@ import numpy.typing as npt
 import warp as wp
 
 from ..errors import InputError
-from ..kernels.remesh_state import Carried
+from ..kernels.remesh import SINKS
+from ..kernels.remesh_state import NO_ROW, Carried
+from ..mesh.growth import lattice_spacing
 from ..mesh.lattice import MAX_LEVEL, volume_shares
 from ..nodal import padded
 
@@ -24,17 +26,18 @@ class Carriage:
     A new node is the midpoint of its deformed edge, so that children have their parent's deformation gradient. Mass is
     lumped, a quarter of each leaf's at its nodes, and moves with its momentum; what a held node cannot take up of it is
     counted in ``support_impulse``. A node between two held ones is held. A load stays where it is; that of a removed
-    node goes to both ends by halves.
+    node goes to both ends by halves. Children have their parent's density and values; a parent has its children's mean.
 
     Attributes:
-        arrays: ``kernels.remesh_state.Carried``; nodal arrays by the nodes' places in the pool, others by those of the
-            tetrahedra. ``u``, ``v``, ``load``, ``mass32`` and ``inverse_mass`` are what stepping reads and writes.
+        arrays: ``kernels.remesh_state.Carried``; nodal arrays by the nodes' places in the pool, with the places that
+            padding names behind them, others by those of the tetrahedra. ``rest``, ``u``, ``v``, ``load``,
+            ``reaction``, ``mass32`` and ``inverse_mass`` are what stepping reads and writes.
         names: Names of the columns of ``arrays.values``.
     """
 
     def __init__(self, forest: DeviceForest, density: npt.ArrayLike, values: Mapping[str, npt.ArrayLike]):
         self.device = forest.device
-        self._nodes = forest.node_capacity
+        self._nodes = forest.node_capacity + int(SINKS)
         self._first_nodes = len(forest.source.points)
         source, elements = forest.source, forest.tree_capacity
         leaves = source.tree.leaves
@@ -45,6 +48,8 @@ class Carriage:
         self.names = tuple(given)
         per_leaf = _of_leaves("density", density, len(leaves)) * fill
         arrays = Carried()
+        arrays.origin = wp.vec3d(*source.origin)
+        arrays.spacing = lattice_spacing(source.cell_size)
         volume = volume_shares(np.arange(MAX_LEVEL + 1)) * source.cell_size**3
         arrays.volume = wp.array(volume, dtype=wp.float64, device=self.device)
         arrays.density = self._of_elements(leaves, per_leaf, elements, wp.float64)
@@ -59,9 +64,13 @@ class Carriage:
         arrays.mass = wp.array(masses, dtype=wp.float64, device=self.device)
         arrays.mass32 = wp.array(masses, dtype=wp.float32, device=self.device)
         arrays.inverse_mass = wp.zeros(self._nodes, dtype=wp.float32, device=self.device)
-        for name in ("u", "v", "load"):
+        for name in ("u", "v", "load", "reaction"):
             setattr(arrays, name, wp.zeros(self._nodes, dtype=wp.vec4, device=self.device))
+        rest = np.zeros((self._nodes, 4), np.float32)
+        rest[: self._first_nodes] = padded(source.points)
+        arrays.rest = wp.array(rest, dtype=wp.vec4, device=self.device)
         arrays.held = wp.zeros(self._nodes, dtype=wp.uint8, device=self.device)
+        arrays.row = wp.full(self._nodes, int(NO_ROW), dtype=wp.int32, device=self.device)
         arrays.gained_mass = wp.zeros(self._nodes, dtype=wp.float64, device=self.device)
         arrays.gained_momentum = wp.zeros(self._nodes, dtype=wp.vec3d, device=self.device)
         arrays.gain_count = wp.zeros(self._nodes, dtype=wp.int32, device=self.device)
@@ -77,6 +86,7 @@ class Carriage:
         velocities: npt.ArrayLike | None = None,
         loads: npt.ArrayLike | None = None,
         held: npt.ArrayLike | None = None,
+        rows: npt.ArrayLike | None = None,
         nodes: npt.ArrayLike | None = None,
     ) -> None:
         """Set the state of nodes.
@@ -84,6 +94,8 @@ class Carriage:
         Args:
             displacements, velocities, loads: [n, 3] [m], [m/s], [N].
             held: Which are fixed or prescribed, bool [n].
+            rows: Which row of keyframes held nodes follow, -1 for none, int32 [n]. A node that is made between two held
+                ones has the row of both; -2 if they follow different ones.
             nodes: Places in the pool [n]; None: those of the forest that this began as, before any pass.
 
         Raises:
@@ -99,13 +111,16 @@ class Carriage:
                 whole = array.numpy().copy()
                 whole[places] = padded(found)
                 array.assign(whole)
+        for name, given in (("held", held), ("row", rows)):
+            if given is not None:
+                found = np.asarray(given)
+                if found.shape != (len(places),):
+                    raise InputError(f"{name} has shape {found.shape}; it must be [{len(places)}]")
+                array = getattr(self.arrays, name)
+                whole = array.numpy().copy()
+                whole[places] = found
+                array.assign(whole)
         if held is not None:
-            mask = np.asarray(held)
-            if mask.shape != (len(places),):
-                raise InputError(f"held has shape {mask.shape}; it must be [{len(places)}]")
-            whole = self.arrays.held.numpy().copy()
-            whole[places] = mask
-            self.arrays.held.assign(whole)
             self._update_inverse_mass()
 
     def values(self, name: str) -> npt.NDArray[np.float32]:
