@@ -47,8 +47,8 @@ class SoftBody(Controls):
         worlds: How many copies.
         device: "cpu", "cuda:0", …; None for Warp's default.
 
-    A body that is remeshed (``Simulation(…, remesh=…)``) has other nodes after a pass: ``node_count`` and all arrays are
-    then asked for anew, and views from before raise ``StaleViewError``.
+    A body that is remeshed (``Simulation(…, remesh=…)``) has other nodes after a pass that changed something: ask for
+    ``node_count`` and arrays anew then; views from before raise ``StaleViewError``.
 
     Attributes:
         worlds, device: As given.

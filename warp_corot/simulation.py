@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from os import PathLike
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,20 +17,14 @@ import warp as wp
 from .body import SoftBody
 from .checks import checked_count, checked_things
 from .elasticity import Corotated, Model
-from .errors import CapacityWarning, InputError, StabilityWarning, UnstableError
+from .errors import InputError, StabilityWarning, UnstableError
 from .indices import checked_indices
-from .kernels.integrate import advance_clock
 from .nodal import vec3_view
 from .remesh.online import OnlineRemesh
+from .remesh.remeshing import Remeshing
 from .solvers import Integrator, SymplecticEuler, largest_frequency
 from .solvers.integrator import StepContext
-
-if TYPE_CHECKING:
-    from .remesh.changing import Changing
-
-#: Steps recorded in one graph, so that Python is out of the loop; more where a launch is many steps.
-GRAPH_STEPS = 64
-BLOCK_STEPS = 1024
+from .solvers.recorded import GRAPH_STEPS, RecordedSteps
 
 #: About how long a run goes on before it looks whether its state is still finite [s].
 CHECK_SECONDS = 0.1
@@ -121,13 +115,10 @@ class Simulation:
             raise InputError(f"integrator is {integrator!r}; it must be an integrator such as SymplecticEuler()")
         self.gravity = _checked_gravity(gravity, self.bodies[0].mesh.up_axis)
 
-        #: What remeshes each body, None for those that stay as they are.
-        self.changing = self._changing_bodies(remesh)
+        self.remeshing = Remeshing(self.bodies, self.models, remesh, deterministic=self.deterministic)
         bound = zip(self.models, self.bodies, strict=True)
         self.fields = tuple(m.bind(body, deterministic=self.deterministic) for m, body in bound)
-        for changing, field in zip(self.changing, self.fields, strict=True):
-            if changing is not None:
-                changing.serve(field)
+        self.remeshing.serve(self.fields)
         self.clock = wp.zeros(1, dtype=wp.int64, device=self.device)
         self._bad_step = wp.array([_NEVER], dtype=wp.int64, device=self.device)
         #: Steps that would have taken as long as the time before the first one of the present length.
@@ -178,16 +169,14 @@ class Simulation:
             UnstableError: On the CPU: the state is not finite any more.
         """
         if self.device.is_capturing:
-            if self._passes:
+            if self.remeshing.every:
                 raise InputError("a simulation with remesh cannot be recorded by others: launches change with the mesh")
-            self._launch_steps(1, whole=True)
+            self._recorded.launch(1, whole=True)
             return
-        self._run(1, whole=True)
-        due = self._passes and self.steps % self._passes == 0
-        if self.device.is_cpu or self._hooks or due:
+        self._recorded.replay(1, whole=True)
+        if self.device.is_cpu or self._hooks or self.remeshing.is_due(self.steps):
             self._check_finite()
-            if due:
-                self._remesh()
+            self._remesh()
             self._call_hooks()
 
     def advance(self, seconds: float) -> None:
@@ -201,7 +190,7 @@ class Simulation:
             raise InputError(f"cannot advance by {seconds} s; it must be zero or a positive time")
         if self.device.is_capturing:
             raise InputError("advance cannot be called while its device is capturing; call step, which records")
-        if self._passes:
+        if self.remeshing.every:
             self.advance_until(self.total_time + seconds)
         else:
             self.advance_steps(round(seconds / self.dt))
@@ -209,12 +198,12 @@ class Simulation:
     def advance_until(self, total_time: float) -> None:
         """Advance until ``total_time`` [s] is as near as whole steps bring it; as ``advance``."""
         count = max(round((total_time - self.total_time) / self.dt), 0)
-        if not self._passes:
+        if not self.remeshing.every:
             self.advance_steps(count)
             return
         # A pass may change the step.
         while count > 0:
-            self.advance_steps(min(count, self._passes - self.steps % self._passes))
+            self.advance_steps(min(count, self.remeshing.every - self.steps % self.remeshing.every))
             count = max(round((total_time - self.total_time) / self.dt), 0)
 
     def advance_steps(self, count: int) -> None:
@@ -223,16 +212,12 @@ class Simulation:
         end = self.total_steps + count
         done, left = self.steps, count
         while left > 0:
-            rests = [h.every for h in self._hooks] + ([self._passes] if self._passes else [])
+            rests = [h.every for h in self._hooks] + [every for every in [self.remeshing.every] if every]
             due = min([done + left, done + self._check_steps, *((done // every + 1) * every for every in rests)])
             started = time.perf_counter()
-            for body in self.bodies:
-                body.adopt_positions()
-            self._launch_runs(due - done)
-            for body in self.bodies:
-                body.publish_positions()
+            self._recorded.replay_runs(due - done)
             self._check_finite()
-            if self._passes and due % self._passes == 0:
+            if self.remeshing.is_due(due):
                 self._remesh()
             if due - done == self._check_steps:
                 longer = CHECK_SECONDS / (time.perf_counter() - started)
@@ -286,8 +271,7 @@ class Simulation:
         for body, field in zip(self.bodies, self.fields, strict=True):
             body.reset(chosen, self.clock)
             field.reset(chosen)
-        if any(self.changing):
-            self._control_step()
+        self._control_step()
 
     # --- looking ---------------------------------------------------------------------------------------------------
 
@@ -345,29 +329,6 @@ class Simulation:
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
-    def _changing_bodies(
-        self, remesh: OnlineRemesh | Sequence[OnlineRemesh | None] | None
-    ) -> tuple[Changing | None, ...]:
-        asked = [remesh] * len(self.bodies) if isinstance(remesh, OnlineRemesh | None) else list(remesh)
-        if len(asked) != len(self.bodies) or not all(isinstance(each, OnlineRemesh | None) for each in asked):
-            raise InputError(
-                f"remesh is {remesh!r}; it must be an OnlineRemesh, or one or None for each of {len(self.bodies)} bodies"
-            )
-        if not any(asked):
-            self._passes = 0
-            return (None,) * len(self.bodies)
-        if self.deterministic and self.device.is_cuda:
-            raise InputError("deterministic runs cannot be remeshed on CUDA: new nodes are numbered as threads come")
-        for each, model in zip(asked, self.models, strict=True):
-            if each is not None:
-                model.check_remeshable()
-        from .remesh.changing import Changing
-
-        self._passes = math.gcd(*(each.every for each in asked if each is not None))
-        return tuple(
-            None if each is None else Changing(body, each) for body, each in zip(self.bodies, asked, strict=True)
-        )
-
     def _found_step(self, stacklevel: int) -> float:
         """The time step that was given, or one that is stable; ``stable_dt`` is found anew."""
         frequencies = [largest_frequency(body, f) for body, f in zip(self.bodies, self.fields, strict=True)]
@@ -388,29 +349,17 @@ class Simulation:
     def _bind_steppers(self) -> None:
         context = StepContext(self.dt, wp.vec3(*self.gravity), self.clock, self._bad_step)
         bound = zip(self.bodies, self.fields, strict=True)
-        self._steppers = [self.integrator.bind(body, field, context) for body, field in bound]
-        self._graphs: dict[tuple[int, bool], wp.Graph] = {}
-        self._recorded_revisions: tuple[int, ...] = ()
+        steppers = [self.integrator.bind(body, field, context) for body, field in bound]
+        self._recorded = RecordedSteps(self.bodies, steppers, self.clock)
 
     def _remesh(self) -> None:
-        """Let the meshes follow the motion, and the step the meshes."""
-        steps = self.steps
-        due = [c for c in self.changing if c is not None and steps % c.options.every == 0]
-        changed = [c.run() for c in due]
-        for changing in due:
-            if changing.is_full and not changing.said_full:
-                changing.said_full = True
-                warnings.warn(
-                    f"the mesh has no room for more than {changing.options.capacity} elements: it is refined no further",
-                    CapacityWarning,
-                    stacklevel=3,
-                )
-        if any(changed):
+        """Let the meshes follow the motion, and the step the meshes, where that is due."""
+        if self.remeshing.run(self.steps):
             self._control_step()
 
     def _control_step(self) -> None:
         """Find the stable step anew where the stiffest elements are others now."""
-        if not any([c.stiffness_changed() for c in self.changing if c is not None]):
+        if not self.remeshing.stiffness_changed():
             return
         before, self.dt = self.dt, self._found_step(stacklevel=5)
         if self.dt == before:
@@ -429,39 +378,6 @@ class Simulation:
         if body not in self.bodies:
             raise InputError("the body is not one of this simulation's")
         return self.bodies.index(body)
-
-    def _launch_steps(self, count: int, *, whole: bool) -> None:
-        """Launch steps; ``whole`` ones take over positions first and publish them after."""
-        if whole:
-            for body in self.bodies:
-                body.adopt_positions()
-        for stepper in self._steppers:
-            stepper.steps(count)
-        wp.launch(advance_clock, dim=1, inputs=[count], outputs=[self.clock], device=self.device)
-        if whole:
-            for body in self.bodies:
-                body.publish_positions()
-
-    def _launch_runs(self, count: int) -> None:
-        """Launch steps as few runs, which are recorded once and replayed."""
-        in_blocks = all(stepper.many_a_launch for stepper in self._steppers)
-        for size in (BLOCK_STEPS, GRAPH_STEPS, 1) if in_blocks else (GRAPH_STEPS, 1):
-            for _ in range(count // size):
-                self._run(size, whole=False)
-            count %= size
-
-    def _run(self, count: int, *, whole: bool) -> None:
-        """Replay recorded steps, recording them first where they are new or the bodies' launches have changed."""
-        revisions = tuple(body.revision for body in self.bodies)
-        if revisions != self._recorded_revisions:
-            self._graphs.clear()
-            self._recorded_revisions = revisions
-        key = (count, whole)
-        if key not in self._graphs:
-            with wp.ScopedCapture(device=self.device) as capture:
-                self._launch_steps(count, whole=whole)
-            self._graphs[key] = capture.graph
-        wp.capture_launch(self._graphs[key])
 
     def _check_finite(self) -> None:
         step = int(self._bad_step.numpy()[0])

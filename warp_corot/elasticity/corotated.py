@@ -69,6 +69,10 @@ class Corotated(Model):
         if self.stiffness not in STIFFNESSES:
             raise InputError(f"stiffness is {self.stiffness!r}; it must be one of {', '.join(STIFFNESSES)}")
 
+    def check_remeshable(self) -> None:
+        if self.rotation == "warm":
+            raise InputError("rotation is 'warm', which is kept from step to step; to be remeshed it must be another")
+
     def bind(self, body: SoftBody, *, deterministic: bool = False) -> CorotatedField | AnisotropicField:
         if isinstance(body.material, Anisotropic):
             return self._bind_anisotropic(body, deterministic)

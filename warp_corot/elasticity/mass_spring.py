@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from ..elements import in_worlds, repeated
+from ..errors import InputError
 from ..kernels.constitutive import stvk_cauchy
 from ..kernels.forces import element_von_mises
 from ..kernels.springs import mass_spring_energies, scatter_mass_spring
@@ -28,6 +29,9 @@ class MassSpring(Model):
     Young's modulus E with Poisson's ratio 1/4. Springs between pairs of points cannot have any other ratio, so the
     material's own is ignored. Von Mises stress is that of Hooke's law with E and 1/4 on the Green strain.
     """
+
+    def check_remeshable(self) -> None:
+        raise InputError("the model MassSpring has springs along the edges that it begins with; it cannot be remeshed")
 
     def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
         return MassSpringField(body, deterministic)

@@ -159,6 +159,13 @@ class Model(ABC):
             InputError: The model cannot be used with this body's mesh.
         """
 
+    def check_remeshable(self) -> None:  # noqa: B027 (most are)
+        """See that a body under this model can be remeshed.
+
+        Raises:
+            InputError: The model keeps something of the elements or edges that it was bound to.
+        """
+
 
 class ElementField(ForceField):
     """Force field of kernels that need nothing but each element's nodal displacements."""

@@ -23,7 +23,8 @@ from ..errors import InputError
 from ..materials import Isotropic
 from ..mesh import TetForest
 from ..mesh.surface import signed_volumes
-from ..simulation import GRAPH_STEPS, Simulation
+from ..simulation import Simulation
+from ..solvers.recorded import GRAPH_STEPS
 from ..solvers import SymplecticEuler
 from .timing import Stages, Times, measure_times
 

@@ -58,7 +58,9 @@ class BlockSteps:
     @classmethod
     def of(cls, body: SoftBody, field: ForceField) -> BlockSteps | None:
         """A body's steps in blocks, or None: not on CUDA, too large, or not made of subtrees of one type alone."""
-        if not body.device.is_cuda or not isinstance(field, SubtreeField) or not isinstance(body.mesh, TetForest):
+        if body.changing is not None or not body.device.is_cuda:
+            return None
+        if not isinstance(field, SubtreeField) or not isinstance(body.mesh, TetForest):
             return None
         if not any(layout.fits for layout in _layouts(body, 0, False, len(body.mesh.tets) // 8)):
             return None

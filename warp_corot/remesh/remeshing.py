@@ -1,0 +1,99 @@
+"""Which bodies of a simulation are remeshed, and when."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from ..errors import CapacityWarning, InputError
+from .online import OnlineRemesh
+
+if TYPE_CHECKING:
+    from ..body import SoftBody
+    from ..elasticity import ForceField, Model
+    from .changing import Changing
+
+
+class Remeshing:
+    """The passes of a simulation.
+
+    Args:
+        bodies, models: The simulation's.
+        asked: What was asked for, for all bodies or one for each.
+        deterministic: Whether a run must come out the same bit by bit.
+
+    Attributes:
+        changing: What remeshes each body, None for those that stay as they are.
+        every: Steps after which a pass may be due; 0 if there is none.
+
+    Raises:
+        InputError: What was asked for is neither, or cannot be had of these bodies and models.
+    """
+
+    def __init__(
+        self,
+        bodies: Sequence[SoftBody],
+        models: Sequence[Model],
+        asked: OnlineRemesh | Sequence[OnlineRemesh | None] | None,
+        *,
+        deterministic: bool,
+    ):
+        options = _one_each(asked, len(bodies))
+        self.every = math.gcd(*(each.every for each in options if each is not None))
+        self.changing: tuple[Changing | None, ...] = (None,) * len(bodies)
+        if not self.every:
+            return
+        if deterministic and bodies[0].device.is_cuda:
+            raise InputError("a deterministic run on CUDA cannot be remeshed: new nodes are numbered as threads come")
+        for each, model in zip(options, models, strict=True):
+            if each is not None:
+                model.check_remeshable()
+        from .changing import Changing
+
+        self.changing = tuple(
+            None if each is None else Changing(body, each) for body, each in zip(bodies, options, strict=True)
+        )
+        self._said_full: set[int] = set()
+
+    def serve(self, fields: Sequence[ForceField]) -> None:
+        """Let the bodies' force fields, made by now, go through the pools."""
+        for changing, field in zip(self.changing, fields, strict=True):
+            if changing is not None:
+                changing.serve(field)
+
+    def is_due(self, steps: int) -> bool:
+        """Whether any pass is due after so many steps."""
+        return self.every > 0 and steps % self.every == 0
+
+    def run(self, steps: int) -> bool:
+        """The passes that are due after so many steps; whether any was.
+
+        Warns:
+            CapacityWarning: A body has no room left for what should be refined; once.
+        """
+        due = [c for c in self.changing if c is not None and steps % c.options.every == 0]
+        for changing in due:
+            changing.run()
+            if changing.is_full and id(changing) not in self._said_full:
+                self._said_full.add(id(changing))
+                most = f"{changing.options.capacity} elements"
+                message = f"the mesh has no room left, its capacity is {most}; it is refined no further"
+                warnings.warn(message, CapacityWarning, stacklevel=5)
+        return bool(due)
+
+    def stiffness_changed(self) -> bool:
+        """Whether the stable step may be another one than when this was last asked."""
+        return any([changing.stiffness_changed() for changing in self.changing if changing is not None])
+
+
+def _one_each(
+    asked: OnlineRemesh | Sequence[OnlineRemesh | None] | None, count: int
+) -> tuple[OnlineRemesh | None, ...]:
+    if isinstance(asked, OnlineRemesh | None):
+        return (asked,) * count
+    given = tuple(asked) if isinstance(asked, Sequence) else ()
+    if len(given) != count or not all(isinstance(each, OnlineRemesh | None) for each in given):
+        raise InputError(f"remesh is {asked!r}; it must be an OnlineRemesh, or one or None for each of {count} bodies")
+    return given
