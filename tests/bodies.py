@@ -8,6 +8,7 @@ class Body:
     """A signed function of points [n, 3], negative inside, in float64, rounded once."""
 
     up_axis = "Y"
+    device = "cpu"
 
     def __init__(self, function, bounds, lipschitz=1.0, labels=None, label_names=()):
         self.function = function

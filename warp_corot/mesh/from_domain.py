@@ -41,7 +41,7 @@ def mesh_domain(
     device: str | wp.Device | None,
 ) -> TetForest:
     """See `TetForest.from_domain`."""
-    where = checked_device(getattr(domain, "device", "cpu") if device is None else device)
+    where = checked_device(domain.device if device is None else device)
     _check(cell_size, min_level, max_level, surface_error, field_tolerance, target_elements, sliver)
     error = 0.0 if surface_error is None else float(surface_error)
 
