@@ -133,3 +133,29 @@ def test_loads_stay_in_sum(device, rng):
         found = adaptive.carriage.arrays.load.numpy()
         assert np.allclose(found.sum(axis=0)[:3], loads.sum(axis=0), atol=1e-5 * np.abs(loads).sum())
     assert np.abs(found[: len(forest.points), :3] - loads).max() > 0.1
+
+
+def test_a_new_node_takes_what_leaves_of_any_density_lose(device, rng):
+    """Densities around one edge span six decades. A leaf of mass M becomes two of M / 2, each with a quarter at each of
+    its nodes: both ends lose M / 8 and the new node, which is in both, gets M / 4."""
+    forest = wc.TetForest.box((1, 1, 1), CUBE, 6)
+    density = 10.0 ** rng.uniform(-2, 4, len(forest.tets))
+    edge = forest.tets[17, [0, 3]]
+    ring = np.isin(forest.tets, edge).sum(axis=1) == 2
+    assert ring.sum() > 3
+    adaptive = DeviceForest(forest, 1000, density=density, device=device)
+    velocities = rng.normal(size=forest.points.shape)
+    adaptive.carriage.set_nodes(velocities=velocities)
+    before = adaptive.carriage.arrays.mass.numpy().copy()
+    (p, size), total = momentum(adaptive), before.sum()
+    RemeshPass(adaptive).apply(np.arange(len(forest.tets)) == 17)
+    assert_sound(adaptive)
+    after, new = adaptive.carriage.arrays.mass.numpy(), len(forest.points)
+    weight = (density * forest.volumes)[ring].sum()
+    assert adaptive.counts()[:4] == (len(forest.tets) + ring.sum(), new + 1, 1, 0)
+    assert after[new] == pytest.approx(weight / 4, rel=1e-12)
+    assert before[edge] - after[edge] == pytest.approx(np.full(2, weight / 8), rel=1e-9)
+    assert after.sum() == pytest.approx(total, rel=1e-14)
+    v = adaptive.carriage.arrays.v.numpy()[new, :3]
+    assert np.allclose(v, velocities[edge].mean(axis=0), atol=1e-6)
+    assert np.allclose(momentum(adaptive)[0], p, atol=1e-7 * size)
