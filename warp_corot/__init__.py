@@ -7,23 +7,22 @@ Interactive Soft Tissue Simulation* (IEEE EMBC 2013).
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from .api import *  # noqa: F403
-
 __version__ = "0.1.0"
 
+if TYPE_CHECKING:
+    from .api import *  # noqa: F403
+else:  # hidden from type checkers, to which every name would exist
 
-def __getattr__(name: str) -> Any:
-    """The first name asked for imports all: so that the command line is ready for Ctrl-C before that."""
-    if name.startswith("__") and name != "__all__":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    api = import_module(".api", __name__)
-    globals().update({"__all__": api.__all__} | {each: getattr(api, each) for each in api.__all__})
-    if name not in globals():
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return globals()[name]
+    def __getattr__(name: str) -> Any:
+        """The first name asked for imports all: so that the command line is ready for Ctrl-C before that."""
+        if name.startswith("__") and name != "__all__":
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        api = import_module(".api", __name__)
+        globals().update({"__all__": api.__all__} | {each: getattr(api, each) for each in api.__all__})
+        if name not in globals():
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return globals()[name]
 
-
-def __dir__() -> list[str]:
-    __getattr__("__all__")
-    return sorted(globals())
+    def __dir__() -> list[str]:
+        __getattr__("__all__")
+        return sorted(globals())
