@@ -1,5 +1,7 @@
 """Forests with void parts: their trees, refinement, forces and pieces."""
 
+import itertools
+
 import numpy as np
 import pytest
 import warp as wp
@@ -87,3 +89,12 @@ def test_the_largest_piece_alone():
     assert_conforming(one)
     assert one.largest_piece() is one
     assert wc.TetForest.box().largest_piece().pieces().tolist() == [0] * 6
+
+
+@pytest.mark.parametrize("far", [1e2, 1e8, 1e20, 1e300])
+def test_points_however_far_are_held_by_elements_on_their_side(forest, far):
+    middle = forest.points.mean(axis=0)
+    for axis, sign in itertools.product(range(3), (-1.0, 1.0)):
+        (element,), _ = forest.embed([middle + sign * far * np.eye(3)[axis]])
+        outermost = (sign * forest.points[:, axis]).max()
+        assert (sign * forest.points[forest.tets[element], axis]).max() == pytest.approx(outermost, abs=1e-3)

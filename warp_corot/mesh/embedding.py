@@ -16,6 +16,9 @@ from .tree import VOID
 if TYPE_CHECKING:
     from .forest import TetForest
 
+#: Points farther away than so many lengths of the mesh count as that far: beyond, float32 tells no distances apart.
+FARTHEST = 1.0e3
+
 #: The walk from one corner of a cube to the opposite one, by the axes in descending order of a point's coordinates.
 _WALKS = np.array([[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]])
 
@@ -84,9 +87,12 @@ def _nearest(forest: TetForest, points: np.ndarray) -> np.ndarray:
         wp.array(forest.points - middle, dtype=wp.vec3, device=device),
         wp.array(faces.ravel(), dtype=wp.int32, device=device),
     )
-    moved = wp.array(points - middle, dtype=wp.vec3, device=device)
+    moved = points - middle
+    limit = FARTHEST * np.ptp(forest.points, axis=0).max()
+    moved *= limit / np.maximum(np.abs(moved).max(axis=1, keepdims=True), limit)
+    given = wp.array(moved, dtype=wp.vec3, device=device)
     closest = wp.empty(len(points), dtype=wp.int32, device=device)
-    wp.launch(kernels.nearest_faces, len(points), [moved, mesh.id, 1.0e15], [closest], device=device)
+    wp.launch(kernels.nearest_faces, len(points), [given, mesh.id, 10.0 * limit], [closest], device=device)
     return parents[closest.numpy()]
 
 
