@@ -47,8 +47,8 @@ def all_frames() -> FrameTable:
         lattice = np.concatenate([lattice, ends.sum(axis=1, dtype=np.int32) // 2])
         below = children(tets, middle, kind).reshape(-1, 4)
         keys_below = _keys(lattice, below, level + 1)
-        for parent, pair in zip(key.tolist(), keys_below.reshape(-1, 2).tolist(), strict=True):
-            born[parent, kind] = (pair[0], pair[1])
+        for parent, (first, second) in zip(key.tolist(), keys_below.reshape(-1, 2).tolist(), strict=True):
+            born[parent, kind] = (first, second)
         level += 1
         seen |= set(keys_below.tolist())
         _, one_of_each = np.unique(keys_below, return_index=True)

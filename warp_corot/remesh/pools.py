@@ -41,8 +41,11 @@ class PassCounts(NamedTuple):
     @classmethod
     def of(cls, counts: npt.NDArray[np.int32]) -> PassCounts:
         """From a copy of ``pools.counts``."""
-        named = (kernels.LEAVES, kernels.NODE_TOP, kernels.ADDED, kernels.REMOVED)
-        return cls(*(int(counts[which]) for which in named), bool(counts[kernels.FULL]))
+        leaves, nodes, added, removed, full = (
+            int(counts[which])
+            for which in (kernels.LEAVES, kernels.NODE_TOP, kernels.ADDED, kernels.REMOVED, kernels.FULL)
+        )
+        return cls(leaves, nodes, added, removed, bool(full))
 
 
 class DeviceForest:
