@@ -1,8 +1,9 @@
 """Corotated forces of orthotropic elements on the CPU, eight to the lanes of vector registers; see ``lanes``.
 
 Both kinds of elements come as general ones, with M multiplied into their rest matrix: F M = M + (d1 d2 d3) B. An
-element that the unscaled iteration does not turn, or that is near having no definite rotation (see ``anisotropic``),
-adds nothing and is flagged; ``repair_anisotropic`` does those.
+element that the unscaled iteration does not turn adds nothing and is flagged; ``repair_anisotropic`` does those. Among
+them are all that are near having no definite rotation (see ``anisotropic``): the iteration turns none whose stretches
+are not within 0.44 and 2.27, and with these det(tr(S) I - S) / |S|^3 is above 0.5.
 """
 
 import functools
@@ -10,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from .anisotropic import INDEFINITE, OrthotropicMaterial, axes_of, element_forces, filled
+from .anisotropic import OrthotropicMaterial, axes_of, element_forces, filled
 from .elements import GeneralElements, frame, rest_volume
 from .general_cpu import ADD_FORCES, gather_elements, rest_inverse_of
 from .lanes import COMPILER_FLAGS, NEWTON, PRELUDE, on_cpu
@@ -37,7 +38,7 @@ _FORCES = f"""{PRELUDE}{NEWTON}
         const triple axis = {{m[j], m[3 + j], m[6 + j]}};
         c[j] = plus(plus(axis, scaled(b[j], d1)), plus(scaled(b[3 + j], d2), scaled(b[6 + j], d3)));
     }}
-    masks8 trusted = newton(c[0], c[1], c[2], spread(1.0f), r);
+    const masks8 trusted = newton(c[0], c[1], c[2], spread(1.0f), r);
     for (int j = 0; j < 3; ++j) r[j] = scaled(spread({0.5**ITERATIONS!r}f), r[j]);
     const lanes8 e0 = dot(r[0], c[0]) - 1.0f, e1 = dot(r[1], c[1]) - 1.0f, e2 = dot(r[2], c[2]) - 1.0f;
     const lanes8 e01 = 0.5f * (dot(r[0], c[1]) + dot(r[1], c[0]));
@@ -52,9 +53,6 @@ _FORCES = f"""{PRELUDE}{NEWTON}
     const lanes8 a0 = h1 * h2 - e12 * e12, a1 = h0 * h2 - e02 * e02, a2 = h0 * h1 - e01 * e01;
     const lanes8 a01 = e02 * e12 + e01 * h2, a02 = e01 * e12 + e02 * h1, a12 = e01 * e02 + h0 * e12;
     const lanes8 det = h0 * a0 - e01 * a01 - e02 * a02;
-    const lanes8 n2 = (e0 + 1.0f) * (e0 + 1.0f) + (e1 + 1.0f) * (e1 + 1.0f) + (e2 + 1.0f) * (e2 + 1.0f)
-        + 2.0f * (e01 * e01 + e02 * e02 + e12 * e12);
-    trusted = trusted & (det > 0.0f) & (det * det >= {INDEFINITE**2!r}f * n2 * n2 * n2);
     // Axial vector of e s - s e.
     const lanes8 w0 = e02 * s01 + e12 * s1 + e2 * s12 - (e01 * s02 + e1 * s12 + e12 * s2);
     const lanes8 w1 = e0 * s02 + e01 * s12 + e02 * s2 - (e02 * s0 + e12 * s01 + e2 * s02);
