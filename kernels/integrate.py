@@ -76,6 +76,12 @@ def advance_clock(steps: int, clock: wp.array[wp.int64]):
 
 
 @wp.kernel(enable_backward=False)
+def set_start(clock: wp.array[wp.int64], world_starts: wp.array[wp.float64]):
+    """Let the time of the one world there is begin now."""
+    world_starts[0] = wp.float64(clock[0])
+
+
+@wp.kernel(enable_backward=False)
 def follow_trajectory(
     # In
     nodes: wp.array[wp.int32],

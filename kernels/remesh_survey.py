@@ -2,49 +2,54 @@
 
 import warp as wp
 
-from .remesh import ADDED, LEAVES, REMOVED, Pools
+from .remesh import LEAVES, Pools
 from .remesh_state import Carried
 
 
 @wp.kernel(enable_backward=False)
 def begin_survey(
     # In
-    pools: Pools,
+    goes: wp.array[wp.int32],
     # Out
-    stiffest: wp.array[wp.int32],
+    found: wp.array[wp.int32],
 ):
-    if pools.counts[ADDED] + pools.counts[REMOVED] > 0:
-        stiffest[0] = 0
+    if goes[0] != 0:
+        found[0] = 0
+        found[1] = 0
 
 
 @wp.kernel(enable_backward=False)
 def find_stiffest(
     # In
     threads: int,
+    goes: wp.array[wp.int32],
     modulus: float,
     mu_column: int,
     lam_column: int,
     pools: Pools,
     carried: Carried,
     # Out
-    stiffest: wp.array[wp.int32],
+    found: wp.array[wp.int32],
 ):
-    """Largest (2 mu + lambda) / (density volume^(2/3)) [1/s^2] of the leaves, as the bits of a float.
+    """Largest (2 mu + lambda) / (density volume^(2/3)) [1/s^2] of the leaves, as the bits of a float, and the finest level.
 
     ``modulus`` is 2 mu + lambda [Pa] where all elements have the same, and columns of ``values`` are negative.
     """
-    count = pools.counts[LEAVES]
-    if pools.counts[ADDED] + pools.counts[REMOVED] == 0:
-        count = 0
+    count = wp.where(goes[0] != 0, pools.counts[LEAVES], 0)
     most = float(0.0)
+    finest = int(0)
     for i in range(wp.tid(), count, threads):
         e = pools.leaves[i]
+        level = pools.level[e]
         stiffness = modulus
         if mu_column >= 0:
             stiffness = 2.0 * carried.values[e, mu_column] + carried.values[e, lam_column]
-        size = wp.pow(float(carried.volume[pools.level[e]]), 2.0 / 3.0)
+        size = wp.pow(float(carried.volume[level]), 2.0 / 3.0)
         most = wp.max(most, stiffness / (float(carried.density[e]) * size))
+        finest = wp.max(finest, level)
     # Positive floats are in the order of their bits. Few threads get so far as to write.
     bits = wp.cast(most, wp.int32)
-    if bits > stiffest[0]:
-        wp.atomic_max(stiffest, 0, bits)
+    if bits > found[0]:
+        wp.atomic_max(found, 0, bits)
+    if finest > found[1]:
+        wp.atomic_max(found, 1, finest)

@@ -5,16 +5,18 @@ from .anisotropy import Orthotropic, TransverselyIsotropic
 from .body import SoftBody
 from .domain import Domain
 from .elasticity import Corotated, EdgeStVK, Linear, MassSpring, NeoHookean, StVenantKirchhoff
-from .errors import InputError, StabilityWarning, UnstableError
+from .errors import CapacityWarning, InputError, StabilityWarning, StaleViewError, UnstableError
 from .io.animate import record
 from .materials import Isotropic
 from .mesh import SurfaceMesh, TetForest, TetMesh
+from .remesh.online import OnlineRemesh
 from .rotations import polar_rotation
 from .simulation import Energy, Simulation
 from .solvers import SymplecticEuler
 
 __all__ = [
     "Activation",
+    "CapacityWarning",
     "Corotated",
     "Domain",
     "EdgeStVK",
@@ -24,11 +26,13 @@ __all__ = [
     "Linear",
     "MassSpring",
     "NeoHookean",
+    "OnlineRemesh",
     "Orthotropic",
     "Simulation",
     "SoftBody",
     "StVenantKirchhoff",
     "StabilityWarning",
+    "StaleViewError",
     "SurfaceMesh",
     "SymplecticEuler",
     "TetForest",

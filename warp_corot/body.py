@@ -16,13 +16,16 @@ from .elements import Mesh, device_elements, element_kind, parts, repeated
 from .errors import InputError
 from .kernels.integrate import adopt_positions, publish_positions, reset_nodes
 from .materials import Isotropic, Material
+from .mesh import TetForest
 from .nodal import padded, vec3_view
 from .trajectory import Trajectory
 from .views import Views
 from .worlds import World
 
 if TYPE_CHECKING:
+    from .mesh.bound import DeviceBinding
     from .remesh.changing import Changing
+    from .remesh.following import FollowingBinding
 
 #: Elements, and with them nodes, are numbered in 32 bits.
 MOST_ELEMENTS = 2**31 - 1
@@ -108,6 +111,10 @@ class SoftBody(Controls):
         self.revision = 0
         self._held: npt.NDArray[np.bool_] | None = np.zeros(n, bool)
         self._views = Views()
+        #: Points that go along with the body.
+        self.bindings: list[FollowingBinding] = []
+        #: Changes whenever the mesh does.
+        self.mesh_revision = 0
         #: Displacements and velocities that worlds are reset to; None for rest.
         self.initial_state: tuple[wp.array, wp.array] | None = None
         self.update_inverse_mass()
@@ -159,6 +166,7 @@ class SoftBody(Controls):
             nodes, elements: How many there are now.
         """
         self.world_node_count, self.world_element_count = nodes, elements
+        self.mesh_revision += 1
         self._mesh = self._material = self._masses = self._held = None
         self._views.expire()
 
@@ -231,6 +239,28 @@ class SoftBody(Controls):
     def nodal_view(self, array: wp.array) -> wp.array:
         """One of the nodal arrays as vec3 [worlds * N], live, until the mesh changes."""
         return self._views.hand_out(vec3_view(array[: self.node_count]))
+
+    def bind(self, points: npt.ArrayLike, triangles: npt.ArrayLike | None = None) -> DeviceBinding:
+        """Points, or with triangles [F, 3] a surface, that go along with the body, also while it is remeshed.
+
+        ``update(body.displacements)`` brings what is returned up to date, on the body's device.
+
+        Args:
+            points: Rest positions [m], [n, 3].
+
+        Raises:
+            InputError: The mesh is not a forest, the body is in several worlds, or as ``TetForest.bind``.
+        """
+        from .remesh.following import FollowingBinding
+
+        if not isinstance(self.mesh, TetForest):
+            raise InputError(f"only a TetForest can have points bound to it, not a {type(self.mesh).__name__}")
+        if self.worlds > 1:
+            raise InputError(f"worlds is {self.worlds}; bind points to the mesh, and move them with one world's nodes")
+        leaves, _ = self.mesh.embed(points)
+        binding = FollowingBinding(self.mesh.bind(points, triangles), self.mesh, leaves, self.device)
+        self.bindings.append(binding)
+        return binding
 
     def adopt_positions(self) -> None:
         """Take over positions that somebody wrote since they were last published."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 import warp as wp
@@ -9,38 +11,36 @@ import warp as wp
 from ..kernels.remesh_follow import bind_points
 from ..mesh import TetForest
 from ..mesh.bound import BoundPoints, DeviceBinding
-from .pools import DeviceForest
 
 #: How far from the border of its element the place is that decides which element a point goes along with, as a share.
 INWARD = 1e-3
 
 
 class FollowingBinding(DeviceBinding):
-    """Bound points of a mesh that changes: after each pass they are bound to the elements that hold them then.
+    """Points bound to a mesh that may change: after each pass they are bound to the elements that hold them then.
 
     Args:
         bound: Bound to the nodes of ``mesh``.
         mesh: As it is now.
         leaves: The leaf that each point is bound to, int32 [V].
-        forest: The pools.
+        device: Where the body is.
     """
 
-    def __init__(self, bound: BoundPoints, mesh: TetForest, leaves: npt.NDArray[np.integer], forest: DeviceForest):
-        super().__init__(bound, forest.device)
-        self._forest = forest
+    def __init__(self, bound: BoundPoints, mesh: TetForest, leaves: npt.NDArray[np.integer], device: wp.Device):
+        super().__init__(bound, device)
         tree = mesh.tree
         roots = tree.ancestors(tree.leaves[leaves], 0)
         corners = mesh.lattice_points[tree.tets[roots]]
         inward = np.clip(bound.weights, 0.0, None)
         inward = (1.0 - INWARD) * inward / inward.sum(axis=1, keepdims=True) + INWARD / 4.0
         inside = np.einsum("vn,vnc->vc", inward, mesh.points[mesh.tets[leaves]])
-        self._roots = wp.array(roots, dtype=wp.int32, device=forest.device)
-        self._inside = wp.array(_coordinates(corners, inside), dtype=wp.vec4d, device=forest.device)
-        self._points = wp.array(_coordinates(corners, bound.points), dtype=wp.vec4d, device=forest.device)
+        self._roots = wp.array(roots, dtype=wp.int32, device=device)
+        self._inside = wp.array(_coordinates(corners, inside), dtype=wp.vec4d, device=device)
+        self._points = wp.array(_coordinates(corners, bound.points), dtype=wp.vec4d, device=device)
 
-    def rebind(self) -> None:
-        """Bind the points to what the leaves are now."""
-        inputs = [self._roots, self._inside, self._points, self._forest.pools]
+    def rebind(self, pools: Any) -> None:
+        """Bind the points to what the leaves are now, in ``kernels.remesh.Pools``."""
+        inputs = [self._roots, self._inside, self._points, pools]
         wp.launch(bind_points, len(self.rest), inputs, [self.nodes, self.weights], device=self.device)
 
 
