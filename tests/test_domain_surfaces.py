@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 import trimesh
 from domains import ROUNDING, around, arrays, same, with_hole
+from meshes import assert_balanced
 from pxr import Gf, Usd, UsdGeom, Vt
+from scipy.spatial.transform import Rotation
 from warp.examples import get_asset_directory
 
 from warp_corot.domain import Domain
+from warp_corot.domain.closing import close_surface
 from warp_corot.errors import InputError
 
 
@@ -115,6 +118,30 @@ def test_a_sphere_with_a_tenth_of_its_triangles_gone(device, rng):
     at = around(domain, rng)
     exact = Domain.sphere(1.0).phi(at)
     assert np.array_equal(domain.phi(at)[np.abs(exact) > 0.05] < 0, exact[np.abs(exact) > 0.05] < 0)
+
+
+def open_boxes_at_an_edge() -> tuple[np.ndarray, np.ndarray]:
+    """Three cubes that share an edge, each without a face at it: their rims all walk that edge the same way."""
+    points, triangles = arrays(trimesh.creation.box((1.0, 1.0, 1.0)))
+    points += 0.5
+    kept = triangles[(points[triangles][:, :, 0] > 0).any(axis=1)]
+    assert len(kept) == 10
+    turned = [Rotation.from_rotvec([0, 0, np.radians(angle)]).apply(points) for angle in (0.0, 120.0, 240.0)]
+    return np.concatenate(turned), np.concatenate([kept + k * len(points) for k in range(3)])
+
+
+def perforated() -> tuple[np.ndarray, np.ndarray]:
+    points, triangles = arrays(trimesh.creation.icosphere(3))
+    return points, triangles[np.random.default_rng(3).random(len(triangles)) > 0.1]
+
+
+@pytest.mark.parametrize("make", [with_hole, perforated, open_boxes_at_an_edge])
+def test_closed_surfaces_have_no_boundary(make):
+    points, triangles = make()
+    closed = close_surface(points, triangles)
+    assert closed.caps > 0
+    assert_balanced(closed)
+    assert trimesh.Trimesh(closed.points, closed.triangles, process=False).volume == pytest.approx(closed.volume)
 
 
 def half(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
