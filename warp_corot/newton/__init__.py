@@ -1,0 +1,36 @@
+"""A corotational solver for scenes of the Newton physics engine, https://github.com/newton-physics/newton.
+
+``SolverCorotated`` steps the tetrahedra of any ``newton.Model``; ``add_forest`` and ``add_mesh`` put this package's
+meshes into a ``newton.ModelBuilder``. Only Newton's public interface is used. It is imported when the first of these
+names is asked for, and comes with ``pip install "warp-corot[newton]"``.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .scene import Added, add_forest, add_mesh
+    from .solver import SolverCorotated
+    from .state import register_custom_attributes
+
+__all__ = ["Added", "SolverCorotated", "add_forest", "add_mesh", "register_custom_attributes"]
+
+_MODULES = {
+    "Added": ".scene",
+    "SolverCorotated": ".solver",
+    "add_forest": ".scene",
+    "add_mesh": ".scene",
+    "register_custom_attributes": ".state",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(import_module(_MODULES[name], __name__), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,113 @@
+"""Soft contacts and attachments: what particles and rigid bodies do to one another."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from ..errors import InputError
+from ..kernels.newton_contacts import ContactLaw, scatter_attachments, scatter_soft_contacts
+from ..kernels.newton_particles import check_contact_count
+from .library import newton
+
+
+class Contacts:
+    """Forces between particles and bodies; reactions are wrenches about the bodies' centres of mass."""
+
+    def __init__(self, model: newton.Model):
+        self.model = model
+        self.device = model.device
+        bodies = model.body_count
+        self._no_poses = wp.empty(0, dtype=wp.transform, device=self.device)
+        self._no_twists = wp.empty(0, dtype=wp.spatial_vector, device=self.device)
+        self._no_points = wp.empty(0, dtype=wp.vec3, device=self.device)
+        self._no_numbers = wp.empty(0, dtype=wp.float32, device=self.device)
+        #: Wrenches of the particles on the bodies in the last substep [N, N m], spatial_vector [B].
+        self.reactions = wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """See that attachments can be stepped.
+
+        Raises:
+            InputError: One of them is rigid.
+        """
+        if self.model.attachment_particle_body_count:
+            stiffness = self.model.attachment_particle_body_stiffness.numpy()
+            bad = np.flatnonzero(~np.isfinite(stiffness))
+            if len(bad):
+                raise InputError(f"attachment {bad[0]} has stiffness {stiffness[bad[0]]}; it must be finite [N/m]")
+
+    @property
+    def stiffest(self) -> float:
+        """The largest stiffness that a contact or an attachment can have [N/m]."""
+        found = [0.0]
+        if self.model.shape_count:
+            found.append(0.5 * (self.model.soft_contact_ke + float(self.model.shape_material_ke.numpy().max())))
+        if self.model.attachment_particle_body_count:
+            found.append(float(self.model.attachment_particle_body_stiffness.numpy().max()))
+        return max(found)
+
+    def check_count(self, contacts: newton.Contacts | None, trouble: wp.array) -> None:
+        if contacts is not None and contacts.soft_contact_max:
+            inputs = [contacts.soft_contact_count, contacts.soft_contact_max]
+            wp.launch(check_contact_count, dim=len(trouble), inputs=inputs, outputs=[trouble], device=self.device)
+
+    def add_forces(
+        self,
+        state: newton.State,
+        contacts: newton.Contacts | None,
+        dt: float,
+        x: wp.array,
+        v: wp.array,
+        f: wp.array,
+        trouble: wp.array,
+    ) -> None:
+        """Add forces on particles to f, vec4 [P], and set ``reactions``. Bodies are where ``state`` has them."""
+        model = self.model
+        if model.body_count:
+            self.reactions.zero_()
+            bodies = [state.body_q, state.body_qd, model.body_com]
+        else:
+            bodies = [self._no_poses, self._no_twists, self._no_points]
+        if contacts is not None and contacts.soft_contact_max and model.shape_count:
+            law = ContactLaw()
+            law.stiffness, law.damping = model.soft_contact_ke, model.soft_contact_kd
+            law.friction_slope, law.friction = model.soft_contact_kf, model.soft_contact_mu
+            law.adhesion = model.particle_adhesion
+            found = [
+                contacts.soft_contact_count,
+                contacts.soft_contact_particle,
+                contacts.soft_contact_indices,
+                contacts.soft_contact_shape,
+                contacts.soft_contact_body_pos,
+                contacts.soft_contact_body_vel,
+                contacts.soft_contact_normal,
+            ]
+            shapes = [
+                model.shape_body,
+                self._no_numbers if model.shape_margin is None else model.shape_margin,
+                model.shape_material_ke,
+                model.shape_material_kd,
+                model.shape_material_kf,
+                model.shape_material_mu,
+            ]
+            particles = [model.particle_flags, model.particle_world, model.particle_radius, model.particle_inv_mass]
+            inputs = [law, dt, *found, *shapes, *particles, x, v, *bodies]
+            outputs = [f, self.reactions, trouble]
+            self._launch(scatter_soft_contacts, contacts.soft_contact_max, inputs, outputs)
+        if model.attachment_particle_body_count:
+            attached = [
+                model.attachment_particle_body_particle,
+                model.attachment_particle_body_body,
+                model.attachment_particle_body_body_point,
+                model.attachment_particle_body_stiffness,
+                model.attachment_particle_body_damping,
+                model.attachment_particle_body_enabled,
+            ]
+            outputs = [f, self.reactions]
+            count = model.attachment_particle_body_count
+            self._launch(scatter_attachments, count, [*attached, x, v, *bodies], outputs)
+
+    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

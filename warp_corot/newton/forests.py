@@ -1,0 +1,113 @@
+"""The forests of a model: which tetrahedra they are, and their forces on the fast path."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from ..body import SoftBody
+from ..elasticity import Corotated
+from ..kernels.newton_particles import add_nodes, gather_nodes
+from ..materials import Isotropic
+from ..mesh import TetForest
+from .library import newton
+from .scene import FORESTS, mesh_fill, right_handed
+from .state import attribute_of
+
+
+class ForestGroup:
+    """All copies of one forest in a model, as the worlds of one body.
+
+    The body's state is not used; it holds the forest's elements and materials for the force field.
+
+    Args:
+        forest: The forest.
+        particles: First particle of each copy.
+        tets: First tetrahedron of each copy.
+
+    Attributes:
+        tets: All copies' tetrahedra among the model's, int32 [copies * T].
+    """
+
+    def __init__(
+        self,
+        model: newton.Model,
+        forest: TetForest,
+        particles: npt.NDArray[np.integer],
+        tets: npt.NDArray[np.integer],
+        rotation_level: int | None,
+    ):
+        self.forest, self.copies = forest, len(particles)
+        self.device = model.device
+        self.rotation_level = rotation_level
+        self.tets = (tets[:, None] + np.arange(len(forest.tets))).ravel()
+        nodes = (particles[:, None] + np.arange(len(forest.points))).ravel()
+        self.count = len(nodes)
+        self._particles = wp.array(nodes, dtype=wp.int32, device=self.device)
+        # Displacements are from the forest's own axes, so only where a copy stands is taken off: no digits are lost.
+        rest = np.tile(forest.points, (self.copies, 1)).reshape(self.copies, -1, 3)
+        there = model.particle_q.numpy().astype(np.float64)[nodes].reshape(rest.shape)
+        rest = rest + (there - rest).mean(axis=1, keepdims=True)
+        padded = np.zeros((self.count, 4), np.float32)
+        padded[:, :3] = rest.reshape(-1, 3)
+        self._rest = wp.array(padded, dtype=wp.vec4, device=self.device)
+        self._u, self._f = (wp.zeros(self.count, dtype=wp.vec4, device=self.device) for _ in range(2))
+
+    def set_material(self, mu: npt.NDArray[np.float64], lam: npt.NDArray[np.float64]) -> None:
+        """Take over Lamé's parameters of the model's tetrahedra [Pa], float64 [all T]."""
+        share = mesh_fill(self.forest)
+        own_mu, own_lam = (a[self.tets].reshape(self.copies, -1) / share for a in (mu, lam))
+        young = own_mu * (3 * own_lam + 2 * own_mu) / (own_lam + own_mu)
+        poisson = own_lam / (2 * (own_lam + own_mu))
+        material = Isotropic(young=_squeezed(young), poisson=_squeezed(poisson), density=1000.0)
+        body = SoftBody(self.forest, material, worlds=self.copies, device=self.device)
+        self._field = Corotated(rotation_level=self.rotation_level).bind(body)
+
+    def add_forces(self, x: wp.array, f: wp.array) -> None:
+        """Add the elastic forces of particles at x to f, both vec4 [P]."""
+        inputs = [self._particles, x, self._rest]
+        wp.launch(gather_nodes, dim=self.count, inputs=inputs, outputs=[self._u], device=self.device)
+        self._field.add_forces(self._u, self._f)
+        wp.launch(add_nodes, dim=self.count, inputs=[self._particles, self._f], outputs=[f], device=self.device)
+
+
+def forest_groups(model: newton.Model, tets: npt.NDArray[np.integer], rotation_level: int | None) -> list[ForestGroup]:
+    """The forests in a model; tetrahedra that are no longer as they were added are left to the general path."""
+    rows = [attribute_of(model, f"forest_{name}") for name in ("key", "particle", "tet")]
+    keys, particles, first = (np.empty(0, int) if row is None else row.numpy() for row in rows)
+    groups = []
+    for key in np.unique(keys):
+        chosen = keys == key
+        starts = particles[chosen], first[chosen]
+        if not 0 <= key < len(FORESTS) or not _is_there(FORESTS[key], tets, *starts, model.particle_count):
+            warnings.warn(
+                "a forest of this model was added in another process, or has been changed since; its tetrahedra are "
+                "stepped one by one",
+                UserWarning,
+                stacklevel=5,
+            )
+            continue
+        groups.append(ForestGroup(model, FORESTS[key], *starts, rotation_level))
+    return groups
+
+
+def _is_there(
+    forest: TetForest,
+    tets: npt.NDArray[np.integer],
+    particles: npt.NDArray[np.integer],
+    first: npt.NDArray[np.integer],
+    particle_count: int,
+) -> bool:
+    own = right_handed(forest)
+    places = zip(particles, first, strict=True)
+    inside = (particles >= 0).all() and (particles + len(forest.points) <= particle_count).all()
+    return bool(inside) and all(np.array_equal(tets[t : t + len(own)], own + p) for p, t in places)
+
+
+def _squeezed(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | float:
+    """[copies, T] as one number where all are alike, to rounding in float32, so that kernels read one only."""
+    one = float(values.flat[0])
+    return one if np.allclose(values, one, rtol=2e-7, atol=0.0) else values

@@ -1,0 +1,114 @@
+"""All that is in a model besides tetrahedra: rigid bodies and joints, springs, triangles and bending edges.
+
+These are stepped by another of Newton's solvers, on a view of the model in which there are no tetrahedra.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import warp as wp
+
+from ..errors import InputError
+from .library import ModelView, SolverBase, SolverSemiImplicit, newton
+
+
+class Others:
+    """Steps of everything else.
+
+    Args:
+        model: The model.
+        rigid_solver: "semi-implicit", a solver of the user's, or None: bodies are not moved.
+        particle_contact: Whether particles collide with one another.
+
+    Attributes:
+        has_particles: Whether particles are integrated here, as something besides tetrahedra acts on them.
+        has_bodies: Whether bodies are.
+    """
+
+    def __init__(self, model: newton.Model, rigid_solver: SolverBase | str | None, particle_contact: bool):
+        own = rigid_solver == "semi-implicit"
+        if not own and rigid_solver is not None and not isinstance(rigid_solver, SolverBase):
+            raise InputError(f"rigid_solver is {rigid_solver!r}; it must be 'semi-implicit', a solver or None")
+        self.model = model
+        triangles = bool(model.tri_count) and bool(np.any(model.tri_materials.numpy()))
+        edges = bool(model.edge_count) and bool(np.any(model.edge_bending_properties.numpy()))
+        self.has_particles = bool(model.spring_count) or triangles or edges or particle_contact
+        self.has_bodies = bool(model.body_count) and rigid_solver is not None
+        self._rigid = rigid_solver if isinstance(rigid_solver, SolverBase) else None
+        self._solver: SolverSemiImplicit | None = None
+        if self.has_particles or (own and model.body_count):
+            view = ModelView(model, "warp_corot_others")
+            view.tet_count = 0
+            if not triangles:
+                view.tri_count = 0
+            if not edges:
+                view.edge_count = 0
+            if not self.has_particles:
+                view.particle_count = 0
+            if not particle_contact:
+                view.particle_grid = None
+            if not own and model.body_count:
+                view.body_count = view.joint_count = 0
+            try:
+                self._solver = SolverSemiImplicit(view, enable_tri_contact=False)
+            except ValueError as error:
+                raise InputError(f"{error} Give another rigid_solver, or None.") from None
+        #: Copies of contacts in which there are none of particles, by the contacts they are of.
+        self._rigid_contacts: tuple[newton.Contacts, newton.Contacts] | None = None
+        self._particle_f = wp.empty(model.particle_count, dtype=wp.vec3, device=model.device)
+
+    @property
+    def particle_forces(self) -> wp.array:
+        """Where the forces on particles go that the step is to be made with [N], vec3 [P]."""
+        return self._particle_f
+
+    def step(
+        self,
+        now: newton.State,
+        out: newton.State,
+        control: newton.Control | None,
+        contacts: newton.Contacts | None,
+        dt: float,
+        body_f: wp.array | None,
+    ) -> None:
+        """A step from ``now`` to ``out`` with the given wrenches on bodies and forces on particles."""
+        rigid = self._without_soft(contacts)
+        with _forces(now, self._particle_f if self.has_particles else now.particle_f, body_f):
+            if self._solver is not None:
+                self._solver.step(now, out, control, rigid, dt)
+            if self._rigid is not None and self.has_bodies:
+                self._rigid.step(now, out, control, rigid, dt)
+
+    def notify_model_changed(self, flags: int) -> None:
+        for solver in (self._solver, self._rigid):
+            if solver is not None:
+                solver.notify_model_changed(flags)
+
+    def reset(self, state: newton.State, world_mask: wp.array | None, flags: int | None) -> None:
+        for solver in (self._solver, self._rigid):
+            if solver is not None:
+                solver.reset(state, world_mask, flags)
+
+    def _without_soft(self, contacts: newton.Contacts | None) -> newton.Contacts | None:
+        if contacts is None:
+            return None
+        if self._rigid_contacts is None or self._rigid_contacts[0] is not contacts:
+            rigid = copy.copy(contacts)
+            rigid.soft_contact_max = 0
+            self._rigid_contacts = contacts, rigid
+        return self._rigid_contacts[1]
+
+
+@contextmanager
+def _forces(state: newton.State, particle_f: wp.array | None, body_f: wp.array | None) -> Iterator[None]:
+    """A state with other forces, for as long as it lasts."""
+    kept = state.particle_f, state.body_f
+    state.particle_f, state.body_f = particle_f, body_f
+    try:
+        yield
+    finally:
+        state.particle_f, state.body_f = kept

@@ -1,0 +1,175 @@
+"""This package's meshes in Newton's scenes."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from ..body import centroids, lumped_masses
+from ..errors import InputError
+from ..indices import checked_indices
+from ..materials import Isotropic
+from ..mesh import TetForest, TetMesh
+from ..mesh.surface import boundary_faces, signed_volumes
+from .library import newton
+from .state import NAMESPACE, register_forests
+
+#: Forests that were added to a builder. A model says by their place here which of its tetrahedra are whose.
+FORESTS: list[TetForest] = []
+
+
+class Added(NamedTuple):
+    """What was added: ranges of indices in the builder."""
+
+    particles: range
+    tetrahedra: range
+
+
+def add_forest(
+    builder: newton.ModelBuilder,
+    mesh: TetForest,
+    material: Isotropic,
+    *,
+    pos: npt.ArrayLike = (0.0, 0.0, 0.0),
+    rot: npt.ArrayLike = (0.0, 0.0, 0.0, 1.0),
+    vel: npt.ArrayLike = (0.0, 0.0, 0.0),
+    k_damp: npt.ArrayLike = 0.0,
+    fixed: npt.ArrayLike | None = None,
+    particle_radius: float | None = None,
+    surface: bool = True,
+) -> Added:
+    """Add an adaptive forest. ``SolverCorotated`` steps it by its subtrees, several times as fast as other tetrahedra.
+
+    To any other solver it is tetrahedra like all others. Where it holds only part of its tetrahedra, stiffness and
+    mass are that part's.
+
+    Args:
+        builder: Where to add it; it can be added to other builders and be replicated afterwards.
+        mesh: The forest.
+        material: Its material; Lamé's parameters become ``k_mu`` and ``k_lambda``.
+        pos: Where the mesh's origin goes [m].
+        rot: How it is turned, a quaternion (x, y, z, w).
+        vel: Velocity of all its particles [m/s].
+        k_damp: Viscosity [Pa s], a number or [T].
+        fixed: Nodes that get no mass, so that they are kinematic: mask bool [N] or indices.
+        particle_radius: For contact [m]; None: the builder's default.
+        surface: Whether triangles without stiffness are added at its boundary, by which viewers draw it.
+
+    Returns:
+        The particles and tetrahedra, in the forest's order.
+
+    Raises:
+        InputError: Not a forest, an anisotropic material, or wrong shapes.
+    """
+    if not isinstance(mesh, TetForest):
+        raise InputError(f"mesh is a {type(mesh).__name__}; add_forest takes a TetForest, add_mesh any tetrahedra")
+    added = _add(builder, mesh, material, pos, rot, vel, k_damp, fixed, particle_radius, surface)
+    register_forests(builder)
+    place = next((k for k, known in enumerate(FORESTS) if known is mesh), len(FORESTS))
+    if place == len(FORESTS):
+        FORESTS.append(mesh)
+    row = {"forest_key": place, "forest_particle": added.particles.start, "forest_tet": added.tetrahedra.start}
+    builder.add_custom_values(**{f"{NAMESPACE}:{name}": value for name, value in row.items()})
+    if mesh.fill is not None:
+        values = builder.custom_attributes[f"{NAMESPACE}:fill"].values
+        assert isinstance(values, dict)
+        cut = np.flatnonzero(mesh.fill != 1.0)
+        values.update(zip((cut + added.tetrahedra.start).tolist(), mesh.fill[cut].tolist(), strict=True))
+    return added
+
+
+def add_mesh(
+    builder: newton.ModelBuilder,
+    mesh: TetMesh,
+    material: Isotropic,
+    *,
+    pos: npt.ArrayLike = (0.0, 0.0, 0.0),
+    rot: npt.ArrayLike = (0.0, 0.0, 0.0, 1.0),
+    vel: npt.ArrayLike = (0.0, 0.0, 0.0),
+    k_damp: npt.ArrayLike = 0.0,
+    fixed: npt.ArrayLike | None = None,
+    particle_radius: float | None = None,
+    surface: bool = True,
+) -> Added:
+    """Add general tetrahedra. Wrongly wound ones, which Newton's builder leaves out, ``TetMesh`` has turned round.
+
+    Arguments, result and errors as ``add_forest``.
+    """
+    if not isinstance(mesh, TetMesh):
+        raise InputError(f"mesh is a {type(mesh).__name__}; add_mesh takes a TetMesh")
+    return _add(builder, mesh, material, pos, rot, vel, k_damp, fixed, particle_radius, surface)
+
+
+def _add(
+    builder: newton.ModelBuilder,
+    mesh: TetForest | TetMesh,
+    material: Isotropic,
+    pos: npt.ArrayLike,
+    rot: npt.ArrayLike,
+    vel: npt.ArrayLike,
+    k_damp: npt.ArrayLike,
+    fixed: npt.ArrayLike | None,
+    radius: float | None,
+    surface: bool,
+) -> Added:
+    if not isinstance(builder, newton.ModelBuilder):
+        raise InputError(f"builder is {builder!r}; it must be a newton.ModelBuilder")
+    if not isinstance(material, Isotropic):
+        raise InputError(f"material is a {type(material).__name__}; in Newton it must be Isotropic")
+    material = material.at(centroids(mesh)) if material.functions else material
+    material.check_shapes(1, len(mesh.tets))
+    turn = np.array(wp.quat_to_matrix(wp.normalize(wp.quat(*_vector(rot, 4, "rot"))))).reshape(3, 3)
+    x = mesh.points @ turn.T + _vector(pos, 3, "pos")
+    masses = lumped_masses(mesh, material)
+    if fixed is not None:
+        masses[checked_indices(fixed, len(x), "node")] = 0.0
+    tets = right_handed(mesh)
+    first, first_tet, count = builder.particle_count, builder.tet_count, len(tets)
+
+    velocity = tuple(_vector(vel, 3, "vel"))
+    radii = None if radius is None else [float(radius)] * len(x)
+    builder.add_particles([tuple(p) for p in x.tolist()], [velocity] * len(x), masses.tolist(), radii)
+    # As ``add_tetrahedron`` does one by one.
+    corners = x[tets]
+    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    builder.tet_indices.extend(map(tuple, (tets + first).tolist()))
+    builder.tet_poses.extend(np.linalg.inv(edges).tolist())
+    builder.tet_activations.extend([0.0] * count)
+    share = mesh_fill(mesh)
+    values = [np.ravel(share * a) for a in (material.mu, material.lam)] + [np.ravel(np.asarray(k_damp, np.float64))]
+    if values[2].size not in (1, count) or not (np.isfinite(values[2]) & (values[2] >= 0)).all():
+        raise InputError(f"k_damp must be zero or positive [Pa s], a number or one for each of {count} tetrahedra")
+    columns = [np.broadcast_to(column, count) for column in values]
+    builder.tet_materials.extend(map(tuple, np.stack(columns, axis=1).tolist()))
+    if surface:
+        faces = boundary_faces(mesh.tets, mesh.points)[0] + first
+        nothing = [0.0] * len(faces)
+        i, j, k = (column.tolist() for column in faces.T)
+        builder.add_triangles(
+            i, j, k, tri_ke=nothing, tri_ka=nothing, tri_kd=nothing, tri_drag=nothing, tri_lift=nothing
+        )
+    return Added(range(first, first + len(x)), range(first_tet, first_tet + count))
+
+
+def mesh_fill(mesh: TetForest | TetMesh) -> Any:
+    """Share of each element that the body takes, float64 [T], or 1 where it takes all of each."""
+    fill = getattr(mesh, "fill", None)
+    return 1.0 if fill is None else fill
+
+
+def right_handed(mesh: TetForest | TetMesh) -> npt.NDArray[np.int32]:
+    """The mesh's elements as Newton wants them, of positive volume; half of a forest's are mirrored. int32 [T, 4]."""
+    tets = np.array(mesh.tets)
+    mirrored = signed_volumes(mesh.points, tets) < 0
+    tets[mirrored] = tets[mirrored][:, [0, 1, 3, 2]]
+    return tets
+
+
+def _vector(given: npt.ArrayLike, size: int, name: str) -> npt.NDArray[np.float64]:
+    values = np.asarray(given, dtype=np.float64).ravel()
+    if values.shape != (size,) or not np.isfinite(values).all():
+        raise InputError(f"{name} is {given!r}; it must be {size} finite numbers")
+    return values

@@ -1,0 +1,268 @@
+"""``SolverCorotated``: corotational tetrahedra in any Newton scene."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..errors import InputError
+from .contact import Contacts
+from .library import CouplingInterface, SolverBase, newton
+from .others import Others
+from .stability import stable_step
+from .state import STATE, attribute_of, register_custom_attributes
+from .steps import Steps
+from .tetrahedra import LAME, Tetrahedra
+
+#: Share of the largest stable step that is taken where substeps are chosen: elements stiffen when strained.
+SAFETY = 0.7
+
+ROTATIONS = ("byers-xu", "warm")
+
+
+class SolverCorotated(SolverBase, CouplingInterface):
+    """Corotated linear elasticity for the tetrahedra of a Newton model, by symplectic Euler.
+
+    Every tetrahedron has its own rotation (forests added by ``add_forest``: also a shared one); the force is the
+    gradient of W = V (mu e:e + lambda/2 tr(e)^2) with e = sym(R^T F) - I, for every F, inverted ones too. Added to it:
+    ``k_damp`` as a viscosity that leaves rigid motion alone, ``Control.tet_activations`` as Newton's other solvers
+    have them (k_lambda a cof F), soft contacts with regularised Coulomb friction, attachments of particles to bodies,
+    external forces, and gravity of each world. Particles without mass are kinematic, those that are not active frozen.
+
+    Rigid bodies, joints and rigid contacts, and springs, triangles and bending edges with stiffness, are stepped along
+    by Newton's ``SolverSemiImplicit`` on a view of the model without tetrahedra; reactions of soft contacts and
+    attachments act on the bodies in the same step. Contacts come from ``newton.CollisionPipeline``; particles do not
+    collide with one another unless asked to, soft bodies not with themselves.
+
+    A step is taken for a world or not at all: where something is not finite, the state stays what it was. On the CPU
+    ``step`` says so at once; on CUDA, where it waits for nothing, a later ``step`` or ``check`` does.
+
+    Example::
+
+        solver = warp_corot.newton.SolverCorotated(model)
+        solver.step(state_in, state_out, control, contacts, dt)
+
+    Args:
+        model: A model with tetrahedra.
+        lame: What k_mu and k_lambda are: "documented", Lamé's parameters, as Newton's documentation has it; or
+            "semi-implicit", what ``SolverSemiImplicit`` makes of them for small strains: mu = 3/4 k_mu,
+            lambda = k_lambda - 5/8 k_mu.
+        damping: Rate of mass-proportional damping [1/s], besides k_damp.
+        substeps: Into how many steps a step is divided; None: as many as it takes to be stable.
+        rotation: "byers-xu", or "warm": found from the one in the state, ``state.warp_corot.rotation``, so that also
+            an inverted element's is continuous in time. It needs ``register_custom_attributes``, and forests then go
+            tetrahedron by tetrahedron.
+        rotation_level: Of forests: whose rotation is used; see ``Corotated``.
+        rigid_solver: What steps rigid bodies: "semi-implicit"; another solver, made for this model, which also gets
+            their forces; or None: nothing does, and reactions are added to ``state_in.body_f`` for who does.
+        particle_contact: Whether particles collide with one another, as in ``SolverSemiImplicit``. Newton's default
+            radius of 0.1 m makes finer meshes fight themselves.
+        stable_dt: The largest stable step [s], where it is known; None: it is found from elements and masses.
+
+    Attributes:
+        stable_dt: The largest stable step of the elements about rest [s].
+        contact_dt: The same with contact or an attachment at every particle [s], as stiff as they can be here.
+
+    Raises:
+        InputError: No tetrahedra, a material that is not positive definite, or an option out of its range.
+    """
+
+    def __init__(
+        self,
+        model: newton.Model,
+        *,
+        lame: str = "documented",
+        damping: float = 0.0,
+        substeps: int | None = 1,
+        rotation: str = "byers-xu",
+        rotation_level: int | None = None,
+        rigid_solver: SolverBase | str | None = "semi-implicit",
+        particle_contact: bool = False,
+        stable_dt: float | None = None,
+    ):
+        if lame not in LAME:
+            raise InputError(f"lame is {lame!r}; it must be one of {', '.join(LAME)}")
+        if rotation not in ROTATIONS:
+            raise InputError(f"rotation is {rotation!r}; it must be one of {', '.join(ROTATIONS)}")
+        if not (math.isfinite(damping) and damping >= 0):
+            raise InputError(f"damping is {damping}; it must be zero or a positive rate in 1/s")
+        if substeps is not None and (isinstance(substeps, bool) or substeps != int(substeps) or substeps < 1):
+            raise InputError(f"substeps is {substeps!r}; it must be a positive whole number or None")
+        if stable_dt is not None and not stable_dt > 0:
+            raise InputError(f"stable_dt is {stable_dt}; it must be a positive number of seconds or None")
+        super().__init__(model)
+        self.substeps = substeps
+        self._given_stable_dt = stable_dt
+        self.tetrahedra = Tetrahedra(model, lame, rotation == "warm", rotation_level)
+        self._contacts = Contacts(model)
+        self._others = Others(model, rigid_solver, particle_contact)
+        self._steps = Steps(model, self.tetrahedra, self._contacts, self._others, damping)
+        self._find_stable_steps()
+
+    @property
+    def body_reactions(self) -> wp.array:
+        """Wrenches of soft contacts and attachments on the bodies in the last substep [N, N m], spatial_vector [B]."""
+        return self._contacts.reactions
+
+    def step(
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        control: newton.Control | None,
+        contacts: newton.Contacts | None,
+        dt: float,
+        *,
+        observables: Any = None,
+    ) -> None:
+        """Step from one state to the other, which may be the same.
+
+        Forces in ``state_in`` act throughout the step and stay as they are. May be captured; launches only.
+
+        Args:
+            state_in, state_out: States of the model.
+            control: Activations, and what joints are driven by; None: the model's.
+            contacts: What ``newton.CollisionPipeline`` found; None: no contact.
+            dt: Time step [s].
+            observables: None, or an empty container of this solver's.
+
+        Raises:
+            InputError: A time step that is not stable, arrays on another device, or states without what the solver
+                needs; then nothing has been launched. On the CPU, unless capturing, also: a state that is not finite,
+                more contacts than the buffer holds, contacts of edges and faces; as ``check``.
+            UnstableError: On the CPU, unless capturing: the step's result is not finite.
+        """
+        self.validate_observables(observables, contacts)
+        self._check_arguments(state_in, state_out, control, contacts)
+        self._steps.check_earlier()
+        count = self._count_for(dt)
+        self._steps.launch(state_in, state_out, control, contacts, dt, count)
+        if self.device.is_cpu and not self.device.is_capturing:
+            self.check()
+
+    def check(self) -> None:
+        """Say what has been wrong since somebody last asked. Waits for the device.
+
+        Worlds of which something is said have stayed as they were. Those in which a state was handed in that is not
+        finite keep what ``state_out`` held before.
+
+        Raises:
+            InputError: States that were handed in, or contacts.
+            UnstableError: A step's result was not finite.
+        """
+        self._steps.check(self.stable_dt)
+
+    def reset(
+        self,
+        state: newton.State,
+        world_mask: wp.array | None = None,
+        flags: int | None = None,
+    ) -> None:
+        """Put chosen worlds of a state back to the model's initial one, rotations too.
+
+        Args:
+            state: The state, changed in place.
+            world_mask: bool [world_count + 1], the last one for what is in no world; None: all.
+            flags: ``newton.StateFlags`` of what is put back: PARTICLE_Q, PARTICLE_QD, and, if this solver steps the
+                bodies, BODY_Q and BODY_QD; None: all.
+        """
+        mask = self._normalize_mask(world_mask)
+        self._steps.reset(state, mask, int(newton.StateFlags.ALL if flags is None else flags))
+        self._others.reset(state, world_mask, flags)
+
+    def notify_model_changed(self, flags: int) -> None:
+        """Take over what has changed in the model: materials of elements, masses, stiffness of contacts.
+
+        Gravity, activations and what contacts and attachments are made of are read in every step anyway.
+
+        Raises:
+            InputError: As on construction.
+        """
+        self._others.notify_model_changed(flags)
+        if self.device.is_capturing:
+            return
+        self.tetrahedra.refresh()
+        self._contacts.refresh()
+        self._find_stable_steps()
+
+    @classmethod
+    def register_custom_attributes(cls, builder: newton.ModelBuilder) -> None:
+        """See ``warp_corot.newton.register_custom_attributes``."""
+        register_custom_attributes(builder)
+
+    def coupling_supports_inertial_property_refresh(self) -> bool:
+        """True: masses are read from the model in every step."""
+        return True
+
+    # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _find_stable_steps(self) -> None:
+        tets = self.tetrahedra
+        arguments = self.model, tets.elements, tets.mu, tets.lam
+        given, stiffest = self._given_stable_dt, self._contacts.stiffest
+        self.stable_dt = stable_step(*arguments, 0.0, tets.damped) if given is None else float(given)
+        self.contact_dt = self.stable_dt
+        if stiffest > 0 and given is None:
+            self.contact_dt = stable_step(*arguments, stiffest, tets.damped)
+
+    def _count_for(self, dt: float) -> int:
+        if not (math.isfinite(dt) and dt > 0):
+            raise InputError(f"dt is {dt}; it must be a positive number of seconds")
+        if self.substeps is None:
+            return max(1, math.ceil(dt / (SAFETY * self.contact_dt)))
+        if dt / self.substeps > self.stable_dt:
+            each = f", {self.substeps} substeps of {dt / self.substeps:.3g} s" if self.substeps > 1 else ""
+            needed = math.ceil(dt / (SAFETY * self.contact_dt))
+            raise InputError(
+                f"dt is {dt:.3g} s{each}; the largest stable step is about {self.stable_dt:.3g} s: "
+                f"make shorter steps, or SolverCorotated(..., substeps={needed}), or substeps=None"
+            )
+        return int(self.substeps)
+
+    def _check_arguments(
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        control: newton.Control | None,
+        contacts: newton.Contacts | None,
+    ) -> None:
+        model = self.model
+        for name, state in (("state_in", state_in), ("state_out", state_out)):
+            if state.particle_q is None or len(state.particle_q) != model.particle_count:
+                there = 0 if state.particle_q is None else len(state.particle_q)
+                raise InputError(f"{name} has {there} particles; the model has {model.particle_count}")
+            if state.particle_q.device != self.device:
+                raise InputError(f"{name} is on {state.particle_q.device}; the model is on {self.device}")
+            if self.tetrahedra.warm and attribute_of(state, "rotation") is None:
+                raise InputError(
+                    f"{name} has no rotations, which rotation='warm' needs: call "
+                    "SolverCorotated.register_custom_attributes(builder) before finalize"
+                )
+            for attribute in STATE:
+                array = attribute_of(state, attribute)
+                if array is not None and len(array) != model.tet_count:
+                    raise InputError(f"{name} has {attribute} of {len(array)} tetrahedra; there are {model.tet_count}")
+        if control is not None and control.tet_activations is not None:
+            if len(control.tet_activations) != model.tet_count:
+                raise InputError(
+                    f"control has {len(control.tet_activations)} tet_activations; there are {model.tet_count}"
+                )
+            if control.tet_activations.device != self.device:
+                raise InputError(f"control is on {control.tet_activations.device}; the model is on {self.device}")
+        if contacts is not None and contacts.soft_contact_max and contacts.soft_contact_count.device != self.device:
+            raise InputError(f"contacts are on {contacts.soft_contact_count.device}; the model is on {self.device}")
+
+    def _normalize_mask(self, world_mask: wp.array | None) -> wp.array:
+        worlds = max(int(self.model.world_count), 1)
+        if world_mask is None:
+            return wp.array(np.ones(worlds + 1, bool), dtype=wp.bool, device=self.device)
+        wanted = f"it must be bool [{self.model.world_count + 1}] on {self.device}"
+        if not isinstance(world_mask, wp.array):
+            raise InputError(f"world_mask is {world_mask!r}; {wanted}")
+        right = world_mask.dtype == wp.bool and world_mask.shape == (self.model.world_count + 1,)
+        if not right or world_mask.device != self.device:
+            found = f"{world_mask.dtype.__name__} {list(world_mask.shape)} on {world_mask.device}"
+            raise InputError(f"world_mask is {found}; {wanted}")
+        return world_mask

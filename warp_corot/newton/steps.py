@@ -1,0 +1,192 @@
+"""The launches of a step, and what they report."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from ..errors import InputError, UnstableError
+from ..kernels import newton_particles as kernels
+from ..kernels.newton_contacts import add_wrenches
+from .contact import Contacts
+from .library import newton
+from .others import Others
+from .state import attribute_of
+from .tetrahedra import Tetrahedra
+
+
+class Steps:
+    """Symplectic Euler for all particles of a model, and everything else along with it.
+
+    Args:
+        model: The model.
+        tetrahedra, contacts, others: Its forces and what else is in it.
+        damping: Rate of mass-proportional damping [1/s].
+    """
+
+    def __init__(self, model: newton.Model, tetrahedra: Tetrahedra, contacts: Contacts, others: Others, damping: float):
+        self.model, self.tetrahedra, self.contacts, self.others = model, tetrahedra, contacts, others
+        self.damping = damping
+        self.device = model.device
+        p, b = model.particle_count, model.body_count
+        self._x, self._v, self._f = (wp.zeros(p, dtype=wp.vec4, device=self.device) for _ in range(3))
+        self._places = max(int(model.world_count), 1) + 1
+        self._trouble = wp.zeros(self._places, dtype=wp.int32, device=self.device)
+        self._report = wp.zeros(kernels.REPORTS, dtype=wp.int32, device=self.device)
+        #: What the host can look at without waiting.
+        self._seen = wp.zeros(kernels.REPORTS, dtype=wp.int32, device="cpu", pinned=self.device.is_cuda)
+        self._kept_particles = [wp.empty(p if others.has_particles else 0, dtype=wp.vec3, device=self.device)] * 2
+        if others.has_particles:
+            self._kept_particles = [wp.empty(p, dtype=wp.vec3, device=self.device) for _ in range(2)]
+        self._body_f = wp.empty(b, dtype=wp.spatial_vector, device=self.device)
+        types = (wp.transform, wp.spatial_vector)
+        self._bodies_before = [wp.empty(b, dtype=dtype, device=self.device) for dtype in types]
+        self._kept_bodies = [wp.empty(b, dtype=dtype, device=self.device) for dtype in types]
+
+    def launch(
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        control: newton.Control | None,
+        contacts: newton.Contacts | None,
+        dt: float,
+        count: int,
+    ) -> None:
+        """Launch a step of ``count`` substeps."""
+        model = self.model
+        activation = model.tet_activations
+        if control is not None and control.tet_activations is not None:
+            activation = control.tet_activations
+        now = state_in
+        for number in range(count):
+            self._launch_forces(now, state_in.particle_f, activation, contacts, dt / count)
+            if self.others.has_bodies:
+                wp.copy(self._body_f, state_in.body_f)
+                self._add_wrenches(1.0, self._body_f)
+            elif model.body_count:
+                self._add_wrenches(1.0 / count, state_in.body_f)
+            self._launch_motion(now, state_out, control, contacts, dt / count)
+            if self.tetrahedra.warm or number == count - 1:
+                self.tetrahedra.write_attributes(state_out, now)
+            inputs = [self._trouble]
+            self._launch(kernels.report_trouble, self._places, inputs, [self._report])
+            now = state_out
+        if self.device.is_cuda:
+            wp.copy(self._seen, self._report)
+
+    def check_earlier(self) -> None:
+        """Say what a step that is done already has reported. On CUDA, outside of captures; waits for nothing."""
+        if self.device.is_cuda and not self.device.is_capturing and self._seen.numpy().any():
+            self.check(None)
+
+    def check(self, stable_dt: float | None) -> None:
+        """See ``SolverCorotated.check``."""
+        report = self._report.numpy().copy()
+        if not report.any():
+            return
+        self._report.zero_()
+        self._seen.zero_()
+        worst = int(np.flatnonzero(report)[-1])
+        world = int(report[worst]) - 1
+        where = f" in world {world}" if self.model.world_count > 1 and world < self.model.world_count else ""
+        if worst == int(kernels.BAD_INPUT):
+            raise InputError(f"state_in is not finite{where}; state_out there was left as it was")
+        if worst == int(kernels.SURFACE_CONTACTS):
+            raise InputError(
+                "contacts hold contacts of edges and faces (enable_rigid_soft_full_surface_contact=True), which "
+                "SolverCorotated does not take: make the CollisionPipeline without it; no step was made"
+            )
+        if worst == int(kernels.TOO_MANY_CONTACTS):
+            raise InputError(
+                "there are more soft contacts than contacts.soft_contact_max: make the CollisionPipeline with a "
+                "larger soft_contact_max; no step was made"
+            )
+        hint = "" if stable_dt is None else f"; the largest stable step at rest is about {stable_dt:.3g} s"
+        raise UnstableError(f"the step's result is not finite{where}; that state stayed as it was{hint}")
+
+    def reset(self, state: newton.State, mask: wp.array, flags: int) -> None:
+        model, bits = self.model, newton.StateFlags
+        if flags & bits.PARTICLE:
+            wanted = [int(bool(flags & bit)) for bit in (bits.PARTICLE_Q, bits.PARTICLE_QD)]
+            inputs = [mask, model.particle_world, *wanted, model.particle_q, model.particle_qd]
+            outputs = [state.particle_q, state.particle_qd]
+            self._launch(kernels.reset_particles, model.particle_count, inputs, outputs)
+            rotations = attribute_of(state, "rotation")
+            if rotations is not None:
+                inputs = [mask, model.particle_world, self.tetrahedra.elements.nodes]
+                self._launch(kernels.reset_rotations, model.tet_count, inputs, [rotations])
+        if self.others.has_bodies and flags & (bits.BODY_Q | bits.BODY_QD):
+            wanted = [int(bool(flags & bit)) for bit in (bits.BODY_Q, bits.BODY_QD)]
+            inputs = [mask, model.body_world, *wanted, model.body_q, model.body_qd]
+            self._launch(kernels.reset_bodies, model.body_count, inputs, [state.body_q, state.body_qd])
+
+    # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _launch_forces(
+        self,
+        now: newton.State,
+        external: wp.array,
+        activation: wp.array,
+        contacts: newton.Contacts | None,
+        dt: float,
+    ) -> None:
+        model = self.model
+        inputs = [now.particle_q, now.particle_qd, external, model.particle_world]
+        outputs = [self._x, self._v, self._f, self._trouble]
+        self._launch(kernels.gather_particles, model.particle_count, inputs, outputs)
+        if model.body_count:
+            inputs = [now.body_q, now.body_qd, model.body_world, int(kernels.BAD_INPUT)]
+            self._launch(kernels.check_bodies, model.body_count, inputs, [self._trouble])
+        self.contacts.check_count(contacts, self._trouble)
+        rotations = attribute_of(now, "rotation")
+        self.tetrahedra.add_forces(self._x, self._f, rotations)
+        self.tetrahedra.add_damping_and_activation(now.particle_q, now.particle_qd, activation, self._f)
+        self.contacts.add_forces(now, contacts, dt, self._x, self._v, self._f, self._trouble)
+
+    def _launch_motion(
+        self,
+        now: newton.State,
+        out: newton.State,
+        control: newton.Control | None,
+        contacts: newton.Contacts | None,
+        dt: float,
+    ) -> None:
+        model, others = self.model, self.others
+        worlds = model.particle_world
+        if others.has_bodies:
+            for kept, array in zip(self._bodies_before, (now.body_q, now.body_qd), strict=True):
+                wp.copy(kept, array)
+            for kept, array in zip(self._kept_bodies, (out.body_q, out.body_qd), strict=True):
+                wp.copy(kept, array)
+        if others.has_particles:
+            for kept, array in zip(self._kept_particles, (out.particle_q, out.particle_qd), strict=True):
+                wp.copy(kept, array)
+            self._launch(kernels.unpad, model.particle_count, [self._f], [others.particle_forces])
+        else:
+            inputs = [dt, self.damping, model.particle_max_velocity, model.gravity, model.particle_inv_mass]
+            inputs += [model.particle_flags, worlds, self._f, self._x, self._v]
+            self._launch(kernels.step_velocities, model.particle_count, inputs, [self._trouble])
+        if others.has_bodies or others.has_particles:
+            others.step(now, out, control, contacts, dt, self._body_f if others.has_bodies else now.body_f)
+        if others.has_bodies:
+            inputs = [out.body_q, out.body_qd, model.body_world, int(kernels.UNSTABLE)]
+            self._launch(kernels.check_bodies, model.body_count, inputs, [self._trouble])
+        if others.has_particles:
+            inputs = [out.particle_q, out.particle_qd, worlds]
+            self._launch(kernels.check_particles, model.particle_count, inputs, [self._trouble])
+            inputs = [worlds, self._trouble, self._x, self._v, *self._kept_particles]
+            outputs = [out.particle_q, out.particle_qd]
+            self._launch(kernels.put_back_particles, model.particle_count, inputs, outputs)
+        else:
+            inputs = [dt, model.particle_flags, worlds, self._trouble, now.particle_q, now.particle_qd, self._v]
+            outputs = [out.particle_q, out.particle_qd]
+            self._launch(kernels.move_particles, model.particle_count, inputs, outputs)
+        if others.has_bodies:
+            inputs = [model.body_world, self._trouble, *self._bodies_before, *self._kept_bodies]
+            self._launch(kernels.put_back_bodies, model.body_count, inputs, [out.body_q, out.body_qd])
+
+    def _add_wrenches(self, share: float, target: wp.array) -> None:
+        self._launch(add_wrenches, self.model.body_count, [share, self.contacts.reactions], [target])
+
+    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

@@ -1,0 +1,163 @@
+"""The tetrahedra of a model as force kernels take them: those of forests by subtrees, all others one by one."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from ..errors import InputError
+from ..kernels.elements import GeneralElements
+from ..kernels.lanes import LANES
+from ..kernels.newton_elements import (
+    lame_parameters,
+    repair_posed,
+    scatter_damping_and_activation,
+    scatter_posed,
+    scatter_posed_lanes,
+    scatter_posed_warm,
+    write_attributes,
+)
+from ..kernels.rotation import quick_rotation
+from .forests import ForestGroup, forest_groups
+from .library import newton
+from .state import STATE, attribute_of
+
+#: How k_mu and k_lambda are read: mu = a k_mu, lambda = k_lambda + b k_mu, as (a, b).
+LAME = {"documented": (1.0, 0.0), "semi-implicit": (0.75, -0.625)}
+
+
+class Tetrahedra:
+    """Forces, rotations and stresses of all tetrahedra of a model.
+
+    Args:
+        model: The model.
+        lame: A key of ``LAME``.
+        warm: Whether rotations are found from those in the state.
+        rotation_level: Whose rotation the leaves of forests use; see ``Corotated``.
+
+    Raises:
+        InputError: There are none, or a material is not positive definite.
+    """
+
+    def __init__(self, model: newton.Model, lame: str, warm: bool, rotation_level: int | None):
+        if not model.tet_count:
+            raise InputError("the model has no tetrahedra; add some with add_soft_mesh, add_soft_grid or add_forest")
+        self.model, self.lame, self.warm = model, lame, warm
+        self.device = model.device
+        self.tets = model.tet_indices.numpy().reshape(-1, 4)
+        self.elements = self._elements(np.arange(model.tet_count))
+        self.mu, self.lam = (wp.empty(model.tet_count, dtype=wp.float32, device=self.device) for _ in range(2))
+        self._all = wp.array(np.arange(model.tet_count), dtype=wp.int32, device=self.device)
+        self.groups: list[ForestGroup] = [] if warm else forest_groups(model, self.tets, rotation_level)
+        single = np.ones(model.tet_count, bool)
+        for group in self.groups:
+            single[group.tets] = False
+        ids = np.flatnonzero(single)
+        self.single_count = len(ids)
+        everything = len(ids) == model.tet_count
+        self._single = self.elements if everything else self._elements(ids)
+        self._single_ids = self._all if everything else wp.array(ids, dtype=wp.int32, device=self.device)
+        self._single_lame = [self.mu, self.lam]
+        if not everything:
+            self._single_lame = [wp.empty(len(ids), dtype=wp.float32, device=self.device) for _ in range(2)]
+        self._flagged = wp.zeros(len(ids), dtype=wp.uint8, device=self.device)
+        fill = attribute_of(model, "fill")
+        self._fill = wp.ones(1, dtype=wp.float32, device=self.device) if fill is None else fill
+        self._no_rotations = wp.empty(0, dtype=wp.quat, device=self.device)
+        self._nothing = {name: wp.empty(0, dtype=dtype, device=self.device) for name, dtype in STATE.items()}
+        self.refresh()
+        self._warn_of_lost()
+
+    def refresh(self) -> None:
+        """Take over the model's present materials.
+
+        Raises:
+            InputError: One of them is not positive definite, or not finite.
+        """
+        materials = self.model.tet_materials.numpy().reshape(-1, 3).astype(np.float64)
+        a, b = LAME[self.lame]
+        mu, lam = a * materials[:, 0], materials[:, 1] + b * materials[:, 0]
+        bad = np.flatnonzero(~(np.isfinite(materials).all(axis=1) & (mu > 0) & (3 * lam + 2 * mu > 0)))
+        if len(bad):
+            t = bad[0]
+            raise InputError(
+                f"tetrahedron {t} has k_mu {materials[t, 0]:g} and k_lambda {materials[t, 1]:g} Pa, which with "
+                f"lame={self.lame!r} are mu {mu[t]:g} and lambda {lam[t]:g}; mu and 3 lambda + 2 mu must be positive"
+            )
+        bad = np.flatnonzero(~(materials[:, 2] >= 0))
+        if len(bad):
+            raise InputError(f"tetrahedron {bad[0]} has k_damp {materials[bad[0], 2]:g} Pa s; it must not be negative")
+        for ids, (of_mu, of_lam) in ((self._all, (self.mu, self.lam)), (self._single_ids, self._single_lame)):
+            self._launch(lame_parameters, len(ids), [self.model.tet_materials, ids, a, b], [of_mu, of_lam])
+        self.damped = bool((materials[:, 2] > 0).any())
+        for group in self.groups:
+            group.set_material(mu, lam)
+
+    def add_forces(self, x: wp.array, f: wp.array, rotations: wp.array | None) -> None:
+        """Add the elastic forces [N] of particles at x to f, both vec4 [P]; ``rotations`` are the state's."""
+        if self.single_count:
+            inputs = [self._single, *self._single_lame, x]
+            if self.warm:
+                inputs = [self._single, *self._single_lame, self._single_ids, x, rotations]
+                self._launch(scatter_posed_warm, self.single_count, inputs, [f])
+            elif self.device.is_cpu:
+                lanes = [self._single, self.single_count, *self._single_lame, x]
+                self._launch(scatter_posed_lanes, -(-self.single_count // LANES), lanes, [f, self._flagged])
+                self._launch(repair_posed, self.single_count, [self._flagged, *inputs], [f])
+            else:
+                self._launch(scatter_posed(quick_rotation), self.single_count, inputs, [f])
+        for group in self.groups:
+            group.add_forces(x, f)
+
+    def add_damping_and_activation(self, q: wp.array, qd: wp.array, activation: wp.array, f: wp.array) -> None:
+        inputs = [self.elements, self.model.tet_materials, activation, q, qd]
+        self._launch(scatter_damping_and_activation, self.model.tet_count, inputs, [f])
+
+    def write_attributes(self, state: newton.State, before: newton.State) -> None:
+        """Write rotations and stresses of a state's positions, where it has room for them."""
+        there = {name: attribute_of(state, name) for name in STATE}
+        if all(array is None for array in there.values()):
+            return
+        kernel = write_attributes(*(array is not None for array in there.values()), self.warm)
+        guesses = attribute_of(before, "rotation") if self.warm else self._no_rotations
+        fill = [self._fill, int(len(self._fill) == self.model.tet_count)]
+        inputs = [self.elements, self.mu, self.lam, *fill, state.particle_q, guesses]
+        outputs = [self._nothing[name] if array is None else array for name, array in there.items()]
+        self._launch(kernel, self.model.tet_count, inputs, outputs)
+
+    def _elements(self, ids: npt.NDArray[np.integer]) -> Any:
+        poses = self.model.tet_poses.numpy().reshape(-1, 3, 3)[ids]
+        elements = GeneralElements()
+        elements.nodes = wp.array(self.tets[ids], dtype=wp.vec4i, device=self.device)
+        elements.targets = elements.nodes
+        elements.rest_inverse = wp.array(poses, dtype=wp.mat33, device=self.device)
+        volumes = 1.0 / (6.0 * np.linalg.det(poses.astype(np.float64)))
+        bad = np.flatnonzero(~(np.isfinite(volumes) & (volumes > 0)))
+        if len(bad):
+            raise InputError(f"tetrahedron {ids[bad[0]]} has a rest volume of {volumes[bad[0]]:g} m^3")
+        elements.volume = wp.array(volumes, dtype=wp.float32, device=self.device)
+        return elements
+
+    def _warn_of_lost(self) -> None:
+        """Say it where the builder seems to have left tetrahedra out."""
+        used = np.zeros(self.model.particle_count, bool)
+        used[self.tets] = True
+        starts, ends = self.model.volume_particle_start, self.model.volume_particle_end
+        if starts is None or ends is None:
+            return
+        ranges = zip(starts.numpy(), ends.numpy(), strict=True)
+        lost = sum(int(np.count_nonzero(~used[start:end])) for start, end in ranges)
+        if lost:
+            warnings.warn(
+                f"{lost} particles of soft bodies are in no tetrahedron: Newton's builder leaves out wrongly wound "
+                "tetrahedra, mass and all; build with warp_corot.newton.add_mesh, which turns them round",
+                UserWarning,
+                stacklevel=4,
+            )
+
+    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
