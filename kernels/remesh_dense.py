@@ -103,19 +103,20 @@ def move_nodes(
 
 
 @wp.func
-def present_name(node: int, pools: Pools, moves: Moves):
-    if node >= pools.counts[NODE_TOP] and node < pools.counts[OLD_TOP]:
+def present_name(node: int, top: int, old_top: int, moves: Moves):
+    """A node's number now; movers had numbers from ``top`` up to ``old_top``."""
+    if node >= top and node < old_top:
         return moves.forward[node]
     return node
 
 
 @wp.func
-def with_present_names(tet: wp.vec4i, pools: Pools, moves: Moves):
+def with_present_names(tet: wp.vec4i, top: int, old_top: int, moves: Moves):
     return wp.vec4i(
-        present_name(tet[0], pools, moves),
-        present_name(tet[1], pools, moves),
-        present_name(tet[2], pools, moves),
-        present_name(tet[3], pools, moves),
+        present_name(tet[0], top, old_top, moves),
+        present_name(tet[1], top, old_top, moves),
+        present_name(tet[2], top, old_top, moves),
+        present_name(tet[3], top, old_top, moves),
     )
 
 
@@ -129,26 +130,27 @@ def rename_ends(
 ):
     """If anyone has moved; nodes that only void tetrahedra name may have ends that did."""
     top = pools.counts[NODE_TOP]
+    old_top = pools.counts[OLD_TOP]
     count = top + pools.sink - pools.node_limit
     if moves.ends[threads - 1] == 0:
         count = 0
     for i in range(wp.tid(), count, threads):
         node = wp.where(i < top, i, pools.node_limit + i - top)
         ends = pools.ends[node]
-        a = present_name(ends[0], pools, moves)
-        b = present_name(ends[1], pools, moves)
+        a = present_name(ends[0], top, old_top, moves)
+        b = present_name(ends[1], top, old_top, moves)
         if a != ends[0] or b != ends[1]:
             pools.ends[node] = wp.vec2i(wp.min(a, b), wp.max(a, b))
 
 
 @wp.func
-def rename_upwards(e: int, pools: Pools, moves: Moves):
+def rename_upwards(e: int, top: int, old_top: int, pools: Pools, moves: Moves):
     """Put present names into a leaf, and into its ancestors as far as they name a mover that it names.
 
     Threads that meet in an ancestor write the same, and each goes on for its own movers.
     """
     before = pools.tets[e]
-    tet = with_present_names(before, pools, moves)
+    tet = with_present_names(before, top, old_top, moves)
     moved = int(0)
     for n in range(4):
         if tet[n] != before[n]:
@@ -157,7 +159,7 @@ def rename_upwards(e: int, pools: Pools, moves: Moves):
         pools.tets[e] = tet
         above = pools.parent[e]
         while above >= 0:
-            whole = with_present_names(pools.tets[above], pools, moves)
+            whole = with_present_names(pools.tets[above], top, old_top, moves)
             names = int(0)
             for n in range(4):
                 for m in range(4):
@@ -179,8 +181,10 @@ def rename_void(
     # In and out
     pools: Pools,
 ):
+    top = pools.counts[NODE_TOP]
+    old_top = pools.counts[OLD_TOP]
     count = pools.void_count
     if moves.ends[threads - 1] == 0:
         count = 0
     for i in range(wp.tid(), count, threads):
-        rename_upwards(pools.void_leaves[i], pools, moves)
+        rename_upwards(pools.void_leaves[i], top, old_top, pools, moves)

@@ -6,7 +6,7 @@ was merged its parent does. A sum over the threads tells each where to begin.
 
 import warp as wp
 
-from .remesh import ADDED, LEAVES, NEW_LEAVES, REMOVED, UNUSED, Pools, padding
+from .remesh import ADDED, LEAVES, NEW_LEAVES, NODE_TOP, OLD_TOP, REMOVED, UNUSED, Pools, padding
 from .remesh_dense import Moves, rename_upwards
 
 
@@ -102,6 +102,8 @@ def adopt_list(
 ):
     """The new list takes the old one's place; nodes that have moved are named anew on the way."""
     new = pools.counts[NEW_LEAVES]
+    top = pools.counts[NODE_TOP]
+    old_top = pools.counts[OLD_TOP]
     count = wp.max(new, pools.counts[LEAVES])
     if pools.counts[ADDED] + pools.counts[REMOVED] == 0:
         count = 0
@@ -109,7 +111,7 @@ def adopt_list(
         if i < new:
             e = pools.new_leaves[i]
             pools.leaves[i] = e
-            pools.leaf_tets[i] = rename_upwards(e, pools, moves)
+            pools.leaf_tets[i] = rename_upwards(e, top, old_top, pools, moves)
         else:
             pools.leaf_tets[i] = padding(i, pools)
 

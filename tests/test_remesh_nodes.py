@@ -146,11 +146,15 @@ def assert_same_state(device, expected):
         assert np.array_equal(values, expected[name]), name
 
 
+START = {
+    "box": lambda: wc.TetForest.box((2, 1, 1), CUBE, 3),
+    "sphere": lambda: wc.TetForest.from_domain(wc.Domain.sphere(0.05), 0.04, max_level=6, surface_error=1e-3),
+}
+
+
 @pytest.mark.parametrize("kind", ["box", "sphere"])
 def test_restarting_leads_back_and_recorded_passes_go_on(kind, device, rng):
-    forest = wc.TetForest.box((2, 1, 1), CUBE, 3)
-    if kind == "sphere":
-        forest = wc.TetForest.from_domain(wc.Domain.sphere(0.05), 0.04, max_level=6, surface_error=1e-3)
+    forest = START[kind]()
     adaptive = moving(forest, device, rng, held=rng.random(len(forest.points)) < 0.2)
     adaptive.remember()
     remesh, first = RemeshPass(adaptive), in_use(adaptive)
@@ -176,10 +180,11 @@ def test_restarting_leads_back_and_recorded_passes_go_on(kind, device, rng):
     assert_sound(adaptive)
 
 
-def test_a_mesh_restarts_at_what_it_began_as(device, rng):
+@pytest.mark.parametrize("kind", ["box", "sphere"])
+def test_a_mesh_restarts_at_what_it_began_as(kind, device, rng):
     """Also when its pools were full and it was compacted in between."""
-    forest = wc.TetForest.box((1, 1, 1), CUBE, 3)
-    adaptive = DeviceForest(forest, 300, density=DENSITY, device=device)
+    forest = START[kind]()
+    adaptive = DeviceForest(forest, len(forest.tets) + 300, density=DENSITY, device=device)
     remesh, first = RemeshPass(adaptive), in_use(adaptive)
     for _ in range(4):
         remesh.apply(np.ones(adaptive.leaf_count, int))
@@ -189,3 +194,7 @@ def test_a_mesh_restarts_at_what_it_began_as(device, rng):
     assert_same_state(adaptive, first)
     assert not adaptive.is_full
     assert np.array_equal(assert_sound(adaptive).tets, forest.tets)
+    for _ in range(4):
+        remesh.apply(np.full(adaptive.leaf_count, -1))
+        assert_sound(adaptive)
+    assert adaptive.leaf_count < len(forest.tets)

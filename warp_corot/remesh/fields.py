@@ -1,9 +1,20 @@
 """Which arrays of the pools and of what is carried belong to nodes, and which to tetrahedra."""
 
 #: Of ``kernels.remesh.Pools``; what a pass leaves behind for nobody is left out.
-OF_NODES = ("lattice", "ends", "valence")
-OF_TETRAHEDRA = ("tets", "level", "parent", "first_child", "code")
+OF_NODES: tuple[str, ...] = ("lattice", "ends", "valence")
+OF_TETRAHEDRA: tuple[str, ...] = ("tets", "level", "parent", "first_child", "code")
 
 #: Of ``kernels.remesh_state.Carried``.
-CARRIED_BY_NODES = ("rest", "u", "v", "load", "reaction", "mass", "held", "row", "mass32", "inverse_mass")
-CARRIED_BY_TETRAHEDRA = ("density", "label", "values")
+CARRIED_BY_NODES: tuple[str, ...] = (
+    "rest",
+    "u",
+    "v",
+    "load",
+    "reaction",
+    "mass",
+    "held",
+    "row",
+    "mass32",
+    "inverse_mass",
+)
+CARRIED_BY_TETRAHEDRA: tuple[str, ...] = ("density", "label", "values")

@@ -34,16 +34,15 @@ class Snapshot:
         pools, arrays = forest.pools, forest.carriage.arrays
         self._counts = pools.counts.numpy().copy()
         self._pieces: list[_Piece] = []
-        self._cleared: list[tuple[wp.array, int]] = []
         used = np.flatnonzero(pools.level.numpy() != kernels.UNUSED)
-        self._keep(pools, OF_TETRAHEDRA, int(used[-1]) + 1)
-        self._keep(arrays, CARRIED_BY_TETRAHEDRA, int(used[-1]) + 1)
+        for struct, names in ((pools, OF_TETRAHEDRA), (arrays, CARRIED_BY_TETRAHEDRA)):
+            self._keep(struct, names, int(used[-1]) + 1)
         for struct, names in ((pools, OF_NODES), (arrays, CARRIED_BY_NODES)):
             self._keep(struct, names, int(self._counts[kernels.NODE_TOP]))
-            if forest.virtual_count:
-                self._keep(struct, names, forest.virtual_count, start=pools.node_limit)
+            self._keep(struct, names, forest.virtual_count, start=pools.node_limit)
         self._keep(pools, ("free_pairs",), int(self._counts[kernels.FREE_PAIRS]))
         self._keep(pools, ("leaves", "leaf_tets"), int(self._counts[kernels.LEAVES]))
+        self._keep(pools, ("void_leaves",), pools.void_count)
         self._keep(arrays, ("impulse",), 1)
 
     def restore(self, forest: DeviceForest) -> None:
@@ -51,8 +50,12 @@ class Snapshot:
         leaves, known = int(present[kernels.LEAVES]), int(self._counts[kernels.LEAVES])
         if leaves > known:
             forest.pools.leaf_tets[known:leaves].assign(forest.padding(known, leaves))
-        for array, value in self._cleared:
-            array.fill_(value)
+        for struct, names in (
+            (forest.pools, (*OF_TETRAHEDRA, *OF_NODES)),
+            (forest.carriage.arrays, (*CARRIED_BY_TETRAHEDRA, *CARRIED_BY_NODES)),
+        ):
+            for name in names:
+                getattr(struct, name).fill_(_UNUSED.get(name, 0))
         for piece in self._pieces:
             piece.write()
         counts = self._counts.copy()
@@ -65,5 +68,3 @@ class Snapshot:
             array = getattr(struct, name)
             if count and array.size:
                 self._pieces.append(_Piece(array, start, wp.clone(array[start : start + count])))
-            if name not in ("free_pairs", "leaves", "leaf_tets", "impulse"):
-                self._cleared.append((array, _UNUSED.get(name, 0)))
