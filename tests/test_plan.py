@@ -33,7 +33,7 @@ def forces(body, model, u):
 def test_every_leaf_is_done_once(level, rotation_level, device, rng):
     forest = mixed(level, rng)
     plan = ForcePlan.of_forest(forest, rotation_level, wp.get_device(device))
-    done = [plan.flat]
+    done = [plan.flat.leaves.numpy()]
     for batch in plan.batches:
         first = batch.subtrees.first.numpy()
         assert len(first) == batch.count

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from .elements import forest_elements, in_worlds
+from .elements import forest_elements, in_worlds, with_targets
 from .kernels.elements import Subtrees
 from .kernels.subtree import GROUP_NODES, LEAVES, group_leaves, group_nodes
 from .mesh import TetForest
@@ -45,6 +45,7 @@ class Batch:
         sharing: Whose rotation their leaves use.
         subtrees: ``kernels.elements.Subtrees``.
         roots: Their roots as forest elements where leaves share the root's rotation, else None.
+        unit: Which of ``Units`` each uses where leaves share one from further up, int32 [count], else None.
         flagged: Set by the kernel where a subtree was left out, uint8 [count, rounded up to eights].
     """
 
@@ -54,6 +55,7 @@ class Batch:
     sharing: Sharing
     subtrees: Any
     roots: Any
+    unit: wp.array | None
     flagged: wp.array
 
     @property
@@ -63,20 +65,94 @@ class Batch:
 
 
 @dataclass(frozen=True)
-class ForcePlan:
-    """Batches of subtrees and the leaves left over.
+class Units:
+    """Tetrahedra, leaves or above these, of which rotations are found.
+
+    Attributes:
+        elements: ``kernels.elements.ForestElements``, or general ones where there is no tree.
+        count: How many one launch goes through.
+        unit: Which of them each of the mesh's elements uses, int32 [T].
+    """
+
+    elements: Any
+    count: int
+    unit: wp.array
+
+    @classmethod
+    def own(cls, elements: Any, count: int) -> Units:
+        """Each element by itself."""
+        return cls(elements, count, wp.array(np.arange(count), dtype=wp.int32, device=elements.nodes.device))
+
+    @classmethod
+    def of_forest(cls, forest: TetForest, rotation_level: int, device: wp.Device, worlds: int = 1) -> Units:
+        """The highest tetrahedra that are not above a level, each once."""
+        ancestors, unit = np.unique(forest.ancestors(rotation_level), return_inverse=True)
+        return cls(
+            forest_elements(forest, ancestors, device, worlds),
+            worlds * len(ancestors),
+            wp.array(in_worlds(unit.ravel(), worlds, len(ancestors)), dtype=wp.int32, device=device),
+        )
+
+
+@dataclass(frozen=True)
+class FlatLeaves:
+    """Leaves that are in no subtree, as elements of their own, world after world.
+
+    Attributes:
+        leaves: Which of the mesh's elements they are, int32 [n]; ``len`` is how many one launch goes through.
+        elements: ``kernels.elements.ForestElements``.
+        unit: Which of ``Units`` each uses where rotations are shared, int32 [n], else None.
+        general: The same leaves as general elements, if that is known, else None.
+        material: Their Lamé parameters mu and lambda [Pa] where these vary and are known, float32 [n] each, else None.
+    """
+
+    leaves: wp.array
+    elements: Any
+    unit: wp.array | None = None
+    general: Any = None
+    material: tuple[wp.array, wp.array] | None = None
+
+    def __len__(self) -> int:
+        return len(self.leaves)
+
+
+class Plan(Protocol):
+    """What a force field goes through, however it came about.
 
     Attributes:
         batches: Subtrees by type, grouped or not, and sharing.
-        flat: The other leaves, indices into the mesh's elements.
+        flat: The other leaves.
         slots: Where forces go first if their sums must have one order, else None.
-        leaf_targets: Then each leaf's slots, int32 [T, 4], of one world.
+        targets: Then each leaf's slots, int32 [worlds * T, 4], else None.
     """
 
+    @property
+    def batches(self) -> tuple[Batch, ...]: ...
+
+    @property
+    def flat(self) -> FlatLeaves: ...
+
+    @property
+    def units(self) -> Units | None:
+        """What rotations are found of if some batch or flat leaf asks for that, else None."""
+        ...
+
+    @property
+    def slots(self) -> Slots | None: ...
+
+    @property
+    def targets(self) -> npt.NDArray[np.int32] | None: ...
+
+
+@dataclass(frozen=True)
+class ForcePlan:
+    """The ``Plan`` of a forest that stays as it is."""
+
     batches: tuple[Batch, ...]
-    flat: npt.NDArray[np.int32]
+    flat: FlatLeaves
+    units: Units | None
     slots: Slots | None = None
-    leaf_targets: npt.NDArray[np.int32] | None = None
+    targets: npt.NDArray[np.int32] | None = None
 
     @classmethod
     def of_forest(
@@ -98,18 +174,26 @@ class ForcePlan:
             deterministic: Whether every unit has slots of its own for its forces.
         """
         members, flat = _members(forest, rotation_level, grouped=grouped and device.is_cuda)
-        nodes = [m.of_leaves(forest.tets) for m in members]
-        if not deterministic:
-            batches = [m.batch(forest, device, worlds, n, n) for m, n in zip(members, nodes, strict=True)]
-            return cls(tuple(batches), flat)
-        slots, targets = Slots.of_units([*nodes, forest.tets[flat]], len(forest.points), device, worlds)
-        leaf_targets = np.empty_like(forest.tets)
-        leaf_targets[flat] = targets[-1]
-        batches = []
-        for m, own_nodes, own_targets in zip(members, nodes, targets[:-1], strict=True):
-            m.hand_down(own_targets, leaf_targets)
-            batches.append(m.batch(forest, device, worlds, own_nodes, own_targets, slots.per_world))
-        return cls(tuple(batches), flat, slots, leaf_targets)
+        units = None
+        if rotation_level is not None and (len(flat) or any(m.sharing is Sharing.ABOVE for m in members)):
+            units = Units.of_forest(forest, rotation_level, device, worlds)
+        of_nodes = [m.of_leaves(forest.tets) for m in members]
+        of_targets, target_count = of_nodes, 0
+        slots = targets = None
+        if deterministic:
+            slots, by_unit = Slots.of_units([*of_nodes, forest.tets[flat]], len(forest.points), device, worlds)
+            *of_targets, of_flat = by_unit
+            target_count = slots.per_world
+            targets = np.empty_like(forest.tets)
+            targets[flat] = of_flat
+            for m, own in zip(members, of_targets, strict=True):
+                m.hand_down(own, targets)
+            targets = in_worlds(targets, worlds, target_count)
+        batches = [
+            m.batch(forest, device, worlds, n, t, target_count, units)
+            for m, n, t in zip(members, of_nodes, of_targets, strict=True)
+        ]
+        return cls(tuple(batches), _flat_leaves(forest, flat, device, worlds, targets, units), units, slots, targets)
 
 
 @dataclass(frozen=True)
@@ -128,7 +212,7 @@ class _Members:
     def of_leaves(self, values: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
         """What leaves have at their nodes, int32 [T, 4], by the nodes of the units: [units, 40 or 10]."""
         if not self.grouped:
-            places = np.array([_place(self.shape, node) for node in range(10)])
+            places = np.array(subtree_nodes(self.shape))
             return values[self.first[:, None] + places[:, 0], places[:, 1]]
         places = np.array(group_nodes(self.shape))
         found = np.full((len(self.first) // 8, GROUP_NODES), -1, np.int32)
@@ -148,7 +232,8 @@ class _Members:
         worlds: int,
         nodes: npt.NDArray[np.int32],
         targets: npt.NDArray[np.int32],
-        target_count: int = 0,
+        target_count: int,
+        units: Units | None,
     ) -> Batch:
         count = worlds * len(self.first)
         root_indices = forest.tree.above(forest.tree.leaves[self.first], SUBTREE_LEVELS)
@@ -162,6 +247,9 @@ class _Members:
         subtrees.targets = subtrees.nodes
         if targets is not nodes:
             subtrees.targets = self._on_device(in_worlds(targets, worlds, target_count), device)
+        unit = None
+        if units is not None and self.sharing is Sharing.ABOVE:
+            unit = _chosen(units.unit, subtrees.first)
         return Batch(
             shape=self.shape,
             grouped=self.grouped,
@@ -169,6 +257,7 @@ class _Members:
             sharing=self.sharing,
             subtrees=subtrees,
             roots=roots if self.sharing is Sharing.ROOT else None,
+            unit=unit,
             flagged=wp.zeros(-(-count // 8) * 8, dtype=wp.uint8, device=device),
         )
 
@@ -224,6 +313,27 @@ def complete_subtrees(forest: TetForest, depth: int) -> npt.NDArray[np.int32]:
     return change[(length == size) & (ancestor[change] >= 0)].astype(np.int32)
 
 
-def _place(shape: int, node: int) -> tuple[int, int]:
-    """A leaf of the subtree, and which of its nodes, where a local node is named."""
-    return next((at, n) for at, leaf in enumerate(LEAVES[shape]) for n in range(4) if leaf[n] == node)
+def subtree_nodes(shape: int) -> list[tuple[int, int]]:
+    """Where to read a subtree's ten nodes: (leaf of 8, local node of 4) for each."""
+    named = [(node, (at, n)) for at, leaf in enumerate(LEAVES[shape]) for n, node in enumerate(leaf)]
+    return [next(place for other, place in named if other == node) for node in range(10)]
+
+
+def _flat_leaves(
+    forest: TetForest,
+    flat: npt.NDArray[np.int32],
+    device: wp.Device,
+    worlds: int,
+    targets: npt.NDArray[np.int32] | None,
+    units: Units | None,
+) -> FlatLeaves:
+    everywhere = in_worlds(flat, worlds, len(forest.tets))
+    leaves = wp.array(everywhere, dtype=wp.int32, device=device)
+    elements = forest_elements(forest, forest.tree.leaves[flat], device, worlds)
+    if targets is not None:
+        elements = with_targets(elements, targets[everywhere])
+    return FlatLeaves(leaves, elements, None if units is None else _chosen(units.unit, leaves))
+
+
+def _chosen(values: wp.array, places: wp.array) -> wp.array:
+    return wp.array(values.numpy()[places.numpy()], dtype=values.dtype, device=values.device)

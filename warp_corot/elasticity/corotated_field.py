@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, ClassVar
 
-import numpy as np
 import warp as wp
 
-from ..elements import forest_elements, in_worlds
 from ..kernels.corotated import (
     corotated_energies,
     corotated_von_mises,
@@ -21,39 +19,41 @@ from ..kernels.corotated import (
 )
 from ..kernels.general_cpu import repair_elements, scatter_elements
 from ..mesh import TetForest
+from ..plan import Units
 from .lanes import Lanes
 from .model import ForceField, leaf_slots
 
 if TYPE_CHECKING:
     from ..body import SoftBody
+    from ..remesh.plan import DevicePlan
+    from ..remesh.pools import DeviceForest
     from .corotated import Corotated
 
 
 @dataclass(frozen=True)
 class Rotations:
-    """Rotations of elements or their ancestors, and who uses which.
+    """Units and their rotations, mat33 [units]."""
 
-    Attributes:
-        units: Whose rotations are found, as elements.
-        count: How many.
-        rotations: mat33 [count].
-        unit: Which of them each element of the mesh uses, int32 [T].
-    """
-
-    units: Any
-    count: int
+    units: Units
     rotations: wp.array
-    unit: wp.array
+
+    @classmethod
+    def of(cls, units: Units) -> Rotations:
+        return cls(units, wp.empty(units.count, dtype=wp.mat33, device=units.unit.device))
 
 
 class CorotatedField(ForceField):
     """Rotations and forces as one kernel where each element uses its own, as two stages otherwise."""
+
+    #: Whether complete subtrees go as one.
+    takes_subtrees: ClassVar[bool] = False
 
     def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
         super().__init__(body, deterministic)
         self.model = model
         kind = body.element_kind
         self._shared: Rotations | None = None
+        self._followed: DevicePlan | None = None
         self._fused = model.rotation_level is None and model.rotation != "warm" and model.stiffness == "factored"
         self._state: dict[str, wp.array] = {}
         if model.rotation == "warm":
@@ -82,14 +82,32 @@ class CorotatedField(ForceField):
             self.launch(reset_quaternions, len(quaternions), [chosen, in_world], [quaternions])
 
     @property
+    def rotation_level(self) -> int | None:
+        """Level of the tree at which rotations are shared, if they are."""
+        return self.model.rotation_level
+
+    def plan_of(self, forest: DeviceForest) -> DevicePlan:
+        from ..remesh.plan import DevicePlan
+
+        return DevicePlan(forest, self.rotation_level, subtrees=self.takes_subtrees)
+
+    def follow(self, plan: DevicePlan) -> None:
+        super().follow(plan)
+        self._followed = plan
+        self._shared = None
+        if not self._fused:
+            self._sharing()
+
+    @property
     def unit_count(self) -> int:
         """How many rotations are found."""
-        return self._sharing().count
+        return self._sharing().units.count
 
     def extract_rotations(self, u: wp.array) -> wp.array:
         """The rotation of every unit, mat33 [units]."""
         shared = self._sharing()
-        self.launch(self._extract, shared.count, [shared.units, u], [*self.state.values(), shared.rotations])
+        units = shared.units
+        self.launch(self._extract, units.count, [units.elements, u], [*self.state.values(), shared.rotations])
         return shared.rotations
 
     def add_rotated_forces(self, u: wp.array, f: wp.array) -> None:
@@ -114,23 +132,21 @@ class CorotatedField(ForceField):
     def _sharing(self) -> Rotations:
         """Who uses whose rotation; made on first use, since own rotations need none of it for their forces."""
         if self._shared is None:
-            body, mesh, level = self.body, self.body.mesh, self.model.rotation_level
-            units, unit = self.elements, np.arange(len(mesh.tets))
-            count = len(mesh.tets)
-            if isinstance(mesh, TetForest) and level is not None:
-                ancestors, unit = np.unique(mesh.ancestors(level), return_inverse=True)
-                units, count = forest_elements(mesh, ancestors, self.device, body.worlds), len(ancestors)
-            self._shared = Rotations(
-                units,
-                body.worlds * count,
-                wp.empty(body.worlds * count, dtype=wp.mat33, device=self.device),
-                wp.array(in_worlds(unit.ravel(), body.worlds, count), dtype=wp.int32, device=self.device),
-            )
+            self._shared = Rotations.of(self._units())
         return self._shared
+
+    def _units(self) -> Units:
+        level = self.rotation_level
+        if level is None:
+            return Units.own(self.elements, self.element_count)
+        if self._followed is not None:
+            return self._followed.all_units
+        assert isinstance(self.body.mesh, TetForest)
+        return Units.of_forest(self.body.mesh, level, self.device, self.body.worlds)
 
     def _launch_with_rotations(self, kernel: wp.Kernel, material: list, u: wp.array, output: wp.array) -> None:
         shared = self._sharing()
-        inputs = [self.elements, *material, u, shared.rotations, shared.unit]
+        inputs = [self.elements, *material, u, shared.rotations, shared.units.unit]
         self.launch(kernel, self.element_count, inputs, [output])
 
 

@@ -19,6 +19,8 @@ from ..slots import Slots
 
 if TYPE_CHECKING:
     from ..body import SoftBody
+    from ..remesh.plan import DevicePlan
+    from ..remesh.pools import DeviceForest
 
 
 class ForceField(ABC):
@@ -59,6 +61,20 @@ class ForceField(ABC):
     @abstractmethod
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         """Launch the kernels that add the forces to the nodes, or to the slots if there are any."""
+
+    def plan_of(self, forest: DeviceForest) -> DevicePlan:
+        """What the field wants to know of a mesh that changes, derived there."""
+        from ..remesh.plan import DevicePlan
+
+        return DevicePlan(forest, subtrees=False)
+
+    def follow(self, plan: DevicePlan) -> None:
+        """Go through the elements of a mesh that changes.
+
+        Called before the first launch, and again, before others are recorded, whenever a pass has changed the size of
+        any launch.
+        """
+        self.elements = plan.elements
 
     def begin_step(self, clock: wp.array, offset: int, dt: float) -> None:  # noqa: B027 (most do not change)
         """Launch what sets the field for a step, where it changes with time.
