@@ -94,7 +94,7 @@ def activate(
     worlds: npt.ArrayLike | None,
 ) -> None:
     """``SoftBody.activate``."""
-    live, count = body.activation, len(body.mesh.tets)
+    live, count = body.activation, body.world_element_count
     own = np.arange(count) if elements is None else checked_indices(np.asarray(elements), count, "element")
     which = np.arange(body.worlds) if worlds is None else checked_indices(np.asarray(worlds), body.worlds, "world")
     chosen = (which[:, None] * count + own).ravel()

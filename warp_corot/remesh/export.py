@@ -28,7 +28,7 @@ def exported(device: DeviceForest) -> TetForest:
     new_ends, new_tree = renumbered(order, ends, tree)
     lattice = lattice[order]
     leaves = places[tree.leaves]
-    known = same_points(lattice, source.lattice)
+    known = _same_points(lattice, source.lattice)
     carriage = device.carriage
     return replace(
         source,
@@ -51,7 +51,7 @@ def _without_doubles(order: np.ndarray, lattice: np.ndarray, real: np.ndarray) -
     is_real = np.zeros(len(lattice), bool)
     is_real[real] = True
     virtual = order[~is_real[order]]
-    twin = same_points(lattice[virtual], lattice[real])
+    twin = _same_points(lattice[virtual], lattice[real])
     doubled = twin >= 0
     stands_for[virtual[doubled]] = real[twin[doubled]]
     gone = np.zeros(len(lattice), bool)
@@ -59,7 +59,7 @@ def _without_doubles(order: np.ndarray, lattice: np.ndarray, real: np.ndarray) -
     return order[~gone[order]], stands_for
 
 
-def same_points(points: np.ndarray, among: np.ndarray) -> np.ndarray:
+def _same_points(points: np.ndarray, among: np.ndarray) -> np.ndarray:
     """Where each lattice point is found among others, -1 where it is not."""
     both, number = np.unique(np.concatenate([among, points]), axis=0, return_inverse=True)
     place = np.full(len(both), -1, np.int64)

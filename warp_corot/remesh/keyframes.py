@@ -9,11 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from ..kernels.remesh_state import MIXED_ROWS, NO_ROW
 from ..trajectory import Trajectory
-
-#: What ``Carried.row`` says of nodes that follow no keyframes, and of new ones between nodes that follow different ones.
-NONE = -1
-BETWEEN = -2
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +41,7 @@ class Keyframes:
 
     def adopt(self, trajectories: Sequence[Trajectory], node_count: int) -> npt.NDArray[np.int32]:
         """Take trajectories over, and say which row each node follows, int32 [N]."""
-        found = np.full(node_count, NONE, np.int32)
+        found = np.full(node_count, int(NO_ROW), np.int32)
         for trajectory in trajectories:
             times, displacements = trajectory.keys()
             first, nodes = len(self._rows), trajectory.nodes.numpy()
@@ -68,9 +65,9 @@ class Keyframes:
             displacements: The nodes' present ones [m], [N, 3]: where an end that follows nothing stays.
         """
         settled = rows.copy()
-        left = np.flatnonzero(settled == BETWEEN)
+        left = np.flatnonzero(settled == int(MIXED_ROWS))
         while len(left):
-            known = (settled[ends[left]] != BETWEEN).all(axis=1)
+            known = (settled[ends[left]] != int(MIXED_ROWS)).all(axis=1)
             for node in left[known]:
                 settled[node] = self._mean_row(ends[node], settled, displacements)
             left = left[~known]

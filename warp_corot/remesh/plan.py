@@ -156,14 +156,14 @@ class DevicePlan:
         leaves, general = self._leaves, None
         if len(leaves.volume):
             general = GeneralElements()
-            general.nodes = general.targets = leaves.nodes[:count]
-            general.rest_inverse, general.volume = leaves.rest_inverse[:count], leaves.volume[:count]
+            general.nodes = general.targets = _first(leaves.nodes, count)
+            general.rest_inverse, general.volume = _first(leaves.rest_inverse, count), _first(leaves.volume, count)
         return FlatLeaves(
-            leaves=self._plan.flat[:count],
-            elements=self._elements(leaves.nodes[:count], leaves.code[:count]),
-            unit=leaves.unit[:count] if self.rotation_shared else None,
+            leaves=_first(self._plan.flat, count),
+            elements=self._elements(_first(leaves.nodes, count), _first(leaves.code, count)),
+            unit=_first(leaves.unit, count) if self.rotation_shared else None,
             general=general,
-            material=(leaves.mu[:count], leaves.lam[:count]) if leaves.mu_row >= 0 else None,
+            material=(_first(leaves.mu, count), _first(leaves.lam, count)) if leaves.mu_row >= 0 else None,
         )
 
     def _elements(self, nodes: wp.array, code: wp.array) -> Any:
@@ -175,3 +175,8 @@ class DevicePlan:
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, int], *arguments: Any) -> None:
         wp.launch(kernel, dim=dim, inputs=list(arguments), device=self.device)
+
+
+def _first(array: wp.array, count: int) -> wp.array:
+    """The first places of an array, which may have none."""
+    return array[:count] if len(array) > count else array

@@ -44,9 +44,10 @@ class PlanArrays:
             self.kinds += [(Sharing.ROOT, rotation_level % 3), *((Sharing.ABOVE, shape) for shape in range(3))]
         sizes = forest.source.cell_size * 0.5 ** np.arange(LATTICE_BITS + 1)
         self.edge_lengths = wp.array(sizes, dtype=wp.float32, device=self.device)
+        self._root_code = int(forest.pools.code[:1].numpy()[0])
         self.plan = self._make_plan(-1 if rotation_level is None else rotation_level, subtrees)
         self.batches = self._make_batches()
-        self.leaves = self._make_leaves(self._most_leaves if subtrees else 0)
+        self.leaves = self._make_leaves(self._most_leaves if subtrees else 1)
 
     def _make_plan(self, rotation_level: int, subtrees: bool) -> Any:
         leaves = self._most_leaves
@@ -57,14 +58,14 @@ class PlanArrays:
         plan.classes = plan.members * len(self.kinds)
         plan.counts, plan.before = self._zeros(plan.classes + 3), self._zeros(plan.classes + 3)
         plan.stale, plan.goes = self._zeros(1), self._zeros(1)
-        plan.code = self._zeros(leaves)
+        plan.code = self._codes(leaves)
         plan.values = self._zeros((len(self._forest.carriage.names), leaves), wp.float32)
         plan.marks = self._zeros(leaves, wp.int8)
         plan.unit = self._zeros(units)
         plan.first = self._zeros((plan.classes, self.most_subtrees))
         plan.flat = self._zeros(leaves)
         plan.unit_nodes = self._padding(units)
-        plan.unit_code = self._zeros(units)
+        plan.unit_code = self._codes(units)
         return plan
 
     def _make_batches(self) -> Any:
@@ -81,7 +82,7 @@ class PlanArrays:
         batches.by_node = int(groups)
         batches.nodes = self._ints(nodes if groups else np.swapaxes(nodes, 1, 2))
         batches.group_nodes = self._ints(of_groups if groups else np.zeros((kinds, 0, GROUP_NODES)))
-        batches.code = self._zeros((plan.classes, most))
+        batches.code = self._codes((plan.classes, most))
         batches.unit = self._zeros((plan.classes if self._shared else 0, most))
         roots = np.repeat(np.repeat(sinks[None, :, None], plan.members, axis=0), 4, axis=2)
         batches.root_nodes = wp.array(roots if self._shared else roots[:0], dtype=wp.vec4i, device=self.device, ndim=2)
@@ -92,7 +93,7 @@ class PlanArrays:
         varies = "mu" in names
         leaves = FlatLeaves()
         leaves.nodes = self._padding(count)
-        leaves.code = self._zeros(count)
+        leaves.code = self._codes(count)
         leaves.unit = self._zeros(count if self._shared else 0)
         leaves.mu_row, leaves.lam_row = (names.index(name) if varies else -1 for name in ("mu", "lam"))
         leaves.mu, leaves.lam = (self._zeros(count if varies else 0, wp.float32) for _ in range(2))
@@ -105,8 +106,6 @@ class PlanArrays:
             codes = (np.arange(frames)[:, None] << MIRROR_BIT) + np.arange(3)
             leaves.inverse_of, _ = self._rest_matrices(codes.ravel())
             _, leaves.volume_of = self._rest_matrices(np.arange(MAX_LEVEL + 1))
-            leaves.rest_inverse.assign(np.broadcast_to(leaves.inverse_of.numpy()[0], (general, 3, 3)))
-            leaves.volume.fill_(float(leaves.volume_of.numpy()[0]))
         return leaves
 
     def _rest_matrices(self, codes: npt.NDArray[np.integer]) -> tuple[wp.array, wp.array]:
@@ -133,6 +132,10 @@ class PlanArrays:
 
     def _padding(self, count: int) -> wp.array:
         return wp.array(np.repeat(self._sinks(count)[:, None], 4, axis=1), dtype=wp.vec4i, device=self.device)
+
+    def _codes(self, shape: int | tuple[int, int]) -> wp.array:
+        """Codes of padding: see ``kernels.remesh_plan.padding_code``."""
+        return wp.full(shape, self._root_code, dtype=wp.int32, device=self.device)
 
     def _zeros(self, shape: int | tuple[int, int], dtype: Any = wp.int32) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=self.device)

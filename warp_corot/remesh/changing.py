@@ -1,0 +1,335 @@
+"""A body whose mesh follows its motion: its arrays are the pools', and each pass is followed by one look at counts."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from ..anisotropy import Anisotropic
+from ..elasticity.subtree_field import SubtreeField
+from ..errors import InputError
+from ..kernels import remesh_survey
+from ..kernels.integrate import set_start
+from ..kernels.remesh_mark import elongation
+from ..kernels.remesh_state import NO_ROW
+from ..materials import Isotropic, Material
+from ..mesh import TetForest
+from ..mesh.lattice import volume_shares
+from .keyframes import Keyframes
+from .online import OnlineRemesh
+from .passes import RemeshPass
+from .plan import DevicePlan
+from .pools import DeviceForest, PassCounts
+from .sizes import launch_size
+
+if TYPE_CHECKING:
+    from ..body import SoftBody
+    from ..elasticity import ForceField
+
+#: Passes for which elements must have stayed coarser before a longer step is looked for.
+PATIENCE = 10
+#: Nodes are launched in multiples of this.
+NODE_GRANULE = 256
+
+
+class Changing:
+    """What remeshes a body.
+
+    Made before the body's force field is, whose launches then go through the pools.
+
+    Attributes:
+        body: The body.
+        options: What was asked for, with numbers everywhere.
+        forest: The pools.
+        passes: What changes them.
+        is_full: Whether refinement had to be left out for want of room.
+
+    Raises:
+        InputError: A general mesh, more than one world, an anisotropic material, or options that do not fit the mesh.
+    """
+
+    def __init__(self, body: SoftBody, options: OnlineRemesh):
+        mesh = body.mesh
+        if not isinstance(mesh, TetForest):
+            raise InputError(f"only a TetForest can be remeshed; the mesh of this body is a {type(mesh).__name__}")
+        if body.worlds > 1:
+            raise InputError(f"worlds is {body.worlds}; only a body in one world can be remeshed")
+        if isinstance(body.material, Anisotropic):
+            raise InputError(f"the material is {type(body.material).__name__}; only an Isotropic one can be remeshed")
+        if body.changing is not None:
+            raise InputError("another simulation remeshes this body already")
+        self.body = body
+        self.device = body.device
+        self.options = options.on(mesh)
+        self.is_full = False
+        self._given: Isotropic = body.material
+        values = {}
+        if body.material_stride:
+            values = {"mu": body.mu.numpy(), "lam": body.lam.numpy()}
+        if body.lame[2] and body.fill is not None:
+            values |= {"own_mu": body.lame[0].numpy(), "own_lam": body.lame[1].numpy()}
+        #: Columns of Lamé's parameters of the material itself, not times the filled share; none if it is uniform.
+        self._lame = ("own_mu", "own_lam") if "own_mu" in values else ("mu", "lam") if body.lame[2] else ()
+        assert self.options.capacity is not None
+        assert self.options.min_level is not None
+        assert self.options.max_level is not None
+        density = np.broadcast_to(self._given.density, (1, len(mesh.tets)))[0]
+        self.forest = DeviceForest(mesh, self.options.capacity, density=density, values=values, device=self.device)
+        self.passes = RemeshPass(
+            self.forest,
+            criterion=self.options.criterion or elongation,
+            refine_above=self.options.refine_above,
+            simplify_below=self.options.simplify_below,
+            min_level=self.options.min_level,
+            max_level=self.options.max_level,
+            parameters=self.options.parameters,
+        )
+        self._keyframes = Keyframes()
+        self._stiffness = self._found_stiffness = 0.0
+        self._coarser_for = 0
+        self._survey = wp.zeros(2, dtype=wp.int32, device=self.device)
+        modulus = 0.0 if values else float(2.0 * body.mu.numpy()[0] + body.lam.numpy()[0])
+        columns = [self.forest.carriage.names.index(name) if values else -1 for name in ("mu", "lam")]
+        self._survey_inputs = [modulus, *columns]
+        self.plan: DevicePlan | None = None
+        #: What is looked at after a pass: counts of the pools and of the plan, and the survey.
+        self._report: wp.array | None = None
+        self._report_parts: list[int] = []
+        self._graph: wp.Graph | None = None
+        self._give_pools_to(body)
+
+    # --- what the body asks for ------------------------------------------------------------------------------------
+
+    def mesh(self) -> TetForest:
+        """The present mesh."""
+        return self.forest.to_forest()
+
+    def material(self) -> Material:
+        """The material of the present elements."""
+        leaves, arrays = self.forest.leaf_elements, self.forest.carriage.arrays
+        fill = self.forest.carriage.values("fill")[leaves] if "fill" in self.forest.carriage.names else 1.0
+        density: Any = self._given.density
+        if np.ndim(density):
+            density = arrays.density.numpy()[leaves] / fill
+        if not self._lame:
+            return Isotropic(self._given.young, self._given.poisson, density)
+        mu, lam = (self.forest.carriage.values(name)[leaves].astype(np.float64) for name in self._lame)
+        return Isotropic(mu * (3.0 * lam + 2.0 * mu) / (lam + mu), 0.5 * lam / (lam + mu), density)
+
+    def masses(self) -> npt.NDArray[np.float64]:
+        """Lumped nodal masses [kg], float64 [N]."""
+        return self._of_nodes(self.forest.carriage.arrays.mass)
+
+    def held(self) -> npt.NDArray[np.bool_]:
+        """Which nodes are held, bool [N]."""
+        return self._of_nodes(self.forest.carriage.arrays.held) != 0
+
+    def hold(self, held: npt.NDArray[np.bool_]) -> None:
+        """Say which nodes are held, bool [N]."""
+        self.forest.carriage.arrays.held[: len(held)].assign(held.astype(np.uint8))
+
+    def remember(self) -> None:
+        """Make the present mesh and state what ``reset`` goes back to."""
+        self.body.adopt_positions()
+        self.forest.remember()
+        self._remembered_revision = self.body.mesh_revision
+        self._note_conditions()
+
+    # --- passes ----------------------------------------------------------------------------------------------------
+
+    def serve(self, field: ForceField) -> None:
+        """Let a force field go through what the leaves are, now and after each pass."""
+        self.field = field
+        level = getattr(field, "rotation_level", None)
+        self.plan = DevicePlan(self.forest, level, subtrees=isinstance(field, SubtreeField))
+        body = self.body
+        body.elements = self.plan.elements
+        if body.material_stride:
+            body.mu, body.lam = (self.plan.values[name] for name in ("mu", "lam"))
+        if self._lame:
+            body.lame = (*(self.plan.values[name] for name in self._lame), 1)
+        field.follow(self.plan)
+        parts = (self.forest.pools.counts, self.plan.class_counts, self._survey)
+        self._report_parts = [len(part) for part in parts]
+        self._report = wp.zeros(sum(self._report_parts), dtype=wp.int32, device=self.device)
+        self._renew()
+        self._remembered_revision = body.mesh_revision
+        self._found_stiffness = self._stiffness
+
+    def run(self) -> None:
+        """One pass over the mesh, and what follows from it if anything has changed."""
+        self.body.adopt_positions()
+        self._note_conditions()
+        if self.device.is_cuda and not wp.is_conditional_graph_supported():
+            self._launch()
+        else:
+            if self._graph is None:
+                with wp.ScopedCapture(device=self.device) as capture:
+                    self._launch()
+                self._graph = capture.graph
+            wp.capture_launch(self._graph)
+        self._look()
+
+    def stiffness_changed(self) -> bool:
+        """Whether the stiffest elements are others than when this was last true: stiffer, or softer for some time."""
+        if self._stiffness > 1.001 * self._found_stiffness:
+            changed = True
+        else:
+            self._coarser_for = self._coarser_for + 1 if self._stiffness < 0.999 * self._found_stiffness else 0
+            changed = self._coarser_for > PATIENCE
+        if changed:
+            self._found_stiffness, self._coarser_for = self._stiffness, 0
+        return changed
+
+    def reset(self, chosen: wp.array, clock: wp.array) -> None:
+        """Go back to the mesh and state of the beginning, or of the last ``remember``, if the world is chosen.
+
+        Loads and held nodes, and what these follow, are those that this mesh had last.
+        """
+        if not chosen.numpy()[0]:
+            return
+        self._note_conditions()
+        self.forest.restart()
+        arrays = self.forest.carriage.arrays
+        for name, kept in self._conditions.items():
+            if name != "v":
+                wp.copy(getattr(arrays, name), kept, count=len(kept))
+        velocities, held = arrays.v[: len(kept)].numpy().copy(), self._conditions["held"].numpy() != 0
+        velocities[held] = self._conditions["v"].numpy()[held]
+        arrays.v[: len(kept)].assign(velocities)
+        arrays.reaction.zero_()
+        wp.launch(set_start, dim=1, inputs=[clock], outputs=[self.body.world_starts], device=self.device)
+        self._renew()
+        self._remembered_revision = self.body.mesh_revision
+        self.body.update_inverse_mass()
+
+    # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _give_pools_to(self, body: SoftBody) -> None:
+        """The body's arrays are the pools' from now on, with what was in them."""
+        arrays, count = self.forest.carriage.arrays, body.node_count
+        body.adopt_positions()
+        for array, given in (
+            (arrays.u, body.node_displacements),
+            (arrays.v, body.node_velocities),
+            (arrays.reaction, body.node_reactions),
+        ):
+            wp.copy(array, given, count=count)
+        if body.has_loads:
+            wp.copy(arrays.load, body.node_loads, count=count)
+        body.node_rest, body.node_displacements, body.node_velocities = arrays.rest, arrays.u, arrays.v
+        body.node_reactions, body.node_loads = arrays.reaction, arrays.load
+        body.node_mass, body.node_inverse_mass = arrays.mass32, arrays.inverse_mass
+        body.node_positions, body.node_forces = wp.clone(arrays.rest), wp.zeros_like(arrays.u)
+        held = body.held.copy()
+        body.changing = self
+        self.hold(held)
+        body.mesh_changed(count, body.element_count)
+        body.update_inverse_mass()
+        self._keep_initial_state(body.initial_state)
+
+    def _launch(self) -> None:
+        """Launch a pass and all that is derived from the mesh, or record it."""
+        self.passes.launch()
+        self._launch_derived()
+
+    def _launch_derived(self) -> None:
+        assert self.plan is not None
+        forest = self.forest
+        self.plan.launch()
+        goes = self.plan.goes
+        wp.launch(remesh_survey.begin_survey, dim=1, inputs=[goes], outputs=[self._survey], device=self.device)
+        inputs = [forest.threads, goes, *self._survey_inputs, forest.pools, forest.carriage.arrays]
+        wp.launch(
+            remesh_survey.find_stiffest, dim=forest.threads, inputs=inputs, outputs=[self._survey], device=self.device
+        )
+        start = 0
+        for part in (forest.pools.counts, self.plan.class_counts, self._survey):
+            wp.copy(self._report, part, dest_offset=start)
+            start += len(part)
+
+    def _renew(self) -> None:
+        """Derive everything from the mesh as it is."""
+        assert self.plan is not None
+        self.plan.outdate()
+        self._launch_derived()
+        self._look(anyway=True)
+
+    def _look(self, *, anyway: bool = False) -> None:
+        """The one look at what the device has done: if the mesh is another one, body and field go through that."""
+        assert self.plan is not None
+        assert self._report is not None
+        counted, classes, (bits, finest) = np.split(self._report.numpy(), np.cumsum(self._report_parts)[:-1])
+        counts = PassCounts.of(counted)
+        self.is_full = counts.full
+        if not (counts.added or counts.removed or anyway):
+            return
+        body = self.body
+        limit = self.forest.node_capacity
+        nodes = launch_size(counts.nodes, body.launch_nodes, NODE_GRANULE, limit)
+        elements = launch_size(counts.leaves, body.launch_elements, 1, len(self.plan.elements.code))
+        moved = (nodes, elements) != (body.launch_nodes, body.launch_elements)
+        body.launch_nodes, body.launch_elements = nodes, elements
+        if self.plan.refresh(classes) or moved:
+            self.field.follow(self.plan)
+            body.revision += 1
+        body.mesh_changed(counts.nodes, counts.leaves)
+        self._stiffness = float(bits.view(np.float32))
+        body.smallest_volume = float(volume_shares(finest)) * self.forest.source.cell_size**3
+        body.publish_positions()
+        self._follow_keyframes()
+        for binding in body.bindings:
+            binding.rebind(self.forest.pools)
+
+    def _note_conditions(self) -> None:
+        """Take over what nodes follow; keep loads and held nodes for ``reset`` while its mesh is the present one."""
+        self._take_trajectories()
+        if self.body.mesh_revision == self._remembered_revision:
+            arrays, count = self.forest.carriage.arrays, self.body.node_count
+            self._conditions = {name: wp.clone(getattr(arrays, name)[:count]) for name in ("held", "load", "row", "v")}
+
+    def _take_trajectories(self) -> None:
+        """Tell the device which keyframes nodes follow, if the user has changed them."""
+        body = self.body
+        if not self._keyframes.are(body.trajectories):
+            rows = self._keyframes.adopt(body.trajectories, body.node_count)
+            self.forest.carriage.arrays.row[: len(rows)].assign(rows)
+
+    def _follow_keyframes(self) -> None:
+        """Tell the host which nodes follow keyframes, new ones among them."""
+        body, arrays = self.body, self.forest.carriage.arrays
+        if not body.trajectories:
+            return
+        rows = self._of_nodes(arrays.row)
+        if (rows < NO_ROW).any():
+            ends = self.forest.pools.ends[: len(rows)].numpy()
+            rows = self._keyframes.settle(rows, ends, self._of_nodes(arrays.u)[:, :3])
+            arrays.row[: len(rows)].assign(rows)
+        found = self._keyframes.trajectories(rows, self.device)
+        if found is not body.trajectories:
+            body.trajectories = found
+            body.revision += 1
+
+    def _keep_initial_state(self, initial: tuple[wp.array, wp.array] | None) -> None:
+        """Let ``reset`` go back to rest on the present mesh, or to the initial state that the body has."""
+        arrays, count = self.forest.carriage.arrays, self.body.node_count
+        present = [wp.clone(array) for array in (arrays.u, arrays.v)]
+        arrays.u.zero_()
+        free = ~self.body.held
+        velocities = self._of_nodes(arrays.v)
+        velocities[free] = 0.0
+        arrays.v[:count].assign(velocities)
+        if initial is not None:
+            for array, kept in zip((arrays.u, arrays.v), initial, strict=True):
+                wp.copy(array, kept, count=count)
+        self.body.publish_positions()
+        self.remember()
+        for array, kept in zip((arrays.u, arrays.v), present, strict=True):
+            wp.copy(array, kept)
+        self.body.publish_positions()
+
+    def _of_nodes(self, array: wp.array) -> npt.NDArray[Any]:
+        return array[: self.body.node_count].numpy().copy()
