@@ -1,14 +1,14 @@
 """What launches read of a derived plan (``remesh_plan``): nodes and codes of subtrees and of the leaves in none.
 
 All is written as far as there is something, and as padding as far as there was something before. Padding stands on
-sinks, which do not move, has no material and the code 0.
+sinks, which do not move.
 """
 
 import warp as wp
 
 from .elements import LEVEL_MASK
 from .remesh import SINKS, Pools, padding
-from .remesh_plan import LEAVES_OF_SUBTREE, Plan, above, extent, flat_row
+from .remesh_plan import LEAVES_OF_SUBTREE, Plan, above, extent, flat_row, padding_code
 from .shapes import MIRROR_BIT
 
 
@@ -102,7 +102,7 @@ def fill_batches(
         shape = kind - 4
     for k in range(t, extent(c, plan), threads):
         first = int(-1)
-        code = int(0)
+        code = padding_code(pools)
         if k < plan.counts[c]:
             first = plan.first[c, k]
             root = above(pools.leaves[first], 3, pools)
@@ -140,7 +140,7 @@ def fill_flat(
     row = flat_row(plan)
     for k in range(wp.tid(), extent(row, plan), threads):
         nodes = padding(k, pools)
-        code = int(0)
+        code = padding_code(pools)
         unit = int(0)
         mu = float(0.0)
         lam = float(0.0)
@@ -182,4 +182,4 @@ def pad_units(
     row = flat_row(plan) + 1
     for k in range(plan.counts[row] + 1 + wp.tid(), extent(row, plan) + 1, threads):
         plan.unit_nodes[k] = padding(k, pools)
-        plan.unit_code[k] = 0
+        plan.unit_code[k] = padding_code(pools)

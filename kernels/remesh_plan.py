@@ -70,6 +70,12 @@ def extent(row: int, plan: Plan):
     return wp.max(plan.counts[row], plan.before[row])
 
 
+@wp.func
+def padding_code(pools: Pools):
+    """That of a root, whose frame is along the axes: deformation gradients of padding are exact, energies zero."""
+    return pools.code[0]
+
+
 @wp.kernel(enable_backward=False)
 def begin_plan(
     # In
@@ -95,7 +101,7 @@ def gather_leaves(
     # In and out
     plan: Plan,
 ):
-    """What leaves are by their places in the list; code and values of padding are zero."""
+    """What leaves are by their places in the list; values of padding are zero."""
     for i in range(wp.tid(), extent(plan.classes + 2, plan), threads):
         if i < pools.counts[LEAVES]:
             e = pools.leaves[i]
@@ -103,7 +109,7 @@ def gather_leaves(
             for c in range(plan.values.shape[0]):
                 plan.values[c, i] = carried_values[e, c]
         else:
-            plan.code[i] = 0
+            plan.code[i] = padding_code(pools)
             if plan.rotation_level >= 0:
                 plan.unit[i] = 0
             for c in range(plan.values.shape[0]):
