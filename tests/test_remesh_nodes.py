@@ -60,6 +60,30 @@ def test_new_nodes_come_after_all_others(device, rng):
     assert np.allclose(rest, body.node_rest.numpy(), rtol=2e-7, atol=0)
 
 
+def test_nodes_that_move_keep_what_they_carry(device, rng):
+    """All but mass, load and velocity, which they may get from nodes that are removed."""
+    forest = wc.TetForest.box((2, 1, 1), CUBE, 6)
+    n = len(forest.points)
+    held = rng.random(n) < 0.5
+    adaptive = moving(forest, device, rng, held=held, rows=np.where(held, rng.integers(-2, 9, n), -1))
+    arrays = adaptive.carriage.arrays
+    reactions = np.zeros((*arrays.reaction.shape, 4), np.float32)
+    reactions[:n][held, :3] = rng.normal(size=(held.sum(), 3))
+    arrays.reaction.assign(reactions)
+    names = ("rest", "u", "reaction", "held", "row")
+
+    def carried():
+        return [getattr(arrays, name).numpy()[: adaptive.node_count].tolist() for name in names]
+
+    remesh, number, before = RemeshPass(adaptive), {p: k for k, p in enumerate(points_of(adaptive))}, carried()
+    for _ in range(3):
+        remesh.apply(random_marks(adaptive, rng, 0.0, 0.6))
+    places = [number[p] for p in points_of(adaptive)]
+    assert len(places) < n
+    assert np.count_nonzero(places != np.arange(len(places))) > 10
+    assert carried() == [[values[k] for k in places] for values in before]
+
+
 def test_nodes_at_the_rim_of_a_void_move_and_virtual_ones_stay(device, rng):
     """Names are changed in void tetrahedra, too."""
     forest = wc.TetForest.from_domain(wc.Domain.sphere(0.05), 0.04, max_level=9, surface_error=3e-4)
@@ -77,6 +101,7 @@ def test_nodes_at_the_rim_of_a_void_move_and_virtual_ones_stay(device, rng):
         remesh.apply(random_marks(adaptive, rng, refine, simplify))
         assert_sound(adaptive)
         moved += sum(p in at_void and n != number.get(p, n) for n, p in enumerate(points_of(adaptive)))
+        adaptive.compact()
         assert np.array_equal(adaptive.pools.lattice.numpy()[places], virtual)
     assert moved > 20
 
