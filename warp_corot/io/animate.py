@@ -8,17 +8,17 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
 from ..simulation import Simulation
-from .skins import Skin, has_domain, skins_of
+from .skins import BoundSkins, has_domain
 
 if TYPE_CHECKING:
     from .skins import Surface
@@ -39,6 +39,7 @@ class Recording:
         frames: Frames written, the one at the beginning included.
         steps: Time steps done.
         simulated: Simulated time [s].
+        elements: Tetrahedra of the bodies drawn, one world of them, in each frame; they change with remeshing only.
         stepping: Wall time of stepping [s], without writing.
         writing: Wall time of reading the state back and writing it [s].
         largest_displacement: Largest displacement from rest of any node in any frame [m].
@@ -49,6 +50,7 @@ class Recording:
     frames: int = 0
     steps: int = 0
     simulated: float = 0.0
+    elements: list[int] = field(default_factory=list)
     stepping: float = 0.0
     writing: float = 0.0
     largest_displacement: float = 0.0
@@ -60,21 +62,39 @@ class _Joined:
 
     def __init__(self, sim: Simulation, world: int):
         self.worlds = [body.world(world) for body in sim.bodies]
-        offsets = np.cumsum([0, *(body.world_node_count for body in sim.bodies)])
-        self.points = np.concatenate([body.mesh.points for body in sim.bodies])
-        self.tets = np.concatenate([b.mesh.tets + n for b, n in zip(sim.bodies, offsets[:-1], strict=True)])
-        self.tets = self.tets.astype(np.int32)
         self.up_axis = sim.bodies[0].mesh.up_axis
+        self.changing = [changing is not None for changing in sim.remeshing.changing]
+        self._join()
+
+    def has_changed(self) -> bool:
+        """Whether the mesh has become another one since this was last asked; then all is that of the present one."""
+        if self._revisions == [world.body.mesh_revision for world in self.worlds]:
+            return False
+        self._join()
+        return True
+
+    @property
+    def meshes(self) -> list[Any]:
+        return [world.body.mesh for world in self.worlds]
+
+    def skins(
+        self, surface: Surface | Sequence[Surface | None] | None, tets: bool | None, labels: bool
+    ) -> BoundSkins | None:
+        """What is drawn in place of the boundary of the tetrahedra; none where nothing but tetrahedra is known."""
+        if surface is None and not labels and tets is not False and not any(map(has_domain, self.meshes)):
+            return None
+        return BoundSkins(self.meshes, surface, labels, self.changing)
+
+    def _join(self) -> None:
+        self._revisions = [world.body.mesh_revision for world in self.worlds]
+        meshes = self.meshes
+        offsets = np.cumsum([0, *(len(mesh.points) for mesh in meshes)])
+        self.points = np.concatenate([mesh.points for mesh in meshes])
+        self.tets = np.concatenate([mesh.tets + n for mesh, n in zip(meshes, offsets[:-1], strict=True)])
+        self.tets = self.tets.astype(np.int32)
         self.fixed = np.concatenate([w.body.constrained[w.nodes] for w in self.worlds])
         for name in ("young", "poisson", "density"):
             setattr(self, name, self._property(name))
-
-    def skins(self, surface: Surface | Sequence[Surface | None] | None, tets: bool | None, labels: bool) -> list[Skin]:
-        """What is drawn in place of the boundary of the tetrahedra; none where nothing but tetrahedra is known."""
-        meshes = [world.body.mesh for world in self.worlds]
-        if surface is None and not labels and tets is not False and not any(map(has_domain, meshes)):
-            return []
-        return skins_of(meshes, surface, labels)
 
     def _property(self, name: str) -> float | npt.NDArray[np.float64]:
         values = []
@@ -129,9 +149,10 @@ def record(
     """Advance a simulation and write a frame of it as often as ``fps`` asks, the present state first.
 
     Several bodies become one mesh, body after body. Of a mesh made from a domain the smooth marched surface is written
-    and not the tetrahedra; of any other mesh the tetrahedra and their boundary. Frame k shows the state after the whole
-    number of steps nearest to k / fps. Whatever ends the run, the frames written stay: Ctrl-C and SIGTERM wait while
-    one is being written.
+    and not the tetrahedra; of any other mesh the tetrahedra and their boundary. Of a body that is remeshed each frame
+    shows the present mesh; smooth surfaces stay the same and are bound to it. Frame k shows the state after the whole
+    number of steps that comes nearest to k / fps. Whatever ends the run, the frames written stay: Ctrl-C and SIGTERM
+    wait while one is being written.
 
     Args:
         sim: Goes on from where it is.
@@ -163,21 +184,32 @@ def record(
         raise InputError(f"the simulation has {sim.worlds} worlds; say which one to draw, as in world=0")
     joined = _Joined(sim, world or 0)
     skins = joined.skins(surface, tets, labels)
-    writer = UsdWriter(Path(path), joined, fps=fps, fixed=joined.fixed, material=joined, skins=skins, tets=tets)
+    writer = UsdWriter(
+        Path(path),
+        joined,
+        fps=fps,
+        fixed=joined.fixed,
+        material=joined,
+        skins=skins.on(joined.meshes) if skins else (),
+        tets=tets,
+        changing=any(joined.changing),
+    )
     done = Recording(writer.path) if recording is None else recording
-    first_step = sim.total_steps
+    first_step, first_time = sim.total_steps, sim.total_time
     with _closed_whole(writer, done):
         for frame in range(count + 1):
             started = time.perf_counter()
-            due = first_step + round(frame / (fps * sim.dt))
-            sim.advance_steps(max(due - sim.total_steps, 0))
+            sim.advance_until(first_time + frame / fps)
             stepped = time.perf_counter()
             with signals_held_back():
+                if joined.has_changed():
+                    bound = skins.on(joined.meshes) if skins else ()
+                    writer.change_mesh(joined, fixed=joined.fixed, material=joined, skins=bound)
                 _write_frame(writer, sim, joined, done)
             done.stepping += stepped - started
             done.writing += time.perf_counter() - stepped
-            done.steps = due - first_step
-            done.simulated = done.steps * sim.dt
+            done.steps = sim.total_steps - first_step
+            done.simulated = sim.total_time - first_time
             if progress:
                 progress(frame, count)
     return done
@@ -189,6 +221,7 @@ def _write_frame(writer: UsdWriter, sim: Simulation, joined: _Joined, done: Reco
     stresses = [sim.von_mises(w.body)[w.elements] for w in joined.worlds]
     writer.write(np.concatenate(positions), velocities=np.concatenate(velocities), von_mises=np.concatenate(stresses))
     done.frames = writer.frames
+    done.elements.append(len(joined.tets))
     # In float64: on the way to an end that is not finite, squares leave float32 first.
     lengths = [np.linalg.norm(w.displacements.numpy().astype(np.float64), axis=1).max() for w in joined.worlds]
     done.final_displacement = float(max(lengths))

@@ -31,11 +31,13 @@ class Skin:
         name: What it is called: "surface", or a label's name.
         surface: Bound to the nodes of the mesh that is drawn.
         look: The USD prim whose faces, texture coordinates and materials it keeps.
+        is_boundary: Whether some of it is the boundary of the mesh itself, which is another one when the mesh is.
     """
 
     name: str
     surface: SurfaceMesh
     look: Look | None = None
+    is_boundary: bool = False
 
     def values(self, nodal: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
         """Nodal values [N] at the points of the surface, float32 [V]."""
@@ -66,14 +68,52 @@ def skins_of(
     Raises:
         InputError: Surfaces that do not fit, or labels where no mesh has any.
     """
-    given = _one_each(surface, len(meshes))
-    if labels and not any(map(has_labels, meshes)):
-        raise InputError("labels is True, but there are none in the mesh; they come from a domain that has")
-    found, offset = [], 0
-    for mesh, own in zip(meshes, given, strict=True):
-        found += [_shifted(skin, offset) for skin in _skins_of_one(mesh, own, labels)]
-        offset += len(mesh.points)
-    return _joined(found)
+    return BoundSkins(meshes, surface, labels).on(meshes)
+
+
+class BoundSkins:
+    """The skins of bodies, bound anew where a body's mesh has become another one.
+
+    Surfaces stay as they are, whatever the mesh: only what their points are bound to changes. The boundary of a mesh
+    itself becomes that of the present one.
+
+    Args:
+        meshes, surface, labels: See `skins_of`.
+        changing: Which meshes may become others: surfaces given for them may be bound to what they were earlier.
+    """
+
+    def __init__(
+        self,
+        meshes: Sequence[Any],
+        surface: Surface | Sequence[Surface | None] | None = None,
+        labels: bool = False,
+        changing: Sequence[bool] | None = None,
+    ):
+        given = _one_each(surface, len(meshes))
+        if labels and not any(map(has_labels, meshes)):
+            raise InputError("labels is True, but there are none in the mesh; they come from a domain that has")
+        self._meshes = list(meshes)
+        may_change = [False] * len(meshes) if changing is None else changing
+        self._skins = [
+            _skins_of_one(mesh, _rebound(own, mesh) if moves and isinstance(own, SurfaceMesh) else own, labels)
+            for mesh, own, moves in zip(meshes, given, may_change, strict=True)
+        ]
+
+    def on(self, meshes: Sequence[Any]) -> list[Skin]:
+        """The skins, bound to the nodes of what the meshes are now, numbered one mesh after the other."""
+        found, offset = [], 0
+        for index, mesh in enumerate(meshes):
+            if mesh is not self._meshes[index]:
+                self._skins[index] = [_bound_anew(skin, mesh) for skin in self._skins[index]]
+                self._meshes[index] = mesh
+            found += [_shifted(skin, offset) for skin in self._skins[index]]
+            offset += len(mesh.points)
+        return _joined(found)
+
+
+def _bound_anew(skin: Skin, mesh: Any) -> Skin:
+    surface = boundary_surface(mesh) if skin.is_boundary else _rebound(skin.surface, mesh)
+    return replace(skin, surface=surface)
 
 
 def _one_each(surface: Any, count: int) -> list[Any]:
@@ -99,7 +139,9 @@ def _skins_of_one(mesh: Any, surface: Any, labels: bool) -> list[Skin]:
         there = np.unique(between.sides)
         names = enumerate(mesh.label_names, start=1)
         return [Skin(name, between.of_label(number)) for number, name in names if number in there]
-    return [Skin("surface", mesh.surface() if has_domain(mesh) else boundary_surface(mesh))]
+    if has_domain(mesh):
+        return [Skin("surface", mesh.surface())]
+    return [Skin("surface", boundary_surface(mesh), is_boundary=True)]
 
 
 def boundary_surface(mesh: Any) -> SurfaceMesh:
@@ -109,6 +151,12 @@ def boundary_surface(mesh: Any) -> SurfaceMesh:
     weights = np.tile([1.0, 0.0, 0.0, 0.0], (len(used), 1))
     nodes = np.repeat(used[:, None], 4, axis=1).astype(np.int32)
     return SurfaceMesh(mesh.points[used], nodes, weights, triangles.reshape(-1, 3).astype(np.int32))
+
+
+def _rebound(surface: SurfaceMesh, mesh: Any) -> SurfaceMesh:
+    """The same points, bound to what holds them in a forest."""
+    bound = mesh.bind(surface.points)
+    return replace(surface, nodes=bound.nodes, weights=bound.weights)
 
 
 def _check_nodes(surface: SurfaceMesh, count: int) -> None:
@@ -150,11 +198,14 @@ def _shifted(skin: Skin, offset: int) -> Skin:
 
 def _joined(skins: Sequence[Skin]) -> list[Skin]:
     """Skins of one name as one, those that keep a prim's look by themselves."""
-    plain: dict[str, list[SurfaceMesh]] = {}
+    plain: dict[str, list[Skin]] = {}
     for skin in skins:
         if skin.look is None:
-            plain.setdefault(skin.name, []).append(skin.surface)
-    whole = [Skin(name, _one_surface(parts)) for name, parts in plain.items()]
+            plain.setdefault(skin.name, []).append(skin)
+    whole = [
+        Skin(name, _one_surface([part.surface for part in parts]), is_boundary=any(part.is_boundary for part in parts))
+        for name, parts in plain.items()
+    ]
     return whole + [skin for skin in skins if skin.look is not None]
 
 

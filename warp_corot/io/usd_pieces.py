@@ -5,6 +5,11 @@ written aside as *pieces*, complete binary files in a folder ``NAME.usd.pieces``
 temporary name, synced to disk and renamed. After each piece a small root stage that plays all of them (value clips)
 replaces the file at the final path in one rename. At the end everything is joined into one file, again written aside
 and renamed over the final path, and the pieces are removed.
+
+Attributes that only change now and then, as the topology of a mesh does, have a sample where they change. A clip plays
+nothing from the one before, so that each piece begins with what holds then. Between two samples of one length OpenUSD
+interpolates floating-point arrays, and it cannot know that their points are others; so where that would be, what was
+holds until just before the change.
 """
 
 import contextlib
@@ -25,6 +30,8 @@ from .whole import sync
 # All that a run's folder ever holds; \w{6} is what OpenUSD's own temporary files end in.
 _OURS = re.compile(r"(piece|part)-\d{6}\.usdc|(part-)?(static|manifest|root|joined)\.usd[ac]?|part-\w+\.\w{6}|lock")
 _CLIP_SET = "default"
+#: How long before a frame [time codes] what is not to be interpolated still holds.
+JUST_BEFORE = 2.0**-10
 
 Samples = dict[str, Any]
 """Values of one frame: attribute path → value."""
@@ -57,7 +64,11 @@ class PieceStore:
         self._static: Sdf.Layer | None = None
         self._varying: dict[str, Sdf.ValueTypeName] = {}
         self._root: Sdf.Layer | None = None
+        self._follows: dict[str, str] = {}
+        self._last: Samples = {}  # the latest value of each attribute
+        self._carried: Samples = {}  # as they were when the last piece was written
         self._pieces: list[tuple[float, float]] = []  # first and last time code of each
+        self._repeated: list[frozenset[str]] = []  # what each piece begins with that is no sample of its own
         self._pending: list[tuple[float, Samples]] = []
         self._pending_bytes = 0
         self._flush_seconds = flush_seconds
@@ -66,12 +77,19 @@ class PieceStore:
         self._last_flush = self._last_add = time.monotonic()
         self._broken = False
 
-    def declare(self, static: Sdf.Layer) -> None:
+    def declare(self, static: Sdf.Layer, follows: Mapping[str, str] | None = None) -> None:
         """Takes the layer with all that does not change; its attributes without a value are the ones that frames give.
 
-        Its stage metadata (units, axis, frame rate) become those of the stage; it must name a default prim.
+        Its stage metadata (units, axis, frame rate) become those of the stage; it must name a default prim. The first
+        frame gives all attributes; later ones may leave out what stays as it is.
+
+        Args:
+            static: The layer.
+            follows: For attributes [n] of things that are other ones after a change, the attribute that a frame gives
+                if they are: values before and after are not interpolated.
         """
         self._static = static
+        self._follows = dict(follows or {})
 
         def visit(path: Sdf.Path) -> None:
             spec = static.GetAttributeAtPath(path) if path.IsPropertyPath() else None
@@ -93,8 +111,12 @@ class PieceStore:
         now = time.monotonic()
         if not self._pieces and not self._pending:  # what came before the first frame is no frame to lose
             self._last_flush = self._last_add = now
+        held = self._held_over(samples)
+        if held:
+            self._pending.append((time_code - JUST_BEFORE, held))
         self._pending.append((time_code, samples))
         self._pending_bytes += nbytes
+        self._last |= samples
         gap, self._last_add = now - self._last_add, now
         interval = max(self._flush_seconds, 4.0 * self._flush_cost)
         # The next frame comes after another such gap: waiting for it must not outlast the interval.
@@ -124,6 +146,8 @@ class PieceStore:
                 self._remove_run(self._run)
             raise OSError(f"{error}; {self._kept()}") from None
         self._pieces.append((first, last))
+        self._repeated.append(frozenset(self._carried.keys() - self._pending[0][1].keys()))
+        self._carried = dict(self._last)
         self._pending, self._pending_bytes = [], 0
         if len(self._pieces) == 1:
             self._remove_stale_runs()
@@ -192,14 +216,22 @@ class PieceStore:
                 raise OSError(f"{self.path}: {name} is no longer there or cannot be read")
             opened.append(piece)
             for time_code in sorted(piece.ListAllTimeSamples()):
-                values = ((path, piece.QueryTimeSample(path, time_code)) for path in self._varying)
+                repeated = self._repeated[index] if time_code == self._pieces[index][0] else frozenset()
+                own = (path for path in self._varying if path not in repeated)
+                values = ((path, piece.QueryTimeSample(path, time_code)) for path in own)
                 yield time_code, {path: value for path, value in values if value is not None}
         yield from self._pending
+
+    def _held_over(self, samples: Samples) -> Samples:
+        """What must be said to hold until just before a frame, lest it is interpolated with what the frame gives."""
+        changed = (path for path, what in self._follows.items() if what in samples and path in self._last)
+        return {path: self._last[path] for path in changed if len(self._last[path]) == len(samples[path])}
 
     def _piece_layer(self) -> Sdf.Layer:
         layer = Sdf.Layer.CreateAnonymous(".usdc")
         self._declare_varying(layer)
-        for time_code, samples in self._pending:
+        (first, earliest), *later = self._pending
+        for time_code, samples in [(first, self._carried | earliest), *later]:
             for path, value in samples.items():
                 layer.SetTimeSample(path, time_code, value)
         layer.startTimeCode = self._pending[0][0]

@@ -1,24 +1,20 @@
-"""The prims of an animated body: its tetrahedra with their boundary, and surfaces bound to it."""
+"""What the prims of an animated body are made of, and the prims of surfaces that are bound to it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, UsdGeom, Vt
 
 from ..errors import InputError
-from ..mesh.bound import vertex_normals
-from ..mesh.surface import boundary_faces
+from ..mesh.bound import SurfaceMesh, vertex_normals
 from .colors import TISSUE, VertexAverage, color_index, srgb_to_linear, stress_colors
 from .skins import Skin
 from .usd_pieces import Samples
-
-if TYPE_CHECKING:
-    from .usd_writer import Mesh
 
 ROOT, TETS, SURFACE = "/SoftBody", "/SoftBody/tetrahedra", "/SoftBody/surface"
 MATERIALS = "/SoftBody/materials"
@@ -35,113 +31,53 @@ class Frame(NamedTuple):
     nodal: NDArray[np.float64] | None
 
 
-@dataclass(frozen=True)
-class Statics:
-    """What a stage says once: held nodes, the material, and whether frames give velocities and stress."""
+class Present(NamedTuple):
+    """A body's mesh: points at rest [N, 3] [m], tetrahedra, all right-handed, int32 [T, 4], the average from
+    tetrahedra to nodes, held nodes (a mask or indices) or None, and the material or None."""
 
+    points: NDArray[np.float64]
+    tets: NDArray[np.int32]
+    average: VertexAverage
     fixed: Any
     material: Any
+
+
+@dataclass(frozen=True)
+class Statics:
+    """What holds for all frames: whether they give velocities and stress."""
+
     velocities: bool
     stress: bool
 
 
-class TetPrims:
-    """The TetMesh prim and, if it is to be drawn, the Mesh of the boundary.
+class SkinPrim:
+    """The Mesh prim of a surface that is bound to the body's nodes.
 
     Args:
-        mesh: At rest.
-        tets: Its tetrahedra, all right-handed, int32 [T, 4].
-        average: From tetrahedra to nodes.
-        boundary: Whether the boundary is drawn.
+        skin: The surface.
+        path: Of the prim.
+        rest: Points of the body's mesh at rest [m], [N, 3].
+        changing: Whether the mesh may become another one, and the surface with it if it is the mesh's boundary.
     """
 
-    def __init__(self, mesh: Mesh, tets: NDArray[np.int32], average: VertexAverage, boundary: bool):
-        self._rest = np.ascontiguousarray(mesh.points, dtype=np.float32)
-        self._tets = tets
-        self._average = average
-        self._boundary = boundary
-        self._faces, _ = boundary_faces(tets)
-        self._surface_nodes, compact = np.unique(self._faces, return_inverse=True)
-        self._surface_faces = compact.reshape(-1, 3).astype(np.int32)
-
-    def declare(self, stage: Any, statics: Statics) -> None:
-        """Everything that does not change, and the attributes that do, without values."""
-        tets = UsdGeom.TetMesh.Define(stage, TETS)
-        tets.CreateTetVertexIndicesAttr(Vt.Vec4iArray.FromNumpy(self._tets))
-        tets.CreateSurfaceFaceVertexIndicesAttr(Vt.Vec3iArray.FromNumpy(self._faces))
-        tets.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
-        # Drawn beside its surface it would show twice, and Hydra takes its uniform primvars for values per face.
-        tets.CreatePurposeAttr(UsdGeom.Tokens.guide)
-        if statics.velocities:
-            tets.CreateVelocitiesAttr()
-        self._declare_primvars(UsdGeom.PrimvarsAPI(tets), statics)
-        declare_moving(tets, statics.stress)
-        if self._boundary:
-            surface = UsdGeom.Mesh.Define(stage, SURFACE)
-            declare_triangles(surface, self._surface_faces)
-            declare_moving(surface, statics.stress)
-
-    def samples(self, frame: Frame) -> Samples:
-        """Values of a frame, but for colours."""
-        x = frame.positions
-        samples: Samples = {f"{TETS}.points": Vt.Vec3fArray.FromNumpy(x), f"{TETS}.extent": extent(x)}
-        if self._boundary:
-            surface = x[self._surface_nodes]
-            samples |= {f"{SURFACE}.points": Vt.Vec3fArray.FromNumpy(surface), f"{SURFACE}.extent": extent(surface)}
-        if frame.velocities is not None:
-            samples[f"{TETS}.velocities"] = Vt.Vec3fArray.FromNumpy(frame.velocities)
-        if frame.stress is not None:
-            samples[f"{TETS}.primvars:vonMises"] = Vt.FloatArray.FromNumpy(frame.stress)
-        return samples
-
-    def colors(self, samples: Samples, limits: Limits, nodal: NDArray[np.float64] | None = None) -> Samples:
-        """Colours of a frame out of its stresses."""
-        if nodal is None:
-            nodal = self._average(np.asarray(samples[f"{TETS}.primvars:vonMises"]))
-        indices = color_index(nodal, *limits)
-        colors = {f"{TETS}.primvars:displayColor:indices": Vt.IntArray.FromNumpy(indices)}
-        if self._boundary:
-            on_surface = Vt.IntArray.FromNumpy(indices[self._surface_nodes])
-            colors[f"{SURFACE}.primvars:displayColor:indices"] = on_surface
-        return colors
-
-    def _declare_primvars(self, primvars: Any, statics: Statics) -> None:
-        rest = Vt.Vec3fArray.FromNumpy(self._rest)
-        primvars.CreatePrimvar("rest", Sdf.ValueTypeNames.Point3fArray, UsdGeom.Tokens.vertex).Set(rest)
-        if statics.stress:
-            stress = primvars.CreatePrimvar("vonMises", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.uniform)
-            stress.GetAttr().SetDocumentation("Von Mises stress of each tetrahedron [Pa]")
-        if statics.fixed is not None:
-            held = np.zeros(len(self._rest), np.int32)
-            held[np.asarray(statics.fixed)] = 1
-            fixed = primvars.CreatePrimvar("fixed", Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.vertex)
-            fixed.Set(Vt.IntArray.FromNumpy(held))
-            fixed.GetAttr().SetDocumentation("1 where the node is held")
-        for name, unit in (("young", " [Pa]"), ("poisson", ""), ("density", " [kg/m³]")):
-            value = getattr(statics.material, name, None)
-            if value is not None:
-                self._declare_property(primvars, name, np.asarray(value, dtype=np.float32), unit)
-
-    def _declare_property(self, primvars: Any, name: str, value: NDArray[np.float32], unit: str) -> None:
-        if value.size == 1:
-            primvar = primvars.CreatePrimvar(name, Sdf.ValueTypeNames.Float, UsdGeom.Tokens.constant)
-            primvar.Set(float(value.reshape(())))
-        else:
-            values = floats(value, (len(self._tets),), f"material.{name}")
-            primvar = primvars.CreatePrimvar(name, Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.uniform)
-            primvar.Set(Vt.FloatArray.FromNumpy(values))
-        primvar.GetAttr().SetDocumentation(f"Material: {name}{unit}")
-
-
-class SkinPrim:
-    """The Mesh prim of a surface that is bound to the body's nodes."""
-
-    def __init__(self, skin: Skin, path: str, mesh: Mesh):
-        self._skin, self._path = skin, path
-        self._rest = np.asarray(mesh.points, dtype=np.float64)
+    def __init__(self, skin: Skin, path: str, rest: NDArray[np.float64], *, changing: bool):
+        self._path = path
+        self._changing = changing and skin.is_boundary
+        self._said: Skin | None = None
         look = skin.look
         self._with_normals = look is None or (look.had_normals and not look.smooth)
         self._with_colors = look is None
+        self.follow(skin, rest)
+
+    def follow(self, skin: Skin, rest: NDArray[np.float64]) -> None:
+        """Draw the surface as it is bound to a mesh of these points from the next frame on."""
+        self._skin, self._rest = skin, np.asarray(rest, dtype=np.float64)
+
+    @property
+    def follows(self) -> dict[str, str]:
+        """See `PieceStore.declare`."""
+        own = ("points", "normals", "velocities", "primvars:vonMises")
+        return {f"{self._path}.{name}": f"{self._path}.faceVertexIndices" for name in own}
 
     def declare(self, stage: Any, statics: Statics) -> None:
         """As `TetPrims.declare`."""
@@ -154,10 +90,15 @@ class SkinPrim:
         else:
             mesh = UsdGeom.Mesh.Define(stage, self._path)
             mesh.GetPrim().SetDisplayName(self._skin.name)
-            declare_triangles(mesh, surface.triangles)
+            declare_triangles(mesh)
+            if not self._changing:
+                for path, value in triangle_samples(self._path, surface.triangles).items():
+                    stage.GetAttributeAtPath(path).Set(value)
         if self._with_normals:
             mesh.CreateNormalsAttr()
             mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+        if self._changing and statics.velocities:
+            mesh.CreateVelocitiesAttr()
         if statics.stress:
             primvars = UsdGeom.PrimvarsAPI(mesh)
             stress = primvars.CreatePrimvar("vonMises", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex)
@@ -177,15 +118,26 @@ class SkinPrim:
             samples[f"{self._path}.normals"] = Vt.Vec3fArray.FromNumpy(normals)
         if frame.nodal is not None:
             samples[f"{self._path}.primvars:vonMises"] = Vt.FloatArray.FromNumpy(self._skin.values(frame.nodal))
+        if self._changing:
+            if frame.velocities is not None:
+                of_points = np.einsum("vn,vnc->vc", surface.weights, frame.velocities[surface.nodes])
+                samples[f"{self._path}.velocities"] = Vt.Vec3fArray.FromNumpy(of_points.astype(np.float32))
+            if self._said is None or not _are_same(self._said.surface, surface):
+                samples |= triangle_samples(self._path, surface.triangles)
+            self._said = self._skin
         return samples
 
     def colors(self, samples: Samples, limits: Limits, _: Any = None) -> Samples:
         """As `TetPrims.colors`."""
-        if not self._with_colors:
+        stress = samples.get(f"{self._path}.primvars:vonMises")
+        if not self._with_colors or stress is None:
             return {}
-        stress = np.asarray(samples[f"{self._path}.primvars:vonMises"])
-        indices = Vt.IntArray.FromNumpy(color_index(stress, *limits))
+        indices = Vt.IntArray.FromNumpy(color_index(np.asarray(stress), *limits))
         return {f"{self._path}.primvars:displayColor:indices": indices}
+
+
+def _are_same(one: SurfaceMesh, other: SurfaceMesh) -> bool:
+    return np.array_equal(one.triangles, other.triangles) and np.array_equal(one.points, other.points)
 
 
 def skin_paths(skins: Sequence[Skin]) -> list[str]:
@@ -203,12 +155,20 @@ def skin_paths(skins: Sequence[Skin]) -> list[str]:
     return paths
 
 
-def declare_triangles(mesh: Any, triangles: NDArray[np.int32]) -> None:
-    """Triangles wound counter-clockwise seen from outside."""
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(triangles), 3))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(triangles).reshape(-1)))
+def declare_triangles(mesh: Any) -> None:
+    """Triangles wound counter-clockwise seen from outside, without values."""
+    mesh.CreateFaceVertexCountsAttr()
+    mesh.CreateFaceVertexIndicesAttr()
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
+
+
+def triangle_samples(path: str, triangles: NDArray[np.int32]) -> Samples:
+    """Values of the faces of a Mesh prim of this path."""
+    return {
+        f"{path}.faceVertexCounts": Vt.IntArray(len(triangles), 3),
+        f"{path}.faceVertexIndices": Vt.IntArray.FromNumpy(np.ascontiguousarray(triangles).reshape(-1)),
+    }
 
 
 def declare_moving(body: Any, with_stress: bool, colored: bool = True) -> None:

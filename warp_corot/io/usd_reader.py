@@ -14,7 +14,8 @@ def read_usd_tets(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], s
     """Reads every tetrahedral prim of a stage, joined into one mesh, in world space.
 
     The rest shape is the primvar ``rest`` where there is one (as in files written by `UsdWriter`), else ``points`` at
-    the default time, else at the first time sample. Inactive and abstract prims are left out; instances are read.
+    the default time, else at the first time sample; so too where the mesh changes over time. Inactive and abstract
+    prims are left out; instances are read.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
@@ -82,6 +83,8 @@ def _rest_points(prim, path: Path) -> NDArray[np.float64]:
     rest = UsdGeom.PrimvarsAPI(prim).GetPrimvar("rest")
     if rest:
         rest_value = rest.ComputeFlattened()
+        if rest_value is None:
+            rest_value = rest.ComputeFlattened(Usd.TimeCode.EarliestTime())
         if rest_value is not None and len(rest_value) == len(value):
             value = rest_value
     return np.asarray(value, dtype=np.float64).reshape(-1, 3)

@@ -15,7 +15,8 @@ from ..mesh.surface import signed_volumes
 from .colors import COLORMAP_NAME, VertexAverage, round_limit
 from .skins import Skin
 from .usd_pieces import PieceStore, Samples
-from .usd_prims import ROOT, SURFACE, TETS, Frame, SkinPrim, Statics, TetPrims, floats, skin_paths
+from .usd_prims import ROOT, SURFACE, TETS, Frame, Present, SkinPrim, Statics, floats, skin_paths
+from .usd_tets import TetPrims
 
 __all__ = ["ROOT", "SURFACE", "TETS", "Mesh", "UsdWriter"]
 
@@ -52,6 +53,12 @@ class UsdWriter:
     [Pa]) a frame, and coloured likewise. One that keeps a prim's look has that prim's faces, primvars, subsets and
     materials (copied to ``/SoftBody/materials``) and colours instead, and normals, now of its vertices, if it had any.
 
+    Of a body whose mesh changes, ``tetVertexIndices`` and all that goes by tetrahedra, nodes or faces are time samples
+    too, those that are not given a frame only where the mesh is another one. They hold until then: OpenUSD interpolates
+    no integers, and no arrays of two lengths; where lengths agree by chance, a sample just before the frame (by
+    `usd_pieces.JUST_BEFORE`) keeps points of different nodes from being interpolated. Between frames points go along
+    their ``velocities``, as the schema has it for meshes that change, which ``surface`` has then, too.
+
     Args:
         path: Where to: .usd or .usdc (binary) or .usda (text). A file there stays until the first frames are safe.
         mesh: The body's mesh at rest.
@@ -63,6 +70,7 @@ class UsdWriter:
         flush_seconds: About the most wall time [s] whose frames a sudden end may lose.
         skins: Surfaces bound to the mesh's nodes.
         tets: Whether the TetMesh is written; None: if there are no skins.
+        changing: Whether the mesh may become another one between frames (`change_mesh`).
 
     Raises:
         InputError: A path that cannot be written to (said now, not after the simulation), or arguments that do not fit.
@@ -81,6 +89,7 @@ class UsdWriter:
         flush_seconds: float = 2.0,
         skins: Sequence[Skin] = (),
         tets: bool | None = None,
+        changing: bool = False,
     ):
         up_axis = up_axis or getattr(mesh, "up_axis", "Y")
         if up_axis not in ("X", "Y", "Z"):
@@ -94,18 +103,12 @@ class UsdWriter:
         self.frames = 0
         self._fps = float(fps)
         self._up_axis = up_axis
-        self._fixed = fixed
-        self._material = material
-
-        self._node_count = len(mesh.points)
-        volumes = signed_volumes(mesh.points, mesh.tets)
-        right_handed = _right_handed(np.asarray(mesh.tets, dtype=np.int32), volumes < 0.0)
-        self._tet_count = len(right_handed)
-        self._average = VertexAverage(right_handed, np.abs(volumes), self._node_count)
-        self._prims: list[TetPrims | SkinPrim] = []
-        if tets or not skins:
-            self._prims.append(TetPrims(mesh, right_handed, self._average, boundary=not skins))
-        self._prims += [SkinPrim(skin, path, mesh) for skin, path in zip(skins, skin_paths(skins), strict=True)]
+        self._changing = changing
+        self._present = _present(mesh, fixed, material)
+        self._tets = TetPrims(self._present, boundary=not skins, changing=changing) if tets or not skins else None
+        named = zip(skins, skin_paths(skins), strict=True)
+        self._skins = [SkinPrim(skin, path, mesh.points, changing=changing) for skin, path in named]
+        self._prims: list[TetPrims | SkinPrim] = [*([self._tets] if self._tets else []), *self._skins]
         self._range_given = stress_range is not None
         self._stress_range = stress_range or (0.0, 0.0)
         self._ranges_used: set[tuple[float, float]] = set()
@@ -116,6 +119,29 @@ class UsdWriter:
     def stress_range(self) -> tuple[float, float]:
         """Stresses [Pa] at the two ends of the colour map, so far."""
         return self._stress_range
+
+    def change_mesh(
+        self, mesh: Mesh, *, fixed: ArrayLike | None = None, material: Any = None, skins: Sequence[Skin] = ()
+    ) -> None:
+        """From the next frame on the body has another mesh, of the same region.
+
+        Args:
+            mesh: At rest.
+            fixed, material: As when this was made.
+            skins: The same surfaces, bound to the mesh.
+
+        Raises:
+            InputError: The writer was not told that the mesh may change, or another number of skins.
+        """
+        if not self._changing:
+            raise InputError(f"{self.path}: the mesh cannot change; the writer must be made with changing=True")
+        if len(skins) != len(self._skins):
+            raise InputError(f"there are {len(skins)} skins now, should be {len(self._skins)} as before")
+        self._present = _present(mesh, fixed, material)
+        if self._tets:
+            self._tets.follow(self._present)
+        for prim, skin in zip(self._skins, skins, strict=True):
+            prim.follow(skin, mesh.points)
 
     def write(
         self, positions: ArrayLike, *, velocities: ArrayLike | None = None, von_mises: ArrayLike | None = None
@@ -136,16 +162,16 @@ class UsdWriter:
         given = (velocities is not None, von_mises is not None)
         if self._given is None:
             self._given = given
-            self._store.declare(self._static_layer())
+            self._store.declare(self._static_layer(), self._follows())
         elif given != self._given:
             raise InputError("velocities and von_mises must be given either for every frame or for none")
 
-        x = floats(positions, (self._node_count, 3), "positions")
+        x = floats(positions, self._present.points.shape, "positions")
         v = None if velocities is None else floats(velocities, x.shape, "velocities")
         stress = nodal = None
         if von_mises is not None:
-            stress = floats(von_mises, (self._tet_count,), "von_mises")
-            nodal = self._average(stress)
+            stress = floats(von_mises, (len(self._present.tets),), "von_mises")
+            nodal = self._present.average(stress)
             self._widen_range(stress)
             self._ranges_used.add(self._stress_range)
             self._store.custom_data["stressColors"] = self._color_legend()
@@ -214,6 +240,12 @@ class UsdWriter:
             colors |= prim.colors(samples, self._stress_range)
         return colors
 
+    def _follows(self) -> dict[str, str]:
+        found: dict[str, str] = {}
+        for prim in self._prims:
+            found |= prim.follows
+        return found if self._changing else {}
+
     def _static_layer(self) -> Sdf.Layer:
         """Everything that does not change, and the attributes that do, without values."""
         assert self._given is not None
@@ -226,10 +258,17 @@ class UsdWriter:
         root = UsdGeom.Xform.Define(stage, ROOT).GetPrim()
         stage.SetDefaultPrim(root)
         Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
-        statics = Statics(self._fixed, self._material, *self._given)
+        statics = Statics(*self._given)
         for prim in self._prims:
             prim.declare(stage, statics)
         return layer
+
+
+def _present(mesh: Mesh, fixed: ArrayLike | None, material: Any) -> Present:
+    points = np.asarray(mesh.points, dtype=np.float64)
+    volumes = signed_volumes(points, mesh.tets)
+    tets = _right_handed(np.asarray(mesh.tets, dtype=np.int32), volumes < 0.0)
+    return Present(points, tets, VertexAverage(tets, np.abs(volumes), len(points)), fixed, material)
 
 
 def _right_handed(tets: NDArray[np.int32], mirrored: NDArray[np.bool_]) -> NDArray[np.int32]:
