@@ -165,8 +165,9 @@ def scatter_damping_and_activation(
     """Viscous stress of k_damp [Pa s], and k_lambda times the activation on the volume, as Newton's solvers have it.
 
     With Green's strain E, P = 3 / tr(F^T F) F (k dE/dt + k tr(dE/dt) I): nothing for a rigid motion, no torque, never
-    any work put in; for small strains it is Newton's k (dF/dt + tr(dF/dt) I), which damps turning too. The factor keeps
-    it from growing with the stretch. The activation's P = k_lambda a cof F is the gradient of k_lambda a J.
+    any work put in. For small strains it is the k (dF/dt + tr(dF/dt) I) of Newton's solvers, which also damps turning
+    (and translation, as they have it). The factor keeps it from growing with the stretch. The activation's
+    P = k_lambda a cof F is the gradient of k_lambda a J.
     """
     t = wp.tid()
     damping = materials[t, 2]

@@ -25,6 +25,10 @@ BAD_INPUT = wp.constant(4)
 REPORTS = 5
 
 
+#: Newton's default for how fast a particle may be [m/s]. What gets there is no motion any more.
+RUNAWAY = wp.constant(1.0e5)
+
+
 @wp.func
 def place_of(world: int, count: int):
     """A world's place in an array over worlds; the last one is that of no world."""
@@ -116,20 +120,25 @@ def step_velocities(
 ):
     """v <- (v + dt (f/m + g)) / (1 + dt damping), no faster than ``most``.
 
-    A particle of no mass is kinematic: it keeps its velocity. One that is not active is frozen.
+    A particle of no mass is kinematic: it keeps its velocity. One that is not active is frozen. What would be faster
+    than ``RUNAWAY`` marks its world as what is not finite does.
     """
     i = wp.tid()
     velocity = load_node(v, i)
+    runs_away = bool(False)
     w = inverse_mass[i]
     if (flags[i] & ACTIVE) != 0:
         if w > 0.0:
             g = gravity[place_of(world[i], gravity.shape[0])]
             velocity = (velocity + dt * (w * load_node(f, i) + g)) / (1.0 + dt * damping)
-        speed = wp.length(velocity)
+        # Scaled, so that nothing is out of range.
+        size = wp.max(wp.max(wp.abs(velocity)), 1.0)
+        speed = size * wp.length(velocity / size)
+        runs_away = speed >= RUNAWAY
         if speed > most:
             velocity = velocity * (most / speed)
         store_node(v, i, velocity)
-    if not is_finite(load_node(x, i) + dt * velocity):
+    if runs_away or not is_finite(load_node(x, i) + dt * velocity):
         wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), UNSTABLE)
 
 
@@ -176,7 +185,7 @@ def check_particles(
     trouble: wp.array[wp.int32],
 ):
     i = wp.tid()
-    if not (is_finite(q[i]) and is_finite(qd[i])):
+    if not (is_finite(q[i]) and wp.max(wp.abs(qd[i])) < 0.5 * RUNAWAY):
         wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), UNSTABLE)
 
 

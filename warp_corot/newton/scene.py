@@ -121,15 +121,20 @@ def _add(
         raise InputError(f"material is a {type(material).__name__}; in Newton it must be Isotropic")
     material = material.at(centroids(mesh)) if material.functions else material
     material.check_shapes(1, len(mesh.tets))
+    share, count = mesh_fill(mesh), len(mesh.tets)
+    values = [np.ravel(share * a) for a in (material.mu, material.lam)] + [np.ravel(np.asarray(k_damp, np.float64))]
+    if values[2].size not in (1, count) or not (np.isfinite(values[2]) & (values[2] >= 0)).all():
+        raise InputError(f"k_damp must be zero or positive [Pa s], a number or one for each of {count} tetrahedra")
+    columns = [np.broadcast_to(column, count) for column in values]
+    velocity = tuple(_vector(vel, 3, "vel"))
     turn = np.array(wp.quat_to_matrix(wp.normalize(wp.quat(*_vector(rot, 4, "rot"))))).reshape(3, 3)
     x = mesh.points @ turn.T + _vector(pos, 3, "pos")
-    masses = lumped_masses(mesh, material)
+    masses = lumped_masses(mesh, material).copy()
     if fixed is not None:
         masses[checked_indices(fixed, len(x), "node")] = 0.0
     tets = right_handed(mesh)
-    first, first_tet, count = builder.particle_count, builder.tet_count, len(tets)
+    first, first_tet = builder.particle_count, builder.tet_count
 
-    velocity = tuple(_vector(vel, 3, "vel"))
     radii = None if radius is None else [float(radius)] * len(x)
     builder.add_particles([tuple(p) for p in x.tolist()], [velocity] * len(x), masses.tolist(), radii)
     # As ``add_tetrahedron`` does one by one.
@@ -138,11 +143,6 @@ def _add(
     builder.tet_indices.extend(map(tuple, (tets + first).tolist()))
     builder.tet_poses.extend(np.linalg.inv(edges).tolist())
     builder.tet_activations.extend([0.0] * count)
-    share = mesh_fill(mesh)
-    values = [np.ravel(share * a) for a in (material.mu, material.lam)] + [np.ravel(np.asarray(k_damp, np.float64))]
-    if values[2].size not in (1, count) or not (np.isfinite(values[2]) & (values[2] >= 0)).all():
-        raise InputError(f"k_damp must be zero or positive [Pa s], a number or one for each of {count} tetrahedra")
-    columns = [np.broadcast_to(column, count) for column in values]
     builder.tet_materials.extend(map(tuple, np.stack(columns, axis=1).tolist()))
     if surface:
         faces = boundary_faces(mesh.tets, mesh.points)[0] + first
