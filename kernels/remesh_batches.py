@@ -8,7 +8,8 @@ import warp as wp
 
 from .elements import LEVEL_MASK
 from .remesh import SINKS, Pools, padding
-from .remesh_plan import LEAVES_OF_SUBTREE, Plan, above, extent, flat_row, padding_code
+from .remesh_lists import LEAVES_OF_SUBTREE
+from .remesh_plan import Plan, above, extent, flat_row, padding_code
 from .shapes import MIRROR_BIT
 
 
@@ -168,18 +169,3 @@ def fill_flat(
             halved = float(1 << (level / 3))
             leaves.rest_inverse[k] = halved * leaves.inverse_of[3 * (code >> MIRROR_BIT) + level % 3]
             leaves.volume[k] = leaves.volume_of[level]
-
-
-@wp.kernel(enable_backward=False)
-def pad_units(
-    # In
-    threads: int,
-    pools: Pools,
-    # In and out
-    plan: Plan,
-):
-    """Units are counted without the first place, which is padding."""
-    row = flat_row(plan) + 1
-    for k in range(plan.counts[row] + 1 + wp.tid(), extent(row, plan) + 1, threads):
-        plan.unit_nodes[k] = padding(k, pools)
-        plan.unit_code[k] = padding_code(pools)

@@ -7,7 +7,8 @@ from warp_corot.kernels import subtree
 from warp_corot.kernels.stiffness import STIFFNESS_LAMBDA, STIFFNESS_MU
 
 import warp_corot as wc
-from warp_corot.plan import ForcePlan, Sharing, complete_subtrees
+from warp_corot.plan import ForcePlan
+from warp_corot.subtrees import Sharing, complete_subtrees
 
 MATERIAL = wc.Isotropic(young=1e4, poisson=0.4, density=1000.0)
 

@@ -8,10 +8,11 @@ from warp_corot.kernels.remesh import SINKS
 from warp_corot.kernels.shapes import FRAME_SHIFT
 
 import warp_corot as wc
-from warp_corot.plan import ForcePlan, Sharing, Units
+from warp_corot.plan import ForcePlan, Units
 from warp_corot.remesh import DeviceForest, RemeshPass
 from warp_corot.remesh.plan import DevicePlan
 from warp_corot.remesh.sizes import launch_size
+from warp_corot.subtrees import Sharing
 
 MESHES = {
     "uniform": lambda: wc.TetForest.box((2, 1, 1), CUBE, 7),
@@ -51,11 +52,11 @@ def by_unit(batch):
 class Comparison:
     """A derived plan, and that of the mesh exported."""
 
-    def __init__(self, plan, forest, rotation_level):
+    def __init__(self, plan, forest, rotation_level, grouped):
         mesh = forest.to_forest()
         self.plan, self.forest = plan, forest
         self.leaves = len(mesh.tets)
-        self.expected = ForcePlan.of_forest(mesh, rotation_level, forest.device)
+        self.expected = ForcePlan.of_forest(mesh, rotation_level, forest.device, grouped=grouped)
         self.mesh_units = None
         if rotation_level is not None:
             self.mesh_units = Units.of_forest(mesh, rotation_level, forest.device)
@@ -148,34 +149,35 @@ class Comparison:
         self.assert_exact(elements, count)
 
 
-def check(plan, forest, rotation_level):
+def check(plan, forest, rotation_level, grouped=None):
     """By the launches as they are, and then all that there is room for: nothing is left over from before."""
-    Comparison(plan, forest, rotation_level).check()
+    Comparison(plan, forest, rotation_level, grouped).check()
     counts = plan.class_counts.numpy()
     plan.refresh(np.full_like(counts, plan.most_leaves - 1))
-    Comparison(plan, forest, rotation_level).check()
+    Comparison(plan, forest, rotation_level, grouped).check()
     plan.refresh(counts)
 
 
 @pytest.mark.parametrize("rotation_level", [None, 0, 1, 2, 3, 4, 5, 6, 7, 9])
+@pytest.mark.parametrize("grouped", [True, False])
 @pytest.mark.parametrize("mesh", MESHES)
-def test_the_plan_is_that_of_the_present_mesh(mesh, rotation_level, device, rng):
+def test_the_plan_is_that_of_the_present_mesh(mesh, grouped, rotation_level, device, rng):
     values = {name: rng.random(len(MESHES[mesh]().tets)) for name in ("mu", "lam")}
     forest = made(mesh, device, values=values)
-    plan = DevicePlan(forest, rotation_level)
+    plan = DevicePlan(forest, rotation_level, grouped=grouped)
     remesh = RemeshPass(forest)
-    check(plan, forest, rotation_level)
+    check(plan, forest, rotation_level, grouped)
     counts = []
     for refine, simplify in ((0.1, 0.1), (0.2, 0.2), (0.0, 0.9), (0.0, 1.0)):
         remesh.apply(random_marks(forest, rng, refine, simplify))
         plan.launch()
         plan.refresh(plan.class_counts.numpy())
-        check(plan, forest, rotation_level)
+        check(plan, forest, rotation_level, grouped)
         counts.append(forest.leaf_count)
     assert counts[0] < counts[1] > counts[3]
     forest.compact()
     plan.derive()
-    check(plan, forest, rotation_level)
+    check(plan, forest, rotation_level, grouped)
 
 
 def test_a_pass_that_changes_nothing_leaves_the_plan_alone(device):

@@ -12,7 +12,8 @@ from ..kernels.general_cpu import repair_elements, rest_matrices, scatter_elemen
 from ..kernels.lanes import LANES
 from ..kernels.repair import repair_own, repair_shared
 from ..mesh import TetForest
-from ..plan import Batch, FlatLeaves, ForcePlan, Plan, Sharing
+from ..plan import FlatLeaves, ForcePlan, Plan
+from ..subtrees import Batch, Sharing
 from .corotated_field import CorotatedField, Rotations
 from .lanes import Lanes, as_general
 

@@ -8,9 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..kernels import remesh_batches, remesh_plan
+from ..kernels import remesh_batches, remesh_lists, remesh_plan, remesh_units
 from ..kernels.elements import ForestElements, GeneralElements, Subtrees
-from ..plan import Batch, FlatLeaves, Sharing, Units
+from ..plan import FlatLeaves, Units
+from ..subtrees import Batch, Sharing
 from .plan_arrays import GRANULE, PlanArrays
 from .pools import DeviceForest
 from .sizes import launch_size
@@ -26,6 +27,7 @@ class DevicePlan:
         forest: The pools.
         rotation_level: Level of the tree at which rotations are shared; None: not shared.
         subtrees: False: all leaves go one by one, for models that know no subtrees.
+        grouped: Whether complete subtrees go in groups where they can, as launches on CUDA alone do; None: there.
 
     Attributes:
         elements: The leaves as ``kernels.elements.ForestElements``.
@@ -39,11 +41,19 @@ class DevicePlan:
 
     slots = targets = None
 
-    def __init__(self, forest: DeviceForest, rotation_level: int | None = None, *, subtrees: bool = True):
+    def __init__(
+        self,
+        forest: DeviceForest,
+        rotation_level: int | None = None,
+        *,
+        subtrees: bool = True,
+        grouped: bool | None = None,
+    ):
         self.forest = forest
         self.device = forest.device
         self._with_subtrees = subtrees
-        made = PlanArrays(forest, rotation_level, subtrees)
+        grouped = self.device.is_cuda if grouped is None else grouped
+        made = PlanArrays(forest, rotation_level, subtrees=subtrees, grouped=grouped)
         self.most_leaves = len(made.plan.code)
         self._kinds, self._most_subtrees = made.kinds, made.most_subtrees
         self._plan, self._batches, self._leaves = made.plan, made.batches, made.leaves
@@ -67,14 +77,14 @@ class DevicePlan:
         self._launch(remesh_plan.gather_leaves, threads, threads, pools, self.forest.carriage.arrays.values, plan)
         if not (self._with_subtrees or self.rotation_shared):
             return
-        self._launch(remesh_plan.mark_leaves, threads, threads, pools, plan, self._sums)
+        self._launch(remesh_lists.mark_leaves, threads, threads, pools, plan, self._sums)
         wp.utils.array_scan(self._sums, self._ends, inclusive=True)
-        self._launch(remesh_plan.list_leaves, threads, threads, pools, self._ends, plan)
+        self._launch(remesh_lists.list_leaves, threads, threads, pools, self._ends, plan)
         if self._with_subtrees:
             self._launch(remesh_batches.fill_batches, (plan.classes, threads), threads, pools, plan, self._batches)
             self._launch(remesh_batches.fill_flat, threads, threads, pools, plan, self._leaves)
         if self.rotation_shared:
-            self._launch(remesh_batches.pad_units, threads, threads, pools, plan)
+            self._launch(remesh_units.pad_units, threads, threads, pools, plan)
 
     def outdate(self) -> None:
         """Let the next launches derive the plan also if the last pass has changed nothing, as after ``restart``."""

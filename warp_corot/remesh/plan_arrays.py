@@ -16,7 +16,7 @@ from ..kernels.remesh_plan import Plan
 from ..kernels.shapes import MIRROR_BIT
 from ..kernels.subtree import GROUP_NODES, group_nodes
 from ..mesh.lattice import LATTICE_BITS, MAX_LEVEL
-from ..plan import Sharing, subtree_nodes
+from ..subtrees import Sharing, subtree_nodes
 from .pools import DeviceForest
 
 #: Subtrees are launched in multiples of this: whole groups, and whole lanes.
@@ -33,9 +33,10 @@ class PlanArrays:
         edge_lengths: As in ``kernels.elements.ForestElements``.
     """
 
-    def __init__(self, forest: DeviceForest, rotation_level: int | None, subtrees: bool):
+    def __init__(self, forest: DeviceForest, rotation_level: int | None, *, subtrees: bool, grouped: bool):
         self._forest = forest
         self.device = forest.device
+        self._grouped = grouped
         self._shared = rotation_level is not None
         self._most_leaves = forest.capacity + LEAF_PADDING
         self.most_subtrees = max(-(-forest.capacity // (8 * GRANULE)) if subtrees else 0, 1) * GRANULE
@@ -54,7 +55,7 @@ class PlanArrays:
         units = leaves if self._shared else 0
         plan = Plan()
         plan.rotation_level, plan.with_subtrees = rotation_level, int(subtrees)
-        plan.members = 2 if self.device.is_cuda else 1
+        plan.members = 2 if self._grouped else 1
         plan.classes = plan.members * len(self.kinds)
         plan.counts, plan.before = self._zeros(plan.classes + 3), self._zeros(plan.classes + 3)
         plan.stale, plan.goes = self._zeros(1), self._zeros(1)
@@ -70,7 +71,6 @@ class PlanArrays:
 
     def _make_batches(self) -> Any:
         most, kinds, plan = self.most_subtrees, len(self.kinds), self.plan
-        groups = plan.members == 2
         sinks = self._sinks(most)
         nodes = np.broadcast_to(sinks, (kinds, 10, most))
         # In a group the k-th node of all eight subtrees' share stands on the sink of one of them.
@@ -79,9 +79,9 @@ class PlanArrays:
         batches = Batches()
         batches.places = self._pairs(np.array([subtree_nodes(shape) for shape in range(3)]))
         batches.group_places = self._pairs(self._group_places)
-        batches.by_node = int(groups)
-        batches.nodes = self._ints(nodes if groups else np.swapaxes(nodes, 1, 2))
-        batches.group_nodes = self._ints(of_groups if groups else np.zeros((kinds, 0, GROUP_NODES)))
+        batches.by_node = int(self.device.is_cuda)
+        batches.nodes = self._ints(nodes if self.device.is_cuda else np.swapaxes(nodes, 1, 2))
+        batches.group_nodes = self._ints(of_groups if self._grouped else np.zeros((kinds, 0, GROUP_NODES)))
         batches.code = self._codes((plan.classes, most))
         batches.unit = self._zeros((plan.classes if self._shared else 0, most))
         roots = np.repeat(np.repeat(sinks[None, :, None], plan.members, axis=0), 4, axis=2)
@@ -89,7 +89,7 @@ class PlanArrays:
         return batches
 
     def _make_leaves(self, count: int) -> Any:
-        names, plan = self._forest.carriage.names, self.plan
+        names = self._forest.carriage.names
         varies = "mu" in names
         leaves = FlatLeaves()
         leaves.nodes = self._padding(count)
@@ -98,7 +98,7 @@ class PlanArrays:
         leaves.mu_row, leaves.lam_row = (names.index(name) if varies else -1 for name in ("mu", "lam"))
         leaves.mu, leaves.lam = (self._zeros(count if varies else 0, wp.float32) for _ in range(2))
         # Eight elements at a time, on the CPU, want to have their own rotations.
-        general = count if plan.members == 1 and not self._shared else 0
+        general = count if self.device.is_cpu and not self._shared else 0
         leaves.rest_inverse = self._zeros(general, wp.mat33)
         leaves.volume = self._zeros(general, wp.float32)
         if general:
