@@ -331,3 +331,28 @@ def test_others_cannot_record_steps_that_change(device):
     sim = wc.Simulation(bar(device), remesh=near(0.1, device))
     with wp.ScopedCapture(device=device), pytest.raises(wc.InputError, match="cannot be recorded by others"):
         sim.step()
+
+
+def test_bodies_of_domains_go_on_as_on_a_mesh_made_that_way(device):
+    ball = wc.Domain.sphere(0.04, device=device)
+    mesh = wc.TetForest.from_domain(ball, 0.03, max_level=6)
+    young = np.where(mesh.points[mesh.tets].mean(axis=1)[:, 1] > 0, 2e4, 6e4)
+    body = wc.SoftBody(mesh, wc.Isotropic(young=young, poisson=0.4, density=1000.0), device=device)
+    body.fix(mesh.points[:, 2] < -0.03)
+    mass, enclosed = body.masses.sum(), float((mesh.fill * mesh.volumes).sum())
+    remesh = near(0.0, device, max_level=8)
+    sim = wc.Simulation(body, integrator=wc.SymplecticEuler(damping=1.0), remesh=remesh)
+    for x in (-0.02, 0.02):
+        remesh.parameters.assign([x, 0.01])
+        sim.advance_steps(25)
+        present = body.mesh
+        assert len(present.tets) != len(mesh.tets)
+        assert body.masses.sum() == pytest.approx(mass, rel=1e-12)
+        assert float((present.fill * present.volumes).sum()) == pytest.approx(enclosed, rel=1e-6)
+        fixed = twin(body, wc.Corotated(), sim)
+        sim.advance_steps(3)
+        fixed.advance_steps(3)
+        moved = np.abs(fixed.body.displacements.numpy()).max()
+        assert np.abs(body.displacements.numpy() - fixed.body.displacements.numpy()).max() < 1e-5 * moved
+        np.testing.assert_allclose(sim.von_mises(), fixed.von_mises(), rtol=1e-2, atol=1e-3 * fixed.von_mises().max())
+        sim.advance_steps(2)

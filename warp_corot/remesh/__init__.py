@@ -24,20 +24,11 @@ not simplified beyond the void beside it, and its marched surface is that of the
 Nodes are told apart by their numbers and edges by those of their ends, never by lattice points, so that several nodes
 may share one.
 
-How a simulation is to use it (not there yet)::
-
-    sim = wc.Simulation(body, remesh=wc.OnlineRemesh(refine_above=1.25, simplify_below=1.08, every=10, capacity=10**6))
-
-- ``OnlineRemesh`` is a frozen dataclass of ``RemeshPass``'s options, ``capacity`` and ``every``.
-- The body's ``node_displacements``, ``node_velocities``, ``node_loads``, ``node_mass`` and ``node_inverse_mass`` become
-  ``carriage.arrays``' ``u``, ``v``, ``load``, ``mass32`` and ``inverse_mass``: arrays of ``node_capacity``, stepped up
-  to ``counts[NODE_TOP]``. Free places have no mass and move nowhere. Constraints become ``held``.
-- mu and lambda times the filled share, activation and directions are ``values`` of elements, gathered by ``leaves``.
-- After a pass in which ``counts[ADDED] + counts[REMOVED]`` is not zero the force plan is derived anew from ``leaves``,
-  ``leaf_tets`` and ``level``, the body's ``revision`` goes up, and ``stable_dt`` is found again if the finest level has
-  changed.
-- ``body.mesh`` is ``DeviceForest.to_forest()`` on demand; bound surfaces are embedded anew.
-- ``is_full`` is looked at where the state is checked, and said once.
+In a simulation (``Simulation(…, remesh=OnlineRemesh(…))``, ``Changing``) the body's nodal arrays are those of the
+carriage. After the pass the same recording derives the force plan (``DevicePlan``) and finds the stiffest element. Then
+the host looks once, at a handful of numbers: whether anything has changed, and how large launches must be. Launches go
+through a little more than there is, so that recorded steps need to be recorded anew only when counts leave their bounds:
+what lies beyond is padding, nodes without mass and elements on ``SINKS``, places that never move, whose forces are zero.
 """
 
 from .passes import RemeshPass
