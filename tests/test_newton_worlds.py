@@ -1,0 +1,130 @@
+"""Many worlds of a Newton model: independent, reset alone, recorded in graphs."""
+
+import numpy as np
+import pytest
+import warp as wp
+from newton_scenes import adaptive_forest, add_grid, builder, newton, run, wc, wn
+
+WORLDS = 64
+
+
+def one_world():
+    made = builder(gravity=(0.0, 0.0, -9.81))
+    add_grid(made, dims=(2, 1, 1), fix_left=True)
+    wn.add_forest(made, adaptive_forest(1, 0.2), wc.Isotropic(2e4, 0.3, 500.0), pos=(0.0, 0.5, 0.22), k_damp=5.0)
+    body = made.add_body(xform=wp.transform(wp.vec3(0.1, 0.6, 0.101), wp.quat_identity()))
+    made.add_shape_box(body, hx=0.3, hy=0.3, hz=0.1, cfg=newton.ModelBuilder.ShapeConfig(density=100.0))
+    return made
+
+
+def worlds(count, device, attributes=False):
+    part = one_world()
+    if attributes:
+        wn.register_custom_attributes(part)
+    made = builder()
+    made.add_ground_plane()
+    made.replicate(part, count)
+    return made.finalize(device=device)
+
+
+def by_world(array, count):
+    return array.numpy().reshape(count, -1, array.numpy().shape[-1])
+
+
+def test_worlds_are_independent(device):
+    """Each goes as it would alone: with its own gravity, activation and velocities, one of them with nonsense."""
+    model = worlds(WORLDS, device)
+    solver = wn.SolverCorotated(model)
+    assert [group.copies for group in solver.tetrahedra.groups] == [WORLDS]
+    gravity = model.gravity.numpy().copy()
+    gravity[:WORLDS, 0] = np.linspace(-3.0, 3.0, WORLDS)
+    model.gravity.assign(gravity)
+    activation = np.repeat(np.linspace(0.0, 0.2, WORLDS), model.tet_count // WORLDS).astype(np.float32)
+    model.tet_activations.assign(activation)
+    velocity = model.particle_qd.numpy().reshape(WORLDS, -1, 3)
+    velocity[7] = np.nan
+    model.particle_qd.assign(velocity.reshape(-1, 3))
+    pipeline = newton.CollisionPipeline(model)
+    now, after = model.state(), model.state()
+    contacts = pipeline.contacts()
+    told = []
+    for _ in range(10):
+        pipeline.collide(now, contacts)
+        try:
+            solver.step(now, after, None, contacts, 5e-4)
+            solver.check()
+        except wc.InputError as error:
+            told.append(str(error))
+        now, after = after, now
+    assert told
+    assert all("in world 7" in line for line in told)
+    x, q = by_world(now.particle_q, WORLDS), by_world(now.body_q, WORLDS)
+    np.testing.assert_array_equal(x[7], by_world(model.particle_q, WORLDS)[7])
+    for world in (0, 6, 8, 50):
+        single = worlds(1, device)
+        single.gravity.assign(gravity[[world] * len(single.gravity)])
+        single.tet_activations.fill_(float(activation[world * single.tet_count]))
+        alone = run(wn.SolverCorotated(single), single, 10, 5e-4, pipeline=newton.CollisionPipeline(single))
+        np.testing.assert_allclose(x[world], alone.particle_q.numpy(), atol=1e-6)
+        np.testing.assert_allclose(q[world], alone.body_q.numpy(), atol=1e-6)
+    assert np.ptp(x[[0, 20, 40, 63]], axis=0).max() > 1e-5
+
+
+def test_one_world_is_reset_alone(device):
+    model = worlds(8, device, attributes=True)
+    solver = wn.SolverCorotated(model)
+    pipeline = newton.CollisionPipeline(model)
+    moved = run(solver, model, 50, 5e-4, pipeline=pipeline)
+    before = {name: getattr(moved, name).numpy().copy() for name in ("particle_q", "particle_qd", "body_q", "body_qd")}
+    rotations = by_world(moved.warp_corot.rotation, 8).copy()
+    mask = np.zeros(9, bool)
+    mask[3] = True
+    solver.reset(moved, wp.array(mask, dtype=wp.bool, device=device))
+    for name, values in before.items():
+        now, then = getattr(moved, name).numpy(), values
+        initial = getattr(model, name).numpy().reshape(8, -1)
+        now, then = now.reshape(8, -1), then.reshape(8, -1)
+        np.testing.assert_array_equal(now[3], initial[3])
+        np.testing.assert_array_equal(np.delete(now, 3, axis=0), np.delete(then, 3, axis=0))
+        assert np.abs(then[3] - initial[3]).max() > 0
+    q = by_world(moved.warp_corot.rotation, 8)
+    np.testing.assert_array_equal(q[3], np.broadcast_to([0, 0, 0, 1], q[3].shape))
+    np.testing.assert_array_equal(q[2], rotations[2])
+    assert np.abs(rotations[3] - q[3]).max() > 0
+
+    after = model.state()
+    kept = by_world(moved.particle_q, 8).copy()
+    solver.reset(after, wp.array(mask, dtype=wp.bool, device=device), newton.StateFlags.PARTICLE_QD)
+    with pytest.raises(wc.InputError, match="world_mask is"):
+        solver.reset(after, wp.zeros(8, dtype=wp.bool, device=device))
+    np.testing.assert_array_equal(by_world(moved.particle_q, 8), kept)
+
+
+def test_recorded_steps_are_the_same(device):
+    """Captured and replayed, nothing is allocated, and the result is what steps one by one have, bit by bit on CPUs."""
+    model = worlds(2, device)
+    pipeline = newton.CollisionPipeline(model)
+    ends = []
+    for each in (None, lambda state: None):
+        state = run(wn.SolverCorotated(model), model, 40, 5e-4, pipeline=pipeline, each=each)
+        ends.append(np.concatenate([state.particle_q.numpy().ravel(), state.body_q.numpy().ravel()]))
+    np.testing.assert_allclose(*ends, atol=0.0 if model.device.is_cpu else 1e-5)
+    assert np.abs(ends[0][: 3 * model.particle_count] - model.particle_q.numpy().ravel()).max() > 1e-4
+
+
+def test_a_replayed_step_says_what_was_wrong(device):
+    model = worlds(2, device)
+    solver = wn.SolverCorotated(model)
+    before, after = model.state(), model.state()
+    solver.step(before, after, None, None, 1e-4)
+    with wp.ScopedCapture(device=device) as capture:
+        solver.step(before, after, None, None, 1e-4)
+    wp.capture_launch(capture.graph)
+    solver.check()
+    before.particle_q.fill_(wp.vec3(np.nan))
+    good = after.particle_q.numpy()
+    wp.capture_launch(capture.graph)
+    np.testing.assert_array_equal(after.particle_q.numpy(), good)
+    with pytest.raises(wc.InputError, match="state_in is not finite"):
+        solver.check()
+    solver.check()
