@@ -26,7 +26,7 @@ from .elements import (
     nodal_forces,
     store_node,
 )
-from .integrate import is_finite, symplectic_euler_velocity
+from .integrate import is_finite, symplectic_euler_velocity, vector_at
 from .rotation import byers_xu
 from .shapes import fingerprint
 from .subtree import LEAVES
@@ -174,8 +174,12 @@ def _repair_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -> 
 
 
 @functools.cache
-def step_block(layout: Layout) -> wp.Kernel:
-    """Symplectic Euler steps of the corotated model, a block a world; launch with ``layout.threads`` a block."""
+def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
+    """Symplectic Euler steps of the corotated model, a block a world; launch with ``layout.threads`` a block.
+
+    Args:
+        load_vectors: What loads are an array of, vec3 or vec4.
+    """
     shape, shared, uniform, parts = layout.shape, layout.shared, layout.uniform, layout.parts
     capacity, threads, zero_slot = layout.subtrees, layout.threads, layout.slot_count
     deformed = deformed_of(shape)
@@ -205,7 +209,7 @@ def step_block(layout: Layout) -> wp.Kernel:
         mass: wp.array[wp.float32],
         inverse_mass: wp.array[wp.float32],
         has_load: int,
-        load: wp.array[wp.vec4],
+        load: wp.array[load_vectors],
         clock: wp.array[wp.int64],
         # In and out
         u: wp.array[wp.vec4],
@@ -293,7 +297,7 @@ def step_block(layout: Layout) -> wp.Kernel:
                     place = about & wp.static(NO_NODE)
                     i = base + place
                     if has_load != 0:
-                        force += load_node(load, i)
+                        force += vector_at(load, i)
                     w = inverse_mass[i]
                     moving = velocity(wp.static(LOAD), place, force)
                     if w > 0.0:

@@ -2,13 +2,43 @@
 
 The state is the displacement from rest: float32 positions would lose what small strains need. Positions are published
 for users after each run of steps, and adopted before the next where somebody changed them.
+
+Loads and positions may be arrays of other programs. Kernels that meet them are there twice: for vec4 arrays, which the
+solver's own are, and for vec3 arrays with any stride.
 """
+
+from typing import Any
 
 import warp as wp
 
 from .elements import load_node, store_node
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def vector_at(vectors: wp.array[wp.vec4], i: int):
+    return load_node(vectors, i)
+
+
+@wp.func
+def vector_at(vectors: wp.array[wp.vec3], i: int):
+    return vectors[i]
+
+
+@wp.func
+def write_vector(vectors: wp.array[wp.vec4], i: int, value: wp.vec3):
+    store_node(vectors, i, value)
+
+
+@wp.func
+def write_vector(vectors: wp.array[wp.vec3], i: int, value: wp.vec3):
+    vectors[i] = value
+
+
+def by_vectors(kernel: wp.Kernel, argument: str) -> dict[type, wp.Kernel]:
+    """A generic kernel for either type of vectors in one of its arrays, chosen here and not anew at every launch."""
+    return {dtype: wp.overload(kernel, {argument: wp.array(dtype=dtype)}) for dtype in (wp.vec3, wp.vec4)}
 
 
 @wp.func
@@ -34,7 +64,7 @@ def step_symplectic_euler(
     mass: wp.array[wp.float32],
     inverse_mass: wp.array[wp.float32],
     has_load: int,
-    load: wp.array[wp.vec4],
+    load: wp.array[Any],
     clock: wp.array[wp.int64],
     offset: int,
     # In and out
@@ -54,7 +84,7 @@ def step_symplectic_euler(
     i = wp.tid()
     force = load_node(f, i)
     if has_load != 0:
-        force += load_node(load, i)
+        force += vector_at(load, i)
     w = inverse_mass[i]
     velocity = load_node(v, i)
     if w > 0.0:
@@ -120,24 +150,24 @@ def publish_positions(
     rest: wp.array[wp.vec4],
     u: wp.array[wp.vec4],
     # Out
-    positions: wp.array[wp.vec4],
+    positions: wp.array[Any],
 ):
     i = wp.tid()
-    store_node(positions, i, load_node(rest, i) + load_node(u, i))
+    write_vector(positions, i, load_node(rest, i) + load_node(u, i))
 
 
 @wp.kernel(enable_backward=False)
 def adopt_positions(
     # In
     rest: wp.array[wp.vec4],
-    positions: wp.array[wp.vec4],
+    positions: wp.array[Any],
     # In and out
     u: wp.array[wp.vec4],
 ):
     """Take over the positions that somebody wrote since they were published; untouched ones keep their digits."""
     i = wp.tid()
     x = load_node(rest, i)
-    p = load_node(positions, i)
+    p = vector_at(positions, i)
     q = x + load_node(u, i)
     if p[0] != q[0] or p[1] != q[1] or p[2] != q[2]:
         store_node(u, i, p - x)
@@ -157,7 +187,7 @@ def reset_nodes(
     # Out
     u: wp.array[wp.vec4],
     v: wp.array[wp.vec4],
-    positions: wp.array[wp.vec4],
+    positions: wp.array[Any],
     reactions: wp.array[wp.vec4],
     world_starts: wp.array[wp.float64],
 ):
@@ -179,5 +209,11 @@ def reset_nodes(
     if inverse_mass[i] > 0.0:
         store_node(v, i, velocity)
     store_node(u, i, displacement)
-    store_node(positions, i, load_node(rest, i) + displacement)
+    write_vector(positions, i, load_node(rest, i) + displacement)
     store_node(reactions, i, wp.vec3())
+
+
+STEP_SYMPLECTIC_EULER = by_vectors(step_symplectic_euler, "load")
+PUBLISH_POSITIONS = by_vectors(publish_positions, "positions")
+ADOPT_POSITIONS = by_vectors(adopt_positions, "positions")
+RESET_NODES = by_vectors(reset_nodes, "positions")

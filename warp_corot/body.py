@@ -14,7 +14,8 @@ from .controls import Controls
 from .device import checked_device
 from .elements import Mesh, device_elements, element_kind, parts, repeated
 from .errors import InputError
-from .kernels.integrate import adopt_positions, publish_positions, reset_nodes
+from .interop import SharedArrays
+from .kernels.integrate import ADOPT_POSITIONS, PUBLISH_POSITIONS, RESET_NODES
 from .materials import Isotropic, Material
 from .mesh import TetForest
 from .nodal import padded, vec3_view
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 MOST_ELEMENTS = 2**31 - 1
 
 
-class SoftBody(Controls):
+class SoftBody(Controls, SharedArrays):
     """The state of one body: displacements, velocities, masses, constraints and loads of its nodes.
 
     Nodal vectors live in 16-byte vec4 arrays, the fourth lane unused, so that a node is one load and, where the card
@@ -264,11 +265,13 @@ class SoftBody(Controls):
 
     def adopt_positions(self) -> None:
         """Take over positions that somebody wrote since they were last published."""
-        self._launch(adopt_positions, [self.node_rest, self.node_positions], [self.node_displacements])
+        kernel = ADOPT_POSITIONS[self.node_positions.dtype]
+        self._launch(kernel, [self.node_rest, self.node_positions], [self.node_displacements])
 
     def publish_positions(self) -> None:
         """Write positions from displacements."""
-        self._launch(publish_positions, [self.node_rest, self.node_displacements], [self.node_positions])
+        kernel = PUBLISH_POSITIONS[self.node_positions.dtype]
+        self._launch(kernel, [self.node_rest, self.node_displacements], [self.node_positions])
 
     def set_initial_state(self) -> None:
         """Make the present state the one that ``Simulation.reset`` goes back to; at first that is rest."""
@@ -292,7 +295,7 @@ class SoftBody(Controls):
         u, v = self.initial_state or (self.node_displacements, self.node_velocities)
         inputs = [chosen, self.world_node_count, int(kept), u, v, self.node_rest, self.node_inverse_mass, clock]
         outputs = [self.node_displacements, self.node_velocities, self.node_positions, self.node_reactions]
-        self._launch(reset_nodes, inputs, [*outputs, self.world_starts])
+        self._launch(RESET_NODES[self.node_positions.dtype], inputs, [*outputs, self.world_starts])
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 

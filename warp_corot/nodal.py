@@ -15,5 +15,5 @@ def padded(vectors: np.ndarray) -> npt.NDArray[np.float32]:
 
 
 def vec3_view(a: wp.array) -> wp.array:
-    """The first three lanes of a vec4 array as a live (strided) vec3 array."""
-    return a.view(wp.float32)[:, :3].view(wp.vec3)
+    """The first three lanes of a vec4 array as a live (strided) vec3 array; a vec3 array as it is."""
+    return a if a.dtype == wp.vec3 else a.view(wp.float32)[:, :3].view(wp.vec3)

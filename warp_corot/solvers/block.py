@@ -53,7 +53,6 @@ class BlockSteps:
         of_block.slots = wp.array(numbers, dtype=wp.uint64, device=device)
         self._block = of_block
         self._layout = layout
-        self._kernel = step_block(layout)
 
     @classmethod
     def of(cls, body: SoftBody, field: ForceField) -> BlockSteps | None:
@@ -79,7 +78,7 @@ class BlockSteps:
         """Launch ``count`` steps, the first ones since the clock was last advanced."""
         body = self.body
         wp.launch(
-            self._kernel,
+            step_block(self._layout, body.node_loads.dtype),
             dim=body.worlds * self._layout.threads,
             block_dim=self._layout.threads,
             inputs=[

@@ -11,7 +11,7 @@ import warp as wp
 
 from ..elasticity import ForceField
 from ..errors import InputError
-from ..kernels.integrate import follow_trajectory, step_symplectic_euler
+from ..kernels.integrate import STEP_SYMPLECTIC_EULER, follow_trajectory
 from .block import BlockSteps
 from .integrator import Integrator, StepContext, Stepper
 
@@ -93,7 +93,7 @@ class SymplecticEulerStepper(Stepper):
         self.field.begin_step(context.clock, offset, context.dt)
         self.field.add_forces(body.node_displacements, body.node_forces)
         wp.launch(
-            step_symplectic_euler,
+            STEP_SYMPLECTIC_EULER[body.node_loads.dtype],
             dim=body.launch_nodes,
             inputs=[
                 context.dt,
