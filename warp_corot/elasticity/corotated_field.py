@@ -69,8 +69,6 @@ class CorotatedField(ForceField):
             self._forces = scatter_matrix_product(model.stiffness == "sparse")
         self._energies = corotated_energies(kind)
         self._von_mises = corotated_von_mises(kind)
-        if not self._fused:
-            self._sharing()
 
     @property
     def state(self) -> dict[str, wp.array]:
@@ -95,8 +93,6 @@ class CorotatedField(ForceField):
         super().follow(plan)
         self._followed = plan
         self._shared = None
-        if not self._fused:
-            self._sharing()
 
     @property
     def unit_count(self) -> int:
@@ -157,6 +153,13 @@ class LeafField(CorotatedField):
         super().__init__(body, model, deterministic)
         if self.deterministic:
             self.slots, self.elements = leaf_slots(body)
+        if not self._fused and body.changing is None:
+            self._sharing()
+
+    def follow(self, plan: DevicePlan) -> None:
+        super().follow(plan)
+        if not self._fused:
+            self._sharing()
 
 
 class LanesField(CorotatedField):

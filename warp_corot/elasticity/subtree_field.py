@@ -30,9 +30,9 @@ class SubtreeField(CorotatedField):
 
     def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
         super().__init__(body, model, deterministic)
-        assert isinstance(body.mesh, TetForest)
         self._uniform = body.material_stride == 0
         if body.changing is None:
+            assert isinstance(body.mesh, TetForest)
             self._go_through(
                 ForcePlan.of_forest(
                     body.mesh, model.rotation_level, self.device, worlds=body.worlds, deterministic=self.deterministic
@@ -54,6 +54,8 @@ class SubtreeField(CorotatedField):
         if plan.units is not None:
             self._shared = Rotations.of(plan.units)
             self._rotations = self._shared.rotations
+        elif self.rotation_level is not None:
+            self._sharing()
         self._kernels = [self._kernel(batch) for batch in plan.batches]
         self._flat_material = self.material_inputs
         self._flat_lanes: Lanes | None = None
