@@ -7,6 +7,7 @@ import json
 import warnings
 import zipfile
 import zlib
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -17,17 +18,22 @@ import warp as wp
 from ..activation import Activation, ElementActivation
 from ..anisotropy import Orthotropic, TransverselyIsotropic
 from ..body import SoftBody
-from ..elasticity import MODELS
+from ..elasticity import MODELS, ForceField, Model
 from ..errors import InputError, StabilityWarning
 from ..materials import Isotropic
 from ..mesh import TetForest, TetMesh, Tree
+from ..remesh.online import OnlineRemesh
 from ..simulation import Simulation
 from ..solvers import INTEGRATORS
+from .checkpoint_remesh import pack_changing, remesh_options, unpack_changing
 from .whole import written_whole
 
+Remesh = OnlineRemesh | Sequence[OnlineRemesh | None] | None
+
 FORMAT = "warp-corot checkpoint"
-#: 2: worlds, deterministic runs. 3: anisotropic materials, activation, forests made from domains. All are read.
-VERSION = 3
+#: 2: worlds, deterministic runs. 3: anisotropic materials, activation, forests made from domains. 4: meshes that
+#: change, steps of changing length. All are read.
+VERSION = 4
 
 MATERIALS = {kind.__name__: kind for kind in (Isotropic, TransverselyIsotropic, Orthotropic)}
 
@@ -55,7 +61,11 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
         "version": VERSION,
         "device": str(sim.device),
         "dt": sim.dt,
+        "stable_dt": sim.stable_dt,
         "steps": sim.steps,
+        "epoch": sim._epoch,
+        "steps_before_reset": sim._steps_before_reset,
+        "time_before_reset": sim._time_before_reset,
         "gravity": sim.gravity,
         "integrator": _described(sim.integrator, INTEGRATORS),
         "deterministic": sim.deterministic,
@@ -63,47 +73,65 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
         "bodies": [],
     }
     for number, (body, model, field) in enumerate(zip(sim.bodies, sim.models, sim.fields, strict=True)):
-        body.adopt_positions()
-        prefix = f"body{number}."
-        header["bodies"].append(
-            {
-                "model": _described(model, MODELS),
-                "mesh": _pack_mesh(body.mesh, prefix, arrays),
-                "material": _name_of(body.material, MATERIALS),
-                "trajectories": len(body.trajectories),
-                "activations": len(body.activations),
-                "field": sorted(field.state),
-            }
-        )
-        for material_field in dataclasses.fields(body.material):
-            arrays[prefix + material_field.name] = np.asarray(getattr(body.material, material_field.name))
-        arrays[prefix + "displacements"] = body.node_displacements.numpy()
-        arrays[prefix + "velocities"] = body.node_velocities.numpy()
-        arrays[prefix + "reactions"] = body.node_reactions.numpy()
-        arrays[prefix + "constrained"] = body.constrained
-        arrays[prefix + "world_starts"] = body.world_starts.numpy()
-        if body.initial_state is not None:
-            for name, array in zip(("displacements", "velocities"), body.initial_state, strict=True):
-                arrays[f"{prefix}initial.{name}"] = array.numpy()
-        if body.has_loads:
-            arrays[prefix + "loads"] = body.node_loads.numpy()
-        for k, trajectory in enumerate(body.trajectories):
-            arrays[f"{prefix}trajectory{k}.nodes"] = trajectory.nodes.numpy()
-            times, displacements = trajectory.keys()
-            arrays[f"{prefix}trajectory{k}.times"] = times
-            arrays[f"{prefix}trajectory{k}.displacements"] = displacements
-        if body.has_activation:
-            arrays[prefix + "activation"] = body.activation.numpy()
-        for k, activation in enumerate(body.activations):
-            for name in ("elements", "times", "stress"):
-                arrays[f"{prefix}activation{k}.{name}"] = getattr(activation, name).numpy()
-        for name, array in field.state.items():
-            arrays[f"{prefix}field.{name}"] = array.numpy()
+        header["bodies"].append(_pack_body(body, model, field, f"body{number}.", arrays))
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
     _write_whole(target, arrays)
 
 
-def load_checkpoint(path: str | PathLike[str], device: str | wp.Device | None = None) -> Simulation:
+def _pack_body(
+    body: SoftBody, model: Model, field: ForceField, prefix: str, arrays: dict[str, np.ndarray]
+) -> dict[str, Any]:
+    """Put a body into arrays whose names begin with ``prefix``; returns what else there is, for JSON."""
+    body.adopt_positions()
+    changing = body.changing
+    mesh, material = (body.mesh, body.material) if changing is None else (changing.forest.source, changing._given)
+    described = {
+        "model": _described(model, MODELS),
+        "mesh": _pack_mesh(mesh, prefix, arrays),
+        "material": _name_of(material, MATERIALS),
+        "trajectories": 0,
+        "activations": len(body.activations),
+        "field": sorted(field.state),
+        "remesh": None,
+    }
+    for material_field in dataclasses.fields(material):
+        arrays[prefix + material_field.name] = np.asarray(getattr(material, material_field.name))
+    arrays[prefix + "world_starts"] = body.world_starts.numpy()
+    for name, array in field.state.items():
+        arrays[f"{prefix}field.{name}"] = array.numpy()
+    if changing is None:
+        described["trajectories"] = len(body.trajectories)
+        _pack_state(body, prefix, arrays)
+    else:
+        described["remesh"] = pack_changing(changing, f"{prefix}remesh.", arrays)
+    return described
+
+
+def _pack_state(body: SoftBody, prefix: str, arrays: dict[str, np.ndarray]) -> None:
+    arrays[prefix + "displacements"] = body.node_displacements.numpy()
+    arrays[prefix + "velocities"] = body.node_velocities.numpy()
+    arrays[prefix + "reactions"] = body.node_reactions.numpy()
+    arrays[prefix + "constrained"] = body.constrained
+    if body.initial_state is not None:
+        for name, array in zip(("displacements", "velocities"), body.initial_state, strict=True):
+            arrays[f"{prefix}initial.{name}"] = array.numpy()
+    if body.has_loads:
+        arrays[prefix + "loads"] = body.node_loads.numpy()
+    for k, trajectory in enumerate(body.trajectories):
+        arrays[f"{prefix}trajectory{k}.nodes"] = trajectory.nodes.numpy()
+        times, displacements = trajectory.keys()
+        arrays[f"{prefix}trajectory{k}.times"] = times
+        arrays[f"{prefix}trajectory{k}.displacements"] = displacements
+    if body.has_activation:
+        arrays[prefix + "activation"] = body.activation.numpy()
+    for k, activation in enumerate(body.activations):
+        for name in ("elements", "times", "stress"):
+            arrays[f"{prefix}activation{k}.{name}"] = getattr(activation, name).numpy()
+
+
+def load_checkpoint(
+    path: str | PathLike[str], device: str | wp.Device | None = None, remesh: Remesh = None
+) -> Simulation:
     """The simulation that ``save_checkpoint`` wrote; see ``Simulation.load``."""
     source = Path(path)
     if not source.is_file():
@@ -123,7 +151,7 @@ def load_checkpoint(path: str | PathLike[str], device: str | wp.Device | None = 
     try:
         if header["version"] < VERSION:
             _upgrade(header, arrays)
-        return _rebuilt_simulation(header, arrays, device)
+        return _rebuilt_simulation(header, arrays, device, remesh)
     except (LookupError, TypeError) as error:
         raise InputError(f"{what}: {error} is missing or wrong") from error
 
@@ -135,62 +163,85 @@ def _upgrade(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
         for number in range(len(header["bodies"])):
             arrays[f"body{number}.world_starts"] = np.zeros(1, np.int64)
     for described in header["bodies"]:
-        described |= {"material": Isotropic.__name__, "activations": 0}
-        described["mesh"] |= {"of_domain": [], "label_names": []}
+        if header["version"] < 3:
+            described |= {"material": Isotropic.__name__, "activations": 0}
+            described["mesh"] |= {"of_domain": [], "label_names": []}
+        described["remesh"] = None
+    header |= {"stable_dt": None, "epoch": 0.0, "steps_before_reset": 0, "time_before_reset": 0.0}
 
 
 def _rebuilt_simulation(
-    header: dict[str, Any], arrays: dict[str, np.ndarray], device: str | wp.Device | None
+    header: dict[str, Any], arrays: dict[str, np.ndarray], device: str | wp.Device | None, remesh: Remesh
 ) -> Simulation:
+    place = header["device"] if device is None else device
     bodies, models = [], []
     for number, described in enumerate(header["bodies"]):
-        prefix = f"body{number}."
-        mesh = _unpack_mesh(described["mesh"], prefix, arrays)
-        material_kind = MATERIALS[described["material"]]
-        material = material_kind(*(arrays[prefix + f.name][()] for f in dataclasses.fields(material_kind)))
-        body = SoftBody(mesh, material, worlds=header["worlds"], device=header["device"] if device is None else device)
-        if prefix + "initial.displacements" in arrays:
-            body.displacements = arrays[prefix + "initial.displacements"][:, :3]
-            body.velocities = arrays[prefix + "initial.velocities"][:, :3]
-            body.set_initial_state()
-        body.fix(arrays[prefix + "constrained"])
-        for k in range(described["trajectories"]):
-            motion = f"{prefix}trajectory{k}."
-            body.follow(
-                arrays[motion + "nodes"],
-                times=arrays[motion + "times"],
-                displacements=arrays[motion + "displacements"],
-            )
-        if prefix + "activation" in arrays:
-            body.activation.assign(arrays[prefix + "activation"])
-        for k in range(described["activations"]):
-            elements, times, stress = (
-                arrays[f"{prefix}activation{k}.{name}"] for name in ("elements", "times", "stress")
-            )
-            body.activations.append(ElementActivation.of_keys(elements, Activation(times, stress), body.device))
-        if prefix + "loads" in arrays:
-            wp.copy(body.loads, wp.array(arrays[prefix + "loads"][:, :3], dtype=wp.vec3, device=body.device))
-        body.displacements = arrays[prefix + "displacements"][:, :3]
-        body.velocities = arrays[prefix + "velocities"][:, :3]
-        body.node_reactions.assign(arrays[prefix + "reactions"])
-        body.world_starts.assign(arrays[prefix + "world_starts"])
-        bodies.append(body)
+        bodies.append(_rebuilt_body(described, f"body{number}.", arrays, header["worlds"], place))
         models.append(_rebuilt(described["model"], MODELS))
-    integrator = dataclasses.replace(_rebuilt(header["integrator"], INTEGRATORS), dt=header["dt"])
+    integrator = _rebuilt(header["integrator"], INTEGRATORS)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", StabilityWarning)  # it was given when the simulation was made
         sim = Simulation(
             bodies,
             model=models,
-            integrator=integrator,
+            integrator=dataclasses.replace(integrator, dt=header["dt"]),
             gravity=header["gravity"],
             deterministic=header["deterministic"],
+            remesh=remesh_options(header["bodies"], arrays, place, remesh),
         )
     sim.clock.fill_(header["steps"])
-    for number, (described, field) in enumerate(zip(header["bodies"], sim.fields, strict=True)):
+    sim._epoch = header["epoch"]
+    sim._steps_before_reset, sim._time_before_reset = header["steps_before_reset"], header["time_before_reset"]
+    if header["stable_dt"] is not None:
+        sim.stable_dt = header["stable_dt"]
+    for number, (described, body, field) in enumerate(zip(header["bodies"], sim.bodies, sim.fields, strict=True)):
+        if described["remesh"] is not None:
+            assert body.changing is not None
+            unpack_changing(body.changing, described["remesh"], f"body{number}.remesh.", arrays)
+            sim.integrator = integrator  # whose step, if none was given, follows the mesh
+        body.world_starts.assign(arrays[f"body{number}.world_starts"].astype(np.float64))
         for name in described["field"]:
             field.state[name].assign(arrays[f"body{number}.field.{name}"])
     return sim
+
+
+def _rebuilt_body(
+    described: dict[str, Any], prefix: str, arrays: dict[str, np.ndarray], worlds: int, device: str | wp.Device
+) -> SoftBody:
+    mesh = _unpack_mesh(described["mesh"], prefix, arrays)
+    material_kind = MATERIALS[described["material"]]
+    material = material_kind(*(arrays[prefix + f.name][()] for f in dataclasses.fields(material_kind)))
+    body = SoftBody(mesh, material, worlds=worlds, device=device)
+    if described["remesh"] is None:
+        _unpack_state(body, described, prefix, arrays)
+    elif described["remesh"]["loads"]:
+        _ = body.loads  # made on first use
+    return body
+
+
+def _unpack_state(body: SoftBody, described: dict[str, Any], prefix: str, arrays: dict[str, np.ndarray]) -> None:
+    if prefix + "initial.displacements" in arrays:
+        body.displacements = arrays[prefix + "initial.displacements"][:, :3]
+        body.velocities = arrays[prefix + "initial.velocities"][:, :3]
+        body.set_initial_state()
+    body.fix(arrays[prefix + "constrained"])
+    for k in range(described["trajectories"]):
+        motion = f"{prefix}trajectory{k}."
+        body.follow(
+            arrays[motion + "nodes"],
+            times=arrays[motion + "times"],
+            displacements=arrays[motion + "displacements"],
+        )
+    if prefix + "activation" in arrays:
+        body.activation.assign(arrays[prefix + "activation"])
+    for k in range(described["activations"]):
+        elements, times, stress = (arrays[f"{prefix}activation{k}.{name}"] for name in ("elements", "times", "stress"))
+        body.activations.append(ElementActivation.of_keys(elements, Activation(times, stress), body.device))
+    if prefix + "loads" in arrays:
+        wp.copy(body.loads, wp.array(arrays[prefix + "loads"][:, :3], dtype=wp.vec3, device=body.device))
+    body.displacements = arrays[prefix + "displacements"][:, :3]
+    body.velocities = arrays[prefix + "velocities"][:, :3]
+    body.node_reactions.assign(arrays[prefix + "reactions"])
 
 
 def _described(thing: Any, names: dict[str, Any]) -> dict[str, Any]:

@@ -24,7 +24,7 @@ class Section:
     """A rectangle out of the rest shape, in squares that are bound to the mesh.
 
     Args:
-        mesh: What moves.
+        mesh: What moves; of a body that is remeshed the present mesh, see `rebind`.
         domain: What the mesh was made from; says which squares are of which label. They may be far smaller than the
             tetrahedra.
         centre: A point of the plane [m], [3]: the origin of its coordinates.
@@ -73,6 +73,13 @@ class Section:
         found = domain.labels_at(middles) if domain.label_names else domain.phi(middles) < 0
         self.names = domain.label_names or ("body",)
         self.numbers = np.asarray(found, np.int32).reshape(len(lines[1]) - 1, -1)
+
+    def rebind(self, mesh: TetForest) -> None:
+        """Bind the squares to what the mesh has become; displacements are of its nodes from now on.
+
+        Squares stay where they are in the rest shape, and of the label that they are of.
+        """
+        self._bound = mesh.bind(self.points)
 
     def moved(self, displacements: npt.ArrayLike | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Where the corners are when nodes are displaced by [N, 3] [m]: their coordinates in the plane [m]."""
