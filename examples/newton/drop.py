@@ -1,0 +1,80 @@
+"""A ball of soft tissue, meshed adaptively, falls on a rigid box, and both come to rest on the ground; stress is logged.
+
+python examples/newton/drop.py --viewer null --test, or --viewer usd --output-path drop.usd, gl, rerun, viser.
+"""
+
+import newton
+import newton.examples
+import numpy as np
+import warp as wp
+
+import warp_corot as wc
+import warp_corot.newton as wn
+
+RADIUS = 0.15
+
+
+class Example:
+    def __init__(self, viewer, args):
+        self.viewer, self.frame_dt, self.sim_time = viewer, 1.0 / 60.0, 0.0
+        builder = newton.ModelBuilder()
+        builder.add_ground_plane()
+        wn.register_custom_attributes(builder)
+        box = builder.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 0.1), wp.quat_identity()))
+        builder.add_shape_box(box, hx=0.3, hy=0.3, hz=0.1, cfg=newton.ModelBuilder.ShapeConfig(density=200.0))
+        ball = wc.Domain.sphere(RADIUS)
+        forest = wc.TetForest.from_domain(ball, 2.2 * RADIUS, max_level=9, surface_error=0.003)
+        tissue = wc.Isotropic(young=3e4, poisson=0.4, density=1000.0)
+        wn.add_forest(builder, forest, tissue, pos=(0.02, 0.0, 0.5), k_damp=10.0, particle_radius=0.005)
+        self.model = builder.finalize()
+        self.model.soft_contact_ke, self.model.soft_contact_kd, self.model.soft_contact_mu = 2e3, 2.0, 0.5
+        self.model.shape_material_ke.fill_(1e4)
+        self.model.shape_material_kd.fill_(100.0)
+        self.solver = wn.SolverCorotated(self.model)
+        self.substeps = 2 * int(np.ceil(self.frame_dt / (1.4 * self.solver.contact_dt)))
+        self.pipeline = newton.CollisionPipeline(self.model)
+        self.contacts = self.pipeline.contacts()
+
+        self.state_0, self.state_1 = self.model.state(), self.model.state()
+        self.control = self.model.control()
+        viewer.set_model(self.model)
+        self.simulate()  # compiles what the recording launches
+        self.state_0.assign(self.model.state())
+        with wp.ScopedCapture() as capture:
+            self.simulate()
+        self.graph = capture.graph
+
+    def simulate(self):
+        for _ in range(self.substeps):
+            self.state_0.clear_forces()
+            self.viewer.apply_forces(self.state_0)
+            self.pipeline.collide(self.state_0, self.contacts)
+            dt = self.frame_dt / self.substeps
+            self.solver.step(self.state_0, self.state_1, self.control, self.contacts, dt)
+            self.state_0, self.state_1 = self.state_1, self.state_0
+
+    def step(self):
+        wp.capture_launch(self.graph)
+        self.sim_time += self.frame_dt
+
+    def render(self):
+        self.viewer.begin_frame(self.sim_time)
+        self.viewer.log_state(self.state_0)
+        stress = self.state_0.warp_corot.von_mises.numpy()
+        self.viewer.log_scalar("largest von Mises stress [Pa]", float(stress.max()))
+        self.viewer.end_frame()
+
+    def test_final(self):
+        self.solver.check()
+        x, v = self.state_0.particle_q.numpy(), self.state_0.particle_qd.numpy()
+        m = self.model.particle_mass.numpy()
+        assert x[:, 2].min() > 0.17, x[:, 2].min()
+        assert 0.2 < m @ x[:, 2] / m.sum() < 0.5
+        assert np.abs(m @ v / m.sum()).max() < 0.5
+        assert 0.07 < self.state_0.body_q.numpy()[0, 2] < 0.11
+        assert 0.0 < self.state_0.warp_corot.von_mises.numpy().max() < 1e5
+
+
+if __name__ == "__main__":
+    viewer, args = newton.examples.init()
+    newton.examples.run(Example(viewer, args), args)

@@ -1,0 +1,86 @@
+"""Four cantilevers of the same rubber in Newton, of tetrahedra that are damped less and less, the last one a forest.
+
+python examples/newton/hanging.py --viewer null --test, or --viewer usd --output-path hanging.usd, gl, rerun, viser.
+"""
+
+import newton
+import newton.examples
+import numpy as np
+import warp as wp
+
+import warp_corot as wc
+import warp_corot.newton as wn
+
+LENGTH, WIDTH, SPACING = 1.2, 0.4, 0.6
+
+
+class Example:
+    def __init__(self, viewer, args):
+        self.viewer, self.frame_dt, self.sim_time = viewer, 1.0 / 60.0, 0.0
+        material = wc.Isotropic(young=1e6, poisson=0.25, density=1000.0)
+        builder = newton.ModelBuilder()
+        builder.add_ground_plane()
+        for k, k_damp in enumerate((1e3, 3e2, 1e2)):
+            builder.add_soft_grid(
+                pos=wp.vec3(0.0, k * SPACING, 1.0),
+                rot=wp.quat_identity(),
+                vel=wp.vec3(),
+                dim_x=12,
+                dim_y=4,
+                dim_z=4,
+                cell_x=0.1,
+                cell_y=0.1,
+                cell_z=0.1,
+                density=material.density,
+                k_mu=material.mu,
+                k_lambda=material.lam,
+                k_damp=k_damp,
+                fix_left=True,
+                particle_radius=0.02,
+            )
+        forest = wc.TetForest.box((3, 1, 1), WIDTH, 6)
+        held = forest.points[:, 0] == 0
+        pos = (0.0, 3 * SPACING, 1.0)
+        wn.add_forest(builder, forest, material, pos=pos, k_damp=1e2, fixed=held, particle_radius=0.02)
+        self.model = builder.finalize()
+        self.solver = wn.SolverCorotated(self.model)
+        self.substeps = 2 * int(np.ceil(self.frame_dt / (1.4 * self.solver.stable_dt)))
+
+        self.state_0, self.state_1 = self.model.state(), self.model.state()
+        self.control = self.model.control()
+        viewer.set_model(self.model)
+        self.simulate()  # compiles what the recording launches
+        self.state_0.assign(self.model.state())
+        with wp.ScopedCapture() as capture:
+            self.simulate()
+        self.graph = capture.graph
+
+    def simulate(self):
+        for _ in range(self.substeps):
+            self.state_0.clear_forces()
+            self.viewer.apply_forces(self.state_0)
+            self.solver.step(self.state_0, self.state_1, self.control, None, self.frame_dt / self.substeps)
+            self.state_0, self.state_1 = self.state_1, self.state_0
+
+    def step(self):
+        wp.capture_launch(self.graph)
+        self.sim_time += self.frame_dt
+
+    def render(self):
+        self.viewer.begin_frame(self.sim_time)
+        self.viewer.log_state(self.state_0)
+        self.viewer.end_frame()
+
+    def test_final(self):
+        self.solver.check()
+        x = self.state_0.particle_q.numpy() - self.model.particle_q.numpy()
+        beam = np.round(self.model.particle_q.numpy()[:, 1] // SPACING).astype(int)
+        sag = [float(x[beam == k, 2].min()) for k in range(4)]
+        assert all(-0.6 < tip < -0.05 for tip in sag), sag
+        # The last one is as heavy as its volume; ``add_soft_grid`` gives every particle a whole cell's mass.
+        assert abs(sag[3]) < abs(sag[2]), sag
+
+
+if __name__ == "__main__":
+    viewer, args = newton.examples.init()
+    newton.examples.run(Example(viewer, args), args)
