@@ -1,4 +1,4 @@
-"""A ball of soft tissue, meshed adaptively, falls on a rigid box, and both come to rest on the ground; stress is logged.
+"""A ball of soft tissue, meshed adaptively, falls on a rigid box; both come to rest on the ground. Stress is logged.
 
 python examples/newton/drop.py --viewer null --test, or --viewer usd --output-path drop.usd, gl, rerun, viser.
 """

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from ..errors import InputError
@@ -100,6 +99,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self._contacts = Contacts(model)
         self._others = Others(model, rigid_solver, particle_contact)
         self._steps = Steps(model, self.tetrahedra, self._contacts, self._others, damping)
+        self._all_worlds = wp.ones(max(int(model.world_count), 1) + 1, dtype=wp.bool, device=self.device)
         self._find_stable_steps()
 
     @property
@@ -168,9 +168,16 @@ class SolverCorotated(SolverBase, CouplingInterface):
             flags: ``newton.StateFlags`` of what is put back: PARTICLE_Q, PARTICLE_QD, and, if this solver steps the
                 bodies, BODY_Q and BODY_QD; None: all.
         """
-        mask = self._normalize_mask(world_mask)
+        mask = self._all_worlds if world_mask is None else self._checked_mask(world_mask)
         self._steps.reset(state, mask, int(newton.StateFlags.ALL if flags is None else flags))
         self._others.reset(state, world_mask, flags)
+
+    def write_attributes(self, state: newton.State) -> None:
+        """Write rotations and stresses of a state's positions into it; ``step`` does so for ``state_out`` itself.
+
+        For states that this solver does not hand out, such as those of Newton's coupled solvers.
+        """
+        self.tetrahedra.write_attributes(state, state)
 
     def notify_model_changed(self, flags: int) -> None:
         """Take over what has changed in the model: materials of elements, masses, stiffness of contacts.
@@ -254,10 +261,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         if contacts is not None and contacts.soft_contact_max and contacts.soft_contact_count.device != self.device:
             raise InputError(f"contacts are on {contacts.soft_contact_count.device}; the model is on {self.device}")
 
-    def _normalize_mask(self, world_mask: wp.array | None) -> wp.array:
-        worlds = max(int(self.model.world_count), 1)
-        if world_mask is None:
-            return wp.array(np.ones(worlds + 1, bool), dtype=wp.bool, device=self.device)
+    def _checked_mask(self, world_mask: wp.array) -> wp.array:
         wanted = f"it must be bool [{self.model.world_count + 1}] on {self.device}"
         if not isinstance(world_mask, wp.array):
             raise InputError(f"world_mask is {world_mask!r}; {wanted}")
