@@ -6,14 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
-from stages import SURFACE, TETS, faults
+from stages import SURFACE, TETS, assert_whole, edges_meet_in_pairs, faults
 
 import warp_corot as wc
 from warp_corot.io.colors import VertexAverage, color_index
 from warp_corot.io.formats import load_tets
 from warp_corot.io.skins import BoundSkins
 from warp_corot.io.usd_writer import UsdWriter
-from warp_corot.mesh.surface import signed_volumes
 
 BOX = wc.TetForest.box((2, 1, 1), 0.1, 2)
 VOLUME = 2 * 0.1**3
@@ -71,44 +70,6 @@ def write(path: Path, flush_every=0, close=True, shown=SHOWN, skins=None, **opti
     return writer
 
 
-def edges_meet_in_pairs(triangles):
-    edges = np.concatenate([triangles[:, [i, j]] for i, j in ((0, 1), (1, 2), (2, 0))])
-    ahead, back = {tuple(edge) for edge in edges}, {tuple(edge[::-1]) for edge in edges}
-    return len(ahead) == len(edges) and ahead == back
-
-
-def assert_whole(stage, time, volume=VOLUME):
-    """All lengths fit, all indices name points, and the tetrahedra and the boundary fill the region without a crack."""
-    tets = UsdGeom.TetMesh.Get(stage, TETS)
-    points = np.array(tets.GetPointsAttr().Get(time))
-    indices = np.array(tets.GetTetVertexIndicesAttr().Get(time))
-    primvars = UsdGeom.PrimvarsAPI(tets)
-    rest = np.array(primvars.GetPrimvar("rest").Get(time), float)
-    assert len(points) == len(rest) == len(primvars.GetPrimvar("fixed").Get(time))
-    assert len(points) == len(tets.GetVelocitiesAttr().Get(time))
-    assert len(points) == len(primvars.GetPrimvar("displayColor").GetIndicesAttr().Get(time))
-    for name in ("vonMises", "young"):
-        assert len(indices) == len(primvars.GetPrimvar(name).Get(time))
-    assert indices.min() == 0
-    assert indices.max() == len(points) - 1
-    # Conforming: no overlap, no gap, and faces that meet do so wholly.
-    volumes = signed_volumes(rest, indices)
-    assert volumes.min() > 0.0
-    assert volumes.sum() == pytest.approx(volume, rel=1e-5)
-    faces = np.array(tets.GetSurfaceFaceVertexIndicesAttr().Get(time))
-    assert edges_meet_in_pairs(faces)
-    assert np.linalg.det(rest[faces]).sum() / 6.0 == pytest.approx(volume, rel=1e-5)
-    surface = UsdGeom.Mesh.Get(stage, SURFACE)
-    drawn = np.array(surface.GetPointsAttr().Get(time))
-    triangles = np.array(surface.GetFaceVertexIndicesAttr().Get(time)).reshape(-1, 3)
-    assert surface.ValidateTopology(
-        surface.GetFaceVertexIndicesAttr().Get(time), surface.GetFaceVertexCountsAttr().Get(time), len(drawn)
-    )[0]
-    assert len(drawn) == len(surface.GetVelocitiesAttr().Get(time))
-    np.testing.assert_array_equal(drawn[triangles], points[faces])
-    return points, rest, indices
-
-
 @pytest.mark.parametrize("flush_every", [0, 1, 3], ids=["at once", "a piece a frame", "pieces"])
 @pytest.mark.parametrize("close", [True, False], ids=["joined", "in pieces"])
 def test_every_frame_shows_its_own_mesh(tmp_path, flush_every, close):
@@ -118,7 +79,7 @@ def test_every_frame_shows_its_own_mesh(tmp_path, flush_every, close):
     stage = Usd.Stage.Open(str(path))
     assert stage.GetEndTimeCode() == len(SHOWN) - 1
     for k, mesh in enumerate(SHOWN):
-        points, rest, indices = assert_whole(stage, float(k))
+        points, rest, indices = assert_whole(stage, float(k), VOLUME)
         x, v, stress = state(mesh, k)
         np.testing.assert_array_equal(points, x.astype(np.float32))
         np.testing.assert_array_equal(rest, mesh.points.astype(np.float32))
@@ -172,7 +133,7 @@ def test_points_of_different_meshes_are_never_interpolated(tmp_path, flush_every
     stage = Usd.Stage.Open(str(tmp_path / "a.usd"))
     for k, (mesh, after) in enumerate(itertools.pairwise(SHOWN)):
         for between in (0.25, 0.9):
-            points, rest, _ = assert_whole(stage, k + between)
+            points, rest, _ = assert_whole(stage, k + between, VOLUME)
             np.testing.assert_array_equal(rest, mesh.points.astype(np.float32))
             share = 0.0 if after is not mesh else between
             expected = (1.0 - share) * state(mesh, k)[0] + share * state(mesh, k + 1)[0]

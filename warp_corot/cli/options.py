@@ -8,6 +8,7 @@ from pathlib import Path
 from ..elasticity import MODELS
 from .label_materials import FORM
 from .organs import MAX_LEVEL_FOR_ERROR, TETS
+from .remesh import add_remesh_options
 from .say import EXIT_CODES
 from .subject import STIFFNESS_PER_WEIGHT
 
@@ -26,6 +27,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParse
   warp-corot simulate liver.stl --unit mm --tets 50000 -o liver.usd
   warp-corot simulate scan.nii.gz --labels liver=3kPa:0.45,vessel=30kPa:0.45 -o scan.usd
   warp-corot simulate box --model linear -o beam.usd
+  warp-corot simulate box --remesh --refine-above 1.03 --simplify-below 1.01 -o beam.usd
 
 expressions for --fix:
   names      x y z (rest coordinates [m], after --scale), xmin xmax ymin ymax zmin zmax, pi, all, none
@@ -92,8 +94,11 @@ warp:bear, warp:bunny and box have defaults of their own for body and motion.
     motion.add_argument(
         "--dt",
         type=float,
-        help="time step [s], shortened so that a whole number makes a frame (default: a safe one, found)",
+        help="time step [s], shortened so that a whole number makes a frame (default: a safe one, found; with --remesh "
+        "it follows the mesh)",
     )
+
+    add_remesh_options(parser.add_argument_group("a mesh that follows the motion, of box, surfaces and scans"))
 
     parser.add_argument("--device", help='"cpu", "cuda:0", ... (default: a GPU if there is one)')
     parser.add_argument("--preview", type=Path, metavar="FILE.png", help="also draw the last frame")

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +20,7 @@ from ..elasticity import MODELS, Corotated, Model
 from ..errors import InputError, UnstableError
 from ..materials import Isotropic
 from ..mesh import TetForest
+from ..remesh.online import OnlineRemesh
 from ..selection import select_nodes
 from ..simulation import Simulation
 from ..solvers import SymplecticEuler
@@ -26,6 +28,7 @@ from .compiling import compiling_said
 from .label_materials import label_material
 from .options import add_parser
 from .organs import find_organ, kind_of, refuse_options
+from .remesh import as_remesh_options, remesh_of
 from .say import complain, interrupt_status
 from .subject import Subject, find_subject
 from .summary import pressure, summary
@@ -54,6 +57,7 @@ def run(args: argparse.Namespace) -> int:
     model = _model(args.model, args.rotation_level)
     kind = kind_of(args.input)
     refuse_options(args, kind)
+    remesh = remesh_of(args, kind)
     with compiling_said(device):
         subject = find_subject(args.input, args.scale) if kind == "tets" else find_organ(args, kind)
         if subject.source and args.output.exists() and args.output.samefile(subject.source):
@@ -62,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         count = frame_count(duration, args.fps)
         started = time.perf_counter()
         body, fixed = _make_body(args, subject)
-        sim = _make_simulation(args, subject, body, model)
+        sim = _make_simulation(args, subject, body, model, remesh)
     subject.times["body"] = time.perf_counter() - started
     steps = 1.0 / (args.fps * sim.dt)
     if steps > MANY_STEPS:
@@ -154,22 +158,38 @@ def _material(args: argparse.Namespace, subject: Subject) -> Isotropic:
     return Isotropic(young, poisson, density)
 
 
-def _make_simulation(args: argparse.Namespace, subject: Subject, body: SoftBody, model: Model) -> Simulation:
-    """The simulation with a whole number of steps to a frame, its kernels compiled."""
+def _make_simulation(
+    args: argparse.Namespace, subject: Subject, body: SoftBody, model: Model, remesh: OnlineRemesh | None
+) -> Simulation:
+    """The simulation, its kernels compiled, with a whole number of steps to a frame if their length is to stay."""
     from ..io.animate import steps_per_frame
 
     damping = subject.damping if args.damping is None else args.damping
     gravity = subject.gravity if args.gravity is None else tuple(args.gravity)
     SymplecticEuler(args.dt, damping)  # checks both, the step before it is shortened
-    # At rest and without weight, a safe step loads every kernel and moves nothing.
-    trial = Simulation(body, model=model, integrator=SymplecticEuler(damping=damping), gravity=(0, 0, 0))
-    wanted = trial.dt if args.dt is None else args.dt
-    dt = 1.0 / (args.fps * steps_per_frame(args.fps, wanted))
-    sim = Simulation(body, model=model, integrator=SymplecticEuler(dt, damping), gravity=gravity)
+    wanted = _tried_step(body, model, damping, remesh)
+    step = args.dt if remesh else args.dt or wanted
+    dt = None if step is None else 1.0 / (args.fps * steps_per_frame(args.fps, step))
+    with as_remesh_options():
+        return Simulation(body, model=model, integrator=SymplecticEuler(dt, damping), gravity=gravity, remesh=remesh)
+
+
+def _tried_step(body: SoftBody, model: Model, damping: float, remesh: OnlineRemesh | None) -> float:
+    """A safe step: at rest and without weight it loads every kernel and moves nothing."""
+    tried = body
+    if remesh:
+        # The body's own mesh is not to change before it begins.
+        tried, remesh = SoftBody(body.mesh, body.material, device=body.device), replace(remesh, every=1)
+        tried.fix(body.constrained)
+    integrator = SymplecticEuler(damping=damping)
+    with as_remesh_options():
+        trial = Simulation(tried, model=model, integrator=integrator, gravity=(0, 0, 0), remesh=remesh)
+    dt = trial.dt
     trial.step()
     trial.von_mises()
-    body.displacements = body.velocities = np.zeros_like(body.mesh.points)
-    return sim
+    if tried is body:
+        body.displacements = body.velocities = np.zeros_like(body.mesh.points)
+    return dt
 
 
 @contextmanager
@@ -190,11 +210,11 @@ def _kept(done: Recording) -> str:
 def _draw(path: Path, subject: Subject, sim: Simulation) -> None:
     from ..io.colors import VertexAverage
     from ..io.preview import render_preview
-    from ..io.skins import Skin, boundary_surface
+    from ..io.skins import BoundSkins
     from ..mesh.surface import signed_volumes
 
-    mesh = subject.mesh
-    skin = Skin("surface", subject.surface or boundary_surface(mesh))
+    mesh = sim.body.mesh
+    (skin,) = BoundSkins([mesh], subject.surface, changing=[mesh is not subject.mesh]).on([mesh])
     average = VertexAverage(mesh.tets, np.abs(signed_volumes(mesh.points, mesh.tets)), len(mesh.points))
     render_preview(
         path,

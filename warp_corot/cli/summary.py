@@ -9,10 +9,12 @@ import numpy as np
 
 from ..elasticity import MODELS
 from ..mesh import TetForest
+from .remesh import remesh_rows
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from ..elements import Mesh
     from ..io.animate import Recording
     from ..materials import Isotropic
     from ..simulation import Simulation
@@ -37,13 +39,15 @@ def summary(subject: Subject, sim: Simulation, done: Recording, fixed: str, prev
     at_end = (
         f"{length(done.final_displacement)} at the end ({done.final_displacement / subject.height:.1%} of the height)"
     )
+    at_last = " (at the end)" if sim.remeshing.every else ""
     rows = [
         *_body(subject),
-        *_materials(subject, material),
+        *remesh_rows(sim, done),
+        *_materials(subject, sim.body.mesh, material),
         ("model", model if level is None else f"{model}, rotations of level {level}"),
         ("fixed", fixed),
         ("gravity", f"{' '.join(f'{g:g}' for g in sim.gravity)} m/s^2, damping {damping:g} /s"),
-        ("time step", f"{1e3 * sim.dt:.4g} ms, largest stable one about {1e3 * sim.stable_dt:.4g} ms"),
+        ("time step", f"{_milliseconds(sim.dt)}, largest stable one about {_milliseconds(sim.stable_dt)}{at_last}"),
         ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"),
         ("wall time", f"{done.stepping:.2f} s stepping, {done.writing:.2f} s writing"),
         ("displacement", f"{length(done.largest_displacement)} largest, {at_end}"),
@@ -71,13 +75,13 @@ def _block(name: str, lines: list[str]) -> list[tuple[str, str]]:
     return [(name if first else "", line) for first, line in zip([True] + len(lines) * [False], lines, strict=False)]
 
 
-def _materials(subject: Subject, material: Isotropic) -> list[tuple[str, str]]:
+def _materials(subject: Subject, mesh: Mesh, material: Isotropic) -> list[tuple[str, str]]:
     if not subject.labels:
         return [("material", _values(material.young, material.poisson, material.density))]
-    assert isinstance(subject.mesh, TetForest)
+    assert isinstance(mesh, TetForest)
     lines = []
     for label in subject.labels:
-        of_label = np.flatnonzero(subject.mesh.elements_of(label.name))
+        of_label = np.flatnonzero(mesh.elements_of(label.name))
         if len(of_label):
             one = (getattr(material, name)[of_label[0]] for name in ("young", "poisson", "density"))
             lines.append(f"{label.name}: {_values(*one)}")
@@ -88,6 +92,10 @@ def _materials(subject: Subject, material: Isotropic) -> list[tuple[str, str]]:
 
 def _values(young: float, poisson: float, density: float) -> str:
     return f"E = {pressure(float(young))}, nu = {poisson:g}, rho = {density:g} kg/m^3"
+
+
+def _milliseconds(seconds: float) -> str:
+    return f"{1e3 * seconds:.4g} ms"
 
 
 def length(metres: float) -> str:

@@ -1,0 +1,95 @@
+"""``warp-corot simulate --remesh``: what it says, writes and refuses."""
+
+import os
+import re
+
+import numpy as np
+import pytest
+import trimesh
+from command_line import SHORT, assert_refused, simulate
+from input_files import write_vtk
+from pxr import UsdGeom
+from stages import SURFACE, assert_whole, opened
+
+import warp_corot as wc
+
+BENT = ["--remesh", "--refine-above", 1.03, "--simplify-below", 1.01, "--device", "cpu"]
+
+
+def counts(out):
+    found = re.search(r"remeshing +(\d+) tetrahedra in the first frame, (\d+) at most, (\d+) in the last", out)
+    return [int(number) for number in found.groups()]
+
+
+def test_the_mesh_follows_the_motion(folder, capsys):
+    assert simulate("box", "-o", "a.usd", *BENT, "--duration", 0.5, "--fps", 10, "--preview", "a.png") == 0
+    out, err = capsys.readouterr()
+    assert "warning" not in err
+    first, most, last = counts(out)
+    assert first == 1152 < last <= most
+    assert "every 10 steps, above 1.03, below 1.01, levels 6 to 9" in out
+    assert "(at the end)" in out
+    stage, _ = opened(folder / "a.usd")
+    assert stage.GetEndTimeCode() == 5
+    for k, count in ((0, first), (5, last)):
+        _, _, indices = assert_whole(stage, k, 3 * 0.064**3)
+        assert len(indices) == count
+    assert (folder / "a.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_it_is_what_the_library_simulates(folder):
+    options = ["--remesh-levels", 5, 8, "--remesh-every", 7, "--capacity", 3000]
+    assert simulate("box", "-o", "a.usd", *BENT, *options, "--duration", 0.2, "--fps", 10) == 0
+    mesh = wc.TetForest.box(cells=(1, 1, 3), cell_size=0.064, level=6)
+    body = wc.SoftBody(mesh, wc.Isotropic(500.0, 0.49, 10.0), device="cpu")
+    body.fix(mesh.points[:, 2] < 1e-9)
+    remesh = wc.OnlineRemesh(refine_above=1.03, simplify_below=1.01, min_level=5, max_level=8, every=7, capacity=3000)
+    sim = wc.Simulation(body, integrator=wc.SymplecticEuler(damping=15.0), gravity=(0.0, -9.8, 0.0), remesh=remesh)
+    sim.advance_until(0.1)
+    sim.advance_until(0.2)
+    assert body.element_count != 1152
+    _, tets = opened(folder / "a.usd")
+    np.testing.assert_array_equal(tets.GetPointsAttr().Get(2), body.positions.numpy())
+
+
+def test_a_given_step_stays(folder, capsys):
+    assert simulate("box", "-o", "a.usd", *BENT, "--dt", 1e-4, "--duration", 0.1, "--fps", 10) == 0
+    assert re.search(r"time step +0\.1 ms", capsys.readouterr().out)
+
+
+def test_of_a_surface_the_smooth_one_is_drawn(folder, capsys):
+    mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.05), 0.05, max_level=3)
+    surface = mesh.surface()
+    trimesh.Trimesh(surface.points, surface.triangles).export(folder / "ball.stl")
+    options = ["--unit", "m", "--tets", 500, "--duration", 0.2, "--fps", 20, "--young", 800]
+    assert simulate("ball.stl", "-o", "a.usd", *BENT, *options, "--preview", "a.png") == 0
+    first, most, last = counts(capsys.readouterr().out)
+    assert most > first or last < first
+    stage, _ = opened(folder / "a.usd")
+    drawn = UsdGeom.Mesh.Get(stage, SURFACE)
+    assert drawn.GetFaceVertexIndicesAttr().GetTimeSamples() == []
+    assert len(drawn.GetPointsAttr().Get(4)) == len(drawn.GetPointsAttr().Get(0))
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["warp:bear", "--remesh"], "--remesh is for box, surfaces and scans"),
+        (["good.vtk", "--remesh"], "good.vtk has tetrahedra of its own"),
+        (["box", "--refine-above", 1.1], "--refine-above is for --remesh"),
+        (["box", "--remesh-levels", 1, 2], "--remesh-levels is for --remesh"),
+        (["box", "--remesh", "--refine-above", 1.0], "--simplify-below is 1.08 and --refine-above 1.0"),
+        (["box", "--remesh", "--refine-above", "nan"], "--refine-above nan"),
+        (["box", "--remesh", "--remesh-levels", 5, 4], "--remesh-levels MIN is 5 and --remesh-levels MAX 4"),
+        (["box", "--remesh", "--remesh-levels", 5, 49], "--remesh-levels MAX is 49"),
+        (["box", "--remesh", "--remesh-levels", 5], "expected 2 arguments"),
+        (["box", "--remesh", "--remesh-every", 0], "--remesh-every is 0"),
+        (["box", "--remesh", "--capacity", 0], "--capacity is 0"),
+        (["box", "--remesh", "--capacity", 10], "--capacity is 10; the mesh has 1152 elements"),
+        (["box", "--remesh", "--model", "mass-spring"], "MassSpring"),
+    ],
+)
+def test_what_is_refused(folder, capsys, args, said):
+    write_vtk(folder / "good.vtk", np.eye(4, 3, k=-1) * 0.1, [[0, 1, 2, 3]])
+    assert_refused(folder, capsys, said, *args, "-o", "out.usd", *SHORT)
+    assert "out.usd" not in os.listdir(folder)

@@ -1,0 +1,114 @@
+"""``--remesh``: its options, what they ask for, and what has become of the mesh."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from ..errors import InputError
+from ..remesh.online import OnlineRemesh
+
+if TYPE_CHECKING:
+    from ..io.animate import Recording
+    from ..simulation import Simulation
+
+#: What Python's arguments are called on the command line.
+ARGUMENTS = {
+    "refine_above": "--refine-above",
+    "simplify_below": "--simplify-below",
+    "min_level": "--remesh-levels MIN",
+    "max_level": "--remesh-levels MAX",
+    "every": "--remesh-every",
+    "capacity": "--capacity",
+}
+#: Options that go with ``--remesh`` only.
+OPTIONS = ("refine_above", "simplify_below", "remesh_levels", "remesh_every", "capacity")
+
+
+def add_remesh_options(group: argparse._ArgumentGroup) -> None:
+    """Add the options to a group of the command's."""
+    group.add_argument(
+        "--remesh",
+        action="store_true",
+        help="refine tetrahedra where they are stretched, and merge them again elsewhere",
+    )
+    group.add_argument(
+        "--refine-above",
+        type=float,
+        metavar="X",
+        help=f"length of an element's longest edge over its length at rest (default: {OnlineRemesh.refine_above:g})",
+    )
+    group.add_argument(
+        "--simplify-below", type=float, metavar="X", help=f"the same (default: {OnlineRemesh.simplify_below:g})"
+    )
+    group.add_argument(
+        "--remesh-levels",
+        type=int,
+        nargs=2,
+        metavar=("MIN", "MAX"),
+        help="how often cubes are bisected at least and at most (default: the coarsest level at first, and three more "
+        "than the finest)",
+    )
+    group.add_argument(
+        "--remesh-every", type=int, metavar="N", help=f"steps between looks (default: {OnlineRemesh.every})"
+    )
+    group.add_argument(
+        "--capacity",
+        type=int,
+        metavar="N",
+        help="at most so many tetrahedra (default: four times those at first, or 100000)",
+    )
+
+
+def remesh_of(args: argparse.Namespace, kind: str) -> OnlineRemesh | None:
+    """What the options ask for, None if the mesh stays as it is.
+
+    Args:
+        args: Of the command.
+        kind: What INPUT is: "surface", "scan" or "tets".
+
+    Raises:
+        InputError: An option that is out of its range or of no effect, or a mesh that cannot be remeshed.
+    """
+    if not args.remesh:
+        for name in OPTIONS:
+            if getattr(args, name) is not None:
+                raise InputError(f"--{name.replace('_', '-')} is for --remesh, which is not given")
+        return None
+    if kind == "tets" and args.input != "box":
+        raise InputError(
+            f"--remesh is for box, surfaces and scans, whose meshes are bisected cubes; {args.input} has tetrahedra of "
+            "its own"
+        )
+    asked = {name: getattr(args, name) for name in ("refine_above", "simplify_below", "capacity")}
+    asked |= {"every": args.remesh_every}
+    asked |= dict(zip(("min_level", "max_level"), args.remesh_levels or (None, None), strict=True))
+    with as_remesh_options():
+        return OnlineRemesh(**{name: value for name, value in asked.items() if value is not None})
+
+
+@contextmanager
+def as_remesh_options() -> Iterator[None]:
+    """Complaints name options in place of Python's arguments."""
+    try:
+        yield
+    except InputError as error:
+        text = str(error)
+        for name, option in ARGUMENTS.items():
+            text = re.sub(rf"\b{name}(?= (is )?[-\d])|(?<=and ){name}\b", option, text)
+        raise InputError(text) from None
+
+
+def remesh_rows(sim: Simulation, done: Recording) -> list[tuple[str, str]]:
+    """What has become of the mesh, for the summary; nothing if it stays as it is."""
+    changing = sim.remeshing.changing[0]
+    if changing is None or not done.elements:
+        return []
+    options, first, last = changing.options, done.elements[0], done.elements[-1]
+    limits = f"above {options.refine_above:g}, below {options.simplify_below:g}"
+    levels = f"levels {options.min_level} to {options.max_level}"
+    counts = f"{first} tetrahedra in the first frame, {max(done.elements)} at most, {last} in the last"
+    return [("remeshing", counts), ("", f"every {options.every} steps, {limits}, {levels}")]
