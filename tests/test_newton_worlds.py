@@ -128,3 +128,33 @@ def test_a_replayed_step_says_what_was_wrong(device):
     with pytest.raises(wc.InputError, match="state_in is not finite"):
         solver.check()
     solver.check()
+
+
+def test_nothing_is_allocated_after_the_first_step(device, monkeypatch):
+    """Forests, general tetrahedra, contact, attachments and attributes, substeps and resets."""
+    made = builder()
+    made.add_ground_plane()
+    wn.register_custom_attributes(made)
+    add_grid(made, dims=(2, 1, 1), damp=5.0)
+    wn.add_forest(made, adaptive_forest(2, 0.2), wc.Isotropic(2e4, 0.3, 500.0), pos=(0.0, 0.5, 0.0))
+    body = made.add_link(mass=1.0, inertia=wp.mat33(np.eye(3)))
+    made.add_attachment_particle_body(0, body, stiffness=100.0)
+    model = made.finalize(device=device)
+    solver = wn.SolverCorotated(model, substeps=2)
+    pipeline = newton.CollisionPipeline(model)
+    before, after, control, contacts = model.state(), model.state(), model.control(), pipeline.contacts()
+    pipeline.collide(before, contacts)
+    solver.step(before, after, control, contacts, 1e-4)
+    solver.reset(after)
+    asked = []
+    for allocator in {wp.get_device_allocator(device), wp.get_device_allocator("cpu")}:
+        allocate = allocator.allocate
+        monkeypatch.setattr(
+            allocator, "allocate", lambda size, allocate=allocate: asked.append(size) or allocate(size), raising=True
+        )
+    wp.zeros(1, device=device)
+    assert len(asked) == 1
+    for _ in range(3):
+        solver.step(before, after, control, contacts, 1e-4)
+        solver.reset(after)
+    assert len(asked) == 1
