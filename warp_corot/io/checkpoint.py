@@ -84,7 +84,9 @@ def _pack_body(
     """Put a body into arrays whose names begin with ``prefix``; returns what else there is, for JSON."""
     body.adopt_positions()
     changing = body.changing
-    mesh, material = (body.mesh, body.material) if changing is None else (changing.forest.source, changing._given)
+    mesh, material = body.mesh, body.material
+    if changing is not None:
+        mesh, material = changing.forest.source, changing.carried_material.given
     described = {
         "model": _described(model, MODELS),
         "mesh": _pack_mesh(mesh, prefix, arrays),

@@ -15,10 +15,9 @@ import numpy.typing as npt
 import warp as wp
 
 from ..errors import InputError
-from ..remesh.fields import CARRIED_BY_NODES, CARRIED_BY_TETRAHEDRA, OF_NODES, OF_TETRAHEDRA
 from ..remesh.keyframes import Row
 from ..remesh.online import OnlineRemesh
-from ..remesh.snapshot import Snapshot, _Piece
+from ..remesh.snapshot import Piece, Snapshot, array_of
 
 if TYPE_CHECKING:
     from ..remesh.changing import Changing
@@ -31,59 +30,56 @@ PLAIN = ("refine_above", "simplify_below", "min_level", "max_level", "every", "c
 #: Where criteria are that can be found again by their names.
 CRITERIA = "warp_corot.kernels."
 
-_OF_POOLS = (*OF_NODES, *OF_TETRAHEDRA, "free_pairs", "leaves", "leaf_tets", "void_leaves")
-_CARRIED = (*CARRIED_BY_NODES, *CARRIED_BY_TETRAHEDRA, "impulse")
-
 
 def pack_changing(changing: Changing, prefix: str, arrays: Arrays) -> dict[str, Any]:
     """Put what remeshes a body into arrays whose names begin with ``prefix``; returns what else there is, for JSON."""
     changing.body.adopt_positions()
-    changing._note_conditions()
-    forest, options = changing.forest, changing.options
+    conditions, forest, options = changing.conditions, changing.forest, changing.options
+    conditions.note()
     parameters = options.parameters
     if parameters is not None:
         arrays[prefix + "parameters"] = parameters.numpy()
-    for name, array in changing._conditions.items():
+    for name, array in conditions.kept.items():
         arrays[f"{prefix}conditions.{name}"] = array.numpy()
-    rows = changing._keyframes._rows
+    rows = conditions.keyframes.rows
     for k, row in enumerate(rows):
         arrays[f"{prefix}row{k}.times"], arrays[f"{prefix}row{k}.displacements"] = row.times, row.displacements
     return {
         "options": {name: getattr(options, name) for name in PLAIN},
         "criterion": None if options.criterion is None else _name_of(options.criterion),
         "parameters": parameters is not None,
-        "conditions": sorted(changing._conditions),
+        "conditions": sorted(conditions.kept),
         "rows": len(rows),
-        "between": [[*ends, row] for ends, row in changing._keyframes._between.items()],
+        "between": [[*ends, row] for ends, row in conditions.keyframes.between.items()],
         "loads": changing.body.has_loads,
-        "at_beginning": changing.body.mesh_revision == changing._remembered_revision,
-        "stiffness": changing._found_stiffness,
-        "coarser_for": changing._coarser_for,
-        "initial": _pack_snapshot(forest, forest._remembered, f"{prefix}initial.", arrays),
-        "present": _pack_snapshot(forest, Snapshot(forest), f"{prefix}present.", arrays),
+        "at_beginning": conditions.of_present_mesh,
+        "stiffness": changing.found_stiffness,
+        "coarser_for": changing.coarser_for,
+        "initial": _pack_snapshot(forest.remembered, f"{prefix}initial.", arrays),
+        "present": _pack_snapshot(Snapshot.of(forest), f"{prefix}present.", arrays),
     }
 
 
 def unpack_changing(changing: Changing, described: dict[str, Any], prefix: str, arrays: Arrays) -> None:
     """Have a body that was made as it began be remeshed as it was when ``pack_changing`` kept it."""
-    forest, keyframes, body = changing.forest, changing._keyframes, changing.body
-    _unpack_snapshot(forest, described["initial"], f"{prefix}initial.", arrays)
+    forest, keyframes, body = changing.forest, changing.conditions.keyframes, changing.body
+    _unpacked_snapshot(forest, described["initial"], f"{prefix}initial.", arrays).restore(forest)
     forest.remember()
-    _unpack_snapshot(forest, described["present"], f"{prefix}present.", arrays)
-    carried = forest.carriage.arrays
-    changing._conditions = {
-        name: wp.array(arrays[f"{prefix}conditions.{name}"], dtype=getattr(carried, name).dtype, device=body.device)
-        for name in described["conditions"]
-    }
-    keyframes._rows = [
+    _unpacked_snapshot(forest, described["present"], f"{prefix}present.", arrays).restore(forest)
+    keyframes.rows = [
         Row(arrays[f"{prefix}row{k}.times"], arrays[f"{prefix}row{k}.displacements"]) for k in range(described["rows"])
     ]
-    keyframes._between = {(a, b): row for a, b, row in described["between"]}
-    changing._renew()
+    keyframes.between = {(a, b): row for a, b, row in described["between"]}
+    changing.renew()
+    carried = forest.carriage.arrays
     body.trajectories = keyframes.trajectories(carried.row[: body.node_count].numpy(), body.device)
     body.revision += 1
-    changing._remembered_revision = body.mesh_revision if described["at_beginning"] else -1
-    changing._found_stiffness, changing._coarser_for = described["stiffness"], described["coarser_for"]
+    kept = {
+        name: _on_device(arrays[f"{prefix}conditions.{name}"], getattr(carried, name))
+        for name in described["conditions"]
+    }
+    changing.conditions.set_kept(kept, of_present_mesh=described["at_beginning"])
+    changing.found_stiffness, changing.coarser_for = described["stiffness"], described["coarser_for"]
 
 
 def remesh_options(
@@ -150,31 +146,18 @@ def _criterion(name: str) -> Any:
     return found if isinstance(found, wp.Function) else None
 
 
-def _pack_snapshot(forest: DeviceForest, snapshot: Snapshot, prefix: str, arrays: Arrays) -> list[list[Any]]:
+def _pack_snapshot(snapshot: Snapshot, prefix: str, arrays: Arrays) -> list[list[Any]]:
     """Put a snapshot's values into arrays; returns their names and the places where they start."""
-    names = {id(array): name for name, array in _pool_arrays(forest).items()}
-    arrays[prefix + "counts"] = snapshot._counts
-    pieces = []
-    for piece in snapshot._pieces:
-        name = names[id(piece.array)]
-        arrays[f"{prefix}{name}.{piece.start}"] = piece.values.numpy()
-        pieces.append([name, piece.start])
-    return pieces
+    arrays[prefix + "counts"] = snapshot.counts
+    for name, start, values in snapshot.pieces:
+        arrays[f"{prefix}{name}.{start}"] = values.numpy()
+    return [[name, start] for name, start, _ in snapshot.pieces]
 
 
-def _unpack_snapshot(forest: DeviceForest, pieces: list[list[Any]], prefix: str, arrays: Arrays) -> None:
-    pools, snapshot = _pool_arrays(forest), Snapshot(forest)
-    snapshot._counts = arrays[prefix + "counts"]
-    snapshot._pieces = [
-        _Piece(pools[name], start, _on_device(arrays[f"{prefix}{name}.{start}"], pools[name])) for name, start in pieces
-    ]
-    snapshot.restore(forest)
+def _unpacked_snapshot(forest: DeviceForest, pieces: list[list[Any]], prefix: str, arrays: Arrays) -> Snapshot:
+    made = [Piece(n, start, _on_device(arrays[f"{prefix}{n}.{start}"], array_of(forest, n))) for n, start in pieces]
+    return Snapshot(arrays[prefix + "counts"], tuple(made))
 
 
 def _on_device(values: npt.NDArray[Any], like: wp.array) -> wp.array:
     return wp.array(values, dtype=like.dtype, ndim=like.ndim, device=like.device)
-
-
-def _pool_arrays(forest: DeviceForest) -> dict[str, wp.array]:
-    pools, carried = forest.pools, forest.carriage.arrays
-    return {name: getattr(pools, name) for name in _OF_POOLS} | {name: getattr(carried, name) for name in _CARRIED}

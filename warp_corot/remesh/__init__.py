@@ -27,8 +27,8 @@ may share one.
 In a simulation (``Simulation(…, remesh=OnlineRemesh(…))``, ``Changing``) the body's nodal arrays are those of the
 carriage. After the pass the same recording derives the force plan (``DevicePlan``) and finds the stiffest element. Then
 the host looks once, at a handful of numbers: whether anything has changed, and how large launches must be. Launches go
-through a little more than there is, so that recorded steps need to be recorded anew only when counts leave their bounds:
-what lies beyond is padding, nodes without mass and elements on ``SINKS``, places that never move, whose forces are zero.
+through a little more than there is, so that recorded steps are recorded anew only when counts leave their bounds. What
+lies beyond is padding: nodes without mass, and elements on places that never move, whose forces are zero.
 """
 
 from .passes import RemeshPass

@@ -14,11 +14,11 @@ from ..errors import InputError
 from ..kernels import remesh_survey
 from ..kernels.integrate import set_start
 from ..kernels.remesh_mark import elongation
-from ..kernels.remesh_state import NO_ROW
-from ..materials import Isotropic, Material
+from ..materials import Material
 from ..mesh import TetForest
 from ..mesh.lattice import volume_shares
-from .keyframes import Keyframes
+from .carried_material import CarriedMaterial
+from .conditions import Conditions
 from .online import OnlineRemesh
 from .passes import RemeshPass
 from .plan import DevicePlan
@@ -45,6 +45,11 @@ class Changing:
         options: What was asked for, with numbers everywhere.
         forest: The pools.
         passes: What changes them.
+        carried_material: What elements carry of the material.
+        conditions: What is done to the nodes.
+        found_stiffness: Of the stiffest element when the step was found last [1/s^2], as ``kernels.remesh_survey``
+            has it.
+        coarser_for: Passes for which there have been softer ones only.
         is_full: Whether refinement had to be left out for want of room.
 
     Raises:
@@ -65,19 +70,18 @@ class Changing:
         self.device = body.device
         self.options = options.on(mesh)
         self.is_full = False
-        self._given: Isotropic = body.material
-        values = {}
-        if body.material_stride:
-            values = {"mu": body.mu.numpy(), "lam": body.lam.numpy()}
-        if body.lame[2] and body.fill is not None:
-            values |= {"own_mu": body.lame[0].numpy(), "own_lam": body.lame[1].numpy()}
-        #: Columns of Lamé's parameters of the material itself, not times the filled share; none if it is uniform.
-        self._lame = ("own_mu", "own_lam") if "own_mu" in values else ("mu", "lam") if body.lame[2] else ()
+        self.carried_material = CarriedMaterial(body)
         assert self.options.capacity is not None
         assert self.options.min_level is not None
         assert self.options.max_level is not None
-        density = np.broadcast_to(self._given.density, (1, len(mesh.tets)))[0]
-        self.forest = DeviceForest(mesh, self.options.capacity, density=density, values=values, device=self.device)
+        self.forest = DeviceForest(
+            mesh,
+            self.options.capacity,
+            density=self.carried_material.density(len(mesh.tets)),
+            values=self.carried_material.values,
+            device=self.device,
+        )
+        self.conditions = Conditions(body, self.forest)
         self.passes = RemeshPass(
             self.forest,
             criterion=self.options.criterion or elongation,
@@ -87,13 +91,12 @@ class Changing:
             max_level=self.options.max_level,
             parameters=self.options.parameters,
         )
-        self._keyframes = Keyframes()
-        self._stiffness = self._found_stiffness = 0.0
-        self._coarser_for = 0
+        self._stiffness = self.found_stiffness = 0.0
+        self.coarser_for = 0
         self._survey = wp.zeros(2, dtype=wp.int32, device=self.device)
-        modulus = 0.0 if values else float(2.0 * body.mu.numpy()[0] + body.lam.numpy()[0])
-        columns = [self.forest.carriage.names.index(name) if values else -1 for name in ("mu", "lam")]
-        self._survey_inputs = [modulus, *columns]
+        names = self.forest.carriage.names
+        columns = [names.index(name) if name in names else -1 for name in ("mu", "lam")]
+        self._survey_inputs = [self.carried_material.modulus, *columns]
         self.plan: DevicePlan | None = None
         #: What is looked at after a pass: counts of the pools and of the plan, and the survey.
         self._report: wp.array | None = None
@@ -109,15 +112,7 @@ class Changing:
 
     def material(self) -> Material:
         """The material of the present elements."""
-        leaves, arrays = self.forest.leaf_elements, self.forest.carriage.arrays
-        fill = self.forest.carriage.values("fill")[leaves] if "fill" in self.forest.carriage.names else 1.0
-        density: Any = self._given.density
-        if np.ndim(density):
-            density = arrays.density.numpy()[leaves] / fill
-        if not self._lame:
-            return Isotropic(self._given.young, self._given.poisson, density)
-        mu, lam = (self.forest.carriage.values(name)[leaves].astype(np.float64) for name in self._lame)
-        return Isotropic(mu * (3.0 * lam + 2.0 * mu) / (lam + mu), 0.5 * lam / (lam + mu), density)
+        return self.carried_material.present(self.forest)
 
     def masses(self) -> npt.NDArray[np.float64]:
         """Lumped nodal masses [kg], float64 [N]."""
@@ -135,8 +130,7 @@ class Changing:
         """Make the present mesh and state what ``reset`` goes back to."""
         self.body.adopt_positions()
         self.forest.remember()
-        self._remembered_revision = self.body.mesh_revision
-        self._note_conditions()
+        self.conditions.keep()
 
     # --- passes ----------------------------------------------------------------------------------------------------
 
@@ -147,22 +141,19 @@ class Changing:
         self.plan = DevicePlan(self.forest, level, subtrees=isinstance(field, SubtreeField))
         body = self.body
         body.elements = self.plan.elements
-        if body.material_stride:
-            body.mu, body.lam = (self.plan.values[name] for name in ("mu", "lam"))
-        if self._lame:
-            body.lame = (*(self.plan.values[name] for name in self._lame), 1)
+        self.carried_material.serve(body, self.plan)
         field.follow(self.plan)
         parts = (self.forest.pools.counts, self.plan.class_counts, self._survey)
         self._report_parts = [len(part) for part in parts]
         self._report = wp.zeros(sum(self._report_parts), dtype=wp.int32, device=self.device)
-        self._renew()
-        self._remembered_revision = body.mesh_revision
-        self._found_stiffness = self._stiffness
+        self.renew()
+        self.conditions.keep()
+        self.found_stiffness = self._stiffness
 
     def run(self) -> None:
         """One pass over the mesh, and what follows from it if anything has changed."""
         self.body.adopt_positions()
-        self._note_conditions()
+        self.conditions.note()
         if self.device.is_cuda and not wp.is_conditional_graph_supported():
             self._launch()
         else:
@@ -173,15 +164,22 @@ class Changing:
             wp.capture_launch(self._graph)
         self._look()
 
+    def renew(self) -> None:
+        """Derive everything from the mesh as it is."""
+        assert self.plan is not None
+        self.plan.outdate()
+        self._launch_derived()
+        self._look(anyway=True)
+
     def stiffness_changed(self) -> bool:
         """Whether the stiffest elements are others than when this was last true: stiffer, or softer for some time."""
-        if self._stiffness > 1.001 * self._found_stiffness:
+        if self._stiffness > 1.001 * self.found_stiffness:
             changed = True
         else:
-            self._coarser_for = self._coarser_for + 1 if self._stiffness < 0.999 * self._found_stiffness else 0
-            changed = self._coarser_for > PATIENCE
+            self.coarser_for = self.coarser_for + 1 if self._stiffness < 0.999 * self.found_stiffness else 0
+            changed = self.coarser_for > PATIENCE
         if changed:
-            self._found_stiffness, self._coarser_for = self._stiffness, 0
+            self.found_stiffness, self.coarser_for = self._stiffness, 0
         return changed
 
     def reset(self, chosen: wp.array, clock: wp.array) -> None:
@@ -191,19 +189,12 @@ class Changing:
         """
         if not chosen.numpy()[0]:
             return
-        self._note_conditions()
+        self.conditions.note()
         self.forest.restart()
-        arrays = self.forest.carriage.arrays
-        for name, kept in self._conditions.items():
-            if name != "v":
-                wp.copy(getattr(arrays, name), kept, count=len(kept))
-        velocities, held = arrays.v[: len(kept)].numpy().copy(), self._conditions["held"].numpy() != 0
-        velocities[held] = self._conditions["v"].numpy()[held]
-        arrays.v[: len(kept)].assign(velocities)
-        arrays.reaction.zero_()
+        self.conditions.put_back()
         wp.launch(set_start, dim=1, inputs=[clock], outputs=[self.body.world_starts], device=self.device)
-        self._renew()
-        self._remembered_revision = self.body.mesh_revision
+        self.renew()
+        self.conditions.keep()
         self.body.update_inverse_mass()
 
     # --- pieces ----------------------------------------------------------------------------------------------------
@@ -251,13 +242,6 @@ class Changing:
             wp.copy(self._report, part, dest_offset=start)
             start += len(part)
 
-    def _renew(self) -> None:
-        """Derive everything from the mesh as it is."""
-        assert self.plan is not None
-        self.plan.outdate()
-        self._launch_derived()
-        self._look(anyway=True)
-
     def _look(self, *, anyway: bool = False) -> None:
         """The one look at what the device has done: if the mesh is another one, body and field go through that."""
         assert self.plan is not None
@@ -280,38 +264,9 @@ class Changing:
         self._stiffness = float(bits.view(np.float32))
         body.smallest_volume = float(volume_shares(finest)) * self.forest.source.cell_size**3
         body.publish_positions()
-        self._follow_keyframes()
+        self.conditions.follow()
         for binding in body.bindings:
             binding.rebind(self.forest.pools)
-
-    def _note_conditions(self) -> None:
-        """Take over what nodes follow; keep loads and held nodes for ``reset`` while its mesh is the present one."""
-        self._take_trajectories()
-        if self.body.mesh_revision == self._remembered_revision:
-            arrays, count = self.forest.carriage.arrays, self.body.node_count
-            self._conditions = {name: wp.clone(getattr(arrays, name)[:count]) for name in ("held", "load", "row", "v")}
-
-    def _take_trajectories(self) -> None:
-        """Tell the device which keyframes nodes follow, if the user has changed them."""
-        body = self.body
-        if not self._keyframes.are(body.trajectories):
-            rows = self._keyframes.adopt(body.trajectories, body.node_count)
-            self.forest.carriage.arrays.row[: len(rows)].assign(rows)
-
-    def _follow_keyframes(self) -> None:
-        """Tell the host which nodes follow keyframes, new ones among them."""
-        body, arrays = self.body, self.forest.carriage.arrays
-        if not body.trajectories:
-            return
-        rows = self._of_nodes(arrays.row)
-        if (rows < NO_ROW).any():
-            ends = self.forest.pools.ends[: len(rows)].numpy()
-            rows = self._keyframes.settle(rows, ends, self._of_nodes(arrays.u)[:, :3])
-            arrays.row[: len(rows)].assign(rows)
-        found = self._keyframes.trajectories(rows, self.device)
-        if found is not body.trajectories:
-            body.trajectories = found
-            body.revision += 1
 
     def _keep_initial_state(self, initial: tuple[wp.array, wp.array] | None) -> None:
         """Let ``reset`` go back to rest on the present mesh, or to the initial state that the body has."""

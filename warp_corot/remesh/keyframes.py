@@ -26,11 +26,16 @@ class Row:
 
 
 class Keyframes:
-    """The rows of keyframes that nodes follow; ``Carried.row`` has each node's number."""
+    """The rows of keyframes that nodes follow; ``Carried.row`` has each node's number.
+
+    Attributes:
+        rows: The rows.
+        between: Which row is the mean of two others.
+    """
 
     def __init__(self) -> None:
-        self._rows: list[Row] = []
-        self._between: dict[tuple[int, int], int] = {}
+        self.rows: list[Row] = []
+        self.between: dict[tuple[int, int], int] = {}
         self._trajectories: list[Trajectory] = []
 
     def are(self, trajectories: Sequence[Trajectory]) -> bool:
@@ -44,12 +49,12 @@ class Keyframes:
         found = np.full(node_count, int(NO_ROW), np.int32)
         for trajectory in trajectories:
             times, displacements = trajectory.keys()
-            first, nodes = len(self._rows), trajectory.nodes.numpy()
+            first, nodes = len(self.rows), trajectory.nodes.numpy()
             if displacements.ndim == 2:
-                self._rows.append(Row(times, displacements))
+                self.rows.append(Row(times, displacements))
                 found[nodes] = first
             else:
-                self._rows += [Row(times, column) for column in np.moveaxis(displacements, 1, 0)]
+                self.rows += [Row(times, column) for column in np.moveaxis(displacements, 1, 0)]
                 found[nodes] = first + np.arange(len(nodes))
         self._trajectories = list(trajectories)
         return found
@@ -79,14 +84,14 @@ class Keyframes:
         of_times: dict[bytes, list[int]] = {}
         nodes = np.flatnonzero(rows >= 0)
         for row in np.unique(rows[nodes]):
-            of_times.setdefault(self._rows[row].times.tobytes(), []).append(int(row))
+            of_times.setdefault(self.rows[row].times.tobytes(), []).append(int(row))
         for same_times in of_times.values():
             own = nodes[np.isin(rows[nodes], same_times)]
-            times = self._rows[same_times[0]].times
+            times = self.rows[same_times[0]].times
             if len(same_times) == 1:
-                displacements = self._rows[same_times[0]].displacements
+                displacements = self.rows[same_times[0]].displacements
             else:
-                displacements = np.stack([self._rows[row].displacements for row in rows[own]], axis=1)
+                displacements = np.stack([self.rows[row].displacements for row in rows[own]], axis=1)
             made.append(Trajectory.of_keys(own, times, displacements, device))
         if not _alike(made, self._trajectories):
             self._trajectories = made
@@ -96,16 +101,16 @@ class Keyframes:
         self, ends: npt.NDArray[np.int32], rows: npt.NDArray[np.int32], displacements: npt.NDArray[np.floating]
     ) -> int:
         a, b = sorted(int(row) for row in rows[ends])
-        if a >= 0 and (a, b) in self._between:
-            return self._between[a, b]
-        followed = [self._rows[row] for row in (a, b) if row >= 0]
+        if a >= 0 and (a, b) in self.between:
+            return self.between[a, b]
+        followed = [self.rows[row] for row in (a, b) if row >= 0]
         times = np.unique(np.concatenate([row.times for row in followed]))
         stays = [np.tile(displacements[end], (len(times), 1)) for end in ends if rows[end] < 0]
         mean = np.mean([row.at(times) for row in followed] + stays, axis=0)
-        self._rows.append(Row(times, mean))
+        self.rows.append(Row(times, mean))
         if a >= 0:
-            self._between[a, b] = len(self._rows) - 1
-        return len(self._rows) - 1
+            self.between[a, b] = len(self.rows) - 1
+        return len(self.rows) - 1
 
 
 def _alike(ones: Sequence[Trajectory], others: Sequence[Trajectory]) -> bool:

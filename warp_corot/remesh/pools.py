@@ -72,6 +72,7 @@ class DeviceForest:
         carriage: What nodes and tetrahedra carry.
         source: The forest that this began as.
         capacity, node_capacity, tree_capacity: Places for leaves, nodes, and tetrahedra of all levels.
+        remembered: What ``restart`` goes back to.
         virtual_count: Nodes that only void tetrahedra name.
         threads: Threads of a launch.
 
@@ -194,11 +195,11 @@ class DeviceForest:
 
     def remember(self) -> None:
         """Keep the present mesh and all that it carries, for ``restart``; it is done once when this is made."""
-        self._remembered = Snapshot(self)
+        self.remembered = Snapshot.of(self)
 
     def restart(self) -> None:
         """Go back to what was kept last. Arrays stay the same, so that recorded passes and steps stay valid."""
-        self._remembered.restore(self)
+        self.remembered.restore(self)
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 

@@ -1,0 +1,92 @@
+"""What is done to the nodes of a changing mesh: which are held and loaded, and which keyframes they follow."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy.typing as npt
+import warp as wp
+
+from ..kernels.remesh_state import NO_ROW
+from .keyframes import Keyframes
+from .pools import DeviceForest
+
+if TYPE_CHECKING:
+    from ..body import SoftBody
+
+
+class Conditions:
+    """Held nodes, loads and keyframes, handed between body and pools.
+
+    Args:
+        body: The body.
+        forest: Its pools.
+
+    Attributes:
+        keyframes: What nodes follow.
+        kept: Held nodes, loads, rows and velocities as ``put_back`` writes them.
+    """
+
+    def __init__(self, body: SoftBody, forest: DeviceForest):
+        self._body = body
+        self._forest = forest
+        self.keyframes = Keyframes()
+        self._revision = -1
+        self.kept: dict[str, wp.array] = {}
+
+    @property
+    def of_present_mesh(self) -> bool:
+        """Whether what is kept is that of the present mesh."""
+        return self._body.mesh_revision == self._revision
+
+    def keep(self) -> None:
+        """From now on, what this mesh has last is what ``put_back`` writes."""
+        self._revision = self._body.mesh_revision
+        self.note()
+
+    def set_kept(self, kept: dict[str, wp.array], *, of_present_mesh: bool) -> None:
+        """Write this from now on, of the present mesh or of another."""
+        self.kept = kept
+        self._revision = self._body.mesh_revision if of_present_mesh else -1
+
+    def note(self) -> None:
+        """Take over what the user has done; to be called before the mesh changes."""
+        self._take_trajectories()
+        if self.of_present_mesh:
+            arrays, count = self._forest.carriage.arrays, self._body.node_count
+            self.kept = {name: wp.clone(getattr(arrays, name)[:count]) for name in ("held", "load", "row", "v")}
+
+    def put_back(self) -> None:
+        """Write what was kept into the mesh for which it was."""
+        arrays, count = self._forest.carriage.arrays, len(self.kept["held"])
+        for name in ("held", "load", "row"):
+            wp.copy(getattr(arrays, name), self.kept[name], count=count)
+        velocities, held = arrays.v[:count].numpy().copy(), self.kept["held"].numpy() != 0
+        velocities[held] = self.kept["v"].numpy()[held]
+        arrays.v[:count].assign(velocities)
+        arrays.reaction.zero_()
+
+    def follow(self) -> None:
+        """Tell the host which nodes follow keyframes after a pass, new ones among them."""
+        body, arrays = self._body, self._forest.carriage.arrays
+        if not body.trajectories:
+            return
+        rows = self._of_nodes(arrays.row)
+        if (rows < NO_ROW).any():
+            ends = self._forest.pools.ends[: len(rows)].numpy()
+            rows = self.keyframes.settle(rows, ends, self._of_nodes(arrays.u)[:, :3])
+            arrays.row[: len(rows)].assign(rows)
+        found = self.keyframes.trajectories(rows, body.device)
+        if found is not body.trajectories:
+            body.trajectories = found
+            body.revision += 1
+
+    def _take_trajectories(self) -> None:
+        """Tell the device which keyframes nodes follow, if the user has changed them."""
+        body = self._body
+        if not self.keyframes.are(body.trajectories):
+            rows = self.keyframes.adopt(body.trajectories, body.node_count)
+            self._forest.carriage.arrays.row[: len(rows)].assign(rows)
+
+    def _of_nodes(self, array: wp.array) -> npt.NDArray[Any]:
+        return array[: self._body.node_count].numpy().copy()
