@@ -10,15 +10,15 @@ from pxr import Usd, UsdGeom
 
 #: What makes an example short enough for a test.
 SHORT = {"sweep": ["--beams", "8"]}
-#: Packages that examples take their data from; large, and so no part of what the tests install.
-DATA = {"brain": "nilearn", "frog": "pyvista"}
+#: Packages that examples need, large, and so no part of what the tests install.
+NEEDS = {"brain": "nilearn", "frog": "pyvista", "with_jax": "jax", "with_pytorch": "torch"}
 EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("*.py"))
 
 
 @pytest.mark.parametrize("script", EXAMPLES, ids=lambda script: script.stem)
 def test_example(script, device, tmp_path, monkeypatch, capsys):
-    if script.stem in DATA:
-        pytest.importorskip(DATA[script.stem])
+    if script.stem in NEEDS:
+        pytest.importorskip(NEEDS[script.stem])
     output = tmp_path / "out.usd"
     options = ["--device", device, "-o", str(output), "--duration", "0.25", *SHORT.get(script.stem, [])]
     monkeypatch.setattr(sys, "argv", [str(script), *options])
