@@ -161,8 +161,8 @@ class Simulation:
         """Advance by one time step.
 
         Inside somebody else's capture on this device the step's launches are recorded, nothing else: no hooks are
-        called and nothing is checked. On CUDA the call does not wait for the device unless hooks are set or a body is
-        due to be remeshed.
+        called and nothing is checked. On CUDA the call does not wait for the device unless hooks are set or bodies are
+        remeshed.
 
         Raises:
             InputError: Somebody is capturing, and there are bodies to be remeshed.
@@ -174,9 +174,10 @@ class Simulation:
             self._recorded.launch(1, whole=True)
             return
         self._recorded.replay(1, whole=True)
-        if self.device.is_cpu or self._hooks or self.remeshing.is_due(self.steps):
+        if self.device.is_cpu or self._hooks or self.remeshing.every:
             self._check_finite()
-            self._remesh()
+            if self.remeshing.every:
+                self._remesh()
             self._call_hooks()
 
     def advance(self, seconds: float) -> None:
@@ -212,7 +213,9 @@ class Simulation:
         end = self.total_steps + count
         done, left = self.steps, count
         while left > 0:
-            rests = [h.every for h in self._hooks] + [every for every in [self.remeshing.every] if every]
+            rests = [hook.every for hook in self._hooks]
+            if self.remeshing.every:
+                rests.append(self.remeshing.every)
             due = min([done + left, done + self._check_steps, *((done // every + 1) * every for every in rests)])
             started = time.perf_counter()
             self._recorded.replay_runs(due - done)
@@ -313,19 +316,27 @@ class Simulation:
         save_checkpoint(self, path)
 
     @classmethod
-    def load(cls, path: str | PathLike[str], *, device: str | wp.Device | None = None) -> Simulation:
+    def load(
+        cls,
+        path: str | PathLike[str],
+        *,
+        device: str | wp.Device | None = None,
+        remesh: OnlineRemesh | Sequence[OnlineRemesh | None] | None = None,
+    ) -> Simulation:
         """Go on from a saved simulation; on the CPU bit by bit as if it had never stopped.
 
         Args:
             path: A file that ``save`` wrote.
             device: Where to go on; None: where it was saved.
+            remesh: In place of what was saved, which does not hold a criterion of your own.
 
         Raises:
-            InputError: No such file, not a checkpoint, one of a newer version, or no such device.
+            InputError: No such file, not a checkpoint, one of a newer version, no such device, or a criterion that is
+                missing.
         """
         from .io.checkpoint import load_checkpoint
 
-        return load_checkpoint(path, device)
+        return load_checkpoint(path, device, remesh)
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
@@ -391,7 +402,8 @@ class Simulation:
         more = f" and {len(bad) - 3} more" if len(bad) > 3 else ""
         where = f" in world {', '.join(map(str, bad[:3]))}{more}" if self.worlds > 1 else ""
         hint = f"dt is {self.dt:.3g} s, the largest stable step at rest about {self.stable_dt:.3g} s"
-        raise UnstableError(f"the state is not finite since step {step} (t = {step * self.dt:.4g} s){where}; {hint}")
+        when = f"step {step} (t = {(step - self._epoch) * self.dt:.4g} s)"
+        raise UnstableError(f"the state is not finite since {when}{where}; {hint}")
 
     def _bad_worlds(self) -> npt.NDArray[np.intp]:
         """The worlds in which something is not finite, as ``kernels.integrate.is_finite`` has it."""
