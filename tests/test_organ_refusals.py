@@ -43,7 +43,7 @@ REFUSED = [
     (["box", "--unit", "mm"], "--unit is for surfaces and scans, and box is not one; say --scale"),
     (["warp:bear", "--tets", "1000"], "--tets is for surfaces and scans"),
     (["box", "--draw-tets"], "--draw-tets is for surfaces and scans"),
-    (["organ.obj", "--tets", "0"], "--tets is 0; it must be a positive whole number"),
+    (["organ.obj", "--tets", "0"], "--tets is 0; it must be a whole number, at least 1"),
     (["organ.obj", "--tets", "1"], "error: --tets is 1; at the coarsest"),
     (["organ.obj", "--tets", "many"], "argument --tets: invalid int value: 'many'"),
     (["organ.obj", "--cell-size", "0"], "--cell-size is 0.0; it must be a positive length"),
