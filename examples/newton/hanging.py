@@ -20,7 +20,7 @@ class Example:
         material = wc.Isotropic(young=1e6, poisson=0.25, density=1000.0)
         builder = newton.ModelBuilder()
         builder.add_ground_plane()
-        for k, k_damp in enumerate((1e3, 3e2, 1e2)):
+        for k, k_damp in enumerate((3e3, 1e3, 3e2)):
             builder.add_soft_grid(
                 pos=wp.vec3(0.0, k * SPACING, 1.0),
                 rot=wp.quat_identity(),
@@ -43,7 +43,7 @@ class Example:
         pos = (0.0, 3 * SPACING, 1.0)
         wn.add_forest(builder, forest, material, pos=pos, k_damp=1e2, fixed=held, particle_radius=0.02)
         self.model = builder.finalize()
-        self.solver = wn.SolverCorotated(self.model)
+        self.solver = wn.SolverCorotated(self.model, damping=4.0)  # 1/s, so that all come to rest
         self.substeps = 2 * int(np.ceil(self.frame_dt / (1.4 * self.solver.stable_dt)))
 
         self.state_0, self.state_1 = self.model.state(), self.model.state()
@@ -77,8 +77,8 @@ class Example:
         beam = np.round(self.model.particle_q.numpy()[:, 1] // SPACING).astype(int)
         sag = [float(x[beam == k, 2].min()) for k in range(4)]
         assert all(-0.6 < tip < -0.05 for tip in sag), sag
-        # The last one is as heavy as its volume; ``add_soft_grid`` gives every particle a whole cell's mass.
-        assert abs(sag[3]) < abs(sag[2]), sag
+        if self.sim_time > 2.9:
+            assert np.abs(self.state_0.particle_qd.numpy()).max() < 0.02
 
 
 if __name__ == "__main__":
