@@ -8,7 +8,8 @@ do that is left out. A particle that touches several shapes is still slowed down
 import warp as wp
 
 from .elements import add_force, load_node
-from .newton_particles import ACTIVE, SURFACE_CONTACTS, place_of
+from .newton_particles import ACTIVE
+from .newton_worlds import SURFACE_CONTACTS, place_of
 
 wp.set_module_options({"enable_backward": False})
 

@@ -7,7 +7,7 @@ import warp as wp
 
 from ..errors import InputError
 from ..kernels.newton_contacts import ContactLaw, scatter_attachments, scatter_soft_contacts
-from ..kernels.newton_particles import check_contact_count
+from ..kernels.newton_worlds import check_contact_count
 from .library import newton
 
 

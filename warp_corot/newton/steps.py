@@ -7,6 +7,7 @@ import warp as wp
 
 from ..errors import InputError, UnstableError
 from ..kernels import newton_particles as kernels
+from ..kernels import newton_worlds as worlds
 from ..kernels.newton_contacts import add_wrenches
 from .contact import Contacts
 from .library import newton
@@ -32,9 +33,9 @@ class Steps:
         self._x, self._v, self._f = (wp.zeros(p, dtype=wp.vec4, device=self.device) for _ in range(3))
         self._places = max(int(model.world_count), 1) + 1
         self._trouble = wp.zeros(self._places, dtype=wp.int32, device=self.device)
-        self._report = wp.zeros(kernels.REPORTS, dtype=wp.int32, device=self.device)
+        self._report = wp.zeros(worlds.REPORTS, dtype=wp.int32, device=self.device)
         #: What the host can look at without waiting.
-        self._seen = wp.zeros(kernels.REPORTS, dtype=wp.int32, device="cpu", pinned=self.device.is_cuda)
+        self._seen = wp.zeros(worlds.REPORTS, dtype=wp.int32, device="cpu", pinned=self.device.is_cuda)
         self._kept_particles = [wp.empty(p if others.has_particles else 0, dtype=wp.vec3, device=self.device)] * 2
         if others.has_particles:
             self._kept_particles = [wp.empty(p, dtype=wp.vec3, device=self.device) for _ in range(2)]
@@ -69,7 +70,7 @@ class Steps:
             if self.tetrahedra.warm or number == count - 1:
                 self.tetrahedra.write_attributes(state_out, now)
             inputs = [self._trouble]
-            self._launch(kernels.report_trouble, self._places, inputs, [self._report])
+            self._launch(worlds.report_trouble, self._places, inputs, [self._report])
             now = state_out
         if self.device.is_cuda:
             wp.copy(self._seen, self._report)
@@ -89,14 +90,14 @@ class Steps:
         worst = int(np.flatnonzero(report)[-1])
         world = int(report[worst]) - 1
         where = f" in world {world}" if self.model.world_count > 1 and world < self.model.world_count else ""
-        if worst == int(kernels.BAD_INPUT):
+        if worst == int(worlds.BAD_INPUT):
             raise InputError(f"state_in is not finite{where}; state_out there was left as it was")
-        if worst == int(kernels.SURFACE_CONTACTS):
+        if worst == int(worlds.SURFACE_CONTACTS):
             raise InputError(
                 "contacts hold contacts of edges and faces (enable_rigid_soft_full_surface_contact=True), which "
                 "SolverCorotated does not take: make the CollisionPipeline without it; no step was made"
             )
-        if worst == int(kernels.TOO_MANY_CONTACTS):
+        if worst == int(worlds.TOO_MANY_CONTACTS):
             raise InputError(
                 "there are more soft contacts than contacts.soft_contact_max: make the CollisionPipeline with a "
                 "larger soft_contact_max; no step was made"
@@ -110,15 +111,15 @@ class Steps:
             wanted = [int(bool(flags & bit)) for bit in (bits.PARTICLE_Q, bits.PARTICLE_QD)]
             inputs = [mask, model.particle_world, *wanted, model.particle_q, model.particle_qd]
             outputs = [state.particle_q, state.particle_qd]
-            self._launch(kernels.reset_particles, model.particle_count, inputs, outputs)
+            self._launch(worlds.reset_particles, model.particle_count, inputs, outputs)
             rotations = attribute_of(state, "rotation")
             if rotations is not None:
                 inputs = [mask, model.particle_world, self.tetrahedra.elements.nodes]
-                self._launch(kernels.reset_rotations, model.tet_count, inputs, [rotations])
+                self._launch(worlds.reset_rotations, model.tet_count, inputs, [rotations])
         if self.others.has_bodies and flags & (bits.BODY_Q | bits.BODY_QD):
             wanted = [int(bool(flags & bit)) for bit in (bits.BODY_Q, bits.BODY_QD)]
             inputs = [mask, model.body_world, *wanted, model.body_q, model.body_qd]
-            self._launch(kernels.reset_bodies, model.body_count, inputs, [state.body_q, state.body_qd])
+            self._launch(worlds.reset_bodies, model.body_count, inputs, [state.body_q, state.body_qd])
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
@@ -135,8 +136,8 @@ class Steps:
         outputs = [self._x, self._v, self._f, self._trouble]
         self._launch(kernels.gather_particles, model.particle_count, inputs, outputs)
         if model.body_count:
-            inputs = [now.body_q, now.body_qd, model.body_world, int(kernels.BAD_INPUT)]
-            self._launch(kernels.check_bodies, model.body_count, inputs, [self._trouble])
+            inputs = [now.body_q, now.body_qd, model.body_world, int(worlds.BAD_INPUT)]
+            self._launch(worlds.check_bodies, model.body_count, inputs, [self._trouble])
         self.contacts.check_count(contacts, self._trouble)
         rotations = attribute_of(now, "rotation")
         self.tetrahedra.add_forces(self._x, self._f, rotations)
@@ -152,7 +153,7 @@ class Steps:
         dt: float,
     ) -> None:
         model, others = self.model, self.others
-        worlds = model.particle_world
+        particle_world = model.particle_world
         if others.has_bodies:
             for kept, array in zip(self._bodies_before, (now.body_q, now.body_qd), strict=True):
                 wp.copy(kept, array)
@@ -164,26 +165,26 @@ class Steps:
             self._launch(kernels.unpad, model.particle_count, [self._f], [others.particle_forces])
         else:
             inputs = [dt, self.damping, model.particle_max_velocity, model.gravity, model.particle_inv_mass]
-            inputs += [model.particle_flags, worlds, self._f, self._x, self._v]
+            inputs += [model.particle_flags, particle_world, self._f, self._x, self._v]
             self._launch(kernels.step_velocities, model.particle_count, inputs, [self._trouble])
         if others.has_bodies or others.has_particles:
             others.step(now, out, control, contacts, dt, self._body_f if others.has_bodies else now.body_f)
         if others.has_bodies:
-            inputs = [out.body_q, out.body_qd, model.body_world, int(kernels.UNSTABLE)]
-            self._launch(kernels.check_bodies, model.body_count, inputs, [self._trouble])
+            inputs = [out.body_q, out.body_qd, model.body_world, int(worlds.UNSTABLE)]
+            self._launch(worlds.check_bodies, model.body_count, inputs, [self._trouble])
         if others.has_particles:
-            inputs = [out.particle_q, out.particle_qd, worlds]
-            self._launch(kernels.check_particles, model.particle_count, inputs, [self._trouble])
-            inputs = [worlds, self._trouble, self._x, self._v, *self._kept_particles]
+            inputs = [out.particle_q, out.particle_qd, particle_world]
+            self._launch(worlds.check_particles, model.particle_count, inputs, [self._trouble])
+            inputs = [particle_world, self._trouble, self._x, self._v, *self._kept_particles]
             outputs = [out.particle_q, out.particle_qd]
-            self._launch(kernels.put_back_particles, model.particle_count, inputs, outputs)
+            self._launch(worlds.put_back_particles, model.particle_count, inputs, outputs)
         else:
-            inputs = [dt, model.particle_flags, worlds, self._trouble, now.particle_q, now.particle_qd, self._v]
+            inputs = [dt, model.particle_flags, particle_world, self._trouble, now.particle_q, now.particle_qd, self._v]
             outputs = [out.particle_q, out.particle_qd]
             self._launch(kernels.move_particles, model.particle_count, inputs, outputs)
         if others.has_bodies:
             inputs = [model.body_world, self._trouble, *self._bodies_before, *self._kept_bodies]
-            self._launch(kernels.put_back_bodies, model.body_count, inputs, [out.body_q, out.body_qd])
+            self._launch(worlds.put_back_bodies, model.body_count, inputs, [out.body_q, out.body_qd])
 
     def _add_wrenches(self, share: float, target: wp.array) -> None:
         self._launch(add_wrenches, self.model.body_count, [share, self.contacts.reactions], [target])
