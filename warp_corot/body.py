@@ -63,11 +63,11 @@ class SoftBody(Controls, SharedArrays):
     """
 
     def __init__(self, mesh: Mesh, material: Material, *, worlds: int = 1, device: str | wp.Device | None = None):
-        #: What remeshes the body, if anything does; then the present mesh and what is known of it on the host are
-        #: looked up when they are asked for.
+        #: What remeshes the body, if anything does.
         self.changing: Changing | None = None
-        self._mesh: Mesh | None = mesh
-        self._material: Any = material.at(centroids(mesh)) if material.functions else material
+        #: What the host knows of the present mesh, by the names of properties.
+        self._known: dict[str, Any] = {"mesh": mesh}
+        self._known["material"] = material.at(centroids(mesh)) if material.functions else material
         self.worlds = checked_count(worlds, "worlds", least=1)
         self.device = checked_device(device)
         self.world_node_count, self.world_element_count = len(mesh.points), len(mesh.tets)
@@ -86,8 +86,8 @@ class SoftBody(Controls, SharedArrays):
         #: Lamé's parameters [Pa] and their stride, 0 or 1; then the same times the filled share, for the forces.
         self.lame = self._lame_arrays(isotropic, None)
         self.mu, self.lam, self.material_stride = self._lame_arrays(isotropic, self.fill)
-        self._masses: npt.NDArray[np.float64] | None = lumped_masses(mesh, self.material, self.worlds)
-        check_float32(self._masses[self._masses > 0], "the mass of a node", "kg")
+        self._known["masses"] = masses = lumped_masses(mesh, self.material, self.worlds)
+        check_float32(masses[masses > 0], "the mass of a node", "kg")
 
         n = self.node_count
         #: How many of the nodes and elements launches go through; those beyond the counts do nothing.
@@ -110,7 +110,7 @@ class SoftBody(Controls, SharedArrays):
         self.world_starts = wp.zeros(self.worlds, dtype=wp.float64, device=self.device)
         #: Changes whenever the launches of a step do, so that recorded steps can be recorded anew.
         self.revision = 0
-        self._held: npt.NDArray[np.bool_] | None = np.zeros(n, bool)
+        self._known["held"] = np.zeros(n, bool)
         self._views = Views()
         #: Points that go along with the body.
         self.bindings: list[FollowingBinding] = []
@@ -125,35 +125,29 @@ class SoftBody(Controls, SharedArrays):
     @property
     def mesh(self) -> Mesh:
         """The mesh; of a body that is remeshed the present one."""
-        if self._mesh is None:
-            assert self.changing is not None
-            self._mesh = self.changing.mesh()
-        return self._mesh
+        return self._look_up("mesh")
 
     @property
     def material(self) -> Any:
         """The material as given, with values in place of functions; of a body that is remeshed that of the present
         elements."""
-        if self._material is None:
-            assert self.changing is not None
-            self._material = self.changing.material()
-        return self._material
+        return self._look_up("material")
 
     @property
     def masses(self) -> npt.NDArray[np.float64]:
         """Lumped nodal masses [kg], float64 [worlds * N]; zero at nodes that no element names."""
-        if self._masses is None:
-            assert self.changing is not None
-            self._masses = self.changing.masses()
-        return self._masses
+        return self._look_up("masses")
 
     @property
     def held(self) -> npt.NDArray[np.bool_]:
         """Which nodes are fixed or prescribed, bool [worlds * N], as the host keeps it; ``constrained`` is a copy."""
-        if self._held is None:
-            assert self.changing is not None
-            self._held = self.changing.held()
-        return self._held
+        return self._look_up("held")
+
+    def _look_up(self, what: str) -> Any:
+        """What the host knows, asked of the device first if that has changed the mesh."""
+        if what not in self._known:
+            self._known[what] = getattr(self.changing, what)()
+        return self._known[what]
 
     def update_inverse_mass(self) -> None:
         super().update_inverse_mass()
@@ -168,7 +162,7 @@ class SoftBody(Controls, SharedArrays):
         """
         self.world_node_count, self.world_element_count = nodes, elements
         self.mesh_revision += 1
-        self._mesh = self._material = self._masses = self._held = None
+        self._known.clear()
         self._views.expire()
 
     # --- state -----------------------------------------------------------------------------------------------------
