@@ -1,0 +1,72 @@
+"""Steps of a body that is remeshed go on as those of a body on a mesh made that way."""
+
+import numpy as np
+import pytest
+from remeshed import near, twin
+
+import warp_corot as wc
+
+MODELS = [
+    wc.Corotated(),
+    wc.Corotated(rotation_level=4),
+    wc.Corotated(subtrees=False),
+    wc.Linear(),
+    wc.StVenantKirchhoff(),
+    wc.NeoHookean(),
+    wc.EdgeStVK(),
+]
+
+
+@pytest.mark.parametrize("model", MODELS, ids=repr)
+@pytest.mark.parametrize("varied", [False, True], ids=["uniform", "varied"])
+def test_steps_go_on_as_on_a_mesh_made_that_way(model, varied, device):
+    mesh = wc.TetForest.box((4, 1, 1), 0.05, 6)
+    young = (lambda x: 2e4 + 4e5 * x[:, 0]) if varied else 3e4
+    density = (lambda x: 900.0 + 2e3 * x[:, 1]) if varied else 1000.0
+    body = wc.SoftBody(mesh, wc.Isotropic(young=young, poisson=0.4, density=density), device=device)
+    body.fix(mesh.points[:, 0] < 1e-9)
+    body.load(mesh.points[:, 0] > 0.2 - 1e-9, [0.0, 0.0, 0.1])
+    mass = body.masses.sum()
+    remesh = near(0.1, device)
+    sim = wc.Simulation(body, model=model, integrator=wc.SymplecticEuler(damping=1.0), remesh=remesh)
+    counts = set()
+    for x in (0.05, 0.1, 0.15, 0.0):
+        remesh.parameters.assign([x, 0.02])
+        sim.advance_steps(20)
+        counts.add(body.element_count)
+        assert body.masses.sum() == pytest.approx(mass, rel=1e-12)
+        fixed = twin(body, model, sim)
+        sim.advance_steps(3)
+        fixed.advance_steps(3)
+        moved = np.abs(fixed.body.displacements.numpy()).max()
+        assert np.abs(body.displacements.numpy() - fixed.body.displacements.numpy()).max() < 1e-5 * moved
+        # Energies of small strains are rounded to 1e-7 of the stiffness.
+        assert sim.energy().elastic == pytest.approx(fixed.energy().elastic, rel=1e-4, abs=1e-7 * 1e4 * 5e-4)
+        np.testing.assert_allclose(sim.von_mises(), fixed.von_mises(), rtol=1e-2, atol=1e-3 * fixed.von_mises().max())
+        sim.advance_steps(2)
+    assert len(counts) == 4
+
+
+def test_bodies_of_domains_go_on_as_on_a_mesh_made_that_way(device):
+    ball = wc.Domain.sphere(0.04, device=device)
+    mesh = wc.TetForest.from_domain(ball, 0.03, max_level=6)
+    young = np.where(mesh.points[mesh.tets].mean(axis=1)[:, 1] > 0, 2e4, 6e4)
+    body = wc.SoftBody(mesh, wc.Isotropic(young=young, poisson=0.4, density=1000.0), device=device)
+    body.fix(mesh.points[:, 2] < -0.03)
+    mass, enclosed = body.masses.sum(), float((mesh.fill * mesh.volumes).sum())
+    remesh = near(0.0, device, max_level=8)
+    sim = wc.Simulation(body, integrator=wc.SymplecticEuler(damping=1.0), remesh=remesh)
+    for x in (-0.02, 0.02):
+        remesh.parameters.assign([x, 0.01])
+        sim.advance_steps(25)
+        present = body.mesh
+        assert len(present.tets) != len(mesh.tets)
+        assert body.masses.sum() == pytest.approx(mass, rel=1e-12)
+        assert float((present.fill * present.volumes).sum()) == pytest.approx(enclosed, rel=1e-6)
+        fixed = twin(body, wc.Corotated(), sim)
+        sim.advance_steps(3)
+        fixed.advance_steps(3)
+        moved = np.abs(fixed.body.displacements.numpy()).max()
+        assert np.abs(body.displacements.numpy() - fixed.body.displacements.numpy()).max() < 1e-5 * moved
+        np.testing.assert_allclose(sim.von_mises(), fixed.von_mises(), rtol=1e-2, atol=1e-3 * fixed.von_mises().max())
+        sim.advance_steps(2)
