@@ -26,6 +26,7 @@ from .usd_prims import (
 )
 
 INDICES = f"{TETS}.tetVertexIndices"
+FACES = f"{TETS}.surfaceFaceVertexIndices"
 REST = f"{TETS}.primvars:rest"
 STRESS = f"{TETS}.primvars:vonMises"
 UNITS = {"young": " [Pa]", "poisson": "", "density": " [kg/m³]"}
@@ -50,7 +51,7 @@ class TetPrims:
     def follow(self, present: Present) -> None:
         """Draw the body as it is from the next frame on."""
         self._present = present
-        self._surface = SurfaceTriangles(present.tets)
+        self._surface = SurfaceTriangles(boundary_faces(present.tets)[0])
 
     @property
     def follows(self) -> dict[str, str]:
@@ -114,7 +115,8 @@ class TetPrims:
         if INDICES in samples and self._changing:
             points, tets = np.asarray(samples[REST], dtype=np.float64), np.asarray(samples[INDICES])
             average = VertexAverage(tets, np.abs(signed_volumes(points, tets)), len(points))
-            self.follow(self._present._replace(points=points, tets=tets, average=average))
+            self._present = self._present._replace(points=points, tets=tets, average=average)
+            self._surface = SurfaceTriangles(np.asarray(samples[FACES]))
         return self._present.average(stress)
 
     def _changes(self) -> Samples:
@@ -138,7 +140,7 @@ class TetPrims:
         present = self._present
         samples: Samples = {
             INDICES: Vt.Vec4iArray.FromNumpy(present.tets),
-            f"{TETS}.surfaceFaceVertexIndices": Vt.Vec3iArray.FromNumpy(self._surface.faces),
+            FACES: Vt.Vec3iArray.FromNumpy(self._surface.faces),
             REST: Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(present.points, dtype=np.float32)),
         }
         if present.fixed is not None:
@@ -178,11 +180,11 @@ class TetPrims:
 
 
 class SurfaceTriangles:
-    """The boundary of tetrahedra: its faces by the mesh's nodes, and its nodes and triangles by themselves."""
+    """The boundary of tetrahedra: its faces [F, 3] by the mesh's nodes, and its nodes and triangles by themselves."""
 
-    def __init__(self, tets: NDArray[np.int32]):
-        self.faces, _ = boundary_faces(tets)
-        self.nodes, compact = np.unique(self.faces, return_inverse=True)
+    def __init__(self, faces: NDArray[np.int32]):
+        self.faces = faces
+        self.nodes, compact = np.unique(faces, return_inverse=True)
         self.triangles = compact.reshape(-1, 3).astype(np.int32)
 
 
