@@ -21,10 +21,10 @@ from ..body import SoftBody
 from ..elasticity import MODELS, ForceField, Model
 from ..errors import InputError, StabilityWarning
 from ..materials import Isotropic
-from ..mesh import TetForest, TetMesh, Tree
 from ..remesh.online import OnlineRemesh
 from ..simulation import Simulation
 from ..solvers import INTEGRATORS
+from .checkpoint_mesh import pack_mesh, unpack_mesh
 from .checkpoint_remesh import pack_changing, remesh_options, unpack_changing
 from .whole import written_whole
 
@@ -36,9 +36,6 @@ FORMAT = "warp-corot checkpoint"
 VERSION = 4
 
 MATERIALS = {kind.__name__: kind for kind in (Isotropic, TransverselyIsotropic, Orthotropic)}
-
-#: What forests have that were made from a domain.
-OF_DOMAIN = ("phi", "fill", "labels", "node_labels")
 
 #: What reading a damaged archive raises.
 DAMAGE = (EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
@@ -89,7 +86,7 @@ def _pack_body(
         mesh, material = changing.forest.source, changing.carried_material.given
     described = {
         "model": _described(model, MODELS),
-        "mesh": _pack_mesh(mesh, prefix, arrays),
+        "mesh": pack_mesh(mesh, prefix, arrays),
         "material": _name_of(material, MATERIALS),
         "trajectories": 0,
         "activations": len(body.activations),
@@ -210,7 +207,7 @@ def _rebuilt_simulation(
 def _rebuilt_body(
     described: dict[str, Any], prefix: str, arrays: dict[str, np.ndarray], worlds: int, device: str | wp.Device
 ) -> SoftBody:
-    mesh = _unpack_mesh(described["mesh"], prefix, arrays)
+    mesh = unpack_mesh(described["mesh"], prefix, arrays)
     material_kind = MATERIALS[described["material"]]
     material = material_kind(*(arrays[prefix + f.name][()] for f in dataclasses.fields(material_kind)))
     body = SoftBody(mesh, material, worlds=worlds, device=device)
@@ -260,44 +257,6 @@ def _name_of(thing: Any, names: dict[str, Any]) -> str:
 
 def _rebuilt(described: dict[str, Any], names: dict[str, Any]) -> Any:
     return names[described["name"]](**described["values"])
-
-
-def _pack_mesh(mesh: TetForest | TetMesh, prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    if isinstance(mesh, TetMesh):
-        arrays[prefix + "points"], arrays[prefix + "tets"] = mesh.points, mesh.tets
-        return {"kind": "general", "up_axis": mesh.up_axis, "repaired": mesh.repaired}
-    arrays[prefix + "lattice"], arrays[prefix + "node_ends"] = mesh.lattice, mesh.node_ends
-    for field in dataclasses.fields(Tree):
-        arrays[f"{prefix}tree.{field.name}"] = getattr(mesh.tree, field.name)
-    of_domain = [name for name in OF_DOMAIN if getattr(mesh, name) is not None]
-    for name in of_domain:
-        arrays[f"{prefix}domain.{name}"] = getattr(mesh, name)
-    return {
-        "kind": "forest",
-        "of_domain": of_domain,
-        "label_names": mesh.label_names,
-        "up_axis": mesh.up_axis,
-        "cells": mesh.cells,
-        "cell_size": mesh.cell_size,
-        "origin": mesh.origin,
-    }
-
-
-def _unpack_mesh(described: dict[str, Any], prefix: str, arrays: dict[str, np.ndarray]) -> TetForest | TetMesh:
-    if described["kind"] == "general":
-        mesh = TetMesh(arrays[prefix + "points"], arrays[prefix + "tets"], up_axis=described["up_axis"])
-        mesh.repaired = described["repaired"]
-        return mesh
-    tree = Tree(**{field.name: arrays[f"{prefix}tree.{field.name}"] for field in dataclasses.fields(Tree)})
-    x, y, z = described["cells"]
-    a, b, c = described["origin"]
-    lattice, ends = arrays[prefix + "lattice"], arrays[prefix + "node_ends"]
-    of_domain = {name: arrays[f"{prefix}domain.{name}"] for name in described["of_domain"]}
-    names = tuple(described["label_names"])
-    up_axis = described["up_axis"]
-    return TetForest(
-        (x, y, z), described["cell_size"], (a, b, c), lattice, ends, tree, up_axis, label_names=names, **of_domain
-    )
 
 
 def _write_whole(target: Path, arrays: dict[str, np.ndarray]) -> None:

@@ -21,15 +21,15 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
-from pxr import Sdf, Tf, Vt
+from pxr import Sdf, Tf
 
 from ..errors import InputError
+from .usd_clips import declare_attributes, new_root, play_pieces, set_time_range, varying_attributes
 from .usd_files import check_stage_path, is_locked, reason, take_lock, usd_name
 from .whole import sync
 
 # All that a run's folder ever holds; \w{6} is what OpenUSD's own temporary files end in.
 _OURS = re.compile(r"(piece|part)-\d{6}\.usdc|(part-)?(static|manifest|root|joined)\.usd[ac]?|part-\w+\.\w{6}|lock")
-_CLIP_SET = "default"
 #: How long before a frame [time codes] what is not to be interpolated still holds.
 JUST_BEFORE = 2.0**-10
 
@@ -90,13 +90,7 @@ class PieceStore:
         """
         self._static = static
         self._follows = dict(follows or {})
-
-        def visit(path: Sdf.Path) -> None:
-            spec = static.GetAttributeAtPath(path) if path.IsPropertyPath() else None
-            if spec and not spec.HasInfo("default") and not spec.HasInfo("connectionPaths"):
-                self._varying[str(path)] = spec.typeName
-
-        static.Traverse(Sdf.Path.absoluteRootPath, visit)
+        self._varying = varying_attributes(static)
 
     def add(self, time_code: float, samples: Samples, nbytes: int) -> None:
         """Takes the values of one frame, ``nbytes`` of them, and writes a piece when it is time to.
@@ -178,7 +172,7 @@ class PieceStore:
                     samples = {**samples, **transform(samples)}
                 for path, value in samples.items():
                     joined.SetTimeSample(path, time_code, value)
-                _set_time_range(joined, time_code)
+                set_time_range(joined, time_code)
             self._annotate(joined)
             self._run.mkdir(parents=True, exist_ok=True)
             self._write(joined, self.path, aside=f"part-joined{self.path.suffix}")
@@ -240,38 +234,16 @@ class PieceStore:
 
     def _declare_varying(self, layer: Sdf.Layer) -> None:
         assert self._static is not None
-        layer.timeCodesPerSecond = self._static.timeCodesPerSecond
-        layer.framesPerSecond = self._static.framesPerSecond
-        for path, type_name in self._varying.items():
-            prim = Sdf.CreatePrimInLayer(layer, Sdf.Path(path).GetPrimPath())
-            Sdf.AttributeSpec(prim, Sdf.Path(path).name, type_name)
+        declare_attributes(layer, self._static, self._varying)
 
     def _root_layer(self, pieces: list[tuple[float, float]]) -> Sdf.Layer:
-        """The small stage that plays the pieces; paths in it are relative, so folder and stage move together."""
         assert self._static is not None
-        static = self._static
-        relative = f"./{usd_name(Path(self.pieces_folder.name, self._run.name))}"
+        folder = f"./{usd_name(Path(self.pieces_folder.name, self._run.name))}"
         if self._root is None:
-            root = self._root = Sdf.Layer.CreateAnonymous(self.path.suffix)
-            for key in static.pseudoRoot.ListInfoKeys():
-                if key not in ("startTimeCode", "endTimeCode"):
-                    root.pseudoRoot.SetInfo(key, static.pseudoRoot.GetInfo(key))
-            root.subLayerPaths.append(f"{relative}/static.usdc")
-            root.startTimeCode = pieces[0][0]
-        root = self._root
-        root.endTimeCode = pieces[-1][1]
-        prim = Sdf.CreatePrimInLayer(root, f"/{static.defaultPrim}")
-        files = [Sdf.AssetPath(f"{relative}/piece-{index:06d}.usdc") for index in range(len(pieces))]
-        active = [(first, float(index)) for index, (first, _) in enumerate(pieces)]
-        clips = {
-            "assetPaths": Sdf.AssetPathArray(files),
-            "active": Vt.Vec2dArray(active),
-            "manifestAssetPath": Sdf.AssetPath(f"{relative}/manifest.usda"),
-            "primPath": f"/{static.defaultPrim}",
-        }
-        prim.SetInfo("clips", {_CLIP_SET: clips})
-        self._annotate(root)
-        return root
+            self._root = new_root(self.path.suffix, self._static, folder, pieces[0][0])
+        play_pieces(self._root, folder, pieces)
+        self._annotate(self._root)
+        return self._root
 
     def _annotate(self, layer: Sdf.Layer) -> None:
         if self.custom_data:
@@ -345,9 +317,3 @@ class PieceStore:
             self._lock.close()
             self._lock = None
         self._pending, self._root = [], None
-
-
-def _set_time_range(layer: Sdf.Layer, time_code: float) -> None:
-    if not layer.HasStartTimeCode():
-        layer.startTimeCode = time_code
-    layer.endTimeCode = time_code
