@@ -9,8 +9,8 @@ from warp_corot.kernels.shapes import FRAME_SHIFT
 
 from warp_corot.elements import shape_codes
 from warp_corot.mesh.lattice import LATTICE_BITS
-from warp_corot.remesh import DeviceForest
 from warp_corot.remesh.fields import CARRIED_BY_NODES
+from warp_corot.remesh.pools import DeviceForest
 
 CUBE = 0.064
 DENSITY = 1000.0

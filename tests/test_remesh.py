@@ -7,7 +7,8 @@ from remesh_cases import CUBE, DENSITY, assert_sound, leaf_list, momentum, movin
 from sequential_remesh import SequentialRemesh
 
 import warp_corot as wc
-from warp_corot.remesh import DeviceForest, RemeshPass
+from warp_corot.remesh.passes import RemeshPass
+from warp_corot.remesh.pools import DeviceForest
 
 
 def run_against_reference(cells, level, device, rng, passes, *, most, limits=(0, 12)):

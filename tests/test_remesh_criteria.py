@@ -7,7 +7,8 @@ from remesh_cases import CUBE, DENSITY, PAIRS, assert_sound, leaf_list, momentum
 from warp_corot.kernels.remesh_mark import ElementState
 
 import warp_corot as wc
-from warp_corot.remesh import DeviceForest, RemeshPass
+from warp_corot.remesh.passes import RemeshPass
+from warp_corot.remesh.pools import DeviceForest
 
 
 def longest_edges(forest, moved):

@@ -5,8 +5,9 @@ import pytest
 from remesh_cases import CUBE, DENSITY, assert_sound, leaf_list, moving, random_marks
 
 import warp_corot as wc
-from warp_corot.remesh import DeviceForest, RemeshPass
 from warp_corot.remesh.fields import CARRIED_BY_NODES, CARRIED_BY_TETRAHEDRA, OF_NODES, OF_TETRAHEDRA
+from warp_corot.remesh.passes import RemeshPass
+from warp_corot.remesh.pools import DeviceForest
 
 
 def points_of(device):

@@ -10,7 +10,7 @@ from warp_corot.kernels.remesh_mark import marking_kernel
 
 import warp_corot as wc
 from warp_corot.experiments.remeshing import CELL, SCENES, TISSUE, run, table
-from warp_corot.remesh import DeviceForest
+from warp_corot.remesh.pools import DeviceForest
 
 CASES = [("bar", "elongation"), ("bar", "strain"), ("slab", "nearness")]
 LEVELS = [9, pytest.param(10, marks=pytest.mark.slow), pytest.param(11, marks=pytest.mark.slow)]

@@ -9,8 +9,9 @@ from warp_corot.kernels.shapes import FRAME_SHIFT
 
 import warp_corot as wc
 from warp_corot.plan import ForcePlan, Units
-from warp_corot.remesh import DeviceForest, RemeshPass
+from warp_corot.remesh.passes import RemeshPass
 from warp_corot.remesh.plan import DevicePlan
+from warp_corot.remesh.pools import DeviceForest
 from warp_corot.remesh.sizes import launch_size
 from warp_corot.subtrees import Sharing
 

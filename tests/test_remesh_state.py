@@ -7,7 +7,8 @@ import pytest
 from remesh_cases import CUBE, DENSITY, assert_sound, momentum, moving, random_marks
 
 import warp_corot as wc
-from warp_corot.remesh import DeviceForest, RemeshPass
+from warp_corot.remesh.passes import RemeshPass
+from warp_corot.remesh.pools import DeviceForest
 
 
 def test_children_keep_the_deformation_and_the_energy(device, rng):
