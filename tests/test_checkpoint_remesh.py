@@ -202,3 +202,23 @@ def test_a_part_left_out_is_found(tmp_path, rng):
         np.savez(tmp_path / "b.npz", **{name: part for name, part in parts.items() if name != missing})
         with pytest.raises(wc.InputError, match="not a whole checkpoint"):
             wc.Simulation.load(tmp_path / "b.npz")
+
+
+def test_the_packages_own_criteria_are_found_by_their_names(tmp_path):
+    from warp_corot.kernels.remesh_criteria import nearness as near_box
+
+    parameters = wp.array([0.1, 0.025, 0.025, 0.01, 0.02, 0.02, 0.02], dtype=wp.float32, device="cpu")
+    remesh = wc.OnlineRemesh(
+        criterion=near_box, parameters=parameters, refine_above=1.0, simplify_below=0.5, max_level=8
+    )
+    sim = wc.Simulation(box("cpu"), remesh=remesh)
+    sim.advance_steps(25)
+    sim.save(tmp_path / "a.npz")
+    resumed = wc.Simulation.load(tmp_path / "a.npz")
+    assert_same(sim.body, resumed.body)
+    count = sim.body.element_count
+    for each in (sim, resumed):
+        each.remeshing.changing[0].options.parameters.assign([0.02, *parameters.numpy()[1:]])
+        each.advance_steps(25)
+    assert sim.body.element_count != count
+    assert_same(sim.body, resumed.body)
