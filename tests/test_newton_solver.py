@@ -145,6 +145,38 @@ class TestAttributes:
         np.testing.assert_array_equal(copied.warp_corot.rotation.numpy(), model.state().warp_corot.rotation.numpy())
         np.testing.assert_array_equal(copied.particle_q.numpy(), model.particle_q.numpy())
 
+    def test_are_found_again_in_newtons_recordings(self, device, rng, tmp_path):
+        """What Newton's recorder gives back is a model and states that step on as those recorded, forests and all."""
+        from newton.viewer import ViewerFile
+
+        model = self.model(device, forest=True)
+        before, after = model.state(), model.state()
+        x = model.particle_q.numpy() + 0.01 * rng.standard_normal((model.particle_count, 3))
+        before.particle_q.assign(x.astype(np.float32))
+        solver = wn.SolverCorotated(model)
+        solver.step(before, after, None, None, 1e-4)
+        viewer = ViewerFile(str(tmp_path / "run.json"))
+        viewer.set_model(model)
+        viewer.begin_frame(0.0)
+        viewer.log_state(after)
+        viewer.end_frame()
+        viewer.close()
+        again = ViewerFile(str(tmp_path / "other.json"), auto_save=False)
+        again.load_recording(str(tmp_path / "run.json"))
+        loaded = newton.Model(device=device)
+        again.load_model(loaded)
+        state = loaded.state()
+        again.load_state(state, 0)
+        restored = wn.SolverCorotated(loaded)
+        restored.write_attributes(state)
+        for name in ("rotation", "stress", "von_mises"):
+            found, had = (getattr(s.warp_corot, name).numpy() for s in (state, after))
+            np.testing.assert_allclose(found, had, atol=1e-5 * np.abs(had).max())
+        ends = [model.state(), loaded.state()]
+        solver.step(after, ends[0], None, None, 1e-4)
+        restored.step(state, ends[1], None, None, 1e-4)
+        np.testing.assert_allclose(ends[1].particle_qd.numpy(), ends[0].particle_qd.numpy(), atol=1e-5)
+
     def test_warm_rotations_of_inverted_elements_are_continuous(self, device):
         """A tetrahedron is pushed through itself: the rotation never jumps."""
         made = builder(gravity=(0.0, 0.0, 0.0))
@@ -286,6 +318,24 @@ class TestBadInput:
         with pytest.raises(wc.InputError, match="control has 5 tet_activations"):
             solver.step(model.state(), model.state(), other.control(), None, 1e-4)
 
+    def test_changed_models(self, device):
+        """Stable steps follow stiffness and mass; gravity alone changes nothing; a bad material is told."""
+        model = grid_model(device)
+        solver = wn.SolverCorotated(model)
+        stable = solver.stable_dt
+        materials = model.tet_materials.numpy().copy()
+        model.tet_materials.assign(4 * materials)
+        model.set_gravity((0.0, 0.0, 1.0))
+        solver.notify_model_changed(newton.ModelFlags.MODEL_PROPERTIES)
+        assert solver.stable_dt == pytest.approx(stable / 2, rel=1e-3)
+        inverse = model.particle_inv_mass.numpy()
+        model.particle_inv_mass.assign(inverse / 4)
+        solver.notify_model_changed(newton.ModelFlags.MODEL_PROPERTIES)
+        assert solver.stable_dt == pytest.approx(stable, rel=1e-3)
+        model.tet_materials.assign(-materials)
+        with pytest.raises(wc.InputError, match="tetrahedron 0 has"):
+            solver.notify_model_changed(newton.ModelFlags.MODEL_PROPERTIES)
+
     def test_hard_attachments(self, device):
         made = builder()
         body = made.add_body(mass=1.0, inertia=wp.mat33(np.eye(3)))
@@ -335,11 +385,14 @@ def test_a_forest_from_elsewhere_goes_one_by_one(device, monkeypatch, rng):
     model = made.finalize(device=device)
     x = model.particle_q.numpy() + 0.01 * rng.standard_normal((model.particle_count, 3))
     wanted = impulse(wn.SolverCorotated(model), model, x)
-    monkeypatch.setattr("warp_corot.newton.forests.FORESTS", [])
-    with pytest.warns(UserWarning, match="one by one"):
-        solver = wn.SolverCorotated(model)
-    assert solver.tetrahedra.single_count == model.tet_count
-    np.testing.assert_allclose(impulse(solver, model, x), wanted, atol=1e-3 * np.abs(wanted).max())
+    # None is known, or one that is as this one but larger.
+    key = int(model.warp_corot.forest_key.numpy()[0])
+    for known in ([], [adaptive_forest(3, 0.5)] * (key + 1)):
+        monkeypatch.setattr("warp_corot.newton.forests.FORESTS", known)
+        with pytest.warns(UserWarning, match="one by one"):
+            solver = wn.SolverCorotated(model)
+        assert solver.tetrahedra.single_count == model.tet_count
+        np.testing.assert_allclose(impulse(solver, model, x), wanted, atol=1e-3 * np.abs(wanted).max())
 
 
 class TestImports:

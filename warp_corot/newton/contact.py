@@ -27,20 +27,20 @@ class Contacts:
         self.refresh()
 
     def refresh(self) -> None:
-        """See that attachments can be stepped.
+        """See that attachments can be stepped, and how stiff they and contacts are.
 
         Raises:
-            InputError: One of them is rigid.
+            InputError: An attachment is rigid.
         """
         if self.model.attachment_particle_body_count:
             stiffness = self.model.attachment_particle_body_stiffness.numpy()
             bad = np.flatnonzero(~np.isfinite(stiffness))
             if len(bad):
                 raise InputError(f"attachment {bad[0]} has stiffness {stiffness[bad[0]]}; it must be finite [N/m]")
+        #: The largest stiffness that a contact or an attachment can have [N/m].
+        self.stiffest = self._find_stiffest()
 
-    @property
-    def stiffest(self) -> float:
-        """The largest stiffness that a contact or an attachment can have [N/m]."""
+    def _find_stiffest(self) -> float:
         found = [0.0]
         if self.model.shape_count:
             found.append(0.5 * (self.model.soft_contact_ke + float(self.model.shape_material_ke.numpy().max())))

@@ -82,7 +82,7 @@ def forest_groups(model: newton.Model, tets: npt.NDArray[np.integer], rotation_l
     for key in np.unique(keys):
         chosen = keys == key
         starts = particles[chosen], first[chosen]
-        if not 0 <= key < len(FORESTS) or not _is_there(FORESTS[key], tets, *starts, model.particle_count):
+        if not 0 <= key < len(FORESTS) or not _is_there(FORESTS[key], model, tets, *starts):
             warnings.warn(
                 "a forest of this model was added in another process, or has been changed since; its tetrahedra are "
                 "stepped one by one",
@@ -96,15 +96,30 @@ def forest_groups(model: newton.Model, tets: npt.NDArray[np.integer], rotation_l
 
 def _is_there(
     forest: TetForest,
+    model: newton.Model,
     tets: npt.NDArray[np.integer],
     particles: npt.NDArray[np.integer],
     first: npt.NDArray[np.integer],
-    particle_count: int,
 ) -> bool:
+    """Whether a model's tetrahedra have the forest's nodes and rest shapes, however they are turned."""
     own = right_handed(forest)
-    places = zip(particles, first, strict=True)
-    inside = (particles >= 0).all() and (particles + len(forest.points) <= particle_count).all()
-    return bool(inside) and all(np.array_equal(tets[t : t + len(own)], own + p) for p, t in places)
+    if not ((particles >= 0).all() and (particles + len(forest.points) <= model.particle_count).all()):
+        return False
+    corners = forest.points[own]
+    shapes = _shapes(np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)))
+    size = np.abs(shapes).max(axis=(1, 2), keepdims=True)
+    poses = model.tet_poses.numpy().reshape(-1, 3, 3)
+    for p, t in zip(particles, first, strict=True):
+        if not np.array_equal(tets[t : t + len(own)], own + p):
+            return False
+        if not (np.abs(_shapes(poses[t : t + len(own)].astype(np.float64)) - shapes) < 1e-4 * size).all():
+            return False
+    return True
+
+
+def _shapes(poses: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """What is left of inverse rest matrices B when elements are turned, B B^T."""
+    return poses @ np.swapaxes(poses, 1, 2)
 
 
 def _squeezed(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | float:

@@ -6,6 +6,7 @@ These are stepped by another of Newton's solvers, on a view of the model in whic
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -34,6 +35,8 @@ class Others:
         if not own and rigid_solver is not None and not isinstance(rigid_solver, SolverBase):
             raise InputError(f"rigid_solver is {rigid_solver!r}; it must be 'semi-implicit', a solver or None")
         self.model = model
+        if own or rigid_solver is None:
+            _warn_of_ignored(model)
         triangles = bool(model.tri_count) and bool(np.any(model.tri_materials.numpy()))
         edges = bool(model.edge_count) and bool(np.any(model.edge_bending_properties.numpy()))
         self.has_particles = bool(model.spring_count) or triangles or edges or particle_contact
@@ -101,6 +104,18 @@ class Others:
             rigid.soft_contact_max = 0
             self._rigid_contacts = contacts, rigid
         return self._rigid_contacts[1]
+
+
+def _warn_of_ignored(model: newton.Model) -> None:
+    """Say in a line what is in a model that nothing steps."""
+    counts = {"tendons": model.tendon_count, "muscles": model.muscle_count}
+    there = [f"{count} {name}" for name, count in counts.items() if count]
+    if there:
+        warnings.warn(
+            f"the model has {' and '.join(there)}, which do nothing here; a rigid_solver that knows them can step them",
+            UserWarning,
+            stacklevel=4,
+        )
 
 
 @contextmanager

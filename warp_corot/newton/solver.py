@@ -180,9 +180,12 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self.tetrahedra.write_attributes(state, state)
 
     def notify_model_changed(self, flags: int) -> None:
-        """Take over what has changed in the model: materials of elements, masses, stiffness of contacts.
+        """Take over what has changed in the model; stable steps are found again where they may have changed.
 
-        Gravity, activations and what contacts and attachments are made of are read in every step anyway.
+        ``ModelFlags.MODEL_PROPERTIES`` says that materials of elements, or masses, have; ``SHAPE_PROPERTIES`` and
+        ``CONSTRAINT_PROPERTIES`` that stiffness of contacts and attachments has. Gravity, activations and forces of
+        contact are read from the model in every step. Waits for the device, except in a capture, in which materials
+        are left as they were.
 
         Raises:
             InputError: As on construction.
@@ -190,9 +193,14 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self._others.notify_model_changed(flags)
         if self.device.is_capturing:
             return
-        self.tetrahedra.refresh()
-        self._contacts.refresh()
-        self._find_stable_steps()
+        bits = newton.ModelFlags
+        elements, stiffest = False, self._contacts.stiffest
+        if flags & bits.MODEL_PROPERTIES:
+            elements = self.tetrahedra.refresh()
+        if flags & (bits.SHAPE_PROPERTIES | bits.CONSTRAINT_PROPERTIES | bits.MODEL_PROPERTIES):
+            self._contacts.refresh()
+        if elements or self._contacts.stiffest != stiffest:
+            self._find_stable_steps()
 
     @classmethod
     def register_custom_attributes(cls, builder: newton.ModelBuilder) -> None:

@@ -20,8 +20,9 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
     """Have states carry what the solver finds in each tetrahedron, as ``state.warp_corot``: before ``finalize``.
 
     ``rotation``: wp.quat [T], from rest to world. ``stress``: wp.mat33 [T], Cauchy stress in world axes [Pa].
-    ``von_mises``: wp.float32 [T] [Pa]. All are those of the positions in the same state. Newton's resets, copies and
-    recordings of states take them along. They cost about one force evaluation a step.
+    ``von_mises``: wp.float32 [T] [Pa]. All are those of the positions in the same state. They cost about one force
+    evaluation a step. ``State.assign`` takes them along. Newton 1.8's ``ViewerFile`` records no namespaces, and could
+    not load a model that has attributes of states without: ``SolverCorotated.write_attributes`` finds them again.
     """
     for name, dtype in STATE.items():
         builder.add_custom_attribute(

@@ -69,16 +69,24 @@ class Tetrahedra:
         self._fill = wp.ones(1, dtype=wp.float32, device=self.device) if fill is None else fill
         self._no_rotations = wp.empty(0, dtype=wp.quat, device=self.device)
         self._nothing = {name: wp.empty(0, dtype=dtype, device=self.device) for name, dtype in STATE.items()}
+        #: Materials and inverse masses that were last taken over.
+        self._seen: list[np.ndarray] = [np.empty(0), np.empty(0)]
         self.refresh()
         self._warn_of_lost()
 
-    def refresh(self) -> None:
+    def refresh(self) -> bool:
         """Take over the model's present materials.
 
+        Returns:
+            Whether these or the masses are others than when this was last called.
+
         Raises:
-            InputError: One of them is not positive definite, or not finite.
+            InputError: A material is not positive definite, or not finite.
         """
-        materials = self.model.tet_materials.numpy().reshape(-1, 3).astype(np.float64)
+        present = [array.numpy().copy() for array in (self.model.tet_materials, self.model.particle_inv_mass)]
+        if all(np.array_equal(a, b) for a, b in zip(present, self._seen, strict=True)):
+            return False
+        materials = present[0].reshape(-1, 3).astype(np.float64)
         a, b = LAME[self.lame]
         mu, lam = a * materials[:, 0], materials[:, 1] + b * materials[:, 0]
         bad = np.flatnonzero(~(np.isfinite(materials).all(axis=1) & (mu > 0) & (3 * lam + 2 * mu > 0)))
@@ -96,6 +104,8 @@ class Tetrahedra:
         self.damped = bool((materials[:, 2] > 0).any())
         for group in self.groups:
             group.set_material(mu, lam)
+        self._seen = present
+        return True
 
     def add_forces(self, x: wp.array, f: wp.array, rotations: wp.array | None) -> None:
         """Add the elastic forces [N] of particles at x to f, both vec4 [P]; ``rotations`` are the state's."""
