@@ -15,21 +15,22 @@ A pass is recorded once and replayed. It has no host round trip: counts stay on 
 wanted any more (conditional nodes of the graph on CUDA), and every launch goes through what there is, not through what
 there might be. On CUDA without conditional nodes the host asks once a round whether to go on.
 
-What is carried (``transfer.Carriage``): a new node is the midpoint of its deformed edge and takes mass and momentum from both
-ends; removal is the reverse and keeps mass and linear momentum to rounding, supports being accounted for. Angular
-momentum and kinetic energy are not kept exactly where velocities vary along an edge. Quantities of elements are per
-full rest volume: children have their parent's, a parent the mean of its children's. Children with different labels are
-not merged. Void tetrahedra stay as they are, and a node that one of them names stays too: a mesh made from a domain is
-not simplified beyond the void beside it, and its marched surface is that of the mesh it began as.
+What is carried (``transfer.Carriage``): a new node is the midpoint of its deformed edge and takes mass and momentum
+from both ends; removal is the reverse and keeps mass and linear momentum to rounding, supports being accounted for.
+Angular momentum and kinetic energy are not kept exactly where velocities vary along an edge. Quantities of elements are
+per full rest volume: children have their parent's, a parent the mean of its children's. Children with different labels
+are not merged. Void tetrahedra stay as they are, and a node that one of them names stays too: a mesh made from a domain
+is not simplified beyond the void beside it, and its marched surface is that of the mesh it began as.
 
 Nodes are told apart by their numbers and edges by those of their ends, never by lattice points, so that several nodes
 may share one.
 
-In a simulation (``Simulation(…, remesh=OnlineRemesh(…))``, ``changing.Changing``) the body's nodal arrays are those of the
-carriage. After the pass the same recording derives the force plan (``plan.DevicePlan``) and finds the stiffest element. Then
-the host looks once, at a handful of numbers: whether anything has changed, and how large launches must be. Launches go
-through a little more than there is, so that recorded steps are recorded anew only when counts leave their bounds. What
-lies beyond is padding: nodes without mass, and elements on places that never move, whose forces are zero.
+In a simulation (``Simulation(…, remesh=OnlineRemesh(…))``, ``changing.Changing``) the body's nodal arrays are those of
+the carriage. After the pass the same recording derives the force plan (``plan.DevicePlan``) and finds the stiffest
+element. Then the host looks once, at a handful of numbers: whether anything has changed, and how large launches must
+be. Launches go through a little more than there is, so that recorded steps are recorded anew only when counts leave
+their bounds. What lies beyond is padding: nodes without mass, and elements on places that never move, whose forces are
+zero.
 """
 
 from .online import OnlineRemesh
