@@ -52,6 +52,12 @@ def rows_of_four(n, device):
 FORMS = [vec3, vec3_among_others, vec4, vec4_between_words, rows_of_three, rows_of_four]
 
 
+def three_of(array):
+    """The first three numbers of each vector as a live vec3 array."""
+    numbers = array if array.dtype == wp.float32 else array.view(wp.float32)
+    return numbers[:, :3].view(wp.vec3)
+
+
 def write(array, vectors):
     """Write vectors [n, 3] into an array of any form, and leave all else in it as it is."""
     whole = array.numpy().copy()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from foreign import FORMS, allocates, bar, read, vec3, vec3_among_others, vec4, write
+from foreign import FORMS, allocates, bar, read, three_of, vec3, vec3_among_others, vec4, write
 
 import warp_corot as wc
 
@@ -45,14 +45,16 @@ class Stranger:
         self.seen = vec3(n, self.device)
         sim.body.use_loads(self.forces)
         sim.body.use_positions(self.positions)
+        # Of these arrays, whatever their form, what the kernels above take.
+        self.pulled, self.watched = (three_of(array) for array in (self.forces, self.positions))
 
     def before(self):
         n = self.sim.body.node_count
-        wp.launch(pull, dim=n, inputs=[self.goals, self.positions, self.forces], device=self.device)
+        wp.launch(pull, dim=n, inputs=[self.goals, self.watched, self.pulled], device=self.device)
 
     def after(self):
         n = self.sim.body.node_count
-        wp.launch(look, dim=n, inputs=[self.positions, self.seen], device=self.device)
+        wp.launch(look, dim=n, inputs=[self.watched, self.seen], device=self.device)
 
     def step(self):
         self.before()
