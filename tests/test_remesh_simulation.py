@@ -250,6 +250,16 @@ def test_wrong_input_is_named(device):
         wc.Simulation(general, remesh=wc.OnlineRemesh())
 
 
+def test_a_remeshed_body_stays_with_its_simulation(device):
+    body = bar(device)
+    sim = wc.Simulation(body, remesh=near(0.1, device))
+    for remesh in (None, wc.OnlineRemesh()):
+        with pytest.raises(wc.InputError, match="cannot be in another; make a SoftBody of its mesh"):
+            wc.Simulation(body, remesh=remesh)
+    sim.advance_steps(10)
+    assert wc.SoftBody(body.mesh, body.material, device=device).element_count == body.element_count
+
+
 def test_others_cannot_record_steps_that_change(device):
     sim = wc.Simulation(bar(device), remesh=near(0.1, device))
     with wp.ScopedCapture(device=device), pytest.raises(wc.InputError, match="cannot be recorded by others"):

@@ -64,8 +64,6 @@ class Changing:
             raise InputError(f"worlds is {body.worlds}; only a body in one world can be remeshed")
         if isinstance(body.material, Anisotropic):
             raise InputError(f"the material is {type(body.material).__name__}; only an Isotropic one can be remeshed")
-        if body.changing is not None:
-            raise InputError("another simulation remeshes this body already")
         self.body = body
         self.device = body.device
         self.options = options.on(mesh)

@@ -40,6 +40,8 @@ class Remeshing:
         *,
         deterministic: bool,
     ):
+        if any(body.changing is not None for body in bodies):
+            raise InputError("a body that one simulation remeshes cannot be in another; make a SoftBody of its mesh")
         options = _one_each(asked, len(bodies))
         self.every = math.gcd(*(each.every for each in options if each is not None))
         self.changing: tuple[Changing | None, ...] = (None,) * len(bodies)
