@@ -56,6 +56,8 @@ class SoftBody(Controls, SharedArrays):
 
     Attributes:
         worlds, device: As given.
+        node_positions: ``positions`` as they lie in memory, vec4 [worlds * N] without gaps; for ``wp.to_jax``, which
+            takes no strided view. After ``use_positions``, the array given there.
 
     Raises:
         InputError: The device is not there, a material array does not have one value per element, stiffness, mass or
