@@ -161,8 +161,14 @@ def test_what_was_written_before_is_not_lost(device):
     np.testing.assert_allclose(read(first), x + SIDE, atol=1e-7)
     sim.step()
     sim.body.use_positions(second)
+    sim.body.velocities = np.tile([100.0, 0.0, 0.0], (n, 1))
     sim.step()
-    np.testing.assert_allclose(read(second), x + SIDE, atol=1e-6)
+    moved = x + SIDE + [100.0 * DT / (1.0 + 5.0 * DT), 0.0, 0.0]
+    np.testing.assert_allclose(read(second), moved, atol=1e-6)
+    sim.body.use_positions(None)
+    sim.body.positions.assign((x - SIDE).astype(np.float32))
+    sim.body.use_positions(first)
+    np.testing.assert_allclose(read(first), x - SIDE, atol=1e-7)
 
 
 def test_another_array_takes_effect_in_recorded_steps(device):
