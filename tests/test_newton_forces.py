@@ -17,6 +17,8 @@ from newton_scenes import (
     wc,
     wn,
 )
+from warp_corot.kernels.newton_elements import scatter_posed
+from warp_corot.kernels.rotation import quick_rotation
 
 
 def bend(x, amount=0.6):
@@ -47,6 +49,20 @@ def test_tetrahedra_against_the_oracle(device, rng, crushed):
     assert (inverted > 5) == crushed
     found = impulse(wn.SolverCorotated(model), model, x)
     assert_near(found, oracle_forces(model, rest, x, MU, LAM), 3e-3 if crushed else 1e-4)
+
+
+def test_one_element_a_thread_as_eight(device, rng):
+    """What runs on CUDA also on the CPU, where eight go together: any F, also such as Newton's iteration cannot do."""
+    model = grid_model(device)
+    tets = wn.SolverCorotated(model).tetrahedra
+    x = np.zeros((model.particle_count, 4), np.float32)
+    x[:, :3] = model.particle_q.numpy() + 0.06 * rng.standard_normal((model.particle_count, 3))
+    nodes = wp.array(x, dtype=wp.vec4, device=device)
+    found, wanted = (wp.zeros_like(nodes) for _ in range(2))
+    inputs = [tets.elements, tets.mu, tets.lam, nodes]
+    wp.launch(scatter_posed(quick_rotation), model.tet_count, inputs, [found], device=device)
+    tets.add_forces(nodes, wanted, None)
+    assert_near(found.numpy(), wanted.numpy(), 1e-5)
 
 
 @pytest.mark.parametrize("copies", [1, 3])

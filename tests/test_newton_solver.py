@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -317,6 +318,20 @@ class TestBadInput:
             solver.step(model.state(), other.state(), None, None, 1e-4)
         with pytest.raises(wc.InputError, match="control has 5 tet_activations"):
             solver.step(model.state(), model.state(), other.control(), None, 1e-4)
+
+    def test_states_on_other_devices(self, device):
+        """There may be one device only: what is asked of a state is its arrays' device."""
+        model = grid_model(device)
+        solver = wn.SolverCorotated(model)
+
+        class Elsewhere(list):
+            device = "cuda:7"
+
+        for name, given in (("state_in", 0), ("state_out", 1)):
+            states = [model.state(), model.state()]
+            states[given] = SimpleNamespace(particle_q=Elsewhere(range(model.particle_count)))
+            with pytest.raises(wc.InputError, match=f"{name} is on cuda:7; the model is on {device}"):
+                solver.step(*states, None, None, 1e-4)
 
     def test_changed_models(self, device):
         """Stable steps follow stiffness and mass; gravity alone changes nothing; a bad material is told."""

@@ -47,6 +47,9 @@ class ForestGroup:
         nodes = (particles[:, None] + np.arange(len(forest.points))).ravel()
         self.count = len(nodes)
         self._particles = wp.array(nodes, dtype=wp.int32, device=self.device)
+        #: The first of them where all follow one another, so that forces need not go by way of the forest's own.
+        self._first = int(nodes[0]) if np.array_equal(nodes, np.arange(nodes[0], nodes[0] + len(nodes))) else None
+        self._part: wp.array | None = None
         # Displacements are from the forest's own axes, so only where a copy stands is taken off: no digits are lost.
         rest = np.tile(forest.points, (self.copies, 1)).reshape(self.copies, -1, 3)
         there = model.particle_q.numpy().astype(np.float64)[nodes].reshape(rest.shape)
@@ -70,8 +73,18 @@ class ForestGroup:
         """Add the elastic forces of particles at x to f, both vec4 [P]."""
         inputs = [self._particles, x, self._rest]
         wp.launch(gather_nodes, dim=self.count, inputs=inputs, outputs=[self._u], device=self.device)
+        if self._first is not None:
+            self._field.add_forces(self._u, self._part_of(f))
+            return
         self._field.add_forces(self._u, self._f)
         wp.launch(add_nodes, dim=self.count, inputs=[self._particles, self._f], outputs=[f], device=self.device)
+
+    def _part_of(self, f: wp.array) -> wp.array:
+        """The forest's nodes in an array over particles; kept, since it is the same array in every step."""
+        assert self._first is not None
+        if self._part is None or self._part.ptr != f.ptr + 16 * self._first:
+            self._part = f[self._first : self._first + self.count]
+        return self._part
 
 
 def forest_groups(model: newton.Model, tets: npt.NDArray[np.integer], rotation_level: int | None) -> list[ForestGroup]:

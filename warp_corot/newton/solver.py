@@ -37,7 +37,8 @@ class SolverCorotated(SolverBase, CouplingInterface):
     collide with one another unless asked to, soft bodies not with themselves.
 
     A step is taken for a world or not at all: where something is not finite, the state stays what it was. On the CPU
-    ``step`` says so at once; on CUDA, where it waits for nothing, a later ``step`` or ``check`` does.
+    ``step`` says so at once; on CUDA, where it waits for nothing, a later ``step`` or ``check`` does. There are no
+    gradients.
 
     Example::
 

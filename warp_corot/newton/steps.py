@@ -69,8 +69,9 @@ class Steps:
             self._launch_motion(now, state_out, control, contacts, dt / count)
             if self.tetrahedra.warm or number == count - 1:
                 self.tetrahedra.write_attributes(state_out, now)
-            inputs = [self._trouble]
-            self._launch(worlds.report_trouble, self._places, inputs, [self._report])
+            # On the CPU a look costs less than a launch; a recorded step must be ready for what comes.
+            if self.device.is_cuda or self.device.is_capturing or self._trouble.numpy().any():
+                self._launch(worlds.report_trouble, self._places, [self._trouble], [self._report])
             now = state_out
         if self.device.is_cuda:
             wp.copy(self._seen, self._report)

@@ -124,6 +124,10 @@ class Tetrahedra:
             group.add_forces(x, f)
 
     def add_damping_and_activation(self, q: wp.array, qd: wp.array, activation: wp.array, f: wp.array) -> None:
+        # On the CPU a look costs less than a launch; a recorded step must be ready for what comes.
+        looks = self.device.is_cpu and not self.device.is_capturing and not self.damped
+        if looks and not activation.numpy().any():
+            return
         inputs = [self.elements, self.model.tet_materials, activation, q, qd]
         self._launch(scatter_damping_and_activation, self.model.tet_count, inputs, [f])
 
