@@ -89,6 +89,22 @@ def test_forests_against_the_oracle(device, rng, copies):
     assert_near(impulse(solver, model, x), oracle_forces(model, rest, x, mu, lam), 1e-3)
 
 
+def test_rotations_of_ancestors(device, rng):
+    """rotation_level: as the same forest has them in this package."""
+    forest = wc.TetForest.box((1, 1, 1), 0.3, 6)
+    material = wc.Isotropic(young=1e4, poisson=0.35, density=1000.0)
+    made = builder()
+    wn.add_forest(made, forest, material, pos=(0.5, 0.0, 1.0))
+    model = made.finalize(device=device)
+    x = bend(forest.points, 0.1) + 0.005 * rng.standard_normal(forest.points.shape)
+    body = wc.SoftBody(forest, material, device=device)
+    body.positions = x
+    wanted = wc.Simulation(body, model=wc.Corotated(rotation_level=3)).forces().numpy()
+    own = impulse(wn.SolverCorotated(model), model, x)
+    assert_near(impulse(wn.SolverCorotated(model, rotation_level=3), model, x), wanted, 1e-3)
+    assert np.abs(own - wanted).max() > 0.01 * np.abs(wanted).max()
+
+
 def test_materials_of_each_tetrahedron(device, rng):
     """Of general meshes and forests, of which parts are cut; both ways to read k_mu and k_lambda; changed ones."""
     forest = adaptive_forest(3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from ..kernels.newton_elements import (
 from ..kernels.rotation import quick_rotation
 from .forests import ForestGroup, forest_groups
 from .library import newton
+from .lost import warn_of_lost
 from .state import STATE, attribute_of
 
 #: How k_mu and k_lambda are read: mu = a k_mu, lambda = k_lambda + b k_mu, as (a, b).
@@ -72,7 +72,7 @@ class Tetrahedra:
         #: Materials and inverse masses that were last taken over.
         self._seen: list[np.ndarray] = [np.empty(0), np.empty(0)]
         self.refresh()
-        self._warn_of_lost()
+        warn_of_lost(model, self.tets)
 
     def refresh(self) -> bool:
         """Take over the model's present materials.
@@ -155,23 +155,6 @@ class Tetrahedra:
             raise InputError(f"tetrahedron {ids[bad[0]]} has a rest volume of {volumes[bad[0]]:g} m^3")
         elements.volume = wp.array(volumes, dtype=wp.float32, device=self.device)
         return elements
-
-    def _warn_of_lost(self) -> None:
-        """Say it where the builder seems to have left tetrahedra out."""
-        used = np.zeros(self.model.particle_count, bool)
-        used[self.tets] = True
-        starts, ends = self.model.volume_particle_start, self.model.volume_particle_end
-        if starts is None or ends is None:
-            return
-        ranges = zip(starts.numpy(), ends.numpy(), strict=True)
-        lost = sum(int(np.count_nonzero(~used[start:end])) for start, end in ranges)
-        if lost:
-            warnings.warn(
-                f"{lost} particles of soft bodies are in no tetrahedron: Newton's builder leaves out wrongly wound "
-                "tetrahedra, mass and all; build with warp_corot.newton.add_mesh, which turns them round",
-                UserWarning,
-                stacklevel=4,
-            )
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

@@ -1,0 +1,42 @@
+"""Tetrahedra that Newton's builder has left out: wrongly wound ones, mass and all, with a line in the log."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import numpy.typing as npt
+
+from ..mesh.surface import boundary_faces
+from .library import newton
+
+
+def warn_of_lost(model: newton.Model, tets: npt.NDArray[np.integer]) -> None:
+    """Say it where soft bodies of a model seem to lack tetrahedra.
+
+    Their surface triangles were found from all tetrahedra: with some left out, these have more faces that are no
+    other's. Or particles are in none at all.
+    """
+    if model.volume_particle_start is None or not len(model.volume_particle_start):
+        return
+    in_body, of_body = np.zeros(model.particle_count, bool), np.zeros(len(tets), bool)
+    ranges = (model.volume_particle_start, model.volume_particle_end, model.volume_tet_start, model.volume_tet_end)
+    for first, last, first_tet, last_tet in zip(*(array.numpy() for array in ranges), strict=True):
+        in_body[first:last] = True
+        of_body[first_tet:last_tet] = True
+    single = in_body.copy()
+    single[tets] = False
+    lost = [f"{np.count_nonzero(single)} particles of soft bodies are in no tetrahedron"] if single.any() else []
+    if model.tri_count:
+        triangles = model.tri_indices.numpy().reshape(-1, 3)
+        surface = np.count_nonzero(in_body[triangles].all(axis=1))
+        faces = len(boundary_faces(tets[of_body])[0])
+        if faces > surface > 0:
+            lost.append(f"soft bodies with {surface} surface triangles have {faces} outer faces")
+    if lost:
+        warnings.warn(
+            f"{' and '.join(lost)}: Newton's builder leaves out wrongly wound tetrahedra, mass and all; build with "
+            "warp_corot.newton.add_mesh, which turns them round",
+            UserWarning,
+            stacklevel=5,
+        )
