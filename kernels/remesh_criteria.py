@@ -36,15 +36,16 @@ def strain(element: ElementState, parameters: wp.array[wp.float32]):
 
 @wp.func
 def nearness(element: ElementState, parameters: wp.array[wp.float32]):
-    """Longest edge over the distance of the moved centroid from a box.
+    """Longest edge over the distance of the moved centroid from a tool, a box that may be rounded off.
 
-    Parameters, all in metres: the box's centre, half its size along each axis, and a length added to the distance, so
-    that elements are not refined without end where they touch.
+    Parameters, all in metres: the box's centre, half its size along each axis, the radius that it is rounded off with
+    (of a ball alone, the half sizes being zero), and a length added to the distance, so that elements are not refined
+    without end where they touch.
     """
     x = element.corner
     for n in range(4):
         x += 0.25 * (element.rest[n] + element.moved[n])
     centre = wp.vec3(parameters[0], parameters[1], parameters[2])
     half = wp.vec3(parameters[3], parameters[4], parameters[5])
-    outside = wp.max(wp.abs(x - centre) - half, wp.vec3(0.0))
-    return longest_edge(element) / (wp.length(outside) + parameters[6])
+    outside = wp.length(wp.max(wp.abs(x - centre) - half, wp.vec3(0.0))) - parameters[6]
+    return longest_edge(element) / (wp.max(outside, 0.0) + parameters[7])

@@ -97,15 +97,15 @@ def test_the_strain_criterion_sees_strain_and_no_rotation(level, device, rng):
 
 
 def test_the_nearness_criterion_goes_by_the_moved_place(device, rng):
-    """Longest edge over the distance of the moved centroid from a box, in float64."""
+    """Longest edge over the distance of the moved centroid from a rounded box, in float64."""
     forest = wc.TetForest.box((2, 1, 1), 0.1, 4)
     gradient = np.eye(3) + 0.3 * rng.normal(size=(3, 3))
-    centre, half, more = np.array([0.05, 0.1, 0.02]), np.array([0.02, 0.0, 0.03]), 0.01
+    centre, half, radius, more = np.array([0.05, 0.1, 0.02]), np.array([0.02, 0.0, 0.03]), 0.02, 0.01
     centroids = forest.points[forest.tets].mean(axis=1) @ gradient.T
     outside = np.linalg.norm(np.maximum(np.abs(centroids - centre) - half, 0.0), axis=1)
-    value = 0.05 * np.sqrt(2.0) / (outside + more)
-    threshold = np.quantile(value, 0.3)
+    value = 0.05 * np.sqrt(2.0) / (np.maximum(outside - radius, 0.0) + more)
+    threshold = np.quantile(value, 0.4)
     clear = np.abs(value / threshold - 1.0) > 1e-5
-    found = marked(forest, gradient, nearness, [*centre, *half, more], threshold, device)
+    found = marked(forest, gradient, nearness, [*centre, *half, radius, more], threshold, device)
     assert np.array_equal(found[clear], (value > threshold)[clear])
     assert clear.mean() > 0.9

@@ -145,7 +145,7 @@ class PressedSlab(Scene):
             "depth": 3,
             "refine_above": 0.58,
             "simplify_below": 0.23,
-            "parameters": [2.5, 2.0, 2.5, 0.5, 0.0, 0.5, 0.1],
+            "parameters": [2.5, 2.0, 2.5, 0.5, 0.0, 0.5, 0.0, 0.1],
         },
     }
 
