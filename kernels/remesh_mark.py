@@ -54,6 +54,11 @@ def load_state(i: int, origin: wp.vec3d, spacing: wp.float64, pools: Pools, u: w
     return state
 
 
+#: Share of its volume below which an element is not refined for its own sake: what is stretched there is mostly no
+#: tissue, and halves of it would hold next to no mass.
+LEAST_FILL = 0.5
+
+
 @functools.cache
 def marking_kernel(criterion: Any) -> wp.Kernel:
     """The kernel that marks leaves by a criterion: a Warp function of an ``ElementState`` and an array of numbers."""
@@ -68,6 +73,8 @@ def marking_kernel(criterion: Any) -> wp.Kernel:
         spacing: wp.float64,
         u: wp.array[wp.vec4],
         parameters: wp.array[wp.float32],
+        values: wp.array2d[wp.float32],
+        fill_column: int,
         # In and out
         pools: Pools,
     ):
@@ -75,7 +82,8 @@ def marking_kernel(criterion: Any) -> wp.Kernel:
             value = criterion(load_state(i, origin, spacing, pools, u), parameters)
             mark = wp.int8(0)
             if value > refine_above:
-                mark = REFINE
+                if fill_column < 0 or values[pools.leaves[i], wp.max(fill_column, 0)] >= wp.static(LEAST_FILL):
+                    mark = REFINE
             elif value < simplify_below:
                 mark = SIMPLIFY
             pools.marks[i] = mark

@@ -1,9 +1,20 @@
-"""What limits the time step of a mesh that has changed: the stiffest of its elements for their size and mass."""
+"""What limits the time step of a mesh that has changed: its stiffest elements for their size and mass, and how many.
+
+An element in a patch of its like vibrates faster than one among larger ones, so that not only the finest level counts.
+"""
 
 import warp as wp
 
 from .remesh import LEAVES, Pools
 from .remesh_state import Carried
+
+
+# Places in what is found; from FINEST_COUNTS on there are partial sums.
+STIFFEST = wp.constant(0)
+FINEST_LEVEL = wp.constant(1)
+FINEST_COUNTS = wp.constant(2)
+PARTIAL_SUMS = wp.constant(256)
+PLACES = 258
 
 
 @wp.kernel(enable_backward=False)
@@ -14,8 +25,7 @@ def begin_survey(
     found: wp.array[wp.int32],
 ):
     if goes[0] != 0:
-        found[0] = 0
-        found[1] = 0
+        found[wp.tid()] = 0
 
 
 @wp.kernel(enable_backward=False)
@@ -49,7 +59,26 @@ def find_stiffest(
         finest = wp.max(finest, level)
     # Positive floats are in the order of their bits. Few threads get so far as to write.
     bits = wp.cast(most, wp.int32)
-    if bits > found[0]:
-        wp.atomic_max(found, 0, bits)
-    if finest > found[1]:
-        wp.atomic_max(found, 1, finest)
+    if bits > found[STIFFEST]:
+        wp.atomic_max(found, STIFFEST, bits)
+    if finest > found[FINEST_LEVEL]:
+        wp.atomic_max(found, FINEST_LEVEL, finest)
+
+
+@wp.kernel(enable_backward=False)
+def count_finest(
+    # In
+    threads: int,
+    goes: wp.array[wp.int32],
+    pools: Pools,
+    # In and out
+    found: wp.array[wp.int32],
+):
+    """How many leaves are of the finest level, in partial sums."""
+    count = wp.where(goes[0] != 0, pools.counts[LEAVES], 0)
+    own = int(0)
+    for i in range(wp.tid(), count, threads):
+        if pools.level[pools.leaves[i]] == found[FINEST_LEVEL]:
+            own += 1
+    if own > 0:
+        wp.atomic_add(found, FINEST_COUNTS + wp.tid() % PARTIAL_SUMS, own)

@@ -233,6 +233,16 @@ def test_arrays_that_do_not_fit_are_refused_in_one_line(device):
     assert own == (sim.body.node_loads, sim.body.node_positions)
 
 
+def test_a_body_with_somebodys_array_is_not_remeshed(form, device):
+    for name in ("loads", "positions"):
+        body = bar(device).body
+        getattr(body, f"use_{name}")(form(body.node_count, device))
+        with pytest.raises(wc.InputError, match=rf"^{name} is somebody else's.*use_{name}\(None\)"):
+            wc.Simulation(body, remesh=wc.OnlineRemesh())
+        getattr(body, f"use_{name}")(None)
+        wc.Simulation(body, remesh=wc.OnlineRemesh()).step()
+
+
 def test_a_body_that_is_remeshed_takes_none(device):
     mesh = wc.TetForest.box(cells=(1, 1, 2), cell_size=0.1, level=3)
     body = wc.SoftBody(mesh, wc.Isotropic(2e4, 0.4, 1000.0), device=device)

@@ -94,3 +94,24 @@ def test_forests_of_domains_refine_and_simplify(device, rng):
     body = wc.SoftBody(mesh, wc.Isotropic(1e3, 0.3, DENSITY), device=device)
     assert body.masses.sum() == pytest.approx(adaptive.carriage.arrays.mass.numpy().sum(), rel=1e-5)
     assert len(mesh.refine([0]).tets) > len(mesh.tets)
+
+
+@wp.func
+def always(element: ElementState, parameters: wp.array[wp.float32]):
+    return 2.0
+
+
+def test_what_holds_little_is_not_refined_for_its_own_sake(device):
+    mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.04, device=device), 0.03, max_level=4)
+    forest = DeviceForest(mesh, 50_000, device=device)
+    RemeshPass(forest, criterion=always, refine_above=1.0, simplify_below=0.0, max_level=20).run()
+    refined = forest.to_forest()
+    stayed = np.isin(refined.tree.leaves, np.flatnonzero(refined.tree.parent >= 0)) & np.isin(
+        refined.tets.view("i4,i4,i4,i4"), mesh.tets.view("i4,i4,i4,i4")
+    ).ravel()
+    assert stayed.any()
+    assert refined.fill[stayed].max() < 0.5
+    untouched = wc.TetForest.box((2, 2, 2), 0.03, 3)
+    forest = DeviceForest(untouched, 50_000, device=device)
+    RemeshPass(forest, criterion=always, refine_above=1.0, simplify_below=0.0, max_level=20).run()
+    assert forest.leaf_count == 2 * len(untouched.tets)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from remeshed import near, twin
+from remeshed import SOFT, near, twin
 
 import warp_corot as wc
 
@@ -70,3 +70,22 @@ def test_bodies_of_domains_go_on_as_on_a_mesh_made_that_way(device):
         assert np.abs(body.displacements.numpy() - fixed.body.displacements.numpy()).max() < 1e-5 * moved
         np.testing.assert_allclose(sim.von_mises(), fixed.von_mises(), rtol=1e-2, atol=1e-3 * fixed.von_mises().max())
         sim.advance_steps(2)
+
+
+def test_the_step_is_stable_for_the_mesh_of_every_time(device):
+    """A patch of fine elements grows, and with it the largest frequency at the same finest level."""
+    body = wc.SoftBody(wc.TetForest.box((4, 1, 1), 0.05, 3), SOFT, device=device)
+    body.fix(body.mesh.points[:, 0] < 1e-9)
+    remesh = near(0.1, device, max_level=8, simplify_below=0.0)
+    remesh.parameters.assign([0.1, 1e-4])
+    sim = wc.Simulation(body, remesh=remesh)
+    steps = []
+    for reach in (1e-4, 5e-3, 1e-2, 2e-2, 4e-2, 8e-2):
+        remesh.parameters.assign([0.1, reach])
+        sim.advance_steps(50)
+        fixed = wc.SoftBody(body.mesh, body.material, device=device)
+        fixed.fix(body.constrained)
+        assert sim.dt <= 0.95 * wc.Simulation(fixed).stable_dt
+        steps.append(sim.dt)
+    assert int(body.mesh.levels.min()) == 8
+    assert steps[-1] < 0.95 * steps[1]

@@ -95,6 +95,18 @@ class SharedArrays:
         if given is None:
             self._own_positions = None
 
+    def check_own_arrays(self) -> None:
+        """See that the body can be remeshed as far as its arrays go.
+
+        Raises:
+            InputError: Somebody else's array stands in for one of its own.
+        """
+        for name, own in (("loads", self._own_loads), ("positions", self._own_positions)):
+            if own is not None:
+                raise InputError(
+                    f"{name} is somebody else's array; a body that is remeshed has its own: use_{name}(None)"
+                )
+
     def _shared(self, array: Any, name: str) -> wp.array:
         """Somebody's array as steps take it: vec4 [worlds * N] if kernels can read it whole, or vec3 with a stride."""
         if self.changing is not None:

@@ -369,8 +369,8 @@ class Simulation:
             self._control_step()
 
     def _control_step(self) -> None:
-        """Find the stable step anew where the stiffest elements are others now."""
-        if not self.remeshing.stiffness_changed():
+        """Find the stable step anew where the elements that limit it are others now."""
+        if not self.remeshing.step_may_change():
             return
         before, self.dt = self.dt, self._found_step(stacklevel=5)
         if self.dt == before:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,9 +15,12 @@ import numpy.typing as npt
 import warp as wp
 
 from ..errors import InputError
+from ..remesh.carried_activation import Keys
+from ..remesh.conditions import KEPT
 from ..remesh.keyframes import Row
 from ..remesh.online import OnlineRemesh
 from ..remesh.snapshot import Piece, Snapshot, array_of
+from ..remesh.survey import Findings
 
 if TYPE_CHECKING:
     from ..remesh.changing import Changing
@@ -44,6 +47,9 @@ def pack_changing(changing: Changing, prefix: str, arrays: Arrays) -> dict[str, 
     rows = conditions.keyframes.rows
     for k, row in enumerate(rows):
         arrays[f"{prefix}row{k}.times"], arrays[f"{prefix}row{k}.displacements"] = row.times, row.displacements
+    keys = conditions.activation.keys
+    for k, each in enumerate(keys):
+        arrays[f"{prefix}activation{k}.times"], arrays[f"{prefix}activation{k}.stress"] = each.times, each.stress
     return {
         "options": {name: getattr(options, name) for name in PLAIN},
         "criterion": None if options.criterion is None else _name_of(options.criterion),
@@ -52,9 +58,10 @@ def pack_changing(changing: Changing, prefix: str, arrays: Arrays) -> dict[str, 
         "rows": len(rows),
         "between": [[*ends, row] for ends, row in conditions.keyframes.between.items()],
         "loads": changing.body.has_loads,
+        "activation": changing.body.has_activation,
+        "activation_rows": [each.first for each in keys],
         "at_beginning": conditions.of_present_mesh,
-        "stiffness": changing.found_stiffness,
-        "coarser_for": changing.coarser_for,
+        "survey": asdict(changing.survey.last),
         "initial": _pack_snapshot(forest.remembered, f"{prefix}initial.", arrays),
         "present": _pack_snapshot(Snapshot.of(forest), f"{prefix}present.", arrays),
     }
@@ -70,16 +77,25 @@ def unpack_changing(changing: Changing, described: dict[str, Any], prefix: str, 
         Row(arrays[f"{prefix}row{k}.times"], arrays[f"{prefix}row{k}.displacements"]) for k in range(described["rows"])
     ]
     keyframes.between = {(a, b): row for a, b, row in described["between"]}
+    if described["activation"]:
+        _ = body.activation  # made on first use
     changing.renew()
+    activation = changing.conditions.activation
+    activation.keys = [
+        Keys(first, arrays[f"{prefix}activation{k}.times"], arrays[f"{prefix}activation{k}.stress"])
+        for k, first in enumerate(described["activation_rows"])
+    ]
+    if activation.keys:
+        activation.serve()
     carried = forest.carriage.arrays
     body.trajectories = keyframes.trajectories(carried.row[: body.node_count].numpy(), body.device)
     body.revision += 1
     kept = {
-        name: _on_device(arrays[f"{prefix}conditions.{name}"], getattr(carried, name))
+        name: wp.array(arrays[f"{prefix}conditions.{name}"], dtype=KEPT[name], device=body.device)
         for name in described["conditions"]
     }
     changing.conditions.set_kept(kept, of_present_mesh=described["at_beginning"])
-    changing.found_stiffness, changing.coarser_for = described["stiffness"], described["coarser_for"]
+    changing.survey.last = Findings(**described["survey"])
 
 
 def remesh_options(

@@ -75,6 +75,8 @@ class RemeshPass:
         self._mark = marking_kernel(criterion)
         self._origin = wp.vec3d(*forest.source.origin)
         self._spacing = lattice_spacing(forest.source.cell_size)
+        names = forest.carriage.names
+        self._fill_column = names.index("fill") if "fill" in names else -1
         self._edges = self._make_edges()
         self._blocks = self._make_blocks()
         self._removal = self._make_removal()
@@ -114,7 +116,7 @@ class RemeshPass:
         if not marked:
             refine_above, simplify_below = self.thresholds
             inputs = [refine_above, simplify_below, self._origin, self._spacing, carried.u, self.parameters]
-            self._many(self._mark, *inputs, pools)
+            self._many(self._mark, *inputs, carried.values, self._fill_column, pools)
         self._many(remesh_edges.want_marked, self.levels[1], pools, edges)
         self._many(remesh_blocks.clear_blocks, pools, self._blocks)
         self._many(remesh_blocks.list_blocks, pools, self._blocks)

@@ -49,8 +49,9 @@ class Remeshing:
             return
         if deterministic and bodies[0].device.is_cuda:
             raise InputError("a deterministic run on CUDA cannot be remeshed: new nodes are numbered as threads come")
-        for each, model in zip(options, models, strict=True):
+        for each, body, model in zip(options, bodies, models, strict=True):
             if each is not None:
+                body.check_own_arrays()
                 model.check_remeshable()
         from .changing import Changing
 
@@ -85,9 +86,9 @@ class Remeshing:
                 warnings.warn(message, CapacityWarning, stacklevel=5)
         return bool(due)
 
-    def stiffness_changed(self) -> bool:
-        """Whether the stable step may be another one than when this was last asked."""
-        return any([changing.stiffness_changed() for changing in self.changing if changing is not None])
+    def step_may_change(self) -> bool:
+        """Whether the stable step is to be found anew; to be asked once a pass."""
+        return any([changing.survey.step_may_change() for changing in self.changing if changing is not None])
 
 
 def _one_each(
