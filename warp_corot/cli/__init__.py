@@ -21,9 +21,9 @@ from .signals import signals_waiting, terminable
 def commands() -> dict[str, ModuleType]:
     """The subcommands by name; they need all of the package, so that importing them takes a while."""
     with signals_waiting():
-        from . import paper, simulate
+        from . import paper, scene, simulate
 
-    return {"simulate": simulate, "paper": paper}
+    return {"simulate": simulate, "scene": scene, "paper": paper}
 
 
 class Parser(argparse.ArgumentParser):

@@ -1,0 +1,243 @@
+"""``warp-corot scene``: a USD stage in, the same stage out with its soft and rigid bodies moving."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..device import checked_device
+from ..errors import InputError, UnstableError
+from .compiling import compiling_said
+from .say import EXIT_CODES, complain, interrupt_status
+from .simulate import _kept as kept
+from .simulate import _progress_bar as progress_bar
+from .summary import _milliseconds as milliseconds
+from .summary import length, pressure
+
+if TYPE_CHECKING:
+    from ..io.animate import Recording
+    from ..io.usd_over import SceneWriter
+    from ..newton.stage_steps import StageSimulation
+
+__all__ = ["add_parser", "run"]
+
+DURATION = 2.0
+
+
+def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
+    """Add the command to ``warp-corot``."""
+    parser = subparsers.add_parser(
+        "scene",
+        help="step a USD stage: soft bodies, rigid bodies, ground",
+        description="Steps the scene of a USD stage and writes a stage over it in which its bodies move, with the "
+        'stress of every tetrahedron. Needs Newton: pip install "warp-corot[newton]" newton-usd-schemas.',
+        epilog=f"""examples:
+  warp-corot scene stage.usda -o moving.usd
+  warp-corot scene stage.usda -o moving.usd --duration 5 --fps 60 --device cuda:0
+  warp-corot scene block.usd -o block-falls.usd --young 2e4 --ground -0.5 --show-stress
+
+what is read, as Newton reads it:
+  TetMesh prims, with or without PhysicsVolumeDeformableSimAPI; of the physics material that is bound to them
+  (PhysicsVolumeDeformableMaterialAPI) youngsModulus, poissonsRatio and density; masses, restShapePoints; attachments
+  to rigid bodies, and to what does not move, by which points are held; graphics meshes of a deformable body
+  rigid bodies, colliders, joints and the gravity of UsdPhysics; metersPerUnit, kilogramsPerUnit, upAxis, transforms
+
+what is written, on top of OUT's sublayer INPUT, which must stay beside it unless --flatten is given:
+  of TetMesh prims points, velocities, primvars:vonMises [Pa], one a tetrahedron, and its colours
+  of rigid bodies their transforms; of graphics meshes their points
+
+{EXIT_CODES}""",
+    )
+    parser.add_argument(
+        "input", metavar="INPUT", type=Path, help="stage with TetMesh prims (.usd, .usda, .usdc, .usdz)"
+    )
+    parser.add_argument(
+        "-o", "--output", required=True, type=Path, metavar="OUT.usd", help="stage to write (.usd, .usdc or .usda)"
+    )
+    said = parser.add_argument_group("what the stage does not say")
+    said.add_argument("--young", type=float, metavar="E", help="Young's modulus [Pa] (default: 20 times the weight of "
+                      "a column as high as the body, over its area)")  # fmt: skip
+    said.add_argument("--poisson", type=float, default=0.45, metavar="NU", help="Poisson's ratio (default: 0.45)")
+    said.add_argument("--density", type=float, default=1000.0, metavar="RHO", help="[kg/m^3] (default: 1000)")
+    said.add_argument(
+        "--ground",
+        default="auto",
+        metavar="HEIGHT",
+        help="height of a ground plane [m]; auto: under the bodies if the stage has no collider and nothing is held "
+        "(default); or none",
+    )
+    said.add_argument(
+        "--fix", metavar="EXPR", help='points that are held, such as "z > zmax - 0.01": see simulate --help [m]'
+    )
+    motion = parser.add_argument_group("the motion")
+    motion.add_argument(
+        "--gravity", type=float, nargs=3, metavar=("X", "Y", "Z"), help="[m/s^2] (default: the stage's, else 9.81 down)"
+    )
+    motion.add_argument(
+        "--viscosity",
+        type=float,
+        metavar="S",
+        help="viscous over elastic shear stress of one strain [s] (default: 5 %% of critical damping for each body's "
+        "slowest vibration)",
+    )
+    motion.add_argument(
+        "--damping", type=float, default=0.0, metavar="C", help="mass-proportional damping, of falls too [1/s] (0)"
+    )
+    motion.add_argument(
+        "--duration", type=float, default=DURATION, metavar="T", help=f"simulated time [s] (default: {DURATION:g})"
+    )
+    motion.add_argument(
+        "--fps", type=float, metavar="F", help="frames per second (default: the stage's time codes per second, else 24)"
+    )
+    motion.add_argument("--dt", type=float, help="longest time step [s] (default: a safe one, found)")
+    shown = parser.add_argument_group("the output")
+    shown.add_argument(
+        "--show-stress", action="store_true", help="colour soft bodies by stress, whatever material they are drawn with"
+    )
+    shown.add_argument("--flatten", action="store_true", help="write one file that needs no other stage")
+    parser.add_argument("--device", help='"cpu", "cuda:0", ... (default: a GPU if there is one)')
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command; returns the exit status.
+
+    Raises:
+        InputError: Newton is not there, bad options, or a bad stage; nothing has been simulated or written.
+    """
+    from ..io.animate import Recording, frame_count, signals_held_back
+    from ..newton.stage import StageOptions
+    from ..newton.stage_steps import StageSimulation
+
+    gravity = None if args.gravity is None else tuple(args.gravity)
+    options = StageOptions(
+        args.young, args.poisson, args.density, gravity, args.viscosity, _ground(args.ground), args.fix
+    )
+    if args.fps is not None:
+        frame_count(args.duration, args.fps)
+    device = checked_device(args.device)
+    with compiling_said(device):
+        sim = StageSimulation(
+            args.input, fps=args.fps, dt=args.dt, options=options, damping=args.damping, device=device
+        )
+    count = frame_count(args.duration, sim.fps)
+    writer = scene_writer(sim, args.output, show_stress=args.show_stress, flatten=args.flatten)
+    for note in sim.parts.notes:
+        complain(note, kind="note")
+    done = Recording(writer.path)
+    try:
+        with progress_bar(count) as progress:
+            for frame in range(count + 1):
+                started = time.perf_counter()
+                if frame:
+                    sim.advance()
+                stepped = time.perf_counter()
+                with signals_held_back():
+                    _write(writer, sim, done)
+                done.stepping += stepped - started
+                done.writing += time.perf_counter() - stepped
+                progress(frame, count)
+        _close(writer, done)
+    except (KeyboardInterrupt, UnstableError, OSError) as error:
+        return _end(error, writer, done)
+    print(_summary(args.input, sim, writer, done))
+    return 0
+
+
+def scene_writer(sim: StageSimulation, path: Path, *, show_stress: bool = False, flatten: bool = False) -> SceneWriter:
+    """What writes the frames of a stage's simulation."""
+    from ..io.usd_over import SceneWriter
+
+    parts = sim.parts
+    return SceneWriter(
+        path,
+        sim.scene,
+        [body.prim for body in parts.soft],
+        dict(zip(parts.rigid, sim.body_poses(), strict=True)),
+        parts.surfaces,
+        fps=sim.fps,
+        ground=parts.ground,
+        show_stress=show_stress,
+        flatten=flatten,
+    )
+
+
+def _ground(text: str) -> float | str:
+    if text in ("auto", "none"):
+        return text
+    try:
+        height = float(text)
+    except ValueError:
+        height = math.nan
+    if not math.isfinite(height):
+        raise InputError(f"--ground {text!r}: it must be a height in m, auto or none")
+    return height
+
+
+def _write(writer: SceneWriter, sim: StageSimulation, done: Recording) -> None:
+    writer.write(sim.show())
+    done.frames = writer.frames
+    done.simulated = sim.time
+    done.steps = sim.frames * sim.steps
+
+
+def _close(writer: SceneWriter, done: Recording) -> None:
+    from ..io.animate import signals_held_back
+
+    started = time.perf_counter()
+    with signals_held_back():
+        writer.close()
+    done.writing += time.perf_counter() - started
+
+
+def _end(error: BaseException, writer: SceneWriter, done: Recording) -> int:
+    """Close the stage after an early end, and say what became of it; returns the exit status."""
+    try:
+        _close(writer, done)
+    except OSError as other:
+        complain(str(other))
+    if isinstance(error, KeyboardInterrupt):
+        complain(f"interrupted; {kept(done)}", kind="")
+        return interrupt_status(error)
+    if isinstance(error, UnstableError):
+        complain(f"{error}; {kept(done)}")
+        return 3
+    complain(str(error))
+    return 1
+
+
+def _summary(source: Path, sim: StageSimulation, writer: SceneWriter, done: Recording) -> str:
+    parts, units = sim.parts, sim.scene.units
+    gravity = sim.parts.model.gravity.numpy()[-1] * units.metres
+    rows = [("stage", f"{units.metres:g} m per unit, {sim.scene.up_axis} up")]
+    for body in parts.soft:
+        size = f"{len(body.prim.points)} points, {len(body.prim.tets)} tetrahedra"
+        material = (
+            f"E = {pressure(float(f'{body.young:.4g}'))}, nu = {body.poisson:.3g}, rho = {body.density:.4g} kg/m^3"
+        )
+        rows.append(("soft body", f"{body.prim.path}: {size}; {material}"))
+    if parts.rigid:
+        rows.append(("rigid bodies", ", ".join(parts.rigid)))
+    stepping = max(done.stepping, 1e-9)
+    rows += [
+        ("colliders", f"{parts.model.shape_count}" + (", with a ground" if parts.ground is not None else "")),
+        ("gravity", f"{' '.join(f'{g:.4g}' for g in gravity)} m/s^2"),
+        ("time step", f"{milliseconds(sim.dt)}, largest stable one about {milliseconds(sim.solver.stable_dt)}"),
+        ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"),
+        ("wall time", f"{done.stepping:.2f} s stepping, {done.writing:.2f} s writing"),
+        ("displacement", f"{length(_displacement(sim))} largest at the end"),
+        ("stress", f"colours up to {pressure(writer.stress_range[1])} (von Mises)"),
+        ("device", f"{parts.model.device} ({parts.model.device.name})"),
+        ("written", f"{done.path}, {done.frames} frames, {done.simulated:.4g} s"),
+    ]
+    return "\n".join([str(source), *(f"  {name:<14}{text}" for name, text in rows)])
+
+
+def _displacement(sim: StageSimulation) -> float:
+    moved = sim.state.particle_q.numpy().astype(np.float64) - sim.parts.model.particle_q.numpy()
+    return float(np.linalg.norm(moved, axis=1).max()) * sim.scene.units.metres

@@ -1,0 +1,198 @@
+"""Stages with tetrahedra as scenes to be simulated: opened, checked, and repaired in memory, never in their files."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Tf, Usd, UsdGeom, UsdPhysics
+
+from ..errors import InputError
+from ..mesh.surface import signed_volumes
+from .formats import USD_SUFFIXES
+from .usd_files import metres_per_unit, open_stage
+
+
+class Units(NamedTuple):
+    """What a stage's numbers are in: lengths in ``metres``, masses in ``kilograms``, time in seconds.
+
+    Everything else follows, as UsdPhysics has it: density in mass over length cubed, and so on.
+    """
+
+    metres: float
+    kilograms: float
+
+    @property
+    def density(self) -> float:
+        """[kg/m^3]."""
+        return self.kilograms / self.metres**3
+
+    @property
+    def pressure(self) -> float:
+        """[Pa]."""
+        return self.kilograms / self.metres
+
+
+class TetPrim(NamedTuple):
+    """A TetMesh prim.
+
+    Attributes:
+        path: Of the prim.
+        points: In its own space, float64 [N, 3].
+        tets: As the prim's orientation has them, after repair, int32 [T, 4].
+        repaired: How many were wound wrongly.
+        left_handed: What its orientation is.
+    """
+
+    path: str
+    points: NDArray[np.float64]
+    tets: NDArray[np.int32]
+    repaired: int
+    left_handed: bool
+
+
+@dataclass(eq=False)
+class Scene:
+    """A stage that has been opened to be simulated; what is changed in it is in its session layer.
+
+    Attributes:
+        path: The file.
+        stage: ``Usd.Stage``, without instances around what can move, and with animation stopped at its first time.
+        units: Of its numbers.
+        up_axis: "X", "Y" or "Z".
+        frame_rate: Time codes per second if the file says so.
+        tets: Its TetMesh prims.
+        animated: Paths of prims with transforms that change over time in the file.
+        uninstanced: Paths of prims that were instances.
+    """
+
+    path: Path
+    stage: Any
+    units: Units
+    up_axis: str
+    frame_rate: float | None
+    tets: list[TetPrim] = field(default_factory=list)
+    animated: list[str] = field(default_factory=list)
+    uninstanced: list[str] = field(default_factory=list)
+
+    def matrix(self, path: str) -> NDArray[np.float64]:
+        """From a prim's space to the world, for row vectors, float64 [4, 4]."""
+        prim = self.stage.GetPrimAtPath(path)
+        return np.array(UsdGeom.XformCache(Usd.TimeCode.Default()).GetLocalToWorldTransform(prim), dtype=np.float64)
+
+    def world_points(self, path: str) -> NDArray[np.float64]:
+        """Points of a prim in the world, float64 [N, 3]."""
+        given = UsdGeom.PointBased(self.stage.GetPrimAtPath(path)).GetPointsAttr().Get()
+        matrix = self.matrix(path)
+        return np.asarray(given, dtype=np.float64).reshape(-1, 3) @ matrix[:3, :3] + matrix[3, :3]
+
+    def parent(self, path: str) -> str:
+        """The path of a prim's parent."""
+        return str(self.stage.GetPrimAtPath(path).GetPath().GetParentPath())
+
+    def has(self, path: str, attribute: str) -> bool:
+        """Whether the file gives an attribute of a prim a value."""
+        found = self.stage.GetPrimAtPath(path).GetAttribute(attribute)
+        return bool(found) and found.HasAuthoredValue()
+
+
+def open_scene(path: str | PathLike[str]) -> Scene:
+    """Open a stage with TetMesh prims.
+
+    Wrongly wound tetrahedra are turned round, which is counted; Newton would leave them out.
+
+    Raises:
+        InputError: No such file, no stage, units that are none, no TetMesh prim, or one that cannot be simulated.
+    """
+    source = Path(path)
+    if source.suffix.lower() not in USD_SUFFIXES:
+        raise InputError(f"{source}: extension {source.suffix or '(none)'}, should be {', '.join(USD_SUFFIXES)}")
+    if not source.is_file():
+        raise InputError(f"{source}: no such file")
+    stage = open_stage(source)
+    errors = stage.GetCompositionErrors()
+    if errors:
+        raise InputError(f"{source}: does not compose: {errors[0]}")
+    stage.SetEditTarget(stage.GetSessionLayer())
+    kilograms = float(UsdPhysics.GetStageKilogramsPerUnit(stage))
+    if not (math.isfinite(kilograms) and kilograms > 0.0):
+        raise InputError(f"{source}: kilogramsPerUnit is {kilograms}, should be a positive number")
+    given = stage.GetRootLayer().timeCodesPerSecond if stage.HasAuthoredMetadata("timeCodesPerSecond") else None
+    units = Units(metres_per_unit(stage, source), kilograms)
+    scene = Scene(source, stage, units, str(UsdGeom.GetStageUpAxis(stage)), given)
+    scene.uninstanced = _without_instances(stage)
+    scene.animated = _stop_animation(stage)
+    for prim in stage.Traverse():
+        if prim.IsA(UsdGeom.TetMesh):
+            scene.tets.append(_tet_prim(prim, source))
+    if not scene.tets:
+        raise InputError(f"{source}: has no TetMesh prim; meshes of other kinds go into `warp-corot simulate`")
+    return scene
+
+
+def _without_instances(stage: Any) -> list[str]:
+    """Open up the instances that hold what can move by itself; of an instance only the whole can."""
+    opened: list[str] = []
+    while moving := [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if _moves_in_instance(prim)]:
+        instance = moving[0]
+        while not instance.IsInstance() or instance.IsInstanceProxy():
+            instance = instance.GetParent()
+        opened.append(str(instance.GetPath()))
+        instance.SetInstanceable(False)
+    return opened
+
+
+def _moves_in_instance(prim: Any) -> bool:
+    return prim.IsInstanceProxy() and (prim.IsA(UsdGeom.TetMesh) or prim.HasAPI(UsdPhysics.RigidBodyAPI))
+
+
+def _stop_animation(stage: Any) -> list[str]:
+    """Have transforms and points be what they are at their first time; the paths of what was animated."""
+    animated = []
+    for prim in stage.Traverse():
+        if not prim.IsA(UsdGeom.Xformable):
+            continue
+        xformable = UsdGeom.Xformable(prim)
+        attributes = [op.GetAttr() for op in xformable.GetOrderedXformOps()]
+        if any(attribute.ValueMightBeTimeVarying() for attribute in attributes):
+            animated.append(str(prim.GetPath()))
+        if prim.IsA(UsdGeom.TetMesh):
+            attributes += [UsdGeom.TetMesh(prim).GetPointsAttr(), UsdGeom.TetMesh(prim).GetTetVertexIndicesAttr()]
+        for attribute in attributes:
+            if attribute.GetNumTimeSamples() and attribute.Get() is None:
+                attribute.Set(attribute.Get(Usd.TimeCode.EarliestTime()))
+    return animated
+
+
+def _tet_prim(prim: Any, source: Path) -> TetPrim:
+    mesh, name = UsdGeom.TetMesh(prim), f"{source}: {prim.GetPath()}"
+    given, indices = mesh.GetPointsAttr().Get(), mesh.GetTetVertexIndicesAttr().Get()
+    if given is None or len(given) == 0 or indices is None or len(indices) == 0:
+        missing = "points" if given is None or len(given) == 0 else "tetVertexIndices"
+        raise InputError(f"{name}: is a TetMesh without {missing}")
+    points = np.asarray(given, dtype=np.float64).reshape(-1, 3)
+    tets = np.array(indices, dtype=np.int32).reshape(-1, 4)
+    if not np.isfinite(points).all():
+        raise InputError(f"{name}: point {int(np.argmin(np.isfinite(points).all(axis=1)))} is not finite")
+    if tets.min() < 0 or tets.max() >= len(points):
+        bad = tets[(tets < 0) | (tets >= len(points))][0]
+        raise InputError(f"{name}: names point {bad} but has points 0 to {len(points) - 1}")
+    left_handed = mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+    volumes = signed_volumes(points, tets) * (-1.0 if left_handed else 1.0)
+    size = float(np.ptp(points, axis=0).max())
+    flat = np.flatnonzero(np.abs(volumes) <= 1e-12 * size**3 / len(tets))
+    if len(flat):
+        raise InputError(f"{name}: {len(flat)} of {len(tets)} tetrahedra have no volume, the first is {flat[0]}")
+    wrong = volumes < 0.0
+    if wrong.any():
+        tets[wrong] = tets[wrong][:, [0, 1, 3, 2]]
+        try:
+            mesh.GetTetVertexIndicesAttr().Set(tets.tolist())
+        except Tf.ErrorException as error:
+            raise InputError(f"{name}: its tetrahedra cannot be turned round: {error}") from None
+    return TetPrim(str(prim.GetPath()), points, tets, int(wrong.sum()), left_handed)

@@ -1,0 +1,169 @@
+"""Scenes of USD stages, stepped frame by frame."""
+
+from __future__ import annotations
+
+import math
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from ..device import checked_device
+from ..errors import InputError
+from ..io.animate import steps_per_frame
+from ..io.usd_over import State
+from ..io.usd_scene import open_scene
+from .library import newton
+from .solver import SAFETY, SolverCorotated
+from .stage import StageOptions, stage_model
+
+#: Steps that are recorded and replayed together; a frame is a whole number of such chunks.
+CHUNK = 16
+#: Longest step where rigid bodies touch something [s].
+RIGID_STEP = 5e-4
+
+
+class StageSimulation:
+    """A USD stage as a scene, stepped by ``SolverCorotated``.
+
+    Its materials, colliders, rigid bodies, joints, attachments and gravity are what ``newton.ModelBuilder.add_usd``
+    reads; rigid bodies are stepped along by Newton. Time begins at zero, and animation in the stage stands still.
+
+    Args:
+        path: A stage with TetMesh prims.
+        fps: Frames per second of simulated time; None: time codes per second of the stage if it says so, else 24.
+        dt: Longest time step [s]; None: a safe one.
+        options: What the stage does not say.
+        damping: Rate of mass-proportional damping [1/s], of free fall, too.
+        device: What to simulate on.
+
+    Attributes:
+        scene: The stage.
+        parts: Its model, and which prim is what in it.
+        solver: The solver.
+        state: ``newton.State``, in the stage's units.
+        dt: The time step [s].
+        steps: How many make a frame.
+        time: Simulated so far [s].
+
+    Raises:
+        InputError: A stage or an option that cannot be used.
+    """
+
+    def __init__(
+        self,
+        path: str | PathLike[str],
+        *,
+        fps: float | None = None,
+        dt: float | None = None,
+        options: StageOptions | None = None,
+        damping: float = 0.0,
+        device: Any = None,
+    ):
+        if dt is not None and not (math.isfinite(dt) and dt > 0):
+            raise InputError(f"dt is {dt:g} s; it must be a positive number")
+        self.scene = open_scene(path)
+        self.fps = 24.0 if fps is None and self.scene.frame_rate is None else float(fps or self.scene.frame_rate or 0)
+        if not (math.isfinite(self.fps) and self.fps > 0):
+            raise InputError(f"fps is {self.fps:g}; it must be a positive number")
+        self.parts = stage_model(self.scene, options or StageOptions(), checked_device(device))
+        model = self.parts.model
+        self.solver = SolverCorotated(model, damping=damping)
+        self._pipeline = newton.CollisionPipeline(model, soft_contact_margin=self.parts.margin)
+        self._contacts = self._pipeline.contacts()
+        self._choose_step(dt)
+        self.state = self._new_state()
+        # Shares its positions with the state, and has stresses, which are wanted once a frame and not once a step.
+        self._shown = model.state()
+        self._shown.particle_q = self.state.particle_q
+        self._visuals = newton.geometry.DeformableVisuals(model) if self.parts.surfaces else None
+        self._graph = self._recorded()
+        self.time = 0.0
+        self.frames = 0
+
+    def advance(self) -> None:
+        """Simulate one frame.
+
+        Raises:
+            UnstableError: The state would not be finite; it stays what it was.
+        """
+        for _ in range(self.steps // self._chunk):
+            wp.capture_launch(self._graph)
+        self.solver.check()
+        self.frames += 1
+        self.time = self.frames / self.fps
+
+    def show(self) -> State:
+        """What a frame shows, copied to the host."""
+        parts = self.parts
+        x, v = self.state.particle_q.numpy(), self.state.particle_qd.numpy()
+        self.solver.write_attributes(self._shown)
+        stress = self._shown.warp_corot.von_mises.numpy() * np.float32(self.scene.units.pressure)
+        surfaces = []
+        if self._visuals is not None:
+            points = self._visuals.update(self.state).points.numpy()
+            surfaces = [points[chosen] for chosen in parts.surface_points]
+        return State(
+            [x[body.particles].copy() for body in parts.soft],
+            [v[body.particles].copy() for body in parts.soft],
+            [stress[body.tets] for body in parts.soft],
+            self.body_poses(),
+            surfaces,
+        )
+
+    def body_poses(self) -> npt.NDArray[np.float64]:
+        """Poses of the rigid bodies in the order of ``parts.rigid``, for row vectors, float64 [B, 4, 4]."""
+        poses = np.zeros((len(self.parts.rigid), 4, 4))
+        if not len(poses):
+            return poses
+        every = self.state.body_q.numpy().astype(np.float64)[list(self.parts.rigid.values())]
+        poses[:, 3, :3], poses[:, 3, 3] = every[:, :3], 1.0
+        x, y, z, w = (every[:, 3:] / np.linalg.norm(every[:, 3:], axis=1, keepdims=True)).T
+        poses[:, :3, :3] = np.moveaxis(
+            np.array(
+                [
+                    [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
+                    [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+                    [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+                ]
+            ),
+            2,
+            0,
+        )
+        return poses
+
+    # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _choose_step(self, dt: float | None) -> None:
+        stable = self.solver.stable_dt
+        if dt is not None and dt > stable:
+            raise InputError(f"dt is {dt:g} s; the largest stable step is about {stable:.3g} s")
+        longest = dt
+        if longest is None:
+            longest = min(SAFETY * self.solver.contact_dt, RIGID_STEP if self.parts.rigid else math.inf, 1.0 / self.fps)
+        count = steps_per_frame(self.fps, longest)
+        self._chunk = min(count, CHUNK)
+        self.steps = -(-count // self._chunk) * self._chunk
+        self.dt = 1.0 / (self.fps * self.steps)
+
+    def _new_state(self) -> newton.State:
+        state = self.parts.model.state()
+        del state.warp_corot
+        return state
+
+    def _step(self, state: newton.State) -> None:
+        state.clear_forces()
+        self._pipeline.collide(state, self._contacts)
+        self.solver.step(state, state, None, self._contacts, self.dt)
+
+    def _recorded(self) -> Any:
+        """The steps of a chunk, as a graph; kernels are loaded on a state that is thrown away."""
+        scratch = self._new_state()
+        self._step(scratch)
+        self.solver.check()
+        with wp.ScopedCapture(device=self.parts.model.device) as capture:
+            for _ in range(self._chunk):
+                self._step(self.state)
+        return capture.graph
