@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from .keyframes import key_before
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -24,11 +26,7 @@ def follow_activation(
     t = elements[k]
     start = world_starts[t // world_element_count]
     now = (wp.float64(clock[0] + wp.int64(offset)) - start) * wp.float64(dt)
-    last = times.shape[0] - 1
-    key = int(0)
-    while key < last - 1 and times[key + 1] <= now:
-        key += 1
-    s = wp.clamp((now - times[key]) / (times[key + 1] - times[key]), wp.float64(0.0), wp.float64(1.0))
+    key, s = key_before(times, now)
     row = wp.min(k, stress.shape[1] - 1)
     a = stress[key, row]
-    activation[t] = a + float(s) * (stress[key + 1, row] - a)
+    activation[t] = a + s * (stress[key + 1, row] - a)

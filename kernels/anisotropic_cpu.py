@@ -12,9 +12,10 @@ from typing import Any
 import warp as wp
 
 from .anisotropic import OrthotropicMaterial, axes_of, element_forces, filled
-from .elements import GeneralElements, frame, rest_volume
+from .elements import ForestElements, GeneralElements, frame, rest_volume
 from .general_cpu import ADD_FORCES, gather_elements, rest_inverse_of
 from .lanes import COMPILER_FLAGS, NEWTON, PRELUDE, on_cpu
+from .remesh_plan import Plan, extent, leaf_row
 from .rotation import ITERATIONS, byers_xu
 
 wp.set_module_options({"enable_backward": False})
@@ -104,6 +105,18 @@ def scatter_anisotropic_lanes(
     eight_anisotropic(elements, material, is_active, activation, wp.tid(), count, u, f, flagged)
 
 
+@wp.func
+def turn_element(
+    elements: Any,
+    material: OrthotropicMaterial,
+    t: int,
+    rest_inverse: wp.array[wp.mat33],
+    volume: wp.array[wp.float32],
+):
+    rest_inverse[t] = rest_inverse_of(elements, t, wp.transpose(frame(elements, t)) * axes_of(material, t))
+    volume[t] = filled(material, t) * rest_volume(elements, t)
+
+
 @functools.cache
 def turn_elements(Elements: Any) -> wp.Kernel:
     """Elements of either kind as ``scatter_anisotropic_lanes`` wants them: Dm^-1 M, and the filled volume."""
@@ -117,11 +130,25 @@ def turn_elements(Elements: Any) -> wp.Kernel:
         rest_inverse: wp.array[wp.mat33],
         volume: wp.array[wp.float32],
     ):
-        t = wp.tid()
-        rest_inverse[t] = rest_inverse_of(elements, t, wp.transpose(frame(elements, t)) * axes_of(material, t))
-        volume[t] = filled(material, t) * rest_volume(elements, t)
+        turn_element(elements, material, wp.tid(), rest_inverse, volume)
 
     return turn_elements
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def turn_changed(
+    # In
+    threads: int,
+    plan: Plan,
+    elements: ForestElements,
+    material: OrthotropicMaterial,
+    # Out
+    rest_inverse: wp.array[wp.mat33],
+    volume: wp.array[wp.float32],
+):
+    """The same of leaves that have changed, and of what padding there is in their place."""
+    for t in range(wp.tid(), extent(leaf_row(plan), plan), threads):
+        turn_element(elements, material, t, rest_inverse, volume)
 
 
 @functools.cache

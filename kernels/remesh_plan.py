@@ -43,6 +43,12 @@ def flat_row(plan: Plan):
 
 
 @wp.func
+def leaf_row(plan: Plan):
+    """Where all leaves are counted."""
+    return plan.classes + 2
+
+
+@wp.func
 def extent(row: int, plan: Plan):
     """How many places of something are written, padding included."""
     if plan.goes[0] == 0:
@@ -68,7 +74,7 @@ def begin_plan(
         plan.goes[0] = 1
         for row in range(plan.classes + 3):
             plan.before[row] = plan.counts[row]
-        plan.counts[plan.classes + 2] = pools.counts[LEAVES]
+        plan.counts[leaf_row(plan)] = pools.counts[LEAVES]
     plan.stale[0] = 0
 
 
@@ -82,7 +88,7 @@ def gather_leaves(
     plan: Plan,
 ):
     """What leaves are by their places in the list; values of padding are zero."""
-    for i in range(wp.tid(), extent(plan.classes + 2, plan), threads):
+    for i in range(wp.tid(), extent(leaf_row(plan), plan), threads):
         if i < pools.counts[LEAVES]:
             e = pools.leaves[i]
             plan.code[i] = pools.code[e]

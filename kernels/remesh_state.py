@@ -5,6 +5,8 @@ removed gives back to each end what it then gains, moving as the end does and, o
 together. So mass and linear momentum stay, and bisection and removal undo each other. Children have their parent's
 density. What ends lose and gain is summed leaf by leaf, so that densities around an edge may differ by any factor, and
 children that are merged may, too.
+
+Tetrahedra carry columns of numbers. Children have their parent's; what a parent has of its children's each column says.
 """
 
 import warp as wp
@@ -15,6 +17,12 @@ from .remesh import ADDED, GAINERS, NODE_TOP, REMOVED, Pools
 # Rows of keyframes for nodes that follow none, and for held nodes between such as follow different ones.
 NO_ROW = wp.constant(-1)
 MIXED_ROWS = wp.constant(-2)
+
+# What a parent has in a column of values. Children are of one volume, so that means keep what values are densities of.
+MEAN = wp.constant(0)  # of both children
+MEAN_OF_CONTENTS = wp.constant(1)  # weighted by what each child holds of its volume
+FIRST = wp.constant(2)  # the first child's
+MEAN_IF_ALIKE = wp.constant(3)  # MEAN_OF_CONTENTS if all whole numbers of both are the same, else FIRST
 
 
 @wp.struct
@@ -39,6 +47,9 @@ class Carried:
     density: wp.array[wp.float64]  # mass per rest volume, what is not filled counted in
     label: wp.array[wp.int32]
     values: wp.array2d[wp.float32]
+    merging: wp.array[wp.int32]  # MEAN, MEAN_OF_CONTENTS, … of each column of values
+    fill_column: int  # that of the filled share, -1 if all is full
+    numbers: wp.array2d[wp.int32]  # whole ones; a parent has its first child's
     # While nodes are removed.
     gained_mass: wp.array[wp.float64]
     gained_momentum: wp.array[wp.vec3d]  # beyond what the mass has that moves as the end does
@@ -64,15 +75,41 @@ def copy_to_children(e: int, child: int, carried: Carried):
         carried.label[child + n] = carried.label[e]
         for c in range(carried.values.shape[1]):
             carried.values[child + n, c] = carried.values[e, c]
+        for c in range(carried.numbers.shape[1]):
+            carried.numbers[child + n, c] = carried.numbers[e, c]
+
+
+@wp.func
+def share_of_first(child: int, carried: Carried):
+    """How much of what both children hold the first one does."""
+    share = float(0.5)
+    if carried.fill_column >= 0:
+        first = carried.values[child, carried.fill_column]
+        both = first + carried.values[child + 1, carried.fill_column]
+        if both > 0.0:
+            share = first / both
+    return share
 
 
 @wp.func
 def average_children(e: int, child: int, carried: Carried):
-    """Children are of one volume, so that means keep what the values are densities of."""
     carried.density[e] = wp.float64(0.5) * (carried.density[child] + carried.density[child + 1])
     carried.label[e] = carried.label[child]
+    alike = bool(True)
+    for c in range(carried.numbers.shape[1]):
+        alike = alike and carried.numbers[child, c] == carried.numbers[child + 1, c]
+        carried.numbers[e, c] = carried.numbers[child, c]
+    share = share_of_first(child, carried)
     for c in range(carried.values.shape[1]):
-        carried.values[e, c] = 0.5 * (carried.values[child, c] + carried.values[child + 1, c])
+        a = carried.values[child, c]
+        b = carried.values[child + 1, c]
+        merging = carried.merging[c]
+        value = 0.5 * (a + b)
+        if merging == FIRST or (merging == MEAN_IF_ALIKE and not alike):
+            value = a
+        elif merging != MEAN:
+            value = b + share * (a - b)
+        carried.values[e, c] = value
 
 
 @wp.func

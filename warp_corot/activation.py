@@ -11,6 +11,7 @@ import warp as wp
 
 from .errors import InputError
 from .indices import checked_indices
+from .keys import checked_times, staying
 
 if TYPE_CHECKING:
     from .controls import Controls
@@ -37,8 +38,7 @@ class Activation:
             t, s = np.asarray(self.times, dtype=np.float64), np.asarray(self.stress, dtype=np.float64)
         except (TypeError, ValueError):
             raise InputError("times and stress of an Activation must be numbers") from None
-        if t.ndim != 1 or len(t) < 2 or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
-            raise InputError(f"times of shape {t.shape} must be at least two finite, increasing numbers")
+        checked_times(t)
         if s.ndim not in (1, 2) or len(s) != len(t) or not np.isfinite(s).all():
             raise InputError(f"stress has shape {s.shape}; it must be finite, [{len(t)}] or [{len(t)}, n]")
         object.__setattr__(self, "times", t)
@@ -77,14 +77,13 @@ class ElementActivation:
 
     def without(self, chosen: np.ndarray) -> ElementActivation | None:
         """The same for the elements that are not among the chosen; None if all are."""
-        elements, stress = self.elements.numpy(), self.stress.numpy()
-        stays = ~np.isin(elements, chosen)
-        if stays.all():
+        left = staying(self.elements.numpy(), chosen, self.stress.numpy())
+        if left is None:
             return self
-        if not stays.any():
+        elements, stress = left
+        if not len(elements):
             return None
-        kept = stress[:, stays] if stress.shape[1] > 1 else stress
-        return ElementActivation.of_keys(elements[stays], Activation(self.times.numpy(), kept), self.elements.device)
+        return ElementActivation.of_keys(elements, Activation(self.times.numpy(), stress), self.elements.device)
 
 
 def activate(

@@ -14,6 +14,10 @@ from .materials import Field, Isotropic, Material, place, set_checked
 
 Array = npt.NDArray[np.float64]
 
+#: The entries of ``Anisotropic.stiffness`` and of ``frames``, row by row, where elements carry them one by one.
+STIFFNESS_ENTRIES = tuple(f"stiffness{n}" for n in range(9))
+FRAME_ENTRIES = tuple(f"frame{n}" for n in range(9))
+
 # How far from a right angle the axes of a material may be: the largest cosine between two.
 _RIGHT_ANGLE = 1e-3
 
@@ -36,6 +40,14 @@ class Anisotropic(Material):
     @abstractmethod
     def frames(self) -> Array:
         """The axes in rest space as the columns of proper rotations, [..., 3, 3]."""
+
+    @abstractmethod
+    def fields_of(self, constants: tuple[Array, Array, Array]) -> dict[str, Array]:
+        """The fields that give these ``constants``, by name."""
+
+    @abstractmethod
+    def directions_of(self, frames: Array) -> dict[str, Array]:
+        """The field that gives these ``frames``, [..., 3, 3], by name."""
 
     def stiffness(self) -> Array:
         """C_11, C_22, C_33, C_12, C_13, C_23, G_12, G_13, G_23 in the material's axes [Pa], [..., 9]."""
@@ -131,6 +143,19 @@ class TransverselyIsotropic(Anisotropic):
             _stacked(self.shear_along, self.shear_along, transverse),
         )
 
+    def fields_of(self, constants: tuple[Array, Array, Array]) -> dict[str, Array]:
+        young, poisson, shear = constants
+        return {
+            "young_along": young[..., 0],
+            "young_across": young[..., 1],
+            "poisson_along": poisson[..., 0],
+            "poisson_across": poisson[..., 2],
+            "shear_along": shear[..., 0],
+        }
+
+    def directions_of(self, frames: Array) -> dict[str, Array]:
+        return {"direction": frames[..., 0]}
+
     def _margin(self) -> Array:
         ratio = np.asarray(self.young_across) / self.young_along
         return 1.0 - self.poisson_across - 2.0 * np.asarray(self.poisson_along) ** 2 * ratio
@@ -189,12 +214,27 @@ class Orthotropic(Anisotropic):
     def constants(self) -> tuple[Array, Array, Array]:
         return self.young, self.poisson, self.shear
 
+    def fields_of(self, constants: tuple[Array, Array, Array]) -> dict[str, Array]:
+        return dict(zip(("young", "poisson", "shear"), constants, strict=True))
+
+    def directions_of(self, frames: Array) -> dict[str, Array]:
+        return {"axes": np.swapaxes(frames, -1, -2)}
+
     def frames(self) -> Array:
         first, second = self.axes[..., 0, :], self.axes[..., 1, :]
         # Rounding and small angles off; which way an axis points does not matter.
         second = second - np.sum(first * second, axis=-1, keepdims=True) * first
         second /= np.linalg.norm(second, axis=-1, keepdims=True)
         return np.stack([first, second, np.cross(first, second)], axis=-1)
+
+
+def constants_of(stiffness: Array) -> tuple[Array, Array, Array]:
+    """``Anisotropic.constants`` of what ``Anisotropic.stiffness`` gives, [..., 9]."""
+    normal = stiffness[..., [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(*stiffness.shape[:-1], 3, 3)
+    compliance = np.linalg.inv(normal)
+    young = 1.0 / np.diagonal(compliance, axis1=-2, axis2=-1)
+    poisson = -compliance[..., [0, 0, 1], [1, 2, 2]] * young[..., [0, 0, 1]]
+    return young, poisson, stiffness[..., 6:]
 
 
 def _stacked(*values: npt.ArrayLike) -> Array:

@@ -106,6 +106,7 @@ class SoftBody(Controls, SharedArrays):
         self.node_inverse_mass = wp.empty(n, dtype=wp.float32, device=self.device)
         self.trajectories: list[Trajectory] = []
         self.element_activation = wp.zeros(1, dtype=wp.float32, device=self.device)
+        self.has_activation = False
         self.activations: list[ElementActivation] = []
         #: Time steps done when each world was last reset, float64 [worlds]; where steps were of other lengths before,
         #: as many of the present ones as would have taken as long.

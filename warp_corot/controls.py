@@ -38,6 +38,7 @@ class Controls:
     activations: list[ElementActivation]
     revision: int
     has_loads: bool
+    has_activation: bool
     _views: Views
 
     @property
@@ -154,7 +155,7 @@ class Controls:
 
     @property
     def activation(self) -> wp.array:
-        """Active stress along the fibres [Pa], float32 [worlds * T]: the live array, made on first use.
+        """Active stress along the fibres [Pa], float32 [worlds * T]: a view of the live array, made on first use.
 
         Positive stress contracts. Write to it between steps; elements that follow an ``Activation`` have in it what
         they had in the last step.
@@ -162,15 +163,17 @@ class Controls:
         Raises:
             InputError: The material has no fibres.
         """
-        if not isinstance(self.material, Anisotropic):
+        if not self.has_activation and not isinstance(self.material, Anisotropic):
             raise InputError(
                 "activation needs a material with a direction, TransverselyIsotropic or Orthotropic; "
                 f"the body's is {type(self.material).__name__}"
             )
         if not self.has_activation:
-            self.element_activation = wp.zeros(self.element_count, dtype=wp.float32, device=self.device)
+            self.has_activation = True
+            if len(self.element_activation) < self.element_count:
+                self.element_activation = wp.zeros(self.element_count, dtype=wp.float32, device=self.device)
             self.revision += 1
-        return self.element_activation
+        return self._views.hand_out(self.element_activation[: self.element_count])
 
     def activate(
         self,
@@ -194,10 +197,6 @@ class Controls:
             InputError: The material has no fibres, wrong shapes, or values that are not finite.
         """
         activate(self, stress, elements, worlds)
-
-    @property
-    def has_activation(self) -> bool:
-        return len(self.element_activation) == self.element_count and isinstance(self.material, Anisotropic)
 
     @property
     def constrained(self) -> npt.NDArray[np.bool_]:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import warp as wp
 
 from .errors import InputError
+from .keys import checked_times, staying
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,10 +37,8 @@ class Trajectory:
         """
         if times is None or displacements is None:
             raise InputError("prescribe needs both times and displacements")
-        t = np.asarray(times, dtype=np.float64)
+        t = checked_times(times)
         d = np.asarray(displacements, dtype=np.float64)
-        if t.ndim != 1 or len(t) < 2 or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
-            raise InputError(f"times of shape {t.shape} must be at least two finite, increasing numbers")
         if d.shape not in ((len(t), 3), (len(t), len(nodes), 3)) or not np.isfinite(d).all():
             raise InputError(
                 f"displacements has shape {d.shape}; it must be finite, [{len(t)}, 3] or [{len(t)}, {len(nodes)}, 3]"
@@ -57,11 +56,11 @@ class Trajectory:
 
     def without(self, chosen: np.ndarray) -> Trajectory | None:
         """The same for the nodes that are not among the chosen; None if all are."""
-        nodes = self.nodes.numpy()
-        stays = ~np.isin(nodes, chosen)
-        if stays.all():
+        left = staying(self.nodes.numpy(), chosen, self.displacements.numpy())
+        if left is None:
             return self
-        if not stays.any():
+        nodes, d = left
+        if not len(nodes):
             return None
-        times, d = self.keys()
-        return Trajectory.of_keys(nodes[stays], times, d[:, stays] if d.ndim == 3 else d, self.nodes.device)
+        kept = d[:, 0] if d.shape[1] == 1 else d
+        return Trajectory.of_keys(nodes, self.times.numpy(), kept, self.nodes.device)

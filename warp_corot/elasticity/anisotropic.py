@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..anisotropy import Anisotropic
+from ..anisotropy import FRAME_ENTRIES, STIFFNESS_ENTRIES, Anisotropic
 from ..checks import check_float32
 from ..kernels.activation import follow_activation
 from ..kernels.anisotropic import (
@@ -18,12 +18,20 @@ from ..kernels.anisotropic import (
     scatter_anisotropic,
     vec9,
 )
-from ..kernels.anisotropic_cpu import repair_anisotropic, scatter_anisotropic_lanes, turn_elements
+from ..kernels.anisotropic_cpu import (
+    repair_anisotropic,
+    scatter_anisotropic_lanes,
+    turn_changed,
+    turn_elements,
+)
+from ..kernels.anisotropic_remesh import assemble_materials
+from ..kernels.elements import GeneralElements
 from .lanes import Lanes, as_general
 from .model import ForceField, leaf_slots
 
 if TYPE_CHECKING:
     from ..body import SoftBody
+    from ..remesh.plan import DevicePlan
 
 
 class AnisotropicField(ForceField):
@@ -58,6 +66,18 @@ class AnisotropicField(ForceField):
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         self.launch(self._forces, self.element_count, [self.elements, self.material, *self._activation, u], [f])
 
+    def follow(self, plan: DevicePlan) -> None:
+        if self.elements is not plan.elements:
+            self.material = changing_material(self.material, self.body, plan)
+        super().follow(plan)
+
+    def derive(self, plan: DevicePlan) -> None:
+        names, material = plan.forest.carriage.names, self.material
+        rows = [names.index(name) if name in names else -1 for name in (FRAME_ENTRIES[0], STIFFNESS_ENTRIES[0])]
+        inputs = [plan.forest.threads, plan.forest.pools, plan.arrays, *rows]
+        if max(rows) >= 0:
+            self.launch(assemble_materials, plan.forest.threads, inputs, [material.axes, material.stiffness])
+
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         self.launch(self._energies, self.element_count, [self.elements, self.material, u], [energies])
 
@@ -69,8 +89,8 @@ class AnisotropicField(ForceField):
         body = self.body
         for activation in body.activations:
             inputs = [activation.elements, activation.times, activation.stress, dt, clock, body.world_starts]
-            inputs += [len(body.mesh.tets), offset]
-            self.launch(follow_activation, len(activation.elements), inputs, [body.activation])
+            inputs += [body.world_element_count, offset]
+            self.launch(follow_activation, len(activation.elements), inputs, [body.element_activation])
 
     @property
     def _activation(self) -> list:
@@ -82,14 +102,41 @@ class AnisotropicLanesField(AnisotropicField):
 
     def __init__(self, body: SoftBody, rotation: wp.Function, deterministic: bool):
         super().__init__(body, rotation, deterministic)
-        kind = body.element_kind
-        # Their rest matrices turned into the material's axes.
-        general = as_general(self.elements, turn_elements(kind), [self.elements, self.material])
-        repair = repair_anisotropic(kind)
-        self._lanes = Lanes(self.elements, general, scatter=scatter_anisotropic_lanes, repair=repair)
+        if body.changing is None:
+            self._general = self._turned()
+            self._lanes = self._lanes_of(self.elements, self._general)
+
+    def follow(self, plan: DevicePlan) -> None:
+        is_new = self.elements is not plan.elements
+        super().follow(plan)
+        if is_new:
+            self._general = self._turned()
+        count = self.element_count
+        self._lanes = self._lanes_of(_first(self.elements, count), _first(self._general, count))
+
+    def derive(self, plan: DevicePlan) -> None:
+        super().derive(plan)
+        inputs = [plan.forest.threads, plan.arrays, self.elements, self.material]
+        self.launch(turn_changed, plan.forest.threads, inputs, [self._general.rest_inverse, self._general.volume])
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         self._lanes.scatter_forces([self.material, *self._activation], u, f)
+
+    def _turned(self) -> GeneralElements:
+        """The elements as general ones, their rest matrices turned into the material's axes."""
+        return as_general(self.elements, turn_elements(self.body.element_kind), [self.elements, self.material])
+
+    def _lanes_of(self, elements: Any, general: GeneralElements) -> Lanes:
+        repair = repair_anisotropic(self.body.element_kind)
+        return Lanes(elements, general, scatter=scatter_anisotropic_lanes, repair=repair)
+
+
+def _first(elements: Any, count: int) -> Any:
+    """The first elements of either kind."""
+    some = type(elements)()
+    some.assign(elements)
+    some.nodes = some.targets = elements.nodes[:count]
+    return some
 
 
 def device_material(body: SoftBody) -> OrthotropicMaterial:
@@ -104,6 +151,20 @@ def device_material(body: SoftBody) -> OrthotropicMaterial:
     material.mu, material.lam, _stride = body.lame
     fill = np.ones(()) if body.fill is None else body.fill
     material.fill, material.fill_stride = _for_elements(fill, 0, body, wp.float32)
+    return material
+
+
+def changing_material(given: OrthotropicMaterial, body: SoftBody, plan: DevicePlan) -> OrthotropicMaterial:
+    """The same material of leaves that change, and of padding; ``AnisotropicField.derive`` writes what varies."""
+    material, count = OrthotropicMaterial(), plan.most_leaves
+    material.assign(given)
+    material.mu, material.lam, material.stride = body.lame
+    if given.axes_stride:
+        material.axes = wp.array(np.tile(np.eye(3), (count, 1, 1)), dtype=wp.mat33, device=body.device)
+    if given.stride:
+        material.stiffness = wp.zeros(count, dtype=vec9, device=body.device)
+    if "fill" in plan.values:
+        material.fill = plan.values["fill"]
     return material
 
 

@@ -76,6 +76,9 @@ class ForceField(ABC):
         """
         self.elements = plan.elements
 
+    def derive(self, plan: DevicePlan) -> None:  # noqa: B027 (most need nothing)
+        """Launch what brings up to date what is kept of such elements, if ``plan.goes``; may be recorded."""
+
     def begin_step(self, clock: wp.array, offset: int, dt: float) -> None:  # noqa: B027 (most do not change)
         """Launch what sets the field for a step, where it changes with time.
 

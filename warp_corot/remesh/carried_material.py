@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from ..anisotropy import FRAME_ENTRIES, STIFFNESS_ENTRIES, Anisotropic, constants_of
+from ..kernels.remesh_state import FIRST, MEAN_IF_ALIKE, MEAN_OF_CONTENTS, NO_ROW
 from ..materials import Isotropic, Material
 from .plan import DevicePlan
 from .pools import DeviceForest
+from .transfer import Column, Numbers
 
 if TYPE_CHECKING:
     from ..body import SoftBody
+
+#: The active stress, and, of whole numbers, the row of keyframes that it follows.
+ACTIVATION = "activation"
+ACTIVATION_ROW = "activation_row"
+
+
+def carried_material(body: SoftBody) -> CarriedMaterial:
+    """What the body's elements are to carry of its material."""
+    return (CarriedAnisotropic if isinstance(body.material, Anisotropic) else CarriedMaterial)(body)
 
 
 class CarriedMaterial:
@@ -20,16 +34,18 @@ class CarriedMaterial:
 
     Attributes:
         given: The material that the body began with.
-        values: What elements carry, by name, [T] each: Lamé's parameters times the filled share, and without it.
+        values: What elements carry, by name, [T] each: Lamé's parameters times the filled share, and without it. Of the
+            latter a parent has the mean that counts by what its children hold.
     """
 
     def __init__(self, body: SoftBody):
-        self.given: Isotropic = body.material
-        self.values: dict[str, npt.NDArray[np.floating]] = {}
+        self.given: Any = body.material
+        self.values: dict[str, npt.NDArray[np.floating] | Column | Numbers] = {}
         if body.material_stride:
             self.values = {"mu": body.mu.numpy(), "lam": body.lam.numpy()}
         if body.lame[2] and body.fill is not None:
-            self.values |= {"own_mu": body.lame[0].numpy(), "own_lam": body.lame[1].numpy()}
+            own = (Column(array.numpy(), int(MEAN_OF_CONTENTS)) for array in body.lame[:2])
+            self.values |= dict(zip(("own_mu", "own_lam"), own, strict=True))
         self._lame = ("own_mu", "own_lam") if "own_mu" in self.values else ("mu", "lam") if body.lame[2] else ()
         #: 2 mu + lambda [Pa] of all elements if they are alike, else 0.
         self.modulus = 0.0 if self.values else float(2.0 * body.mu.numpy()[0] + body.lam.numpy()[0])
@@ -47,12 +63,64 @@ class CarriedMaterial:
 
     def present(self, forest: DeviceForest) -> Material:
         """The material of the present elements."""
-        leaves, carriage = forest.leaf_elements, forest.carriage
-        density: Any = self.given.density
-        if np.ndim(density):
-            fill = carriage.values("fill")[leaves] if "fill" in carriage.names else 1.0
-            density = carriage.arrays.density.numpy()[leaves] / fill
+        density = self._present_density(forest)
         if not self._lame:
             return Isotropic(self.given.young, self.given.poisson, density)
-        mu, lam = (carriage.values(name)[leaves].astype(np.float64) for name in self._lame)
+        mu, lam = _of_leaves(forest, self._lame).T
         return Isotropic(mu * (3.0 * lam + 2.0 * mu) / (lam + mu), 0.5 * lam / (lam + mu), density)
+
+    def _present_density(self, forest: DeviceForest) -> Any:
+        if not np.ndim(self.given.density):
+            return self.given.density
+        fill = _of_leaves(forest, ("fill",))[:, 0] if "fill" in forest.carriage.names else 1.0
+        return forest.carriage.arrays.density.numpy()[forest.leaf_elements] / fill
+
+
+class CarriedAnisotropic(CarriedMaterial):
+    """What of an anisotropic material varies from element to element, and active stress.
+
+    Beside the nearest isotropic material elements carry axes, stiffness in these, active stress and the row of
+    keyframes that it follows. Children have all their parent's. A parent has its first child's axes and row; its
+    stiffness is the mean of both children's, counted by what they hold, and so is its active stress if both follow the
+    same row or none; otherwise that is the first child's.
+    """
+
+    def __init__(self, body: SoftBody):
+        super().__init__(body)
+        count = len(body.mesh.tets)
+        stiffness, frames = self.given.stiffness(), self.given.frames()
+        self._stiffness_varies = stiffness.size > 9
+        self._axes_vary = frames.size > 9
+        if self._stiffness_varies:
+            self.values |= _columns(STIFFNESS_ENTRIES, stiffness, count, int(MEAN_OF_CONTENTS))
+        if self._axes_vary:
+            self.values |= _columns(FRAME_ENTRIES, frames, count, int(FIRST))
+        active = body.element_activation.numpy() if body.has_activation else 0.0
+        self.values[ACTIVATION] = Column(active, int(MEAN_IF_ALIKE))
+        self.values[ACTIVATION_ROW] = Numbers(int(NO_ROW))
+
+    def serve(self, body: SoftBody, plan: DevicePlan) -> None:
+        super().serve(body, plan)
+        body.element_activation = plan.values[ACTIVATION]
+
+    def present(self, forest: DeviceForest) -> Material:
+        changed: dict[str, Any] = {"density": self._present_density(forest)}
+        if self._stiffness_varies:
+            changed |= self.given.fields_of(constants_of(_of_leaves(forest, STIFFNESS_ENTRIES)))
+        if self._axes_vary:
+            changed |= self.given.directions_of(_of_leaves(forest, FRAME_ENTRIES).reshape(-1, 3, 3))
+        return replace(self.given, **changed)
+
+
+def _columns(
+    names: Sequence[str], values: npt.NDArray[np.float64], count: int, merging: int
+) -> dict[str, npt.NDArray[np.floating] | Column | Numbers]:
+    """Columns of values [count, …], a number each."""
+    table = values.reshape(count, len(names))
+    return {name: Column(column, merging) for name, column in zip(names, table.T, strict=True)}
+
+
+def _of_leaves(forest: DeviceForest, names: Sequence[str]) -> npt.NDArray[np.float64]:
+    """What the present leaves carry in some columns, [T, names]."""
+    chosen = [forest.carriage.names.index(name) for name in names]
+    return forest.carriage.arrays.values.numpy()[forest.leaf_elements][:, chosen].astype(np.float64)

@@ -8,29 +8,26 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..anisotropy import Anisotropic
 from ..elasticity.subtree_field import SubtreeField
 from ..errors import InputError
-from ..kernels import remesh_survey
 from ..kernels.integrate import set_start
 from ..kernels.remesh_mark import elongation
 from ..materials import Material
 from ..mesh import TetForest
 from ..mesh.lattice import volume_shares
-from .carried_material import CarriedMaterial
+from .carried_material import carried_material
 from .conditions import Conditions
 from .online import OnlineRemesh
 from .passes import RemeshPass
 from .plan import DevicePlan
 from .pools import DeviceForest, PassCounts
 from .sizes import launch_size
+from .survey import Survey
 
 if TYPE_CHECKING:
     from ..body import SoftBody
     from ..elasticity import ForceField
 
-#: Passes for which elements must have stayed coarser before a longer step is looked for.
-PATIENCE = 10
 #: Nodes are launched in multiples of this.
 NODE_GRANULE = 256
 
@@ -46,14 +43,12 @@ class Changing:
         forest: The pools.
         passes: What changes them.
         carried_material: What elements carry of the material.
-        conditions: What is done to the nodes.
-        found_stiffness: Of the stiffest element when the step was found last [1/s^2], as ``kernels.remesh_survey``
-            has it.
-        coarser_for: Passes for which there have been softer ones only.
+        conditions: What is done to nodes and fibres.
+        survey: What limits the time step.
         is_full: Whether refinement had to be left out for want of room.
 
     Raises:
-        InputError: A general mesh, more than one world, an anisotropic material, or options that do not fit the mesh.
+        InputError: A general mesh, more than one world, or options that do not fit the mesh.
     """
 
     def __init__(self, body: SoftBody, options: OnlineRemesh):
@@ -62,13 +57,11 @@ class Changing:
             raise InputError(f"only a TetForest can be remeshed; the mesh of this body is a {type(mesh).__name__}")
         if body.worlds > 1:
             raise InputError(f"worlds is {body.worlds}; only a body in one world can be remeshed")
-        if isinstance(body.material, Anisotropic):
-            raise InputError(f"the material is {type(body.material).__name__}; only an Isotropic one can be remeshed")
         self.body = body
         self.device = body.device
         self.options = options.on(mesh)
         self.is_full = False
-        self.carried_material = CarriedMaterial(body)
+        self.carried_material = carried_material(body)
         assert self.options.capacity is not None
         assert self.options.min_level is not None
         assert self.options.max_level is not None
@@ -89,12 +82,7 @@ class Changing:
             max_level=self.options.max_level,
             parameters=self.options.parameters,
         )
-        self._stiffness = self.found_stiffness = 0.0
-        self.coarser_for = 0
-        self._survey = wp.zeros(2, dtype=wp.int32, device=self.device)
-        names = self.forest.carriage.names
-        columns = [names.index(name) if name in names else -1 for name in ("mu", "lam")]
-        self._survey_inputs = [self.carried_material.modulus, *columns]
+        self.survey = Survey(self.forest, self.carried_material.modulus)
         self.plan: DevicePlan | None = None
         #: What is looked at after a pass: counts of the pools and of the plan, and the survey.
         self._report: wp.array | None = None
@@ -141,12 +129,12 @@ class Changing:
         body.elements = self.plan.elements
         self.carried_material.serve(body, self.plan)
         field.follow(self.plan)
-        parts = (self.forest.pools.counts, self.plan.class_counts, self._survey)
+        parts = (self.forest.pools.counts, self.plan.class_counts, self.survey.found)
         self._report_parts = [len(part) for part in parts]
         self._report = wp.zeros(sum(self._report_parts), dtype=wp.int32, device=self.device)
         self.renew()
         self.conditions.keep()
-        self.found_stiffness = self._stiffness
+        self.survey.settle()
 
     def run(self) -> None:
         """One pass over the mesh, and what follows from it if anything has changed."""
@@ -168,17 +156,6 @@ class Changing:
         self.plan.outdate()
         self._launch_derived()
         self._look(anyway=True)
-
-    def stiffness_changed(self) -> bool:
-        """Whether the stiffest elements are others than when this was last true: stiffer, or softer for some time."""
-        if self._stiffness > 1.001 * self.found_stiffness:
-            changed = True
-        else:
-            self.coarser_for = self.coarser_for + 1 if self._stiffness < 0.999 * self.found_stiffness else 0
-            changed = self.coarser_for > PATIENCE
-        if changed:
-            self.found_stiffness, self.coarser_for = self._stiffness, 0
-        return changed
 
     def reset(self, chosen: wp.array, clock: wp.array) -> None:
         """Go back to the mesh and state of the beginning, or of the last ``remember``, if the world is chosen.
@@ -229,14 +206,10 @@ class Changing:
         assert self.plan is not None
         forest = self.forest
         self.plan.launch()
-        goes = self.plan.goes
-        wp.launch(remesh_survey.begin_survey, dim=1, inputs=[goes], outputs=[self._survey], device=self.device)
-        inputs = [forest.threads, goes, *self._survey_inputs, forest.pools, forest.carriage.arrays]
-        wp.launch(
-            remesh_survey.find_stiffest, dim=forest.threads, inputs=inputs, outputs=[self._survey], device=self.device
-        )
+        self.field.derive(self.plan)
+        self.survey.launch(self.plan.goes)
         start = 0
-        for part in (forest.pools.counts, self.plan.class_counts, self._survey):
+        for part in (forest.pools.counts, self.plan.class_counts, self.survey.found):
             wp.copy(self._report, part, dest_offset=start)
             start += len(part)
 
@@ -244,7 +217,7 @@ class Changing:
         """The one look at what the device has done: if the mesh is another one, body and field go through that."""
         assert self.plan is not None
         assert self._report is not None
-        counted, classes, (bits, finest) = np.split(self._report.numpy(), np.cumsum(self._report_parts)[:-1])
+        counted, classes, surveyed = np.split(self._report.numpy(), np.cumsum(self._report_parts)[:-1])
         counts = PassCounts.of(counted)
         self.is_full = counts.full
         if not (counts.added or counts.removed or anyway):
@@ -259,8 +232,8 @@ class Changing:
             self.field.follow(self.plan)
             body.revision += 1
         body.mesh_changed(counts.nodes, counts.leaves)
-        self._stiffness = float(bits.view(np.float32))
-        body.smallest_volume = float(volume_shares(finest)) * self.forest.source.cell_size**3
+        self.survey.read(surveyed)
+        body.smallest_volume = float(volume_shares(self.survey.finest_level)) * self.forest.source.cell_size**3
         body.publish_positions()
         self.conditions.follow()
         for binding in body.bindings:

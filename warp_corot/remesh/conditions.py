@@ -1,4 +1,4 @@
-"""What is done to the nodes of a changing mesh: which are held and loaded, and which keyframes they follow."""
+"""What is done to a changing mesh: which nodes are held and loaded, how fibres pull, which keyframes both follow."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import numpy.typing as npt
 import warp as wp
 
 from ..kernels.remesh_state import NO_ROW
+from .carried_activation import CarriedActivation
+from .carried_material import ACTIVATION, ACTIVATION_ROW
 from .keyframes import Keyframes
 from .pools import DeviceForest
 
@@ -15,8 +17,19 @@ if TYPE_CHECKING:
     from ..body import SoftBody
 
 
+#: What is kept for ``put_back``.
+KEPT: dict[str, Any] = {
+    "held": wp.uint8,
+    "load": wp.vec4,
+    "row": wp.int32,
+    "v": wp.vec4,
+    ACTIVATION: wp.float32,
+    ACTIVATION_ROW: wp.int32,
+}
+
+
 class Conditions:
-    """Held nodes, loads and keyframes, handed between body and pools.
+    """Held nodes, loads, active stress and keyframes, handed between body and pools.
 
     Args:
         body: The body.
@@ -24,13 +37,15 @@ class Conditions:
 
     Attributes:
         keyframes: What nodes follow.
-        kept: Held nodes, loads, rows and velocities as ``put_back`` writes them.
+        activation: Active stress, and what it follows.
+        kept: Held nodes, loads, rows, velocities and active stress as ``put_back`` writes them.
     """
 
     def __init__(self, body: SoftBody, forest: DeviceForest):
         self._body = body
         self._forest = forest
         self.keyframes = Keyframes()
+        self.activation = CarriedActivation(body, forest)
         self._revision = -1
         self.kept: dict[str, wp.array] = {}
 
@@ -52,9 +67,11 @@ class Conditions:
     def note(self) -> None:
         """Take over what the user has done; to be called before the mesh changes."""
         self._take_trajectories()
+        self.activation.note(self.kept.get(ACTIVATION_ROW))
         if self.of_present_mesh:
             arrays, count = self._forest.carriage.arrays, self._body.node_count
             self.kept = {name: wp.clone(getattr(arrays, name)[:count]) for name in ("held", "load", "row", "v")}
+            self.kept |= self.activation.kept()
 
     def put_back(self) -> None:
         """Write what was kept into the mesh for which it was."""
@@ -65,9 +82,11 @@ class Conditions:
         velocities[held] = self.kept["v"].numpy()[held]
         arrays.v[:count].assign(velocities)
         arrays.reaction.zero_()
+        self.activation.put_back(self.kept)
 
     def follow(self) -> None:
-        """Tell the host which nodes follow keyframes after a pass, new ones among them."""
+        """Tell the host which nodes and elements follow keyframes after a pass, new ones among them."""
+        self.activation.follow()
         body, arrays = self._body, self._forest.carriage.arrays
         if not body.trajectories:
             return

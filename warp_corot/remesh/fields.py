@@ -17,4 +17,4 @@ CARRIED_BY_NODES: tuple[str, ...] = (
     "mass32",
     "inverse_mass",
 )
-CARRIED_BY_TETRAHEDRA: tuple[str, ...] = ("density", "label", "values")
+CARRIED_BY_TETRAHEDRA: tuple[str, ...] = ("density", "label", "values", "numbers")

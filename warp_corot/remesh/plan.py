@@ -118,6 +118,11 @@ class DevicePlan:
         return True
 
     @property
+    def arrays(self) -> Any:
+        """``kernels.remesh_plan.Plan``, for launches that derive more from it."""
+        return self._plan
+
+    @property
     def rotation_shared(self) -> bool:
         return bool(self._plan.rotation_level >= 0)
 

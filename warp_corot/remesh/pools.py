@@ -17,7 +17,7 @@ from ..mesh import TetForest
 from ..mesh.tree import LIVE, VOID, Tree
 from .frames import all_frames
 from .snapshot import Snapshot
-from .transfer import Carriage
+from .transfer import Carriage, Column, Numbers
 
 #: Threads of a launch on CUDA for each multiprocessor.
 THREADS_PER_PROCESSOR = 1024
@@ -63,7 +63,7 @@ class DeviceForest:
         density: Mass per rest volume [kg/m^3], a number or one for each leaf [T]; the forest's filled share comes on
             top.
         values: Other quantities of leaves by name, [T] each, that are per full rest volume, as Lamé's parameters times
-            the filled share: children have their parent's, a parent its children's mean.
+            the filled share: children have their parent's, a parent its children's mean or what a ``Column`` says.
         node_capacity: How many nodes; None: one for every two more leaves, where five or six a node are usual.
         device: "cpu", "cuda:0", …; None for Warp's default.
 
@@ -86,7 +86,7 @@ class DeviceForest:
         capacity: int,
         *,
         density: npt.ArrayLike = 1.0,
-        values: Mapping[str, npt.ArrayLike] | None = None,
+        values: Mapping[str, npt.ArrayLike | Column | Numbers] | None = None,
         node_capacity: int | None = None,
         device: str | wp.Device | None = None,
     ):

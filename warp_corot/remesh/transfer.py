@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import warp as wp
 
 from ..errors import InputError
 from ..kernels.remesh import SINKS
-from ..kernels.remesh_state import NO_ROW, Carried
+from ..kernels.remesh_state import MEAN, NO_ROW, Carried
 from ..mesh.growth import lattice_spacing
 from ..mesh.lattice import MAX_LEVEL, volume_shares
 from ..nodal import padded
@@ -20,32 +21,51 @@ if TYPE_CHECKING:
     from .pools import DeviceForest
 
 
+@dataclass(frozen=True, eq=False)
+class Column:
+    """Values of leaves, [T] or one for all, and what a parent has of its children's: see ``kernels.remesh_state``."""
+
+    values: npt.ArrayLike
+    merging: int = int(MEAN)
+
+
+@dataclass(frozen=True, eq=False)
+class Numbers:
+    """Whole numbers of leaves, [T] or one for all; a parent has its first child's."""
+
+    values: npt.ArrayLike
+
+
 class Carriage:
     """State of nodes and material of tetrahedra, in arrays as large as the pools.
 
     A new node is the midpoint of its deformed edge, so that children have their parent's deformation gradient. Mass is
     lumped, a quarter of each leaf's at its nodes, and moves with its momentum; what a held node cannot take up of it is
     counted in ``support_impulse``. A node between two held ones is held. A load stays where it is; that of a removed
-    node goes to both ends by halves. Children have their parent's density and values; a parent has its children's mean.
+    node goes to both ends by halves. Children have their parent's density and values; a parent has its children's mean,
+    or what a ``Column`` says.
 
     Attributes:
         arrays: ``kernels.remesh_state.Carried``; nodal arrays by the nodes' places in the pool, with the places that
             padding names behind them, others by those of the tetrahedra. ``rest``, ``u``, ``v``, ``load``,
             ``reaction``, ``mass32`` and ``inverse_mass`` are what stepping reads and writes.
-        names: Names of the columns of ``arrays.values``.
+        names, number_names: Names of the columns of ``arrays.values`` and ``arrays.numbers``.
     """
 
-    def __init__(self, forest: DeviceForest, density: npt.ArrayLike, values: Mapping[str, npt.ArrayLike]):
+    def __init__(
+        self, forest: DeviceForest, density: npt.ArrayLike, values: Mapping[str, npt.ArrayLike | Column | Numbers]
+    ):
         self.device = forest.device
         self._nodes = forest.node_capacity + int(SINKS)
         self._first_nodes = len(forest.source.points)
         source, elements = forest.source, forest.tree_capacity
         leaves = source.tree.leaves
         fill = 1.0 if source.fill is None else source.fill
-        given = {name: _of_leaves(name, value, len(leaves)) for name, value in values.items()}
+        numbers = {name: given.values for name, given in values.items() if isinstance(given, Numbers)}
+        columns = {name: _as_column(given) for name, given in values.items() if name not in numbers}
         if source.fill is not None:
-            given["fill"] = np.asarray(source.fill)
-        self.names = tuple(given)
+            columns["fill"] = Column(source.fill)
+        self.names, self.number_names = tuple(columns), tuple(numbers)
         per_leaf = _of_leaves("density", density, len(leaves)) * fill
         arrays = Carried()
         arrays.origin = wp.vec3d(*source.origin)
@@ -55,10 +75,11 @@ class Carriage:
         arrays.density = self._of_elements(leaves, per_leaf, elements, wp.float64)
         labels = np.zeros(len(leaves)) if source.labels is None else source.labels
         arrays.label = self._of_elements(leaves, labels, elements, wp.int32)
-        columns = np.zeros((elements, len(given)), np.float32)
-        for column, value in zip(columns.T, given.values(), strict=True):
-            column[leaves] = value
-        arrays.values = wp.array(columns, dtype=wp.float32, device=self.device, ndim=2)
+        arrays.values = self._table(leaves, {n: c.values for n, c in columns.items()}, elements, wp.float32)
+        merging = [column.merging for column in columns.values()]
+        arrays.merging = wp.array(merging, dtype=wp.int32, device=self.device)
+        arrays.fill_column = self.names.index("fill") if "fill" in columns else -1
+        arrays.numbers = self._table(leaves, numbers, elements, wp.int32)
         masses = np.zeros(self._nodes)
         np.add.at(masses, source.tets, (0.25 * per_leaf * volume[source.levels])[:, None])
         arrays.mass = wp.array(masses, dtype=wp.float64, device=self.device)
@@ -143,6 +164,17 @@ class Carriage:
         spread = np.zeros(count, wp.dtype_to_numpy(dtype))
         spread[leaves] = values
         return wp.array(spread, dtype=dtype, device=self.device)
+
+    def _table(self, leaves: np.ndarray, given: Mapping[str, npt.ArrayLike], count: int, dtype: Any) -> wp.array:
+        table = np.zeros((count, len(given)), wp.dtype_to_numpy(dtype))
+        for column, (name, value) in zip(table.T, given.items(), strict=True):
+            column[leaves] = _of_leaves(name, value, len(leaves))
+        return wp.array(table, dtype=dtype, device=self.device, ndim=2)
+
+
+def _as_column(given: npt.ArrayLike | Column | Numbers) -> Column:
+    assert not isinstance(given, Numbers)
+    return given if isinstance(given, Column) else Column(given)
 
 
 def _of_leaves(name: str, given: npt.ArrayLike, count: int) -> npt.NDArray[np.float64]:

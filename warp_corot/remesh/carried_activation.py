@@ -1,0 +1,134 @@
+"""Active stress of a changing mesh, and the keyframes that it follows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from ..activation import Activation, ElementActivation
+from ..kernels.anisotropic_remesh import READ_LEAVES, WRITE_LEAVES
+from ..kernels.remesh_state import NO_ROW
+from .carried_material import ACTIVATION, ACTIVATION_ROW
+from .pools import DeviceForest
+
+if TYPE_CHECKING:
+    from ..body import SoftBody
+
+
+@dataclass(frozen=True, eq=False)
+class Keys:
+    """Keyframes of rows ``first`` and following: times [s], [K], and active stress [Pa], [K, rows]."""
+
+    first: int
+    times: npt.NDArray[np.float64]
+    stress: npt.NDArray[np.float32]
+
+    @property
+    def end(self) -> int:
+        return self.first + self.stress.shape[1]
+
+    def follow(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.bool_]:
+        """Whose row is one of these."""
+        return (rows >= self.first) & (rows < self.end)
+
+
+class CarriedActivation:
+    """Active stress as elements carry it, handed between body and pools; of other bodies nothing is done.
+
+    Args:
+        body: The body.
+        forest: Its pools.
+
+    Attributes:
+        keys: The keyframes that elements follow, or did on the mesh that ``put_back`` is for.
+    """
+
+    def __init__(self, body: SoftBody, forest: DeviceForest):
+        self._body = body
+        self._forest = forest
+        self.keys: list[Keys] = []
+        self._made: list[ElementActivation] = []
+
+    def note(self, kept_rows: wp.array | None) -> None:
+        """Take over what the user has done.
+
+        Args:
+            kept_rows: Rows that ``put_back`` may be asked to write, whose keyframes are still wanted then.
+        """
+        body = self._body
+        if not body.has_activation:
+            return
+        self._write(ACTIVATION, body.element_activation[: body.element_count])
+        now = body.activations
+        if len(now) != len(self._made) or any(a is not b for a, b in zip(now, self._made, strict=True)):
+            self._write(ACTIVATION_ROW, self._adopt(now, kept_rows))
+
+    def kept(self) -> dict[str, wp.array]:
+        """What ``put_back`` takes, of the present mesh."""
+        if not self._body.has_activation:
+            return {}
+        return {name: self._read(name) for name in (ACTIVATION, ACTIVATION_ROW)}
+
+    def put_back(self, kept: dict[str, wp.array]) -> None:
+        """Write this into the mesh for which it was; the pools are that already."""
+        for name in (ACTIVATION, ACTIVATION_ROW):
+            if name in kept:
+                self._write(name, kept[name])
+
+    def follow(self) -> None:
+        """Tell the host which elements follow keyframes after a pass."""
+        if self._made or self._body.activations:
+            self.serve()
+
+    def serve(self) -> None:
+        """Let the body's elements follow the keyframes that they carry the rows of."""
+        rows = self._read(ACTIVATION_ROW).numpy()
+        self._made = [made for keys in self.keys if (made := _of_keys(keys, rows, self._body.device))]
+        self._body.activations = list(self._made)
+        self._body.revision += 1
+
+    def _adopt(self, activations: Sequence[ElementActivation], kept_rows: wp.array | None) -> wp.array:
+        """Number the keyframes of these, and say which row each element follows, int32 [T]."""
+        rows = np.full(self._body.element_count, int(NO_ROW), np.int32)
+        wanted = np.empty(0, np.int32) if kept_rows is None else kept_rows.numpy()
+        self.keys = [keys for keys in self.keys if keys.follow(wanted).any()]
+        for activation in activations:
+            first, elements = max((keys.end for keys in self.keys), default=0), activation.elements.numpy()
+            keys = Keys(first, activation.times.numpy(), activation.stress.numpy())
+            rows[elements] = first + (np.arange(len(elements)) if keys.end - first > 1 else 0)
+            self.keys.append(keys)
+        self._made = list(activations)
+        return wp.array(rows, dtype=wp.int32, device=self._body.device)
+
+    def _write(self, name: str, given: wp.array) -> None:
+        columns, number = self._columns(name)
+        inputs = [self._forest.pools.leaves, given, number]
+        wp.launch(WRITE_LEAVES[given.dtype], len(given), inputs, [columns], device=self._body.device)
+
+    def _read(self, name: str) -> wp.array:
+        columns, number = self._columns(name)
+        count = self._body.element_count
+        found = wp.empty(count, dtype=columns.dtype, device=self._body.device)
+        inputs = [self._forest.pools.leaves, columns, number]
+        wp.launch(READ_LEAVES[found.dtype], count, inputs, [found], device=self._body.device)
+        return found
+
+    def _columns(self, name: str) -> tuple[wp.array, int]:
+        carriage = self._forest.carriage
+        if name in carriage.names:
+            return carriage.arrays.values, carriage.names.index(name)
+        return carriage.arrays.numbers, carriage.number_names.index(name)
+
+
+def _of_keys(keys: Keys, rows: npt.NDArray[np.int32], device: wp.Device) -> ElementActivation | None:
+    """Who follows these keyframes, if anybody does."""
+    elements = np.flatnonzero(keys.follow(rows))
+    if not len(elements):
+        return None
+    stress = keys.stress if keys.end - keys.first == 1 else keys.stress[:, rows[elements] - keys.first]
+    return ElementActivation.of_keys(elements, Activation(keys.times, stress), device)
