@@ -71,7 +71,7 @@ class StageSimulation:
         self.parts = stage_model(self.scene, options or StageOptions(), checked_device(device))
         model = self.parts.model
         self.solver = SolverCorotated(model, damping=damping)
-        self._pipeline = newton.CollisionPipeline(model, soft_contact_margin=self.parts.margin)
+        self._pipeline = newton.CollisionPipeline(model, soft_contact_gap=self.parts.margin)
         self._contacts = self._pipeline.contacts()
         self._choose_step(dt)
         self.state = self._new_state()
