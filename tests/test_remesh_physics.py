@@ -75,7 +75,7 @@ def marked(forest, gradient, criterion, parameters, threshold, device):
     wp.launch(
         marking_kernel(criterion),
         dim=1,
-        inputs=[*inputs, adaptive.carriage.arrays.u, numbers, adaptive.pools],
+        inputs=[*inputs, adaptive.carriage.arrays.u, numbers, adaptive.carriage.arrays.values, -1, adaptive.pools],
         device=device,
     )
     return adaptive.pools.marks.numpy() == 1
