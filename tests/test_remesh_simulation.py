@@ -104,6 +104,21 @@ def test_reset_goes_back_to_the_first_mesh_and_state(device):
     assert sim.dt == pytest.approx(dt, rel=0.05)
 
 
+def test_reset_has_nodes_follow_what_those_of_the_first_mesh_did(device):
+    """Also if those of a later mesh do no more."""
+    body = bar(device)
+    sim = wc.Simulation(body, remesh=near(0.1, device), integrator=wc.SymplecticEuler(damping=5.0))
+    body.prescribe(body.mesh.points[:, 0] > 0.2 - 1e-9, times=[0.0, 0.01], displacements=[[0, 0, 0], [0.01, 0, 0]])
+    sim.advance_steps(20)
+    body.fix(body.mesh.points[:, 0] > 0.2 - 1e-9)
+    assert not body.trajectories
+    sim.advance_steps(10)
+    sim.reset()
+    sim.advance(0.015)
+    end = body.mesh.points[:, 0] > 0.2 - 1e-9
+    np.testing.assert_allclose(body.displacements.numpy()[end], np.tile([0.01, 0.0, 0.0], (end.sum(), 1)), atol=1e-6)
+
+
 def test_the_initial_state_is_one_on_the_mesh_of_its_time(device):
     body = bar(device)
     sim = wc.Simulation(body, remesh=near(0.1, device))

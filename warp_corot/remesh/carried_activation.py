@@ -82,7 +82,7 @@ class CarriedActivation:
 
     def follow(self) -> None:
         """Tell the host which elements follow keyframes after a pass."""
-        if self._made or self._body.activations:
+        if self.keys:
             self.serve()
 
     def serve(self) -> None:

@@ -47,6 +47,7 @@ class Conditions:
         self.keyframes = Keyframes()
         self.activation = CarriedActivation(body, forest)
         self._revision = -1
+        self._is_back = False
         self.kept: dict[str, wp.array] = {}
 
     @property
@@ -83,13 +84,16 @@ class Conditions:
         arrays.v[:count].assign(velocities)
         arrays.reaction.zero_()
         self.activation.put_back(self.kept)
+        self._is_back = True
 
     def follow(self) -> None:
         """Tell the host which nodes and elements follow keyframes after a pass, new ones among them."""
         self.activation.follow()
         body, arrays = self._body, self._forest.carriage.arrays
-        if not body.trajectories:
+        # Nodes that were let go later follow again what they did on the mesh that is back.
+        if not (body.trajectories or self._is_back):
             return
+        self._is_back = False
         rows = self._of_nodes(arrays.row)
         if (rows < NO_ROW).any():
             ends = self._forest.pools.ends[: len(rows)].numpy()
