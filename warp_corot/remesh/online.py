@@ -23,6 +23,10 @@ class OnlineRemesh:
     ``refine_above``, and given up with its sibling where both are below ``simplify_below``. Between the two nothing
     happens. An element is bisected once a pass, and again where its neighbours ask for it.
 
+    Children have their parent's material, with the direction of its fibres, and pull as it did. A parent has the mean
+    of its children's stiffness, density and active stress, but its first child's directions, and that child's active
+    stress where the two follow different keyframes.
+
     Attributes:
         refine_above, simplify_below: Thresholds in the criterion's unit; the first is the larger one. By default of the
             elongation of an element's longest edge, deformed over rest (Tagawa et al. 2013).
