@@ -175,10 +175,6 @@ class _Store(PieceStore):
         super().__init__(path)
         self._below = below.resolve()
 
-    def declare(self, static: Sdf.Layer, follows: Mapping[str, str] | None = None) -> None:
-        static.subLayerPaths = [usd_name(self._below)]  # the pieces' folder comes and goes: no way leads from there
-        super().declare(static, follows)
-
     def finish(self, transform: Callable[[Samples], Mapping[str, Any]] | None = None) -> None:
         if self._static is not None:
             self._static.subLayerPaths = [_way(self.path, self._below)]
@@ -186,7 +182,8 @@ class _Store(PieceStore):
 
     def _root_layer(self, pieces: list[tuple[float, float]]) -> Sdf.Layer:
         root = super()._root_layer(pieces)
-        root.subLayerPaths = [name for name in root.subLayerPaths if name.endswith("/static.usdc")]
+        if len(root.subLayerPaths) == 1:
+            root.subLayerPaths.append(_way(self.path, self._below))
         clips = root.GetPrimAtPath(f"/{root.defaultPrim}").GetInfo("clips")
         for name in sorted({f"/{path.split('/')[1].split('.')[0]}" for path in self._varying}):
             own = {key: dict(values) | {"primPath": name} for key, values in clips.items()}

@@ -134,6 +134,8 @@ def _add_usd(builder: newton.ModelBuilder, scene: Scene) -> dict[str, Any]:
                 schema_resolvers=resolvers,
                 return_deformable_results=True,
             )
+        except ImportError:
+            raise InputError("Newton reads stages with newton-usd-schemas: pip install newton-usd-schemas") from None
         except (RuntimeError, ValueError) as error:
             raise InputError(f"{scene.path}: {error}") from None
     for message in dict.fromkeys(str(warning.message) for warning in said):

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import warp as wp
 
 from ..device import checked_device
-from ..errors import InputError
+from ..errors import InputError, UnstableError
 from ..io.animate import steps_per_frame
 from ..io.usd_over import State
 from ..io.usd_scene import open_scene
@@ -87,11 +87,15 @@ class StageSimulation:
         """Simulate one frame.
 
         Raises:
-            UnstableError: The state would not be finite; it stays what it was.
+            UnstableError: The state would not be finite, or there are more contacts than there is room for; it stays
+                what it was before that.
         """
         for _ in range(self.steps // self._chunk):
             wp.capture_launch(self._graph)
-        self.solver.check()
+        try:
+            self.solver.check()
+        except InputError as error:
+            raise UnstableError(f"after {self.time:.3g} s: {error}") from None
         self.frames += 1
         self.time = self.frames / self.fps
 
