@@ -119,6 +119,18 @@ def test_elements_that_a_body_takes_a_share_of(model, device, rng):
     assert len(counts) == 3
 
 
+@pytest.mark.parametrize("model", MODELS, ids=repr)
+def test_elements_that_are_crushed(model, device, rng):
+    """Their material goes over to the nearest isotropic one, which is that of the present elements, too."""
+    body = bar(MATERIALS["all"](), device, level=4)
+    sim = wc.Simulation(body, model=model, remesh=near(0.1, device, max_level=6))
+    sim.advance_steps(5)
+    edge = np.cbrt(body.mesh.volumes.min())
+    body.displacements = edge * rng.uniform(-1.5, 1.5, (body.node_count, 3))
+    forces = [each.forces().numpy() for each in (sim, active_twin(body, model, sim))]
+    np.testing.assert_allclose(forces[0], forces[1], atol=1e-5 * np.abs(forces[1]).max())
+
+
 def test_fibres_pull_by_where_they_are(device):
     """Whatever is refined and merged within each half: keyframes at one end, a constant at the other."""
     body = bar(muscle([1, 0, 0]), device)

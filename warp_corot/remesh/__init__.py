@@ -20,8 +20,9 @@ from both ends; removal is the reverse and keeps mass and linear momentum to rou
 Angular momentum and kinetic energy are not kept exactly where velocities vary along an edge. Quantities of elements are
 per full rest volume: children have their parent's, a parent the mean of its children's. Of an anisotropic material a
 parent has its first child's axes, and the mean of both stiffnesses counted by what each child holds; active stress goes
-the same way, with the keyframes that it follows (``carried_material``). Children with different labels are not merged. Void tetrahedra stay as they are, and a node that one of them names stays too: a mesh made from a domain
-is not simplified beyond the void beside it, and its marched surface is that of the mesh it began as.
+the same way, with the keyframes that it follows (``carried_material``). Children with different labels are not merged.
+Void tetrahedra stay as they are, and a node that one of them names stays too: a mesh made from a domain is not
+simplified beyond the void beside it, and its marched surface is that of the mesh it began as.
 
 Nodes are told apart by their numbers and edges by those of their ends, never by lattice points, so that several nodes
 may share one.
