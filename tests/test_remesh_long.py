@@ -104,6 +104,7 @@ def test_pulled_and_pressed_at_random(seconds, device):
     assert sim.total_time == pytest.approx(seconds, abs=sim.dt)
     assert max(counts) > 3 * min(counts)
     assert not body.changing.is_full
-    # The first third warms up what is kept; then memory stays to a few per cent.
-    steady = memory[len(memory) // 3 :]
-    assert max(steady[len(steady) // 2 :]) < max(steady[: len(steady) // 2]) * 1.02 + (4 << 20)
+    # The first third warms up what is kept; after that nothing grows with the number of meshes there have been.
+    steady = np.array(memory[len(memory) // 3 :], dtype=float)
+    growth = np.polyfit(np.linspace(0.0, 1.0, len(steady)), steady, 1)[0]
+    assert growth < 4 << 20
