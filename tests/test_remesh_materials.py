@@ -100,13 +100,19 @@ def test_steps_go_on_as_on_a_mesh_made_that_way(kind, model, device):
 
 
 @pytest.mark.parametrize("model", MODELS, ids=repr)
-def test_elements_that_a_body_takes_a_share_of(model, device, rng):
+@pytest.mark.parametrize("has_fibres", [False, True], ids=["isotropic", "fibres"])
+def test_elements_that_a_body_takes_a_share_of(has_fibres, model, device, rng):
     mesh = ball(device)
     count = len(mesh.tets)
-    young = rng.uniform(0.5, 2.0, (count, 1)) * [3e4, 8e3, 4e3]
-    body = wc.SoftBody(mesh, wood(random_axes(rng, count), young=young), device=device)
+    stiffer = rng.uniform(0.5, 2.0, count)
+    if has_fibres:
+        material = wood(random_axes(rng, count), young=stiffer[:, None] * [3e4, 8e3, 4e3])
+    else:
+        material = wc.Isotropic(young=2e4 * stiffer, poisson=0.4, density=1000.0)
+    body = wc.SoftBody(mesh, material, device=device)
     body.fix(mesh.points[:, 2] < -0.03)
-    body.activate(rng.uniform(-500.0, 500.0, count))
+    if has_fibres:
+        body.activate(rng.uniform(-500.0, 500.0, count))
     remesh = near(0.0, device, min_level=1, max_level=8)
     sim = wc.Simulation(body, model=model, integrator=wc.SymplecticEuler(damping=1.0), remesh=remesh)
     counts = {count}
