@@ -32,11 +32,12 @@ def elongation(element: ElementState, parameters: wp.array[wp.float32]):
 
 
 @wp.func
-def load_state(i: int, origin: wp.vec3d, spacing: wp.float64, pools: Pools, u: wp.array[wp.vec4]):
+def load_state(e: int, origin: wp.vec3d, spacing: wp.float64, pools: Pools, u: wp.array[wp.vec4]):
+    """What a criterion sees of a tetrahedron, a leaf or one above leaves."""
     state = ElementState()
-    tet = pools.leaf_tets[i]
+    tet = pools.tets[e]
     p = pools.lattice[tet[0]]
-    state.level = pools.level[pools.leaves[i]]
+    state.level = pools.level[e]
     state.corner = wp.vec3(
         float(origin[0] + wp.float64(p[0]) * spacing),
         float(origin[1] + wp.float64(p[1]) * spacing),
@@ -61,7 +62,11 @@ LEAST_FILL = 0.5
 
 @functools.cache
 def marking_kernel(criterion: Any) -> wp.Kernel:
-    """The kernel that marks leaves by a criterion: a Warp function of an ``ElementState`` and an array of numbers."""
+    """The kernel that marks leaves by a criterion: a Warp function of an ``ElementState`` and an array of numbers.
+
+    A leaf is not given up if its parent would be refined at once: edges of an element and of its halves point elsewhere,
+    so that what is stretched in one may not be in the other.
+    """
 
     @wp.kernel(enable_backward=False, module="unique")
     def mark_leaves(
@@ -79,13 +84,16 @@ def marking_kernel(criterion: Any) -> wp.Kernel:
         pools: Pools,
     ):
         for i in range(wp.tid(), pools.counts[LEAVES], threads):
-            value = criterion(load_state(i, origin, spacing, pools, u), parameters)
+            e = pools.leaves[i]
+            value = criterion(load_state(e, origin, spacing, pools, u), parameters)
             mark = wp.int8(0)
             if value > refine_above:
-                if fill_column < 0 or values[pools.leaves[i], wp.max(fill_column, 0)] >= wp.static(LEAST_FILL):
+                if fill_column < 0 or values[e, wp.max(fill_column, 0)] >= wp.static(LEAST_FILL):
                     mark = REFINE
-            elif value < simplify_below:
-                mark = SIMPLIFY
+            elif value < simplify_below and pools.parent[e] >= 0:
+                above = criterion(load_state(pools.parent[e], origin, spacing, pools, u), parameters)
+                if above <= refine_above:
+                    mark = SIMPLIFY
             pools.marks[i] = mark
 
     return mark_leaves

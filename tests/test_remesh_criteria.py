@@ -11,10 +11,10 @@ from warp_corot.remesh.passes import RemeshPass
 from warp_corot.remesh.pools import DeviceForest
 
 
-def longest_edges(forest, moved):
-    """Longest rest edge of each leaf, deformed over rest, by the nodes' positions alone."""
-    x = forest.points[forest.tets]
-    y = moved[forest.tets]
+def longest_edges(forest, tets, moved):
+    """Longest rest edge of tetrahedra, deformed over rest, by the nodes' positions alone."""
+    x = forest.points[tets]
+    y = moved[tets]
     rest = np.stack([np.linalg.norm(x[:, i] - x[:, j], axis=1) for i, j in PAIRS])
     now = np.stack([np.linalg.norm(y[:, i] - y[:, j], axis=1) for i, j in PAIRS])
     longest = rest.argmax(axis=0), np.arange(len(x))
@@ -25,17 +25,35 @@ def test_elongation_of_the_longest_edge_decides(device, rng):
     forest = wc.TetForest.box((2, 1, 1), CUBE, 8, origin=(1.0, -2.0, 0.5))
     x = forest.points[:, 0] - 1.0
     u = np.column_stack([2.0 * x**2 / CUBE, 0 * x, 0 * x]) * 0.3 + 1e-3 * rng.normal(size=(len(x), 3))
-    ratio = longest_edges(forest, forest.points + u)
-    assert np.abs(ratio[:, None] - (1.3, 1.1)).min() > 1e-6
+    ratio = longest_edges(forest, forest.tets, forest.points + u)
+    parents = forest.tree.tets[forest.tree.above(forest.tree.leaves, 1)]
+    above = longest_edges(forest, parents, forest.points + u)
+    assert np.abs(np.stack([ratio, above])[..., None] - (1.3, 1.1)).min() > 1e-6
     adaptive = DeviceForest(forest, 50000, device=device)
     adaptive.carriage.set_nodes(displacements=u)
     RemeshPass(adaptive, refine_above=1.3, simplify_below=1.1).run()
-    expected = np.where(ratio > 1.3, 1, np.where(ratio < 1.1, -1, 0))
+    expected = np.where(ratio > 1.3, 1, np.where((ratio < 1.1) & (above < 1.3), -1, 0))
+    assert ((ratio < 1.1) & (above > 1.3)).any()
     assert np.array_equal(adaptive.pools.marks.numpy()[: len(ratio)], expected)
     assert {-1, 0, 1} == set(expected)
     twin = DeviceForest(forest, 50000, device=device)
     RemeshPass(twin).apply(expected)
     assert leaf_list(assert_sound(adaptive)) == leaf_list(twin.to_forest())
+
+
+@pytest.mark.parametrize("stretch", [1.18, 1.3, 1.5])
+def test_a_body_at_rest_stays_as_it_is(stretch, device):
+    """Under the same stretch everywhere passes come to an end, also where thresholds are next to one another."""
+    forest = wc.TetForest.box((1, 1, 1), CUBE, 3)
+    adaptive = DeviceForest(forest, 50_000, device=device)
+    adaptive.carriage.set_nodes(displacements=forest.points * [stretch - 1.0, 0.0, 0.0])
+    remesh = RemeshPass(adaptive, refine_above=1.16, simplify_below=1.15, max_level=9)
+    counts = []
+    for _ in range(12):
+        remesh.run()
+        counts.append(adaptive.counts())
+    assert counts[0].added + counts[0].removed > 0
+    assert counts[-1].added == counts[-1].removed == 0
 
 
 @wp.func
@@ -106,9 +124,10 @@ def test_what_holds_little_is_not_refined_for_its_own_sake(device):
     forest = DeviceForest(mesh, 50_000, device=device)
     RemeshPass(forest, criterion=always, refine_above=1.0, simplify_below=0.0, max_level=20).run()
     refined = forest.to_forest()
-    stayed = np.isin(refined.tree.leaves, np.flatnonzero(refined.tree.parent >= 0)) & np.isin(
-        refined.tets.view("i4,i4,i4,i4"), mesh.tets.view("i4,i4,i4,i4")
-    ).ravel()
+    stayed = (
+        np.isin(refined.tree.leaves, np.flatnonzero(refined.tree.parent >= 0))
+        & np.isin(refined.tets.view("i4,i4,i4,i4"), mesh.tets.view("i4,i4,i4,i4")).ravel()
+    )
     assert stayed.any()
     assert refined.fill[stayed].max() < 0.5
     untouched = wc.TetForest.box((2, 2, 2), 0.03, 3)
