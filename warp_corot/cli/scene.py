@@ -95,6 +95,12 @@ what is written, on top of OUT's sublayer INPUT, which must stay beside it unles
         "--fps", type=float, metavar="F", help="frames per second (default: the stage's time codes per second, else 24)"
     )
     motion.add_argument("--dt", type=float, help="longest time step [s] (default: a safe one, found)")
+    motion.add_argument(
+        "--rigid",
+        choices=("semi-implicit", "xpbd", "none"),
+        default="semi-implicit",
+        help="which of Newton's solvers steps rigid bodies and joints (default: semi-implicit)",
+    )
     shown = parser.add_argument_group("the output")
     shown.add_argument(
         "--show-stress", action="store_true", help="colour soft bodies by stress, whatever material they are drawn with"
@@ -123,7 +129,13 @@ def run(args: argparse.Namespace) -> int:
     device = checked_device(args.device)
     with compiling_said(device):
         sim = StageSimulation(
-            args.input, fps=args.fps, dt=args.dt, options=options, damping=args.damping, device=device
+            args.input,
+            fps=args.fps,
+            dt=args.dt,
+            options=options,
+            damping=args.damping,
+            rigid=args.rigid,
+            device=device,
         )
     count = frame_count(args.duration, sim.fps)
     writer = scene_writer(sim, args.output, show_stress=args.show_stress, flatten=args.flatten)

@@ -41,8 +41,9 @@ class StageModel:
         model: ``newton.Model``, in the stage's units.
         soft: Its soft bodies.
         rigid: Indices of rigid bodies by their prims' paths.
-        surfaces: What is drawn in place of soft bodies, and goes along.
-        surface_points: For each, which of Newton's skinned points its points are.
+        surfaces: Meshes that go along: graphics of soft bodies first, then cloth.
+        surface_points: For each of the graphics, which of Newton's skinned points its points are.
+        cloth: For each cloth, the range of its particles in the model.
         ground: Corners of a ground plane that was added [4, 3], or None.
         margin: How far from each other contacts are looked for.
         notes: What was chosen, a line each.
@@ -54,6 +55,7 @@ class StageModel:
     rigid: dict[str, int] = field(default_factory=dict)
     surfaces: list[Surface] = field(default_factory=list)
     surface_points: list[npt.NDArray[np.intp]] = field(default_factory=list)
+    cloth: list[slice] = field(default_factory=list)
     ground: npt.NDArray[np.float64] | None = None
     margin: float = 0.0
     notes: list[str] = field(default_factory=list)
@@ -245,6 +247,11 @@ def _find_surfaces(made: StageModel, found: dict[str, Any]) -> None:
         _, nearest = cKDTree(rest).query(points)
         made.surfaces.append(Surface(path, points))
         made.surface_points.append(nearest + starts[index])
+    for path, ranges in found["path_cloth_map"].items():
+        made.surfaces.append(Surface(path, made.scene.world_points(path)))
+        made.cloth.append(slice(*ranges["particle"]))
+    if found["path_cable_map"]:
+        made.notes.append(f"cables are simulated but not written: {', '.join(found['path_cable_map'])}")
 
 
 __all__ = ["StageModel", "StageOptions", "stage_model"]

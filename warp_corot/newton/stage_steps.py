@@ -21,8 +21,12 @@ from .stage import StageOptions, stage_model
 
 #: Steps that are recorded and replayed together; a frame is a whole number of such chunks.
 CHUNK = 16
+#: What can step rigid bodies.
+RIGID = ("semi-implicit", "xpbd", "none")
 #: Longest step where rigid bodies touch something [s].
 RIGID_STEP = 5e-4
+#: The same with cloth, of which the largest stable step is not known.
+CLOTH_STEP = 2e-4
 
 
 class StageSimulation:
@@ -37,6 +41,7 @@ class StageSimulation:
         dt: Longest time step [s]; None: a safe one.
         options: What the stage does not say.
         damping: Rate of mass-proportional damping [1/s], of free fall, too.
+        rigid: Which of Newton's solvers steps rigid bodies and joints: "semi-implicit", "xpbd", or "none".
         device: What to simulate on.
 
     Attributes:
@@ -60,17 +65,20 @@ class StageSimulation:
         dt: float | None = None,
         options: StageOptions | None = None,
         damping: float = 0.0,
+        rigid: str = "semi-implicit",
         device: Any = None,
     ):
         if dt is not None and not (math.isfinite(dt) and dt > 0):
             raise InputError(f"dt is {dt:g} s; it must be a positive number")
+        if rigid not in RIGID:
+            raise InputError(f"rigid is {rigid!r}; it must be one of {', '.join(RIGID)}")
         self.scene = open_scene(path)
         self.fps = 24.0 if fps is None and self.scene.frame_rate is None else float(fps or self.scene.frame_rate or 0)
         if not (math.isfinite(self.fps) and self.fps > 0):
             raise InputError(f"fps is {self.fps:g}; it must be a positive number")
         self.parts = stage_model(self.scene, options or StageOptions(), checked_device(device))
         model = self.parts.model
-        self.solver = SolverCorotated(model, damping=damping)
+        self.solver = self._new_solver(rigid, damping)
         self._pipeline = newton.CollisionPipeline(model, soft_contact_gap=self.parts.margin)
         self._contacts = self._pipeline.contacts()
         self._choose_step(dt)
@@ -78,7 +86,7 @@ class StageSimulation:
         # Shares its positions with the state, and has stresses, which are wanted once a frame and not once a step.
         self._shown = model.state()
         self._shown.particle_q = self.state.particle_q
-        self._visuals = newton.geometry.DeformableVisuals(model) if self.parts.surfaces else None
+        self._visuals = newton.geometry.DeformableVisuals(model) if self.parts.surface_points else None
         self._graph = self._recorded()
         self.time = 0.0
         self.frames = 0
@@ -109,6 +117,7 @@ class StageSimulation:
         if self._visuals is not None:
             points = self._visuals.update(self.state).points.numpy()
             surfaces = [points[chosen] for chosen in parts.surface_points]
+        surfaces += [x[particles].copy() for particles in parts.cloth]
         return State(
             [x[body.particles].copy() for body in parts.soft],
             [v[body.particles].copy() for body in parts.soft],
@@ -140,13 +149,30 @@ class StageSimulation:
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
+    def _new_solver(self, rigid: str, damping: float) -> SolverCorotated:
+        model = self.parts.model
+        try:
+            solver: Any = {"semi-implicit": rigid, "none": None}.get(rigid)
+            if rigid == "xpbd":
+                solver = newton.solvers.SolverXPBD(model)
+            return SolverCorotated(model, damping=damping, rigid_solver=solver)
+        except ValueError as error:  # Newton's, and InputError, which is one
+            said = str(error).replace(" Give another rigid_solver, or None.", "")
+            hint = f"; another than {rigid} can be chosen (--rigid)" if "does not support" in said else ""
+            raise InputError(f"{self.scene.path}: {said.rstrip('.')}{hint}") from None
+
     def _choose_step(self, dt: float | None) -> None:
         stable = self.solver.stable_dt
         if dt is not None and dt > stable:
             raise InputError(f"dt is {dt:g} s; the largest stable step is about {stable:.3g} s")
         longest = dt
         if longest is None:
-            longest = min(SAFETY * self.solver.contact_dt, RIGID_STEP if self.parts.rigid else math.inf, 1.0 / self.fps)
+            longest = min(SAFETY * self.solver.contact_dt, 1.0 / self.fps)
+            if self.parts.rigid:
+                longest = min(longest, RIGID_STEP)
+            if self.parts.cloth:
+                longest = min(longest, CLOTH_STEP)
+                self.parts.notes.append(f"there is cloth, with which steps are at most {1e3 * CLOTH_STEP:g} ms (--dt)")
         count = steps_per_frame(self.fps, longest)
         self._chunk = min(count, CHUNK)
         self.steps = -(-count // self._chunk) * self._chunk
