@@ -96,6 +96,19 @@ def standing(path: Path, height=0.0, **options) -> Path:
     return made.save()
 
 
+def crowd(path, **options) -> StageMaker:
+    """A block with a visual material, a box that falls on it, and things that have nothing to do with physics."""
+    made = StageMaker(path, **options)
+    mesh = made.block(at=(-0.1, -0.1, 0.02))
+    made.material(mesh)
+    look = UsdShade.Material.Define(made.stage, "/Looks/Skin")
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(look)
+    made.box(at=(0.02, 0.0, 0.5))
+    made.ground()
+    UsdGeom.Camera.Define(made.stage, "/Camera")
+    return made
+
+
 def simulated(path: Path, frames: int, device="cpu", **options) -> StageSimulation:
     sim = StageSimulation(path, device=device, **options)
     for _ in range(frames):
@@ -133,6 +146,7 @@ __all__ = [
     "StageMaker",
     "StageOptions",
     "StageSimulation",
+    "crowd",
     "newton",
     "scene_writer",
     "simulated",

@@ -49,7 +49,7 @@ what is read, as Newton reads it:
 
 what is written, on top of OUT's sublayer INPUT, which must stay beside it unless --flatten is given:
   of TetMesh prims points, velocities, primvars:vonMises [Pa], one a tetrahedron, and its colours
-  of rigid bodies their transforms; of graphics meshes their points
+  of rigid bodies their transforms; of graphics meshes and cloth their points
 
 {EXIT_CODES}""",
     )
