@@ -10,7 +10,6 @@ newton = pytest.importorskip("newton")
 pytest.importorskip("newton_usd_schemas")
 
 import warp_corot as wc  # noqa: E402
-from warp_corot.cli.scene import scene_writer  # noqa: E402
 from warp_corot.mesh.surface import signed_volumes  # noqa: E402
 from warp_corot.newton.stage_steps import StageOptions, StageSimulation  # noqa: E402
 
@@ -119,7 +118,7 @@ def simulated(path: Path, frames: int, device="cpu", **options) -> StageSimulati
 def written(path: Path, out: Path, frames: int, shown=None, **options) -> StageSimulation:
     """The simulation, and its frames in a stage; ``shown`` gets all that was to be in them."""
     sim = StageSimulation(path, device="cpu")
-    writer = scene_writer(sim, out, **options)
+    writer = sim.writer(out, **options)
     for frame in range(frames + 1):
         if frame:
             sim.advance()
@@ -148,7 +147,6 @@ __all__ = [
     "StageSimulation",
     "crowd",
     "newton",
-    "scene_writer",
     "simulated",
     "standing",
     "wc",

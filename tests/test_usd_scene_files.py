@@ -11,7 +11,7 @@ import time
 import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdValidation, Vt
-from scene_stages import SIM, StageMaker, StageSimulation, crowd, scene_writer, standing, wc, world_points, written
+from scene_stages import SIM, StageMaker, StageSimulation, crowd, standing, wc, world_points, written
 
 from warp_corot.cli import main
 from warp_corot.io.colors import stress_colors
@@ -334,7 +334,7 @@ def test_whatever_ends_a_run_the_stage_opens(tmp_path, number, status):
 
 def test_frames_that_are_written_after_the_end(tmp_path):
     sim = StageSimulation(standing(tmp_path / "in.usda"), device="cpu")
-    writer = scene_writer(sim, tmp_path / "out.usda")
+    writer = sim.writer(tmp_path / "out.usda")
     writer.write(sim.show())
     writer.close()
     writer.close()

@@ -60,14 +60,14 @@ class TestAtRest:
         assert sag == pytest.approx(0.5 * DENSITY * G * HEIGHT**2 / YOUNG, rel=0.1)
 
 
-def test_stresses_are_those_of_the_positions(tmp_path):
+def test_stresses_are_those_of_the_positions(device, tmp_path):
     """Hooke's stress of the strain that is left without the rotation, by SciPy's polar decomposition."""
     made = StageMaker(tmp_path / "stage.usda", metres=0.01)
     young = 4e4
     made.material(made.block(), young=young, poisson=0.3)
     made.box(at=(0.15, 0.1, 0.45), mass=4.0)
     made.ground()
-    sim = simulated(made.save(), 5)
+    sim = simulated(made.save(), 5, device)
     state, tets = sim.show(), sim.scene.tets[0].tets
     rest, x = (a.astype(float)[tets] for a in (sim.parts.model.particle_q.numpy(), state.positions[0]))
     edges = [np.swapaxes(a[:, 1:] - a[:, :1], 1, 2) for a in (rest, x)]
@@ -84,7 +84,7 @@ def test_stresses_are_those_of_the_positions(tmp_path):
 
 
 @pytest.mark.parametrize("form", [{"metres": 0.01}, {"up": "Y"}, {"metres": 0.001, "kilograms": 0.001, "up": "Y"}])
-def test_units_and_axes_are_those_of_the_stage(tmp_path, form):
+def test_units_and_axes_are_those_of_the_stage(device, tmp_path, form):
     """A block that is dropped and hit by a box moves the same, whatever the stage's numbers are in."""
     ends = []
     for name, options in (("one.usda", {}), ("other.usda", form)):
@@ -92,7 +92,7 @@ def test_units_and_axes_are_those_of_the_stage(tmp_path, form):
         made.material(made.block(at=(-0.1, -0.1, 0.02)))
         made.box(at=(0.02, 0.0, 0.5))
         made.ground()
-        sim = simulated(made.save(), 12)
+        sim = simulated(made.save(), 12, device)
         state = sim.show()
         assert len(state.bodies) == 1
         back = [2, 0, 1] if options.get("up") == "Y" else [0, 1, 2]
@@ -106,9 +106,9 @@ def test_units_and_axes_are_those_of_the_stage(tmp_path, form):
     np.testing.assert_allclose(other_stress, stress, atol=0.02 * stress.max())
 
 
-def test_a_fall_is_free(tmp_path):
+def test_a_fall_is_free(device, tmp_path):
     """Viscosity slows no fall: what frames show is g t^2 / 2, and the velocity g t."""
-    sim = simulated(standing(tmp_path / "stage.usda", height=1.0), 6)
+    sim = simulated(standing(tmp_path / "stage.usda", height=1.0), 6, device)
     state, t = sim.show(), sim.time
     assert t == pytest.approx(0.25)
     fallen = sim.parts.model.particle_q.numpy()[:, 2] - state.positions[0][:, 2]

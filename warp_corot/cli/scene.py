@@ -138,7 +138,7 @@ def run(args: argparse.Namespace) -> int:
             device=device,
         )
     count = frame_count(args.duration, sim.fps)
-    writer = scene_writer(sim, args.output, show_stress=args.show_stress, flatten=args.flatten)
+    writer = sim.writer(args.output, show_stress=args.show_stress, flatten=args.flatten)
     for note in sim.parts.notes:
         complain(note, kind="note")
     done = Recording(writer.path)
@@ -159,24 +159,6 @@ def run(args: argparse.Namespace) -> int:
         return _end(error, writer, done)
     print(_summary(args.input, sim, writer, done))
     return 0
-
-
-def scene_writer(sim: StageSimulation, path: Path, *, show_stress: bool = False, flatten: bool = False) -> SceneWriter:
-    """What writes the frames of a stage's simulation."""
-    from ..io.usd_over import SceneWriter
-
-    parts = sim.parts
-    return SceneWriter(
-        path,
-        sim.scene,
-        [body.prim for body in parts.soft],
-        dict(zip(parts.rigid, sim.body_poses(), strict=True)),
-        parts.surfaces,
-        fps=sim.fps,
-        ground=parts.ground,
-        show_stress=show_stress,
-        flatten=flatten,
-    )
 
 
 def _ground(text: str) -> float | str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ import warp as wp
 from ..device import checked_device
 from ..errors import InputError, UnstableError
 from ..io.animate import steps_per_frame
-from ..io.usd_over import State
+from ..io.usd_over import SceneWriter, State
 from ..io.usd_scene import open_scene
 from .library import newton
 from .solver import SAFETY, SolverCorotated
@@ -124,6 +125,30 @@ class StageSimulation:
             [stress[body.tets] for body in parts.soft],
             self.body_poses(),
             surfaces,
+        )
+
+    def writer(self, path: str | PathLike[str], *, show_stress: bool = False, flatten: bool = False) -> SceneWriter:
+        """What writes frames over the stage; see ``SceneWriter``.
+
+        Example::
+
+            writer = sim.writer("moving.usd")
+            for _ in range(48):
+                sim.advance()
+                writer.write(sim.show())
+            writer.close()
+        """
+        parts = self.parts
+        return SceneWriter(
+            Path(path),
+            self.scene,
+            [body.prim for body in parts.soft],
+            dict(zip(parts.rigid, self.body_poses(), strict=True)),
+            parts.surfaces,
+            fps=self.fps,
+            ground=parts.ground,
+            show_stress=show_stress,
+            flatten=flatten,
         )
 
     def body_poses(self) -> npt.NDArray[np.float64]:
