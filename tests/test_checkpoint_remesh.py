@@ -54,7 +54,7 @@ def ball(device):
 CASES = [
     (box, wc.OnlineRemesh(refine_above=1.02, simplify_below=1.005, max_level=8), wc.SymplecticEuler(damping=2.0)),
     (loaded_and_moved, None, wc.SymplecticEuler(damping=2.0)),
-    (ball, wc.OnlineRemesh(refine_above=1.03, simplify_below=1.01, max_level=6), wc.SymplecticEuler(dt=1e-4)),
+    (ball, wc.OnlineRemesh(refine_above=1.02, simplify_below=1.01, max_level=6), wc.SymplecticEuler(dt=1e-4)),
 ]
 
 

@@ -45,7 +45,7 @@ def pack_changing(changing: Changing, prefix: str, arrays: Arrays) -> dict[str, 
     for name, array in conditions.kept.items():
         arrays[f"{prefix}conditions.{name}"] = array.numpy()
     rows = conditions.keyframes.rows
-    for k, row in enumerate(rows):
+    for k, row in rows.items():
         arrays[f"{prefix}row{k}.times"], arrays[f"{prefix}row{k}.displacements"] = row.times, row.displacements
     keys = conditions.activation.keys
     for k, each in enumerate(keys):
@@ -55,7 +55,7 @@ def pack_changing(changing: Changing, prefix: str, arrays: Arrays) -> dict[str, 
         "criterion": None if options.criterion is None else _name_of(options.criterion),
         "parameters": parameters is not None,
         "conditions": sorted(conditions.kept),
-        "rows": len(rows),
+        "rows": list(rows),
         "between": [[*ends, row] for ends, row in conditions.keyframes.between.items()],
         "loads": changing.body.has_loads,
         "activation": changing.body.has_activation,
@@ -73,9 +73,9 @@ def unpack_changing(changing: Changing, described: dict[str, Any], prefix: str, 
     _unpacked_snapshot(forest, described["initial"], f"{prefix}initial.", arrays).restore(forest)
     forest.remember()
     _unpacked_snapshot(forest, described["present"], f"{prefix}present.", arrays).restore(forest)
-    keyframes.rows = [
-        Row(arrays[f"{prefix}row{k}.times"], arrays[f"{prefix}row{k}.displacements"]) for k in range(described["rows"])
-    ]
+    keyframes.rows = {
+        k: Row(arrays[f"{prefix}row{k}.times"], arrays[f"{prefix}row{k}.displacements"]) for k in described["rows"]
+    }
     keyframes.between = {(a, b): row for a, b, row in described["between"]}
     if described["activation"]:
         _ = body.activation  # made on first use

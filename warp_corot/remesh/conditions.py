@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import numpy.typing as npt
 import warp as wp
 
@@ -99,6 +100,7 @@ class Conditions:
             ends = self._forest.pools.ends[: len(rows)].numpy()
             rows = self.keyframes.settle(rows, ends, self._of_nodes(arrays.u)[:, :3])
             arrays.row[: len(rows)].assign(rows)
+        self._forget(rows)
         found = self.keyframes.trajectories(rows, body.device)
         if found is not body.trajectories:
             body.trajectories = found
@@ -110,6 +112,12 @@ class Conditions:
         if not self.keyframes.are(body.trajectories):
             rows = self.keyframes.adopt(body.trajectories, body.node_count)
             self._forest.carriage.arrays.row[: len(rows)].assign(rows)
+            self._forget(rows)
+
+    def _forget(self, rows: npt.NDArray[np.int32]) -> None:
+        """Forget the keyframes that no node follows, now or in what is kept."""
+        kept = self.kept["row"].numpy() if "row" in self.kept else np.empty(0, np.int32)
+        self.keyframes.forget(but=np.concatenate([rows, kept]))
 
     def _of_nodes(self, array: wp.array) -> npt.NDArray[Any]:
         return array[: self._body.node_count].numpy().copy()

@@ -29,12 +29,12 @@ class Keyframes:
     """The rows of keyframes that nodes follow; ``Carried.row`` has each node's number.
 
     Attributes:
-        rows: The rows.
+        rows: The rows by their numbers.
         between: Which row is the mean of two others.
     """
 
     def __init__(self) -> None:
-        self.rows: list[Row] = []
+        self.rows: dict[int, Row] = {}
         self.between: dict[tuple[int, int], int] = {}
         self._trajectories: list[Trajectory] = []
 
@@ -49,13 +49,9 @@ class Keyframes:
         found = np.full(node_count, int(NO_ROW), np.int32)
         for trajectory in trajectories:
             times, displacements = trajectory.keys()
-            first, nodes = len(self.rows), trajectory.nodes.numpy()
-            if displacements.ndim == 2:
-                self.rows.append(Row(times, displacements))
-                found[nodes] = first
-            else:
-                self.rows += [Row(times, column) for column in np.moveaxis(displacements, 1, 0)]
-                found[nodes] = first + np.arange(len(nodes))
+            columns = displacements[:, None] if displacements.ndim == 2 else displacements
+            numbers = [self._add(Row(times.copy(), column.copy())) for column in np.moveaxis(columns, 1, 0)]
+            found[trajectory.nodes.numpy()] = numbers
         self._trajectories = list(trajectories)
         return found
 
@@ -97,6 +93,13 @@ class Keyframes:
             self._trajectories = made
         return self._trajectories
 
+    def forget(self, but: npt.NDArray[np.int32]) -> None:
+        """Keep the rows of these numbers only."""
+        wanted = {number for number in np.unique(but).tolist() if number >= 0}
+        if len(wanted) < len(self.rows):
+            self.rows = {number: row for number, row in self.rows.items() if number in wanted}
+            self.between = {ends: row for ends, row in self.between.items() if {*ends, row} <= wanted}
+
     def _mean_row(
         self, ends: npt.NDArray[np.int32], rows: npt.NDArray[np.int32], displacements: npt.NDArray[np.floating]
     ) -> int:
@@ -107,10 +110,15 @@ class Keyframes:
         times = np.unique(np.concatenate([row.times for row in followed]))
         stays = [np.tile(displacements[end], (len(times), 1)) for end in ends if rows[end] < 0]
         mean = np.mean([row.at(times) for row in followed] + stays, axis=0)
-        self.rows.append(Row(times, mean))
+        number = self._add(Row(times, mean))
         if a >= 0:
-            self.between[a, b] = len(self.rows) - 1
-        return len(self.rows) - 1
+            self.between[a, b] = number
+        return number
+
+    def _add(self, row: Row) -> int:
+        number = max(self.rows, default=-1) + 1
+        self.rows[number] = row
+        return number
 
 
 def _alike(ones: Sequence[Trajectory], others: Sequence[Trajectory]) -> bool:

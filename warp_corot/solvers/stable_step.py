@@ -49,20 +49,22 @@ def largest_frequency(body: SoftBody, field: ForceField) -> float:
 
 
 class _Lanczos:
-    """The iteration's vectors on the device, vec4 [N]: the present one, the one before and the next."""
+    """The iteration's vectors on the device, vec4, as long as launches: the present one, the one before, the next."""
 
     def __init__(self, body: SoftBody, field: ForceField):
         self.body = body
         self.field = field
         self.probe = PROBE * body.smallest_volume ** (1.0 / 3.0)
-        self.q, self.before, self.next, self.u, self.f = (wp.zeros_like(body.node_displacements) for _ in range(5))
+        self.q, self.before, self.next = (
+            wp.zeros(body.launch_nodes, dtype=wp.vec4, device=body.device) for _ in range(3)
+        )
+        self.u, self.f, self._rest = (wp.zeros_like(body.node_displacements) for _ in range(3))
         self._sums = wp.zeros(lanczos.PARTIAL_SUMS, dtype=wp.float64, device=body.device)
         self._largest = wp.zeros(lanczos.PARTIAL_SUMS, dtype=wp.float32, device=body.device)
         start = padded(np.random.default_rng(0).standard_normal((body.node_count, 3), np.float32))
         start[body.node_inverse_mass[: body.node_count].numpy() == 0] = 0.0
         self.q[: body.node_count].assign(start)
         self._launch(lanczos.scale_by, [1.0 / np.sqrt(self._inner(self.q, self.q)), self.q])
-        self._rest = wp.zeros_like(self.f)
 
     def find_rest_forces(self) -> None:
         """What forces there are without displacements, by active stress: of those with any, only the rest counts."""
@@ -75,7 +77,7 @@ class _Lanczos:
         self._launch(lanczos.largest_motions, [inverse_mass, self.q, self._largest], lanczos.PARTIAL_SUMS)
         scale = self.probe / float(self._largest.numpy().max())
         self._launch(lanczos.probe_motion, [scale, inverse_mass, self.q, self.u])
-        wp.copy(self.f, self._rest)
+        wp.copy(self.f, self._rest, count=self.body.launch_nodes)
         self.field.add_forces(self.u, self.f)
         self._launch(lanczos.apply_stiffness, [scale, beta, inverse_mass, self.f, self.before, self.next])
         diagonal = self._inner(self.q, self.next)
