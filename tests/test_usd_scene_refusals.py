@@ -118,6 +118,8 @@ def test_files_that_are_no_stages(tmp_path, capsys):
         assert run(tmp_path / name, "-o", tmp_path / "out.usda") == 2
         assert message in capsys.readouterr().err
     source = standing(tmp_path / "in.usda")
+    assert run(source, "-o", tmp_path / "no" / "out.usda") == 2
+    assert "output folder" in capsys.readouterr().err
     assert run(source, "-o", source) == 2
     assert "is the input" in capsys.readouterr().err
 

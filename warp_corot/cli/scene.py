@@ -117,6 +117,7 @@ def run(args: argparse.Namespace) -> int:
         InputError: Newton is not there, bad options, or a bad stage; nothing has been simulated or written.
     """
     from ..io.animate import Recording, frame_count, signals_held_back
+    from ..io.usd_pieces import PieceStore
     from ..newton.stage import StageOptions
     from ..newton.stage_steps import StageSimulation
 
@@ -126,6 +127,7 @@ def run(args: argparse.Namespace) -> int:
     )
     if args.fps is not None:
         frame_count(args.duration, args.fps)
+    PieceStore(args.output)  # checks, and writes nothing before the first frame
     device = checked_device(args.device)
     with compiling_said(device):
         sim = StageSimulation(
