@@ -13,8 +13,8 @@ import warp_corot as wc
 def within(element: ElementState, parameters: wp.array[wp.float32]):
     """1 for elements with a corner that is within a distance of a point."""
     point = wp.vec3(parameters[0], parameters[1], parameters[2])
-    least = float(1.0)
-    for n in range(4):
+    least = wp.length(element.corner - point)
+    for n in range(1, 4):
         least = wp.min(least, wp.length(element.corner + element.rest[n] - point))
     return wp.where(least < parameters[3], 1.0, 0.0)
 
