@@ -11,8 +11,13 @@ from pxr import Usd, UsdGeom
 #: What makes an example short enough for a test.
 SHORT = {"sweep": ["--beams", "8"]}
 #: Packages that examples need, large, and so no part of what the tests install.
-NEEDS = {"brain": "nilearn", "frog": "pyvista", "with_jax": "jax", "with_pytorch": "torch"}
-NEEDS["usd_scene"] = "newton_usd_schemas"
+NEEDS = {
+    "brain": "nilearn",
+    "frog": "pyvista",
+    "usd_scene": "newton_usd_schemas",
+    "with_jax": "jax",
+    "with_pytorch": "torch",
+}
 EXAMPLES = sorted((Path(__file__).parent.parent / "examples").glob("*.py"))
 
 
