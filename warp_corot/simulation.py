@@ -15,11 +15,12 @@ import numpy.typing as npt
 import warp as wp
 
 from .body import SoftBody
-from .checks import checked_count, checked_things
+from .checks import checked_count
 from .elasticity import Corotated, Model
 from .errors import InputError, StabilityWarning, UnstableError
 from .indices import checked_indices
 from .nodal import vec3_view
+from .parts import checked_bodies, checked_gravity, checked_integrator, checked_models
 from .remesh.online import OnlineRemesh
 from .remesh.remeshing import Remeshing
 from .solvers import Integrator, SymplecticEuler, largest_frequency
@@ -91,29 +92,12 @@ class Simulation:
         deterministic: bool = False,
         remesh: OnlineRemesh | Sequence[OnlineRemesh | None] | None = None,
     ):
-        self.bodies = checked_things(bodies, SoftBody, "body", "a SoftBody")
-        if not self.bodies:
-            raise InputError("a simulation needs at least one body")
-        if len(set(self.bodies)) < len(self.bodies):
-            raise InputError("a body is given twice; each can be stepped once only")
-        self.device = self.bodies[0].device
-        self.worlds = self.bodies[0].worlds
+        self.bodies = checked_bodies(bodies)
+        self.device, self.worlds = self.bodies[0].device, self.bodies[0].worlds
         self.deterministic = bool(deterministic)
-        for body in self.bodies:
-            if body.worlds != self.worlds:
-                raise InputError(f"bodies are in {self.worlds} and {body.worlds} worlds; they must be in as many")
-            if body.device != self.device:
-                raise InputError(f"bodies are on {self.device} and {body.device}; they must be on one device")
-            if not (body.node_inverse_mass.numpy() > 0).any():
-                raise InputError(f"all {body.node_count} nodes of the body are held; at least one must be free to move")
-        models = checked_things(Corotated() if model is None else model, Model, "model", "a model such as Corotated()")
-        self.models = models * len(self.bodies) if isinstance(model, Model | None) else models
-        if len(self.models) != len(self.bodies):
-            raise InputError(f"there are {len(self.models)} models for {len(self.bodies)} bodies")
-        self.integrator = SymplecticEuler() if integrator is None else integrator
-        if not isinstance(self.integrator, Integrator):
-            raise InputError(f"integrator is {integrator!r}; it must be an integrator such as SymplecticEuler()")
-        self.gravity = _checked_gravity(gravity, self.bodies[0].mesh.up_axis)
+        self.models = checked_models(Corotated() if model is None else model, len(self.bodies))
+        self.integrator = checked_integrator(SymplecticEuler() if integrator is None else integrator)
+        self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
 
         self.remeshing = Remeshing(self.bodies, self.models, remesh, deterministic=self.deterministic)
         bound = zip(self.models, self.bodies, strict=True)
@@ -418,18 +402,3 @@ class Simulation:
         for hook in tuple(self._hooks):
             if steps % hook.every == 0:
                 hook.callback(self)
-
-
-def _checked_gravity(gravity: npt.ArrayLike | None, up_axis: str) -> tuple[float, float, float]:
-    if gravity is None:
-        down = np.zeros(3)
-        down["XYZ".index(up_axis)] = -9.81
-    else:
-        try:
-            down = np.asarray(gravity, dtype=np.float64)
-        except (TypeError, ValueError):
-            down = np.empty(0)
-        if down.shape != (3,) or not np.isfinite(down).all():
-            raise InputError(f"gravity is {gravity!r}; it must be three finite accelerations in m/s^2")
-    x, y, z = (float(a) for a in down)
-    return x, y, z
