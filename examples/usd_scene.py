@@ -9,7 +9,7 @@ from pathlib import Path
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
 import warp_corot as wc
-from warp_corot.newton.stage_steps import StageSimulation
+from warp_corot.newton import StageSimulation
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--device", help="cpu or cuda:0")

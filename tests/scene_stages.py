@@ -11,7 +11,7 @@ pytest.importorskip("newton_usd_schemas")
 
 import warp_corot as wc  # noqa: E402
 from warp_corot.mesh.surface import signed_volumes  # noqa: E402
-from warp_corot.newton.stage_steps import StageOptions, StageSimulation  # noqa: E402
+from warp_corot.newton import StageOptions, StageSimulation  # noqa: E402
 
 YOUNG, DENSITY, CELL = 2e5, 1000.0, 0.1
 SIM = "/World/Soft/sim"

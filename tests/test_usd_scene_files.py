@@ -15,7 +15,7 @@ from scene_stages import SIM, StageMaker, StageSimulation, crowd, standing, wc, 
 
 from warp_corot.cli import main
 from warp_corot.io.colors import stress_colors
-from warp_corot.newton.stage_steps import StageOptions
+from warp_corot.newton import StageOptions
 
 
 def pose(stage, path, frame):

@@ -1,8 +1,9 @@
 """A corotational solver for scenes of the Newton physics engine, https://github.com/newton-physics/newton.
 
 ``SolverCorotated`` steps the tetrahedra of any ``newton.Model``; ``add_forest`` and ``add_mesh`` put this package's
-meshes into a ``newton.ModelBuilder``. Only Newton's public interface is used. It is imported when the first of these
-names is asked for, and comes with ``pip install "warp-corot[newton]"``.
+meshes into a ``newton.ModelBuilder``; ``StageSimulation`` steps the scene of a USD stage. Only Newton's public
+interface is used. It is imported when the first of these names is asked for, and comes with
+``pip install "warp-corot[newton]"``.
 """
 
 from importlib import import_module
@@ -11,13 +12,25 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .scene import Added, add_forest, add_mesh
     from .solver import SolverCorotated
+    from .stage_material import StageOptions
+    from .stage_steps import StageSimulation
     from .state import register_custom_attributes
 
-__all__ = ["Added", "SolverCorotated", "add_forest", "add_mesh", "register_custom_attributes"]
+__all__ = [
+    "Added",
+    "SolverCorotated",
+    "StageOptions",
+    "StageSimulation",
+    "add_forest",
+    "add_mesh",
+    "register_custom_attributes",
+]
 
 _MODULES = {
     "Added": ".scene",
     "SolverCorotated": ".solver",
+    "StageOptions": ".stage_material",
+    "StageSimulation": ".stage_steps",
     "add_forest": ".scene",
     "add_mesh": ".scene",
     "register_custom_attributes": ".state",
