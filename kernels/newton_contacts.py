@@ -7,7 +7,7 @@ do that is left out. A particle that touches several shapes is still slowed down
 
 import warp as wp
 
-from .elements import add_force, load_node
+from .elements import add_force
 from .newton_particles import ACTIVE
 from .newton_worlds import SURFACE_CONTACTS, place_of
 
@@ -76,8 +76,8 @@ def scatter_soft_contacts(
     world: wp.array[wp.int32],
     radius: wp.array[wp.float32],
     inverse_mass: wp.array[wp.float32],
-    x: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
+    q: wp.array[wp.vec3],
+    qd: wp.array[wp.vec3],
     body_q: wp.array[wp.transform],
     body_qd: wp.array[wp.spatial_vector],
     body_com: wp.array[wp.vec3],
@@ -111,7 +111,7 @@ def scatter_soft_contacts(
     margin = float(0.0)
     if shape_margin.shape[0] > 0:
         margin = shape_margin[shape]
-    gap = wp.dot(normal, load_node(x, i) - point) - radius[i] - margin
+    gap = wp.dot(normal, q[i] - point) - radius[i] - margin
     if gap > law.adhesion:
         return
     most = float(1.0e30)
@@ -120,7 +120,7 @@ def scatter_soft_contacts(
     force = contact_force(
         normal,
         gap,
-        load_node(v, i) - velocity,
+        qd[i] - velocity,
         0.5 * (law.stiffness + shape_ke[shape]),
         0.5 * (law.damping + shape_kd[shape]),
         0.5 * (law.friction_slope + shape_kf[shape]),
@@ -141,8 +141,8 @@ def scatter_attachments(
     stiffness: wp.array[wp.float32],
     damping: wp.array[wp.float32],
     enabled: wp.array[wp.bool],
-    x: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
+    q: wp.array[wp.vec3],
+    qd: wp.array[wp.vec3],
     body_q: wp.array[wp.transform],
     body_qd: wp.array[wp.spatial_vector],
     body_com: wp.array[wp.vec3],
@@ -159,8 +159,8 @@ def scatter_attachments(
     pose = body_q[b]
     point = wp.transform_point(pose, body_point[a])
     arm = point - wp.transform_point(pose, body_com[b])
-    relative = load_node(v, i) - body_point_velocity(body_qd[b], arm)
-    force = -stiffness[a] * (load_node(x, i) - point) - damping[a] * relative
+    relative = qd[i] - body_point_velocity(body_qd[b], arm)
+    force = -stiffness[a] * (q[i] - point) - damping[a] * relative
     add_force(f, i, force)
     wp.atomic_sub(body_f, b, wp.spatial_vector(force, wp.cross(arm, force)))
 

@@ -17,6 +17,9 @@ from .rotation import ITERATIONS, byers_xu, cofactor, identity3, warm_rotation
 
 wp.set_module_options({"enable_backward": False})
 
+#: Tetrahedra that a thread looks at whether they are active.
+EACH = wp.constant(4)
+
 
 @wp.func
 def deformation_gradient(elements: GeneralElements, t: int, x: wp.array[wp.vec4]):
@@ -40,9 +43,39 @@ def corotated_stress(f: wp.mat33, r: wp.mat33, mu: float, lam: float):
     return r * hooke(corotated_strain(f, wp.mat33(), r), mu, lam)
 
 
+@wp.func
+def viscous_stress(f: wp.mat33, rate_of_f: wp.mat33, k: float):
+    """Of k_damp [Pa s]: with Green's strain E, P = 3 / tr(F^T F) F (k dE/dt + k tr(dE/dt) I).
+
+    Nothing for a rigid motion, no torque, never any work put in. For small strains it is the k (dF/dt + tr(dF/dt) I) of
+    Newton's solvers, which also damps turning (and translation, as they have it). The factor keeps it from growing
+    with the stretch.
+    """
+    product = wp.transpose(f) * rate_of_f
+    rate = 0.5 * (product + wp.transpose(product))
+    scale = 3.0 * k / wp.max(wp.ddot(f, f), 1.0e-12)
+    return scale * (f * (rate + wp.trace(rate) * identity3()))
+
+
+@wp.func
+def active_stress(f: wp.mat33, k: float):
+    """k cof F, the gradient of k J: with k = k_lambda times the activation what Newton's solvers have."""
+    return k * cofactor(f)
+
+
+@wp.func
+def place_in_model(ids: wp.array[wp.int32], first: int, t: int):
+    """Which of the model's tetrahedra the t-th of a part is: of a list, or of a range where the list is empty."""
+    place = first + t
+    if ids.shape[0] > 0:
+        place = ids[t]
+    return place
+
+
 @functools.cache
-def scatter_posed(rotation: wp.Function) -> wp.Kernel:
-    """Corotated forces, each element with the rotation of its own deformation gradient."""
+def scatter_posed(rotation: wp.Function, damped: bool) -> wp.Kernel:
+    """All forces of tetrahedra, each with the rotation of its own deformation gradient; ``ids`` are their places in
+    ``activation``."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def scatter_posed(
@@ -50,13 +83,26 @@ def scatter_posed(rotation: wp.Function) -> wp.Kernel:
         elements: GeneralElements,
         mu: wp.array[wp.float32],
         lam: wp.array[wp.float32],
+        k_lambda: wp.array[wp.float32],
+        k_damp: wp.array[wp.float32],
+        ids: wp.array[wp.int32],
+        activation: wp.array[wp.float32],
         x: wp.array[wp.vec4],
+        v: wp.array[wp.vec3],
         # Out
         f: wp.array[wp.vec4],
     ):
         t = wp.tid()
+        a = activation[place_in_model(ids, 0, t)]
         gradient = deformation_gradient(elements, t, x)
-        scatter_stress(elements, t, corotated_stress(gradient, rotation(gradient), mu[t], lam[t]), f)
+        p = corotated_stress(gradient, rotation(gradient), mu[t], lam[t])
+        if a != 0.0:
+            p += active_stress(gradient, k_lambda[t] * a)
+        if wp.static(damped):
+            k = k_damp[t]
+            if k != 0.0:
+                p += viscous_stress(gradient, difference_gradient(elements, t, v), k)
+        scatter_stress(elements, t, p, f)
 
     return scatter_posed
 
@@ -73,10 +119,10 @@ def scatter_posed_warm(
     # Out
     f: wp.array[wp.vec4],
 ):
-    """As ``scatter_posed``, from the rotations that the state came with; ``ids`` are the elements' places there."""
+    """Elastic forces from the rotations that the state came with; ``ids`` are the elements' places there."""
     t = wp.tid()
     gradient = deformation_gradient(elements, t, x)
-    r = wp.quat_to_matrix(warm_rotation(gradient, guesses[ids[t]]))
+    r = wp.quat_to_matrix(warm_rotation(gradient, guesses[place_in_model(ids, 0, t)]))
     scatter_stress(elements, t, corotated_stress(gradient, r, mu[t], lam[t]), f)
 
 
@@ -151,41 +197,53 @@ def repair_posed(
 # --- what is Newton's own, whatever the elastic model ----------------------------------------------------------------
 
 
-@wp.kernel(enable_backward=False)
-def scatter_damping_and_activation(
-    # In
-    elements: GeneralElements,
-    materials: wp.array2d[wp.float32],
-    activation: wp.array[wp.float32],
-    q: wp.array[wp.vec3],
-    qd: wp.array[wp.vec3],
-    # Out
-    f: wp.array[wp.vec4],
-):
-    """Viscous stress of k_damp [Pa s], and k_lambda times the activation on the volume, as Newton's solvers have it.
+@functools.cache
+def scatter_damping_and_activation(damped: bool) -> wp.Kernel:
+    """What is not elastic in the forces of ``count`` tetrahedra of a model, for those whose elastic part is another
+    kernel's.
 
-    With Green's strain E, P = 3 / tr(F^T F) F (k dE/dt + k tr(dE/dt) I): nothing for a rigid motion, no torque, never
-    any work put in. For small strains it is the k (dF/dt + tr(dF/dt) I) of Newton's solvers, which also damps turning
-    (and translation, as they have it). The factor keeps it from growing with the stretch. The activation's
-    P = k_lambda a cof F is the gradient of k_lambda a J.
+    A thread looks at ``EACH`` of them, so that where none is active or damped it waits for memory once.
     """
-    t = wp.tid()
-    damping = materials[t, 2]
-    a = activation[t]
-    if damping == 0.0 and a == 0.0:
-        return
-    gradient = difference_gradient(elements, t, q)
-    p = (materials[t, 1] * a) * cofactor(gradient)
-    if damping != 0.0:
-        product = wp.transpose(gradient) * difference_gradient(elements, t, qd)
-        rate = 0.5 * (product + wp.transpose(product))
-        scale = 3.0 * damping / wp.max(wp.ddot(gradient, gradient), 1.0e-12)
-        p += scale * (gradient * (rate + wp.trace(rate) * identity3()))
-    scatter_stress(elements, t, p, f)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def scatter_damping_and_activation(
+        # In
+        elements: GeneralElements,
+        k_lambda: wp.array[wp.float32],
+        k_damp: wp.array[wp.float32],
+        ids: wp.array[wp.int32],
+        first: int,
+        count: int,
+        activation: wp.array[wp.float32],
+        q: wp.array[wp.vec3],
+        v: wp.array[wp.vec3],
+        # Out
+        f: wp.array[wp.vec4],
+    ):
+        thread = wp.tid()
+        threads = (count + EACH - 1) // EACH
+        any_of = float(0.0)
+        for j in range(EACH):
+            t = place_in_model(ids, first, wp.min(thread + j * threads, count - 1))
+            any_of += wp.abs(activation[t])
+            if wp.static(damped):
+                any_of += k_damp[t]
+        if any_of == 0.0:
+            return
+        for k in range(thread, count, threads):
+            t = place_in_model(ids, first, k)
+            a = activation[t]
+            gradient = difference_gradient(elements, t, q)
+            p = active_stress(gradient, k_lambda[t] * a)
+            if wp.static(damped):
+                p += viscous_stress(gradient, difference_gradient(elements, t, v), k_damp[t])
+            scatter_stress(elements, t, p, f)
+
+    return scatter_damping_and_activation
 
 
 @wp.kernel(enable_backward=False)
-def lame_parameters(
+def split_materials(
     # In
     materials: wp.array2d[wp.float32],
     ids: wp.array[wp.int32],
@@ -194,12 +252,18 @@ def lame_parameters(
     # Out
     mu: wp.array[wp.float32],
     lam: wp.array[wp.float32],
+    k_lambda: wp.array[wp.float32],
+    k_damp: wp.array[wp.float32],
 ):
-    """Lamé's parameters of chosen elements: mu = a k_mu, lambda = k_lambda + b k_mu."""
+    """Lamé's parameters of chosen elements, mu = a k_mu, lambda = k_lambda + b k_mu, and what else is in Newton's rows,
+    one after another."""
     t = wp.tid()
-    k_mu = materials[ids[t], 0]
+    row = place_in_model(ids, 0, t)
+    k_mu = materials[row, 0]
     mu[t] = mu_from_mu * k_mu
-    lam[t] = materials[ids[t], 1] + lam_from_mu * k_mu
+    lam[t] = materials[row, 1] + lam_from_mu * k_mu
+    k_lambda[t] = materials[row, 1]
+    k_damp[t] = materials[row, 2]
 
 
 @functools.cache

@@ -1,7 +1,7 @@
 """Particles of a Newton model through a step: into padded arrays, one step of symplectic Euler, and out again.
 
-A step is taken world by world or not at all. Velocities after the step are found first, and a world in which anything
-is not finite is marked; then all other worlds are written, and the marked ones keep the state they came with.
+A step is taken world by world or not at all. A world in which anything is not finite is marked, and ``newton_worlds``
+puts it back to the state it came with. One that came with what is not finite is not written at all.
 """
 
 import warp as wp
@@ -23,19 +23,32 @@ def gather_particles(
     qd: wp.array[wp.vec3],
     external: wp.array[wp.vec3],
     world: wp.array[wp.int32],
+    rest: wp.array[wp.vec4],
+    wrong: int,
     # Out
     x: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
     f: wp.array[wp.vec4],
+    kept_q: wp.array[wp.vec3],
+    kept_qd: wp.array[wp.vec3],
     trouble: wp.array[wp.int32],
 ):
-    """Positions and velocities padded to 16 bytes; forces begin with the external ones [N]."""
+    """Positions, displacements from ``rest``, and copies, of those the arrays that are not empty; forces begin with the
+    external ones [N]. What is not finite marks its world."""
     i = wp.tid()
-    store_node(x, i, q[i])
-    store_node(v, i, qd[i])
-    store_node(f, i, external[i])
-    if not (is_finite(q[i]) and is_finite(qd[i]) and is_finite(external[i])):
-        trouble[place_of(world[i], trouble.shape[0])] = BAD_INPUT
+    at = q[i]
+    velocity = qd[i]
+    force = external[i]
+    store_node(f, i, force)
+    if x.shape[0] > 0:
+        store_node(x, i, at)
+    if u.shape[0] > 0:
+        store_node(u, i, at - load_node(rest, i))
+    if kept_q.shape[0] > 0:
+        kept_q[i] = at
+        kept_qd[i] = velocity
+    if not (is_finite(at) and is_finite(velocity) and is_finite(force)):
+        wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), wrong)
 
 
 @wp.kernel(enable_backward=False)
@@ -69,7 +82,7 @@ def add_nodes(
 
 
 @wp.kernel(enable_backward=False)
-def step_velocities(
+def step_particles(
     # In
     dt: float,
     damping: float,
@@ -79,22 +92,27 @@ def step_velocities(
     flags: wp.array[wp.int32],
     world: wp.array[wp.int32],
     f: wp.array[wp.vec4],
-    x: wp.array[wp.vec4],
-    # In and out
-    v: wp.array[wp.vec4],
+    q: wp.array[wp.vec3],
+    qd: wp.array[wp.vec3],
     # Out
+    q_out: wp.array[wp.vec3],
+    qd_out: wp.array[wp.vec3],
     trouble: wp.array[wp.int32],
 ):
-    """v <- (v + dt (f/m + g)) / (1 + dt damping), no faster than ``most``.
+    """v <- (v + dt (f/m + g)) / (1 + dt damping), no faster than ``most``; x <- x + dt v.
 
     A particle of no mass is kinematic: it keeps its velocity. One that is not active is frozen. What would be faster
-    than ``RUNAWAY`` marks its world as what is not finite does.
+    than ``RUNAWAY`` marks its world as what is not finite does; in worlds marked before nothing moves.
     """
     i = wp.tid()
-    velocity = load_node(v, i)
-    runs_away = bool(False)
-    w = inverse_mass[i]
-    if (flags[i] & ACTIVE) != 0:
+    place = place_of(world[i], trouble.shape[0])
+    wrong = trouble[place]
+    if wrong == BAD_INPUT:
+        return
+    at = q[i]
+    velocity = qd[i]
+    if wrong == SOUND and (flags[i] & ACTIVE) != 0:
+        w = inverse_mass[i]
         if w > 0.0:
             g = gravity[place_of(world[i], gravity.shape[0])]
             velocity = (velocity + dt * (w * load_node(f, i) + g)) / (1.0 + dt * damping)
@@ -104,36 +122,11 @@ def step_velocities(
         runs_away = speed >= RUNAWAY
         if speed > most:
             velocity = velocity * (most / speed)
-        store_node(v, i, velocity)
-    if runs_away or not is_finite(load_node(x, i) + dt * velocity):
-        wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), UNSTABLE)
-
-
-@wp.kernel(enable_backward=False)
-def move_particles(
-    # In
-    dt: float,
-    flags: wp.array[wp.int32],
-    world: wp.array[wp.int32],
-    trouble: wp.array[wp.int32],
-    q: wp.array[wp.vec3],
-    qd: wp.array[wp.vec3],
-    v: wp.array[wp.vec4],
-    # Out
-    q_out: wp.array[wp.vec3],
-    qd_out: wp.array[wp.vec3],
-):
-    """x <- x + dt v in sound worlds; the others keep what they came with, or what was there if that was not finite."""
-    i = wp.tid()
-    wrong = trouble[place_of(world[i], trouble.shape[0])]
-    if wrong == SOUND:
-        velocity = load_node(v, i)
-        moving = (flags[i] & ACTIVE) != 0
-        q_out[i] = q[i] + wp.where(moving, dt, 0.0) * velocity
-        qd_out[i] = velocity
-    elif wrong != BAD_INPUT:
-        q_out[i] = q[i]
-        qd_out[i] = qd[i]
+        at += dt * velocity
+        if runs_away or not is_finite(at):
+            wp.atomic_max(trouble, place, UNSTABLE)
+    q_out[i] = at
+    qd_out[i] = velocity
 
 
 @wp.kernel(enable_backward=False)

@@ -5,7 +5,6 @@ Entities of no world (-1) have the last place in arrays over worlds.
 
 import warp as wp
 
-from .elements import load_node
 from .integrate import is_finite
 
 wp.set_module_options({"enable_backward": False})
@@ -62,23 +61,30 @@ def put_back_particles(
     # In
     world: wp.array[wp.int32],
     trouble: wp.array[wp.int32],
-    x: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
+    before_q: wp.array[wp.vec3],
+    before_qd: wp.array[wp.vec3],
     kept_q: wp.array[wp.vec3],
     kept_qd: wp.array[wp.vec3],
     # Out
     q: wp.array[wp.vec3],
     qd: wp.array[wp.vec3],
 ):
-    """Undo what another solver wrote to particles of marked worlds."""
+    """Undo what was written to particles of marked worlds.
+
+    Args:
+        before_q, before_qd: The state that the step began with.
+        kept_q, kept_qd: What was in the state that it went to, for worlds that began with what is not finite; or empty,
+            where those were not written.
+    """
     i = wp.tid()
     wrong = trouble[place_of(world[i], trouble.shape[0])]
     if wrong == BAD_INPUT:
-        q[i] = kept_q[i]
-        qd[i] = kept_qd[i]
+        if kept_q.shape[0] > 0:
+            q[i] = kept_q[i]
+            qd[i] = kept_qd[i]
     elif wrong != SOUND:
-        q[i] = load_node(x, i)
-        qd[i] = load_node(v, i)
+        q[i] = before_q[i]
+        qd[i] = before_qd[i]
 
 
 @wp.kernel(enable_backward=False)
@@ -111,7 +117,7 @@ def put_back_bodies(
     q: wp.array[wp.transform],
     qd: wp.array[wp.spatial_vector],
 ):
-    """Undo what a rigid solver wrote to bodies of marked worlds."""
+    """Undo what a rigid solver wrote to bodies of marked worlds; as ``put_back_particles``."""
     b = wp.tid()
     wrong = trouble[place_of(world[b], trouble.shape[0])]
     if wrong == BAD_INPUT:
@@ -128,11 +134,18 @@ def report_trouble(
     trouble: wp.array[wp.int32],
     # Out
     report: wp.array[wp.int32],
+    seen: wp.array[wp.int32],
 ):
-    """Remember what was wrong and in which world, and begin the next step with nothing wrong."""
+    """Remember what was wrong and in which world, and begin the next step with nothing wrong.
+
+    Args:
+        seen: That something was, for the host, in its own memory.
+    """
     w = wp.tid()
-    if trouble[w] != SOUND:
-        wp.atomic_max(report, trouble[w], w + 1)
+    wrong = trouble[w]
+    if wrong != SOUND:
+        wp.atomic_max(report, wrong, w + 1)
+        seen[0] = 1
         trouble[w] = SOUND
 
 

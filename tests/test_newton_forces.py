@@ -51,18 +51,31 @@ def test_tetrahedra_against_the_oracle(device, rng, crushed):
     assert_near(found, oracle_forces(model, rest, x, MU, LAM), 3e-3 if crushed else 1e-4)
 
 
-def test_one_element_a_thread_as_eight(device, rng):
-    """What runs on CUDA also on the CPU, where eight go together: any F, also such as Newton's iteration cannot do."""
-    model = grid_model(device)
-    tets = wn.SolverCorotated(model).tetrahedra
-    x = np.zeros((model.particle_count, 4), np.float32)
-    x[:, :3] = model.particle_q.numpy() + 0.06 * rng.standard_normal((model.particle_count, 3))
-    nodes = wp.array(x, dtype=wp.vec4, device=device)
-    found, wanted = (wp.zeros_like(nodes) for _ in range(2))
-    inputs = [tets.elements, tets.mu, tets.lam, nodes]
-    wp.launch(scatter_posed(quick_rotation), model.tet_count, inputs, [found], device=device)
-    tets.add_forces(nodes, wanted, None)
-    assert_near(found.numpy(), wanted.numpy(), 1e-5)
+def columns(model):
+    """mu, lambda, k_lambda and k_damp, as documented."""
+    k_mu, k_lambda, k_damp = model.tet_materials.numpy().reshape(-1, 3).T
+    return [wp.array(a, dtype=wp.float32, device=model.device) for a in (k_mu, k_lambda, k_lambda, k_damp)]
+
+
+@pytest.mark.parametrize("damped", [False, True])
+def test_all_forces_at_once_as_one_after_another(device, rng, damped):
+    """What runs on CUDA also on the CPU, where eight elements go together and what is not elastic apart from them: any
+    F, also such as Newton's iteration cannot do."""
+    model = grid_model(device, damp=50.0 * damped)
+    x = model.particle_q.numpy() + 0.06 * rng.standard_normal((model.particle_count, 3))
+    v = rng.standard_normal(x.shape)
+    active = rng.uniform(-0.3, 0.3, model.tet_count) * (rng.random(model.tet_count) < 0.5)
+    control = model.control()
+    control.tet_activations.assign(active.astype(np.float32))
+    solver = wn.SolverCorotated(model, stable_dt=1.0)
+    wanted = impulse(solver, model, x, v, control)
+    tets, found = solver.tetrahedra, wp.zeros(model.particle_count, dtype=wp.vec4, device=device)
+    qd = wp.array(v, dtype=wp.vec3, device=device)
+    padded = wp.array(np.pad(x, ((0, 0), (0, 1))), dtype=wp.vec4, device=device)
+    ids = wp.array(np.arange(model.tet_count), dtype=wp.int32, device=device)
+    inputs = [tets.elements, *columns(model), ids, control.tet_activations, padded, qd]
+    wp.launch(scatter_posed(quick_rotation, damped), model.tet_count, inputs, [found], device=device)
+    assert_near(found.numpy()[:, :3], wanted, 1e-4)
 
 
 @pytest.mark.parametrize("copies", [1, 3])

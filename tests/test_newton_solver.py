@@ -11,6 +11,8 @@ import pytest
 import warp as wp
 from newton_scenes import adaptive_forest, add_grid, builder, checked_step, grid_model, impulse, newton, run, wc, wn
 
+from warp_corot.newton.state import ForestName
+
 PACKAGE = Path(wn.__file__).parent
 
 
@@ -168,7 +170,8 @@ class TestAttributes:
         again.load_model(loaded)
         state = loaded.state()
         again.load_state(state, 0)
-        restored = wn.SolverCorotated(loaded)
+        with pytest.warns(UserWarning, match="from a file.* one by one"):
+            restored = wn.SolverCorotated(loaded)
         restored.write_attributes(state)
         for name in ("rotation", "stress", "von_mises"):
             found, had = (getattr(s.warp_corot, name).numpy() for s in (state, after))
@@ -404,16 +407,15 @@ class TestBadInput:
         assert made.particle_count == made.tet_count == 0
 
 
-def test_a_forest_from_elsewhere_goes_one_by_one(device, monkeypatch, rng):
+def test_a_forest_from_elsewhere_goes_one_by_one(device, rng):
     made = builder()
     wn.add_forest(made, adaptive_forest(3), wc.Isotropic(1e4, 0.3, 1000.0))
     model = made.finalize(device=device)
     x = model.particle_q.numpy() + 0.01 * rng.standard_normal((model.particle_count, 3))
     wanted = impulse(wn.SolverCorotated(model), model, x)
-    # None is known, or one that is as this one but larger.
-    key = int(model.warp_corot.forest_key.numpy()[0])
-    for known in ([], [adaptive_forest(3, 0.5)] * (key + 1)):
-        monkeypatch.setattr("warp_corot.newton.forests.FORESTS", known)
+    # A name that has been through a file, or that of one that is as this one but larger.
+    for name in (str(model.warp_corot.forest[0]), ForestName.of(adaptive_forest(3, 0.5))):
+        model.warp_corot.forest[0] = name
         with pytest.warns(UserWarning, match="one by one"):
             solver = wn.SolverCorotated(model)
         assert solver.tetrahedra.single_count == model.tet_count

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from newton_scenes import adaptive_forest, add_grid, builder, newton, run, wc, wn
+from newton_scenes import adaptive_forest, add_grid, builder, checked_step, newton, run, wc, wn
 
 WORLDS = 64
 
@@ -128,6 +128,35 @@ def test_a_replayed_step_says_what_was_wrong(device):
     with pytest.raises(wc.InputError, match="state_in is not finite"):
         solver.check()
     solver.check()
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+@pytest.mark.parametrize("in_place", [False, True])
+def test_substeps_are_taken_all_or_none(device, in_place, recorded):
+    """What runs away in the second of three substeps has moved by then; its world, bodies too, is where it was."""
+    model = worlds(2, device)
+    solver = wn.SolverCorotated(model, substeps=3)
+    before, dt = model.state(), 3e-4
+    after = before if in_place else model.state()
+    solver.step(before, after, None, None, dt)
+    pushed = np.zeros((2, model.particle_count // 2, 3), np.float32)
+    pushed[1, :, 0] = model.particle_mass.numpy().reshape(2, -1)[1] * 6e4 / (dt / 3)
+    before.particle_f.assign(pushed.reshape(-1, 3))
+    names = ("particle_q", "particle_qd", "body_q", "body_qd")
+    began = [by_world(getattr(before, name), 2).copy() for name in names]
+    if recorded:
+        with wp.ScopedCapture(device=device) as capture:
+            solver.step(before, after, None, None, dt)
+        wp.capture_launch(capture.graph)
+        with pytest.raises(wc.UnstableError, match="world 1"):
+            solver.check()
+    else:
+        with pytest.raises(wc.UnstableError, match="world 1"):
+            checked_step(solver, before, after, dt=dt)
+    for name, had in zip(names, began, strict=True):
+        has = by_world(getattr(after, name), 2)
+        np.testing.assert_array_equal(has[1], had[1])
+        assert np.abs(has[0] - had[0]).max() > 0
 
 
 def test_nothing_is_allocated_after_the_first_step(device, monkeypatch):

@@ -56,18 +56,19 @@ class Contacts:
     def add_forces(
         self,
         state: newton.State,
+        of_bodies: newton.State,
         contacts: newton.Contacts | None,
         dt: float,
-        x: wp.array,
-        v: wp.array,
         f: wp.array,
         trouble: wp.array,
     ) -> None:
-        """Add forces on particles to f, vec4 [P], and set ``reactions``. Bodies are where ``state`` has them."""
+        """Add forces on a state's particles to f, vec4 [P], and set ``reactions``. Bodies are where ``of_bodies`` has
+        them."""
         model = self.model
+        q, qd = state.particle_q, state.particle_qd
         if model.body_count:
             self.reactions.zero_()
-            bodies = [state.body_q, state.body_qd, model.body_com]
+            bodies = [of_bodies.body_q, of_bodies.body_qd, model.body_com]
         else:
             bodies = [self._no_poses, self._no_twists, self._no_points]
         if contacts is not None and contacts.soft_contact_max and model.shape_count:
@@ -93,7 +94,7 @@ class Contacts:
                 model.shape_material_mu,
             ]
             particles = [model.particle_flags, model.particle_world, model.particle_radius, model.particle_inv_mass]
-            inputs = [law, dt, *found, *shapes, *particles, x, v, *bodies]
+            inputs = [law, dt, *found, *shapes, *particles, q, qd, *bodies]
             outputs = [f, self.reactions, trouble]
             self._launch(scatter_soft_contacts, contacts.soft_contact_max, inputs, outputs)
         if model.attachment_particle_body_count:
@@ -107,7 +108,7 @@ class Contacts:
             ]
             outputs = [f, self.reactions]
             count = model.attachment_particle_body_count
-            self._launch(scatter_attachments, count, [*attached, x, v, *bodies], outputs)
+            self._launch(scatter_attachments, count, [*attached, q, qd, *bodies], outputs)
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

@@ -14,7 +14,7 @@ from ..kernels.newton_particles import add_nodes, gather_nodes
 from ..materials import Isotropic
 from ..mesh import TetForest
 from .library import newton
-from .scene import FORESTS, mesh_fill, right_handed
+from .scene import mesh_fill, right_handed
 from .state import attribute_of
 
 
@@ -29,7 +29,10 @@ class ForestGroup:
         tets: First tetrahedron of each copy.
 
     Attributes:
-        tets: All copies' tetrahedra among the model's, int32 [copies * T].
+        tets: All copies' tetrahedra among the model's, int [copies * T].
+        nodes: All copies' particles, int [copies * N].
+        rest: Where these rest [m], float32 [copies * N, 4].
+        follow_one_another: Whether the particles are a range, so that forces need not go by way of the forest's own.
     """
 
     def __init__(
@@ -44,20 +47,21 @@ class ForestGroup:
         self.device = model.device
         self.rotation_level = rotation_level
         self.tets = (tets[:, None] + np.arange(len(forest.tets))).ravel()
-        nodes = (particles[:, None] + np.arange(len(forest.points))).ravel()
-        self.count = len(nodes)
-        self._particles = wp.array(nodes, dtype=wp.int32, device=self.device)
-        #: The first of them where all follow one another, so that forces need not go by way of the forest's own.
-        self._first = int(nodes[0]) if np.array_equal(nodes, np.arange(nodes[0], nodes[0] + len(nodes))) else None
-        self._part: wp.array | None = None
+        self.nodes = (particles[:, None] + np.arange(len(forest.points))).ravel()
+        self.count = len(self.nodes)
+        self.follow_one_another = bool((np.diff(self.nodes) == 1).all())
         # Displacements are from the forest's own axes, so only where a copy stands is taken off: no digits are lost.
         rest = np.tile(forest.points, (self.copies, 1)).reshape(self.copies, -1, 3)
-        there = model.particle_q.numpy().astype(np.float64)[nodes].reshape(rest.shape)
+        there = model.particle_q.numpy().astype(np.float64)[self.nodes].reshape(rest.shape)
         rest = rest + (there - rest).mean(axis=1, keepdims=True)
-        padded = np.zeros((self.count, 4), np.float32)
-        padded[:, :3] = rest.reshape(-1, 3)
-        self._rest = wp.array(padded, dtype=wp.vec4, device=self.device)
-        self._u, self._f = (wp.zeros(self.count, dtype=wp.vec4, device=self.device) for _ in range(2))
+        self.rest = np.zeros((self.count, 4), np.float32)
+        self.rest[:, :3] = rest.reshape(-1, 3)
+        #: Its nodes in arrays over particles; kept, since these are the same arrays in every step.
+        self._parts: dict[int, wp.array] = {}
+        if not self.follow_one_another:
+            self._particles = wp.array(self.nodes, dtype=wp.int32, device=self.device)
+            self._rest = wp.array(self.rest, dtype=wp.vec4, device=self.device)
+            self._u, self._f = (wp.zeros(self.count, dtype=wp.vec4, device=self.device) for _ in range(2))
 
     def set_material(self, mu: npt.NDArray[np.float64], lam: npt.NDArray[np.float64]) -> None:
         """Take over Lamé's parameters of the model's tetrahedra [Pa], float64 [all T]."""
@@ -69,41 +73,45 @@ class ForestGroup:
         body = SoftBody(self.forest, material, worlds=self.copies, device=self.device)
         self._field = Corotated(rotation_level=self.rotation_level).bind(body)
 
-    def add_forces(self, x: wp.array, f: wp.array) -> None:
-        """Add the elastic forces of particles at x to f, both vec4 [P]."""
+    def add_forces(self, x: wp.array, u: wp.array, f: wp.array) -> None:
+        """Add the elastic forces of particles at x, displaced by u, to f, all vec4 [P].
+
+        Of x and u it reads one: displacements where its particles follow one another, positions where they do not.
+        """
+        if self.follow_one_another:
+            self._field.add_forces(self._part_of(u), self._part_of(f))
+            return
         inputs = [self._particles, x, self._rest]
         wp.launch(gather_nodes, dim=self.count, inputs=inputs, outputs=[self._u], device=self.device)
-        if self._first is not None:
-            self._field.add_forces(self._u, self._part_of(f))
-            return
         self._field.add_forces(self._u, self._f)
         wp.launch(add_nodes, dim=self.count, inputs=[self._particles, self._f], outputs=[f], device=self.device)
 
-    def _part_of(self, f: wp.array) -> wp.array:
-        """The forest's nodes in an array over particles; kept, since it is the same array in every step."""
-        assert self._first is not None
-        if self._part is None or self._part.ptr != f.ptr + 16 * self._first:
-            self._part = f[self._first : self._first + self.count]
-        return self._part
+    def _part_of(self, nodal: wp.array) -> wp.array:
+        if nodal.ptr not in self._parts:
+            self._parts[nodal.ptr] = nodal[int(self.nodes[0]) : int(self.nodes[-1]) + 1]
+        return self._parts[nodal.ptr]
 
 
 def forest_groups(model: newton.Model, tets: npt.NDArray[np.integer], rotation_level: int | None) -> list[ForestGroup]:
     """The forests in a model; tetrahedra that are no longer as they were added are left to the general path."""
-    rows = [attribute_of(model, f"forest_{name}") for name in ("key", "particle", "tet")]
-    keys, particles, first = (np.empty(0, int) if row is None else row.numpy() for row in rows)
+    names = attribute_of(model, "forest") or []
+    rows = [attribute_of(model, f"forest_{name}") for name in ("particle", "tet")]
+    particles, first = (np.empty(0, int) if row is None else row.numpy() for row in rows)
+    forests = [getattr(name, "forest", None) for name in names]
+    keys = np.array([id(forest) for forest in forests], dtype=np.int64)
     groups = []
-    for key in np.unique(keys):
-        chosen = keys == key
-        starts = particles[chosen], first[chosen]
-        if not 0 <= key < len(FORESTS) or not _is_there(FORESTS[key], model, tets, *starts):
+    for key in dict.fromkeys(keys.tolist()):
+        chosen = np.flatnonzero(keys == key)
+        forest, starts = forests[chosen[0]], (particles[chosen], first[chosen])
+        if not isinstance(forest, TetForest) or not _is_there(forest, model, tets, *starts):
             warnings.warn(
-                "a forest of this model was added in another process, or has been changed since; its tetrahedra are "
+                "a forest of this model comes from a file, or has been changed since it was added; its tetrahedra are "
                 "stepped one by one",
                 UserWarning,
                 stacklevel=5,
             )
             continue
-        groups.append(ForestGroup(model, FORESTS[key], *starts, rotation_level))
+        groups.append(ForestGroup(model, forest, *starts, rotation_level))
     return groups
 
 

@@ -15,10 +15,7 @@ from ..materials import Isotropic
 from ..mesh import TetForest, TetMesh
 from ..mesh.surface import boundary_faces, signed_volumes
 from .library import newton
-from .state import NAMESPACE, register_forests
-
-#: Forests that were added to a builder. A model says by their place here which of its tetrahedra are whose.
-FORESTS: list[TetForest] = []
+from .state import NAMESPACE, ForestName, register_forests
 
 
 class Added(NamedTuple):
@@ -68,10 +65,8 @@ def add_forest(
         raise InputError(f"mesh is a {type(mesh).__name__}; add_forest takes a TetForest, add_mesh any tetrahedra")
     added = _add(builder, mesh, material, pos, rot, vel, k_damp, fixed, particle_radius, surface)
     register_forests(builder)
-    place = next((k for k, known in enumerate(FORESTS) if known is mesh), len(FORESTS))
-    if place == len(FORESTS):
-        FORESTS.append(mesh)
-    row = {"forest_key": place, "forest_particle": added.particles.start, "forest_tet": added.tetrahedra.start}
+    starts = {"forest_particle": added.particles.start, "forest_tet": added.tetrahedra.start}
+    row = {"forest": ForestName.of(mesh), **starts}
     builder.add_custom_values(**{f"{NAMESPACE}:{name}": value for name, value in row.items()})
     if mesh.fill is not None:
         values = builder.custom_attributes[f"{NAMESPACE}:fill"].values

@@ -6,6 +6,7 @@ from typing import Any
 
 import warp as wp
 
+from ..mesh import TetForest
 from .library import newton
 
 NAMESPACE = "warp_corot"
@@ -14,6 +15,21 @@ FOREST = f"{NAMESPACE}:forest"
 
 #: Attributes of every tetrahedron in a state, with their types.
 STATE = {"rotation": wp.quat, "stress": wp.mat33, "von_mises": wp.float32}
+
+
+class ForestName(str):
+    """The name of a forest in builders and models, which has the forest with it for as long as they last.
+
+    Newton keeps text as it is given; whatever writes it to a file and reads it again has a plain ``str``.
+    """
+
+    forest: TetForest
+
+    @classmethod
+    def of(cls, forest: TetForest) -> ForestName:
+        name = cls(f"forest of {len(forest.tets)} tetrahedra")
+        name.forest = forest
+        return name
 
 
 def register_custom_attributes(builder: newton.ModelBuilder) -> None:
@@ -37,12 +53,13 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
 
 
 def register_forests(builder: newton.ModelBuilder) -> None:
-    """Room in the model for which tetrahedra are a forest's, and how full they are."""
-    if f"{NAMESPACE}:forest_key" in builder.custom_attributes:
+    """Room in the model for which tetrahedra are which forest's, and how full they are."""
+    if f"{NAMESPACE}:forest" in builder.custom_attributes:
         return
     attribute = newton.ModelBuilder.CustomAttribute
     builder.add_custom_frequency(newton.ModelBuilder.CustomFrequency(name="forest", namespace=NAMESPACE))
-    for name, references in (("forest_key", None), ("forest_particle", "particle"), ("forest_tet", "tetrahedron")):
+    builder.add_custom_attribute(attribute(name="forest", dtype=str, frequency=FOREST, default="", namespace=NAMESPACE))
+    for name, references in (("forest_particle", "particle"), ("forest_tet", "tetrahedron")):
         builder.add_custom_attribute(
             attribute(name=name, dtype=wp.int32, frequency=FOREST, references=references, namespace=NAMESPACE)
         )
@@ -57,6 +74,6 @@ def register_forests(builder: newton.ModelBuilder) -> None:
     )
 
 
-def attribute_of(owner: Any, name: str) -> wp.array | None:
+def attribute_of(owner: Any, name: str) -> Any:
     """An attribute of a model's or a state's namespace, if it is there."""
     return getattr(getattr(owner, NAMESPACE, None), name, None)

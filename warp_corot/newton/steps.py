@@ -30,19 +30,25 @@ class Steps:
         self.damping = damping
         self.device = model.device
         p, b = model.particle_count, model.body_count
-        self._x, self._v, self._f = (wp.zeros(p, dtype=wp.vec4, device=self.device) for _ in range(3))
+        self._f = wp.zeros(p, dtype=wp.vec4, device=self.device)
         self._places = max(int(model.world_count), 1) + 1
         self._trouble = wp.zeros(self._places, dtype=wp.int32, device=self.device)
         self._report = wp.zeros(worlds.REPORTS, dtype=wp.int32, device=self.device)
-        #: What the host can look at without waiting.
-        self._seen = wp.zeros(worlds.REPORTS, dtype=wp.int32, device="cpu", pinned=self.device.is_cuda)
-        self._kept_particles = [wp.empty(p if others.has_particles else 0, dtype=wp.vec3, device=self.device)] * 2
-        if others.has_particles:
-            self._kept_particles = [wp.empty(p, dtype=wp.vec3, device=self.device) for _ in range(2)]
+        #: That there is a report: what the host can look at without waiting.
+        self._seen = wp.zeros(1, dtype=wp.int32, device="cpu", pinned=self.device.is_cuda)
+        self._seen_by_device = self._seen
+        if self.device.is_cuda:
+            # The same memory: what is pinned has one address everywhere.
+            self._seen_by_device = wp.array(ptr=self._seen.ptr, shape=1, dtype=wp.int32, device=self.device)
+        types = (wp.vec3, wp.vec3)
+        self._particles_before = [wp.empty(p, dtype=dtype, device=self.device) for dtype in types]
+        self._nothing = [wp.empty(0, dtype=dtype, device=self.device) for dtype in types]
+        kept = p if others.has_particles else 0
+        self._kept_particles = [wp.empty(kept, dtype=dtype, device=self.device) for dtype in types]
         self._body_f = wp.empty(b, dtype=wp.spatial_vector, device=self.device)
-        types = (wp.transform, wp.spatial_vector)
-        self._bodies_before = [wp.empty(b, dtype=dtype, device=self.device) for dtype in types]
-        self._kept_bodies = [wp.empty(b, dtype=dtype, device=self.device) for dtype in types]
+        of_bodies = (wp.transform, wp.spatial_vector)
+        self._bodies_before = [wp.empty(b, dtype=dtype, device=self.device) for dtype in of_bodies]
+        self._kept_bodies = [wp.empty(b, dtype=dtype, device=self.device) for dtype in of_bodies]
 
     def launch(
         self,
@@ -53,32 +59,37 @@ class Steps:
         dt: float,
         count: int,
     ) -> None:
-        """Launch a step of ``count`` substeps."""
+        """Launch a step of ``count`` substeps. What goes wrong in a world in one of them undoes all, and ends it."""
         model = self.model
         activation = model.tet_activations
         if control is not None and control.tet_activations is not None:
             activation = control.tet_activations
+        before = self._launch_begin(state_in, state_out, contacts)
         now = state_in
         for number in range(count):
-            self._launch_forces(now, state_in.particle_f, activation, contacts, dt / count)
+            copied = number == 0 and before[0] is self._particles_before
+            self._launch_forces(now, state_in, activation, contacts, dt / count, number, copied)
             if self.others.has_bodies:
                 wp.copy(self._body_f, state_in.body_f)
                 self._add_wrenches(1.0, self._body_f)
             elif model.body_count:
                 self._add_wrenches(1.0 / count, state_in.body_f)
             self._launch_motion(now, state_out, control, contacts, dt / count)
+            self._launch_undoing(state_out, *before)
             if self.tetrahedra.warm or number == count - 1:
                 self.tetrahedra.write_attributes(state_out, now)
-            # On the CPU a look costs less than a launch; a recorded step must be ready for what comes.
-            if self.device.is_cuda or self.device.is_capturing or self._trouble.numpy().any():
-                self._launch(worlds.report_trouble, self._places, [self._trouble], [self._report])
             now = state_out
-        if self.device.is_cuda:
-            wp.copy(self._seen, self._report)
+        if self._may_be_wrong():
+            inputs, outputs = [self._trouble], [self._report, self._seen_by_device]
+            self._launch(worlds.report_trouble, self._places, inputs, outputs)
+
+    def _may_be_wrong(self) -> bool:
+        # On the CPU a look costs less than a launch; a recorded step must be ready for what comes.
+        return self.device.is_cuda or self.device.is_capturing or bool(self._trouble.numpy().any())
 
     def check_earlier(self) -> None:
         """Say what a step that is done already has reported. On CUDA, outside of captures; waits for nothing."""
-        if self.device.is_cuda and not self.device.is_capturing and self._seen.numpy().any():
+        if self.device.is_cuda and not self.device.is_capturing and self._seen.numpy()[0]:
             self.check(None)
 
     def check(self, stable_dt: float | None) -> None:
@@ -124,26 +135,54 @@ class Steps:
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
+    def _launch_begin(
+        self, state_in: newton.State, state_out: newton.State, contacts: newton.Contacts | None
+    ) -> tuple[list[wp.array], list[wp.array]]:
+        """What is done once a step.
+
+        Returns:
+            Particles and bodies as they are before the step: those of ``state_in``, or, if they are written to, copies.
+        """
+        model, others = self.model, self.others
+        if others.has_particles:
+            _copy(self._kept_particles, [state_out.particle_q, state_out.particle_qd])
+        particles = [state_in.particle_q, state_in.particle_qd]
+        if _overlap(particles, [state_out.particle_q, state_out.particle_qd]):
+            particles = self._particles_before
+        bodies: list[wp.array] = []
+        if model.body_count:
+            bodies = [state_in.body_q, state_in.body_qd]
+            inputs = [*bodies, model.body_world, int(worlds.BAD_INPUT)]
+            self._launch(worlds.check_bodies, model.body_count, inputs, [self._trouble])
+        if others.has_bodies:
+            _copy(self._kept_bodies, [state_out.body_q, state_out.body_qd])
+            if _overlap(bodies, [state_out.body_q, state_out.body_qd]):
+                _copy(self._bodies_before, bodies)
+                bodies = self._bodies_before
+        self.contacts.check_count(contacts, self._trouble)
+        return particles, bodies
+
     def _launch_forces(
         self,
         now: newton.State,
-        external: wp.array,
+        state_in: newton.State,
         activation: wp.array,
         contacts: newton.Contacts | None,
         dt: float,
+        number: int,
+        copied: bool,
     ) -> None:
-        model = self.model
-        inputs = [now.particle_q, now.particle_qd, external, model.particle_world]
-        outputs = [self._x, self._v, self._f, self._trouble]
+        """All forces on particles, which are copied if the step begins with them and writes over them."""
+        model, tets = self.model, self.tetrahedra
+        # Where this was finite before, it has become what it is by the step.
+        wrong = int(worlds.UNSTABLE if number else worlds.BAD_INPUT)
+        inputs = [now.particle_q, now.particle_qd, state_in.particle_f, model.particle_world, tets.rest, wrong]
+        copies = self._particles_before if copied else self._nothing
+        outputs = [tets.x, tets.u, self._f, *copies, self._trouble]
         self._launch(kernels.gather_particles, model.particle_count, inputs, outputs)
-        if model.body_count:
-            inputs = [now.body_q, now.body_qd, model.body_world, int(worlds.BAD_INPUT)]
-            self._launch(worlds.check_bodies, model.body_count, inputs, [self._trouble])
-        self.contacts.check_count(contacts, self._trouble)
-        rotations = attribute_of(now, "rotation")
-        self.tetrahedra.add_forces(self._x, self._f, rotations)
-        self.tetrahedra.add_damping_and_activation(now.particle_q, now.particle_qd, activation, self._f)
-        self.contacts.add_forces(now, contacts, dt, self._x, self._v, self._f, self._trouble)
+        tets.add_forces(now, activation, self._f)
+        of_bodies = now if self.others.has_bodies else state_in
+        self.contacts.add_forces(now, of_bodies, contacts, dt, self._f, self._trouble)
 
     def _launch_motion(
         self,
@@ -155,19 +194,13 @@ class Steps:
     ) -> None:
         model, others = self.model, self.others
         particle_world = model.particle_world
-        if others.has_bodies:
-            for kept, array in zip(self._bodies_before, (now.body_q, now.body_qd), strict=True):
-                wp.copy(kept, array)
-            for kept, array in zip(self._kept_bodies, (out.body_q, out.body_qd), strict=True):
-                wp.copy(kept, array)
         if others.has_particles:
-            for kept, array in zip(self._kept_particles, (out.particle_q, out.particle_qd), strict=True):
-                wp.copy(kept, array)
             self._launch(kernels.unpad, model.particle_count, [self._f], [others.particle_forces])
         else:
             inputs = [dt, self.damping, model.particle_max_velocity, model.gravity, model.particle_inv_mass]
-            inputs += [model.particle_flags, particle_world, self._f, self._x, self._v]
-            self._launch(kernels.step_velocities, model.particle_count, inputs, [self._trouble])
+            inputs += [model.particle_flags, particle_world, self._f, now.particle_q, now.particle_qd]
+            outputs = [out.particle_q, out.particle_qd, self._trouble]
+            self._launch(kernels.step_particles, model.particle_count, inputs, outputs)
         if others.has_bodies or others.has_particles:
             others.step(now, out, control, contacts, dt, self._body_f if others.has_bodies else now.body_f)
         if others.has_bodies:
@@ -176,15 +209,17 @@ class Steps:
         if others.has_particles:
             inputs = [out.particle_q, out.particle_qd, particle_world]
             self._launch(worlds.check_particles, model.particle_count, inputs, [self._trouble])
-            inputs = [particle_world, self._trouble, self._x, self._v, *self._kept_particles]
-            outputs = [out.particle_q, out.particle_qd]
-            self._launch(worlds.put_back_particles, model.particle_count, inputs, outputs)
-        else:
-            inputs = [dt, model.particle_flags, particle_world, self._trouble, now.particle_q, now.particle_qd, self._v]
-            outputs = [out.particle_q, out.particle_qd]
-            self._launch(kernels.move_particles, model.particle_count, inputs, outputs)
-        if others.has_bodies:
-            inputs = [model.body_world, self._trouble, *self._bodies_before, *self._kept_bodies]
+
+    def _launch_undoing(self, out: newton.State, particles: list[wp.array], bodies: list[wp.array]) -> None:
+        """Put back worlds in which something is wrong."""
+        if not self._may_be_wrong():
+            return
+        model = self.model
+        inputs = [model.particle_world, self._trouble, *particles, *self._kept_particles]
+        outputs = [out.particle_q, out.particle_qd]
+        self._launch(worlds.put_back_particles, model.particle_count, inputs, outputs)
+        if self.others.has_bodies:
+            inputs = [model.body_world, self._trouble, *bodies, *self._kept_bodies]
             self._launch(worlds.put_back_bodies, model.body_count, inputs, [out.body_q, out.body_qd])
 
     def _add_wrenches(self, share: float, target: wp.array) -> None:
@@ -192,3 +227,13 @@ class Steps:
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+
+def _copy(to: list[wp.array], given: list[wp.array]) -> None:
+    for a, b in zip(to, given, strict=True):
+        wp.copy(a, b)
+
+
+def _overlap(a: list[wp.array], b: list[wp.array]) -> bool:
+    """Whether any of some arrays is one of the others."""
+    return bool({array.ptr for array in a} & {array.ptr for array in b})

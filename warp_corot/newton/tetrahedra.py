@@ -12,12 +12,13 @@ from ..errors import InputError
 from ..kernels.elements import GeneralElements
 from ..kernels.lanes import LANES
 from ..kernels.newton_elements import (
-    lame_parameters,
+    EACH,
     repair_posed,
     scatter_damping_and_activation,
     scatter_posed,
     scatter_posed_lanes,
     scatter_posed_warm,
+    split_materials,
     write_attributes,
 )
 from ..kernels.rotation import quick_rotation
@@ -30,14 +31,30 @@ from .state import STATE, attribute_of
 LAME = {"documented": (1.0, 0.0), "semi-implicit": (0.75, -0.625)}
 
 
+class Part:
+    """Some of a model's tetrahedra, as a kernel takes them: a range, or a list."""
+
+    def __init__(self, tets: npt.NDArray[np.integer], device: wp.Device):
+        self.first, self.count = int(tets[0]), len(tets)
+        listed = tets if (np.diff(tets) != 1).any() else tets[:0]
+        self.ids = wp.array(listed, dtype=wp.int32, device=device)
+
+
 class Tetrahedra:
     """Forces, rotations and stresses of all tetrahedra of a model.
+
+    Forces are of positions that have been gathered (see ``kernels.newton_particles``) into arrays that are empty where
+    no element needs them.
 
     Args:
         model: The model.
         lame: A key of ``LAME``.
         warm: Whether rotations are found from those in the state.
         rotation_level: Whose rotation the leaves of forests use; see ``Corotated``.
+
+    Attributes:
+        x: Positions of particles [m], vec4 [P]; for elements one by one.
+        rest, u: Where particles of forests rest, and their displacements from there [m], vec4 [P].
 
     Raises:
         InputError: There are none, or a material is not positive definite.
@@ -50,21 +67,19 @@ class Tetrahedra:
         self.device = model.device
         self.tets = model.tet_indices.numpy().reshape(-1, 4)
         self.elements = self._elements(np.arange(model.tet_count))
-        self.mu, self.lam = (wp.empty(model.tet_count, dtype=wp.float32, device=self.device) for _ in range(2))
-        self._all = wp.array(np.arange(model.tet_count), dtype=wp.int32, device=self.device)
+        #: mu, lambda, k_lambda [Pa] and k_damp [Pa s] of all.
+        self._materials = self._room_for_materials(model.tet_count)
+        self.mu, self.lam = self._materials[:2]
         self.groups: list[ForestGroup] = [] if warm else forest_groups(model, self.tets, rotation_level)
         single = np.ones(model.tet_count, bool)
         for group in self.groups:
             single[group.tets] = False
-        ids = np.flatnonzero(single)
-        self.single_count = len(ids)
-        everything = len(ids) == model.tet_count
-        self._single = self.elements if everything else self._elements(ids)
-        self._single_ids = self._all if everything else wp.array(ids, dtype=wp.int32, device=self.device)
-        self._single_lame = [self.mu, self.lam]
-        if not everything:
-            self._single_lame = [wp.empty(len(ids), dtype=wp.float32, device=self.device) for _ in range(2)]
-        self._flagged = wp.zeros(len(ids), dtype=wp.uint8, device=self.device)
+        self._take_single(np.flatnonzero(single))
+        #: Whether activation and damping of those are in the elastic forces' kernel.
+        self._fused = self.device.is_cuda and not warm
+        everything = [Part(np.arange(model.tet_count), self.device)]
+        self._others = [Part(group.tets, self.device) for group in self.groups] if self._fused else everything
+        self._make_room_for_nodes()
         fill = attribute_of(model, "fill")
         self._fill = wp.ones(1, dtype=wp.float32, device=self.device) if fill is None else fill
         self._no_rotations = wp.empty(0, dtype=wp.quat, device=self.device)
@@ -99,37 +114,41 @@ class Tetrahedra:
         bad = np.flatnonzero(~(materials[:, 2] >= 0))
         if len(bad):
             raise InputError(f"tetrahedron {bad[0]} has k_damp {materials[bad[0], 2]:g} Pa s; it must not be negative")
-        for ids, (of_mu, of_lam) in ((self._all, (self.mu, self.lam)), (self._single_ids, self._single_lame)):
-            self._launch(lame_parameters, len(ids), [self.model.tet_materials, ids, a, b], [of_mu, of_lam])
+        self._launch(split_materials, len(materials), [self.model.tet_materials, self._no_ids, a, b], self._materials)
+        if self._single_materials is not self._materials:
+            inputs = [self.model.tet_materials, self._single_ids, a, b]
+            self._launch(split_materials, self.single_count, inputs, self._single_materials)
         self.damped = bool((materials[:, 2] > 0).any())
         for group in self.groups:
             group.set_material(mu, lam)
         self._seen = present
         return True
 
-    def add_forces(self, x: wp.array, f: wp.array, rotations: wp.array | None) -> None:
-        """Add the elastic forces [N] of particles at x to f, both vec4 [P]; ``rotations`` are the state's."""
+    def add_forces(self, state: newton.State, activation: wp.array, f: wp.array) -> None:
+        """Add the forces [N] of a state, of which positions have been gathered, to f, vec4 [P]."""
+        q, v = state.particle_q, state.particle_qd
         if self.single_count:
-            inputs = [self._single, *self._single_lame, x]
+            elastic = [self._single, *self._single_materials[:2]]
             if self.warm:
-                inputs = [self._single, *self._single_lame, self._single_ids, x, rotations]
+                inputs = [*elastic, self._single_ids, self.x, attribute_of(state, "rotation")]
                 self._launch(scatter_posed_warm, self.single_count, inputs, [f])
-            elif self.device.is_cpu:
-                lanes = [self._single, self.single_count, *self._single_lame, x]
-                self._launch(scatter_posed_lanes, -(-self.single_count // LANES), lanes, [f, self._flagged])
-                self._launch(repair_posed, self.single_count, [self._flagged, *inputs], [f])
+            elif self._fused:
+                inputs = [self._single, *self._single_materials, self._single_ids, activation, self.x, v]
+                self._launch(scatter_posed(quick_rotation, self.damped), self.single_count, inputs, [f])
             else:
-                self._launch(scatter_posed(quick_rotation), self.single_count, inputs, [f])
+                inputs = [self._single, self.single_count, *elastic[1:], self.x]
+                self._launch(scatter_posed_lanes, -(-self.single_count // LANES), inputs, [f, self._flagged])
+                self._launch(repair_posed, self.single_count, [self._flagged, *elastic, self.x], [f])
         for group in self.groups:
-            group.add_forces(x, f)
-
-    def add_damping_and_activation(self, q: wp.array, qd: wp.array, activation: wp.array, f: wp.array) -> None:
+            group.add_forces(self.x, self.u, f)
         # On the CPU a look costs less than a launch; a recorded step must be ready for what comes.
         looks = self.device.is_cpu and not self.device.is_capturing and not self.damped
         if looks and not activation.numpy().any():
             return
-        inputs = [self.elements, self.model.tet_materials, activation, q, qd]
-        self._launch(scatter_damping_and_activation, self.model.tet_count, inputs, [f])
+        for part in self._others:
+            inputs = [self.elements, *self._materials[2:], part.ids, part.first, part.count, activation, q, v]
+            threads = -(-part.count // int(EACH))
+            self._launch(scatter_damping_and_activation(self.damped), threads, inputs, [f])
 
     def write_attributes(self, state: newton.State, before: newton.State) -> None:
         """Write rotations and stresses of a state's positions, where it has room for them."""
@@ -142,6 +161,32 @@ class Tetrahedra:
         inputs = [self.elements, self.mu, self.lam, *fill, state.particle_q, guesses]
         outputs = [self._nothing[name] if array is None else array for name, array in there.items()]
         self._launch(kernel, self.model.tet_count, inputs, outputs)
+
+    def _take_single(self, ids: npt.NDArray[np.integer]) -> None:
+        """Tetrahedra that go one by one."""
+        self.single_count = len(ids)
+        self._no_ids = wp.empty(0, dtype=wp.int32, device=self.device)
+        self._flagged = wp.zeros(len(ids), dtype=wp.uint8, device=self.device)
+        if len(ids) == self.model.tet_count:
+            self._single, self._single_ids, self._single_materials = self.elements, self._no_ids, self._materials
+            return
+        self._single = self._elements(ids)
+        self._single_ids = wp.array(ids, dtype=wp.int32, device=self.device)
+        self._single_materials = self._room_for_materials(len(ids))
+
+    def _make_room_for_nodes(self) -> None:
+        ranges = [group for group in self.groups if group.follow_one_another]
+        count = self.model.particle_count
+        one_by_one = bool(self.single_count) or len(ranges) < len(self.groups)
+        self.x = wp.zeros(count if one_by_one else 0, dtype=wp.vec4, device=self.device)
+        self.u = wp.zeros(count if ranges else 0, dtype=wp.vec4, device=self.device)
+        rest = np.zeros((len(self.u), 4), np.float32)
+        for group in ranges:
+            rest[group.nodes] = group.rest
+        self.rest = wp.array(rest, dtype=wp.vec4, device=self.device)
+
+    def _room_for_materials(self, count: int) -> list[wp.array]:
+        return [wp.empty(count, dtype=wp.float32, device=self.device) for _ in range(4)]
 
     def _elements(self, ids: npt.NDArray[np.integer]) -> Any:
         poses = self.model.tet_poses.numpy().reshape(-1, 3, 3)[ids]
