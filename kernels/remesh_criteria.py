@@ -3,7 +3,10 @@
 import warp as wp
 
 from .bisection import refinement_end
+from .constitutive import corotated_strain, hooke
+from .forces import von_mises
 from .remesh_mark import ElementState
+from .rotation import byers_xu, identity3
 
 
 @wp.func
@@ -13,13 +16,31 @@ def longest_edge(element: ElementState):
 
 
 @wp.func
-def green_strain(element: ElementState):
-    """Green strain E = (F^T F - I) / 2, which is free of rotations."""
+def displacement_gradient(element: ElementState):
+    """du/dX, which is F - I."""
     rest = wp.matrix_from_cols(element.rest[1], element.rest[2], element.rest[3])
     u = element.moved[0]
     moved = wp.matrix_from_cols(element.moved[1] - u, element.moved[2] - u, element.moved[3] - u)
-    gradient = moved * wp.inverse(rest)
+    return moved * wp.inverse(rest)
+
+
+@wp.func
+def green_strain(element: ElementState):
+    """Green strain E = (F^T F - I) / 2, which is free of rotations."""
+    gradient = displacement_gradient(element)
     return 0.5 * (gradient + wp.transpose(gradient) + wp.transpose(gradient) * gradient)
+
+
+@wp.func
+def von_mises_stress(element: ElementState, parameters: wp.array[wp.float32]):
+    """Von Mises stress of the corotated law [Pa], times the longest edge over ``parameters[0]`` [m] as in ``strain``.
+
+    A parent's material is known once it has been an element; one that never was counts as free of stress.
+    """
+    gradient = displacement_gradient(element)
+    r = byers_xu(identity3() + gradient)
+    stress = hooke(corotated_strain(gradient, identity3(), r), element.mu, element.lam)
+    return von_mises(stress) * longest_edge(element) / parameters[0]
 
 
 @wp.func

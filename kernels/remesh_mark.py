@@ -9,6 +9,10 @@ from .bisection import refinement_end
 from .elements import load_node
 from .remesh import LEAVES, REFINE, SIMPLIFY, Pools
 
+#: Share of its volume below which an element is not refined for its own sake: what is stretched there is mostly no
+#: tissue, and halves of it would hold next to no mass.
+LEAST_FILL = 0.5
+
 mat43 = wp.types.matrix(shape=(4, 3), dtype=wp.float32)
 
 
@@ -20,6 +24,20 @@ class ElementState:
     corner: wp.vec3  # rest position of node 0 [m]
     rest: mat43  # rest positions from there, a row a node [m]
     moved: mat43  # displacements, a row a node [m]
+    mu: float  # Lamé's parameters [Pa], of the nearest isotropic material
+    lam: float
+
+
+@wp.struct
+class Contents:
+    """What tetrahedra are made of, as far as marking looks at it; columns of ``Carried.values``, or -1."""
+
+    values: wp.array2d[wp.float32]
+    mu: float  # Lamé's parameters of all if they are alike, where there are no columns of them
+    lam: float
+    mu_column: int
+    lam_column: int
+    fill_column: int
 
 
 @wp.func
@@ -32,7 +50,14 @@ def elongation(element: ElementState, parameters: wp.array[wp.float32]):
 
 
 @wp.func
-def load_state(e: int, origin: wp.vec3d, spacing: wp.float64, pools: Pools, u: wp.array[wp.vec4]):
+def load_state(
+    e: int,
+    origin: wp.vec3d,
+    spacing: wp.float64,
+    pools: Pools,
+    contents: Contents,
+    u: wp.array[wp.vec4],
+):
     """What a criterion sees of a tetrahedron, a leaf or one above leaves."""
     state = ElementState()
     tet = pools.tets[e]
@@ -52,20 +77,28 @@ def load_state(e: int, origin: wp.vec3d, spacing: wp.float64, pools: Pools, u: w
         moved[n] = load_node(u, tet[n])
     state.rest = rest
     state.moved = moved
+    state.mu = contents.mu
+    state.lam = contents.lam
+    if contents.mu_column >= 0:
+        state.mu = contents.values[e, contents.mu_column]
+        state.lam = contents.values[e, contents.lam_column]
     return state
 
 
-#: Share of its volume below which an element is not refined for its own sake: what is stretched there is mostly no
-#: tissue, and halves of it would hold next to no mass.
-LEAST_FILL = 0.5
+@wp.func
+def holds_enough(e: int, contents: Contents):
+    """Whether an element may be refined for its own sake."""
+    if contents.fill_column < 0:
+        return True
+    return contents.values[e, contents.fill_column] >= wp.static(LEAST_FILL)
 
 
 @functools.cache
 def marking_kernel(criterion: Any) -> wp.Kernel:
     """The kernel that marks leaves by a criterion: a Warp function of an ``ElementState`` and an array of numbers.
 
-    A leaf is not given up if its parent would be refined at once: edges of an element and of its halves point elsewhere,
-    so that what is stretched in one may not be in the other.
+    A leaf is not given up if its parent would be refined at once: edges of an element and of its halves point
+    elsewhere, so that what is stretched in one may not be in the other.
     """
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -78,20 +111,19 @@ def marking_kernel(criterion: Any) -> wp.Kernel:
         spacing: wp.float64,
         u: wp.array[wp.vec4],
         parameters: wp.array[wp.float32],
-        values: wp.array2d[wp.float32],
-        fill_column: int,
+        contents: Contents,
         # In and out
         pools: Pools,
     ):
         for i in range(wp.tid(), pools.counts[LEAVES], threads):
             e = pools.leaves[i]
-            value = criterion(load_state(e, origin, spacing, pools, u), parameters)
+            value = criterion(load_state(e, origin, spacing, pools, contents, u), parameters)
             mark = wp.int8(0)
             if value > refine_above:
-                if fill_column < 0 or values[e, wp.max(fill_column, 0)] >= wp.static(LEAST_FILL):
+                if holds_enough(e, contents):
                     mark = REFINE
             elif value < simplify_below and pools.parent[e] >= 0:
-                above = criterion(load_state(pools.parent[e], origin, spacing, pools, u), parameters)
+                above = criterion(load_state(pools.parent[e], origin, spacing, pools, contents, u), parameters)
                 if above <= refine_above:
                     mark = SIMPLIFY
             pools.marks[i] = mark

@@ -8,7 +8,6 @@ import warp as wp
 from .remesh import LEAVES, Pools
 from .remesh_state import Carried
 
-
 # Places in what is found; from FINEST_COUNTS on there are partial sums.
 STIFFEST = wp.constant(0)
 FINEST_LEVEL = wp.constant(1)
@@ -41,7 +40,7 @@ def find_stiffest(
     # Out
     found: wp.array[wp.int32],
 ):
-    """Largest (2 mu + lambda) / (density volume^(2/3)) [1/s^2] of the leaves, as the bits of a float, and the finest level.
+    """Largest (2 mu + lambda) / (density volume^(2/3)) [1/s^2] of the leaves, as a float's bits, and the finest level.
 
     ``modulus`` is 2 mu + lambda [Pa] where all elements have the same, and columns of ``values`` are negative.
     """

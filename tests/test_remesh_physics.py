@@ -5,11 +5,11 @@ import functools
 import numpy as np
 import pytest
 import warp as wp
-from warp_corot.kernels.remesh_criteria import nearness, strain
-from warp_corot.kernels.remesh_mark import marking_kernel
+from warp_corot.kernels.remesh_criteria import nearness, strain, von_mises_stress
 
 import warp_corot as wc
 from warp_corot.experiments.remeshing import CELL, SCENES, TISSUE, run, table
+from warp_corot.remesh.passes import RemeshPass
 from warp_corot.remesh.pools import DeviceForest
 
 CASES = [("bar", "elongation"), ("bar", "strain"), ("slab", "nearness")]
@@ -70,14 +70,9 @@ def marked(forest, gradient, criterion, parameters, threshold, device):
     """Which leaves a criterion finds to be above a threshold where the deformation gradient is the same everywhere."""
     adaptive = DeviceForest(forest, len(forest.tets), device=device)
     adaptive.carriage.set_nodes(displacements=forest.points @ (gradient - np.eye(3)).T)
-    inputs = [1, threshold, 0.5 * threshold, wp.vec3d(*forest.origin), wp.float64(forest.cell_size / 2**16)]
     numbers = wp.array(parameters, dtype=wp.float32, device=device)
-    wp.launch(
-        marking_kernel(criterion),
-        dim=1,
-        inputs=[*inputs, adaptive.carriage.arrays.u, numbers, adaptive.carriage.arrays.values, -1, adaptive.pools],
-        device=device,
-    )
+    mark = RemeshPass(adaptive, criterion=criterion, refine_above=threshold, simplify_below=0.0, parameters=numbers)
+    mark.run()
     return adaptive.pools.marks.numpy() == 1
 
 
@@ -107,5 +102,27 @@ def test_the_nearness_criterion_goes_by_the_moved_place(device, rng):
     threshold = np.quantile(value, 0.4)
     clear = np.abs(value / threshold - 1.0) > 1e-5
     found = marked(forest, gradient, nearness, [*centre, *half, radius, more], threshold, device)
+    assert np.array_equal(found[clear], (value > threshold)[clear])
+    assert clear.mean() > 0.9
+
+
+@pytest.mark.parametrize("varied", [False, True], ids=["uniform", "varied"])
+def test_the_stress_criterion_goes_by_the_bodys_stress(varied, device, rng):
+    forest = wc.TetForest.box((2, 1, 1), 0.1, 5)
+    young = rng.uniform(1e3, 1e5, len(forest.tets)) if varied else 1e4
+    body = wc.SoftBody(forest, wc.Isotropic(young, 0.4, 1000.0), device=device)
+    body.displacements = 2e-3 * rng.normal(size=(body.node_count, 3))
+    sim = wc.Simulation(body)
+    value = sim.von_mises() * 0.05 / 0.02  # longest edges of level 5 are 0.05 m
+    threshold = float(np.quantile(value, 0.4))
+    clear = np.abs(value / threshold - 1.0) > 1e-3
+    numbers = wp.array([0.02], dtype=wp.float32, device=device)
+    other = wc.SoftBody(forest, body.material, device=device)
+    other.displacements = body.displacements
+    options = {"refine_above": threshold, "simplify_below": 0.0, "min_level": 0, "max_level": 12, "parameters": numbers}
+    remesh = wc.OnlineRemesh(criterion=von_mises_stress, capacity=len(forest.tets), every=1, **options)
+    changing = wc.Simulation(other, remesh=remesh).remeshing.changing[0]
+    changing.run()
+    found = changing.forest.pools.marks.numpy()[: len(value)] == 1
     assert np.array_equal(found[clear], (value > threshold)[clear])
     assert clear.mean() > 0.9

@@ -47,6 +47,8 @@ class CarriedMaterial:
             own = (Column(array.numpy(), int(MEAN_OF_CONTENTS)) for array in body.lame[:2])
             self.values |= dict(zip(("own_mu", "own_lam"), own, strict=True))
         self._lame = ("own_mu", "own_lam") if "own_mu" in self.values else ("mu", "lam") if body.lame[2] else ()
+        #: Lamé's parameters of the material itself [Pa], or what elements carry them as.
+        self.lame: Any = self._lame or tuple(float(array.numpy()[0]) for array in body.lame[:2])
         #: 2 mu + lambda [Pa] of all elements if they are alike, else 0.
         self.modulus = 0.0 if self.values else float(2.0 * body.mu.numpy()[0] + body.lam.numpy()[0])
 

@@ -81,6 +81,7 @@ class Changing:
             min_level=self.options.min_level,
             max_level=self.options.max_level,
             parameters=self.options.parameters,
+            lame=self.carried_material.lame,
         )
         self.survey = Survey(self.forest, self.carried_material.modulus)
         self.plan: DevicePlan | None = None

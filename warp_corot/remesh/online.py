@@ -20,8 +20,9 @@ class OnlineRemesh:
     """Refinement and simplification while a simulation runs; see ``warp_corot.remesh``.
 
     Every ``every`` steps a pass looks at all elements: an element is bisected where the criterion is above
-    ``refine_above``, and given up with its sibling where both are below ``simplify_below``. Between the two nothing
-    happens. An element is bisected once a pass, and again where its neighbours ask for it.
+    ``refine_above``, and given up with its sibling where both are below ``simplify_below`` and their parent would not be
+    refined again. Between the two nothing happens. An element is bisected once a pass, and again where its neighbours
+    ask for it. One of a domain's mesh of which the body takes less than half is not refined for its own sake.
 
     Children have their parent's material, with the direction of its fibres, and pull as it did. A parent has the mean
     of its children's stiffness, density and active stress, but its first child's directions, and that child's active
@@ -35,8 +36,9 @@ class OnlineRemesh:
         every: Steps between passes.
         capacity: How many elements there may be; None: four times those of the mesh, at least 100,000. When it is
             reached refinement stops, with one warning, and the simulation goes on.
-        criterion: A Warp function (``@wp.func``) of a ``kernels.remesh_mark.ElementState`` and an array of numbers, in
-            place of the elongation.
+        criterion: In place of the elongation: one of ``kernels.remesh_criteria``, ``strain``, ``von_mises_stress`` or
+            ``nearness``, or a Warp function (``@wp.func``) of your own of a ``kernels.remesh_mark.ElementState`` and an
+            array of numbers.
         parameters: Those numbers, float32 [n] on the simulation's device, which may be written to between steps.
 
     Raises:

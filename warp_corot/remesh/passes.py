@@ -20,7 +20,7 @@ from ..kernels import (
     remesh_simplify,
     remesh_state,
 )
-from ..kernels.remesh_mark import elongation, marking_kernel
+from ..kernels.remesh_mark import Contents, elongation, marking_kernel
 from ..mesh.growth import lattice_spacing
 from ..mesh.lattice import MAX_LEVEL
 from .pools import DeviceForest
@@ -39,6 +39,7 @@ class RemeshPass:
         refine_above, simplify_below: Thresholds, in the criterion's unit; the first is the larger one.
         min_level, max_level: Leaves of these levels are not simplified and not refined.
         parameters: Numbers for the criterion, float32 [n] on the device, which may change between passes.
+        lame: Lamé's parameters for the criterion [Pa], or what elements carry them as.
 
     Raises:
         InputError: Thresholds that cannot both hold, levels out of order or beyond the lattice's depth.
@@ -54,6 +55,7 @@ class RemeshPass:
         min_level: int = 0,
         max_level: int = MAX_LEVEL,
         parameters: wp.array | None = None,
+        lame: tuple[float, float] | tuple[str, str] = (0.0, 0.0),
     ):
         if not (math.isfinite(refine_above) and math.isfinite(simplify_below) and simplify_below < refine_above):
             raise InputError(
@@ -75,8 +77,7 @@ class RemeshPass:
         self._mark = marking_kernel(criterion)
         self._origin = wp.vec3d(*forest.source.origin)
         self._spacing = lattice_spacing(forest.source.cell_size)
-        names = forest.carriage.names
-        self._fill_column = names.index("fill") if "fill" in names else -1
+        self._contents = self._make_contents(lame)
         self._edges = self._make_edges()
         self._blocks = self._make_blocks()
         self._removal = self._make_removal()
@@ -116,7 +117,7 @@ class RemeshPass:
         if not marked:
             refine_above, simplify_below = self.thresholds
             inputs = [refine_above, simplify_below, self._origin, self._spacing, carried.u, self.parameters]
-            self._many(self._mark, *inputs, carried.values, self._fill_column, pools)
+            self._many(self._mark, *inputs, self._contents, pools)
         self._many(remesh_edges.want_marked, self.levels[1], pools, edges)
         self._many(remesh_blocks.clear_blocks, pools, self._blocks)
         self._many(remesh_blocks.list_blocks, pools, self._blocks)
@@ -174,6 +175,19 @@ class RemeshPass:
         """Launch a kernel that goes through as many things as there are."""
         threads = self.forest.threads
         wp.launch(kernel, dim=threads, inputs=[threads, *arguments], device=self.device)
+
+    def _make_contents(self, lame: tuple[float, float] | tuple[str, str]) -> Any:
+        names = self.forest.carriage.names
+
+        def column(name: float | str) -> int:
+            return names.index(name) if name in names else -1
+
+        contents = Contents()
+        contents.values = self.forest.carriage.arrays.values
+        contents.mu_column, contents.lam_column = column(lame[0]), column(lame[1])
+        contents.mu, contents.lam = (0.0 if isinstance(value, str) else float(value) for value in lame)
+        contents.fill_column = column("fill")
+        return contents
 
     def _make_edges(self) -> Any:
         size = 1 << (2 * (self.forest.node_capacity + self.forest.threads)).bit_length()
