@@ -14,10 +14,8 @@ from ..device import checked_device
 from ..errors import InputError, UnstableError
 from .compiling import compiling_said
 from .say import EXIT_CODES, complain, interrupt_status
-from .simulate import _kept as kept
-from .simulate import _progress_bar as progress_bar
-from .summary import _milliseconds as milliseconds
-from .summary import length, pressure
+from .simulate import kept_so_far, progress_bar
+from .summary import length, milliseconds, pressure
 
 if TYPE_CHECKING:
     from ..io.animate import Recording
@@ -198,10 +196,10 @@ def _end(error: BaseException, writer: SceneWriter, done: Recording) -> int:
     except OSError as other:
         complain(str(other))
     if isinstance(error, KeyboardInterrupt):
-        complain(f"interrupted; {kept(done)}", kind="")
+        complain(f"interrupted; {kept_so_far(done)}", kind="")
         return interrupt_status(error)
     if isinstance(error, UnstableError):
-        complain(f"{error}; {kept(done)}")
+        complain(f"{error}; {kept_so_far(done)}")
         return 3
     complain(str(error))
     return 1

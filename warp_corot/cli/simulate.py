@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
 
     done = Recording(args.output)
     try:
-        with _progress_bar(count) as progress:
+        with progress_bar(count) as progress:
             record(
                 sim,
                 args.output,
@@ -91,10 +91,10 @@ def run(args: argparse.Namespace) -> int:
         if args.preview:
             _draw(args.preview, subject, sim)
     except KeyboardInterrupt as signalled:
-        complain(f"interrupted; {_kept(done)}", kind="")
+        complain(f"interrupted; {kept_so_far(done)}", kind="")
         return interrupt_status(signalled)
     except UnstableError as error:
-        complain(f"{error}; {_kept(done)}")
+        complain(f"{error}; {kept_so_far(done)}")
         return 3
     except OSError as error:
         complain(str(error))
@@ -193,7 +193,7 @@ def _tried_step(body: SoftBody, model: Model, damping: float, remesh: OnlineReme
 
 
 @contextmanager
-def _progress_bar(count: int) -> Iterator[Progress]:
+def progress_bar(count: int) -> Iterator[Progress]:
     from tqdm import tqdm
 
     form = "{desc}  {percentage:3.0f} % |{bar}| frame {n_fmt} of {total_fmt}, {remaining} left"
@@ -201,7 +201,7 @@ def _progress_bar(count: int) -> Iterator[Progress]:
         yield lambda frame, _: bar.update(frame - bar.n)
 
 
-def _kept(done: Recording) -> str:
+def kept_so_far(done: Recording) -> str:
     if not done.frames:
         return "no frame was written"
     return f"{done.frames} frames, {done.simulated:.3g} s, are kept in {done.path}"

@@ -47,7 +47,7 @@ def summary(subject: Subject, sim: Simulation, done: Recording, fixed: str, prev
         ("model", model if level is None else f"{model}, rotations of level {level}"),
         ("fixed", fixed),
         ("gravity", f"{' '.join(f'{g:g}' for g in sim.gravity)} m/s^2, damping {damping:g} /s"),
-        ("time step", f"{_milliseconds(sim.dt)}, largest stable one about {_milliseconds(sim.stable_dt)}{at_last}"),
+        ("time step", f"{milliseconds(sim.dt)}, largest stable one about {milliseconds(sim.stable_dt)}{at_last}"),
         ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"),
         ("wall time", f"{done.stepping:.2f} s stepping, {done.writing:.2f} s writing"),
         ("displacement", f"{length(done.largest_displacement)} largest, {at_end}"),
@@ -94,7 +94,7 @@ def _values(young: float, poisson: float, density: float) -> str:
     return f"E = {pressure(float(young))}, nu = {poisson:g}, rho = {density:g} kg/m^3"
 
 
-def _milliseconds(seconds: float) -> str:
+def milliseconds(seconds: float) -> str:
     return f"{1e3 * seconds:.4g} ms"
 
 

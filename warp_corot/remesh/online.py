@@ -20,9 +20,9 @@ class OnlineRemesh:
     """Refinement and simplification while a simulation runs; see ``warp_corot.remesh``.
 
     Every ``every`` steps a pass looks at all elements: an element is bisected where the criterion is above
-    ``refine_above``, and given up with its sibling where both are below ``simplify_below`` and their parent would not be
-    refined again. Between the two nothing happens. An element is bisected once a pass, and again where its neighbours
-    ask for it. One of a domain's mesh of which the body takes less than half is not refined for its own sake.
+    ``refine_above``, and given up with its sibling where both are below ``simplify_below`` and their parent would not
+    be refined again. Between the two nothing happens. An element is bisected once a pass, and again where its
+    neighbours ask for it. One of which the body takes less than half is not refined for its own sake.
 
     Children have their parent's material, with the direction of its fibres, and pull as it did. A parent has the mean
     of its children's stiffness, density and active stress, but its first child's directions, and that child's active
