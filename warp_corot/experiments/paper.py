@@ -24,8 +24,8 @@ from ..materials import Isotropic
 from ..mesh import TetForest
 from ..mesh.surface import signed_volumes
 from ..simulation import Simulation
-from ..solvers.recorded import GRAPH_STEPS
 from ..solvers import SymplecticEuler
+from ..solvers.recorded import GRAPH_STEPS
 from .timing import Stages, Times, measure_times
 
 Array = npt.NDArray[np.float64]
