@@ -1,5 +1,6 @@
 """How commands end: what is said, and with which exit status."""
 
+import functools
 import re
 import signal
 from contextlib import nullcontext
@@ -84,8 +85,11 @@ def test_interrupted_before_anything_runs(stage, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_signals_wait_while_modules_are_imported(number, status):
+def test_signals_wait_while_modules_are_imported(number, status, request):
     """An exception in the middle is swallowed by some modules; after them it is not."""
+    # A shell has its background jobs ignore Ctrl-C.
+    request.addfinalizer(functools.partial(signal.signal, number, signal.getsignal(number)))
+    signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     came_to = []
 
     def imports():
