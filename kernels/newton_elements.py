@@ -9,16 +9,43 @@ import functools
 import warp as wp
 
 from .constitutive import corotated_strain, hooke
-from .elements import GeneralElements, load_node, scatter_stress
-from .forces import von_mises
+from .elements import GeneralElements, add_force, load_node, scatter_stress
 from .general_cpu import ADD_FORCES, gather_elements
 from .lanes import COMPILER_FLAGS, NEWTON, PRELUDE, on_cpu
-from .rotation import ITERATIONS, byers_xu, cofactor, identity3, warm_rotation
+from .rotation import ITERATIONS, byers_xu, cofactor, column, identity3, warm_rotation
 
 wp.set_module_options({"enable_backward": False})
 
 #: Tetrahedra that a thread looks at whether they are active.
 EACH = wp.constant(4)
+
+
+@wp.struct
+class PosedElements:
+    """As ``GeneralElements``, so that the threads of a warp read what is side by side."""
+
+    nodes: wp.array[wp.vec4i]  # [T]
+    rest_inverse: wp.array2d[wp.float32]  # [9, T], row by row
+    volume: wp.array[wp.float32]  # [T]
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const int4 n = *reinterpret_cast<const int4*>(&wp::index(nodes, t));
+    return wp::vec_t<4, wp::int32>(n.x, n.y, n.z, n.w);
+#else
+    return wp::index(nodes, t);
+#endif
+""")
+def load_four(nodes: wp.array[wp.vec4i], t: int) -> wp.vec4i:
+    """An element's nodes by one 16-byte load; see ``load_node``."""
+    ...
+
+
+@wp.func
+def rest_inverse_of(elements: PosedElements, t: int):
+    b = elements.rest_inverse
+    return wp.mat33(b[0, t], b[1, t], b[2, t], b[3, t], b[4, t], b[5, t], b[6, t], b[7, t], b[8, t])
 
 
 @wp.func
@@ -80,7 +107,7 @@ def scatter_posed(rotation: wp.Function, damped: bool) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def scatter_posed(
         # In
-        elements: GeneralElements,
+        elements: PosedElements,
         mu: wp.array[wp.float32],
         lam: wp.array[wp.float32],
         k_lambda: wp.array[wp.float32],
@@ -94,15 +121,26 @@ def scatter_posed(rotation: wp.Function, damped: bool) -> wp.Kernel:
     ):
         t = wp.tid()
         a = activation[place_in_model(ids, 0, t)]
-        gradient = deformation_gradient(elements, t, x)
+        n = load_four(elements.nodes, t)
+        x0 = load_node(x, n[0])
+        edges = wp.matrix_from_cols(load_node(x, n[1]) - x0, load_node(x, n[2]) - x0, load_node(x, n[3]) - x0)
+        gradient = edges * rest_inverse_of(elements, t)
         p = corotated_stress(gradient, rotation(gradient), mu[t], lam[t])
         if a != 0.0:
             p += active_stress(gradient, k_lambda[t] * a)
         if wp.static(damped):
             k = k_damp[t]
             if k != 0.0:
-                p += viscous_stress(gradient, difference_gradient(elements, t, v), k)
-        scatter_stress(elements, t, p, f)
+                v0 = v[n[0]]
+                edge_rates = wp.matrix_from_cols(v[n[1]] - v0, v[n[2]] - v0, v[n[3]] - v0)
+                p += viscous_stress(gradient, edge_rates * rest_inverse_of(elements, t), k)
+        # Read again, so as to keep no registers meanwhile.
+        h = (-elements.volume[t]) * p * wp.transpose(rest_inverse_of(elements, t))
+        f1, f2, f3 = column(h, 0), column(h, 1), column(h, 2)
+        add_force(f, n[0], -(f1 + f2 + f3))
+        add_force(f, n[1], f1)
+        add_force(f, n[2], f2)
+        add_force(f, n[3], f3)
 
     return scatter_posed
 
@@ -240,68 +278,3 @@ def scatter_damping_and_activation(damped: bool) -> wp.Kernel:
             scatter_stress(elements, t, p, f)
 
     return scatter_damping_and_activation
-
-
-@wp.kernel(enable_backward=False)
-def split_materials(
-    # In
-    materials: wp.array2d[wp.float32],
-    ids: wp.array[wp.int32],
-    mu_from_mu: float,
-    lam_from_mu: float,
-    # Out
-    mu: wp.array[wp.float32],
-    lam: wp.array[wp.float32],
-    k_lambda: wp.array[wp.float32],
-    k_damp: wp.array[wp.float32],
-):
-    """Lamé's parameters of chosen elements, mu = a k_mu, lambda = k_lambda + b k_mu, and what else is in Newton's rows,
-    one after another."""
-    t = wp.tid()
-    row = place_in_model(ids, 0, t)
-    k_mu = materials[row, 0]
-    mu[t] = mu_from_mu * k_mu
-    lam[t] = materials[row, 1] + lam_from_mu * k_mu
-    k_lambda[t] = materials[row, 1]
-    k_damp[t] = materials[row, 2]
-
-
-@functools.cache
-def write_attributes(has_rotation: bool, has_stress: bool, has_von_mises: bool, is_warm: bool) -> wp.Kernel:
-    """Rotation and Cauchy stress of every element, those of them that the state has room for."""
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def write_attributes(
-        # In
-        elements: GeneralElements,
-        mu: wp.array[wp.float32],
-        lam: wp.array[wp.float32],
-        fill: wp.array[wp.float32],
-        fill_stride: int,
-        q: wp.array[wp.vec3],
-        guesses: wp.array[wp.quat],
-        # Out
-        rotations: wp.array[wp.quat],
-        stresses: wp.array[wp.mat33],
-        equivalent: wp.array[wp.float32],
-    ):
-        t = wp.tid()
-        gradient = difference_gradient(elements, t, q)
-        r = wp.mat33()
-        if wp.static(is_warm):
-            turned = warm_rotation(gradient, guesses[t])
-            r = wp.quat_to_matrix(turned)
-            if wp.static(has_rotation):
-                rotations[t] = turned
-        else:
-            r = byers_xu(gradient)
-            if wp.static(has_rotation):
-                rotations[t] = wp.normalize(wp.quat_from_matrix(r))
-        share = 1.0 / fill[t * fill_stride]
-        stress = share * hooke(corotated_strain(gradient, wp.mat33(), r), mu[t], lam[t])
-        if wp.static(has_stress):
-            stresses[t] = r * stress * wp.transpose(r)
-        if wp.static(has_von_mises):
-            equivalent[t] = von_mises(stress)
-
-    return write_attributes

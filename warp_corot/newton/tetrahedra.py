@@ -11,15 +11,15 @@ import warp as wp
 from ..errors import InputError
 from ..kernels.elements import GeneralElements
 from ..kernels.lanes import LANES
+from ..kernels.newton_attributes import split_materials, write_attributes
 from ..kernels.newton_elements import (
     EACH,
+    PosedElements,
     repair_posed,
     scatter_damping_and_activation,
     scatter_posed,
     scatter_posed_lanes,
     scatter_posed_warm,
-    split_materials,
-    write_attributes,
 )
 from ..kernels.rotation import quick_rotation
 from .forests import ForestGroup, forest_groups
@@ -71,12 +71,12 @@ class Tetrahedra:
         self._materials = self._room_for_materials(model.tet_count)
         self.mu, self.lam = self._materials[:2]
         self.groups: list[ForestGroup] = [] if warm else forest_groups(model, self.tets, rotation_level)
+        #: Whether activation and damping of those that go one by one are in the elastic forces' kernel.
+        self._fused = self.device.is_cuda and not warm
         single = np.ones(model.tet_count, bool)
         for group in self.groups:
             single[group.tets] = False
         self._take_single(np.flatnonzero(single))
-        #: Whether activation and damping of those are in the elastic forces' kernel.
-        self._fused = self.device.is_cuda and not warm
         everything = [Part(np.arange(model.tet_count), self.device)]
         self._others = [Part(group.tets, self.device) for group in self.groups] if self._fused else everything
         self._make_room_for_nodes()
@@ -162,17 +162,29 @@ class Tetrahedra:
         outputs = [self._nothing[name] if array is None else array for name, array in there.items()]
         self._launch(kernel, self.model.tet_count, inputs, outputs)
 
+    def posed(self, ids: npt.NDArray[np.integer]) -> Any:
+        """Chosen elements as ``scatter_posed`` takes them."""
+        posed = PosedElements()
+        posed.nodes = wp.array(self.tets[ids], dtype=wp.vec4i, device=self.device)
+        rows = np.ascontiguousarray(self.model.tet_poses.numpy().reshape(-1, 9)[ids].T)
+        posed.rest_inverse = wp.array(rows, dtype=wp.float32, device=self.device)
+        posed.volume = wp.array(self.elements.volume.numpy()[ids], dtype=wp.float32, device=self.device)
+        return posed
+
     def _take_single(self, ids: npt.NDArray[np.integer]) -> None:
         """Tetrahedra that go one by one."""
         self.single_count = len(ids)
         self._no_ids = wp.empty(0, dtype=wp.int32, device=self.device)
         self._flagged = wp.zeros(len(ids), dtype=wp.uint8, device=self.device)
-        if len(ids) == self.model.tet_count:
-            self._single, self._single_ids, self._single_materials = self.elements, self._no_ids, self._materials
-            return
-        self._single = self._elements(ids)
-        self._single_ids = wp.array(ids, dtype=wp.int32, device=self.device)
-        self._single_materials = self._room_for_materials(len(ids))
+        everything = len(ids) == self.model.tet_count
+        if self._fused:
+            self._single = self.posed(ids)
+        else:
+            self._single = self.elements if everything else self._elements(ids)
+        self._single_ids, self._single_materials = self._no_ids, self._materials
+        if not everything:
+            self._single_ids = wp.array(ids, dtype=wp.int32, device=self.device)
+            self._single_materials = self._room_for_materials(len(ids))
 
     def _make_room_for_nodes(self) -> None:
         ranges = [group for group in self.groups if group.follow_one_another]
