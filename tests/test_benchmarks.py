@@ -192,3 +192,19 @@ def test_the_largest_stable_step_is_found(limit):
     found = Threshold().largest_stable_step(guess=1e-3)
     assert found <= min(limit, LONGEST)
     assert found >= min(limit, LONGEST) / PRECISION
+
+
+def test_remesh(device, tmp_path):
+    path = tmp_path / "remesh.json"
+    done = run("remesh.py", "--device", device, "--level", 6, "--rounds", 1, "--json", path)
+    rows = report(done, path)["rows"]
+    assert {row["stage"] for row in rows} == {
+        "a time step",
+        "nothing",
+        "1 %, in one place",
+        "1 %, scattered",
+        "doubled",
+    }
+    for row in rows:
+        assert row["error"] <= 1e-9
+        assert row["bisected"] >= {"doubled": 384}.get(row["stage"], 0)
