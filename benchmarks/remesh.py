@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """What a remeshing pass costs: one that changes nothing, one that changes 1 %, one that doubles the mesh.
 
-    python benchmarks/remesh.py [--device cuda:0] [--level 20] [--json FILE]
+    python benchmarks/remesh.py [--device cuda:0] [--level 21] [--json FILE]
 
 One root cube, bisected uniformly to several levels up to the one given. Each pass begins with the same mesh; putting it
 back is not timed. What is checked is that the leaves fill the cube and that as many were bisected as must be.
@@ -24,7 +24,7 @@ from warp_corot.mesh.lattice import volume_shares
 from warp_corot.remesh.pools import DeviceForest
 from warp_corot.simulation import Simulation
 
-LEVELS = (7, 10, 14, 17, 20)
+LEVELS = (7, 10, 14, 17)
 HEADER = ("what", "of it", "leaves", "ms", "spread", "ns/leaf", "bisected", "ns/bisected")
 PASS, WHOLE = "pass", "with plan and readback"
 #: Numbers of the criterion: a radius round the cube's corner, or a share of all.
@@ -143,7 +143,7 @@ def main() -> int:
     given = options.level
     device = checked(options, of, range(3, 22))
     if given is None:
-        options.level = 20 if device.is_cuda else 17
+        options.level = 21 if device.is_cuda else 17
     warnings.simplefilter("ignore", wc.StabilityWarning)
     start = time.perf_counter()
     about = machine(device) | {"rounds": options.rounds}
