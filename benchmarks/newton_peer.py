@@ -64,12 +64,12 @@ def _forces(problem: Problem, density: Callable, x: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _Elements:
+class Elements:
     tets: np.ndarray
     poses: np.ndarray
 
     @classmethod
-    def of(cls, problem: Problem) -> _Elements:
+    def of(cls, problem: Problem) -> Elements:
         tets = wc.TetMesh(problem.mesh.points, problem.mesh.tets).tets
         x = problem.mesh.points[tets]
         return cls(tets, np.linalg.inv(np.swapaxes(x[:, 1:] - x[:, :1], 1, 2)).astype(np.float32))
@@ -78,7 +78,7 @@ class _Elements:
 def force_case(problem: Problem) -> Case:
     """``eval_tetrahedra`` with no damping."""
     device, count = problem.device, problem.tet_count
-    elements = _Elements.of(problem)
+    elements = Elements.of(problem)
     x = wp.array(problem.x.astype(np.float32), dtype=wp.vec3, device=device)
     f = wp.zeros_like(x)
     inputs = [
@@ -108,7 +108,7 @@ def force_case(problem: Problem) -> Case:
 
 def _model(problem: Problem) -> newton.Model:
     builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=tuple(GRAVITY))
-    elements = _Elements.of(problem)
+    elements = Elements.of(problem)
     masses = problem.body.masses.copy()
     masses[problem.held] = 0.0
     n, count = problem.node_count, problem.tet_count

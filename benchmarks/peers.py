@@ -9,6 +9,7 @@ out, with a word. Every timed result is checked against float64 in the same run.
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import math
 import sys
@@ -52,7 +53,9 @@ from warp_corot.rotations import rotation_function
 
 HEADER = ("stage", "variant", "ns/tet", "spread", "Gtet/s", "x ours", "error", "largest dt", "simulated s/s")
 
-PEERS = {"newton": "newton_peer", "mujoco": "mujoco_peer"}
+PEERS = {"newton": "newton_cases", "mujoco": "mujoco_peer"}
+
+LEVELS = range(SUBTREE_LEVELS, 25)
 
 GRAVITY = (0.0, 0.0, -9.81)
 
@@ -119,9 +122,7 @@ def force_cases(problem: Problem, newton: ModuleType | None) -> list[Case]:
         force_case(problem, "ours, neo-Hookean", body, wc.NeoHookean().bind(body), "neo_hookean"),
         force_case(problem, "ours, neo-Hookean, general mesh", general, wc.NeoHookean().bind(general), "neo_hookean"),
     ]
-    if newton is not None:
-        cases.append(newton.force_case(problem))
-    return cases
+    return cases if newton is None else cases + newton.force_cases(problem)
 
 
 # --- steps ------------------------------------------------------------------------------------------------------------
@@ -175,22 +176,27 @@ class OurSteps(Steppable):
         return step_error(self.sim, self.start, problem.sample, forces)
 
 
-def step_cases(problem: Problem, peers: Sequence[ModuleType]) -> list[Case]:
-    """Steps at four fifths of the largest that stands."""
+def our_steps(problem: Problem) -> list[Steppable]:
     up = SUBTREE_LEVELS
     shared = wc.Corotated(rotation_level=problem.level - up)
-    solvers: list[Steppable] = [
+    return [
         OurSteps("corotated, own rotations", problem, wc.Corotated(), "corotated"),
         OurSteps("corotated, rotations 3 up", problem, shared, "corotated", up),
         OurSteps("neo-Hookean", problem, wc.NeoHookean(), "neo_hookean"),
     ]
+
+
+def step_cases(problem: Problem, peers: Sequence[ModuleType], ours: bool = True) -> list[Case]:
+    """Steps at four fifths of the largest that stands."""
+    solvers = our_steps(problem)
+    guess = solvers[0].dt
+    solvers = solvers if ours else []
     for module in peers:
         if problem.tet_count > module.MOST_TETS:
             print(f"{module.NAME}: steps left out above {module.MOST_TETS} tetrahedra; try a lower --step-level")
             continue
         tell(f"building {module.NAME}'s model")
         solvers += module.steps(problem)
-    guess = solvers[0].dt
     return [_step_case(problem, solver, guess) for solver in solvers]
 
 
@@ -256,24 +262,36 @@ def printed(lines: Sequence[dict[str, Any]]) -> str:
     return table(HEADER, rows, 2)
 
 
-def main() -> int:
-    of = parser(__doc__.split("\n\n")[0], "peers.py")
+def add_step_level(of: argparse.ArgumentParser) -> None:
     of.add_argument("--step-level", type=int, help="level for whole steps (default: 18 on CUDA, 12 on the CPU)")
-    options = of.parse_args()
-    levels = range(SUBTREE_LEVELS, 25)
-    device = checked(options, of, levels)
+
+
+def check_step_level(options: argparse.Namespace, of: argparse.ArgumentParser, device: wp.Device) -> None:
     if options.step_level is None:
         options.step_level = min(options.level, 18 if device.is_cuda else 12)
-    if options.step_level not in levels:
-        of.error(f"--step-level is {options.step_level}; it must be from {levels.start} to {levels.stop - 1}")
+    if options.step_level not in LEVELS:
+        of.error(f"--step-level is {options.step_level}; it must be from {LEVELS.start} to {LEVELS.stop - 1}")
+
+
+def problems(options: argparse.Namespace, device: wp.Device) -> tuple[Problem, Problem]:
+    """The one that forces are timed on, and the one that steps are."""
+    tell(f"building level {options.level}")
+    problem = Problem(options.level, device)
+    return problem, problem if options.step_level == options.level else Problem(options.step_level, device)
+
+
+def main() -> int:
+    of = parser(__doc__.split("\n\n")[0], "peers.py")
+    add_step_level(of)
+    options = of.parse_args()
+    device = checked(options, of, LEVELS)
+    check_step_level(options, of, device)
     warnings.simplefilter("ignore", wc.StabilityWarning)
     start = time.perf_counter()
     about = machine(device)
     newton, mujoco = peer("newton"), peer("mujoco")
     copy = about["copy_gb_per_s"] = copy_bandwidth(device)
-    tell(f"building level {options.level}")
-    problem = Problem(options.level, device)
-    stepping = problem if options.step_level == options.level else Problem(options.step_level, device)
+    problem, stepping = problems(options, device)
     about |= {"level": options.level, "step_level": options.step_level, "rounds": options.rounds}
     about["peers"] = {m.__name__: m.NAME for m in (newton, mujoco) if m is not None}
     print(f"{about['name']} ({device}), Warp {about['warp']}: rotations and forces at level {options.level}, ", end="")
