@@ -41,7 +41,21 @@ class SubtreeField(CorotatedField):
 
     def follow(self, plan: DevicePlan) -> None:
         super().follow(plan)
+        self._load_kernels(plan)
         self._go_through(plan)
+
+    def _load_kernels(self, plan: DevicePlan) -> None:
+        """Everything that any mesh may come to need, so that nothing is compiled once steps are made."""
+        for shape, grouped, sharing in plan.kinds:
+            kernel = self._kernel(shape, grouped, sharing)
+            wp.load_module(kernel.module, self.device, block_dim=self._block)
+        single = (self._forces, self._own, self._extract, repair_own, repair_shared, scatter_elements, repair_elements)
+        for kernel in single if self.device.is_cpu else single[:-2]:
+            wp.load_module(kernel.module, self.device)
+
+    @property
+    def _block(self) -> int:
+        return subtree_cuda.BLOCK if self.device.is_cuda else 256
 
     def _go_through(self, plan: Plan) -> None:
         """Make the launches of a plan."""
@@ -56,7 +70,7 @@ class SubtreeField(CorotatedField):
             self._rotations = self._shared.rotations
         elif self.rotation_level is not None:
             self._sharing()
-        self._kernels = [self._kernel(batch) for batch in plan.batches]
+        self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]
         self._flat_material = self.material_inputs
         self._flat_lanes: Lanes | None = None
         if len(plan.flat):
@@ -88,27 +102,29 @@ class SubtreeField(CorotatedField):
             else:
                 self.launch(self._own, len(flat), inputs, [f])
 
-    def _kernel(self, batch: Batch) -> wp.Kernel:
-        given = batch.sharing is Sharing.ABOVE
+    def _kernel(self, shape: int, grouped: bool, sharing: Sharing) -> wp.Kernel:
+        given = sharing is Sharing.ABOVE
         if self.device.is_cuda:
-            if batch.sharing is Sharing.OWN:
-                return subtree_cuda.scatter_subtrees_own(batch.shape, batch.grouped, self._uniform)
-            return subtree_cuda.scatter_subtrees_shared(batch.shape, batch.grouped, self._uniform, given)
-        if batch.sharing is Sharing.OWN:
-            return subtree_cpu.scatter_subtrees_own(batch.shape)
-        return subtree_cpu.scatter_subtrees_shared(batch.shape, given)
+            if sharing is Sharing.OWN:
+                return subtree_cuda.scatter_subtrees_own(shape, grouped, self._uniform)
+            return subtree_cuda.scatter_subtrees_shared(shape, grouped, self._uniform, given)
+        if sharing is Sharing.OWN:
+            return subtree_cpu.scatter_subtrees_own(shape)
+        return subtree_cpu.scatter_subtrees_shared(shape, given)
 
     def _launch_batch(self, batch: Batch, kernel: wp.Kernel, u: wp.array, f: wp.array) -> None:
         body = self.body
         if self.device.is_cuda:
-            threads, block = batch.count, subtree_cuda.BLOCK
+            threads = batch.count
             inputs = [batch.subtrees, body.mu, body.lam, u]
         else:
-            threads, block = -(-batch.count // LANES), 256
+            threads = -(-batch.count // LANES)
             inputs = [batch.subtrees, batch.count, *self.material_inputs, u]
         if batch.sharing is not Sharing.OWN:
             inputs += [self._rotations, self._no_unit if batch.unit is None else batch.unit]
-        wp.launch(kernel, dim=threads, inputs=inputs, outputs=[f, batch.flagged], device=self.device, block_dim=block)
+        wp.launch(
+            kernel, dim=threads, inputs=inputs, outputs=[f, batch.flagged], device=self.device, block_dim=self._block
+        )
         flags = batch.flags_by_eights
         inputs = [self.elements, *self.material_inputs, u]
         if batch.sharing is Sharing.OWN:

@@ -88,6 +88,7 @@ class Changing:
         #: What is looked at after a pass: counts of the pools and of the plan, and the survey.
         self._report: wp.array | None = None
         self._report_parts: list[int] = []
+        #: A pass and what follows; none where a device's graphs know no conditions.
         self._graph: wp.Graph | None = None
         self._give_pools_to(body)
 
@@ -136,18 +137,18 @@ class Changing:
         self.renew()
         self.conditions.keep()
         self.survey.settle()
+        if not self.device.is_cuda or wp.is_conditional_graph_supported():
+            with wp.ScopedCapture(device=self.device) as capture:
+                self._launch()
+            self._graph = capture.graph
 
     def run(self) -> None:
         """One pass over the mesh, and what follows from it if anything has changed."""
         self.body.adopt_positions()
         self.conditions.note()
-        if self.device.is_cuda and not wp.is_conditional_graph_supported():
+        if self._graph is None:
             self._launch()
         else:
-            if self._graph is None:
-                with wp.ScopedCapture(device=self.device) as capture:
-                    self._launch()
-                self._graph = capture.graph
             wp.capture_launch(self._graph)
         self._look()
 

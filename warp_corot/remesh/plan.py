@@ -123,6 +123,14 @@ class DevicePlan:
         return self._plan
 
     @property
+    def kinds(self) -> list[tuple[int, bool, Sharing]]:
+        """Shape, whether in groups, and sharing of all batches that there may ever be."""
+        if not self._with_subtrees:
+            return []
+        members = (True, False) if self._plan.members == 2 else (False,)
+        return [(shape, grouped, sharing) for sharing, shape in self._kinds for grouped in members]
+
+    @property
     def rotation_shared(self) -> bool:
         return bool(self._plan.rotation_level >= 0)
 
