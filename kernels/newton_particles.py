@@ -16,6 +16,32 @@ wp.set_module_options({"enable_backward": False})
 ACTIVE = wp.constant(1)
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __shared__ float staged[3 * 1024];
+    const unsigned all = 0xffffffffu;
+    const int lane = threadIdx.x & 31;
+    if (__activemask() == all && __all_sync(all, a.strides[0] == 12 && i == __shfl_sync(all, i, 0) + lane)) {
+        float* const own = staged + 3 * (threadIdx.x - lane);
+        float* const out = reinterpret_cast<float*>(&wp::index(a, i - lane));
+        __syncwarp();
+        for (int axis = 0; axis < 3; ++axis) own[3 * lane + axis] = value[axis];
+        __syncwarp();
+        for (int part = 0; part < 96; part += 32) out[part + lane] = own[part + lane];
+        return;
+    }
+#endif
+    wp::index(a, i) = value;
+""")
+def store_vector(a: wp.array[wp.vec3], i: int, value: wp.vec3):
+    """Write vector i, where neighbouring threads write neighbouring ones.
+
+    A vec3 is three words of four bytes, each of which a warp would write to every third place: twelve sectors of memory
+    three times over. So where all its threads are there they exchange their words first, and write whole sectors.
+    """
+    ...
+
+
 @wp.kernel(enable_backward=False)
 def gather_particles(
     # In
@@ -45,8 +71,8 @@ def gather_particles(
     if u.shape[0] > 0:
         store_node(u, i, at - load_node(rest, i))
     if kept_q.shape[0] > 0:
-        kept_q[i] = at
-        kept_qd[i] = velocity
+        store_vector(kept_q, i, at)
+        store_vector(kept_qd, i, velocity)
     if not (is_finite(at) and is_finite(velocity) and is_finite(force)):
         wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), wrong)
 
@@ -125,8 +151,8 @@ def step_particles(
         at += dt * velocity
         if runs_away or not is_finite(at):
             wp.atomic_max(trouble, place, UNSTABLE)
-    q_out[i] = at
-    qd_out[i] = velocity
+    store_vector(q_out, i, at)
+    store_vector(qd_out, i, velocity)
 
 
 @wp.kernel(enable_backward=False)
