@@ -6,6 +6,7 @@ not displacements, and stores a rest matrix, activation and three material param
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -69,6 +70,7 @@ class Elements:
     poses: np.ndarray
 
     @classmethod
+    @functools.lru_cache(maxsize=1)
     def of(cls, problem: Problem) -> Elements:
         tets = wc.TetMesh(problem.mesh.points, problem.mesh.tets).tets
         x = problem.mesh.points[tets]
