@@ -9,9 +9,10 @@ import functools
 import warp as wp
 
 from .constitutive import corotated_strain, hooke
-from .elements import GeneralElements, add_force, load_node, scatter_stress
+from .elements import GeneralElements, load_node, scatter_stress
 from .general_cpu import ADD_FORCES, gather_elements
 from .lanes import COMPILER_FLAGS, NEWTON, PRELUDE, on_cpu
+from .newton_merging import add_four_forces
 from .rotation import ITERATIONS, byers_xu, cofactor, column, identity3, warm_rotation
 
 wp.set_module_options({"enable_backward": False})
@@ -100,9 +101,10 @@ def place_in_model(ids: wp.array[wp.int32], first: int, t: int):
 
 
 @functools.cache
-def scatter_posed(rotation: wp.Function, damped: bool) -> wp.Kernel:
+def scatter_posed(rotation: wp.Function, damped: bool, rounds: int = 1) -> wp.Kernel:
     """All forces of tetrahedra, each with the rotation of its own deformation gradient; ``ids`` are their places in
-    ``activation``."""
+    ``activation``; ``rounds``: see ``add_four_forces``."""
+    add_forces = add_four_forces(rounds)
 
     @wp.kernel(module="unique", enable_backward=False)
     def scatter_posed(
@@ -137,10 +139,7 @@ def scatter_posed(rotation: wp.Function, damped: bool) -> wp.Kernel:
         # Read again, so as to keep no registers meanwhile.
         h = (-elements.volume[t]) * p * wp.transpose(rest_inverse_of(elements, t))
         f1, f2, f3 = column(h, 0), column(h, 1), column(h, 2)
-        add_force(f, n[0], -(f1 + f2 + f3))
-        add_force(f, n[1], f1)
-        add_force(f, n[2], f2)
-        add_force(f, n[3], f3)
+        add_forces(f, n, -(f1 + f2 + f3), f1, f2, f3)
 
     return scatter_posed
 
