@@ -1,8 +1,10 @@
 """The Newton solver as a solver: the same motions as this package's simulation, Newton's conventions, bad input."""
 
+import gc
 import re
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -420,6 +422,23 @@ def test_a_forest_from_elsewhere_goes_one_by_one(device, rng):
             solver = wn.SolverCorotated(model)
         assert solver.tetrahedra.single_count == model.tet_count
         np.testing.assert_allclose(impulse(solver, model, x), wanted, atol=1e-3 * np.abs(wanted).max())
+
+
+def test_a_forest_lives_as_long_as_its_models(device):
+    """Whoever makes a model of a forest need not keep it; and no list keeps those of models that are gone."""
+    forest = adaptive_forest(2)
+    watched, made = weakref.ref(forest), builder()
+    for k in range(2):
+        wn.add_forest(made, forest, wc.Isotropic(1e4, 0.3, 1000.0), pos=(k, 0.0, 0.0))
+    whole = builder()
+    whole.replicate(made, 3)
+    model = whole.finalize(device=device)
+    del forest, made, whole
+    gc.collect()
+    assert wn.SolverCorotated(model).tetrahedra.groups[0].copies == 6
+    del model
+    gc.collect()
+    assert watched() is None
 
 
 class TestImports:
