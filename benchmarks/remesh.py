@@ -57,7 +57,8 @@ class Scene:
             criterion=choice,
             parameters=self.numbers,
         )
-        self.sim = Simulation(self.body, integrator=wc.SymplecticEuler(dt=1e-6), gravity=(0, 0, 0), remesh=options)
+        # With gravity, for a CPU is slow where numbers are next to nothing.
+        self.sim = Simulation(self.body, integrator=wc.SymplecticEuler(dt=1e-6), remesh=options)
         self.changing = self.sim.remeshing.changing[0]
         assert self.changing is not None
         self.forest: DeviceForest = self.changing.forest
