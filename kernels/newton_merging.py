@@ -15,7 +15,8 @@ def add_four_forces(rounds: int) -> wp.Function:
 
     On CUDA a sum in memory costs more than all else, and elements that follow one another mostly share nodes. So a
     thread gives its forces on nodes that it shares with the next one to that, two by two, then four by four, as many
-    ``rounds``.
+    ``rounds``. In the order of a forest's leaves 2.5 sums an element are left after one, 2.0 after two; in that of
+    ``add_soft_grid`` 2.95 and 2.46; of 4.
     """
     snippet = f"""
     int at[4];
