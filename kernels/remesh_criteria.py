@@ -70,3 +70,7 @@ def nearness(element: ElementState, parameters: wp.array[wp.float32]):
     half = wp.vec3(parameters[3], parameters[4], parameters[5])
     outside = wp.length(wp.max(wp.abs(x - centre) - half, wp.vec3(0.0))) - parameters[6]
     return longest_edge(element) / (wp.max(outside, 0.0) + parameters[7])
+
+
+#: How many parameters each of these reads.
+PARAMETER_COUNTS = {von_mises_stress: 1, strain: 1, nearness: 8}

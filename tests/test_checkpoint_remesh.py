@@ -207,7 +207,7 @@ def test_a_part_left_out_is_found(tmp_path, rng):
 def test_the_packages_own_criteria_are_found_by_their_names(tmp_path):
     from warp_corot.kernels.remesh_criteria import nearness as near_box
 
-    parameters = wp.array([0.1, 0.025, 0.025, 0.01, 0.02, 0.02, 0.02], dtype=wp.float32, device="cpu")
+    parameters = wp.array([0.1, 0.025, 0.025, 0.01, 0.02, 0.02, 0.02, 0.002], dtype=wp.float32, device="cpu")
     remesh = wc.OnlineRemesh(
         criterion=near_box, parameters=parameters, refine_above=1.0, simplify_below=0.5, max_level=8
     )

@@ -11,7 +11,7 @@ import warp as wp
 from ..elasticity.subtree_field import SubtreeField
 from ..errors import InputError
 from ..kernels.integrate import set_start
-from ..kernels.remesh_mark import elongation
+from ..kernels.remesh_mark import elongation, marking_kernel
 from ..materials import Material
 from ..mesh import TetForest
 from ..mesh.lattice import volume_shares
@@ -52,14 +52,11 @@ class Changing:
     """
 
     def __init__(self, body: SoftBody, options: OnlineRemesh):
+        self.options = fitted(options, body)
         mesh = body.mesh
-        if not isinstance(mesh, TetForest):
-            raise InputError(f"only a TetForest can be remeshed; the mesh of this body is a {type(mesh).__name__}")
-        if body.worlds > 1:
-            raise InputError(f"worlds is {body.worlds}; only a body in one world can be remeshed")
+        assert isinstance(mesh, TetForest)
         self.body = body
         self.device = body.device
-        self.options = options.on(mesh)
         self.is_full = False
         self.carried_material = carried_material(body)
         assert self.options.capacity is not None
@@ -261,3 +258,27 @@ class Changing:
 
     def _of_nodes(self, array: wp.array) -> npt.NDArray[Any]:
         return array[: self.body.node_count].numpy().copy()
+
+
+def fitted(options: OnlineRemesh, body: SoftBody) -> OnlineRemesh:
+    """The options with numbers in place of what is found from the body's mesh.
+
+    Raises:
+        InputError: A general mesh, more than one world, options that do not fit the mesh, parameters on another device,
+            or a criterion that does not compile.
+    """
+    mesh = body.mesh
+    if not isinstance(mesh, TetForest):
+        raise InputError(f"only a TetForest can be remeshed; the mesh of this body is a {type(mesh).__name__}")
+    if body.worlds > 1:
+        raise InputError(f"worlds is {body.worlds}; only a body in one world can be remeshed")
+    numbers = options.parameters
+    if numbers is not None and numbers.device != body.device:
+        raise InputError(f"parameters is on {numbers.device}; it must be on {body.device}, as the body is")
+    if options.criterion is not None:
+        try:
+            wp.load_module(marking_kernel(options.criterion).module, body.device)
+        except Exception as error:  # of whatever kind: it is the user's code that is compiled
+            reason = str(error).strip().rpartition("\n")[2].lstrip(";")
+            raise InputError(f"the criterion {options.criterion.func.__name__!r} does not compile: {reason}") from error
+    return options.on(mesh)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,6 +12,7 @@ import warp as wp
 
 from ..checks import checked_count
 from ..errors import InputError
+from ..kernels.remesh_criteria import PARAMETER_COUNTS
 from ..mesh import TetForest
 from ..mesh.lattice import MAX_LEVEL
 
@@ -39,11 +41,13 @@ class OnlineRemesh:
         criterion: In place of the elongation: one of ``kernels.remesh_criteria``, ``strain``, ``von_mises_stress`` or
             ``nearness``, or a Warp function (``@wp.func``) of your own of a ``kernels.remesh_mark.ElementState`` and an
             array of numbers.
-        parameters: Those numbers, float32 [n] on the simulation's device, which may be written to between steps.
+        parameters: Those numbers, float32 [n] on the simulation's device, which may be written to between steps. They
+            must be all that the criterion reads: there is no check within kernels.
 
     Raises:
         InputError: Thresholds that cannot both hold, levels out of order or beyond the lattice's depth, a criterion
-            that is no Warp function, or a number of steps or elements that is not positive.
+            that is no Warp function or has other arguments, too few parameters, or a number of steps or elements that
+            is not positive.
     """
 
     refine_above: float = 1.25
@@ -68,18 +72,10 @@ class OnlineRemesh:
                 raise InputError(f"{name} is {level!r}; it must be a whole number from 0 to {MAX_LEVEL}")
         if self.min_level is not None and self.max_level is not None and self.min_level > self.max_level:
             raise InputError(f"min_level is {self.min_level} and max_level {self.max_level}; the first is the smaller")
-        if self.criterion is not None and not isinstance(self.criterion, wp.Function):
-            raise InputError(
-                f"criterion is {self.criterion!r}; it must be a Warp function (@wp.func) of an ElementState"
-            )
         checked_count(self.every, "every", least=1)
         if self.capacity is not None:
             checked_count(self.capacity, "capacity", least=1)
-        numbers = self.parameters
-        if numbers is not None and not (
-            isinstance(numbers, wp.array) and numbers.dtype == wp.float32 and numbers.ndim == 1
-        ):
-            raise InputError(f"parameters is {numbers!r}; it must be a Warp array of float32, [n]")
+        _check_criterion(self.criterion, self.parameters)
 
     def on(self, mesh: TetForest) -> OnlineRemesh:
         """The same with numbers in place of what is found from a mesh.
@@ -105,3 +101,23 @@ def _is_finite(given: Any) -> bool:
 
 def _is_level(given: Any) -> bool:
     return isinstance(given, int | np.integer) and not isinstance(given, bool) and bool(0 <= given <= MAX_LEVEL)
+
+
+def _check_criterion(criterion: Any, numbers: Any) -> None:
+    """See that the criterion is a function of an element and numbers, and that there are as many as it reads."""
+    if criterion is not None:
+        if not isinstance(criterion, wp.Function) or criterion.func is None:
+            raise InputError(f"criterion is {criterion!r}; it must be a Warp function (@wp.func) of an ElementState")
+        count = len(inspect.signature(criterion.func).parameters)
+        if count != 2:
+            raise InputError(
+                f"the criterion {criterion.func.__name__!r} takes {count} arguments; "
+                "it must take two, an ElementState and an array of float32"
+            )
+    if numbers is not None and not (
+        isinstance(numbers, wp.array) and numbers.dtype == wp.float32 and numbers.ndim == 1 and len(numbers) > 0
+    ):
+        raise InputError(f"parameters is {numbers!r}; it must be a Warp array of float32, [n], not empty")
+    needed, given = PARAMETER_COUNTS.get(criterion, 0), 0 if numbers is None else len(numbers)
+    if given < needed:
+        raise InputError(f"the criterion {criterion.func.__name__!r} has {given} parameters; it reads {needed}")

@@ -49,11 +49,14 @@ class Remeshing:
             return
         if deterministic and bodies[0].device.is_cuda:
             raise InputError("a deterministic run on CUDA cannot be remeshed: new nodes are numbered as threads come")
+        from .changing import Changing, fitted
+
+        # All of them before the first one is given pools: what is refused leaves the bodies as they are.
         for each, body, model in zip(options, bodies, models, strict=True):
             if each is not None:
                 body.check_own_arrays()
                 model.check_remeshable()
-        from .changing import Changing
+                fitted(each, body)
 
         self.changing = tuple(
             None if each is None else Changing(body, each) for body, each in zip(bodies, options, strict=True)
