@@ -90,6 +90,7 @@ def test_bad_stages_are_one_line(tmp_path, capsys, how, message):
         (["--young", "0"], "young"),
         (["--poisson", "0.5"], "poisson"),
         (["--density", "0"], "density"),
+        (["--gravity", "0", "0", "nan"], "gravity is (0.0, 0.0, nan); it must be three finite numbers"),
         (["--viscosity", "-1"], "viscosity is -1; it must be"),
         (["--damping", "-1"], "damping is -1"),
         (["--ground", "deep"], "--ground 'deep'"),
@@ -117,6 +118,11 @@ def test_files_that_are_no_stages(tmp_path, capsys):
     ):
         assert run(tmp_path / name, "-o", tmp_path / "out.usda") == 2
         assert message in capsys.readouterr().err
+    (tmp_path / "typo.usda").write_text('#usda 1.0\ndef Cube "Box"\n{\n    double size = = 3\n}\n')
+    assert run(tmp_path / "typo.usda", "-o", tmp_path / "out.usda") == 2
+    err = capsys.readouterr().err
+    assert "typo.usda: is not a USD file that OpenUSD can open: line 4: " in err
+    assert len(err.splitlines()) == 1
     source = standing(tmp_path / "in.usda")
     assert run(source, "-o", tmp_path / "no" / "out.usda") == 2
     assert "output folder" in capsys.readouterr().err

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 from scene_stages import (
     CELL,
     DENSITY,
@@ -156,6 +156,38 @@ def test_what_a_stage_does_not_say_is_chosen_and_said(tmp_path):
     assert "there is a ground at z = 0 m" in notes
     x = sim.show().positions[0][:, 2]
     assert -0.02 * HEIGHT < 0.01 * x.min() < 0.0
+
+
+@pytest.mark.parametrize(("kinematic", "height"), [(False, -0.3), (True, None)])
+def test_there_is_a_ground_unless_a_collider_stays(tmp_path, kinematic, height):
+    """A block on a box that falls needs one below the box; one that does not fall is what it stands on."""
+    made = StageMaker(tmp_path / "stage.usda", metres=0.01, up="Y")
+    made.material(made.block(at=(-0.1, -0.1, 0.0)))
+    cube = made.box(at=(0.0, 0.0, -0.2))
+    UsdPhysics.RigidBodyAPI(cube.GetPrim()).CreateKinematicEnabledAttr(kinematic)
+    sim = StageSimulation(made.save(), device="cpu")
+    if height is None:
+        assert sim.parts.ground is None
+    else:
+        np.testing.assert_allclose(0.01 * sim.parts.ground[:, 1], height, atol=1e-6)
+
+
+def test_a_box_on_joints_stays(tmp_path):
+    made = StageMaker(tmp_path / "stage.usda")
+    made.material(made.block(at=(-0.1, -0.1, 0.0)))
+    cube = made.box(at=(0.0, 0.0, -0.2))
+    joint = UsdPhysics.FixedJoint.Define(made.stage, "/World/Joint")
+    joint.CreateBody1Rel().SetTargets([cube.GetPath()])
+    assert StageSimulation(made.save(), device="cpu").parts.ground is None
+
+
+def test_an_expression_that_holds_nothing_is_said(tmp_path):
+    path = standing(tmp_path / "stage.usda")
+    notes = [
+        StageSimulation(path, device="cpu", options=StageOptions(fix=f)).parts.notes for f in ("z > 9", "z < 0.01")
+    ]
+    assert "no point is held by 'z > 9'" in " ".join(notes[0])
+    assert "no point" not in " ".join(notes[1])
 
 
 def test_options_where_a_stage_says_nothing(tmp_path):

@@ -66,7 +66,7 @@ what is written, on top of OUT's sublayer INPUT, which must stay beside it unles
         "--ground",
         default="auto",
         metavar="HEIGHT",
-        help="height of a ground plane [m]; auto: under the bodies if the stage has no collider and nothing is held "
+        help="height of a ground plane [m]; auto: under the bodies if nothing is held and no collider stays in place "
         "(default); or none",
     )
     said.add_argument(

@@ -39,8 +39,10 @@ def open_stage(path: Path) -> Any:
     """
     try:
         return Usd.Stage.Open(usd_name(path))
-    except Tf.ErrorException:
-        raise InputError(f"{path}: is not a USD file that OpenUSD can open") from None
+    except Tf.ErrorException as error:
+        where = re.search(rf"{re.escape(path.name)}:(\d+):\d+: ([^\n]+)", str(error))
+        why = f": line {where[1]}: {where[2].rstrip(chr(39))}" if where else ""
+        raise InputError(f"{path}: is not a USD file that OpenUSD can open{why}") from None
 
 
 def metres_per_unit(stage: Any, path: Path) -> float:

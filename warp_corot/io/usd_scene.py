@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -90,6 +91,15 @@ class Scene:
         given = UsdGeom.PointBased(self.stage.GetPrimAtPath(path)).GetPointsAttr().Get()
         matrix = self.matrix(path)
         return np.asarray(given, dtype=np.float64).reshape(-1, 3) @ matrix[:3, :3] + matrix[3, :3]
+
+    def lowest(self, paths: Iterable[str]) -> float:
+        """How low prims and what is under them reach along the up axis, by their bounds; infinite if there are none."""
+        tokens = UsdGeom.Tokens
+        purposes = [tokens.default_, tokens.render, tokens.proxy, tokens.guide]
+        cache = UsdGeom.BBoxCache(Usd.TimeCode.Default(), purposes)
+        bounds = [cache.ComputeWorldBound(self.stage.GetPrimAtPath(path)).ComputeAlignedRange() for path in paths]
+        axis = "XYZ".index(self.up_axis)
+        return min((float(one.GetMin()[axis]) for one in bounds if not one.IsEmpty()), default=math.inf)
 
     def parent(self, path: str) -> str:
         """The path of a prim's parent."""

@@ -70,6 +70,8 @@ def stage_model(scene: Scene, options: StageOptions, device: Any = None) -> Stag
     Isotropic(1.0 if options.young is None else options.young, options.poisson, options.density)  # checks them
     if options.viscosity is not None and not (math.isfinite(options.viscosity) and options.viscosity >= 0):
         raise InputError(f"viscosity is {options.viscosity:g}; it must be zero or a positive time in seconds")
+    if options.gravity is not None and not (np.shape(options.gravity) == (3,) and np.isfinite(options.gravity).all()):
+        raise InputError(f"gravity is {options.gravity}; it must be three finite numbers [m/s^2]")
     made, units = StageModel(scene), scene.units
     repaired = sum(prim.repaired for prim in scene.tets)
     if repaired:
@@ -182,9 +184,13 @@ def _hold(made: StageModel, builder: newton.ModelBuilder, found: dict[str, Any],
             body = next(b for b in made.soft if b.particles.start <= particle < b.particles.stop)
             builder.attachment_particle_body_stiffness[index] = body.young * body.edge / made.scene.units.kilograms
     if options.fix is not None:
+        chosen: set[int] = set()
         for body in made.soft:
             points = np.array(builder.particle_q[body.particles], dtype=np.float64) * made.scene.units.metres
-            held |= set((np.flatnonzero(select_nodes(options.fix, points)) + body.particles.start).tolist())
+            chosen |= set((np.flatnonzero(select_nodes(options.fix, points)) + body.particles.start).tolist())
+        if not chosen:
+            made.notes.append(f"no point is held by {options.fix!r}; coordinates are world ones in metres (--fix)")
+        held |= chosen
     for particle in held:
         builder.particle_mass[particle] = 0.0
     if held:
@@ -197,13 +203,15 @@ def _hold(made: StageModel, builder: newton.ModelBuilder, found: dict[str, Any],
 def _stand(made: StageModel, builder: newton.ModelBuilder, options: StageOptions, held: int) -> None:
     """Add a ground plane if one is wanted."""
     ground = options.ground
-    if ground == "none" or (ground == "auto" and (builder.shape_count or held)):
-        if not (builder.shape_count or held):
+    stands = bool(held) or _something_stays(builder)
+    if ground == "none" or (ground == "auto" and stands):
+        if not stands:
             made.notes.append("nothing holds the bodies: they fall freely")
         return
     axis, units = "XYZ".index(made.scene.up_axis), made.scene.units
     x = np.array(builder.particle_q, dtype=np.float64)
-    height = float(x[:, axis].min()) if isinstance(ground, str) else ground / units.metres
+    lowest = min(float(x[:, axis].min()), made.scene.lowest(made.rigid))
+    height = lowest if isinstance(ground, str) else ground / units.metres
     builder.add_ground_plane(height=height)
     if isinstance(ground, str):
         made.notes.append(
@@ -216,6 +224,23 @@ def _stand(made: StageModel, builder: newton.ModelBuilder, options: StageOptions
     for column, signs in zip(others, ((-1, 1, 1, -1), (-1, -1, 1, 1)), strict=True):
         corners[:, column] = middle[column] + reach * np.array(signs)
     made.ground = corners
+
+
+def _something_stays(builder: newton.ModelBuilder) -> bool:
+    """Whether there is a collider that does not fall: on no body, a kinematic one, or one jointed to what stays."""
+    collides = int(newton.ShapeFlags.COLLIDE_SHAPES) | int(newton.ShapeFlags.COLLIDE_PARTICLES)
+    staying = {-1} | {k for k, flags in enumerate(builder.body_flags) if flags & int(newton.BodyFlags.KINEMATIC)}
+    joints = [
+        (parent, child)
+        for parent, child, kind in zip(builder.joint_parent, builder.joint_child, builder.joint_type, strict=True)
+        if kind != newton.JointType.FREE
+    ]
+    before = 0
+    while len(staying) > before:
+        before = len(staying)
+        staying |= {child for parent, child in joints if parent in staying}
+    shapes = zip(builder.shape_body, builder.shape_flags, strict=True)
+    return any(body in staying and flags & collides for body, flags in shapes)
 
 
 def _set_contacts(made: StageModel, builder: newton.ModelBuilder) -> None:
