@@ -1,8 +1,8 @@
-"""What is refused of criteria and bodies before anything is changed."""
+"""What is refused of criteria and bodies before anything is changed, and where a full mesh is said."""
 
 import pytest
 import warp as wp
-from remeshed import SOFT, bar
+from remeshed import SOFT, bar, near
 from warp_corot.kernels.remesh_criteria import nearness, strain, von_mises_stress
 from warp_corot.kernels.remesh_mark import ElementState
 
@@ -52,3 +52,14 @@ def test_what_is_refused_leaves_all_bodies_as_they_are(device):
     with pytest.raises(wc.InputError, match="the mesh of this body is a TetMesh"):
         wc.Simulation([body, general], remesh=wc.OnlineRemesh())
     wc.Simulation([body, general], remesh=[wc.OnlineRemesh(), None]).step()
+
+
+@pytest.mark.parametrize(
+    "go", [lambda sim: sim.step(), lambda sim: sim.advance(sim.dt), lambda sim: sim.advance_steps(1)]
+)
+def test_a_full_mesh_is_said_at_the_line_of_the_user(go, device):
+    body = bar(device)
+    sim = wc.Simulation(body, remesh=near(0.1, device, every=1, capacity=body.element_count))
+    with pytest.warns(wc.CapacityWarning) as said:
+        go(sim)
+    assert [warning.filename for warning in said] == [__file__]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import sys
 import warnings
 from collections.abc import Sequence
+from types import FrameType
 from typing import TYPE_CHECKING
 
 from ..errors import CapacityWarning, InputError
@@ -86,12 +88,25 @@ class Remeshing:
                 self._said_full.add(id(changing))
                 most = f"{changing.options.capacity} elements"
                 message = f"the mesh has no room left, its capacity is {most}; it is refined no further"
-                warnings.warn(message, CapacityWarning, stacklevel=5)
+                warnings.warn(message, CapacityWarning, stacklevel=_depth_of_user())
         return bool(due)
 
     def step_may_change(self) -> bool:
         """Whether the stable step is to be found anew; to be asked once a pass."""
         return any([changing.survey.step_may_change() for changing in self.changing if changing is not None])
+
+
+def _depth_of_user() -> int:
+    """How many calls above the one that warns the first is that is not this package's.
+
+    ``step`` is not as deep as ``advance``, and what is said at a line of the package is said there once for all
+    simulations.
+    """
+    frame: FrameType | None = sys._getframe(1)
+    depth, package = 1, __name__.partition(".")[0]
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == package:
+        frame, depth = frame.f_back, depth + 1
+    return depth
 
 
 def _one_each(
