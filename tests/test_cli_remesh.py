@@ -76,6 +76,7 @@ def test_of_a_surface_the_smooth_one_is_drawn(folder, capsys):
     [
         (["warp:bear", "--remesh"], "--remesh is for box, surfaces and scans"),
         (["good.vtk", "--remesh"], "good.vtk has tetrahedra of its own"),
+        (["missing.vtk", "--remesh"], "missing.vtk: no such file"),
         (["box", "--refine-above", 1.1], "--refine-above is for --remesh"),
         (["box", "--remesh-levels", 1, 2], "--remesh-levels is for --remesh"),
         (["box", "--remesh", "--refine-above", 1.0], "--simplify-below is 1.08 and --refine-above 1.0"),

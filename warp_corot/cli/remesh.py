@@ -6,6 +6,7 @@ import argparse
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import InputError
@@ -78,7 +79,9 @@ def remesh_of(args: argparse.Namespace, kind: str) -> OnlineRemesh | None:
             if getattr(args, name) is not None:
                 raise InputError(f"--{name.replace('_', '-')} is for --remesh, which is not given")
         return None
-    if kind == "tets" and args.input != "box":
+    # What is not there is said by who reads it.
+    there = args.input.startswith("warp:") or Path(args.input).exists()
+    if kind == "tets" and args.input != "box" and there:
         raise InputError(
             f"--remesh is for box, surfaces and scans, whose meshes are bisected cubes; {args.input} has tetrahedra of "
             "its own"

@@ -30,6 +30,9 @@ class OnlineRemesh:
     of its children's stiffness, density and active stress, but its first child's directions, and that child's active
     stress where the two follow different keyframes.
 
+    ``Simulation.reset()`` goes back to the mesh of the initial state, with the loads, held nodes and motions that it
+    had last: what was given while there was another mesh is gone.
+
     Attributes:
         refine_above, simplify_below: Thresholds in the criterion's unit; the first is the larger one. By default of the
             elongation of an element's longest edge, deformed over rest (Tagawa et al. 2013).
