@@ -52,7 +52,8 @@ class SoftBody(Controls, SharedArrays):
         device: "cpu", "cuda:0", …; None for Warp's default.
 
     A body that is remeshed (``Simulation(…, remesh=…)``) has other nodes after a pass that changed something: ask for
-    ``node_count`` and arrays anew then; views from before raise ``StaleViewError``.
+    ``node_count`` and arrays anew then; views from before raise ``StaleViewError``. Its ``node_`` arrays have as many
+    places as there may ever be nodes, and more; the first ``node_count`` of them count.
 
     Attributes:
         worlds, device: As given.

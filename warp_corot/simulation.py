@@ -22,7 +22,7 @@ from .indices import checked_indices
 from .nodal import vec3_view
 from .parts import checked_bodies, checked_gravity, checked_integrator, checked_models
 from .remesh.online import OnlineRemesh
-from .remesh.remeshing import Remeshing
+from .remesh.remeshing import Remeshing, depth_of_user
 from .solvers import Integrator, SymplecticEuler, largest_frequency
 from .solvers.integrator import StepContext
 from .solvers.recorded import GRAPH_STEPS, RecordedSteps
@@ -107,7 +107,7 @@ class Simulation:
         self._bad_step = wp.array([_NEVER], dtype=wp.int64, device=self.device)
         #: Steps that would have taken as long as the time before the first one of the present length.
         self._epoch = 0.0
-        self.dt = self._found_step(stacklevel=3)
+        self.dt = self._found_step()
         self._bind_steppers()
         self._steps_before_reset = 0
         self._time_before_reset = 0.0
@@ -120,6 +120,11 @@ class Simulation:
     def body(self) -> SoftBody:
         """The first body."""
         return self.bodies[0]
+
+    @property
+    def remesh(self) -> tuple[OnlineRemesh | None, ...]:
+        """How each body is remeshed, with numbers in place of None; the arrays of parameters are the live ones."""
+        return tuple(None if each is None else each.options for each in self.remeshing.changing)
 
     @property
     def steps(self) -> int:
@@ -229,8 +234,9 @@ class Simulation:
     def reset(self, worlds: npt.ArrayLike | wp.array | None = None) -> None:
         """Put worlds back to their initial state: rest, or what ``SoftBody.set_initial_state`` took as such.
 
-        Their prescribed motions begin anew; materials, loads and held nodes stay as they are. The clock goes on unless
-        all worlds are reset by ``reset()``.
+        Their prescribed motions begin anew; materials, loads and held nodes stay as they are. A body that is remeshed
+        goes back to the mesh of that state, with the loads and held nodes that this mesh had last. The clock goes on
+        unless all worlds are reset by ``reset()``.
 
         Args:
             worlds: None for all; an index, indices or a mask bool [worlds]; or a Warp array int32 [worlds] on the
@@ -312,7 +318,7 @@ class Simulation:
         Args:
             path: A file that ``save`` wrote.
             device: Where to go on; None: where it was saved.
-            remesh: In place of what was saved, which does not hold a criterion of your own.
+            remesh: In place of what was saved, which does not hold a criterion of your own; the capacity stays.
 
         Raises:
             InputError: No such file, not a checkpoint, one of a newer version, no such device, or a criterion that is
@@ -324,7 +330,7 @@ class Simulation:
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
-    def _found_step(self, stacklevel: int) -> float:
+    def _found_step(self) -> float:
         """The time step that was given, or one that is stable; ``stable_dt`` is found anew."""
         frequencies = [largest_frequency(body, f) for body, f in zip(self.bodies, self.fields, strict=True)]
         steps = [2.0 / w if w > 0 else math.inf for w in frequencies]
@@ -335,7 +341,7 @@ class Simulation:
                 warnings.warn(
                     f"the time step {given:.3g} s is beyond the largest stable one, about {self.stable_dt:.3g} s",
                     StabilityWarning,
-                    stacklevel=stacklevel,
+                    stacklevel=depth_of_user(),
                 )
             return given
         safe = min(m.step_safety * dt for m, dt in zip(self.models, steps, strict=True))
@@ -356,7 +362,7 @@ class Simulation:
         """Find the stable step anew where the elements that limit it are others now."""
         if not self.remeshing.step_may_change():
             return
-        before, self.dt = self.dt, self._found_step(stacklevel=5)
+        before, self.dt = self.dt, self._found_step()
         if self.dt == before:
             return
         # What has been simulated, and how long ago worlds were reset, in steps of the new length.

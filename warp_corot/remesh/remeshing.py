@@ -88,7 +88,7 @@ class Remeshing:
                 self._said_full.add(id(changing))
                 most = f"{changing.options.capacity} elements"
                 message = f"the mesh has no room left, its capacity is {most}; it is refined no further"
-                warnings.warn(message, CapacityWarning, stacklevel=_depth_of_user())
+                warnings.warn(message, CapacityWarning, stacklevel=depth_of_user())
         return bool(due)
 
     def step_may_change(self) -> bool:
@@ -96,7 +96,7 @@ class Remeshing:
         return any([changing.survey.step_may_change() for changing in self.changing if changing is not None])
 
 
-def _depth_of_user() -> int:
+def depth_of_user() -> int:
     """How many calls above the one that warns the first is that is not this package's.
 
     ``step`` is not as deep as ``advance``, and what is said at a line of the package is said there once for all
