@@ -1,8 +1,10 @@
 """What acts between particles and rigid bodies of a Newton model: soft contacts with friction, and attachments.
 
 Every force on a particle is taken from the body, wrench about its centre of mass, so momentum is exchanged exactly.
-Damping and friction turn no particle's velocity round within a step, however light it is: so much of the law as would
-do that is left out. A particle that touches several shapes is still slowed down by each.
+Damping and friction turn no relative velocity round within a step, however light particle and body are: so much of the
+law as would do that is left out. A body that is touched in n places counts in each as a piece of 1/n of its mass and
+inertia, which bounds what all of them do together; springs, too, are no stiffer than such a piece can follow. A
+particle that touches several shapes is still slowed down by each.
 """
 
 import warp as wp
@@ -12,6 +14,11 @@ from .newton_particles import ACTIVE
 from .newton_worlds import SURFACE_CONTACTS, place_of
 
 wp.set_module_options({"enable_backward": False})
+
+#: Largest k dt^2 / m of a spring on a body's piece; symplectic Euler is stable below 4, dampers and particle included.
+MOST_STIFF = wp.constant(0.5)
+#: More than any limit.
+NO_LIMIT = wp.constant(1.0e30)
 
 
 @wp.struct
@@ -31,27 +38,155 @@ def body_point_velocity(twist: wp.spatial_vector, arm: wp.vec3):
     return wp.spatial_top(twist) + wp.cross(wp.spatial_bottom(twist), arm)
 
 
+@wp.struct
+class Mobility:
+    """How a body's piece at a contact gives way, and a particle."""
+
+    particle: float  # 1/m [1/kg]
+    linear: float  # 1/m of the body's piece [1/kg]
+    angular: wp.mat33  # Its inverse inertia in world axes [1/(kg m^2)]
+    arm: wp.vec3  # From the body's centre of mass [m]
+
+
+@wp.func
+def mobility_of(
+    particle: float,
+    body: int,
+    places: wp.array[wp.int32],
+    fixed_flag: int,
+    body_flags: wp.array[wp.int32],
+    inverse_mass: wp.array[wp.float32],
+    inverse_inertia: wp.array[wp.mat33],
+    pose: wp.transform,
+    arm: wp.vec3,
+):
+    """Of a particle of an inverse mass, and of a body; its share where it is touched in several places."""
+    m = Mobility()
+    m.particle = particle
+    m.arm = arm
+    if body >= 0:  # noqa: SIM102 - what is read next is there only then
+        if (body_flags[body] & fixed_flag) == 0:
+            n = float(wp.max(places[body], 1))
+            turn = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+            m.linear = n * inverse_mass[body]
+            m.angular = n * (turn * inverse_inertia[body] * wp.transpose(turn))
+    return m
+
+
+@wp.func
+def body_mobility(m: Mobility, direction: wp.vec3):
+    """Inverse mass of the body's piece at the contact along a unit vector [1/kg]."""
+    a = wp.cross(m.arm, direction)
+    return m.linear + wp.dot(a, m.angular * a)
+
+
+@wp.func
+def most_damping(m: Mobility, direction: wp.vec3, dt: float):
+    """What stops the relative velocity along a unit vector within a step [kg/s]."""
+    w = m.particle + body_mobility(m, direction)
+    most = float(NO_LIMIT)
+    if w > 0.0:
+        most = 1.0 / (w * dt)
+    return most
+
+
+@wp.func
+def most_stiffness(m: Mobility, direction: wp.vec3, dt: float):
+    """What the body's piece can follow [N/m]; of the particle, the time step takes care."""
+    w = body_mobility(m, direction)
+    most = float(NO_LIMIT)
+    if w > 0.0:
+        most = MOST_STIFF / (w * dt * dt)
+    return most
+
+
 @wp.func
 def contact_force(
-    normal: wp.vec3, gap: float, v: wp.vec3, stiffness: float, damping: float, slope: float, mu: float, most: float
+    normal: wp.vec3,
+    gap: float,
+    v: wp.vec3,
+    stiffness: float,
+    damping: float,
+    slope: float,
+    mu: float,
+    m: Mobility,
+    dt: float,
 ):
     """Force on the particle [N]: spring and damper along the normal, regularised Coulomb friction across it.
 
     Args:
         v: Velocity of the particle relative to the body's point.
-        most: Mass over time step: what stops a velocity of one within the step [kg/s].
     """
     towards = wp.dot(normal, v)
-    push = -stiffness * gap
+    push = -wp.min(stiffness, most_stiffness(m, normal, dt)) * gap
     if gap < 0.0 and towards < 0.0:
-        push -= wp.min(damping, most) * towards
+        push -= wp.min(damping, most_damping(m, normal, dt)) * towards
     sliding = v - towards * normal
     speed = wp.length(sliding)
-    drag = wp.min(wp.min(slope, most) * speed, mu * wp.max(push, 0.0))
     force = push * normal
     if speed > 0.0:
-        force -= (drag / speed) * sliding
+        across = sliding / speed
+        drag = wp.min(wp.min(slope, most_damping(m, across, dt)) * speed, mu * wp.max(push, 0.0))
+        force -= drag * across
     return force
+
+
+@wp.func
+def contact_gap(
+    normal: wp.vec3, x: wp.vec3, radius: float, point: wp.vec3, shape: int, shape_margin: wp.array[wp.float32]
+):
+    gap = wp.dot(normal, x - point) - radius
+    if shape_margin.shape[0] > 0:
+        gap -= shape_margin[shape]
+    return gap
+
+
+@wp.kernel(enable_backward=False)
+def count_soft_contacts(
+    # In
+    law: ContactLaw,
+    count: wp.array[wp.int32],
+    contact_particle: wp.array[wp.int32],
+    contact_shape: wp.array[wp.int32],
+    contact_point: wp.array[wp.vec3],
+    contact_normal: wp.array[wp.vec3],
+    shape_body: wp.array[wp.int32],
+    shape_margin: wp.array[wp.float32],
+    flags: wp.array[wp.int32],
+    radius: wp.array[wp.float32],
+    q: wp.array[wp.vec3],
+    body_q: wp.array[wp.transform],
+    # In and out
+    places: wp.array[wp.int32],
+):
+    """In how many places bodies are touched."""
+    c = wp.tid()
+    if c >= wp.min(count[0], contact_particle.shape[0]):
+        return
+    i = contact_particle[c]
+    shape = contact_shape[c]
+    if i < 0:
+        return
+    body = shape_body[shape]
+    if body < 0 or (flags[i] & ACTIVE) == 0:
+        return
+    point = wp.transform_point(body_q[body], contact_point[c])
+    if contact_gap(contact_normal[c], q[i], radius[i], point, shape, shape_margin) <= law.adhesion:
+        wp.atomic_add(places, body, 1)
+
+
+@wp.kernel(enable_backward=False)
+def count_attachments(
+    # In
+    body: wp.array[wp.int32],
+    enabled: wp.array[wp.bool],
+    # In and out
+    places: wp.array[wp.int32],
+):
+    """As ``count_soft_contacts``."""
+    a = wp.tid()
+    if enabled[a]:
+        wp.atomic_add(places, body[a], 1)
 
 
 @wp.kernel(enable_backward=False)
@@ -78,6 +213,11 @@ def scatter_soft_contacts(
     inverse_mass: wp.array[wp.float32],
     q: wp.array[wp.vec3],
     qd: wp.array[wp.vec3],
+    fixed_flag: int,
+    body_flags: wp.array[wp.int32],
+    body_inverse_mass: wp.array[wp.float32],
+    body_inverse_inertia: wp.array[wp.mat33],
+    places: wp.array[wp.int32],
     body_q: wp.array[wp.transform],
     body_qd: wp.array[wp.spatial_vector],
     body_com: wp.array[wp.vec3],
@@ -102,21 +242,27 @@ def scatter_soft_contacts(
     point = contact_point[c]
     velocity = contact_velocity[c]
     arm = wp.vec3()
+    pose = wp.transform_identity()
     if body >= 0:
         pose = body_q[body]
         point = wp.transform_point(pose, point)
         arm = point - wp.transform_point(pose, body_com[body])
         velocity = wp.transform_vector(pose, velocity) + body_point_velocity(body_qd[body], arm)
     normal = contact_normal[c]
-    margin = float(0.0)
-    if shape_margin.shape[0] > 0:
-        margin = shape_margin[shape]
-    gap = wp.dot(normal, q[i] - point) - radius[i] - margin
+    gap = contact_gap(normal, q[i], radius[i], point, shape, shape_margin)
     if gap > law.adhesion:
         return
-    most = float(1.0e30)
-    if inverse_mass[i] > 0.0:
-        most = 1.0 / (inverse_mass[i] * dt)
+    m = mobility_of(
+        inverse_mass[i],
+        body,
+        places,
+        fixed_flag,
+        body_flags,
+        body_inverse_mass,
+        body_inverse_inertia,
+        pose,
+        arm,
+    )
     force = contact_force(
         normal,
         gap,
@@ -125,7 +271,8 @@ def scatter_soft_contacts(
         0.5 * (law.damping + shape_kd[shape]),
         0.5 * (law.friction_slope + shape_kf[shape]),
         0.5 * (law.friction + shape_mu[shape]),
-        most,
+        m,
+        dt,
     )
     add_force(f, i, force)
     if body >= 0:
@@ -135,14 +282,21 @@ def scatter_soft_contacts(
 @wp.kernel(enable_backward=False)
 def scatter_attachments(
     # In
+    dt: float,
     particle: wp.array[wp.int32],
     body: wp.array[wp.int32],
     body_point: wp.array[wp.vec3],
     stiffness: wp.array[wp.float32],
     damping: wp.array[wp.float32],
     enabled: wp.array[wp.bool],
+    inverse_mass: wp.array[wp.float32],
     q: wp.array[wp.vec3],
     qd: wp.array[wp.vec3],
+    fixed_flag: int,
+    body_flags: wp.array[wp.int32],
+    body_inverse_mass: wp.array[wp.float32],
+    body_inverse_inertia: wp.array[wp.mat33],
+    places: wp.array[wp.int32],
     body_q: wp.array[wp.transform],
     body_qd: wp.array[wp.spatial_vector],
     body_com: wp.array[wp.vec3],
@@ -160,7 +314,19 @@ def scatter_attachments(
     point = wp.transform_point(pose, body_point[a])
     arm = point - wp.transform_point(pose, body_com[b])
     relative = qd[i] - body_point_velocity(body_qd[b], arm)
-    force = -stiffness[a] * (q[i] - point) - damping[a] * relative
+    m = mobility_of(
+        inverse_mass[i], b, places, fixed_flag, body_flags, body_inverse_mass, body_inverse_inertia, pose, arm
+    )
+    # The sum over three directions is more than any one's.
+    every = body_mobility(m, wp.vec3(1.0, 0.0, 0.0))
+    every += body_mobility(m, wp.vec3(0.0, 1.0, 0.0)) + body_mobility(m, wp.vec3(0.0, 0.0, 1.0))
+    k = float(stiffness[a])
+    d = float(damping[a])
+    if every > 0.0:
+        k = wp.min(k, MOST_STIFF / (every * dt * dt))
+    if every + m.particle > 0.0:
+        d = wp.min(d, 1.0 / ((every + m.particle) * dt))
+    force = -k * (q[i] - point) - d * relative
     add_force(f, i, force)
     wp.atomic_sub(body_f, b, wp.spatial_vector(force, wp.cross(arm, force)))
 

@@ -163,6 +163,88 @@ class TestBodies:
         assert model.particle_mass.numpy() @ state.particle_qd.numpy()[:, 2] > 0.1
 
 
+def light_box(device, density):
+    """A box of 1 dm, 2 cm above a soft block on the ground; 1 kg/m^3 are a gram."""
+    made = builder(radius=0.005)
+    body = made.add_body(xform=wp.transform(wp.vec3(0.1, 0.1, 0.28), wp.quat_identity()))
+    made.add_shape_box(body, hx=0.05, hy=0.05, hz=0.05, cfg=newton.ModelBuilder.ShapeConfig(density=density))
+    add_grid(made, dims=(4, 4, 4), cell=0.05, pos=(0.0, 0.0, 0.005), mu=1e5, lam=1e5, damp=10.0)
+    made.add_ground_plane()
+    return made.finalize(device=device)
+
+
+class TestLightBodies:
+    @pytest.mark.parametrize(("density", "ke", "kd"), [(5.0, None, None), (200.0, None, None), (5.0, 1e5, 1e3)])
+    def test_come_to_rest(self, device, density, ke, kd):
+        """At half the safe step a box far lighter than what is below it does not rise above where it was dropped.
+
+        What is left is rocking: it stands on the highest particle, in the middle.
+        """
+        model = light_box(device, density)
+        if ke is not None:
+            contact_parameters(model, ke=ke, kd=kd, kf=1e3)
+        solver = wn.SolverCorotated(model, damping=15.0)
+        dt = 0.5 * solver.contact_dt
+        heights, speeds = [], []
+
+        def watch(state):
+            heights.append(float(state.body_q.numpy()[0, 2]))
+            speeds.append(float(np.abs(state.body_qd.numpy()[0, :3]).max()))
+
+        state = run(solver, model, 2 * round(0.6 / dt), dt, pipeline=newton.CollisionPipeline(model), each=watch)
+        assert max(heights) < 0.285
+        assert max(speeds) < 1.0
+        assert max(speeds[-round(0.1 / dt) :]) < 0.05
+        assert 0.25 < heights[-1] < 0.26
+        assert np.abs(state.body_q.numpy()[0, 3:5]).max() < 0.01
+
+    def test_all_dampers_of_a_body_together_turn_no_velocity_round(self, device):
+        """However strong: 25 kinematic particles under a box without springs stop it at most, also its turning."""
+        made = builder(gravity=(0.0, 0.0, 0.0))
+        body = made.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 0.05), wp.quat_identity()))
+        made.add_shape_box(body, hx=0.05, hy=0.05, hz=0.05, cfg=newton.ModelBuilder.ShapeConfig(density=5.0))
+        for x in np.linspace(-0.04, 0.04, 5):
+            for y in np.linspace(-0.04, 0.04, 5):
+                made.add_particle(wp.vec3(x, y, -0.0099), wp.vec3(), 0.0)
+        add_grid(made, pos=(3.0, 0.0, 0.0))
+        model = made.finalize(device=device)
+        contact_parameters(model, ke=0.0, kd=1e6, kf=0.0, mu=0.0)
+        pipeline = newton.CollisionPipeline(model)
+        solver = wn.SolverCorotated(model)
+        before, after = model.state(), model.state()
+        before.body_qd.assign(np.array([[0.0, 0.0, -1.0, 0.0, 0.0, 0.0]], np.float32))
+        contacts = pipeline.contacts()
+        pipeline.collide(before, contacts)
+        solver.step(before, after, None, contacts, 1e-4)
+        assert contacts.soft_contact_count.numpy()[0] == 25
+        twist = after.body_qd.numpy()[0]
+        assert -0.9 < twist[2] < 1e-5
+        energy = 0.5 * float(model.body_mass.numpy()[0]) * float(twist[:3] @ twist[:3])
+        energy += 0.5 * float(twist[3:] @ model.body_inertia.numpy()[0] @ twist[3:])
+        assert energy < 0.5 * float(model.body_mass.numpy()[0])
+
+    def test_shorten_the_safe_step(self, device):
+        """4/dt^2 = w^2 + k/m of the body."""
+        rates, inverse = [], []
+        for density in (1.0, 3.0):
+            model = light_box(device, density)
+            contact_parameters(model, ke=1e5)
+            solver = wn.SolverCorotated(model)
+            w = 2.0 / solver.contact_dt
+            rates.append(w * w)
+            inverse.append(1.0 / float(model.body_mass.numpy()[0]))
+        assert inverse[0] == pytest.approx(1000.0, rel=1e-3)
+        # The block's damping makes its own share of dt depend on w a little.
+        assert rates[0] - rates[1] == pytest.approx(1e5 * (inverse[0] - inverse[1]), rel=0.2)
+        solver = wn.SolverCorotated(model)
+        model.body_inv_mass.fill_(1000.0)
+        solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
+        assert (2.0 / solver.contact_dt) ** 2 == pytest.approx(rates[0], rel=1e-5)
+        model.body_flags.fill_(int(newton.BodyFlags.KINEMATIC))
+        solver.notify_model_changed(newton.ModelFlags.BODY_PROPERTIES)
+        assert (2.0 / solver.contact_dt) ** 2 < 0.5 * rates[1]
+
+
 def model_without_particles(model):
     from newton.solvers.experimental.coupled import ModelView
 

@@ -64,7 +64,8 @@ class SolverCorotated(SolverBase, CouplingInterface):
 
     Attributes:
         stable_dt: The largest stable step of the elements about rest [s].
-        contact_dt: The same with contact or an attachment at every particle [s], as stiff as they can be here.
+        contact_dt: The same with contact or an attachment at every particle [s], as stiff as they can be here, with the
+            lightest rigid body at its other end.
 
     Raises:
         InputError: No tetrahedra, a material that is not positive definite, or an option out of its range.
@@ -195,12 +196,13 @@ class SolverCorotated(SolverBase, CouplingInterface):
         if self.device.is_capturing:
             return
         bits = newton.ModelFlags
-        elements, stiffest = False, self._contacts.stiffest
+        elements, before = False, (self._contacts.stiffest, self._contacts.lightest)
         if flags & bits.MODEL_PROPERTIES:
             elements = self.tetrahedra.refresh()
-        if flags & (bits.SHAPE_PROPERTIES | bits.CONSTRAINT_PROPERTIES | bits.MODEL_PROPERTIES):
+        of_contacts = bits.SHAPE_PROPERTIES | bits.CONSTRAINT_PROPERTIES | bits.MODEL_PROPERTIES
+        if flags & (of_contacts | bits.BODY_PROPERTIES | bits.BODY_INERTIAL_PROPERTIES):
             self._contacts.refresh()
-        if elements or self._contacts.stiffest != stiffest:
+        if elements or (self._contacts.stiffest, self._contacts.lightest) != before:
             self._find_stable_steps()
 
     @classmethod
@@ -221,7 +223,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self.stable_dt = stable_step(*arguments, 0.0, tets.damped) if given is None else float(given)
         self.contact_dt = self.stable_dt
         if stiffest > 0 and given is None:
-            self.contact_dt = stable_step(*arguments, stiffest, tets.damped)
+            self.contact_dt = stable_step(*arguments, stiffest, tets.damped, self._contacts.lightest)
 
     def _count_for(self, dt: float) -> int:
         if not (math.isfinite(dt) and dt > 0):

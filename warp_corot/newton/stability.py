@@ -54,7 +54,13 @@ class _Springs:
 
 
 def stable_step(
-    model: newton.Model, elements: Any, mu: wp.array, lam: wp.array, stiffness: float, damped: bool
+    model: newton.Model,
+    elements: Any,
+    mu: wp.array,
+    lam: wp.array,
+    stiffness: float,
+    damped: bool,
+    lightest: float = 0.0,
 ) -> float:
     """The largest stable step of symplectic Euler about rest [s]; infinite if nothing can move.
 
@@ -66,9 +72,12 @@ def stable_step(
         mu, lam: Lamé's parameters [Pa], float32 [T].
         stiffness: Of a spring at every particle [N/m], for contact.
         damped: Whether there is any k_damp.
+        lightest: Inverse mass of the lightest body at the other end of such a spring [1/kg]; 0: none moves. Bodies that
+            are touched in several places need no shorter steps; see ``kernels.newton_contacts``.
     """
     body = cast(Any, _Particles(model, elements.volume.numpy().astype(np.float64)))
     w = largest_frequency(body, cast(Any, _Springs(elements, mu, lam, stiffness)))
+    w = math.sqrt(w * w + stiffness * lightest)
     c = 0.0
     if damped:
         viscosity = model.tet_materials.numpy().reshape(-1, 3)[:, 2]
