@@ -4,6 +4,7 @@ import gc
 import re
 import subprocess
 import sys
+import warnings
 import weakref
 from pathlib import Path
 from types import SimpleNamespace
@@ -211,6 +212,8 @@ class TestBadInput:
             wn.SolverCorotated(model, **options)
 
     def test_models(self, device):
+        self.expect("model is None; it must be a newton.Model", None)
+        self.expect("model is a ModelBuilder; it must be", builder())
         self.expect("no tetrahedra", builder().finalize(device=device))
         for mu, lam, message in ((-1.0, 1e4, "k_mu -1"), (1e4, -1e4, "must be positive"), (np.nan, 1e4, "k_mu nan")):
             self.expect(f"tetrahedron 0 has .*{message}", grid_model(device, mu=mu, lam=lam))
@@ -224,8 +227,21 @@ class TestBadInput:
             ("lame", "newton"),
             ("rotation", "svd"),
             ("damping", -1.0),
+            ("lame", None),
+            ("lame", ["documented"]),
+            ("rotation", None),
+            ("damping", None),
+            ("damping", "1"),
+            ("damping", np.nan),
             ("substeps", 0),
+            ("substeps", 1.5),
+            ("substeps", "4"),
+            ("substeps", True),
+            ("substeps", np.inf),
+            ("substeps", np.nan),
+            ("substeps", [2]),
             ("stable_dt", 0.0),
+            ("stable_dt", "1"),
             ("rigid_solver", "mujoco"),
         ):
             self.expect(f"{name} is ", model, **{name: value})
@@ -243,9 +259,23 @@ class TestBadInput:
         count = int(re.search(r"substeps=(\d+)", str(told.value))[1])
         run(wn.SolverCorotated(model, substeps=count), model, 10, 1.2 * solver.stable_dt)
         run(wn.SolverCorotated(model, substeps=None), model, 10, 1.2 * solver.stable_dt)
-        for dt in (0.0, -1e-4, np.nan):
+        for dt in (0.0, -1e-4, np.nan, np.inf, None, "1e-4"):
             with pytest.raises(wc.InputError, match="dt is"):
                 solver.step(model.state(), after, None, None, dt)
+
+    def test_what_stable_steps_leave_out(self, device):
+        for options, name in (({"tri_ke": 1e3}, "triangles"), ({}, "springs")):
+            made = builder()
+            add_grid(made, **options)
+            if name == "springs":
+                made.add_spring(0, 7, ke=500.0, kd=1.0, control=0.0)
+            with pytest.warns(UserWarning, match=f"the model has {name} with stiffness, which stable_dt") as told:
+                wn.SolverCorotated(made.finalize(device=device), substeps=None)
+            assert len(told) == 1
+            assert told[0].filename == __file__
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UserWarning)
+            wn.SolverCorotated(grid_model(device))
 
     def test_the_stable_step_is_what_it_is_said_to_be(self, device):
         """A little under it a small motion stays small, a little over it does not; without damping and with."""
@@ -321,6 +351,10 @@ class TestBadInput:
         solver = wn.SolverCorotated(model)
         with pytest.raises(wc.InputError, match="state_out has 8 particles; the model has 36"):
             solver.step(model.state(), other.state(), None, None, 1e-4)
+        with pytest.raises(wc.InputError, match=r"state_in is None; it must be a newton.State"):
+            solver.step(None, model.state(), None, None, 1e-4)
+        with pytest.raises(wc.InputError, match="state_out is a SimpleNamespace"):
+            solver.step(model.state(), SimpleNamespace(particles=3), None, None, 1e-4)
         with pytest.raises(wc.InputError, match="control has 5 tet_activations"):
             solver.step(model.state(), model.state(), other.control(), None, 1e-4)
 

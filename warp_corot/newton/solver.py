@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from numbers import Real
 from typing import Any
 
 import warp as wp
 
 from ..errors import InputError
 from .contact import Contacts
-from .library import CouplingInterface, SolverBase, newton
+from .library import CouplingInterface, ModelView, SolverBase, newton
 from .others import Others
-from .stability import stable_step
+from .stability import stable_step, warn_of_left_out
 from .state import STATE, attribute_of, register_custom_attributes
 from .steps import Steps
 from .tetrahedra import LAME, Tetrahedra
@@ -51,7 +52,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
             "semi-implicit", what ``SolverSemiImplicit`` makes of them for small strains: mu = 3/4 k_mu,
             lambda = k_lambda - 5/8 k_mu.
         damping: Rate of mass-proportional damping [1/s], besides k_damp.
-        substeps: Into how many steps a step is divided; None: as many as it takes to be stable.
+        substeps: Into how many steps a step is divided; None: as many as tetrahedra and contacts take to be stable.
         rotation: "byers-xu", or "warm": found from the one in the state, ``state.warp_corot.rotation``, so that also
             an inverted element's is continuous in time. It needs ``register_custom_attributes``, and forests then go
             tetrahedron by tetrahedron.
@@ -63,7 +64,9 @@ class SolverCorotated(SolverBase, CouplingInterface):
         stable_dt: The largest stable step [s], where it is known; None: it is found from elements and masses.
 
     Attributes:
-        stable_dt: The largest stable step of the elements about rest [s].
+        stable_dt: The largest stable step of the tetrahedra about rest [s]. Springs, triangles (cloth) and bending
+            edges with stiffness, and joints, are left out of it, of ``contact_dt``, and of ``substeps=None``; of the
+            first three a warning tells.
         contact_dt: The same with contact or an attachment at every particle [s], as stiff as they can be here, with the
             lightest rigid body at its other end.
 
@@ -84,16 +87,18 @@ class SolverCorotated(SolverBase, CouplingInterface):
         particle_contact: bool = False,
         stable_dt: float | None = None,
     ):
-        if lame not in LAME:
+        if not isinstance(model, newton.Model) and not isinstance(model, ModelView):
+            raise InputError(f"model is {_named(model)}; it must be a newton.Model, as builder.finalize() makes it")
+        if not isinstance(lame, str) or lame not in LAME:
             raise InputError(f"lame is {lame!r}; it must be one of {', '.join(LAME)}")
-        if rotation not in ROTATIONS:
+        if not isinstance(rotation, str) or rotation not in ROTATIONS:
             raise InputError(f"rotation is {rotation!r}; it must be one of {', '.join(ROTATIONS)}")
-        if not (math.isfinite(damping) and damping >= 0):
-            raise InputError(f"damping is {damping}; it must be zero or a positive rate in 1/s")
-        if substeps is not None and (isinstance(substeps, bool) or substeps != int(substeps) or substeps < 1):
+        if not (_is_finite(damping) and damping >= 0):
+            raise InputError(f"damping is {damping!r}; it must be zero or a positive rate in 1/s")
+        if substeps is not None and not (_is_finite(substeps) and substeps == int(substeps) and substeps >= 1):
             raise InputError(f"substeps is {substeps!r}; it must be a positive whole number or None")
-        if stable_dt is not None and not stable_dt > 0:
-            raise InputError(f"stable_dt is {stable_dt}; it must be a positive number of seconds or None")
+        if stable_dt is not None and not (isinstance(stable_dt, Real) and stable_dt > 0):
+            raise InputError(f"stable_dt is {stable_dt!r}; it must be a positive number of seconds or None")
         super().__init__(model)
         self.substeps = substeps
         self._given_stable_dt = stable_dt
@@ -103,6 +108,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self._steps = Steps(model, self.tetrahedra, self._contacts, self._others, damping)
         self._all_worlds = wp.ones(max(int(model.world_count), 1) + 1, dtype=wp.bool, device=self.device)
         self._find_stable_steps()
+        warn_of_left_out(model)
 
     @property
     def body_reactions(self) -> wp.array:
@@ -226,8 +232,8 @@ class SolverCorotated(SolverBase, CouplingInterface):
             self.contact_dt = stable_step(*arguments, stiffest, tets.damped, self._contacts.lightest)
 
     def _count_for(self, dt: float) -> int:
-        if not (math.isfinite(dt) and dt > 0):
-            raise InputError(f"dt is {dt}; it must be a positive number of seconds")
+        if not (_is_finite(dt) and dt > 0):
+            raise InputError(f"dt is {dt!r}; it must be a positive number of seconds")
         if self.substeps is None:
             return max(1, math.ceil(dt / (SAFETY * self.contact_dt)))
         if dt / self.substeps > self.stable_dt:
@@ -248,6 +254,8 @@ class SolverCorotated(SolverBase, CouplingInterface):
     ) -> None:
         model = self.model
         for name, state in (("state_in", state_in), ("state_out", state_out)):
+            if getattr(state, "particle_q", self) is self:
+                raise InputError(f"{name} is {_named(state)}; it must be a newton.State, as model.state() makes it")
             if state.particle_q is None or len(state.particle_q) != model.particle_count:
                 there = 0 if state.particle_q is None else len(state.particle_q)
                 raise InputError(f"{name} has {there} particles; the model has {model.particle_count}")
@@ -281,3 +289,12 @@ class SolverCorotated(SolverBase, CouplingInterface):
             found = f"{world_mask.dtype.__name__} {list(world_mask.shape)} on {world_mask.device}"
             raise InputError(f"world_mask is {found}; {wanted}")
         return world_mask
+
+
+def _is_finite(value: Any) -> bool:
+    """Whether something is a finite number."""
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _named(value: Any) -> str:
+    return "None" if value is None else f"a {type(value).__name__}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, cast
@@ -86,3 +87,23 @@ def stable_step(
     if w == 0.0 and c == 0.0:
         return math.inf
     return 4.0 / (c + math.sqrt(c * c + 4.0 * w * w))
+
+
+def warn_of_left_out(model: newton.Model) -> None:
+    """Say in a line what stable steps leave out."""
+    there = [
+        name
+        for name, count, stiffness, columns in (
+            ("springs", model.spring_count, model.spring_stiffness, 1),
+            ("triangles", model.tri_count, model.tri_materials, 2),
+            ("bending edges", model.edge_count, model.edge_bending_properties, 1),
+        )
+        if count and np.any(stiffness.numpy().reshape(count, -1)[:, :columns])
+    ]
+    if there:
+        warnings.warn(
+            f"the model has {' and '.join(there)} with stiffness, which stable_dt, contact_dt and substeps=None leave "
+            "out: make steps short enough for them, too",
+            UserWarning,
+            stacklevel=3,
+        )
