@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -180,7 +181,10 @@ class StageSimulation:
             solver: Any = {"semi-implicit": rigid, "none": None}.get(rigid)
             if rigid == "xpbd":
                 solver = newton.solvers.SolverXPBD(model)
-            return SolverCorotated(model, damping=damping, rigid_solver=solver)
+            with warnings.catch_warnings():
+                # Steps are chosen here with what these leave out in mind, and a note says so.
+                warnings.filterwarnings("ignore", "the model has .* which stable_dt")
+                return SolverCorotated(model, damping=damping, rigid_solver=solver)
         except ValueError as error:  # Newton's, and InputError, which is one
             said = str(error).replace(" Give another rigid_solver, or None.", "")
             hint = f"; another than {rigid} can be chosen (--rigid)" if "does not support" in said else ""
