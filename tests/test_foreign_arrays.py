@@ -233,6 +233,18 @@ def test_arrays_that_do_not_fit_are_refused_in_one_line(device):
     assert own == (sim.body.node_loads, sim.body.node_positions)
 
 
+def test_one_array_cannot_be_both(form, device):
+    body = bar(device).body
+    array = form(body.node_count, device)
+    body.use_loads(array)
+    with pytest.raises(wc.InputError, match="positions is the array that loads are read from"):
+        body.use_positions(array)
+    body.use_loads(None)
+    body.use_positions(array)
+    with pytest.raises(wc.InputError, match="loads is the array that positions are written to"):
+        body.use_loads(array)
+
+
 def test_a_body_with_somebodys_array_is_not_remeshed(form, device):
     for name in ("loads", "positions"):
         body = bar(device).body

@@ -56,9 +56,12 @@ class SharedArrays:
                 copy. None for the body's own again, as they were.
 
         Raises:
-            InputError: Not such an array, on another device, or the body is remeshed.
+            InputError: Not such an array, the one positions are written to, on another device, or the body is
+                remeshed.
         """
         given = None if loads is None else self._shared(loads, "loads")
+        if given is not None and given.ptr == self.node_positions.ptr:
+            raise InputError("loads is the array that positions are written to; it must be another")
         if self._own_loads is None:
             self._own_loads = (self.node_loads, self.has_loads)
         before = self.node_loads, self.has_loads
@@ -83,6 +86,8 @@ class SharedArrays:
         given = None if positions is None else vec3_view(self._shared(positions, "positions"))
         if given is not None and abs(given.strides[0]) < wp.types.type_size_in_bytes(wp.vec3):
             raise InputError(f"positions has {given.strides[0]} bytes from node to node; no two nodes may overlap")
+        if given is not None and given.ptr == self.node_loads.ptr:
+            raise InputError("positions is the array that loads are read from; it must be another")
         before = self.node_positions
         if self._own_positions is None:
             # Only here: an array that somebody takes back may be gone by now.
