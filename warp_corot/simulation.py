@@ -17,12 +17,12 @@ import warp as wp
 from .body import SoftBody
 from .checks import checked_count
 from .elasticity import Corotated, Model
-from .errors import InputError, StabilityWarning, UnstableError
+from .errors import InputError, StabilityWarning, UnstableError, depth_of_user
 from .indices import checked_indices
 from .nodal import vec3_view
 from .parts import checked_bodies, checked_gravity, checked_integrator, checked_models
 from .remesh.online import OnlineRemesh
-from .remesh.remeshing import Remeshing, depth_of_user
+from .remesh.remeshing import Remeshing
 from .solvers import Integrator, SymplecticEuler, largest_frequency
 from .solvers.integrator import StepContext
 from .solvers.recorded import GRAPH_STEPS, RecordedSteps

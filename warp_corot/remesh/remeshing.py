@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-import sys
 import warnings
 from collections.abc import Sequence
-from types import FrameType
 from typing import TYPE_CHECKING
 
-from ..errors import CapacityWarning, InputError
+from ..errors import CapacityWarning, InputError, depth_of_user
 from .online import OnlineRemesh
 
 if TYPE_CHECKING:
@@ -94,19 +92,6 @@ class Remeshing:
     def step_may_change(self) -> bool:
         """Whether the stable step is to be found anew; to be asked once a pass."""
         return any([changing.survey.step_may_change() for changing in self.changing if changing is not None])
-
-
-def depth_of_user() -> int:
-    """How many calls above the one that warns the first is that is not this package's.
-
-    ``step`` is not as deep as ``advance``, and what is said at a line of the package is said there once for all
-    simulations.
-    """
-    frame: FrameType | None = sys._getframe(1)
-    depth, package = 1, __name__.partition(".")[0]
-    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == package:
-        frame, depth = frame.f_back, depth + 1
-    return depth
 
 
 def _one_each(
