@@ -31,14 +31,23 @@ def home_slot(key: wp.int64, mask: int):
 
 
 @wp.func
-def find_midpoint(a: int, b: int, keys: wp.array[wp.int64], values: wp.array[wp.int32]):
-    """The node at the middle of an edge, -1 where there is none."""
+def find_slot(a: int, b: int, keys: wp.array[wp.int64]):
+    """Where an edge stands in a table, or -1."""
     key = edge_key(a, b)
     mask = keys.shape[0] - 1
     slot = home_slot(key, mask)
     while keys[slot] != key and keys[slot] != EMPTY:
         slot = (slot + 1) & mask
     if keys[slot] == key:
+        return slot
+    return -1
+
+
+@wp.func
+def find_midpoint(a: int, b: int, keys: wp.array[wp.int64], values: wp.array[wp.int32]):
+    """The node at the middle of an edge, -1 where there is none."""
+    slot = find_slot(a, b, keys)
+    if slot >= 0:
         return values[slot]
     return -1
 

@@ -12,6 +12,7 @@ from typing import Any
 import warp as wp
 
 from .elements import load_node, store_node
+from .keyframes import key_before
 
 wp.set_module_options({"enable_backward": False})
 
@@ -131,16 +132,10 @@ def follow_trajectory(
     i = nodes[k]
     start = world_starts[i // world_node_count]
     t = (wp.float64(clock[0] + wp.int64(offset + 1)) - start) * wp.float64(dt)
-    last = times.shape[0] - 1
-    key = int(0)
-    while key < last - 1 and times[key + 1] <= t:
-        key += 1
-    s = (t - times[key]) / (times[wp.min(key + 1, last)] - times[key])
-    s = wp.clamp(s, wp.float64(0.0), wp.float64(1.0))
+    key, s = key_before(times, t)
     row = wp.min(k, displacements.shape[1] - 1)
     a = displacements[key, row]
-    b = displacements[wp.min(key + 1, last), row]
-    target = a + float(s) * (b - a)
+    target = a + s * (displacements[key + 1, row] - a)
     store_node(v, i, (target - load_node(u, i)) / dt)
 
 

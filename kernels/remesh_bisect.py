@@ -3,7 +3,7 @@
 import warp as wp
 
 from .bisection import first_half, halfway, refinement_end, second_half
-from .growth import LIVE
+from .growth import LIVE, find_slot
 from .remesh import (
     ADDED,
     BIRTHS,
@@ -18,7 +18,7 @@ from .remesh import (
     WANTED,
     Pools,
 )
-from .remesh_edges import LOW_HALF, WantedEdges, find_slot
+from .remesh_edges import LOW_HALF, WantedEdges
 from .remesh_state import Carried, copy_to_children, make_node, quarter_mass
 from .shapes import FRAME_SHIFT
 from .springs import FIRST_NODE, SECOND_NODE

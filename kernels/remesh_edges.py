@@ -8,7 +8,7 @@ inwards, and each single bisection leaves the mesh conforming: it may stop at an
 import warp as wp
 
 from .bisection import refinement_end
-from .growth import EMPTY, LIVE, claim_slot, edge_key, home_slot
+from .growth import EMPTY, LIVE, claim_slot, edge_key, find_slot
 from .remesh import (
     BIRTHS,
     FIRST_NEW,
@@ -46,19 +46,6 @@ class WantedEdges:
     pairs: wp.array[wp.int32]  # where its pairs begin among those that are taken in a round
     wanted: wp.array[wp.int32]  # slots of all wanted edges
     most: int  # so many edges can be wanted in a pass
-
-
-@wp.func
-def find_slot(a: int, b: int, keys: wp.array[wp.int64]):
-    """Where an edge stands in the table, or -1."""
-    key = edge_key(a, b)
-    mask = keys.shape[0] - 1
-    slot = home_slot(key, mask)
-    while keys[slot] != key and keys[slot] != EMPTY:
-        slot = (slot + 1) & mask
-    if keys[slot] == key:
-        return slot
-    return -1
 
 
 @wp.func
