@@ -1,4 +1,4 @@
-"""What tests of other people's arrays and programs share: a body, and arrays of every form that it takes."""
+"""What tests of other people's arrays and programs share: a body, arrays of every form that it takes, slow work."""
 
 import io
 
@@ -20,6 +20,15 @@ def bar(device, *, level=3, worlds=1, gravity=(0.0, 0.0, 0.0), fixed=True, model
         body.fix(mesh.points[:, 2] < 1e-9)
     integrator = wc.SymplecticEuler(dt=DT, damping=damping)
     return wc.Simulation(body, model=model, integrator=integrator, gravity=gravity, deterministic=True)
+
+
+@wp.kernel(enable_backward=False)
+def dawdle(rounds: int, done: wp.array[wp.float32]):
+    """One thread that takes a while, and whose outcome cannot be known without."""
+    x = done[0]
+    for _ in range(rounds):
+        x = wp.sin(x) + 1.0
+    done[0] = x
 
 
 def vec3(n, device):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from foreign import FORMS, allocates, bar, read, three_of, vec3, vec3_among_others, vec4, write
+from foreign import FORMS, allocates, bar, dawdle, read, three_of, vec3, vec3_among_others, vec4, write
 
 import warp_corot as wc
 
@@ -23,15 +23,6 @@ def look(positions: wp.array[wp.vec3], seen: wp.array[wp.vec3]):
     """What comes after a step: a running sum that depends on every step's positions."""
     i = wp.tid()
     seen[i] = 0.5 * seen[i] + RATE * positions[i]
-
-
-@wp.kernel(enable_backward=False)
-def dawdle(rounds: int, done: wp.array[wp.float32]):
-    """One thread that takes a while, and whose outcome cannot be known without."""
-    x = done[0]
-    for _ in range(rounds):
-        x = wp.sin(x) + 1.0
-    done[0] = x
 
 
 class Stranger:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+from foreign import dawdle
 from newton_scenes import adaptive_forest, add_grid, builder, checked_step, newton, run, wc, wn
 
 WORLDS = 64
@@ -159,8 +160,8 @@ def test_substeps_are_taken_all_or_none(device, in_place, recorded):
         assert np.abs(has[0] - had[0]).max() > 0
 
 
-def test_nothing_is_allocated_after_the_first_step(device, monkeypatch):
-    """Forests, general tetrahedra, contact, attachments and attributes, substeps and resets."""
+def with_everything(device, substeps=1):
+    """A solver with forests, general tetrahedra, contact, attachments and attributes, and the arguments of a step."""
     made = builder()
     made.add_ground_plane()
     wn.register_custom_attributes(made)
@@ -169,12 +170,16 @@ def test_nothing_is_allocated_after_the_first_step(device, monkeypatch):
     body = made.add_link(mass=1.0, inertia=wp.mat33(np.eye(3)))
     made.add_attachment_particle_body(0, body, stiffness=100.0)
     model = made.finalize(device=device)
-    solver = wn.SolverCorotated(model, substeps=2)
     pipeline = newton.CollisionPipeline(model)
-    before, after, control, contacts = model.state(), model.state(), model.control(), pipeline.contacts()
+    before, contacts = model.state(), pipeline.contacts()
     pipeline.collide(before, contacts)
-    solver.step(before, after, control, contacts, 1e-4)
-    solver.reset(after)
+    return wn.SolverCorotated(model, substeps=substeps), (before, model.state(), model.control(), contacts, 1e-4)
+
+
+def test_nothing_is_allocated_after_the_first_step(device, monkeypatch):
+    solver, arguments = with_everything(device, substeps=2)
+    solver.step(*arguments)
+    solver.reset(arguments[1])
     asked = []
     for allocator in {wp.get_device_allocator(device), wp.get_device_allocator("cpu")}:
         allocate = allocator.allocate
@@ -184,6 +189,57 @@ def test_nothing_is_allocated_after_the_first_step(device, monkeypatch):
     wp.zeros(1, device=device)
     assert len(asked) == 1
     for _ in range(3):
-        solver.step(before, after, control, contacts, 1e-4)
-        solver.reset(after)
+        solver.step(*arguments)
+        solver.reset(arguments[1])
     assert len(asked) == 1
+
+
+def test_steps_do_not_wait_for_the_device(device):
+    """They come back while work that was queued before them, and takes long, is still going on."""
+    if not wp.get_device(device).is_cuda:
+        pytest.skip("the CPU has no queue")
+    solver, arguments = with_everything(device, substeps=2)
+    done = wp.zeros(1, dtype=wp.float32, device=device)
+    wp.launch(dawdle, dim=1, inputs=[1], outputs=[done], device=device)
+    solver.step(*arguments)
+    solver.reset(arguments[1])
+    wp.synchronize_device(device)
+    wp.launch(dawdle, dim=1, inputs=[30_000_000], outputs=[done], device=device)
+    dawdled = wp.record_event(wp.Event(device))
+    for _ in range(20):
+        solver.step(*arguments)
+        solver.reset(arguments[1])
+    assert not dawdled.is_complete
+    solver.check()
+    assert dawdled.is_complete
+
+
+def test_steps_on_somebody_elses_stream(device):
+    """A stream that waits for nobody: whatever ran on another one would come too early."""
+    if not wp.get_device(device).is_cuda:
+        pytest.skip("streams are for CUDA")
+    ends = []
+    for stream in (wp.get_stream(device), wp.Stream(device)):
+        solver, arguments = with_everything(device)
+        before, after, *_ = arguments
+        wp.synchronize_device(device)
+        rest, x = wp.clone(before.particle_q), before.particle_q
+        done = wp.zeros(1, dtype=wp.float32, device=device)
+        wp.launch(dawdle, dim=1, inputs=[1], outputs=[done], device=device)
+        wp.synchronize_device(device)
+        with wp.ScopedStream(stream, sync_enter=False):
+            for _ in range(5):
+                x.fill_(wp.vec3(np.nan))
+                wp.launch(dawdle, dim=1, inputs=[200_000], outputs=[done], device=device)
+                wp.copy(x, rest)
+                solver.step(*arguments)
+                wp.copy(rest, after.particle_q)
+                wp.copy(before.particle_qd, after.particle_qd)
+            with wp.ScopedCapture(stream=stream) as capture:
+                solver.step(*arguments)
+            wp.capture_launch(capture.graph)
+        wp.synchronize_stream(stream)
+        solver.check()
+        ends.append(after.particle_qd.numpy())
+    assert np.abs(ends[0]).max() > 1e-4
+    np.testing.assert_allclose(ends[1], ends[0], rtol=1e-4, atol=1e-6)
