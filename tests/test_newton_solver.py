@@ -99,8 +99,12 @@ class TestParticles:
         both.particle_q.assign(x)
         solver.step(before, after, None, None, 1e-4)
         solver.step(both, both, None, None, 1e-4)
-        np.testing.assert_array_equal(after.particle_q.numpy(), both.particle_q.numpy())
-        np.testing.assert_array_equal(after.particle_qd.numpy(), both.particle_qd.numpy())
+        # CUDA adds forces up in any order.
+        few = 0.0 if model.device.is_cpu else 2e-6
+        for name in ("particle_q", "particle_qd"):
+            a, b = (getattr(state, name).numpy() for state in (after, both))
+            np.testing.assert_allclose(a, b, rtol=0, atol=few * np.abs(a).max())
+        assert np.abs(after.particle_qd.numpy()).max() > 0.01
 
     def test_substeps_are_steps(self, device):
         model = grid_model(device, fix_left=True)
