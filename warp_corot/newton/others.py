@@ -14,7 +14,12 @@ import numpy as np
 import warp as wp
 
 from ..errors import InputError
+from ..kernels.newton_linear import scatter_bending, scatter_springs, scatter_triangles
 from .library import ModelView, SolverBase, SolverSemiImplicit, newton
+
+#: Contacts with other particles that one is in, in a heap of them, for how stiff these are together. Those of two that
+#: move against each other count twice, and those on opposite sides as the square of their directions' cosines.
+CONTACTS = 4.0
 
 
 class Others:
@@ -28,6 +33,8 @@ class Others:
     Attributes:
         has_particles: Whether particles are integrated here, as something besides tetrahedra acts on them.
         has_bodies: Whether bodies are.
+        damped: Whether springs, triangles or bending edges have dampers.
+        contact: Stiffness [N/m] and damping [N s/m] of particles' contacts with one another, at each of them.
     """
 
     def __init__(self, model: newton.Model, rigid_solver: SolverBase | str | None, particle_contact: bool):
@@ -35,10 +42,11 @@ class Others:
         if not own and rigid_solver is not None and not isinstance(rigid_solver, SolverBase):
             raise InputError(f"rigid_solver is {rigid_solver!r}; it must be 'semi-implicit', a solver or None")
         self.model = model
+        self._particle_contact = particle_contact
         if own or rigid_solver is None:
             _warn_of_ignored(model)
-        triangles = bool(model.tri_count) and bool(np.any(model.tri_materials.numpy()))
-        edges = bool(model.edge_count) and bool(np.any(model.edge_bending_properties.numpy()))
+        self._triangles = triangles = bool(model.tri_count) and bool(np.any(model.tri_materials.numpy()))
+        self._edges = edges = bool(model.edge_count) and bool(np.any(model.edge_bending_properties.numpy()))
         self.has_particles = bool(model.spring_count) or triangles or edges or particle_contact
         self.has_bodies = bool(model.body_count) and rigid_solver is not None
         self._rigid = rigid_solver if isinstance(rigid_solver, SolverBase) else None
@@ -63,6 +71,52 @@ class Others:
         #: Copies of contacts in which there are none of particles, by the contacts they are of.
         self._rigid_contacts: tuple[newton.Contacts, newton.Contacts] | None = None
         self._particle_f = wp.empty(model.particle_count, dtype=wp.vec3, device=model.device)
+        #: Stiffness and damping that were last taken over.
+        self._seen: list[np.ndarray] = []
+        self.refresh()
+
+    def refresh(self) -> bool:
+        """Take over how stiff and damped everything is at present.
+
+        Returns:
+            Whether that is otherwise than when this was last called.
+        """
+        model = self.model
+        present: list[np.ndarray] = [np.zeros(2)]
+        dampers = [0.0]
+        if self._particle_contact and model.particle_grid is not None:
+            present[0] = CONTACTS * np.array([model.particle_ke, model.particle_kd], np.float64)
+        if model.spring_count:
+            present += [model.spring_stiffness.numpy().copy(), model.spring_damping.numpy().copy()]
+            dampers.append(float(present[-1].max()))
+        if self._triangles:
+            present.append(model.tri_materials.numpy()[:, :3].copy())
+            dampers.append(float(present[-1][:, 2].max()))
+        if self._edges:
+            present.append(model.edge_bending_properties.numpy().copy())
+            dampers.append(float(present[-1][:, 1].max()))
+        self.contact = float(present[0][0]), float(present[0][1])
+        self.damped = max(dampers) > 0.0
+        same = len(present) == len(self._seen) and all(map(np.array_equal, present, self._seen))
+        self._seen = present
+        return not same
+
+    def add_linear_forces(self, u: wp.array, f: wp.array, damping: bool) -> None:
+        """Add the forces of small displacements from the model's initial positions, or of velocities there, vec4 [P].
+
+        Contact of particles with one another is none of them.
+        """
+        model, x = self.model, self.model.particle_q
+        if model.spring_count:
+            modulus = model.spring_damping if damping else model.spring_stiffness
+            inputs = [x, model.spring_indices, model.spring_rest_length, modulus, int(damping), u]
+            wp.launch(scatter_springs, dim=model.spring_count, inputs=inputs, outputs=[f], device=model.device)
+        if self._triangles:
+            inputs = [x, model.tri_indices, model.tri_poses, model.tri_materials, int(damping), u]
+            wp.launch(scatter_triangles, dim=model.tri_count, inputs=inputs, outputs=[f], device=model.device)
+        if self._edges:
+            inputs = [x, model.edge_indices, model.edge_bending_properties, int(damping), u]
+            wp.launch(scatter_bending, dim=model.edge_count, inputs=inputs, outputs=[f], device=model.device)
 
     @property
     def particle_forces(self) -> wp.array:

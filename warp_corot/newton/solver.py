@@ -12,7 +12,7 @@ from ..errors import InputError
 from .contact import Contacts
 from .library import CouplingInterface, ModelView, SolverBase, newton
 from .others import Others
-from .stability import stable_step, warn_of_left_out
+from .stability import stable_step
 from .state import STATE, attribute_of, register_custom_attributes
 from .steps import Steps
 from .tetrahedra import LAME, Tetrahedra
@@ -52,7 +52,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
             "semi-implicit", what ``SolverSemiImplicit`` makes of them for small strains: mu = 3/4 k_mu,
             lambda = k_lambda - 5/8 k_mu.
         damping: Rate of mass-proportional damping [1/s], besides k_damp.
-        substeps: Into how many steps a step is divided; None: as many as tetrahedra and contacts take to be stable.
+        substeps: Into how many steps a step is divided; None: as many as ``contact_dt`` takes to be stable.
         rotation: "byers-xu", or "warm": found from the one in the state, ``state.warp_corot.rotation``, so that also
             an inverted element's is continuous in time. It needs ``register_custom_attributes``, and forests then go
             tetrahedron by tetrahedron.
@@ -64,11 +64,10 @@ class SolverCorotated(SolverBase, CouplingInterface):
         stable_dt: The largest stable step [s], where it is known; None: it is found from elements and masses.
 
     Attributes:
-        stable_dt: The largest stable step of the tetrahedra about rest [s]. Springs, triangles (cloth) and bending
-            edges with stiffness, and joints, are left out of it, of ``contact_dt``, and of ``substeps=None``; of the
-            first three a warning tells.
+        stable_dt: The largest stable step about rest [s], of tetrahedra, springs, triangles (cloth) and bending edges
+            with their damping. Joints are left out of it, of ``contact_dt``, and of ``substeps=None``.
         contact_dt: The same with contact or an attachment at every particle [s], as stiff as they can be here, with the
-            lightest rigid body at its other end.
+            lightest rigid body at its other end; with ``particle_contact``, among other particles, too.
 
     Raises:
         InputError: No tetrahedra, a material that is not positive definite, or an option out of its range.
@@ -108,7 +107,6 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self._steps = Steps(model, self.tetrahedra, self._contacts, self._others, damping)
         self._all_worlds = wp.ones(max(int(model.world_count), 1) + 1, dtype=wp.bool, device=self.device)
         self._find_stable_steps()
-        warn_of_left_out(model)
 
     @property
     def body_reactions(self) -> wp.array:
@@ -204,7 +202,8 @@ class SolverCorotated(SolverBase, CouplingInterface):
         bits = newton.ModelFlags
         elements, before = False, (self._contacts.stiffest, self._contacts.lightest)
         if flags & bits.MODEL_PROPERTIES:
-            elements = self.tetrahedra.refresh()
+            changed = [self.tetrahedra.refresh(), self._others.refresh()]
+            elements = any(changed)
         of_contacts = bits.SHAPE_PROPERTIES | bits.CONSTRAINT_PROPERTIES | bits.MODEL_PROPERTIES
         if flags & (of_contacts | bits.BODY_PROPERTIES | bits.BODY_INERTIAL_PROPERTIES):
             self._contacts.refresh()
@@ -223,13 +222,14 @@ class SolverCorotated(SolverBase, CouplingInterface):
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _find_stable_steps(self) -> None:
-        tets = self.tetrahedra
-        arguments = self.model, tets.elements, tets.mu, tets.lam
-        given, stiffest = self._given_stable_dt, self._contacts.stiffest
-        self.stable_dt = stable_step(*arguments, 0.0, tets.damped) if given is None else float(given)
-        self.contact_dt = self.stable_dt
-        if stiffest > 0 and given is None:
-            self.contact_dt = stable_step(*arguments, stiffest, tets.damped, self._contacts.lightest)
+        tets, others, contacts = self.tetrahedra, self._others, self._contacts
+        given = self._given_stable_dt
+        self.stable_dt = self.contact_dt = stable_step(tets, others) if given is None else float(given)
+        stiffness, damping = others.contact
+        stiffness += contacts.stiffest
+        if given is None and (stiffness > 0 or damping > 0):
+            of_bodies = contacts.stiffest * contacts.lightest
+            self.contact_dt = stable_step(tets, others, stiffness, damping, of_bodies)
 
     def _count_for(self, dt: float) -> int:
         if not (_is_finite(dt) and dt > 0):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, cast
@@ -18,6 +17,8 @@ from ..kernels.forces import scatter_forces
 from ..kernels.lanczos import add_scaled
 from ..solvers import largest_frequency
 from .library import newton
+from .others import Others
+from .tetrahedra import Tetrahedra
 
 
 class _Particles:
@@ -33,21 +34,23 @@ class _Particles:
         self.smallest_volume = float(volumes.min())
 
 
-class _Springs:
-    """Forces of small displacements from rest: of elements, and of a spring at every particle.
+class _SmallMotions:
+    """Forces of small displacements from rest, or of velocities there: of elements, of what else there is, and of a
+    spring or damper at every particle.
 
     Elements turn with their rotations; where there are none to speak of, the model is linear elasticity.
     """
 
-    def __init__(self, elements: Any, mu: wp.array, lam: wp.array, stiffness: float):
-        self.elements, self.stiffness = elements, stiffness
+    def __init__(self, elements: Any, mu: wp.array, lam: wp.array, others: Others, damping: bool, at_particles: float):
+        self.elements, self.others, self.damping, self.at_particles = elements, others, damping, at_particles
         self.lame = [mu, lam, 1]
         self.kernel = scatter_forces(GeneralElements, linear_stress)
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
         count = len(self.elements.volume)
         wp.launch(self.kernel, dim=count, inputs=[self.elements, *self.lame, u], outputs=[f], device=u.device)
-        wp.launch(add_scaled, dim=len(u), inputs=[-self.stiffness, u], outputs=[f], device=u.device)
+        self.others.add_linear_forces(u, f, self.damping)
+        wp.launch(add_scaled, dim=len(u), inputs=[-self.at_particles, u], outputs=[f], device=u.device)
 
     @contextmanager
     def state_kept(self) -> Iterator[None]:
@@ -55,55 +58,32 @@ class _Springs:
 
 
 def stable_step(
-    model: newton.Model,
-    elements: Any,
-    mu: wp.array,
-    lam: wp.array,
-    stiffness: float,
-    damped: bool,
-    lightest: float = 0.0,
+    tets: Tetrahedra, others: Others, stiffness: float = 0.0, damping: float = 0.0, of_bodies: float = 0.0
 ) -> float:
     """The largest stable step of symplectic Euler about rest [s]; infinite if nothing can move.
 
-    With the largest frequency w and the largest rate of damping c (each of its own motion, so that this is never too
-    large) it is stable while w^2 dt^2 + 2 c dt < 4.
+    With the largest frequency w and the largest rate of damping c it is stable while w^2 dt^2 + 2 c dt < 4: w^2 and c
+    are the largest eigenvalues of M^-1 K and M^-1 C, each of its own motion, so that this is never too large. They are
+    those of tetrahedra at rest and of springs, triangles and bending edges about the model's initial positions, all
+    together.
 
     Args:
-        elements: All tetrahedra.
-        mu, lam: Lamé's parameters [Pa], float32 [T].
+        tets, others: What there is.
         stiffness: Of a spring at every particle [N/m], for contact.
-        damped: Whether there is any k_damp.
-        lightest: Inverse mass of the lightest body at the other end of such a spring [1/kg]; 0: none moves. Bodies that
+        damping: Of a damper at every particle [N s/m].
+        of_bodies: Stiffness over mass at the other end of such a spring [1/s^2]; 0: nothing moves there. Bodies that
             are touched in several places need no shorter steps; see ``kernels.newton_contacts``.
     """
-    body = cast(Any, _Particles(model, elements.volume.numpy().astype(np.float64)))
-    w = largest_frequency(body, cast(Any, _Springs(elements, mu, lam, stiffness)))
-    w = math.sqrt(w * w + stiffness * lightest)
+    model = tets.model
+    body = cast(Any, _Particles(model, tets.elements.volume.numpy().astype(np.float64)))
+    motions = _SmallMotions(tets.elements, tets.mu, tets.lam, others, False, stiffness)
+    w = math.sqrt(largest_frequency(body, cast(Any, motions)) ** 2 + of_bodies)
     c = 0.0
-    if damped:
+    if tets.damped or others.damped or damping > 0:
         viscosity = model.tet_materials.numpy().reshape(-1, 3)[:, 2]
         half, whole = (wp.array(s * viscosity, dtype=wp.float32, device=model.device) for s in (0.5, 1.0))
-        c = largest_frequency(body, cast(Any, _Springs(elements, half, whole, 0.0))) ** 2
+        motions = _SmallMotions(tets.elements, half, whole, others, True, damping)
+        c = largest_frequency(body, cast(Any, motions)) ** 2
     if w == 0.0 and c == 0.0:
         return math.inf
     return 4.0 / (c + math.sqrt(c * c + 4.0 * w * w))
-
-
-def warn_of_left_out(model: newton.Model) -> None:
-    """Say in a line what stable steps leave out."""
-    there = [
-        name
-        for name, count, stiffness, columns in (
-            ("springs", model.spring_count, model.spring_stiffness, 1),
-            ("triangles", model.tri_count, model.tri_materials, 2),
-            ("bending edges", model.edge_count, model.edge_bending_properties, 1),
-        )
-        if count and np.any(stiffness.numpy().reshape(count, -1)[:, :columns])
-    ]
-    if there:
-        warnings.warn(
-            f"the model has {' and '.join(there)} with stiffness, which stable_dt, contact_dt and substeps=None leave "
-            "out: make steps short enough for them, too",
-            UserWarning,
-            stacklevel=3,
-        )
