@@ -156,6 +156,26 @@ def step_particles(
 
 
 @wp.kernel(enable_backward=False)
+def damp_particles(
+    # In
+    dt: float,
+    damping: float,
+    inverse_mass: wp.array[wp.float32],
+    flags: wp.array[wp.int32],
+    # In and out
+    q: wp.array[wp.vec3],
+    qd: wp.array[wp.vec3],
+):
+    """What ``step_particles`` has of damping, after a step that was taken without."""
+    i = wp.tid()
+    if inverse_mass[i] > 0.0 and (flags[i] & ACTIVE) != 0:
+        velocity = qd[i]
+        slower = velocity / (1.0 + dt * damping)
+        q[i] += dt * (slower - velocity)
+        qd[i] = slower
+
+
+@wp.kernel(enable_backward=False)
 def unpad(a: wp.array[wp.vec4], b: wp.array[wp.vec3]):
     i = wp.tid()
     b[i] = load_node(a, i)

@@ -203,6 +203,9 @@ class Steps:
             self._launch(kernels.step_particles, model.particle_count, inputs, outputs)
         if others.has_bodies or others.has_particles:
             others.step(now, out, control, contacts, dt, self._body_f if others.has_bodies else now.body_f)
+        if others.has_particles and self.damping > 0:
+            inputs = [dt, self.damping, model.particle_inv_mass, model.particle_flags]
+            self._launch(kernels.damp_particles, model.particle_count, inputs, [out.particle_q, out.particle_qd])
         if others.has_bodies:
             inputs = [out.body_q, out.body_qd, model.body_world, int(worlds.UNSTABLE)]
             self._launch(worlds.check_bodies, model.body_count, inputs, [self._trouble])
