@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -27,8 +26,6 @@ CHUNK = 16
 RIGID = ("semi-implicit", "xpbd", "none")
 #: Longest step where rigid bodies touch something [s].
 RIGID_STEP = 5e-4
-#: The same with cloth, of which the largest stable step is not known.
-CLOTH_STEP = 2e-4
 
 
 class StageSimulation:
@@ -181,10 +178,7 @@ class StageSimulation:
             solver: Any = {"semi-implicit": rigid, "none": None}.get(rigid)
             if rigid == "xpbd":
                 solver = newton.solvers.SolverXPBD(model)
-            with warnings.catch_warnings():
-                # Steps are chosen here with what these leave out in mind, and a note says so.
-                warnings.filterwarnings("ignore", "the model has .* which stable_dt")
-                return SolverCorotated(model, damping=damping, rigid_solver=solver)
+            return SolverCorotated(model, damping=damping, rigid_solver=solver)
         except ValueError as error:  # Newton's, and InputError, which is one
             said = str(error).replace(" Give another rigid_solver, or None.", "")
             hint = f"; another than {rigid} can be chosen (--rigid)" if "does not support" in said else ""
@@ -199,9 +193,6 @@ class StageSimulation:
             longest = min(SAFETY * self.solver.contact_dt, 1.0 / self.fps)
             if self.parts.rigid:
                 longest = min(longest, RIGID_STEP)
-            if self.parts.cloth:
-                longest = min(longest, CLOTH_STEP)
-                self.parts.notes.append(f"there is cloth, with which steps are at most {1e3 * CLOTH_STEP:g} ms (--dt)")
         count = steps_per_frame(self.fps, longest)
         self._chunk = min(count, CHUNK)
         self.steps = -(-count // self._chunk) * self._chunk
