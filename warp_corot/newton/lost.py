@@ -10,12 +10,29 @@ import numpy.typing as npt
 from ..mesh.surface import boundary_faces
 from .library import newton
 
+_REPAIR = (
+    "build with warp_corot.newton.add_mesh(builder, warp_corot.TetMesh(points, tets), ...), which turns them round"
+)
+
+
+def why_none(model: newton.Model) -> str:
+    """In a line, why a model has no tetrahedra, and what to do."""
+    bodies = 0 if model.volume_particle_start is None else len(model.volume_particle_start)
+    if not bodies:
+        return "the model has no tetrahedra; add some with add_soft_mesh, add_soft_grid or add_forest"
+    labels = [str(label) for label in model.volume_label]
+    named = f"{bodies} soft bod{'y' if bodies == 1 else 'ies'} ({', '.join(labels[:3])}{', ...' * (bodies > 3)})"
+    return (
+        f"the model has no tetrahedra, though {named}: Newton's builder leaves out wrongly wound tetrahedra, mass and "
+        f"all, and these are all so; {_REPAIR}"
+    )
+
 
 def warn_of_lost(model: newton.Model, tets: npt.NDArray[np.integer]) -> None:
     """Say it where soft bodies of a model seem to lack tetrahedra.
 
     Their surface triangles were found from all tetrahedra: with some left out, these have more faces that are no
-    other's. Or particles are in none at all.
+    other's. Or particles are in none at all, and the triangles do not show that no tetrahedron ever had them.
     """
     if model.volume_particle_start is None or not len(model.volume_particle_start):
         return
@@ -26,17 +43,19 @@ def warn_of_lost(model: newton.Model, tets: npt.NDArray[np.integer]) -> None:
         of_body[first_tet:last_tet] = True
     single = in_body.copy()
     single[tets] = False
-    lost = [f"{np.count_nonzero(single)} particles of soft bodies are in no tetrahedron"] if single.any() else []
+    surface = faces = 0
     if model.tri_count:
         triangles = model.tri_indices.numpy().reshape(-1, 3)
-        surface = np.count_nonzero(in_body[triangles].all(axis=1))
+        surface = int(np.count_nonzero(in_body[triangles].all(axis=1)))
         faces = len(boundary_faces(tets[of_body])[0])
-        if faces > surface > 0:
-            lost.append(f"soft bodies with {surface} surface triangles have {faces} outer faces")
+    lost = []
+    if single.any() and not faces == surface > 0:
+        lost.append(f"{np.count_nonzero(single)} particles of soft bodies are in no tetrahedron")
+    if faces > surface > 0:
+        lost.append(f"soft bodies with {surface} surface triangles have {faces} outer faces")
     if lost:
         warnings.warn(
-            f"{' and '.join(lost)}: Newton's builder leaves out wrongly wound tetrahedra, mass and all; build with "
-            "warp_corot.newton.add_mesh, which turns them round",
+            f"{' and '.join(lost)}: Newton's builder leaves out wrongly wound tetrahedra, mass and all; {_REPAIR}",
             UserWarning,
             stacklevel=5,
         )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import warp as wp
+from scipy.spatial.transform import Rotation
 
 from ..body import centroids, lumped_masses
 from ..errors import InputError
@@ -48,18 +50,20 @@ def add_forest(
         mesh: The forest.
         material: Its material; Lamé's parameters become ``k_mu`` and ``k_lambda``.
         pos: Where the mesh's origin goes [m].
-        rot: How it is turned, a quaternion (x, y, z, w).
+        rot: How it is turned, a unit quaternion (x, y, z, w).
         vel: Velocity of all its particles [m/s].
         k_damp: Viscosity [Pa s], a number or [T].
         fixed: Nodes that get no mass, so that they are kinematic: mask bool [N] or indices.
-        particle_radius: For contact [m]; None: the builder's default.
+        particle_radius: For contact [m], zero or positive; None: the builder's default.
         surface: Whether triangles without stiffness are added at its boundary, by which viewers draw it.
 
     Returns:
         The particles and tetrahedra, in the forest's order.
 
     Raises:
-        InputError: Not a forest, an anisotropic material, or wrong shapes.
+        InputError: Not a forest, an anisotropic material, an argument of the wrong type or shape or out of its range,
+            or a place so far away that positions in float32 cannot tell the corners of a tetrahedron from one another.
+            Nothing has been added then.
     """
     if not isinstance(mesh, TetForest):
         raise InputError(f"mesh is a {type(mesh).__name__}; add_forest takes a TetForest, add_mesh any tetrahedra")
@@ -117,20 +121,18 @@ def _add(
     material = material.at(centroids(mesh)) if material.functions else material
     material.check_shapes(1, len(mesh.tets))
     share, count = mesh_fill(mesh), len(mesh.tets)
-    values = [np.ravel(share * a) for a in (material.mu, material.lam)] + [np.ravel(np.asarray(k_damp, np.float64))]
-    if values[2].size not in (1, count) or not (np.isfinite(values[2]) & (values[2] >= 0)).all():
-        raise InputError(f"k_damp must be zero or positive [Pa s], a number or one for each of {count} tetrahedra")
-    columns = [np.broadcast_to(column, count) for column in values]
+    columns = [np.broadcast_to(np.ravel(share * a), count) for a in (material.mu, material.lam)]
+    columns.append(np.broadcast_to(_damping(k_damp, count), count))
     velocity = tuple(_vector(vel, 3, "vel"))
-    turn = np.array(wp.quat_to_matrix(wp.normalize(wp.quat(*_vector(rot, 4, "rot"))))).reshape(3, 3)
-    x = mesh.points @ turn.T + _vector(pos, 3, "pos")
+    x = mesh.points @ _rotation(rot).T + _vector(pos, 3, "pos")
     masses = lumped_masses(mesh, material).copy()
     if fixed is not None:
         masses[checked_indices(fixed, len(x), "node")] = 0.0
+    radii = None if radius is None else [_radius(radius)] * len(x)
     tets = right_handed(mesh)
+    _check_resolved(x, tets, pos)
     first, first_tet = builder.particle_count, builder.tet_count
 
-    radii = None if radius is None else [float(radius)] * len(x)
     builder.add_particles([tuple(p) for p in x.tolist()], [velocity] * len(x), masses.tolist(), radii)
     # As ``add_tetrahedron`` does one by one.
     corners = x[tets]
@@ -163,8 +165,55 @@ def right_handed(mesh: TetForest | TetMesh) -> npt.NDArray[np.int32]:
     return tets
 
 
+def _check_resolved(x: npt.NDArray[np.float64], tets: npt.NDArray[np.int32], pos: npt.ArrayLike) -> None:
+    """Refuse a place where rounding to float32 changes the volume of a tetrahedron by more than a tenth."""
+    volumes = signed_volumes(x, tets)
+    rounded = signed_volumes(x.astype(np.float32).astype(np.float64), tets)
+    if not (np.abs(rounded - volumes) < 0.1 * volumes).all():
+        step = float(np.spacing(np.abs(x).max().astype(np.float32)))
+        raise InputError(
+            f"pos is {pos!r}: positions there are {step:.2g} m apart in float32, too coarse for tetrahedra of "
+            f"{volumes.min():.2g} m^3; build nearer to the origin"
+        )
+
+
+def _rotation(given: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """The matrix of a unit quaternion (x, y, z, w), which may be one to rounding in float32, float64 [3, 3]."""
+    rot = _vector(given, 4, "rot")
+    norm = float(np.linalg.norm(rot))
+    if abs(norm - 1.0) > 1e-3:
+        raise InputError(f"rot is {given!r}, of length {norm:.4g}; it must be a unit quaternion (x, y, z, w)")
+    return np.asarray(Rotation.from_quat(rot).as_matrix())
+
+
+def _radius(given: float) -> float:
+    if isinstance(given, bool) or not isinstance(given, Real) or not (math.isfinite(given) and given >= 0):
+        raise InputError(f"particle_radius is {given!r}; it must be zero or a positive number [m], or None")
+    return float(given)
+
+
+def _damping(given: npt.ArrayLike, count: int) -> npt.NDArray[np.float64]:
+    """k_damp [Pa s], float64 [1] or [count]."""
+    values = _numbers(given)
+    wanted = f"k_damp must be zero or positive [Pa s], a number or one for each of {count} tetrahedra"
+    if values is None or values.size not in (1, count):
+        raise InputError(f"{wanted}; it is {repr(given) if np.ndim(given) == 0 else f'of shape {np.shape(given)}'}")
+    bad = np.flatnonzero(~(np.isfinite(values) & (values >= 0)))
+    if len(bad):
+        raise InputError(f"{wanted}; it is {values[bad[0]]:g}{f' in {bad[0]}' if values.size > 1 else ''}")
+    return values
+
+
 def _vector(given: npt.ArrayLike, size: int, name: str) -> npt.NDArray[np.float64]:
-    values = np.asarray(given, dtype=np.float64).ravel()
-    if values.shape != (size,) or not np.isfinite(values).all():
+    values = _numbers(given)
+    if values is None or values.shape != (size,) or not np.isfinite(values).all():
         raise InputError(f"{name} is {given!r}; it must be {size} finite numbers")
     return values
+
+
+def _numbers(given: npt.ArrayLike) -> npt.NDArray[np.float64] | None:
+    """Numbers one after the other, float64 [n], or None if they are no numbers."""
+    try:
+        return np.asarray(given, dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        return None

@@ -24,7 +24,7 @@ from ..kernels.newton_elements import (
 from ..kernels.rotation import quick_rotation
 from .forests import ForestGroup, forest_groups
 from .library import newton
-from .lost import warn_of_lost
+from .lost import warn_of_lost, why_none
 from .state import STATE, attribute_of
 
 #: Threads of a block of the elastic kernel on CUDA: more wait longer for one another (H200: 64 takes 0.86 of 256).
@@ -64,7 +64,7 @@ class Tetrahedra:
 
     def __init__(self, model: newton.Model, lame: str, warm: bool, rotation_level: int | None):
         if not model.tet_count:
-            raise InputError("the model has no tetrahedra; add some with add_soft_mesh, add_soft_grid or add_forest")
+            raise InputError(why_none(model))
         self.model, self.lame, self.warm = model, lame, warm
         self.device = model.device
         self.tets = model.tet_indices.numpy().reshape(-1, 4)

@@ -1,0 +1,122 @@
+"""What is handed to ``add_forest``, ``add_mesh`` and, through Newton's own builder, to the solver: one clear line."""
+
+import numpy as np
+import pytest
+import warp as wp
+from newton_scenes import builder, wc, wn
+from scipy.spatial.transform import Rotation
+
+NAN = float("nan")
+TISSUE = wc.Isotropic(1e4, 0.3, 1000.0)
+
+
+def forest():
+    return wc.TetForest.box((2, 1, 1), 0.2, 1)
+
+
+def mesh():
+    one = forest()
+    return wc.TetMesh(one.points, one.tets)
+
+
+ADDING = [(wn.add_forest, forest), (wn.add_mesh, mesh)]
+BAD = [
+    ({"rot": (0, 0, 0, 0)}, "rot is .*of length 0; it must be a unit quaternion"),
+    ({"rot": (0, 0, 1, 1)}, r"rot is .*of length 1\.414"),
+    ({"rot": (0, 0, 0)}, "rot is .*4 finite numbers"),
+    ({"rot": (0, 0, NAN, 1)}, "rot is .*4 finite numbers"),
+    ({"rot": "upright"}, "rot is 'upright'; it must be 4 finite numbers"),
+    ({"pos": (0, NAN, 0)}, "pos is .*3 finite numbers"),
+    ({"pos": (0, float("inf"), 0)}, "pos is .*3 finite numbers"),
+    ({"pos": 1.0}, "pos is 1.0; it must be 3 finite numbers"),
+    ({"pos": None}, "pos is None"),
+    ({"pos": [(0, 0), 0]}, "pos is .*3 finite numbers"),
+    ({"pos": (0, 0, 1e7)}, "pos is .*1 m apart in float32, too coarse"),
+    ({"vel": (NAN, 0, 0)}, "vel is .*3 finite numbers"),
+    ({"vel": "fast"}, "vel is 'fast'"),
+    ({"k_damp": -1.0}, "k_damp must be .*; it is -1"),
+    ({"k_damp": NAN}, "k_damp must be .*; it is nan"),
+    ({"k_damp": "much"}, "k_damp must be .*; it is 'much'"),
+    ({"k_damp": [1.0, 2.0, 3.0]}, r"k_damp must be .*; it is of shape \(3,\)"),
+    ({"k_damp": [1.0] * 23 + [-2.0]}, "k_damp must be .*; it is -2 in 23"),
+    ({"particle_radius": -0.1}, "particle_radius is -0.1; it must be zero or a positive number"),
+    ({"particle_radius": NAN}, "particle_radius is nan"),
+    ({"particle_radius": "small"}, "particle_radius is 'small'"),
+    ({"particle_radius": [0.1, 0.2]}, "particle_radius is"),
+    ({"fixed": [99]}, "node"),
+    ({"fixed": [0.5]}, "node"),
+]
+
+
+@pytest.mark.parametrize(("add", "made"), ADDING)
+@pytest.mark.parametrize(("options", "message"), BAD)
+def test_bad_arguments_are_one_line_and_add_nothing(add, made, options, message):
+    to = builder()
+    with pytest.raises(wc.InputError, match=message) as said:
+        add(to, made(), TISSUE, **options)
+    assert "\n" not in str(said.value)
+    assert to.particle_count == to.tet_count == to.tri_count == 0
+
+
+@pytest.mark.parametrize(("add", "made"), ADDING)
+def test_what_is_added_is_where_it_is_put(add, made):
+    """Turned by SciPy's rotation of the same quaternion; Warp's types are as good as tuples."""
+    turn, there = Rotation.from_rotvec([0.3, -0.5, 0.8]), np.array([1.0, -2.0, 0.5])
+    quaternion = wp.quat(*turn.as_quat().tolist())
+    to = builder()
+    one = made()
+    options = {"vel": wp.vec3(0.0, 1.0, 2.0), "particle_radius": 0, "k_damp": np.arange(24.0)}
+    added = add(to, one, TISSUE, pos=wp.vec3(*there.tolist()), rot=quaternion, **options)
+    model = to.finalize(device="cpu")
+    np.testing.assert_allclose(model.particle_q.numpy(), turn.apply(one.points) + there, atol=1e-6)
+    np.testing.assert_array_equal(model.particle_qd.numpy(), [[0.0, 1.0, 2.0]] * len(added.particles))
+    np.testing.assert_array_equal(model.particle_radius.numpy(), 0.0)
+    np.testing.assert_array_equal(model.tet_materials.numpy().reshape(-1, 3)[:, 2], np.arange(24.0))
+
+
+def soft_mesh(to, points, tets, label=None):
+    to.add_soft_mesh(
+        pos=wp.vec3(), rot=wp.quat_identity(), scale=1.0, vel=wp.vec3(), vertices=points.tolist(),
+        indices=tets.ravel().tolist(), density=1000.0, k_mu=1e4, k_lambda=1e4, label=label,
+    )  # fmt: skip
+
+
+class TestWhatTheBuilderLeftOut:
+    def test_all_tetrahedra(self, device):
+        """All wrongly wound: Newton's builder has none of them, and it is said which body's, and what to do."""
+        one = mesh()
+        to = builder()
+        soft_mesh(to, one.points, one.tets[:, [1, 0, 2, 3]], "liver")
+        model = to.finalize(device=device)
+        assert model.tet_count == 0
+        with pytest.raises(wc.InputError, match=r"1 soft body \(liver\): .*all so; build with .*add_mesh\(") as said:
+            wn.SolverCorotated(model)
+        assert "\n" not in str(said.value)
+        to = builder()
+        wn.add_mesh(to, wc.TetMesh(one.points, np.ascontiguousarray(one.tets[:, [1, 0, 2, 3]])), TISSUE)
+        assert wn.SolverCorotated(to.finalize(device=device)).model.tet_count == len(one.tets)
+
+    def test_a_model_without_soft_bodies(self, device):
+        to = builder()
+        to.add_particle((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0)
+        with pytest.raises(wc.InputError, match="the model has no tetrahedra; add some with add_soft_mesh"):
+            wn.SolverCorotated(to.finalize(device=device))
+
+    def test_a_tetrahedron_at_a_corner(self, device):
+        """Its corner was in no other; there are fewer outer faces now, not more."""
+        points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 1.0]])
+        to = builder()
+        soft_mesh(to, points, np.array([[0, 1, 2, 3], [2, 1, 3, 4]]))
+        model = to.finalize(device=device)
+        assert (model.tet_count, model.tri_count) == (1, 6)
+        with pytest.warns(UserWarning, match="1 particles of soft bodies are in no tetrahedron.*add_mesh"):
+            wn.SolverCorotated(model)
+
+    @pytest.mark.filterwarnings("error")
+    def test_points_that_no_tetrahedron_has(self, device):
+        """They are nobody's loss: nothing is said of them."""
+        one = mesh()
+        to = builder()
+        soft_mesh(to, np.concatenate([one.points, [[9.0, 9.0, 9.0]]]), one.tets)
+        model = to.finalize(device=device)
+        assert wn.SolverCorotated(model).stable_dt > 0.0
