@@ -45,6 +45,9 @@ what is read, as Newton reads it:
   to rigid bodies, and to what does not move, by which points are held; graphics meshes of a deformable body
   rigid bodies, colliders, joints and the gravity of UsdPhysics; metersPerUnit, kilogramsPerUnit, upAxis, transforms
 
+what touches what: points of soft bodies, and of cloth, touch colliders and rigid bodies, but not one another; rigid
+  bodies touch rigid bodies and colliders
+
 what is written, on top of OUT's sublayer INPUT, which must stay beside it unless --flatten is given:
   of TetMesh prims points, velocities, primvars:vonMises [Pa], one a tetrahedron, and its colours
   of rigid bodies their transforms; of graphics meshes and cloth their points
@@ -60,14 +63,22 @@ what is written, on top of OUT's sublayer INPUT, which must stay beside it unles
     said = parser.add_argument_group("what the stage does not say")
     said.add_argument("--young", type=float, metavar="E", help="Young's modulus [Pa] (default: 20 times the weight of "
                       "a column as high as the body, over its area)")  # fmt: skip
-    said.add_argument("--poisson", type=float, default=0.45, metavar="NU", help="Poisson's ratio (default: 0.45)")
-    said.add_argument("--density", type=float, default=1000.0, metavar="RHO", help="[kg/m^3] (default: 1000)")
+    said.add_argument("--poisson", type=float, metavar="NU", help="Poisson's ratio (default: 0.45)")
+    said.add_argument("--density", type=float, metavar="RHO", help="[kg/m^3] (default: 1000)")
     said.add_argument(
         "--ground",
         default="auto",
         metavar="HEIGHT",
         help="height of a ground plane [m]; auto: under the bodies if nothing is held and no collider stays in place "
         "(default); or none",
+    )
+    said.add_argument(
+        "--radius",
+        type=float,
+        default=0.0,
+        metavar="R",
+        help="how far around each point of soft bodies contact is felt [m]: half of an edge closes the gaps between "
+        "points, through which what is smaller slips, and keeps bodies that far off what they touch (default: 0)",
     )
     said.add_argument(
         "--fix", metavar="EXPR", help='points that are held, such as "z > zmax - 0.01": see simulate --help [m]'
@@ -121,7 +132,7 @@ def run(args: argparse.Namespace) -> int:
 
     gravity = None if args.gravity is None else tuple(args.gravity)
     options = StageOptions(
-        args.young, args.poisson, args.density, gravity, args.viscosity, _ground(args.ground), args.fix
+        args.young, args.poisson, args.density, gravity, args.viscosity, _ground(args.ground), args.fix, args.radius
     )
     if args.fps is not None:
         frame_count(args.duration, args.fps)
@@ -212,7 +223,7 @@ def _summary(source: Path, sim: StageSimulation, writer: SceneWriter, done: Reco
     for body in parts.soft:
         size = f"{len(body.prim.points)} points, {len(body.prim.tets)} tetrahedra"
         material = (
-            f"E = {pressure(float(f'{body.young:.4g}'))}, nu = {body.poisson:.3g}, rho = {body.density:.4g} kg/m^3"
+            f"E = {pressure(float(f'{body.young:.4g}'))}, nu = {body.poisson:.4g}, rho = {body.density:.4g} kg/m^3"
         )
         rows.append(("soft body", f"{body.prim.path}: {size}; {material}"))
     if parts.rigid:

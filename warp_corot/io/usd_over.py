@@ -77,7 +77,7 @@ class SceneWriter:
         flatten: Whether everything is joined into one file at the end.
 
     Raises:
-        InputError: A path that cannot be written to, or the scene's own file.
+        InputError: A path that cannot be written to, or a file that the scene is made of.
     """
 
     def __init__(
@@ -97,6 +97,8 @@ class SceneWriter:
         self.path = self._store.path
         if self.path.exists() and self.path.samefile(scene.path):
             raise InputError(f"{self.path}: is the input, should be another file")
+        if scene.uses(self.path):
+            raise InputError(f"{self.path}: is part of the input {scene.path}, should be another file")
         self.frames = 0
         self._scene, self._flatten, self._show_stress = scene, flatten, show_stress
         self._layer = _base_layer(scene, fps)

@@ -17,6 +17,7 @@ from ..errors import InputError
 from ..mesh.surface import signed_volumes
 from .formats import USD_SUFFIXES
 from .usd_files import metres_per_unit, open_stage
+from .usd_physics import is_physical, material_said, settle_gravity
 
 
 class Units(NamedTuple):
@@ -70,6 +71,9 @@ class Scene:
         tets: Its TetMesh prims.
         animated: Paths of prims with transforms that change over time in the file.
         uninstanced: Paths of prims that were instances.
+        stopped: Paths of prims that the file animates, and whose animation physics does not follow.
+        skipped: Paths of TetMesh prims that are only patterns, of a point instancer.
+        physics_scenes: Paths of the prims that gravity comes from; the first of them counts.
     """
 
     path: Path
@@ -80,6 +84,23 @@ class Scene:
     tets: list[TetPrim] = field(default_factory=list)
     animated: list[str] = field(default_factory=list)
     uninstanced: list[str] = field(default_factory=list)
+    stopped: list[str] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+    physics_scenes: list[str] = field(default_factory=list)
+
+    @property
+    def says_metres(self) -> bool:
+        """Whether the file says how long its unit is."""
+        return bool(UsdGeom.StageHasAuthoredMetersPerUnit(self.stage))
+
+    def says(self, path: str) -> dict[str, float]:
+        """What the file gives of "young", "poisson" and "density" for a TetMesh prim; see ``material_said``."""
+        return material_said(self.stage.GetPrimAtPath(path))
+
+    def uses(self, file: Path) -> bool:
+        """Whether a file is one of the layers that the stage is made of."""
+        used = (layer.realPath for layer in self.stage.GetUsedLayers())
+        return any(name and file.exists() and file.samefile(name) for name in used if Path(name).exists())
 
     def matrix(self, path: str) -> NDArray[np.float64]:
         """From a prim's space to the world, for row vectors, float64 [4, 4]."""
@@ -92,14 +113,19 @@ class Scene:
         matrix = self.matrix(path)
         return np.asarray(given, dtype=np.float64).reshape(-1, 3) @ matrix[:3, :3] + matrix[3, :3]
 
-    def lowest(self, paths: Iterable[str]) -> float:
-        """How low prims and what is under them reach along the up axis, by their bounds; infinite if there are none."""
+    def bounds(self, path: str) -> NDArray[np.float64] | None:
+        """Corners of a box in the world around a prim and what is under it, float64 [2, 3]; None: it is empty."""
         tokens = UsdGeom.Tokens
         purposes = [tokens.default_, tokens.render, tokens.proxy, tokens.guide]
-        cache = UsdGeom.BBoxCache(Usd.TimeCode.Default(), purposes)
-        bounds = [cache.ComputeWorldBound(self.stage.GetPrimAtPath(path)).ComputeAlignedRange() for path in paths]
+        found = UsdGeom.BBoxCache(Usd.TimeCode.Default(), purposes).ComputeWorldBound(self.stage.GetPrimAtPath(path))
+        box = found.ComputeAlignedRange()
+        return None if box.IsEmpty() else np.array([box.GetMin(), box.GetMax()], dtype=np.float64)
+
+    def lowest(self, paths: Iterable[str]) -> float:
+        """How low prims and what is under them reach along the up axis, by their bounds; infinite if there are none."""
         axis = "XYZ".index(self.up_axis)
-        return min((float(one.GetMin()[axis]) for one in bounds if not one.IsEmpty()), default=math.inf)
+        found = [self.bounds(path) for path in paths]
+        return min((float(box[0, axis]) for box in found if box is not None), default=math.inf)
 
     def parent(self, path: str) -> str:
         """The path of a prim's parent."""
@@ -136,10 +162,15 @@ def open_scene(path: str | PathLike[str]) -> Scene:
     units = Units(metres_per_unit(stage, source), kilograms)
     scene = Scene(source, stage, units, str(UsdGeom.GetStageUpAxis(stage)), given)
     scene.uninstanced = _without_instances(stage)
-    scene.animated = _stop_animation(stage)
+    scene.animated, scene.stopped = _stop_animation(stage)
+    scene.physics_scenes = settle_gravity(stage, source)
     for prim in stage.Traverse():
-        if prim.IsA(UsdGeom.TetMesh):
+        if prim.IsA(UsdGeom.TetMesh) and _is_pattern(prim):
+            scene.skipped.append(str(prim.GetPath()))
+        elif prim.IsA(UsdGeom.TetMesh):
             scene.tets.append(_tet_prim(prim, source))
+    if not scene.tets and scene.skipped:
+        raise InputError(f"{source}: its only TetMesh prims are patterns of a point instancer: {scene.skipped[0]}")
     if not scene.tets:
         raise InputError(f"{source}: has no TetMesh prim; meshes of other kinds go into `warp-corot simulate`")
     return scene
@@ -161,22 +192,34 @@ def _moves_in_instance(prim: Any) -> bool:
     return prim.IsInstanceProxy() and (prim.IsA(UsdGeom.TetMesh) or prim.HasAPI(UsdPhysics.RigidBodyAPI))
 
 
-def _stop_animation(stage: Any) -> list[str]:
-    """Have transforms and points be what they are at their first time; the paths of what was animated."""
-    animated = []
+def _is_pattern(prim: Any) -> bool:
+    while prim and not prim.IsA(UsdGeom.PointInstancer):
+        prim = prim.GetParent()
+    return bool(prim)
+
+
+def _stop_animation(stage: Any) -> tuple[list[str], list[str]]:
+    """Have transforms and points be what they are at their first time.
+
+    Returns:
+        Paths of what has animated transforms, and of what of that, or of its points, physics would have to follow.
+    """
+    animated, stopped = [], []
     for prim in stage.Traverse():
         if not prim.IsA(UsdGeom.Xformable):
             continue
-        xformable = UsdGeom.Xformable(prim)
-        attributes = [op.GetAttr() for op in xformable.GetOrderedXformOps()]
-        if any(attribute.ValueMightBeTimeVarying() for attribute in attributes):
+        attributes = [op.GetAttr() for op in UsdGeom.Xformable(prim).GetOrderedXformOps()]
+        if moves := any(attribute.ValueMightBeTimeVarying() for attribute in attributes):
             animated.append(str(prim.GetPath()))
         if prim.IsA(UsdGeom.TetMesh):
             attributes += [UsdGeom.TetMesh(prim).GetPointsAttr(), UsdGeom.TetMesh(prim).GetTetVertexIndicesAttr()]
+            moves = any(attribute.ValueMightBeTimeVarying() for attribute in attributes)
+        if moves and is_physical(prim):
+            stopped.append(str(prim.GetPath()))
         for attribute in attributes:
             if attribute.GetNumTimeSamples() and attribute.Get() is None:
                 attribute.Set(attribute.Get(Usd.TimeCode.EarliestTime()))
-    return animated
+    return animated, stopped
 
 
 def _tet_prim(prim: Any, source: Path) -> TetPrim:
@@ -198,6 +241,7 @@ def _tet_prim(prim: Any, source: Path) -> TetPrim:
     flat = np.flatnonzero(np.abs(volumes) <= 1e-12 * size**3 / len(tets))
     if len(flat):
         raise InputError(f"{name}: {len(flat)} of {len(tets)} tetrahedra have no volume, the first is {flat[0]}")
+    _check_in_world(prim, points, tets, name)
     wrong = volumes < 0.0
     if wrong.any():
         tets[wrong] = tets[wrong][:, [0, 1, 3, 2]]
@@ -206,3 +250,16 @@ def _tet_prim(prim: Any, source: Path) -> TetPrim:
         except Tf.ErrorException as error:
             raise InputError(f"{name}: its tetrahedra cannot be turned round: {error}") from None
     return TetPrim(str(prim.GetPath()), points, tets, int(wrong.sum()), left_handed)
+
+
+def _check_in_world(prim: Any, points: NDArray[np.float64], tets: NDArray[np.int32], name: str) -> None:
+    """Refuse tetrahedra that lose their volume on their way into the world, where positions are float32."""
+    matrix = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim), dtype=np.float64)
+    there = (points @ matrix[:3, :3] + matrix[3, :3]).astype(np.float32).astype(np.float64)
+    before, after = signed_volumes(points, tets), signed_volumes(there, tets)
+    gone = np.count_nonzero(~(after * np.sign(before * np.linalg.det(matrix[:3, :3])) > 0.0))
+    if gone:
+        raise InputError(
+            f"{name}: {gone} of {len(tets)} tetrahedra have too little volume for float32 where they are in the world: "
+            "a scale of zero, or too far from the origin"
+        )

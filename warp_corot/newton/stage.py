@@ -18,10 +18,10 @@ import numpy.typing as npt
 from ..errors import InputError
 from ..io.usd_over import Surface
 from ..io.usd_scene import Scene
-from ..materials import Isotropic
 from ..selection import select_nodes
 from .library import newton
 from .stage_material import Body, StageOptions, contact_law, give_material
+from .stage_start import check_ground, notes_of, staying, used_points
 from .state import register_custom_attributes
 
 GRAVITY = 9.81
@@ -46,6 +46,7 @@ class StageModel:
         cloth: For each cloth, the range of its particles in the model.
         ground: Corners of a ground plane that was added [4, 3], or None.
         margin: How far from each other contacts are looked for.
+        cables: Paths of cables.
         notes: What was chosen, a line each.
     """
 
@@ -58,6 +59,7 @@ class StageModel:
     cloth: list[slice] = field(default_factory=list)
     ground: npt.NDArray[np.float64] | None = None
     margin: float = 0.0
+    cables: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
@@ -65,13 +67,8 @@ def stage_model(scene: Scene, options: StageOptions, device: Any = None) -> Stag
     """The model of a stage.
 
     Raises:
-        InputError: What Newton cannot read, a material that is not positive definite, or options out of their range.
+        InputError: What Newton cannot read, a material that is not positive definite, or a ground that cuts a body.
     """
-    Isotropic(1.0 if options.young is None else options.young, options.poisson, options.density)  # checks them
-    if options.viscosity is not None and not (math.isfinite(options.viscosity) and options.viscosity >= 0):
-        raise InputError(f"viscosity is {options.viscosity:g}; it must be zero or a positive time in seconds")
-    if options.gravity is not None and not (np.shape(options.gravity) == (3,) and np.isfinite(options.gravity).all()):
-        raise InputError(f"gravity is {options.gravity}; it must be three finite numbers [m/s^2]")
     made, units = StageModel(scene), scene.units
     repaired = sum(prim.repaired for prim in scene.tets)
     if repaired:
@@ -82,7 +79,7 @@ def stage_model(scene: Scene, options: StageOptions, device: Any = None) -> Stag
             UserWarning,
             stacklevel=2,
         )
-    builder = _builder(scene)
+    builder = _builder(scene, options)
     found = _add_usd(builder, scene)
     if options.gravity is not None:
         builder.gravity = tuple(g / units.metres for g in options.gravity)
@@ -93,6 +90,7 @@ def stage_model(scene: Scene, options: StageOptions, device: Any = None) -> Stag
         made.notes += [note] if note else []
     held = _hold(made, builder, found, options)
     _stand(made, builder, options, held)
+    made.notes += notes_of(made, builder, options)
     _set_contacts(made, builder)
     register_custom_attributes(builder)
     try:
@@ -108,11 +106,11 @@ def stage_model(scene: Scene, options: StageOptions, device: Any = None) -> Stag
     return made
 
 
-def _builder(scene: Scene) -> newton.ModelBuilder:
+def _builder(scene: Scene, options: StageOptions) -> newton.ModelBuilder:
     """A builder with its defaults in the stage's units, and marks for materials that are not given."""
     metres, kilograms = scene.units
     builder = newton.ModelBuilder(up_axis=scene.up_axis, gravity=_down(scene.up_axis, GRAVITY / metres))
-    builder.default_particle_radius = 0.0
+    builder.default_particle_radius = options.radius / metres
     builder.default_tet_k_mu = builder.default_tet_k_lambda = builder.default_tet_density = math.nan
     builder.rigid_gap /= metres
     shape = builder.default_shape_cfg
@@ -137,6 +135,8 @@ def _add_usd(builder: newton.ModelBuilder, scene: Scene) -> dict[str, Any]:
                 load_static_visual_shapes=False,
                 schema_resolvers=resolvers,
                 return_deformable_results=True,
+                only_load_enabled_rigid_bodies=True,
+                ignore_paths=scene.skipped,
             )
         except ImportError:
             raise InputError("Newton reads stages with newton-usd-schemas: pip install newton-usd-schemas") from None
@@ -209,9 +209,12 @@ def _stand(made: StageModel, builder: newton.ModelBuilder, options: StageOptions
             made.notes.append("nothing holds the bodies: they fall freely")
         return
     axis, units = "XYZ".index(made.scene.up_axis), made.scene.units
-    x = np.array(builder.particle_q, dtype=np.float64)
-    lowest = min(float(x[:, axis].min()), made.scene.lowest(made.rigid))
+    x = np.array(builder.particle_q, dtype=np.float64)[used_points(made, builder)]
+    radius = options.radius / units.metres
+    lowest = min(float(x[:, axis].min()) - radius, made.scene.lowest(made.rigid))
     height = lowest if isinstance(ground, str) else ground / units.metres
+    if not isinstance(ground, str):
+        check_ground(made, builder, height, radius)
     builder.add_ground_plane(height=height)
     if isinstance(ground, str):
         made.notes.append(
@@ -229,18 +232,9 @@ def _stand(made: StageModel, builder: newton.ModelBuilder, options: StageOptions
 def _something_stays(builder: newton.ModelBuilder) -> bool:
     """Whether there is a collider that does not fall: on no body, a kinematic one, or one jointed to what stays."""
     collides = int(newton.ShapeFlags.COLLIDE_SHAPES) | int(newton.ShapeFlags.COLLIDE_PARTICLES)
-    staying = {-1} | {k for k, flags in enumerate(builder.body_flags) if flags & int(newton.BodyFlags.KINEMATIC)}
-    joints = [
-        (parent, child)
-        for parent, child, kind in zip(builder.joint_parent, builder.joint_child, builder.joint_type, strict=True)
-        if kind != newton.JointType.FREE
-    ]
-    before = 0
-    while len(staying) > before:
-        before = len(staying)
-        staying |= {child for parent, child in joints if parent in staying}
+    still = staying(builder)
     shapes = zip(builder.shape_body, builder.shape_flags, strict=True)
-    return any(body in staying and flags & collides for body, flags in shapes)
+    return any(body in still and flags & collides for body, flags in shapes)
 
 
 def _set_contacts(made: StageModel, builder: newton.ModelBuilder) -> None:
@@ -275,8 +269,7 @@ def _find_surfaces(made: StageModel, found: dict[str, Any]) -> None:
     for path, ranges in found["path_cloth_map"].items():
         made.surfaces.append(Surface(path, made.scene.world_points(path)))
         made.cloth.append(slice(*ranges["particle"]))
-    if found["path_cable_map"]:
-        made.notes.append(f"cables are simulated but not written: {', '.join(found['path_cable_map'])}")
+    made.cables = list(found["path_cable_map"])
 
 
 __all__ = ["StageModel", "StageOptions", "stage_model"]

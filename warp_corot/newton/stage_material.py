@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from ..errors import InputError
 from ..io.usd_scene import Scene, TetPrim
@@ -19,6 +20,10 @@ STIFFNESS_PER_WEIGHT = 20.0
 DAMPED_SHARE = 0.05
 #: Stiffness of contact over that of a tetrahedron, Young's modulus times edge: how deep bodies sink into the ground.
 CONTACT_STIFFNESS = 3.0
+#: What is taken where a stage has no material, and nothing else is wanted; density in kg/m^3.
+POISSON, DENSITY = 0.45, 1000.0
+#: Young's modulus [Pa] and Poisson's ratio of a material that does not say them, as Newton has it.
+FALLBACK = (1e6, 0.3)
 
 
 @dataclass(frozen=True)
@@ -26,23 +31,38 @@ class StageOptions:
     """What the stage does not say, in SI units.
 
     Attributes:
-        young: Young's modulus of bodies without a material [Pa]; None: by their weight.
-        poisson, density: The same for Poisson's ratio and density [kg/m^3].
+        young: Young's modulus where the stage gives none [Pa]; None: by the weight of bodies without a material, 1 MPa
+            for materials without it.
+        poisson: The same for Poisson's ratio; None: 0.45 for bodies without a material, 0.3 for materials without it.
+        density: The same for density [kg/m^3]; None: 1000.
         gravity: [m/s^2], in place of the stage's own.
         viscosity: Viscous stress over elastic shear stress of one strain [s]; None: so much that the slowest vibration
             of each body is damped by a twentieth of critical damping.
         ground: Height of a ground plane [m]; "auto": under everything, if the stage has nothing to stand on or to hang
             from; "none".
         fix: Expression for the nodes that are held; see ``select_nodes``.
+        radius: How far around each point of a soft body contact is felt [m].
     """
 
     young: float | None = None
-    poisson: float = 0.45
-    density: float = 1000.0
+    poisson: float | None = None
+    density: float | None = None
     gravity: tuple[float, float, float] | None = None
     viscosity: float | None = None
     ground: float | str = "auto"
     fix: str | None = None
+    radius: float = 0.0
+
+    def __post_init__(self) -> None:
+        young, poisson, density = self.young, self.poisson, self.density
+        # Checks them.
+        Isotropic(_first(young, 1.0), _first(poisson, POISSON), _first(density, DENSITY))
+        if self.viscosity is not None and not (math.isfinite(self.viscosity) and self.viscosity >= 0):
+            raise InputError(f"viscosity is {self.viscosity:g}; it must be zero or a positive time in seconds")
+        if self.gravity is not None and not (np.shape(self.gravity) == (3,) and np.isfinite(self.gravity).all()):
+            raise InputError(f"gravity is {self.gravity}; it must be three finite numbers [m/s^2]")
+        if not (math.isfinite(self.radius) and self.radius >= 0):
+            raise InputError(f"radius is {self.radius:g}; it must be zero or a positive length in metres")
 
 
 @dataclass(eq=False)
@@ -90,29 +110,33 @@ def give_material(
     units, path = scene.units, body.prim.path
     x = np.array(builder.particle_q[body.particles], dtype=np.float64)
     tets = np.array(builder.tet_indices[body.tets]).reshape(-1, 4) - body.particles.start
-    volumes = np.abs(np.linalg.det(x[tets[:, 1:]] - x[tets[:, :1]])) / 6.0
+    volumes = 1.0 / (6.0 * np.abs(np.linalg.det(np.array(builder.tet_poses[body.tets]).reshape(-1, 3, 3))))
     body.edge = float((6.0 * math.sqrt(2.0) * volumes.mean()) ** (1 / 3)) * units.metres
+    said, chosen = scene.says(path), []
     masses = np.array(builder.particle_mass[body.particles], dtype=np.float64)
-    chosen = []
-    if np.isnan(masses).any():
-        share = options.density / units.density * volumes / 4.0
-        masses = np.bincount(tets.ravel(), np.repeat(share, 4), minlength=len(x)).astype(np.float64)
+    if "density" not in said:
+        density = _first(options.density, DENSITY)
+        # A body's are there already, of a default; those of other tetrahedra are not.
+        masses = _lumped(tets, volumes, len(x)) if np.isnan(masses).any() else masses / (masses.sum() / volumes.sum())
+        masses *= density / units.density
         builder.particle_mass[body.particles] = masses.tolist()
-        chosen.append(f"density {options.density:g} kg/m^3")
+        chosen.append(("density", f"density {density:g} kg/m^3"))
     body.density = float(masses.sum() / volumes.sum()) * units.density
     if not body.density > 0.0:
         raise InputError(f"{scene.path}: {path}: has no mass")
     size = np.ptp(x, axis=0) * units.metres
     lame = np.array(builder.tet_materials[body.tets], dtype=np.float64)
-    if np.isnan(lame[:, :2]).any():
-        young = options.young
-        if young is None:
-            height = float(size["XYZ".index(scene.up_axis)])
-            young = float(f"{STIFFNESS_PER_WEIGHT * body.density * gravity * height:.1e}")
-        material = Isotropic(young, options.poisson, body.density)
-        lame[:, :2] = [float(material.mu) / units.pressure, float(material.lam) / units.pressure]
-        chosen.insert(0, f"E = {young:g} Pa, nu = {options.poisson:g}")
-        body.given = False
+    body.given = not np.isnan(lame[:, :2]).any()
+    if not {"young", "poisson"} <= said.keys():
+        height = float(size["XYZ".index(scene.up_axis)])
+        weight = float(f"{STIFFNESS_PER_WEIGHT * body.density * gravity * height:.1e}")
+        young, poisson = FALLBACK if body.given else (weight, POISSON)
+        young = said["young"] * units.pressure if "young" in said else _first(options.young, young)
+        poisson = said["poisson"] if "poisson" in said else _first(options.poisson, poisson)
+        lame[:, 0] = young / (2.0 * (1.0 + poisson)) / units.pressure
+        lame[:, 1] = 2.0 * lame[:, 0] * poisson / (1.0 - 2.0 * poisson)
+        taken = {"young": f"E = {young:g} Pa", "poisson": f"nu = {poisson:g}"}
+        chosen[:0] = [(name, text) for name, text in taken.items() if name not in said]
     mu, lam = lame[:, 0] * units.pressure, lame[:, 1] * units.pressure
     if not (np.isfinite(lame[:, :2]).all() and (mu > 0.0).all() and (3.0 * lam + 2.0 * mu > 0.0).all()):
         raise InputError(
@@ -129,7 +153,17 @@ def give_material(
     builder.tet_materials[body.tets] = [tuple(row) for row in lame.tolist()]
     if not chosen:
         return None
-    return f"{path} has no physics material for a volume: {', '.join(chosen)} (--young, --poisson, --density)"
+    missing = "no physics material for a volume" if not body.given else "a physics material that does not say all"
+    return f"{path} has {missing}: {', '.join(text for _, text in chosen)} ({', '.join(f'--{n}' for n, _ in chosen)})"
+
+
+def _lumped(tets: npt.NDArray[np.integer], volumes: npt.NDArray[np.float64], count: int) -> npt.NDArray[np.float64]:
+    """A quarter of each tetrahedron's volume at each of its corners, float64 [count]."""
+    return np.bincount(tets.ravel(), np.repeat(volumes / 4.0, 4), minlength=count).astype(np.float64)
+
+
+def _first(given: float | None, default: float) -> float:
+    return default if given is None else given
 
 
 def contact_law(soft: Sequence[Body]) -> tuple[float, float]:

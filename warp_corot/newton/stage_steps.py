@@ -19,6 +19,7 @@ from ..io.usd_scene import open_scene
 from .library import newton
 from .solver import SAFETY, SolverCorotated
 from .stage import StageOptions, stage_model
+from .stage_start import warn_of_overlaps
 
 #: Steps that are recorded and replayed together; a frame is a whole number of such chunks.
 CHUNK = 16
@@ -80,6 +81,8 @@ class StageSimulation:
         self.solver = self._new_solver(rigid, damping)
         self._pipeline = newton.CollisionPipeline(model, soft_contact_gap=self.parts.margin)
         self._contacts = self._pipeline.contacts()
+        self._pipeline.collide(model.state(), self._contacts)
+        warn_of_overlaps(self.parts, self._contacts)
         self._choose_step(dt)
         self.state = self._new_state()
         # Shares its positions with the state, and has stresses, which are wanted once a frame and not once a step.
@@ -176,13 +179,18 @@ class StageSimulation:
         model = self.parts.model
         try:
             solver: Any = {"semi-implicit": rigid, "none": None}.get(rigid)
+            if rigid == "none" and (standing := [*self.parts.cables, *self.parts.rigid]):
+                self.parts.notes.append(f"stay where they are (--rigid none): {', '.join(standing)}")
             if rigid == "xpbd":
                 solver = newton.solvers.SolverXPBD(model)
             return SolverCorotated(model, damping=damping, rigid_solver=solver)
         except ValueError as error:  # Newton's, and InputError, which is one
-            said = str(error).replace(" Give another rigid_solver, or None.", "")
+            said = str(error).replace(" Give another rigid_solver, or None.", "").rstrip(".")
             hint = f"; another than {rigid} can be chosen (--rigid)" if "does not support" in said else ""
-            raise InputError(f"{self.scene.path}: {said.rstrip('.')}{hint}") from None
+            if hint and self.parts.cables:
+                said = f"has cables, as {self.parts.cables[0]}, which no solver here steps: {said}"
+                hint = "; --rigid none leaves cables and rigid bodies where they are"
+            raise InputError(f"{self.scene.path}: {said}{hint}") from None
 
     def _choose_step(self, dt: float | None) -> None:
         stable = self.solver.stable_dt
