@@ -229,7 +229,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         stiffness += contacts.stiffest
         if given is None and (stiffness > 0 or damping > 0):
             of_bodies = contacts.stiffest * contacts.lightest
-            self.contact_dt = stable_step(tets, others, stiffness, damping, of_bodies)
+            self.contact_dt = min(self.stable_dt, stable_step(tets, others, stiffness, damping, of_bodies))
 
     def _count_for(self, dt: float) -> int:
         if not (_is_finite(dt) and dt > 0):

@@ -14,11 +14,15 @@ import warp as wp
 from ..kernels.constitutive import linear_stress
 from ..kernels.elements import GeneralElements
 from ..kernels.forces import scatter_forces
-from ..kernels.lanczos import add_scaled
+from ..kernels.lanczos import add_scaled, scale_by
 from ..solvers import largest_frequency
 from .library import newton
 from .others import Others
 from .tetrahedra import Tetrahedra
+
+#: How often a step is lengthened, and from which largest eigenvalue on, of 4, it is long enough.
+LENGTHENINGS = 6
+ENOUGH = 3.95
 
 
 class _Particles:
@@ -57,15 +61,32 @@ class _SmallMotions:
         yield
 
 
+class _Sum:
+    """dt^2 K + 2 dt C, as forces."""
+
+    def __init__(self, dt: float, elastic: _SmallMotions, viscous: _SmallMotions):
+        self.parts = (dt * dt, elastic), (2.0 * dt, viscous)
+
+    def add_forces(self, u: wp.array, f: wp.array) -> None:
+        for factor, motions in self.parts:
+            scaled = wp.clone(u)
+            wp.launch(scale_by, dim=len(u), inputs=[factor, scaled], device=u.device)
+            motions.add_forces(scaled, f)
+
+    @contextmanager
+    def state_kept(self) -> Iterator[None]:
+        yield
+
+
 def stable_step(
     tets: Tetrahedra, others: Others, stiffness: float = 0.0, damping: float = 0.0, of_bodies: float = 0.0
 ) -> float:
     """The largest stable step of symplectic Euler about rest [s]; infinite if nothing can move.
 
-    With the largest frequency w and the largest rate of damping c it is stable while w^2 dt^2 + 2 c dt < 4: w^2 and c
-    are the largest eigenvalues of M^-1 K and M^-1 C, each of its own motion, so that this is never too large. They are
-    those of tetrahedra at rest and of springs, triangles and bending edges about the model's initial positions, all
-    together.
+    It is stable while no eigenvalue of dt^2 M^-1 K + 2 dt M^-1 C is above 4. With w^2 the largest of M^-1 K and c that
+    of M^-1 C, which may be of other motions, w^2 dt^2 + 2 c dt = 4 gives a step that is short enough; from there it is
+    lengthened as far as it goes. K and C are those of tetrahedra at rest and of springs, triangles and bending edges
+    about the model's initial positions, all together.
 
     Args:
         tets, others: What there is.
@@ -76,14 +97,26 @@ def stable_step(
     """
     model = tets.model
     body = cast(Any, _Particles(model, tets.elements.volume.numpy().astype(np.float64)))
-    motions = _SmallMotions(tets.elements, tets.mu, tets.lam, others, False, stiffness)
-    w = math.sqrt(largest_frequency(body, cast(Any, motions)) ** 2 + of_bodies)
-    c = 0.0
-    if tets.damped or others.damped or damping > 0:
-        viscosity = model.tet_materials.numpy().reshape(-1, 3)[:, 2]
-        half, whole = (wp.array(s * viscosity, dtype=wp.float32, device=model.device) for s in (0.5, 1.0))
-        motions = _SmallMotions(tets.elements, half, whole, others, True, damping)
-        c = largest_frequency(body, cast(Any, motions)) ** 2
-    if w == 0.0 and c == 0.0:
+    elastic = _SmallMotions(tets.elements, tets.mu, tets.lam, others, False, stiffness)
+    w2 = _largest(body, elastic) + of_bodies
+    if not (tets.damped or others.damped or damping > 0):
+        return 2.0 / math.sqrt(w2) if w2 > 0 else math.inf
+    viscosity = model.tet_materials.numpy().reshape(-1, 3)[:, 2]
+    half, whole = (wp.array(s * viscosity, dtype=wp.float32, device=model.device) for s in (0.5, 1.0))
+    viscous = _SmallMotions(tets.elements, half, whole, others, True, damping)
+    c = _largest(body, viscous)
+    if w2 == 0.0 and c == 0.0:
         return math.inf
-    return 4.0 / (c + math.sqrt(c * c + 4.0 * w * w))
+    dt = 4.0 / (c + math.sqrt(c * c + 4.0 * w2))
+    for _ in range(LENGTHENINGS if w2 > 0 and c > 0 else 0):
+        found = _largest(body, _Sum(dt, elastic, viscous)) + dt * dt * of_bodies
+        if found >= ENOUGH:
+            break
+        # Eigenvalues grow no faster than dt^2.
+        dt *= math.sqrt(4.0 / found)
+    return dt
+
+
+def _largest(body: Any, motions: _SmallMotions | _Sum) -> float:
+    """The largest eigenvalue of M^-1 times what gives such forces."""
+    return largest_frequency(body, cast(Any, motions)) ** 2
