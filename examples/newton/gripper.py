@@ -1,6 +1,7 @@
-"""Two fingers close on a soft block, lift it and hold it, by friction alone.
+"""Two fingers close on a soft block, lift it and hold it.
 
-python examples/newton/gripper.py --viewer null --test --num-frames 180, or --viewer usd --output-path gripper.usd, gl.
+python examples/newton/gripper.py --viewer null --test --num-frames 180, or --viewer usd --output-path gripper.usd, gl,
+rerun, viser. Without a display: PYGLET_HEADLESS=1 and --viewer gl --headless.
 """
 
 import newton
@@ -11,9 +12,9 @@ import warp as wp
 import warp_corot as wc
 import warp_corot.newton as wn
 
-HALF, FINGER = 0.05, 0.02
+HALF, FINGER, GREY = 0.05, 0.02, (0.35, 0.42, 0.5)
 CLOSED, LIFTED = 0.5, 1.5  # when the fingers are closed and when they are up [s]
-SQUEEZE, HEIGHT = 0.006, 0.2  # how far they press in, and how far they lift [m]
+SQUEEZE, HEIGHT = 0.012, 0.2  # how far they press in, and how far they lift [m]
 
 
 @wp.kernel
@@ -40,19 +41,22 @@ class Example:
         self.viewer, self.frame_dt, self.sim_time = viewer, 1.0 / 60.0, 0.0
         builder = newton.ModelBuilder()
         builder.add_ground_plane()
+        drawn = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False, has_particle_collision=False)
+        arm = wp.transform(wp.vec3(0.0, 0.0, 0.1), wp.quat_identity())
         for side in (-1.0, 1.0):
             start = wp.vec3(side * (HALF + FINGER + 0.02), 0.0, HALF)
             finger = builder.add_body(xform=wp.transform(start, wp.quat_identity()))
-            builder.add_shape_box(finger, hx=FINGER, hy=0.04, hz=0.04)
+            builder.add_shape_box(finger, hx=FINGER, hy=0.04, hz=0.04, color=GREY)
+            builder.add_shape_box(finger, xform=arm, hx=0.5 * FINGER, hy=0.015, hz=0.06, cfg=drawn, color=GREY)
             builder.body_flags[finger] = int(newton.BodyFlags.KINEMATIC)
-        forest = wc.TetForest.box((1, 1, 1), 2 * HALF, 6)
-        rubber = wc.Isotropic(young=1e5, poisson=0.4, density=500.0)
+        forest = wc.TetForest.box((1, 1, 1), 2 * HALF, 9)
+        rubber = wc.Isotropic(young=5e4, poisson=0.4, density=500.0)
         wn.add_forest(builder, forest, rubber, pos=(-HALF, -HALF, 0.003), k_damp=20.0, particle_radius=0.002)
         self.model = builder.finalize()
-        self.model.soft_contact_ke, self.model.soft_contact_kd = 2e3, 1.0
-        self.model.soft_contact_kf, self.model.soft_contact_mu = 100.0, 0.8
-        for array, value in (("ke", 2e3), ("kd", 1.0), ("kf", 100.0), ("mu", 0.8)):
-            getattr(self.model, f"shape_material_{array}").fill_(value)
+        # Stiffness [N/m], damping and friction's slope [N s/m] of a particle's contact, and friction.
+        for name, value in (("ke", 2e3), ("kd", 1.0), ("kf", 1e4), ("mu", 0.8)):
+            setattr(self.model, f"soft_contact_{name}", value)
+            getattr(self.model, f"shape_material_{name}").fill_(value)
         self.solver = wn.SolverCorotated(self.model)
         self.substeps = 2 * int(np.ceil(self.frame_dt / (1.4 * self.solver.contact_dt)))
         self.pipeline = newton.CollisionPipeline(self.model)
@@ -62,6 +66,7 @@ class Example:
         self.state_0, self.state_1 = self.model.state(), self.model.state()
         self.control = self.model.control()
         viewer.set_model(self.model)
+        viewer.set_camera(wp.vec3(0.28, -0.68, 0.3), pitch=-13.0, yaw=112.0)
         self.simulate()  # compiles what the recording launches
         self.state_0.assign(self.model.state())
         self.time.zero_()
@@ -99,4 +104,7 @@ class Example:
 
 if __name__ == "__main__":
     viewer, args = newton.examples.init()
-    newton.examples.run(Example(viewer, args), args)
+    try:
+        newton.examples.run(Example(viewer, args), args)
+    except KeyboardInterrupt:  # rerun and viser run until then; what is written is kept
+        viewer.close()

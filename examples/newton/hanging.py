@@ -1,6 +1,7 @@
 """Four cantilevers of the same rubber in Newton, of tetrahedra that are damped less and less, the last one a forest.
 
 python examples/newton/hanging.py --viewer null --test, or --viewer usd --output-path hanging.usd, gl, rerun, viser.
+Without a display: PYGLET_HEADLESS=1 and --viewer gl --headless.
 """
 
 import newton
@@ -42,6 +43,10 @@ class Example:
         held = forest.points[:, 0] == 0
         pos = (0.0, 3 * SPACING, 1.0)
         wn.add_forest(builder, forest, material, pos=pos, k_damp=1e2, fixed=held, particle_radius=0.02)
+        # The wall is only drawn: nothing touches anything here.
+        drawn = newton.ModelBuilder.ShapeConfig(has_shape_collision=False, has_particle_collision=False)
+        wall = wp.transform(wp.vec3(-0.05, 1.5 * SPACING + 0.5 * WIDTH, 0.8), wp.quat_identity())
+        builder.add_shape_box(-1, xform=wall, hx=0.05, hy=1.3, hz=0.8, cfg=drawn, color=(0.35, 0.42, 0.5))
         self.model = builder.finalize()
         self.solver = wn.SolverCorotated(self.model, damping=4.0)  # 1/s, so that all come to rest
         self.substeps = 2 * int(np.ceil(self.frame_dt / (1.4 * self.solver.stable_dt)))
@@ -49,6 +54,7 @@ class Example:
         self.state_0, self.state_1 = self.model.state(), self.model.state()
         self.control = self.model.control()
         viewer.set_model(self.model)
+        viewer.set_camera(wp.vec3(3.6, -1.3, 2.0), pitch=-14.0, yaw=142.0)
         self.simulate()  # compiles what the recording launches
         self.state_0.assign(self.model.state())
         with wp.ScopedCapture() as capture:
@@ -83,4 +89,7 @@ class Example:
 
 if __name__ == "__main__":
     viewer, args = newton.examples.init()
-    newton.examples.run(Example(viewer, args), args)
+    try:
+        newton.examples.run(Example(viewer, args), args)
+    except KeyboardInterrupt:  # rerun and viser run until then; what is written is kept
+        viewer.close()
