@@ -101,6 +101,40 @@ class TestMaterials:
         assert "E = 1e+06 Pa, nu = 0.3, density 1000 kg/m^3" in made.notes[0]
 
 
+class TestFriction:
+    @pytest.mark.parametrize(("soft", "ground"), [(0.0, 0.0), (0.2, 0.4)])
+    def test_a_body_slides_by_the_mean_of_both(self, tmp_path, soft, ground):
+        """Pulled sideways by s g, it gains s g - mu g a second: it slides without turning over."""
+
+        def change(made, mesh):
+            bind(made, mesh, youngsModulus=2e5, poissonsRatio=0.0, density=1000.0, dynamicFriction=soft)
+            floor = UsdShade.Material.Define(made.stage, "/Materials/Floor")
+            UsdPhysics.MaterialAPI.Apply(floor.GetPrim()).CreateDynamicFrictionAttr(ground)
+            prim = made.stage.GetPrimAtPath("/Ground")
+            UsdShade.MaterialBindingAPI.Apply(prim).Bind(floor, materialPurpose="physics")
+
+        path = block(tmp_path / "in.usda", change, material=False)
+        options = StageOptions(gravity=(4.905, 0.0, -9.81), viscosity=5e-3)
+        sim = StageSimulation(path, device="cpu", options=options)
+        speeds = []
+        for _ in range(12):
+            sim.advance()
+            masses = sim.parts.model.particle_mass.numpy()
+            speeds.append(np.average(sim.show().velocities[0][:, 0], weights=masses))
+        gained = (speeds[-1] - speeds[3]) * 24 / 8
+        assert gained == pytest.approx((0.5 - 0.5 * (soft + ground)) * 9.81, rel=0.06)
+
+    def test_friction_of_several_bodies_is_one(self, tmp_path):
+        def change(made, mesh):
+            bind(made, mesh, dynamicFriction=0.2)
+            made.material(made.block(body="/World/Other", at=(0.5, 0.0, 0.0)))
+
+        made = parts(block(tmp_path / "in.usda", change, material=False))
+        assert made.model.soft_contact_mu == pytest.approx(0.2)
+        assert "soft bodies have one friction, the mean of those given: 0.2" in made.notes
+        assert parts(block(tmp_path / "other.usda")).model.soft_contact_mu == 0.5
+
+
 class TestGravity:
     @pytest.mark.parametrize("metres", [1.0, 0.01])
     @pytest.mark.parametrize("magnitude", [-1.0, -9.81, float("-inf")])

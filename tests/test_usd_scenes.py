@@ -282,6 +282,19 @@ def test_attachments_to_the_world_hold_points(tmp_path):
     assert lowest == pytest.approx(0.5 * DENSITY * G * HEIGHT**2 / YOUNG, rel=0.3)
 
 
+def test_a_bar_hangs_by_what_its_weight_makes_of_it(tmp_path):
+    """rho g L^2 / (2 E), which linear tetrahedra have exactly where there is no Poisson's effect."""
+    made = StageMaker(tmp_path / "stage.usda", metres=0.01)
+    made.material(made.block(cells=(1, 1, 6), at=(0.0, 0.0, 1.0)), young=2e6)
+    options = StageOptions(fix="z > zmax - 1e-4", viscosity=0.01)
+    sim = simulated(made.save(), 36, options=options)
+    rest, x = (0.01 * a[:, 2].astype(float) for a in (sim.parts.model.particle_q.numpy(), sim.show().positions[0]))
+    lowest = rest < rest.min() + 1e-6
+    length = 6 * CELL
+    assert (rest - x)[lowest].mean() == pytest.approx(0.5 * DENSITY * G * length**2 / 2e6, rel=0.02)
+    assert sim.show().von_mises[0].mean() == pytest.approx(0.5 * DENSITY * G * length, rel=0.02)
+
+
 def test_attachments_to_a_rigid_body_carry_it(tmp_path):
     """A box hangs from a block that hangs from the world: the stress below is the box's weight over the area."""
     made = StageMaker(tmp_path / "stage.usda")

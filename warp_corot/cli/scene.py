@@ -41,7 +41,8 @@ def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParse
 
 what is read, as Newton reads it:
   TetMesh prims, with or without PhysicsVolumeDeformableSimAPI; of the physics material that is bound to them
-  (PhysicsVolumeDeformableMaterialAPI) youngsModulus, poissonsRatio and density; masses, restShapePoints; attachments
+  (PhysicsVolumeDeformableMaterialAPI) youngsModulus, poissonsRatio and density, and dynamicFriction (0.5 if not given;
+  contact has the mean of both sides' friction); masses, restShapePoints; attachments
   to rigid bodies, and to what does not move, by which points are held; graphics meshes of a deformable body
   rigid bodies, colliders, joints and the gravity of UsdPhysics; metersPerUnit, kilogramsPerUnit, upAxis, transforms
 

@@ -19,10 +19,11 @@ _BODY = "PhysicsDeformableBodyAPI"
 
 
 def material_said(prim: Any) -> dict[str, float]:
-    """What a stage gives of "young", "poisson" and "density" for a TetMesh prim, in its units, where Newton takes it.
+    """What a stage gives of "young", "poisson", "density" and "friction" for a TetMesh prim, in its units.
 
-    Of the physics material that is bound to it; of density also by a mass or a density of the deformable body, or by
-    the masses of points or elements: then it is there, but infinite. Zero density, by UsdPhysics, is none.
+    It is what Newton takes, but for the dynamic friction, which it passes over. It is of the physics material that is
+    bound to the prim; density also by a mass or a density of the deformable body, or by the masses of points or
+    elements: then it is there, but infinite. Zero density, by UsdPhysics, is none.
     """
     found: dict[str, float] = {}
     material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0].GetPrim()
@@ -32,7 +33,9 @@ def material_said(prim: Any) -> dict[str, float]:
             found["young"] = young
         if poisson is not None and -1.0 < poisson < 1.0:
             found["poisson"] = poisson if poisson < 0.5 else NEARLY_INCOMPRESSIBLE
-        density = _number(material, "density")
+        density, friction = _number(material, "density"), _number(material, "dynamicFriction")
+        if friction is not None and friction >= 0.0:
+            found["friction"] = friction
         if density is not None and density > 0.0:
             found["density"] = density
     body = _deformable_body(prim)

@@ -94,7 +94,7 @@ class Scene:
         return bool(UsdGeom.StageHasAuthoredMetersPerUnit(self.stage))
 
     def says(self, path: str) -> dict[str, float]:
-        """What the file gives of "young", "poisson" and "density" for a TetMesh prim; see ``material_said``."""
+        """What the file says of what a TetMesh prim is made of; see ``material_said``."""
         return material_said(self.stage.GetPrimAtPath(path))
 
     def uses(self, file: Path) -> bool:

@@ -100,6 +100,7 @@ def stage_model(scene: Scene, options: StageOptions, device: Any = None) -> Stag
     stiffness, damping = contact_law(made.soft)
     model.soft_contact_ke, model.soft_contact_kd = stiffness / units.kilograms, damping / units.kilograms
     model.soft_contact_kf /= units.kilograms
+    _set_friction(made)
     model.particle_max_velocity /= units.metres
     made.margin = max(body.edge for body in made.soft) / units.metres
     _find_surfaces(made, found)
@@ -248,6 +249,16 @@ def _set_contacts(made: StageModel, builder: newton.ModelBuilder) -> None:
             builder.shape_material_ke[shape] = stiffness
         if builder.shape_material_kd[shape] == default.kd:
             builder.shape_material_kd[shape] = damping
+
+
+def _set_friction(made: StageModel) -> None:
+    """Take the friction of the soft bodies from the stage: one number in Newton, used in the mean with a shape's."""
+    said = [made.scene.says(body.prim.path) for body in made.soft]
+    given = [one["friction"] for one in said if "friction" in one]
+    if given:
+        made.model.soft_contact_mu = sum(given) / len(given)
+    if given and (len(set(given)) > 1 or len(given) < len(said)):
+        made.notes.append(f"soft bodies have one friction, the mean of those given: {made.model.soft_contact_mu:.3g}")
 
 
 def _find_surfaces(made: StageModel, found: dict[str, Any]) -> None:
