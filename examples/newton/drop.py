@@ -86,7 +86,7 @@ class Example:
         self.viewer.begin_frame(self.sim_time)
         self.viewer.log_state(self.state_0)
         stress = self.state_0.warp_corot.von_mises.numpy()
-        self.viewer.log_scalar("largest von Mises stress [Pa]", float(stress.max()))
+        self.viewer.log_scalar("largest_von_mises_stress_in_Pa", float(stress.max()))
         self.viewer.end_frame()
 
     def test_final(self):
