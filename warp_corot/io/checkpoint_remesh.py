@@ -87,8 +87,9 @@ def unpack_changing(changing: Changing, described: dict[str, Any], prefix: str, 
     ]
     if activation.keys:
         activation.serve()
-    carried = forest.carriage.arrays
-    body.trajectories = keyframes.trajectories(carried.row[: body.node_count].numpy(), body.device)
+    rows = forest.carriage.arrays.row[: body.node_count].numpy()
+    nodes = np.flatnonzero(rows >= 0).astype(np.int32)
+    body.trajectories = keyframes.trajectories(nodes, rows[nodes], body.device)
     body.revision += 1
     kept = {
         name: wp.array(arrays[f"{prefix}conditions.{name}"], dtype=KEPT[name], device=body.device)

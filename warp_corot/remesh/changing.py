@@ -82,7 +82,7 @@ class Changing:
         )
         self.survey = Survey(self.forest, self.carried_material.modulus)
         self.plan: DevicePlan | None = None
-        #: What is looked at after a pass: counts of the pools and of the plan, and the survey.
+        #: What is looked at after a pass: counts of the pools and of the plan, the survey, and who follows keyframes.
         self._report: wp.array | None = None
         self._report_parts: list[int] = []
         #: A pass and what follows; none where a device's graphs know no conditions.
@@ -128,7 +128,7 @@ class Changing:
         body.elements = self.plan.elements
         self.carried_material.serve(body, self.plan)
         field.follow(self.plan)
-        parts = (self.forest.pools.counts, self.plan.class_counts, self.survey.found)
+        parts = self._found()
         self._report_parts = [len(part) for part in parts]
         self._report = wp.zeros(sum(self._report_parts), dtype=wp.int32, device=self.device)
         self.renew()
@@ -203,20 +203,25 @@ class Changing:
 
     def _launch_derived(self) -> None:
         assert self.plan is not None
-        forest = self.forest
         self.plan.launch()
         self.field.derive(self.plan)
         self.survey.launch(self.plan.goes)
+        self.conditions.launch(self.plan.goes)
         start = 0
-        for part in (forest.pools.counts, self.plan.class_counts, self.survey.found):
+        for part in self._found():
             wp.copy(self._report, part, dest_offset=start)
             start += len(part)
+
+    def _found(self) -> tuple[wp.array, ...]:
+        """What launches find that the host looks at, int32."""
+        assert self.plan is not None
+        return self.forest.pools.counts, self.plan.class_counts, self.survey.found, self.conditions.found
 
     def _look(self, *, anyway: bool = False) -> None:
         """The one look at what the device has done: if the mesh is another one, body and field go through that."""
         assert self.plan is not None
         assert self._report is not None
-        counted, classes, surveyed = np.split(self._report.numpy(), np.cumsum(self._report_parts)[:-1])
+        counted, classes, surveyed, followers = np.split(self._report.numpy(), np.cumsum(self._report_parts)[:-1])
         counts = PassCounts.of(counted)
         self.is_full = counts.full
         if not (counts.added or counts.removed or anyway):
@@ -234,7 +239,7 @@ class Changing:
         self.survey.read(surveyed)
         body.smallest_volume = float(volume_shares(self.survey.finest_level)) * self.forest.source.cell_size**3
         body.publish_positions()
-        self.conditions.follow()
+        self.conditions.follow(followers)
         for binding in body.bindings:
             binding.rebind(self.forest.pools)
 

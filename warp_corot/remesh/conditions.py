@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..kernels.remesh_state import NO_ROW
+from ..kernels import remesh_followers as kernels
 from .carried_activation import CarriedActivation
 from .carried_material import ACTIVATION, ACTIVATION_ROW
 from .keyframes import Keyframes
@@ -40,6 +40,7 @@ class Conditions:
         keyframes: What nodes follow.
         activation: Active stress, and what it follows.
         kept: Held nodes, loads, rows, velocities and active stress as ``put_back`` writes them.
+        found: What ``launch`` has found, int32, for ``follow``.
     """
 
     def __init__(self, body: SoftBody, forest: DeviceForest):
@@ -50,6 +51,11 @@ class Conditions:
         self._revision = -1
         self._is_back = False
         self.kept: dict[str, wp.array] = {}
+        #: The rows in what is kept; None: not looked at yet.
+        self._kept_rows: set[int] | None = None
+        self.found = wp.zeros(kernels.PLACES, dtype=wp.int32, device=forest.device)
+        #: Nodes that follow keyframes, and their rows, in any order.
+        self._followers = [wp.empty(forest.node_capacity, dtype=wp.int32, device=forest.device) for _ in range(2)]
 
     @property
     def of_present_mesh(self) -> bool:
@@ -63,7 +69,7 @@ class Conditions:
 
     def set_kept(self, kept: dict[str, wp.array], *, of_present_mesh: bool) -> None:
         """Write this from now on, of the present mesh or of another."""
-        self.kept = kept
+        self.kept, self._kept_rows = kept, None
         self._revision = self._body.mesh_revision if of_present_mesh else -1
 
     def note(self) -> None:
@@ -74,6 +80,7 @@ class Conditions:
             arrays, count = self._forest.carriage.arrays, self._body.node_count
             self.kept = {name: wp.clone(getattr(arrays, name)[:count]) for name in ("held", "load", "row", "v")}
             self.kept |= self.activation.kept()
+            self._kept_rows = None
 
     def put_back(self) -> None:
         """Write what was kept into the mesh for which it was."""
@@ -87,24 +94,46 @@ class Conditions:
         self.activation.put_back(self.kept)
         self._is_back = True
 
-    def follow(self) -> None:
-        """Tell the host which nodes and elements follow keyframes after a pass, new ones among them."""
+    def launch(self, goes: wp.array) -> None:
+        """Look which nodes follow keyframes if ``goes`` [1] is not zero; may be recorded."""
+        forest = self._forest
+        device, threads = forest.device, forest.threads
+        wp.launch(kernels.begin_followers, kernels.PLACES, inputs=[goes], outputs=[self.found], device=device)
+        inputs = [threads, goes, forest.pools, forest.carriage.arrays]
+        wp.launch(kernels.list_followers, threads, inputs, [*self._followers, self.found], device=device)
+
+    def follow(self, found: npt.NDArray[np.int32]) -> None:
+        """Tell the host which nodes and elements follow keyframes after a pass, new ones among them.
+
+        Args:
+            found: A copy of the array of this name.
+        """
         self.activation.follow()
-        body, arrays = self._body, self._forest.carriage.arrays
+        body = self._body
         # Nodes that were let go later follow again what they did on the mesh that is back.
         if not (body.trajectories or self._is_back):
             return
         self._is_back = False
-        rows = self._of_nodes(arrays.row)
-        if (rows < NO_ROW).any():
-            ends = self._forest.pools.ends[: len(rows)].numpy()
-            rows = self.keyframes.settle(rows, ends, self._of_nodes(arrays.u)[:, :3])
-            arrays.row[: len(rows)].assign(rows)
+        if found[kernels.MIXED]:
+            self._settle()
+        nodes, rows = (array[: int(found[kernels.FOLLOWERS])].numpy() for array in self._followers)
+        order = np.argsort(nodes)
+        nodes, rows = nodes[order], rows[order]
         self._forget(rows)
-        found = self.keyframes.trajectories(rows, body.device)
-        if found is not body.trajectories:
-            body.trajectories = found
+        trajectories = self.keyframes.trajectories(nodes, rows, body.device)
+        if trajectories is not body.trajectories:
+            body.trajectories = trajectories
             body.revision += 1
+
+    def _settle(self) -> None:
+        """Give rows to nodes between such as follow different ones."""
+        arrays = self._forest.carriage.arrays
+        rows = self._of_nodes(arrays.row)
+        ends = self._forest.pools.ends[: len(rows)].numpy()
+        rows = self.keyframes.settle(rows, ends, self._of_nodes(arrays.u)[:, :3])
+        arrays.row[: len(rows)].assign(rows)
+        everywhere = wp.ones(1, dtype=wp.int32, device=self._forest.device)
+        self.launch(everywhere)
 
     def _take_trajectories(self) -> None:
         """Tell the device which keyframes nodes follow, if the user has changed them."""
@@ -116,8 +145,9 @@ class Conditions:
 
     def _forget(self, rows: npt.NDArray[np.int32]) -> None:
         """Forget the keyframes that no node follows, now or in what is kept."""
-        kept = self.kept["row"].numpy() if "row" in self.kept else np.empty(0, np.int32)
-        self.keyframes.forget(but=np.concatenate([rows, kept]))
+        if self._kept_rows is None:
+            self._kept_rows = set(np.unique(self.kept["row"].numpy()).tolist()) if "row" in self.kept else set()
+        self.keyframes.forget(but=self._kept_rows.union(np.unique(rows).tolist()))
 
     def _of_nodes(self, array: wp.array) -> npt.NDArray[Any]:
         return array[: self._body.node_count].numpy().copy()
