@@ -313,6 +313,27 @@ class TestContactOfParticles:
         assert max(kinetic) < 2.0 * energy
         assert kinetic[-1] > 0.5 * energy
 
+    def test_is_newtons(self, device, rng):
+        """Whatever grid neighbours are found with."""
+        made = held_builder()
+        points = rng.uniform(0.0, 1.0, (300, 3))
+        for x, v in zip(points, rng.standard_normal((300, 3)), strict=True):
+            made.add_particle(wp.vec3(*map(float, x)), wp.vec3(*map(float, v)), M, radius=0.05)
+        model = made.finalize(device=device)
+        ends = []
+        for solver in (
+            wn.SolverCorotated(model, particle_contact=True),
+            newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False),
+        ):
+            now, after = model.state(), model.state()
+            for _ in range(20):
+                now.clear_forces()
+                solver.step(now, after, None, None, 2e-5)
+                now, after = after, now
+            ends.append(now.particle_qd.numpy()[8:])
+        assert np.abs(ends[1] - model.particle_qd.numpy()[8:]).max() > 0.1
+        np.testing.assert_allclose(ends[0], ends[1], atol=2e-5 * np.abs(ends[1]).max())
+
     def test_is_of_no_account_where_there_is_none(self, device):
         model = grid_model(device)
         apart, together = (wn.SolverCorotated(model, particle_contact=c).contact_dt for c in (False, True))

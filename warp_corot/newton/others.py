@@ -6,6 +6,7 @@ These are stepped by another of Newton's solvers, on a view of the model in whic
 from __future__ import annotations
 
 import copy
+import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -62,6 +63,8 @@ class Others:
                 view.particle_count = 0
             if not particle_contact:
                 view.particle_grid = None
+            elif model.device.is_cpu and model.particle_grid is not None:
+                view.particle_grid = _grid_for(model)
             if not own and model.body_count:
                 view.body_count = view.joint_count = 0
             try:
@@ -158,6 +161,12 @@ class Others:
             rigid.soft_contact_max = 0
             self._rigid_contacts = contacts, rigid
         return self._rigid_contacts[1]
+
+
+def _grid_for(model: newton.Model) -> wp.HashGrid:
+    """A grid of about as many cells as there are particles: clearing Newton's two million would be most of a step."""
+    size = 2 ** math.ceil(math.log2(max(model.particle_count, 1)) / 3)
+    return wp.HashGrid(*3 * [min(max(size, 8), 128)], device=model.device)
 
 
 def _warn_of_ignored(model: newton.Model) -> None:
