@@ -284,6 +284,13 @@ class TestNotes:
         assert "not one another" in notes(block(tmp_path / "in.usda", change))
         assert "not one another" not in notes(block(tmp_path / "other.usda"))
 
+    def test_collision_that_cannot_be_disabled(self, tmp_path):
+        def change(_, mesh):
+            mesh.GetPrim().CreateAttribute("physics:collisionEnabled", Sdf.ValueTypeNames.Bool).Set(False)
+
+        assert f"{SIM} collides, though its collision is disabled" in notes(block(tmp_path / "in.usda", change))
+        assert "disabled" not in notes(block(tmp_path / "other.usda"))
+
     def test_rigid_bodies_that_are_disabled_stay(self, tmp_path):
         def change(made, _):
             cube = made.box(at=(0.0, 0.0, -0.2))

@@ -41,10 +41,12 @@ def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParse
 
 what is read, as Newton reads it:
   TetMesh prims, with or without PhysicsVolumeDeformableSimAPI; of the physics material that is bound to them
-  (PhysicsVolumeDeformableMaterialAPI) youngsModulus, poissonsRatio and density, and dynamicFriction (0.5 if not given;
-  contact has the mean of both sides' friction); masses, restShapePoints; attachments
-  to rigid bodies, and to what does not move, by which points are held; graphics meshes of a deformable body
-  rigid bodies, colliders, joints and the gravity of UsdPhysics; metersPerUnit, kilogramsPerUnit, upAxis, transforms
+  (PhysicsVolumeDeformableMaterialAPI) youngsModulus (else 1 MPa), poissonsRatio (else 0.3), density (else 1000 kg/m^3)
+  and dynamicFriction (else 0.5; contact has the mean of both sides'); masses, restShapePoints; attachments to rigid
+  bodies, and to what does not move, by which points are held; graphics meshes of a deformable body; cloth, as Newton's
+  membrane; no cables
+  rigid bodies, colliders, joints and the gravity of UsdPhysics, at their first moment if they are animated;
+  metersPerUnit, kilogramsPerUnit, upAxis, transforms
 
 what touches what: points of soft bodies, and of cloth, touch colliders and rigid bodies, but not one another; rigid
   bodies touch rigid bodies and colliders

@@ -99,6 +99,9 @@ def notes_of(made: StageModel, builder: newton.ModelBuilder, options: StageOptio
     for body in made.soft:
         if alone := np.count_nonzero(~used[body.particles]):
             yield f"{body.prim.path}: points in no tetrahedron, which stay where they are: {alone}"
+        attribute = scene.stage.GetPrimAtPath(body.prim.path).GetAttribute("physics:collisionEnabled")
+        if attribute and attribute.Get() is False:
+            yield f"{body.prim.path} collides, though its collision is disabled: Newton has no such switch for points"
     given = {"young": options.young, "poisson": options.poisson, "density": options.density}
     for name, value in given.items():
         if value is not None and all(name in scene.says(body.prim.path) for body in made.soft):
