@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from ..kernels import lanczos
-from ..nodal import padded
 
 if TYPE_CHECKING:
     from ..body import SoftBody
@@ -31,20 +31,14 @@ def largest_frequency(body: SoftBody, field: ForceField) -> float:
     if not free:
         return 0.0
     iteration = _Lanczos(body, field)
-    diagonal: list[float] = []
-    off: list[float] = [0.0]
     with field.state_kept():
         iteration.find_rest_forces()
-        for _ in range(min(LANCZOS_STEPS, 3 * free)):
-            a, b = iteration.step(off[-1])
-            diagonal.append(a)
-            off.append(b)
-            if b <= 1e-6 * max(map(abs, diagonal)):
-                break
-    size = len(diagonal)
-    tridiagonal = np.diag(diagonal) + np.diag(off[1:size], 1) + np.diag(off[1:size], -1)
+        for step in range(min(LANCZOS_STEPS, 3 * free)):
+            iteration.launch(step)
+    diagonal, off = iteration.coefficients()
+    tridiagonal = np.diag(diagonal) + np.diag(off[1:-1], 1) + np.diag(off[1:-1], -1)
     values, vectors = np.linalg.eigh(tridiagonal)
-    bound = values[-1] + off[size] * abs(vectors[-1, -1])
+    bound = values[-1] + off[-1] * abs(vectors[-1, -1])
     return float(np.sqrt(max(bound, 0.0)))
 
 
@@ -56,41 +50,60 @@ class _Lanczos:
         self.field = field
         self.probe = PROBE * body.smallest_volume ** (1.0 / 3.0)
         self.q, self.before, self.next = (
-            wp.zeros(body.launch_nodes, dtype=wp.vec4, device=body.device) for _ in range(3)
+            wp.empty(body.launch_nodes, dtype=wp.vec4, device=body.device) for _ in range(3)
         )
         self.u, self.f, self._rest = (wp.zeros_like(body.node_displacements) for _ in range(3))
-        self._sums = wp.zeros(lanczos.PARTIAL_SUMS, dtype=wp.float64, device=body.device)
-        self._largest = wp.zeros(lanczos.PARTIAL_SUMS, dtype=wp.float32, device=body.device)
-        start = padded(np.random.default_rng(0).standard_normal((body.node_count, 3), np.float32))
-        start[body.node_inverse_mass[: body.node_count].numpy() == 0] = 0.0
-        self.q[: body.node_count].assign(start)
-        self._launch(lanczos.scale_by, [1.0 / np.sqrt(self._inner(self.q, self.q)), self.q])
+        parts = min(body.launch_nodes, lanczos.PARTS)
+        self._parts, self._sums, self._largest, self._diagonal, self._off = (
+            wp.empty(size, dtype=wp.float64, device=body.device)
+            for size in (parts, lanczos.FOLDED, lanczos.FOLDED, LANCZOS_STEPS, LANCZOS_STEPS + 1)
+        )
+        self._scale = wp.empty(1, dtype=wp.float32, device=body.device)
+        self._steps = 0
+        self._launch(lanczos.random_motion, [0, body.node_inverse_mass, self.q])
+        self._normalise(self.q, 0)
 
     def find_rest_forces(self) -> None:
         """What forces there are without displacements, by active stress: of those with any, only the rest counts."""
         self.field.add_forces(self.u, self._rest)
         self._launch(lanczos.scale_by, [-1.0, self._rest])
 
-    def step(self, beta: float) -> tuple[float, float]:
-        """One step; the last off-diagonal entry in, the next diagonal and off-diagonal ones out [1/s^2]."""
+    def launch(self, step: int) -> None:
+        """Launch a step; each is one after the last."""
         inverse_mass = self.body.node_inverse_mass
-        self._launch(lanczos.largest_motions, [inverse_mass, self.q, self._largest], lanczos.PARTIAL_SUMS)
-        scale = self.probe / float(self._largest.numpy().max())
-        self._launch(lanczos.probe_motion, [scale, inverse_mass, self.q, self.u])
+        self._launch(lanczos.largest_motions, [inverse_mass, self.q, self._parts], len(self._parts))
+        self._launch(lanczos.fold, [self._parts, self._sums, self._largest], lanczos.FOLDED)
+        self._launch(lanczos.take_scale, [self.probe, self._largest, self._scale], 1)
+        self._launch(lanczos.probe_motion, [self._scale, inverse_mass, self.q, self.u])
         wp.copy(self.f, self._rest, count=self.body.launch_nodes)
         self.field.add_forces(self.u, self.f)
-        self._launch(lanczos.apply_stiffness, [scale, beta, inverse_mass, self.f, self.before, self.next])
-        diagonal = self._inner(self.q, self.next)
-        self._launch(lanczos.add_scaled, [-diagonal, self.q, self.next])
-        off = float(np.sqrt(self._inner(self.next, self.next)))
-        if off > 0.0:
-            self._launch(lanczos.scale_by, [1.0 / off, self.next])
+        arguments = [self._scale, self._off, step, inverse_mass, self.f, self.before, self.next]
+        self._launch(lanczos.apply_stiffness, arguments)
+        self._sum(self.q, self.next, self._diagonal, step)
+        self._launch(lanczos.take_away, [self._diagonal, step, self.q, self.next])
+        self._normalise(self.next, step + 1)
         self.before, self.q, self.next = self.q, self.next, self.before
-        return diagonal, off
+        self._steps = step + 1
 
-    def _inner(self, a: wp.array, b: wp.array) -> float:
-        self._launch(lanczos.inner_products, [a, b, self._sums], lanczos.PARTIAL_SUMS)
-        return float(self._sums.numpy().sum())
+    def coefficients(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Diagonal and off-diagonal entries [1/s^2], of these one more at either end; of steps that mean something.
+
+        Waits for the device.
+        """
+        diagonal, off = self._diagonal.numpy()[: self._steps], self._off.numpy()[: self._steps + 1]
+        ended = off[1:] <= 1e-6 * np.maximum.accumulate(np.abs(diagonal))
+        size = int(np.argmax(ended)) + 1 if ended.any() else self._steps
+        return diagonal[:size], off[: size + 1]
+
+    def _normalise(self, a: wp.array, place: int) -> None:
+        """Divide a vector by its length, which goes into its place among off-diagonal entries."""
+        self._sum(a, a, self._off, place, root=True)
+        self._launch(lanczos.divide_by, [self._off, place, a])
+
+    def _sum(self, a: wp.array, b: wp.array, numbers: wp.array, place: int, *, root: bool = False) -> None:
+        self._launch(lanczos.inner_products, [a, b, self._parts], len(self._parts))
+        self._launch(lanczos.fold, [self._parts, self._sums, self._largest], lanczos.FOLDED)
+        self._launch(lanczos.take_sum, [self._sums, int(root), place, numbers], 1)
 
     def _launch(self, kernel: wp.Kernel, arguments: list, dim: int | None = None) -> None:
         count = self.body.launch_nodes if dim is None else dim
