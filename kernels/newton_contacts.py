@@ -3,26 +3,29 @@
 Every force on a particle is taken from the body, wrench about its centre of mass, so momentum is exchanged exactly.
 Damping and friction turn no relative velocity round within a step, however light particle and body are: so much of the
 law as would do that is left out. A body that is touched in n places counts in each as a piece of 1/n of its mass and
-inertia, which bounds what all of them do together; springs, too, are no stiffer than such a piece can follow. A
-particle that touches several shapes is still slowed down by each.
+inertia, which bounds what all of them do together. A particle that touches several shapes is still slowed down by
+each. Springs act on the body where it would give way to them; see ``newton_yielding``.
 """
 
 import warp as wp
 
 from .elements import add_force
 from .newton_mobility import (
-    MOST_STIFF,
     Mobility,
     body_mobility,
     body_point_velocity,
     mobility_of,
     most_damping,
-    most_stiffness,
+    spring_row,
 )
 from .newton_particles import ACTIVE
 from .newton_worlds import SURFACE_CONTACTS, place_of
 
 wp.set_module_options({"enable_backward": False})
+
+#: Where a body gives way to springs entirely, this share of the strongest damper acts, too: explicit steps give back up
+#: to a quarter more than they got from a contact that lasts only a few of them.
+LOSS = wp.constant(0.5)
 
 
 @wp.struct
@@ -46,17 +49,21 @@ def contact_force(
     slope: float,
     mu: float,
     m: Mobility,
+    yielded: float,
     dt: float,
 ):
     """Force on the particle [N]: spring and damper along the normal, regularised Coulomb friction across it.
 
     Args:
+        gap: As the body gives way.
         v: Velocity of the particle relative to the body's point.
+        yielded: Share of the gap that is gone by that.
     """
     towards = wp.dot(normal, v)
-    push = -wp.min(stiffness, most_stiffness(m, normal, dt)) * gap
+    push = -stiffness * gap
     if gap < 0.0 and towards < 0.0:
-        push -= wp.min(damping, most_damping(m, normal, dt)) * towards
+        most = most_damping(m, normal, dt)
+        push -= wp.min(damping + LOSS * yielded * most, most) * towards
     sliding = v - towards * normal
     speed = wp.length(sliding)
     force = push * normal
@@ -75,54 +82,6 @@ def contact_gap(
     if shape_margin.shape[0] > 0:
         gap -= shape_margin[shape]
     return gap
-
-
-@wp.kernel(enable_backward=False)
-def count_soft_contacts(
-    # In
-    law: ContactLaw,
-    count: wp.array[wp.int32],
-    contact_particle: wp.array[wp.int32],
-    contact_shape: wp.array[wp.int32],
-    contact_point: wp.array[wp.vec3],
-    contact_normal: wp.array[wp.vec3],
-    shape_body: wp.array[wp.int32],
-    shape_margin: wp.array[wp.float32],
-    flags: wp.array[wp.int32],
-    radius: wp.array[wp.float32],
-    q: wp.array[wp.vec3],
-    body_q: wp.array[wp.transform],
-    # In and out
-    places: wp.array[wp.int32],
-):
-    """In how many places bodies are touched."""
-    c = wp.tid()
-    if c >= wp.min(count[0], contact_particle.shape[0]):
-        return
-    i = contact_particle[c]
-    shape = contact_shape[c]
-    if i < 0:
-        return
-    body = shape_body[shape]
-    if body < 0 or (flags[i] & ACTIVE) == 0:
-        return
-    point = wp.transform_point(body_q[body], contact_point[c])
-    if contact_gap(contact_normal[c], q[i], radius[i], point, shape, shape_margin) <= law.adhesion:
-        wp.atomic_add(places, body, 1)
-
-
-@wp.kernel(enable_backward=False)
-def count_attachments(
-    # In
-    body: wp.array[wp.int32],
-    enabled: wp.array[wp.bool],
-    # In and out
-    places: wp.array[wp.int32],
-):
-    """As ``count_soft_contacts``."""
-    a = wp.tid()
-    if enabled[a]:
-        wp.atomic_add(places, body[a], 1)
 
 
 @wp.kernel(enable_backward=False)
@@ -157,6 +116,7 @@ def scatter_soft_contacts(
     body_q: wp.array[wp.transform],
     body_qd: wp.array[wp.spatial_vector],
     body_com: wp.array[wp.vec3],
+    yielding: wp.array[wp.spatial_vector],
     # Out
     f: wp.array[wp.vec4],
     body_f: wp.array[wp.spatial_vector],
@@ -186,6 +146,12 @@ def scatter_soft_contacts(
         velocity = wp.transform_vector(pose, velocity) + body_point_velocity(body_qd[body], arm)
     normal = contact_normal[c]
     gap = contact_gap(normal, q[i], radius[i], point, shape, shape_margin)
+    yielded = float(0.0)
+    if body >= 0:
+        less = wp.dot(spring_row(normal, arm), yielding[body])
+        if gap < 0.0:
+            yielded = wp.clamp(less / gap, 0.0, 1.0)
+        gap -= less
     if gap > law.adhesion:
         return
     m = mobility_of(
@@ -208,6 +174,7 @@ def scatter_soft_contacts(
         0.5 * (law.friction_slope + shape_kf[shape]),
         0.5 * (law.friction + shape_mu[shape]),
         m,
+        yielded,
         dt,
     )
     add_force(f, i, force)
@@ -236,6 +203,7 @@ def scatter_attachments(
     body_q: wp.array[wp.transform],
     body_qd: wp.array[wp.spatial_vector],
     body_com: wp.array[wp.vec3],
+    yielding: wp.array[wp.spatial_vector],
     # Out
     f: wp.array[wp.vec4],
     body_f: wp.array[wp.spatial_vector],
@@ -256,13 +224,11 @@ def scatter_attachments(
     # The sum over three directions is more than any one's.
     every = body_mobility(m, wp.vec3(1.0, 0.0, 0.0))
     every += body_mobility(m, wp.vec3(0.0, 1.0, 0.0)) + body_mobility(m, wp.vec3(0.0, 0.0, 1.0))
-    k = float(stiffness[a])
     d = float(damping[a])
-    if every > 0.0:
-        k = wp.min(k, MOST_STIFF / (every * dt * dt))
     if every + m.particle > 0.0:
         d = wp.min(d, 1.0 / ((every + m.particle) * dt))
-    force = -k * (q[i] - point) - d * relative
+    point += body_point_velocity(yielding[b], arm)
+    force = -stiffness[a] * (q[i] - point) - d * relative
     add_force(f, i, force)
     wp.atomic_sub(body_f, b, wp.spatial_vector(force, wp.cross(arm, force)))
 

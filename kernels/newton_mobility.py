@@ -1,11 +1,9 @@
-"""How light a particle and a body are where they touch, and how much of a damper or a spring they can follow."""
+"""How light a particle and a body are where they touch, and how much of a damper they can follow."""
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-#: Largest k dt^2 / m of a spring on a body's piece; symplectic Euler is stable below 4, dampers and particle included.
-MOST_STIFF = wp.constant(0.5)
 #: More than any limit.
 NO_LIMIT = wp.constant(1.0e30)
 
@@ -69,10 +67,6 @@ def most_damping(m: Mobility, direction: wp.vec3, dt: float):
 
 
 @wp.func
-def most_stiffness(m: Mobility, direction: wp.vec3, dt: float):
-    """What the body's piece can follow [N/m]; of the particle, the time step takes care."""
-    w = body_mobility(m, direction)
-    most = float(NO_LIMIT)
-    if w > 0.0:
-        most = MOST_STIFF / (w * dt * dt)
-    return most
+def spring_row(normal: wp.vec3, arm: wp.vec3):
+    """How fast a body's point at ``arm`` goes along a unit vector, by the body's twist."""
+    return wp.spatial_vector(normal, wp.cross(arm, normal))

@@ -6,15 +6,16 @@ import numpy as np
 import warp as wp
 
 from ..errors import InputError
-from ..kernels.newton_contacts import (
-    ContactLaw,
-    count_attachments,
-    count_soft_contacts,
-    scatter_attachments,
-    scatter_soft_contacts,
-)
+from ..kernels.newton_contacts import ContactLaw, scatter_attachments, scatter_soft_contacts
 from ..kernels.newton_worlds import check_contact_count
+from ..kernels.newton_yielding import gather_attachments, gather_soft_contacts, solve_yielding
 from .library import newton
+
+#: ``newton.BodyFlags.KINEMATIC``, of bodies that move as they are told.
+KINEMATIC = int(newton.BodyFlags.KINEMATIC)
+
+#: How often it is asked which contacts still hold where bodies have given way.
+ROUNDS = 2
 
 
 class Contacts:
@@ -32,6 +33,10 @@ class Contacts:
         #: In how many places bodies are touched or held, int32 [B].
         self._places = wp.zeros(bodies, dtype=wp.int32, device=self.device)
         self._no_numbers = wp.empty(0, dtype=wp.float32, device=self.device)
+        #: Curvature and slope of springs on bodies, and how far these give way to them [m]; of twists, [B].
+        self._curvature = wp.zeros(bodies, dtype=wp.spatial_matrixf, device=self.device)
+        self._slope = wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device)
+        self._yielding = wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device)
         #: Wrenches of the particles on the bodies in the last substep [N, N m], spatial_vector [B].
         self.reactions = wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device)
         self.refresh()
@@ -92,62 +97,79 @@ class Contacts:
         them."""
         model = self.model
         q, qd = state.particle_q, state.particle_qd
+        touching = contacts if contacts is not None and contacts.soft_contact_max and model.shape_count else None
+        attached = model.attachment_particle_body_count
+        law = self._law()
         if model.body_count:
             self.reactions.zero_()
+            if touching is not None or attached:
+                self._find_yielding(state, of_bodies, touching, dt, law)
             masses = [model.body_flags, model.body_inv_mass, model.body_inv_inertia, self._places]
-            bodies = [of_bodies.body_q, of_bodies.body_qd, model.body_com]
-            self._places.zero_()
+            bodies = [of_bodies.body_q, of_bodies.body_qd, model.body_com, self._yielding]
         else:
             masses = [self._no_flags, self._no_numbers, self._no_inertia, self._places]
-            bodies = [self._no_poses, self._no_twists, self._no_points]
-        bodies = [int(newton.BodyFlags.KINEMATIC), *masses, *bodies]
-        if model.attachment_particle_body_count:
-            # Before the contacts: they share the body with these.
-            inputs = [model.attachment_particle_body_body, model.attachment_particle_body_enabled]
-            self._launch(count_attachments, model.attachment_particle_body_count, inputs, [self._places])
-        if contacts is not None and contacts.soft_contact_max and model.shape_count:
-            law = ContactLaw()
-            law.stiffness, law.damping = model.soft_contact_ke, model.soft_contact_kd
-            law.friction_slope, law.friction = model.soft_contact_kf, model.soft_contact_mu
-            law.adhesion = model.particle_adhesion
+            bodies = [self._no_poses, self._no_twists, self._no_points, self._no_twists]
+        bodies = [KINEMATIC, *masses, *bodies]
+        if touching is not None:
             found = [
-                contacts.soft_contact_count,
-                contacts.soft_contact_particle,
-                contacts.soft_contact_indices,
-                contacts.soft_contact_shape,
-                contacts.soft_contact_body_pos,
-                contacts.soft_contact_body_vel,
-                contacts.soft_contact_normal,
+                touching.soft_contact_count,
+                touching.soft_contact_particle,
+                touching.soft_contact_indices,
+                touching.soft_contact_shape,
+                touching.soft_contact_body_pos,
+                touching.soft_contact_body_vel,
+                touching.soft_contact_normal,
             ]
-            shapes = [
-                model.shape_body,
-                self._no_numbers if model.shape_margin is None else model.shape_margin,
-                model.shape_material_ke,
-                model.shape_material_kd,
-                model.shape_material_kf,
-                model.shape_material_mu,
-            ]
-            if model.body_count:
-                inputs = [law, found[0], found[1], found[3], found[4], found[6], shapes[0], shapes[1]]
-                inputs += [model.particle_flags, model.particle_radius, q, of_bodies.body_q]
-                self._launch(count_soft_contacts, contacts.soft_contact_max, inputs, [self._places])
+            shapes = [model.shape_body, self._margins(), model.shape_material_ke, model.shape_material_kd]
+            shapes += [model.shape_material_kf, model.shape_material_mu]
             particles = [model.particle_flags, model.particle_world, model.particle_radius, model.particle_inv_mass]
             inputs = [law, dt, *found, *shapes, *particles, q, qd, *bodies]
-            outputs = [f, self.reactions, trouble]
-            self._launch(scatter_soft_contacts, contacts.soft_contact_max, inputs, outputs)
-        if model.attachment_particle_body_count:
-            attached = [
-                model.attachment_particle_body_particle,
-                model.attachment_particle_body_body,
-                model.attachment_particle_body_body_point,
-                model.attachment_particle_body_stiffness,
-                model.attachment_particle_body_damping,
-                model.attachment_particle_body_enabled,
-                model.particle_inv_mass,
-            ]
-            outputs = [f, self.reactions]
-            count = model.attachment_particle_body_count
-            self._launch(scatter_attachments, count, [dt, *attached, q, qd, *bodies], outputs)
+            self._launch(scatter_soft_contacts, touching.soft_contact_max, inputs, [f, self.reactions, trouble])
+        if attached:
+            inputs = [dt, *self._attachments(), model.attachment_particle_body_damping]
+            inputs += [model.attachment_particle_body_enabled, model.particle_inv_mass, q, qd, *bodies]
+            self._launch(scatter_attachments, attached, inputs, [f, self.reactions])
+
+    def _find_yielding(
+        self, state: newton.State, of_bodies: newton.State, touching: newton.Contacts | None, dt: float, law: ContactLaw
+    ) -> None:
+        """How far bodies give way to springs, and in how many places they are touched."""
+        model, q = self.model, state.particle_q
+        self._places.zero_()
+        outputs = [self._places, self._curvature, self._slope]
+        bodies = [of_bodies.body_q, model.body_com]
+        for number in range(ROUNDS if touching is not None else 1):
+            if touching is not None:
+                inputs = [law, touching.soft_contact_count, touching.soft_contact_particle, touching.soft_contact_shape]
+                inputs += [touching.soft_contact_body_pos, touching.soft_contact_normal]
+                inputs += [model.shape_body, self._margins(), model.shape_material_ke]
+                inputs += [model.particle_flags, model.particle_radius, q, KINEMATIC, model.body_flags, *bodies]
+                inputs += [self._yielding, number]
+                self._launch(gather_soft_contacts, touching.soft_contact_max, inputs, outputs)
+            if model.attachment_particle_body_count:
+                inputs = [*self._attachments(), model.attachment_particle_body_enabled, q, *bodies, number]
+                self._launch(gather_attachments, model.attachment_particle_body_count, inputs, outputs)
+            inputs = [dt, KINEMATIC, model.body_flags, model.body_inv_mass, model.body_inv_inertia, of_bodies.body_q]
+            self._launch(solve_yielding, model.body_count, inputs, [self._curvature, self._slope, self._yielding])
+
+    def _law(self) -> ContactLaw:
+        law, model = ContactLaw(), self.model
+        law.stiffness, law.damping = model.soft_contact_ke, model.soft_contact_kd
+        law.friction_slope, law.friction = model.soft_contact_kf, model.soft_contact_mu
+        law.adhesion = model.particle_adhesion
+        return law
+
+    def _margins(self) -> wp.array:
+        return self._no_numbers if self.model.shape_margin is None else self.model.shape_margin
+
+    def _attachments(self) -> list[wp.array]:
+        model = self.model
+        return [
+            model.attachment_particle_body_particle,
+            model.attachment_particle_body_body,
+            model.attachment_particle_body_body_point,
+            model.attachment_particle_body_stiffness,
+        ]
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
