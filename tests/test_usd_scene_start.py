@@ -174,7 +174,8 @@ class TestLyingInOneAnother:
         path = block(tmp_path / "in.usda", ground=False, at=(-0.1, -0.1, 0.02), **form)
         with pytest.raises(wc.InputError, match=rf"ground is {height:g} m; {SIM} .* {axis} = 0\.02 m.*at most 0\.02"):
             parts(path, ground=height)
-        assert parts(path, ground=0.02).ground is not None
+        # So is what is a little too high, against the edge of a tetrahedron.
+        assert all(parts(path, ground=free).ground is not None for free in (0.02, 0.024))
         with pytest.raises(wc.InputError, match=r"at most -0\.03 is free"):
             parts(path, ground=0.0, radius=0.05)
 
