@@ -1,4 +1,10 @@
-"""Soft contacts and attachments: what particles and rigid bodies do to one another."""
+"""Soft contacts and attachments: what particles and rigid bodies do to one another.
+
+Contacts are of particles: a body smaller than their spacing sinks in between them, and one whose edge they pass in a
+step is pushed aside. So particles' radii should exceed what a body goes in a step, and half of the spacing where bodies
+are as small as that; the pipeline's ``soft_contact_margin`` should exceed what a body goes between two ``collide``, or
+contacts are found too late, when they are deep, and throw it out.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +21,7 @@ from .library import newton
 KINEMATIC = int(newton.BodyFlags.KINEMATIC)
 
 #: How often it is asked which contacts still hold where bodies have given way.
-ROUNDS = 2
+ROUNDS = 4
 
 
 class Contacts:
