@@ -18,7 +18,10 @@ def light_box(device, density):
 
 
 class TestLightBodies:
-    @pytest.mark.parametrize(("density", "ke", "kd"), [(5.0, None, None), (200.0, None, None), (5.0, 1e5, 1e3)])
+    @pytest.mark.parametrize(
+        ("density", "ke", "kd"),
+        [pytest.param(5.0, 1e5, 1e3, marks=pytest.mark.slow), (5.0, None, None), (200.0, None, None)],
+    )
     def test_come_to_rest(self, device, density, ke, kd):
         """At half the safe step a box far lighter than what is below it does not rise above where it was dropped.
 
