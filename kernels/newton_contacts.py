@@ -9,7 +9,7 @@ each. Springs act on the body where it would give way to them; see ``newton_yiel
 
 import warp as wp
 
-from .elements import add_force
+from .elements import add_force, load_node
 from .newton_mobility import (
     Mobility,
     body_mobility,
@@ -48,6 +48,7 @@ def contact_force(
     damping: float,
     slope: float,
     mu: float,
+    pull: wp.vec3,
     m: Mobility,
     yielded: float,
     dt: float,
@@ -57,6 +58,7 @@ def contact_force(
     Args:
         gap: As the body gives way.
         v: Velocity of the particle relative to the body's point.
+        pull: What all other forces add to it in this step [m/s].
         yielded: Share of the gap that is gone by that.
     """
     towards = wp.dot(normal, v)
@@ -64,12 +66,15 @@ def contact_force(
     if gap < 0.0 and towards < 0.0:
         most = most_damping(m, normal, dt)
         push -= wp.min(damping + LOSS * yielded * most, most) * towards
-    sliding = v - towards * normal
+    # Implicit, of the velocity that there would be without friction. Of the present one, what pulls at a light particle
+    # would move it on by a step's worth of that every step, however much friction there may be.
+    sliding = v + pull
+    sliding -= wp.dot(normal, sliding) * normal
     speed = wp.length(sliding)
     force = push * normal
-    if speed > 0.0:
+    if speed > 0.0 and slope > 0.0:
         across = sliding / speed
-        drag = wp.min(wp.min(slope, most_damping(m, across, dt)) * speed, mu * wp.max(push, 0.0))
+        drag = wp.min(speed / (1.0 / slope + 1.0 / most_damping(m, across, dt)), mu * wp.max(push, 0.0))
         force -= drag * across
     return force
 
@@ -108,6 +113,8 @@ def scatter_soft_contacts(
     inverse_mass: wp.array[wp.float32],
     q: wp.array[wp.vec3],
     qd: wp.array[wp.vec3],
+    gravity: wp.array[wp.vec3],
+    before: wp.array[wp.vec4],
     fixed_flag: int,
     body_flags: wp.array[wp.int32],
     body_inverse_mass: wp.array[wp.float32],
@@ -165,6 +172,9 @@ def scatter_soft_contacts(
         pose,
         arm,
     )
+    pull = wp.vec3()
+    if inverse_mass[i] > 0.0:
+        pull = dt * (inverse_mass[i] * load_node(before, i) + gravity[place_of(world[i], gravity.shape[0])])
     force = contact_force(
         normal,
         gap,
@@ -173,6 +183,7 @@ def scatter_soft_contacts(
         0.5 * (law.damping + shape_kd[shape]),
         0.5 * (law.friction_slope + shape_kf[shape]),
         0.5 * (law.friction + shape_mu[shape]),
+        pull,
         m,
         yielded,
         dt,

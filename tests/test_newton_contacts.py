@@ -6,6 +6,7 @@ import warp as wp
 from newton_scenes import add_grid, builder, grid_model, momentum, newton, run, semi_implicit, wc, wn
 
 KE = 2e4
+KF, DT = 1e5, 4e-4
 
 
 def contact_parameters(model, ke=KE, kd=20.0, kf=100.0, mu=0.5):
@@ -43,27 +44,35 @@ class TestGround:
             weights.append(KE * depth.sum() / (9.81 * model.particle_mass.numpy().sum()))
         assert weights == pytest.approx([1.0, 1.0], abs=0.01)
 
-    @pytest.mark.parametrize(("slope", "slides"), [(0.3, False), (0.8, True)])
-    def test_friction_on_a_slope(self, device, slope, slides):
-        """Gravity at an angle; tan = slope against mu = 0.5. What slides does so by g (sin - mu cos)."""
-        angle = np.arctan(slope)
+    def slope(self, device, tangent, steps, **options):
+        """A block under gravity at an angle, with mu = 0.5: its velocities, and its lowest layer's places."""
+        angle = np.arctan(tangent)
         g = 9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)])
-        model, pipeline = on_ground(device, gravity=tuple(g), mu=0.5)
-        model.soft_contact_kf = 1e5
-        model.shape_material_kf.fill_(1e5)
-        solver = wn.SolverCorotated(model)
-        m = model.particle_mass.numpy()
-        speeds = []
+        model, pipeline = on_ground(device, gravity=tuple(g), mu=0.5, **options)
+        model.soft_contact_kf = KF
+        model.shape_material_kf.fill_(KF)
+        m, z = model.particle_mass.numpy(), model.particle_q.numpy()[:, 2]
+        below = z < z.min() + 1e-3
+        speeds, places = [], []
 
         def watch(state):
             speeds.append(float(m @ state.particle_qd.numpy()[:, 0]) / m.sum())
+            places.append(float(state.particle_q.numpy()[below, 0].mean()))
 
-        run(solver, model, 1500, 4e-4, pipeline=pipeline, each=watch)
-        if slides:
-            gained = (speeds[-1] - speeds[499]) / (1000 * 4e-4)
-            assert gained == pytest.approx(9.81 * (np.sin(angle) - 0.5 * np.cos(angle)), rel=0.05)
-        else:
-            assert abs(np.mean(speeds[-500:])) < 0.01
+        run(wn.SolverCorotated(model), model, steps, DT, pipeline=pipeline, each=watch)
+        return speeds, places, float(m.sum()) * g, int(below.sum())
+
+    def test_slides_where_friction_is_too_little(self, device):
+        """By g (sin - mu cos)."""
+        speeds, _, weight, _ = self.slope(device, 0.8, 1500)
+        mass = np.linalg.norm(weight) / 9.81
+        assert (speeds[-1] - speeds[499]) / (1000 * DT) == pytest.approx((weight[0] + 0.5 * weight[2]) / mass, rel=0.05)
+
+    def test_sticks_where_friction_is_enough(self, device):
+        """But for what the law's slope allows, F / kf of each node, however light these are; once it does not sway."""
+        _, places, weight, nodes = self.slope(device, 0.3, 2500, damp=500.0)
+        creep = (places[-1] - places[1749]) / (750 * DT)
+        assert creep == pytest.approx(weight[0] / (nodes * KF), rel=0.2)
 
     def test_is_not_fallen_through(self, device):
         model, pipeline = on_ground(device, vel=(0.0, 0.0, -3.0), damp=50.0)

@@ -38,6 +38,8 @@ class Contacts:
         self._no_flags = wp.empty(0, dtype=wp.int32, device=self.device)
         #: In how many places bodies are touched or held, int32 [B].
         self._places = wp.zeros(bodies, dtype=wp.int32, device=self.device)
+        #: Forces on particles before those of contacts [N], which friction takes account of.
+        self._before = wp.empty(model.particle_count, dtype=wp.vec4, device=self.device)
         self._no_numbers = wp.empty(0, dtype=wp.float32, device=self.device)
         #: Curvature and slope of springs on bodies, and how far these give way to them [m]; of twists, [B].
         self._curvature = wp.zeros(bodies, dtype=wp.spatial_matrixf, device=self.device)
@@ -129,7 +131,8 @@ class Contacts:
             shapes = [model.shape_body, self._margins(), model.shape_material_ke, model.shape_material_kd]
             shapes += [model.shape_material_kf, model.shape_material_mu]
             particles = [model.particle_flags, model.particle_world, model.particle_radius, model.particle_inv_mass]
-            inputs = [law, dt, *found, *shapes, *particles, q, qd, *bodies]
+            wp.copy(self._before, f)
+            inputs = [law, dt, *found, *shapes, *particles, q, qd, model.gravity, self._before, *bodies]
             self._launch(scatter_soft_contacts, touching.soft_contact_max, inputs, [f, self.reactions, trouble])
         if attached:
             inputs = [dt, *self._attachments(), model.attachment_particle_body_damping]

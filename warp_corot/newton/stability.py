@@ -93,7 +93,7 @@ def stable_step(
         stiffness: Of a spring at every particle [N/m], for contact.
         damping: Of a damper at every particle [N s/m].
         of_bodies: Stiffness over mass at the other end of such a spring [1/s^2]; 0: nothing moves there. Bodies that
-            are touched in several places need no shorter steps; see ``kernels.newton_contacts``.
+            are touched in several places need no shorter steps; see ``kernels.newton_yielding``.
     """
     model = tets.model
     body = cast(Any, _Particles(model, tets.elements.volume.numpy().astype(np.float64)))
