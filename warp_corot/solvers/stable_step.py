@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from ..elasticity import ForceField
 
 LANCZOS_STEPS = 30
+#: Of how many steps the best one is taken.
+LAST_STEPS = 8
 
 # Probing displacements as a share of the smallest element's size: small enough to be linear, large enough for float32.
 PROBE = 1e-3
@@ -35,11 +37,18 @@ def largest_frequency(body: SoftBody, field: ForceField) -> float:
         iteration.find_rest_forces()
         for step in range(min(LANCZOS_STEPS, 3 * free)):
             iteration.launch(step)
-    diagonal, off = iteration.coefficients()
-    tridiagonal = np.diag(diagonal) + np.diag(off[1:-1], 1) + np.diag(off[1:-1], -1)
-    values, vectors = np.linalg.eigh(tridiagonal)
-    bound = values[-1] + off[-1] * abs(vectors[-1, -1])
-    return float(np.sqrt(max(bound, 0.0)))
+    return float(np.sqrt(max(_largest_value(*iteration.coefficients()), 0.0)))
+
+
+def _largest_value(diagonal: npt.NDArray[np.float64], off: npt.NDArray[np.float64]) -> float:
+    """The largest Ritz value with its residual, of the last step or of one shortly before where that is less: rounding
+    brings copies of values that are found already, and with them residuals that mean nothing."""
+    bounds = []
+    for size in range(max(len(diagonal) - LAST_STEPS, 0) + 1, len(diagonal) + 1):
+        tridiagonal = np.diag(diagonal[:size]) + np.diag(off[1:size], 1) + np.diag(off[1:size], -1)
+        values, vectors = np.linalg.eigh(tridiagonal)
+        bounds.append(values[-1] + off[size] * abs(vectors[-1, -1]))
+    return float(max(min(bounds), values[-1]))
 
 
 class _Lanczos:
