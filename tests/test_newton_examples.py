@@ -136,6 +136,14 @@ def test_newtons_hanging_bodies(exchanged, frames):
 
 
 @pytest.mark.slow
+def test_newtons_hanging_bodies_come_to_rest(exchanged):
+    """With damping by mass; the softest damped of them would swing for minutes without."""
+    _, x, v = exchanged("softbody.example_softbody_hanging", 300, damping=4.0)
+    assert np.abs(v[-1]).max() < 5e-3 < 0.1 * np.abs(v).max()
+    assert x[-1, :, 2].mean() < x[0, :, 2].mean()
+
+
+@pytest.mark.slow
 def test_newtons_ball_on_a_soft_body(exchanged):
     name, options = "multiphysics.example_rigid_soft_contact", ("--solver", "semi_implicit")
     _, x, _ = exchanged(name, 300, options, solver="SolverSemiImplicit")
