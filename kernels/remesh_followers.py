@@ -12,17 +12,6 @@ PLACES = 2
 
 
 @wp.kernel(enable_backward=False)
-def begin_followers(
-    # In
-    goes: wp.array[wp.int32],
-    # Out
-    found: wp.array[wp.int32],
-):
-    if goes[0] != 0:
-        found[wp.tid()] = 0
-
-
-@wp.kernel(enable_backward=False)
 def list_followers(
     # In
     threads: int,

@@ -79,6 +79,18 @@ def begin_plan(
 
 
 @wp.kernel(enable_backward=False)
+def begin_counts(
+    # In
+    goes: wp.array[wp.int32],
+    # Out
+    found: wp.array[wp.int32],
+):
+    """Forget what was counted of the mesh before, if there is to be another count."""
+    if goes[0] != 0:
+        found[wp.tid()] = 0
+
+
+@wp.kernel(enable_backward=False)
 def gather_leaves(
     # In
     threads: int,

@@ -17,17 +17,6 @@ PLACES = 258
 
 
 @wp.kernel(enable_backward=False)
-def begin_survey(
-    # In
-    goes: wp.array[wp.int32],
-    # Out
-    found: wp.array[wp.int32],
-):
-    if goes[0] != 0:
-        found[wp.tid()] = 0
-
-
-@wp.kernel(enable_backward=False)
 def find_stiffest(
     # In
     threads: int,

@@ -2,7 +2,7 @@
 
 Contacts are of particles: a body smaller than their spacing sinks in between them, and one whose edge they pass in a
 step is pushed aside. So particles' radii should exceed what a body goes in a step, and half of the spacing where bodies
-are as small as that; the pipeline's ``soft_contact_margin`` should exceed what a body goes between two ``collide``, or
+are as small as that; the pipeline's ``soft_contact_gap`` should exceed what a body goes between two ``collide``, or
 contacts are found too late, when they are deep, and throw it out.
 """
 

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import warp as wp
 
 from ..kernels import remesh_followers as kernels
+from ..kernels.remesh_plan import begin_counts
 from .carried_activation import CarriedActivation
 from .carried_material import ACTIVATION, ACTIVATION_ROW
 from .keyframes import Keyframes
@@ -98,7 +99,7 @@ class Conditions:
         """Look which nodes follow keyframes if ``goes`` [1] is not zero; may be recorded."""
         forest = self._forest
         device, threads = forest.device, forest.threads
-        wp.launch(kernels.begin_followers, kernels.PLACES, inputs=[goes], outputs=[self.found], device=device)
+        wp.launch(begin_counts, kernels.PLACES, inputs=[goes], outputs=[self.found], device=device)
         inputs = [threads, goes, forest.pools, forest.carriage.arrays]
         wp.launch(kernels.list_followers, threads, inputs, [*self._followers, self.found], device=device)
 

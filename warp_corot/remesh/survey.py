@@ -9,6 +9,7 @@ import numpy.typing as npt
 import warp as wp
 
 from ..kernels import remesh_survey as kernels
+from ..kernels.remesh_plan import begin_counts
 from .pools import DeviceForest
 
 #: Passes for which the stiffest elements must have been softer ones before a longer step is looked for.
@@ -64,7 +65,7 @@ class Survey:
         """Look at the elements if ``goes`` [1] is not zero; may be recorded."""
         forest = self._forest
         device, threads = forest.device, forest.threads
-        wp.launch(kernels.begin_survey, dim=kernels.PLACES, inputs=[goes], outputs=[self.found], device=device)
+        wp.launch(begin_counts, dim=kernels.PLACES, inputs=[goes], outputs=[self.found], device=device)
         inputs = [threads, goes, *self._inputs, forest.pools, forest.carriage.arrays]
         wp.launch(kernels.find_stiffest, dim=threads, inputs=inputs, outputs=[self.found], device=device)
         inputs = [threads, goes, forest.pools]
