@@ -35,8 +35,9 @@ class SolverCorotated(SolverBase, CouplingInterface):
     Rigid bodies, joints and rigid contacts, and springs, triangles and bending edges with stiffness, are stepped along
     by Newton's ``SolverSemiImplicit`` on a view of the model without tetrahedra; reactions of soft contacts and
     attachments act on the bodies in the same step. Contacts come from ``newton.CollisionPipeline``, whose
-    ``soft_contact_gap`` should exceed what anything goes between two ``collide``: what is found late is deep by then, and
-    throws light bodies out. Particles do not collide with one another unless asked to, soft bodies not with themselves.
+    ``soft_contact_gap`` should exceed what anything goes between two ``collide``: what is found late is deep by then,
+    and throws light bodies out. Particles do not collide with one another unless asked to, soft bodies not with
+    themselves.
 
     A step is taken for a world or not at all: where something is not finite, the state stays what it was. On the CPU
     ``step`` says so at once; on CUDA, where it waits for nothing, a later ``step`` or ``check`` does. There are no
