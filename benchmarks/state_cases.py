@@ -1,0 +1,287 @@
+"""The forces of every law on every path, in every state of a body."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+from measure import WRONG, Case, kind
+from problem import SUBTREE_LEVELS, Sample, oracle, padded
+from solver_cases import put_back
+from state_bodies import GRAVITY, MATERIAL, State, Subject
+
+import warp_corot as wc
+from warp_corot.elasticity import ForceField, Model
+from warp_corot.elements import forest_elements
+from warp_corot.errors import InputError
+
+#: Fibres along y, three times as stiff as across.
+FIBRES = (3 * MATERIAL["young"], MATERIAL["young"], 0.4, MATERIAL["poisson"], MATERIAL["young"] / 3)
+#: Nodes whose anisotropic forces are checked: the oracle takes them as differences of differences.
+FIBRE_NODES = 60
+#: Elements are left out of the check where s2 + s3 is below this share of s1: their rotation is any.
+DEFINITE = 0.02
+#: General meshes of more elements are not made.
+MOST_GENERAL = 10_000_000
+#: Whole steps are timed for bodies of at most so many elements.
+MOST_STEPPED = {"cuda": 200_000, "cpu": 20_000}
+#: The step that they take, as a share of the default one: the state hardly changes.
+STEP_SHARE = 0.01
+#: Errors are relative to the largest force, or where that is less, to the force of such a strain.
+LEAST_STRAIN = 1e-3
+
+DEFAULT, LEAF, GENERAL = "default", "leaf by leaf", "general mesh"
+
+
+@dataclass
+class Row:
+    """A law in a state, and the cases that time it by path.
+
+    Attributes:
+        state: Of the body; law: its name; paths: cases by path.
+        flagged: The share of subtrees that the default path leaves to the robust rotation, once it has run.
+    """
+
+    state: State
+    law: str
+    paths: dict[str, Case]
+    flagged: Callable[[], float | None]
+
+
+def rows_of(subject: Subject, states: list[State], device: wp.Device, laws: tuple[str, ...] | None) -> list[Row]:
+    """Every law on every path in every state."""
+    bench = Bench(subject, device)
+    found = []
+    for law, paths in bench.fields().items():
+        if laws is None or law in laws:
+            for state in states:
+                cases = {path: bench.force_case(state, law, path, field) for path, field in paths.items()}
+                found.append(Row(state, law, cases, lambda field=paths[DEFAULT]: flagged_share(field)))
+    if len(subject.mesh.tets) <= MOST_STEPPED[kind(device)] and (laws is None or STEP in laws):
+        sims = bench.simulations()
+        for state in states:
+            cases = {path: bench.step_case(state, path, sim) for path, sim in sims.items()}
+            found.append(Row(state, STEP, cases, lambda: None))
+    return found
+
+
+#: The name of rows that are whole steps.
+STEP = "corotated, whole step"
+
+
+def models(level: int) -> Iterator[tuple[str, str, Model]]:
+    """Names of laws, the oracle's names, and the models themselves."""
+    yield "corotated", "corotated", wc.Corotated()
+    if level >= SUBTREE_LEVELS:
+        yield f"corotated, rotations {SUBTREE_LEVELS} up", "shared", wc.Corotated(rotation_level=level - SUBTREE_LEVELS)
+    with contextlib.suppress(InputError, TypeError, ValueError):  # of versions without it
+        yield "corotated, auto", "auto", wc.Corotated(rotation_level="auto")  # type: ignore[arg-type]
+    yield "linear", "linear", wc.Linear()
+    yield "StVK", "stvk", wc.StVenantKirchhoff()
+    yield "neo-Hookean", "neo_hookean", wc.NeoHookean()
+
+
+def flagged_share(field: ForceField) -> float | None:
+    """The share of its subtrees that a field's last launch left to the robust rotation."""
+    batches = getattr(getattr(field, "plan", None), "batches", ())
+    flags = [batch.flagged.numpy()[: batch.count] != 0 for batch in batches]
+    return float(np.concatenate(flags).mean()) if flags else None
+
+
+class Bench:
+    """The bodies that one subject is: a forest and a general mesh, isotropic and with fibres."""
+
+    def __init__(self, subject: Subject, device: wp.Device):
+        self.subject, self.device = subject, device
+        mesh = subject.mesh
+        self.fill = 1.0 if mesh.fill is None else mesh.fill
+        self.level = int(np.bincount(mesh.levels).argmax())
+        self.sample = Sample(mesh.points, mesh.tets)
+        self.few = Few(self.sample, FIBRE_NODES)
+        self.mu, self.lam = (float(value) for value in oracle.lame(MATERIAL["young"], MATERIAL["poisson"]))
+        self.C = oracle.elasticity(*oracle.transverse(*FIBRES), axes=np.roll(np.eye(3), 2, axis=0))
+        self._forces: dict[tuple[int, str], np.ndarray] = {}
+
+    def meshes(self) -> Iterator[tuple[str, wc.TetForest | wc.TetMesh, np.ndarray | float]]:
+        """By path, with the share of each element that must be put into the material."""
+        mesh = self.subject.mesh
+        yield DEFAULT, mesh, 1.0
+        if len(mesh.tets) * self.subject.worlds <= MOST_GENERAL:
+            yield GENERAL, wc.TetMesh(mesh.points, mesh.tets), self.fill
+
+    def body(self, mesh: wc.TetForest | wc.TetMesh, material: wc.Isotropic | wc.TransverselyIsotropic) -> wc.SoftBody:
+        return wc.SoftBody(mesh, material, worlds=self.subject.worlds, device=self.device)
+
+    def isotropic(self, share: np.ndarray | float) -> wc.Isotropic:
+        return wc.Isotropic(MATERIAL["young"] * share, MATERIAL["poisson"], MATERIAL["density"] * share)
+
+    def fibres(self, share: np.ndarray | float) -> wc.TransverselyIsotropic:
+        along, across, *ratios, shear = FIBRES
+        density = MATERIAL["density"] * share
+        return wc.TransverselyIsotropic(
+            along * share, across * share, *ratios, shear * share, direction=(0.0, 1.0, 0.0), density=density
+        )
+
+    def fields(self) -> dict[str, dict[str, ForceField]]:
+        """Force fields by law and path; laws without a path of subtrees have none that is leaf by leaf."""
+        found: dict[str, dict[str, ForceField]] = {}
+        self.reference: dict[str, str] = {}
+        for path, mesh, share in self.meshes():
+            body = self.body(mesh, self.isotropic(share))
+            for name, reference, model in models(self.level):
+                if path == GENERAL and getattr(model, "rotation_level", None) is not None:
+                    continue
+                self.reference[name] = reference
+                fields = found.setdefault(name, {})
+                fields[path] = model.bind(body)
+                if path == DEFAULT and "subtrees" in {f.name for f in dataclasses.fields(model)}:
+                    fields[LEAF] = dataclasses.replace(model, subtrees=False).bind(body)
+            fibres = self.body(mesh, self.fibres(share))
+            fields = found.setdefault("transversely isotropic", {})
+            fields[path] = wc.Corotated().bind(fibres)
+            if path == DEFAULT:
+                fields[LEAF] = wc.Corotated(subtrees=False).bind(fibres)
+        self.reference["transversely isotropic"] = "fibres"
+        return found
+
+    def simulations(self) -> dict[str, wc.Simulation]:
+        found = {}
+        for path, mesh, share in self.meshes():
+            for name, model in ((path, wc.Corotated()), (LEAF, wc.Corotated(subtrees=False))):
+                if name == GENERAL or path == DEFAULT:
+                    body = self.body(mesh, self.isotropic(share))
+                    body.fix(self.subject.held)
+                    default = wc.Simulation(body, model=model).dt
+                    integrator = wc.SymplecticEuler(STEP_SHARE * default)
+                    found[name] = wc.Simulation(body, model=model, integrator=integrator, gravity=GRAVITY)
+        return found
+
+    # --- cases --------------------------------------------------------------------------------------------------------
+
+    @property
+    def tets(self) -> int:
+        """Elements of all worlds."""
+        return len(self.subject.mesh.tets) * self.subject.worlds
+
+    @property
+    def checked_world(self) -> slice:
+        """The nodes of the world in the middle."""
+        count = len(self.subject.points)
+        return slice(self.subject.worlds // 2 * count, (self.subject.worlds // 2 + 1) * count)
+
+    def force_case(self, state: State, law: str, path: str, field: ForceField) -> Case:
+        """``field.add_forces`` in a state."""
+        u = self.on_device(state)
+        f = wp.zeros_like(u)
+
+        def error() -> float:
+            f.zero_()
+            field.add_forces(u, f)
+            return self.error(state, self.reference[law], f.numpy()[self.checked_world, :3])
+
+        # Of rotations that the device chooses the oracle knows nothing: the error is what sharing them does.
+        wrong = None if self.reference[law] == "auto" else WRONG
+        return Case(state.name, law, lambda: field.add_forces(u, f), error, self.tets, wrong=wrong)
+
+    def step_case(self, state: State, path: str, sim: wc.Simulation) -> Case:
+        """Whole steps from a state, always the same ones; what the first does to velocities is checked."""
+        start, body = self.on_device(state), sim.body
+        steps = int(np.clip(1_000_000 // self.tets, 64, 512))
+
+        def error() -> float:
+            put_back(body, start)
+            sim.advance_steps(1)
+            mass = body.masses[self.checked_world, None]
+            acceleration = body.velocities.numpy()[self.checked_world] / sim.dt - GRAVITY
+            return self.error(state, "corotated", mass * acceleration, ~self.subject.held)
+
+        return Case(
+            state.name,
+            STEP,
+            lambda: sim.advance_steps(steps),
+            error,
+            self.tets,
+            repeats=steps,
+            recorded=False,
+            reset=lambda: put_back(body, start),
+        )
+
+    def on_device(self, state: State) -> wp.array:
+        u = np.tile(padded(state.u), (self.subject.worlds, 1))
+        return wp.array(u, dtype=wp.vec4, device=self.device)
+
+    # --- references ---------------------------------------------------------------------------------------------------
+
+    def error(self, state: State, reference: str, found: np.ndarray, free: np.ndarray | None = None) -> float:
+        """How far forces [N, 3] of one world are off, at the sample's nodes whose elements have definite rotations.
+
+        Args:
+            free: Nodes that count, bool [N]; None for all.
+        """
+        sample = self.few if reference == "fibres" else self.sample
+        F = sample.mesh.deformation_gradients(self.x(state, sample))
+        s = np.linalg.svd(F, compute_uv=False)
+        indefinite = s[:, 1] + np.sign(np.linalg.det(F)) * s[:, 2] < DEFINITE * s[:, 0]
+        left_out = np.zeros(len(sample.used), bool)
+        left_out[sample.mesh.tets[indefinite]] = True
+        keep = ~left_out[sample.rows] & (True if free is None else free[sample.nodes])
+        wanted, found = self.forces(state, reference)[keep], found[sample.nodes[keep]]
+        if not np.isfinite(found).all():
+            return float("inf")
+        least = LEAST_STRAIN * MATERIAL["young"] * float(np.mean(sample.mesh.volumes)) ** (2 / 3)
+        return float(np.abs(found - wanted).max() / max(np.abs(wanted).max(), least))
+
+    def x(self, state: State, sample: Sample | Few) -> np.ndarray:
+        """Positions of the nodes that a sample uses, float64."""
+        return self.subject.points[sample.used] + state.u[sample.used].astype(float)
+
+    def forces(self, state: State, reference: str) -> np.ndarray:
+        """The float64 forces [n, 3] of a sample."""
+        key = id(state), reference
+        if key not in self._forces:
+            self._forces[key] = self._found_forces(state, reference)
+        return self._forces[key]
+
+    def _found_forces(self, state: State, reference: str) -> np.ndarray:
+        if reference == "fibres":
+            sample, law, options = self.few, oracle.anisotropic, {}
+            C = np.broadcast_to(self.C, (len(sample.elements), 3, 3, 3, 3))
+            mu, lam = C * self._shares(sample)[:, None, None, None, None], None
+        else:
+            sample, options = self.sample, {}
+            law = oracle.DENSITIES[{"shared": "corotated", "auto": "corotated"}.get(reference, reference)]
+            mu, lam = (value * self._shares(sample) for value in (self.mu, self.lam))
+            if reference == "shared":
+                options = {"R": self._shared_rotations(state)}
+        found = oracle.continuum(law, sample.mesh, self.x(state, sample), mu, lam, **options)
+        return found[1][sample.rows]
+
+    def _shares(self, sample: Sample | Few) -> np.ndarray:
+        """What share of each element of a sample the body fills [m]."""
+        return np.broadcast_to(self.fill, len(self.subject.mesh.tets))[sample.elements]
+
+    def _shared_rotations(self, state: State) -> np.ndarray:
+        """The ancestor's rotation for each element of the sample [m, 3, 3]."""
+        mesh = self.subject.mesh
+        ancestors = mesh.ancestors(self.level - SUBTREE_LEVELS)[self.sample.elements]
+        tets = forest_elements(mesh, ancestors, self.device).nodes.numpy()
+        used, local = np.unique(tets, return_inverse=True)
+        at_rest = oracle.Mesh(mesh.points[used], local.reshape(-1, 4))
+        return oracle.polar(at_rest.deformation_gradients(mesh.points[used] + state.u[used].astype(float)))
+
+
+class Few:
+    """The first nodes of a sample, as a sample."""
+
+    def __init__(self, sample: Sample, count: int):
+        self.nodes, rows = sample.nodes[:count], sample.rows[:count]
+        here = np.isin(sample.mesh.tets, rows).any(axis=1)
+        self.elements = sample.elements[here]
+        local, tets = np.unique(sample.mesh.tets[here], return_inverse=True)
+        self.used = sample.used[local]
+        self.mesh = oracle.Mesh(sample.mesh.points[local], tets.reshape(-1, 4))
+        self.rows = np.searchsorted(self.used, self.nodes)

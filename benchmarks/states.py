@@ -1,0 +1,176 @@
+#!/usr/bin/env python3
+"""What forces cost in the states that tissue gets into: under its weight, twisted, pulled, turned over.
+
+    python benchmarks/states.py [--device cuda:0] [--levels 6 9 12 15 18] [--organs 20000 100000] [--json FILE]
+
+Every law on the path that users get, leaf by leaf and on the same elements as a general mesh, timed in turn and checked
+against float64. Young's modulus is 5 kPa, density 1000 kg/m^3; state_bodies.py has how each state is made.
+"""
+
+from __future__ import annotations
+
+import gc
+import sys
+import time
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import warp as wp
+from measure import Case, Parser, Result, checked, finish, machine, measure, number, parser, percent, table, tell
+from state_bodies import State, Subject, beam, cube, notched_beam, organ
+from state_cases import DEFAULT, GENERAL, LEAF, Row, rows_of
+
+import warp_corot as wc
+
+LEVELS = {"cuda": [6, 9, 12, 15, 18], "cpu": [6, 9, 12]}
+ORGANS = {"cuda": [20_000, 100_000, 1_000_000], "cpu": [20_000]}
+ROUNDS = {"cuda": 9, "cpu": 7}
+BODIES = ("beam", "beams", "notch", "cube", "ball", "bunny")
+#: Copies of the level-6 beam that are stepped together.
+WORLDS = {"cuda": 1024, "cpu": 16}
+#: Of more elements than these, some drawn at random are looked at.
+LOOKED_AT = 200_000
+
+STATES = ("body", "state", "made by", "tets", "inverted", "cond 50 %", "90 %", "99 %")
+FORCES = ("state", "law", "ns/tet", "spread", "Gtet/s", "/ leaf", "/ rest", "/ general", "flagged", "error")
+
+
+def subjects(options: Any, where: str) -> Iterator[Subject]:
+    """One after the other, so that only one is in memory."""
+    for level in options.levels:
+        for name, make in (("beam", beam), ("notch", notched_beam), ("cube", cube)):
+            if name in options.bodies and not (name == "notch" and level < 6):
+                tell(f"building {name} {level}")
+                yield make(level)
+    if "beams" in options.bodies:
+        yield beam(options.levels[0], WORLDS[where])
+    for count in options.organs:
+        for name in ("ball", "bunny"):
+            if name in options.bodies:
+                tell(f"building {name} {count}")
+                yield organ(name, count)
+
+
+def look(subject: Subject, state: State) -> dict[str, Any]:
+    """How strained a state is: the share of inverted elements, condition numbers of F."""
+    tets = subject.mesh.tets
+    if len(tets) > LOOKED_AT:
+        chosen = np.random.default_rng(5).integers(0, len(tets), LOOKED_AT)
+    else:
+        chosen = np.arange(len(tets))
+    F = subject.deformation_gradients(chosen, state.u)
+    s = np.linalg.svd(F, compute_uv=False)
+    with np.errstate(divide="ignore"):
+        condition = np.percentile(s[:, 0] / s[:, 2], [50, 90, 99])
+    return {
+        "body": subject.name,
+        "state": state.name,
+        "how": state.how,
+        "tets": len(tets) * subject.worlds,
+        "inverted": float((np.linalg.det(F) < 0).mean()),
+        "condition": condition.tolist(),
+    }
+
+
+def line(subject: Subject, row: Row, results: dict[int, Result], rest: Result) -> dict[str, Any]:
+    """A row of the report."""
+    found = {path: results[id(case)] for path, case in row.paths.items()}
+    own = found[DEFAULT]
+    own.case.run()
+    return {
+        "stage": f"{subject.name}, {row.state.name}",
+        "variant": row.law,
+        "tets": own.case.tets,
+        "ns_per_tet": own.ns,
+        "spread": own.spread,
+        "gtet_per_s": 1.0 / own.ns,
+        "over_leaf_by_leaf": own.relative_to(found[LEAF]) if LEAF in found else None,
+        "over_rest": own.relative_to(rest),
+        "over_general": own.relative_to(found[GENERAL]) if GENERAL in found else None,
+        "flagged": row.flagged(),
+        "error": max(r.error for r in found.values()),
+        "paths": {path: {"ns_per_tet": r.ns, "spread": r.spread, "error": r.error} for path, r in found.items()},
+    }
+
+
+def timed(subject: Subject, device: wp.Device, options: Any) -> tuple[list[dict], list[dict], list[Result]]:
+    """States, rows and results of one body."""
+    states = list(subject.all_states(device))
+    rows = rows_of(subject, states, device, options.laws)
+    cases: list[Case] = [case for row in rows for case in row.paths.values()]
+    results = measure(cases, device, options.rounds, lambda said: tell(f"{subject.name}: {said}"))
+    by_case = {id(case): result for case, result in zip(cases, results, strict=True)}
+    rests = {row.law: by_case[id(row.paths[DEFAULT])] for row in rows if row.state is states[0]}
+    lines = [line(subject, row, by_case, rests[row.law]) for row in rows]
+    return [look(subject, state) for state in states], lines, results
+
+
+def show(looks: list[dict], lines: list[dict]) -> None:
+    cells = [
+        [d["body"], d["state"], d["how"], str(d["tets"]), percent(d["inverted"]), *map(number, d["condition"])]
+        for d in looks
+    ]
+    print(table(STATES, cells, 3))
+    print()
+    cells = [
+        [
+            d["stage"],
+            d["variant"],
+            number(d["ns_per_tet"]),
+            percent(d["spread"]),
+            number(d["gtet_per_s"]),
+            *(number(d[over]) for over in ("over_leaf_by_leaf", "over_rest", "over_general")),
+            percent(d["flagged"]),
+            f"{d['error']:.1e}",
+        ]
+        for d in lines
+    ]
+    print(table(FORCES, cells, 2), flush=True)
+    print()
+
+
+def command_line() -> Parser:
+    of = parser(__doc__.split("\n\n")[0], "states.py")
+    of.add_argument("--levels", type=int, nargs="+", help="of beams and cubes (default: 6 9 12, on CUDA to 18)")
+    of.add_argument("--organs", type=int, nargs="*", help="about how many elements balls and bunnies have")
+    of.add_argument("--bodies", nargs="+", choices=BODIES, default=BODIES)
+    of.add_argument("--laws", nargs="+", help="some of the laws, by their names in the table")
+    of.add_argument("--quick", action="store_true", help="one small beam and cube, two rounds: to see that it works")
+    return of
+
+
+def main() -> int:
+    of = command_line()
+    options = of.parse_args()
+    if options.quick:
+        options.levels, options.organs, options.rounds = (
+            options.levels or [3],
+            options.organs or [],
+            options.rounds or 2,
+        )
+        options.bodies = ("beam", "cube")
+    options.level = min(options.levels or [6])
+    device = checked(options, of, range(3, 25))
+    where = "cuda" if device.is_cuda else "cpu"
+    options.levels = options.levels or LEVELS[where]
+    options.organs = ORGANS[where] if options.organs is None else options.organs
+    warnings.simplefilter("ignore", wc.StabilityWarning)
+    start = time.perf_counter()
+    about = machine(device)
+    print(f"{about['name']} ({device}), Warp {about['warp']}", flush=True)
+    looks, lines, results = [], [], []
+    for subject in subjects(options, where):
+        found = timed(subject, device, options)
+        tell("")
+        show(*found[:2])
+        for kept, new in zip((looks, lines, results), found, strict=True):
+            kept += new
+        gc.collect()
+    about |= {"rounds": options.rounds, "seconds": time.perf_counter() - start}
+    return finish(options, {"benchmark": "states", **about, "states": looks, "rows": lines}, results)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
