@@ -108,7 +108,7 @@ def test_peers(package, rows, device, tmp_path):
         assert row["error"] <= (1.0 if name in ("VBD", "XPBD") else 1e-4)
 
 
-@pytest.mark.parametrize("script", ["kernels.py", "peers.py"])
+@pytest.mark.parametrize("script", ["kernels.py", "peers.py", "states.py"])
 @pytest.mark.parametrize(
     ("option", "value", "said"),
     [
@@ -208,3 +208,25 @@ def test_remesh(device, tmp_path):
     for row in rows:
         assert row["error"] <= 1e-9
         assert row["bisected"] >= {"doubled": 384}.get(row["stage"], 0)
+
+
+def test_states(device, tmp_path):
+    path = tmp_path / "states.json"
+    done = run("states.py", "--device", device, "--quick", "--laws", "corotated", "neo-Hookean", "--json", path)
+    found = report(done, path)
+    assert {(row["state"], row["body"]) for row in found["states"]} >= {
+        ("at rest", "beam 3"),
+        ("under its weight", "beam 3"),
+        ("all leaves turned over", "cube 3"),
+    }
+    for row in found["states"]:
+        inverted = {"one leaf turned over": 1 / 48, "all leaves turned over": 1.0}
+        if row["state"] in inverted:
+            assert row["inverted"] == pytest.approx(inverted[row["state"]])
+        assert 1.0 <= row["condition"][0] <= row["condition"][2]
+    for row in found["rows"]:
+        assert row["error"] <= 1e-3
+        assert row["over_rest"] > 0
+        assert row["over_general"] > 0
+        if row["stage"].endswith("at rest") and row["variant"] == "corotated":
+            assert row["flagged"] == 0.0
