@@ -1,11 +1,12 @@
 """Soft bodies under their own weight, by defaults: no error, no nonsense, and no energy that gravity did not give.
 
-The laws and their tolerances stand in ``loaded``.
+The bodies stand in ``loaded``, the laws and their tolerances in ``falls``.
 """
 
 import numpy as np
 import pytest
-from loaded import DOZEN, FEW, GRAVITY, LAWS, LONG, MANY, SHAPES, SHORT, THIRTY, Fall, Loaded, fall, violations
+from falls import Fall, fall, violations
+from loaded import DOZEN, FEW, GRAVITY, LAWS, LONG, MANY, SHAPES, SHORT, THIRTY, Loaded
 
 
 @pytest.mark.parametrize("case", DOZEN, ids=str)
