@@ -12,7 +12,7 @@ import math
 
 import warp as wp
 
-from .rotation import cofactor, column, identity3
+from .rotation import cofactor, column, identity3, reciprocal
 
 wp.set_module_options({"enable_backward": False})
 
@@ -125,7 +125,7 @@ def log_of_dilation(d: float):
 
     ln(1 + d) = 2 artanh(s) with s = d / (2 + d), a series to s^11 where |s| <= 1/3: it leaves out 1.4e-7 at most.
     """
-    s = d / (2.0 + d)
+    s = d * reciprocal(2.0 + d)
     z = s * s
     series = z * (1.0 / 3.0 + z * (1.0 / 5.0 + z * (1.0 / 7.0 + z * (1.0 / 9.0 + z * (1.0 / 11.0)))))
     log = 2.0 * s * (1.0 + series)
@@ -142,7 +142,7 @@ def volumetric_slope(d: float, mu: float, lam: float):
     slope = float(0.0)
     if d >= J0 - 1.0:
         log, _excess = log_of_dilation(d)
-        slope = (lam * log + mu * d) / (1.0 + d)
+        slope = (lam * log + mu * d) * reciprocal(1.0 + d)
     else:
         at_j0 = (lam * LOG_J0 + mu * (J0 - 1.0)) / J0
         curvature = (mu + lam * (1.0 - LOG_J0)) / (J0 * J0)

@@ -1,7 +1,7 @@
 """Kernel factories of the element loop: forces, energies and stresses of a law on a kind of elements.
 
-``stress``, ``energy`` and ``cauchy`` are functions of ``constitutive``; ``Elements`` is a struct of ``elements``. Material parameters are
-arrays of one entry (uniform) or one per element; ``stride`` is 0 or 1 accordingly.
+``stress``, ``energy`` and ``cauchy`` are functions of ``constitutive``; ``Elements`` is a struct of ``elements``.
+Material parameters are arrays of one entry (uniform) or one per element; ``stride`` is 0 or 1 accordingly.
 """
 
 import functools

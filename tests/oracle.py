@@ -111,7 +111,7 @@ def stvk(F, mu, lam):
 
 
 def neo_hookean_volumetric(J, mu, lam, J0=0.5):
-    """U(J) = -mu ln J + lam/2 (ln J)^2 for J >= J0, its Taylor polynomial of second order about J0 below; U' and U''."""
+    """U(J) = -mu ln J + lam/2 (ln J)^2 for J >= J0, its Taylor polynomial of order 2 about J0 below; U', U''."""
     above = np.maximum(J, J0)
     step = np.minimum(J - J0, 0.0)
     log = np.log(above)
