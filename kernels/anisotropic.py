@@ -15,7 +15,7 @@ from typing import Any
 
 import warp as wp
 
-from .constitutive import corotated_strain, hooke
+from .constitutive import corotated_strain, hooke, stretch_strain
 from .elements import frame, local_gradient, rest_volume, scatter_stress
 from .forces import von_mises
 from .rotation import cofactor, column, identity3, largest_entry
@@ -131,6 +131,12 @@ def material_gradient(elements: Any, t: int, m: wp.mat33, u: wp.array[wp.vec4]):
     return local_gradient(elements, t, u) * turn, turn
 
 
+@wp.func
+def material_strain(g: wp.mat33, m: wp.mat33, r: wp.mat33):
+    """e = S - I in the material's axes; r is the rotation of m + g."""
+    return stretch_strain(corotated_strain(g, m, r), wp.transpose(m) * g)
+
+
 @functools.cache
 def element_forces(rotation: wp.Function) -> wp.Function:
     """What adds the forces of element t."""
@@ -148,7 +154,7 @@ def element_forces(rotation: wp.Function) -> wp.Function:
         m = axes_of(material, t)
         g, turn = material_gradient(elements, t, m, u)
         r = rotation(m + g)
-        stress, a = turned_stress(corotated_strain(g, m, r), material, t)
+        stress, a = turned_stress(material_strain(g, m, r), material, t)
         p = r * (stress + wp.skew(a))
         if is_active != 0:
             # s (F d) d^T, and d is the first axis.
@@ -196,7 +202,7 @@ def anisotropic_energies(Elements: Any, rotation: wp.Function) -> wp.Kernel:
         t = wp.tid()
         m = axes_of(material, t)
         g, _turn = material_gradient(elements, t, m, u)
-        strain = corotated_strain(g, m, rotation(m + g))
+        strain = material_strain(g, m, rotation(m + g))
         density = filled(material, t) * energy_density(strain, material, t)
         energies[t] = wp.float64(density) * wp.float64(rest_volume(elements, t))
 
@@ -221,7 +227,7 @@ def anisotropic_von_mises(Elements: Any, rotation: wp.Function) -> wp.Kernel:
         t = wp.tid()
         m = axes_of(material, t)
         g, _turn = material_gradient(elements, t, m, u)
-        strain = corotated_strain(g, m, rotation(m + g))
+        strain = material_strain(g, m, rotation(m + g))
         stress, _a = turned_stress(strain, material, t)
         if is_active != 0:
             stress[0, 0] += activation[t]

@@ -1,7 +1,7 @@
 """Kernel factories of the element loop: forces, energies and stresses of a law on a kind of elements.
 
-``law`` arguments are functions of ``constitutive``; ``Elements`` is a struct of ``elements``. Material parameters are
-arrays of one entry (uniform) or one per element; ``stride`` is 0 or 1 accordingly.
+``stress``, ``energy`` and ``cauchy`` are functions of ``constitutive``; ``Elements`` is a struct of ``elements``.
+Material parameters are arrays of one entry (uniform) or one per element; ``stride`` is 0 or 1 accordingly.
 """
 
 import functools
@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from .elements import frame, local_gradient, rest_volume, scatter_stress
+from .elements import ForestElements, GeneralElements, frame, local_gradient, rest_volume, scatter_stress
 
 wp.set_module_options({"enable_backward": False})
 
@@ -22,6 +22,28 @@ def von_mises(s: wp.mat33):
     c = s[2, 2] - s[0, 0]
     shear = s[0, 1] * s[0, 1] + s[1, 2] * s[1, 2] + s[2, 0] * s[2, 0]
     return wp.sqrt(0.5 * (a * a + b * b + c * c) + 3.0 * shear)
+
+
+@wp.func
+def own_gradient(elements: ForestElements, t: int, u: wp.array[wp.vec4]):
+    """A = Q^T G: the displacement gradient of element t in its local frame, rows and columns."""
+    return wp.transpose(frame(elements, t)) * local_gradient(elements, t, u)
+
+
+@wp.func
+def own_gradient(elements: GeneralElements, t: int, u: wp.array[wp.vec4]):
+    return local_gradient(elements, t, u)
+
+
+@wp.func
+def scatter_own_stress(elements: ForestElements, t: int, p: wp.mat33, f: wp.array[wp.vec4]):
+    """Add the nodal forces of a first Piola-Kirchhoff stress in the frame of ``own_gradient``."""
+    scatter_stress(elements, t, frame(elements, t) * p, f)
+
+
+@wp.func
+def scatter_own_stress(elements: GeneralElements, t: int, p: wp.mat33, f: wp.array[wp.vec4]):
+    scatter_stress(elements, t, p, f)
 
 
 @functools.cache
@@ -40,8 +62,8 @@ def scatter_forces(Elements: Any, stress: wp.Function) -> wp.Kernel:
         f: wp.array[wp.vec4],
     ):
         t = wp.tid()
-        g = local_gradient(elements, t, u)
-        scatter_stress(elements, t, stress(g, frame(elements, t), mu[t * stride], lam[t * stride]), f)
+        p = stress(own_gradient(elements, t, u), mu[t * stride], lam[t * stride])
+        scatter_own_stress(elements, t, p, f)
 
     return scatter_forces
 
@@ -62,8 +84,7 @@ def element_energies(Elements: Any, energy: wp.Function) -> wp.Kernel:
         energies: wp.array[wp.float64],
     ):
         t = wp.tid()
-        g = local_gradient(elements, t, u)
-        density = energy(g, frame(elements, t), mu[t * stride], lam[t * stride])
+        density = energy(own_gradient(elements, t, u), mu[t * stride], lam[t * stride])
         energies[t] = wp.float64(density) * wp.float64(rest_volume(elements, t))
 
     return element_energies
@@ -85,7 +106,6 @@ def element_von_mises(Elements: Any, cauchy: wp.Function) -> wp.Kernel:
         stress: wp.array[wp.float32],
     ):
         t = wp.tid()
-        g = local_gradient(elements, t, u)
-        stress[t] = von_mises(cauchy(g, frame(elements, t), mu[t * stride], lam[t * stride]))
+        stress[t] = von_mises(cauchy(own_gradient(elements, t, u), mu[t * stride], lam[t * stride]))
 
     return element_von_mises

@@ -11,42 +11,14 @@ import warp as wp
 from .constitutive import corotated_strain, hooke
 from .elements import GeneralElements, load_node, scatter_stress
 from .general_cpu import ADD_FORCES, gather_elements
+from .general_cuda import PosedElements, add_stress, edge_differences, load_four, rest_inverse_of
 from .lanes import COMPILER_FLAGS, NEWTON, PRELUDE, on_cpu
-from .newton_merging import add_four_forces
-from .rotation import ITERATIONS, byers_xu, cofactor, column, identity3, warm_rotation
+from .rotation import ITERATIONS, byers_xu, cofactor, identity3, warm_rotation
 
 wp.set_module_options({"enable_backward": False})
 
 #: Tetrahedra that a thread looks at whether they are active.
 EACH = wp.constant(4)
-
-
-@wp.struct
-class PosedElements:
-    """As ``GeneralElements``, so that the threads of a warp read what is side by side."""
-
-    nodes: wp.array[wp.vec4i]  # [T]
-    rest_inverse: wp.array2d[wp.float32]  # [9, T], row by row
-    volume: wp.array[wp.float32]  # [T]
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const int4 n = *reinterpret_cast<const int4*>(&wp::index(nodes, t));
-    return wp::vec_t<4, wp::int32>(n.x, n.y, n.z, n.w);
-#else
-    return wp::index(nodes, t);
-#endif
-""")
-def load_four(nodes: wp.array[wp.vec4i], t: int) -> wp.vec4i:
-    """An element's nodes by one 16-byte load; see ``load_node``."""
-    ...
-
-
-@wp.func
-def rest_inverse_of(elements: PosedElements, t: int):
-    b = elements.rest_inverse
-    return wp.mat33(b[0, t], b[1, t], b[2, t], b[3, t], b[4, t], b[5, t], b[6, t], b[7, t], b[8, t])
 
 
 @wp.func
@@ -104,7 +76,7 @@ def place_in_model(ids: wp.array[wp.int32], first: int, t: int):
 def scatter_posed(rotation: wp.Function, damped: bool, rounds: int = 1) -> wp.Kernel:
     """All forces of tetrahedra, each with the rotation of its own deformation gradient; ``ids`` are their places in
     ``activation``; ``rounds``: see ``add_four_forces``."""
-    add_forces = add_four_forces(rounds)
+    add = add_stress(rounds)
 
     @wp.kernel(module="unique", enable_backward=False)
     def scatter_posed(
@@ -124,9 +96,7 @@ def scatter_posed(rotation: wp.Function, damped: bool, rounds: int = 1) -> wp.Ke
         t = wp.tid()
         a = activation[place_in_model(ids, 0, t)]
         n = load_four(elements.nodes, t)
-        x0 = load_node(x, n[0])
-        edges = wp.matrix_from_cols(load_node(x, n[1]) - x0, load_node(x, n[2]) - x0, load_node(x, n[3]) - x0)
-        gradient = edges * rest_inverse_of(elements, t)
+        gradient = edge_differences(n, x) * rest_inverse_of(elements, t)
         p = corotated_stress(gradient, rotation(gradient), mu[t], lam[t])
         if a != 0.0:
             p += active_stress(gradient, k_lambda[t] * a)
@@ -136,10 +106,7 @@ def scatter_posed(rotation: wp.Function, damped: bool, rounds: int = 1) -> wp.Ke
                 v0 = v[n[0]]
                 edge_rates = wp.matrix_from_cols(v[n[1]] - v0, v[n[2]] - v0, v[n[3]] - v0)
                 p += viscous_stress(gradient, edge_rates * rest_inverse_of(elements, t), k)
-        # Read again, so as to keep no registers meanwhile.
-        h = (-elements.volume[t]) * p * wp.transpose(rest_inverse_of(elements, t))
-        f1, f2, f3 = column(h, 0), column(h, 1), column(h, 2)
-        add_forces(f, n, -(f1 + f2 + f3), f1, f2, f3)
+        add(elements, t, n, p, f)
 
     return scatter_posed
 

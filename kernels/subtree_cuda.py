@@ -92,7 +92,7 @@ def _merge_snippet(shape: int) -> str:
 
 
 @functools.cache
-def _memory(shape: int, grouped: bool) -> tuple[wp.Function, wp.Function]:
+def memory_of(shape: int, grouped: bool) -> tuple[wp.Function, wp.Function]:
     """How a subtree's displacements come in and its forces go out."""
     if grouped:
 
@@ -130,7 +130,7 @@ def _memory(shape: int, grouped: bool) -> tuple[wp.Function, wp.Function]:
 @functools.cache
 def scatter_subtrees_own(shape: int, grouped: bool, uniform: bool) -> wp.Kernel:
     """Corotated forces of subtrees, every leaf with its own rotation. Launch with block_dim BLOCK."""
-    load, add = _memory(shape, grouped)
+    load, add = memory_of(shape, grouped)
     deformed, forces = deformed_of(shape), own_forces(shape, uniform)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
@@ -162,7 +162,7 @@ def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: boo
 
     Launch with block_dim BLOCK.
     """
-    load, add = _memory(shape, grouped)
+    load, add = memory_of(shape, grouped)
     deformed, forces = deformed_of(shape), shared_forces(shape, uniform, given)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)

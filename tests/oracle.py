@@ -110,15 +110,15 @@ def stvk(F, mu, lam):
     return psi, F @ stress
 
 
-def log_continued(J, J0=0.1):
-    """ln J for J >= J0 and its second-order Taylor expansion about J0 below, with first and second derivatives."""
+def neo_hookean_volumetric(J, mu, lam, J0=0.5):
+    """U(J) = -mu ln J + lam/2 (ln J)^2 for J >= J0, its Taylor polynomial of order 2 about J0 below; U', U''."""
     above = np.maximum(J, J0)
     step = np.minimum(J - J0, 0.0)
-    return (
-        np.log(above) + step / J0 - 0.5 * (step / J0) ** 2,
-        1 / above - step / J0**2,
-        -1 / above**2,
-    )
+    log = np.log(above)
+    value = -mu * log + 0.5 * lam * log**2
+    slope = (lam * log - mu) / above
+    curvature = (mu + lam * (1 - log)) / above**2
+    return value + step * (slope + 0.5 * curvature * step), slope + curvature * step, curvature
 
 
 def cofactor(F):
@@ -126,9 +126,9 @@ def cofactor(F):
 
 
 def neo_hookean(F, mu, lam):
-    L, dL, _ = log_continued(np.linalg.det(F))
-    psi = 0.5 * mu * (np.sum(F**2, axis=(-2, -1)) - 3) - mu * L + 0.5 * lam * L**2
-    return psi, _times(mu, F) + _times((lam * L - mu) * dL, cofactor(F))
+    U, dU, _ = neo_hookean_volumetric(np.linalg.det(F), mu, lam)
+    psi = 0.5 * mu * (np.sum(F**2, axis=(-2, -1)) - 3) + U
+    return psi, _times(mu, F) + _times(dU, cofactor(F))
 
 
 def continuum(density, mesh, x, mu, lam, **options):
@@ -264,11 +264,11 @@ def corotated_tangent(F, mu, lam):
 
 
 def neo_hookean_tangent(F, mu, lam):
-    L, dL, ddL = log_continued(np.linalg.det(F))
+    _, dU, ddU = neo_hookean_volumetric(np.linalg.det(F), mu, lam)
     cof = cofactor(F)
     dcof = np.einsum("ikm,JLN,tmN->tiJkL", LEVI_CIVITA, LEVI_CIVITA, F)
     identity = np.einsum("ik,JL->iJkL", IDENTITY, IDENTITY)
-    terms = (np.broadcast_to(mu, L.shape), (lam * L - mu) * dL, lam * dL**2 + (lam * L - mu) * ddL)
+    terms = (np.broadcast_to(mu, dU.shape), dU, ddU)
     mu, first, second = (term[:, None, None, None, None] for term in terms)
     return mu * identity + first * dcof + second * np.einsum("tiJ,tkL->tiJkL", cof, cof)
 

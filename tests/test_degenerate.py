@@ -72,7 +72,7 @@ def test_flattened_cube_comes_back(level, device, rng):
 def test_inverted_neo_hookean_pushes_back(stretch, device):
     """One tetrahedron with its tip pushed through its base: the tip is pushed to its own side, and soon is there.
 
-    The continuation is stiff (at J = -3, 3e5 times lambda), so that the step is short and the damping strong.
+    Strong damping, so that it stays there.
     """
     mesh = wc.TetMesh(CUBE * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, 1]]), [[0, 1, 2, 3]])
     sim, body = simulation(mesh, "neo_hookean", device, dt=1e-6, damping=3000.0, material=SOFT)
@@ -90,20 +90,14 @@ def test_inverted_neo_hookean_pushes_back(stretch, device):
 
 @pytest.mark.parametrize("case", CRUSHED)
 def test_neo_hookean_is_finite_when_crushed(case, device, rng):
-    """Force and energy are the oracle's.
-
-    Near J = 0 elements are so stiff that the rounding of F shows: the bound is relative to the force of one unit of F's
-    cofactor, not to the forces themselves, which may vanish.
-    """
+    """Force and energy are the oracle's."""
     mesh = wc.TetForest.box((1, 1, 1), CUBE, 3)
     sim, body = simulation(mesh, "neo_hookean", device)
     u = (crushed(mesh.points, case, rng) - mesh.points).astype(np.float32)
     place(body, u)
-    reference = oracle_mesh(mesh)
     lame = oracle.lame(MATERIAL["young"], MATERIAL["poisson"])
-    energies, forces = oracle.evaluate("neo_hookean", reference, mesh.points + u.astype(float), *lame)
-    L, dL, _ = oracle.log_continued(np.linalg.det(reference.deformation_gradients(mesh.points + u.astype(float))))
-    stress = lame[0] + np.abs(lame[1] * L - lame[0]) * dL
-    scale = np.max(stress * reference.volumes * np.linalg.norm(reference.gradients, axis=2).max(1))
-    assert np.abs(sim.forces().numpy() - forces).max() < 1e-6 * scale + 1e-5 * np.abs(forces).max()
+    energies, forces = oracle.evaluate("neo_hookean", oracle_mesh(mesh), mesh.points + u.astype(float), *lame)
+    # Crushed to a point, every force is zero but for rounding, of a stress of some lambda.
+    scale = max(np.abs(forces).max(), 0.1 * lame[1] * CUBE**2)
+    assert np.abs(sim.forces().numpy() - forces).max() < 1e-5 * scale
     assert sim.energy().elastic == pytest.approx(energies.sum(), rel=1e-5)

@@ -161,14 +161,16 @@ def test_neo_hookean_incompressible_limit():
 
 
 def test_neo_hookean_continuation_is_smooth():
-    """ln J continues through J0 = 0.1 with its value and first two derivatives, and is defined everywhere."""
-    below, above = oracle.log_continued(np.array(0.1 - 1e-9)), oracle.log_continued(np.array(0.1 + 1e-9))
+    """U(J) continues through J0 = 0.5 with its value and first two derivatives, a parabola that falls throughout."""
+    mu, lam = 2.0, 5.0
+    below, above = (oracle.neo_hookean_volumetric(np.array(0.5 + d), mu, lam) for d in (-1e-9, 1e-9))
     assert below == pytest.approx(above, rel=1e-6)
-    L, dL, ddL = oracle.log_continued(np.linspace(-3, 0.1, 2001))
-    assert np.allclose(np.gradient(L, 3.1 / 2000)[1:-1], dL[1:-1])
-    assert (dL > 0).all()
-    assert np.allclose(ddL, -100)
-    assert oracle.log_continued(np.array(1.7))[0] == pytest.approx(np.log(1.7))
+    U, dU, ddU = oracle.neo_hookean_volumetric(np.linspace(-3, 0.5, 2001), mu, lam)
+    assert np.allclose(np.gradient(U, 3.5 / 2000)[1:-1], dU[1:-1])
+    assert (dU < 0).all()
+    assert np.allclose(ddU, 4 * (mu + lam * (1 + np.log(2))))
+    log = np.log(1.7)
+    assert oracle.neo_hookean_volumetric(np.array(1.7), mu, lam)[0] == pytest.approx(-mu * log + lam / 2 * log**2)
 
 
 def test_stiffness_agrees_with_scikit_fem(rng):

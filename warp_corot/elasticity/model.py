@@ -203,7 +203,10 @@ class ElementField(ForceField):
         self._energies = energies
         self._von_mises = von_mises
         if self.deterministic:
-            self.slots, self.elements = leaf_slots(body)
+            self._take_slots()
+
+    def _take_slots(self) -> None:
+        self.slots, self.elements = leaf_slots(self.body)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         self.launch(self._forces, self.element_count, [self.elements, *self.material_inputs, u], [f])

@@ -10,11 +10,11 @@ import warp as wp
 
 from ..errors import InputError
 from ..kernels.elements import GeneralElements
+from ..kernels.general_cuda import BLOCK, PosedElements
 from ..kernels.lanes import LANES
 from ..kernels.newton_attributes import split_materials, write_attributes
 from ..kernels.newton_elements import (
     EACH,
-    PosedElements,
     repair_posed,
     scatter_damping_and_activation,
     scatter_posed,
@@ -27,8 +27,6 @@ from .library import newton
 from .lost import warn_of_lost, why_none
 from .state import STATE, attribute_of
 
-#: Threads of a block of the elastic kernel on CUDA: more wait longer for one another (H200: 64 takes 0.86 of 256).
-BLOCK = 64
 #: How k_mu and k_lambda are read: mu = a k_mu, lambda = k_lambda + b k_mu, as (a, b).
 LAME = {"documented": (1.0, 0.0), "semi-implicit": (0.75, -0.625)}
 

@@ -1,0 +1,87 @@
+"""The subtree kernels of laws that need no rotation (CUDA): linear, St. Venant-Kirchhoff, neo-Hookean."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from ..kernels import subtree_cuda
+from ..kernels.subtree_laws import scatter_subtrees
+from ..mesh import TetForest
+from ..plan import FlatLeaves, ForcePlan, Plan
+from ..subtrees import chosen
+from .model import LawField
+
+if TYPE_CHECKING:
+    from ..body import SoftBody
+    from ..remesh.plan import DevicePlan
+    from ..remesh.pools import DeviceForest
+
+
+class LawSubtreeField(LawField):
+    """Complete subtrees in batches; the leaves that are in none one by one, under the same law.
+
+    Args:
+        body: A forest's, on CUDA.
+        stress, energy, cauchy: The law, functions of ``kernels.constitutive``.
+        deterministic: As for every field.
+    """
+
+    def __init__(
+        self,
+        body: SoftBody,
+        *,
+        stress: wp.Function,
+        energy: wp.Function,
+        cauchy: wp.Function,
+        deterministic: bool = False,
+    ):
+        super().__init__(body, stress=stress, energy=energy, cauchy=cauchy, deterministic=deterministic)
+        self._stress = stress
+        self._uniform = body.material_stride == 0
+        if body.changing is None:
+            assert isinstance(body.mesh, TetForest)
+            self._go_through(
+                ForcePlan.of_forest(body.mesh, None, self.device, worlds=body.worlds, deterministic=self.deterministic)
+            )
+
+    def _take_slots(self) -> None:
+        """The plan has them."""
+
+    def plan_of(self, forest: DeviceForest) -> DevicePlan:
+        from ..remesh.plan import DevicePlan
+
+        return DevicePlan(forest)
+
+    def follow(self, plan: DevicePlan) -> None:
+        super().follow(plan)
+        # Everything that any mesh may come to need, so that nothing is compiled once steps are made.
+        for shape, grouped, _sharing in plan.kinds:
+            wp.load_module(self._kernel(shape, grouped).module, self.device, block_dim=subtree_cuda.BLOCK)
+        wp.load_module(self._forces.module, self.device)
+        self._go_through(plan)
+
+    def _go_through(self, plan: Plan) -> None:
+        self.plan = plan
+        self.slots = plan.slots
+        self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in plan.batches]
+        self._flat_material = self._material_of(plan.flat)
+
+    def _material_of(self, flat: FlatLeaves) -> list:
+        if flat.material is not None:
+            return [*flat.material, 1]
+        if self._uniform or not len(flat):
+            return self.material_inputs
+        return [*(chosen(values, flat.leaves) for values in (self.body.mu, self.body.lam)), 1]
+
+    def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
+        return scatter_subtrees(shape, grouped, self._uniform, self._stress)
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        body, flat = self.body, self.plan.flat
+        for batch, kernel in zip(self.plan.batches, self._kernels, strict=True):
+            inputs = [batch.subtrees, body.mu, body.lam, u]
+            wp.launch(kernel, batch.count, inputs=inputs, outputs=[f], device=self.device, block_dim=subtree_cuda.BLOCK)
+        if len(flat):
+            self.launch(self._forces, len(flat), [flat.elements, *self._flat_material, u], [f])
