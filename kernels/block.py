@@ -13,24 +13,13 @@ import functools
 import warp as wp
 
 from .block_layout import FIRST_SHIFT, FOLLOWING_SHIFT, NEIGHBOURS, NO_NODE, NODE_WORDS, NUMBERS, WARP, Layout
-from .constitutive import corotated_strain, hooke
-from .elements import (
-    FRAME_SHIFT,
-    LEVEL_MASK,
-    ForestElements,
-    Subtrees,
-    frame,
-    gradient_of,
-    load_node,
-    mirror_sign,
-    nodal_forces,
-    store_node,
-)
+from .constitutive import hooke, symmetric
+from .elements import FRAME_SHIFT, LEVEL_MASK, Subtrees, load_node, mirror_sign, store_node
 from .integrate import is_finite, symplectic_euler_velocity, vector_at
-from .rotation import byers_xu
-from .shapes import fingerprint
-from .subtree import LEAVES
-from .subtree_forces import deformed_of, mat10, own_forces, shared_forces
+from .rotation import column, identity3, robust_rotation
+from .shapes import VOLUME, fingerprint
+from .subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS
+from .subtree_forces import columns_of, leaf_forces_of, mat10, own_forces, shared_forces
 
 wp.set_module_options({"enable_backward": False})
 
@@ -40,7 +29,6 @@ BUSY_THREADS = 512
 LOAD, STORE, LOAD_BYTES = 0, 1, 2
 
 vec3u = wp.types.vector(length=NODE_WORDS, dtype=wp.uint64)
-mat84i = wp.types.matrix(shape=(8, 4), dtype=wp.int32)
 
 
 @wp.func_native("""
@@ -55,6 +43,16 @@ def synchronize_block(): ...
 def number_in(word: wp.uint64, k: int):
     """The k-th of the four 16-bit numbers in a word."""
     return int((word >> wp.uint64(16 * k)) & wp.uint64(0xFFFF))
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __ffs(bits) - 1;
+#else
+    return __builtin_ctz(bits);
+#endif
+""")
+def lowest_bit(bits: int) -> int: ...
 
 
 @wp.func_native("""
@@ -99,8 +97,6 @@ class BlockBody:
     """A body as its block goes through it: one world's subtrees, and who adds up which slots."""
 
     subtrees: Subtrees  # of one world, one by one
-    elements: ForestElements  # the leaves
-    roots: ForestElements  # the subtrees' roots, where these give the rotation
     subtree_count: int
     node_count: int
     element_count: int
@@ -109,55 +105,105 @@ class BlockBody:
     slots: wp.array2d[wp.uint64]  # [2, tasks] four slots each, the zero one past the last, in bytes
 
 
+def _table(rows: list[list[int]]) -> wp.Function:
+    """Whole numbers by row and column. A matrix that is indexed so would be copied for every use."""
+    numbers = ", ".join(str(number) for row in rows for number in row)
+    snippet = f"""
+    static const signed char numbers[{len(rows) * len(rows[0])}] = {{{numbers}}};
+    return numbers[{len(rows[0])} * row + column];
+"""
+
+    @wp.func_native(snippet)
+    def look_up(row: int, column: int) -> int: ...
+
+    return look_up
+
+
+def _vectors(rows: list) -> wp.Function:
+    """Constant vectors by number."""
+    numbers = ", ".join(f"{float(c)!r}f" for row in rows for c in row)
+    snippet = f"""
+    static const float numbers[{3 * len(rows)}] = {{{numbers}}};
+    return wp::vec_t<3, wp::float32>(numbers[3 * i], numbers[3 * i + 1], numbers[3 * i + 2]);
+"""
+
+    @wp.func_native(snippet)
+    def look_up(i: int) -> wp.vec3: ...
+
+    return look_up
+
+
 def _repair_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -> wp.Function:
-    """What does a part again that the fast iteration does not turn."""
-    leaves_each = 8 // layout.parts
-    leaf_nodes = mat84i(*(node for leaf in LEAVES[layout.shape] for node in leaf))
-    places = wp.types.matrix(shape=(layout.parts, 10), dtype=wp.int32)
-    place_of = places(*(place for row in layout.places for place in row))
+    """What does the leaves of a part that the fast iteration left out.
+
+    It takes numbers, not the body: a struct that a function which is not inlined takes is copied for every call.
+    """
+    shape, leaves_each = layout.shape, 8 // layout.parts
+    node_of, place_of = _table([list(leaf) for leaf in LEAVES[shape]]), _table(layout.places)
+    handed = _table([[int(h)] for h in HANDEDNESS[shape]])
+    rest_of = _vectors([[2.0 * c for c in point] for point in POSITIONS[shape]])
+    frame_of = _vectors([column for leaf in FRAMES[shape] for column in leaf])
+    columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
 
     @wp.func
-    def node_at(body: BlockBody, s: int, local: int):
-        return displacement(wp.static(LOAD), body.subtrees.nodes[local, s], wp.vec3())
+    def position(words: vec3u, k: int, q: wp.mat33, inv_h: float):
+        """Of node k, relative to the first's displacement, in edge lengths of a leaf."""
+        moved = displacement(wp.static(LOAD_BYTES), number_in(words[k // NUMBERS], k % NUMBERS), wp.vec3())
+        origin = displacement(wp.static(LOAD_BYTES), number_in(words[0], 0), wp.vec3())
+        return (moved - origin) * inv_h + q * rest_of(k)
 
     @wp.func(inline=False)
     def repair(
-        body: BlockBody,
+        words: vec3u,
         s: int,
         part: int,
-        material: int,
+        left_out: int,
+        maubach: wp.mat33,
+        h: float,
+        mirror: float,
         mu: wp.array[wp.float32],
         lam: wp.array[wp.float32],
+        material: int,
         stride: int,
     ):
-        """Forces of a part that the fast iteration does not turn, leaf by leaf with the robust rotation."""
-        for_all = wp.mat33()
+        """Add the forces of the leaves that were left out, one by one with the robust rotation, to the part's slots.
+
+        ``maubach`` is the subtree's frame, left-handed if ``mirror`` is -1; ``material`` is where the first leaf's stands.
+        """
+        inv_h = 1.0 / h
+        area = wp.static(VOLUME[shape]) * h * h
+        turned = wp.mat33()
         if wp.static(layout.shared):
-            g = gradient_of(
-                body.roots, s, node_at(body, s, 0), node_at(body, s, 1), node_at(body, s, 2), node_at(body, s, 3)
+            c0, c1, c2 = columns(
+                position(words, 0, maubach, inv_h),
+                position(words, 1, maubach, inv_h),
+                position(words, 2, maubach, inv_h),
+                position(words, 3, maubach, inv_h),
             )
-            q = frame(body.roots, s)
-            for_all = byers_xu(q + g) * wp.transpose(q)
-        of_leaf = wp.static(leaf_nodes)
-        of_part = wp.static(place_of)
-        leaf = part * wp.static(leaves_each)
-        end = leaf + wp.static(leaves_each)
-        while leaf < end:
-            t = body.subtrees.first[s] + leaf
-            g = gradient_of(
-                body.elements,
-                t,
-                node_at(body, s, of_leaf[leaf, 0]),
-                node_at(body, s, of_leaf[leaf, 1]),
-                node_at(body, s, of_leaf[leaf, 2]),
-                node_at(body, s, of_leaf[leaf, 3]),
+            r = robust_rotation(wp.matrix_from_cols(c0, c1, c2 * mirror))
+            turned = wp.matrix_from_cols(column(r, 0), column(r, 1), column(r, 2) * mirror)
+        left = left_out & (wp.static((1 << leaves_each) - 1) << (part * wp.static(leaves_each)))
+        while left != 0:
+            leaf = lowest_bit(left)
+            left = left & (left - 1)
+            c0, c1, c2 = columns(
+                position(words, node_of(leaf, 0), maubach, inv_h),
+                position(words, node_of(leaf, 1), maubach, inv_h),
+                position(words, node_of(leaf, 2), maubach, inv_h),
+                position(words, node_of(leaf, 3), maubach, inv_h),
             )
-            q = frame(body.elements, t)
-            r = for_all * q
-            if wp.static(not layout.shared):
-                r = byers_xu(q + g)
+            # R times the leaf's Maubach frame.
+            z = wp.mat33()
+            if wp.static(layout.shared):
+                z = turned * wp.matrix_from_cols(frame_of(3 * leaf), frame_of(3 * leaf + 1), frame_of(3 * leaf + 2))
+            else:
+                hand = mirror * float(handed(leaf, 0))
+                r = robust_rotation(wp.matrix_from_cols(c0, c1, c2 * hand))
+                z = wp.matrix_from_cols(column(r, 0), column(r, 1), column(r, 2) * hand)
             i = material + leaf * stride
-            f0, f1, f2, f3 = nodal_forces(body.elements, t, r * hooke(corotated_strain(g, q, r), mu[i], lam[i]))
+            strain = symmetric(wp.transpose(z) * wp.matrix_from_cols(c0, c1, c2)) - identity3()
+            p = z * hooke(strain, area * mu[i], area * lam[i])
+            f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
             for n in range(4):
                 force = f0
                 if n == 1:
@@ -166,9 +212,8 @@ def _repair_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -> 
                     force = f2
                 if n == 3:
                     force = f3
-                at = s + of_part[part, of_leaf[leaf, n]] * wp.static(layout.subtrees)
+                at = s + place_of(part, node_of(leaf, n)) * wp.static(layout.subtrees)
                 slot(wp.static(STORE), at, slot(wp.static(LOAD), at, force) + force)
-            leaf += 1
 
     return repair
 
@@ -182,7 +227,6 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
     """
     shape, shared, uniform, parts = layout.shape, layout.shared, layout.uniform, layout.parts
     capacity, threads, zero_slot = layout.subtrees, layout.threads, layout.slot_count
-    deformed = deformed_of(shape)
     own = [own_forces(shape, uniform, layout.leaves(part)) for part in range(parts)]
     turned = [shared_forces(shape, uniform, False, layout.leaves(part)) for part in range(parts)]
     needs, places = [layout.needs(part) for part in range(parts)], layout.places
@@ -239,7 +283,6 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
         mirror = mirror_sign(code)
         q = body.subtrees.frames[code >> FRAME_SHIFT]
         material = (world * body.element_count + body.subtrees.first[mine]) * stride
-        inv_h = 1.0 / h
         damped = 1.0 / (1.0 + dt * damping)
         # In registers from here on, two nodes each.
         words = vec3u()
@@ -252,7 +295,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
         step = int(0)
         while step < steps:
             if s < body.subtree_count:
-                trusted = bool(True)
+                left_out = int(0)
                 for p in range(wp.static(parts)):
                     if part == p:
                         x = mat10()
@@ -263,17 +306,17 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
                                     number_in(words[k // wp.static(NUMBERS)], k % wp.static(NUMBERS)),
                                     wp.vec3(),
                                 )
-                        y = deformed(x, q, inv_h, mirror)
                         g = mat10()
                         if wp.static(shared):
-                            g, trusted = wp.static(turned[p])(y, h, mirror, wp.mat33(), mu, lam, material)
+                            g, left_out = wp.static(turned[p])(x, q, h, mirror, wp.mat33(), mu, lam, material)
                         else:
-                            g, trusted = wp.static(own[p])(y, h, mirror, mu, lam, material)
+                            g, left_out = wp.static(own[p])(x, q, h, mirror, mu, lam, material)
                         for k in range(10):
                             if wp.static(places[p][k] >= 0):
                                 slot(wp.static(STORE), s + wp.static(places[p][k] * capacity), g[k])
-                if not trusted:
-                    repair(body, s, part, material, mu, lam, stride)
+                if left_out != 0:
+                    maubach = wp.matrix_from_cols(column(q, 0), column(q, 1), column(q, 2) * mirror)
+                    repair(words, s, part, left_out, maubach, h, mirror, mu, lam, material, stride)
             synchronize_block()
             task = thread
             while task < wp.static(layout.tasks):

@@ -94,7 +94,12 @@ def stvk_cauchy(a: wp.mat33, mu: float, lam: float):
 
 @wp.func
 def corotated_strain(g: wp.mat33, q: wp.mat33, r: wp.mat33):
-    return symmetric(wp.transpose(r) * (q + g)) - identity3()
+    """sym(R^T F) - I without cancellation where G is small, also for a shared rotation.
+
+    With D = R Q - Q, sym((R Q)^T Q) - I = -D^T D / 2: that holds for rotations alone, and drops what rounding adds.
+    """
+    d = r - q
+    return symmetric(wp.transpose(r) * g) - 0.5 * (wp.transpose(d) * d)
 
 
 @wp.func

@@ -1,25 +1,72 @@
-"""Forces of the subtrees that the fast kernels left out: leaf by leaf with the rotation that is right for every F.
+"""Forces of the leaves that the subtree kernels left out: flat or inverted ones, with the rotation that is right for
+every F.
 
-Which those are is a byte a subtree, read eight at a time: nearly always all are zero. A group of eight subtrees is one
-thread's, so that where each group has a slot of its own for its forces, their order is settled.
+Which those are is a byte a subtree, a bit a leaf. On CUDA the subtrees that have any stand in a list (``LeftOut``), and
+one launch of a fixed size goes through it. On the CPU, and where the order of the sums must be settled, a thread reads
+the bytes of eight subtrees at a time, nearly always all zero, and goes through their leaves in order.
 """
 
 import warp as wp
 
 from .constitutive import corotated_strain, hooke
 from .elements import ForestElements, frame, local_gradient, scatter_stress
-from .rotation import byers_xu
+from .rotation import robust_rotation
 
 wp.set_module_options({"enable_backward": False})
 
 #: Subtrees that one thread looks after; ``flagged`` has a multiple of these.
 SUBTREES = 8
 LEAVES = 8
+#: Threads of a block that goes through a list.
+LIST_BLOCK = 128
 
 
-@wp.func
-def is_flagged(flags: wp.uint64, member: int):
-    return ((flags >> wp.uint64(8 * member)) & wp.uint64(255)) != wp.uint64(0)
+@wp.struct
+class LeftOut:
+    """The list of subtrees with leaves that were left out."""
+
+    # Entries, then blocks that are done with the list: both zero between evaluations.
+    counts: wp.array[wp.int32]  # [2]
+    entries: wp.array[wp.vec2i]  # [capacity] where its first leaf (own rotations) or it itself stands, and the mask
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    // One addition for all threads of a warp that are here.
+    const unsigned here = __activemask();
+    const unsigned lane = threadIdx.x & 31;
+    const int leader = __ffs(here) - 1;
+    int begin = 0;
+    if (lane == leader) begin = atomicAdd(&wp::index(list.counts, 0), __popc(here));
+    begin = __shfl_sync(here, begin, leader);
+    wp::index(list.entries, begin + __popc(here & ((1u << lane) - 1))) = wp::vec_t<2, wp::int32>(place, mask);
+#else
+    wp::index(list.entries, wp::index(list.counts, 0)++) = wp::vec_t<2, wp::int32>(place, mask);
+#endif
+""")
+def append(list: LeftOut, place: int, mask: int):
+    """Add a subtree to the list."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+    if (threadIdx.x == 0) {
+        __threadfence();
+        int* const counts = &wp::index(list.counts, 0);
+        if (atomicAdd(counts + 1, 1) == blocks - 1) {
+            counts[0] = 0;
+            counts[1] = 0;
+        }
+    }
+#else
+    wp::index(list.counts, 0) = 0;
+#endif
+""")
+def leave(list: LeftOut, blocks: int):
+    """Empty the list once every block is done with it."""
+    ...
 
 
 @wp.func
@@ -29,6 +76,106 @@ def scatter_turned(
     """Add the forces of element t with r, the rotation of its F Q."""
     strain = corotated_strain(local_gradient(elements, t, u), frame(elements, t), r)
     scatter_stress(elements, t, r * hooke(strain, mu, lam), f)
+
+
+@wp.func
+def scatter_own(
+    elements: ForestElements,
+    t: int,
+    mu: wp.array[wp.float32],
+    lam: wp.array[wp.float32],
+    stride: int,
+    u: wp.array[wp.vec4],
+    f: wp.array[wp.vec4],
+):
+    """Add the forces of element t with its own rotation."""
+    r = robust_rotation(frame(elements, t) + local_gradient(elements, t, u))
+    scatter_turned(elements, t, r, mu[t * stride], lam[t * stride], u, f)
+
+
+@wp.func
+def root_rotation(roots: ForestElements, s: int, u: wp.array[wp.vec4]):
+    q = frame(roots, s)
+    return robust_rotation(q + local_gradient(roots, s, u)) * wp.transpose(q)
+
+
+# --- by a list -------------------------------------------------------------------------------------------------------
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def repair_listed_own(
+    # In
+    threads: int,
+    elements: ForestElements,
+    mu: wp.array[wp.float32],
+    lam: wp.array[wp.float32],
+    stride: int,
+    u: wp.array[wp.vec4],
+    # In and out
+    listed: LeftOut,
+    # Out
+    f: wp.array[wp.vec4],
+):
+    """Every leaf with its own rotation. A thread a leaf, or where there are more a thread a subtree.
+
+    Launch with block_dim LIST_BLOCK and as many ``threads``, a multiple of it.
+    """
+    count = listed.counts[0]
+    if count == 0:
+        return
+    each = wp.where(LEAVES * count <= threads, LEAVES, 1)
+    i = wp.tid()
+    while i < count * each:
+        entry = listed.entries[i // each]
+        mask = entry[1]
+        if each > 1:
+            mask = mask & (1 << (i % each))
+        leaf = int(0)
+        while mask >= (1 << leaf):
+            if (mask >> leaf) & 1 == 1:
+                scatter_own(elements, entry[0] + leaf, mu, lam, stride, u, f)
+            leaf += 1
+        i += threads
+    leave(listed, threads // LIST_BLOCK)
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def repair_listed_shared(
+    # In
+    threads: int,
+    first: wp.array[wp.int32],
+    roots: ForestElements,
+    elements: ForestElements,
+    mu: wp.array[wp.float32],
+    lam: wp.array[wp.float32],
+    stride: int,
+    u: wp.array[wp.vec4],
+    # In and out
+    listed: LeftOut,
+    # Out
+    f: wp.array[wp.vec4],
+):
+    """Every leaf of a listed subtree with the rotation of the subtree's root, a thread a leaf; launch as the other."""
+    count = listed.counts[0]
+    if count == 0:
+        return
+    i = wp.tid()
+    while i < count * LEAVES:
+        s = listed.entries[i // LEAVES][0]
+        t = first[s] + i % LEAVES
+        r = root_rotation(roots, s, u) * frame(elements, t)
+        scatter_turned(elements, t, r, mu[t * stride], lam[t * stride], u, f)
+        i += threads
+    leave(listed, threads // LIST_BLOCK)
+
+
+# --- by bytes, in order ------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def is_left_out(flags: wp.uint64, leaf: int):
+    """Whether leaf 0 to 63 of eight subtrees is."""
+    return ((flags >> wp.uint64(leaf)) & wp.uint64(1)) != wp.uint64(0)
 
 
 @wp.kernel(enable_backward=False)
@@ -51,11 +198,9 @@ def repair_own(
         return
     leaf = int(0)
     while leaf < SUBTREES * LEAVES:
-        member = leaf // LEAVES
-        if is_flagged(flags, member):
-            t = first[SUBTREES * i + member] + leaf % LEAVES
-            r = byers_xu(frame(elements, t) + local_gradient(elements, t, u))
-            scatter_turned(elements, t, r, mu[t * stride], lam[t * stride], u, f)
+        if is_left_out(flags, leaf):
+            t = first[SUBTREES * i + leaf // LEAVES] + leaf % LEAVES
+            scatter_own(elements, t, mu, lam, stride, u, f)
         leaf += 1
 
 
@@ -80,10 +225,9 @@ def repair_shared(
         return
     member = int(0)
     while member < SUBTREES:
-        if is_flagged(flags, member):
+        if is_left_out(flags, LEAVES * member):
             s = SUBTREES * i + member
-            q = frame(roots, s)
-            rotation = byers_xu(q + local_gradient(roots, s, u)) * wp.transpose(q)
+            rotation = root_rotation(roots, s, u)
             leaf = int(0)
             while leaf < LEAVES:
                 t = first[s] + leaf

@@ -61,7 +61,7 @@ _SCATTER = """
     const int end = wp::min(8, count - first_subtree);
     for (int lane = 0; lane < end; ++lane) {
         const int s = first_subtree + lane;
-        flagged.data[s] = trusted[lane] ? 0 : 1;
+        flagged.data[s] = trusted[lane] ? 0 : 255;
         if (!trusted[lane]) continue;
         const int* node = subtrees.nodes.data + 10 * s;
         for (int k = 0; k < 10; ++k) {

@@ -2,35 +2,74 @@
 
 Three things make it fast. Forces are summed over the eight leaves in registers, and over a group of eight subtrees in
 shared memory, by a table that tells each lane which slots to add up, so that nothing is added atomically twice. What
-leaves for global memory are 16-byte vector reductions where the card has them. And rotations are found by four unscaled
+leaves for global memory are 16-byte vector reductions where the card has them. And rotations are found by a few unscaled
 iterations.
 
-A subtree that these do not turn adds nothing and is flagged; ``repair`` does flagged subtrees.
+A leaf that these do not turn adds nothing. Its bit is set in its subtree's byte, and the subtree is put on a list;
+``repair`` does those leaves. Bodies of one type of subtree alone have a kernel of their own; all others are one launch,
+in which each thread block looks up what it is to do.
 """
 
 import functools
 
 import warp as wp
 
-from .elements import ADD_FORCE, FRAME_SHIFT, LEVEL_MASK, Subtrees, add_force, load_node, mirror_sign
+from .elements import (
+    ADD_FORCE,
+    FRAME_SHIFT,
+    LEVEL_MASK,
+    ForestElements,
+    Subtrees,
+    add_force,
+    frame,
+    gradient_of,
+    load_node,
+    mirror_sign,
+    nodal_forces,
+    node_displacements,
+)
+from .newton_merging import add_four_forces
+from .repair import LeftOut, append
+from .rotation import ITERATIONS, column, newton_rotation
 from .subtree import GROUP_NODES, SLOT_STRIDE, group_slots, group_sources
-from .subtree_forces import deformed_of, mat10, own_forces, shared_forces
+from .subtree_forces import SMALL, mat10, own_forces, shared_forces, small_strain_stress
 
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 128
+#: Blocks of a multiprocessor that registers must leave room for, by type: as many as forces without ``small_forces`` do.
+RESIDENT = (6, 5, 5)
+#: What ``Stretch.shape`` is for leaves in no subtree.
+FLAT = 3
+
+
+@wp.struct
+class Stretch:
+    """Subtrees of one type, or leaves in none, that neighbouring thread blocks go through."""
+
+    begin: int  # the first of these blocks
+    count: int
+    shape: int
+    grouped: int
+    subtrees: Subtrees
+    flagged: wp.array[wp.uint8]
 
 
 def _numbers(values: list[int]) -> str:
     return ", ".join(map(str, values))
 
 
-def _load_snippet(shape: int) -> str:
+def _table(name: str, rows: list[list[int]]) -> str:
+    numbers = ", ".join(f"{{{_numbers(row)}}}" for row in rows)
+    return f"static const unsigned char {name}[{len(rows)}][{len(rows[0])}] = {{{numbers}}};"
+
+
+def _load_snippet(shapes: tuple[int, ...]) -> str:
     """Stage a group's displacements in shared memory, each read once, and hand every lane its subtree's ten."""
-    slots = [place for ten in group_slots(shape) for place in ten]
+    slots = [[place for ten in group_slots(shape) for place in ten] for shape in shapes]
     return f"""
 #if defined(__CUDA_ARCH__)
-    static const unsigned char slot[80] = {{{_numbers(slots)}}};
+    {_table("slot", slots)}
     __shared__ float4 staged[{BLOCK // 8}][{GROUP_NODES + 1}];
     const int lane = threadIdx.x & 7;
     const int g = threadIdx.x >> 3;
@@ -43,7 +82,7 @@ def _load_snippet(shape: int) -> str:
     wp::mat_t<10, 3, wp::float32> x;
     #pragma unroll
     for (int k = 0; k < 10; ++k) {{
-        const float4 a = staged[g][slot[10 * lane + k]];
+        const float4 a = staged[g][slot[row][10 * lane + k]];
         x.data[k][0] = a.x; x.data[k][1] = a.y; x.data[k][2] = a.z;
     }}
     return x;
@@ -53,31 +92,32 @@ def _load_snippet(shape: int) -> str:
 """
 
 
-def _merge_snippet(shape: int) -> str:
+def _merge_snippet(shapes: tuple[int, ...]) -> str:
     """Sum a group's forces in shared memory and reduce each node's once; a lane sums every eighth node's."""
-    sources = group_sources(shape)
+    sources = [group_sources(shape) for shape in shapes]
     empty = 10  # the spare slot of the first subtree, kept zero
-    table: list[int] = []
+    tables: list[list[int]] = [[] for _ in shapes]
     rounds = ""
     for r in range(GROUP_NODES // 8):
-        lists = sources[8 * r : 8 * r + 8]
-        longest = max(map(len, lists))
+        lists = [of_shape[8 * r : 8 * r + 8] for of_shape in sources]
+        longest = max(len(slots) for of_shape in lists for slots in of_shape)
         rounds += f"""
     {{
         float4 sum = make_float4(0.f, 0.f, 0.f, 0.f);
         #pragma unroll
         for (int m = 0; m < {longest}; ++m) {{
-            const float4 a = part[g][source[{len(table)} + 8 * m + lane]];
+            const float4 a = part[g][source[row][{len(tables[0])} + 8 * m + lane]];
             sum.x += a.x; sum.y += a.y; sum.z += a.z;
         }}
         const int node = wp::index(targets, group, {8 * r} + lane);
         const wp::vec_t<3, wp::float32> force(sum.x, sum.y, sum.z);
         if (node >= 0) {{ {ADD_FORCE} }}
     }}"""
-        table += [slots[m] if m < len(slots) else empty for m in range(longest) for slots in lists]
+        for table, of_shape in zip(tables, lists, strict=True):
+            table += [slots[m] if m < len(slots) else empty for m in range(longest) for slots in of_shape]
     return f"""
 #if defined(__CUDA_ARCH__)
-    static const unsigned char source[{len(table)}] = {{{_numbers(table)}}};
+    {_table("source", tables)}
     __shared__ float4 part[{BLOCK // 8}][{8 * SLOT_STRIDE + 1}];
     const int lane = threadIdx.x & 7;
     const int g = threadIdx.x >> 3;
@@ -92,48 +132,60 @@ def _merge_snippet(shape: int) -> str:
 
 
 @functools.cache
+def _group_memory(shapes: tuple[int, ...]) -> tuple[wp.Function, wp.Function]:
+    """How displacements of subtrees in groups come in and their forces go out; ``row`` says which of the shapes."""
+
+    @wp.func_native(_load_snippet(shapes))
+    def load_group(nodes: wp.array2d[wp.int32], group: int, row: int, u: wp.array[wp.vec4]) -> mat10: ...
+
+    @wp.func_native(_merge_snippet(shapes))
+    def merge_group(targets: wp.array2d[wp.int32], group: int, row: int, x: mat10, f: wp.array[wp.vec4]): ...
+
+    return load_group, merge_group
+
+
+@wp.func
+def load_single(subtrees: Subtrees, s: int, u: wp.array[wp.vec4]):
+    x = mat10()
+    for k in range(10):
+        x[k] = load_node(u, subtrees.nodes[k, s])
+    return x
+
+
+@wp.func
+def add_single(subtrees: Subtrees, s: int, g: mat10, f: wp.array[wp.vec4]):
+    for k in range(10):
+        add_force(f, subtrees.targets[k, s], g[k])
+
+
+@functools.cache
 def memory_of(shape: int, grouped: bool) -> tuple[wp.Function, wp.Function]:
     """How a subtree's displacements come in and its forces go out."""
-    if grouped:
-
-        @wp.func_native(_load_snippet(shape))
-        def load_group(nodes: wp.array2d[wp.int32], group: int, u: wp.array[wp.vec4]) -> mat10: ...
-
-        @wp.func_native(_merge_snippet(shape))
-        def merge_group(targets: wp.array2d[wp.int32], group: int, x: mat10, f: wp.array[wp.vec4]): ...
-
-        @wp.func
-        def load(subtrees: Subtrees, s: int, u: wp.array[wp.vec4]):
-            return load_group(subtrees.nodes, s // 8, u)
-
-        @wp.func
-        def add(subtrees: Subtrees, s: int, g: mat10, f: wp.array[wp.vec4]):
-            merge_group(subtrees.targets, s // 8, g, f)
-
-        return load, add
+    if not grouped:
+        return load_single, add_single
+    load_group, merge_group = _group_memory((shape,))
 
     @wp.func
     def load(subtrees: Subtrees, s: int, u: wp.array[wp.vec4]):
-        x = mat10()
-        for k in range(10):
-            x[k] = load_node(u, subtrees.nodes[k, s])
-        return x
+        return load_group(subtrees.nodes, s // 8, 0, u)
 
     @wp.func
     def add(subtrees: Subtrees, s: int, g: mat10, f: wp.array[wp.vec4]):
-        for k in range(10):
-            add_force(f, subtrees.targets[k, s], g[k])
+        merge_group(subtrees.targets, s // 8, 0, g, f)
 
     return load, add
 
 
 @functools.cache
-def scatter_subtrees_own(shape: int, grouped: bool, uniform: bool) -> wp.Kernel:
-    """Corotated forces of subtrees, every leaf with its own rotation. Launch with block_dim BLOCK."""
-    load, add = memory_of(shape, grouped)
-    deformed, forces = deformed_of(shape), own_forces(shape, uniform)
+def scatter_subtrees_own(shape: int, grouped: bool, uniform: bool, listed: bool) -> wp.Kernel:
+    """Corotated forces of subtrees of one type, every leaf with its own rotation. Launch with block_dim BLOCK.
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    ``listed`` says whether subtrees with leaves that are left out are put on a list.
+    """
+    load, add = memory_of(shape, grouped)
+    forces = own_forces(shape, uniform)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, RESIDENT[shape]))
     def scatter_subtrees_own(
         # In
         subtrees: Subtrees,
@@ -143,27 +195,32 @@ def scatter_subtrees_own(shape: int, grouped: bool, uniform: bool) -> wp.Kernel:
         # Out
         f: wp.array[wp.vec4],
         flagged: wp.array[wp.uint8],
+        left_out: LeftOut,
     ):
         s = wp.tid()
         code = subtrees.code[s]
         h = 0.5 * subtrees.size[(code & LEVEL_MASK) // 3]
         mirror = mirror_sign(code)
-        x = deformed(load(subtrees, s, u), subtrees.frames[code >> FRAME_SHIFT], 1.0 / h, mirror)
-        g, trusted = forces(x, h, mirror, mu, lam, wp.where(wp.static(uniform), 0, subtrees.first[s]))
-        flagged[s] = wp.where(trusted, wp.uint8(0), wp.uint8(1))
+        q = subtrees.frames[code >> FRAME_SHIFT]
+        x = load(subtrees, s, u)
+        g, mask = forces(x, q, h, mirror, mu, lam, wp.where(wp.static(uniform), 0, subtrees.first[s]))
+        flagged[s] = wp.uint8(mask)
+        if wp.static(listed):
+            if mask != 0:
+                append(left_out, subtrees.first[s], mask)
         add(subtrees, s, g, f)
 
     return scatter_subtrees_own
 
 
 @functools.cache
-def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: bool) -> wp.Kernel:
+def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: bool, listed: bool) -> wp.Kernel:
     """Corotated forces of subtrees whose leaves share a rotation: the subtree root's, or a given one from further up.
 
     Launch with block_dim BLOCK.
     """
     load, add = memory_of(shape, grouped)
-    deformed, forces = deformed_of(shape), shared_forces(shape, uniform, given)
+    forces = shared_forces(shape, uniform, given)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
     def scatter_subtrees_shared(
@@ -177,19 +234,138 @@ def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: boo
         # Out
         f: wp.array[wp.vec4],
         flagged: wp.array[wp.uint8],
+        left_out: LeftOut,
     ):
         s = wp.tid()
         code = subtrees.code[s]
         h = 0.5 * subtrees.size[(code & LEVEL_MASK) // 3]
         mirror = mirror_sign(code)
         q = subtrees.frames[code >> FRAME_SHIFT]
-        x = deformed(load(subtrees, s, u), q, 1.0 / h, mirror)
+        x = load(subtrees, s, u)
         turn = wp.mat33()
         if wp.static(given):
             turn = rotations[unit[s]] * q
-        g, trusted = forces(x, h, mirror, turn, mu, lam, wp.where(wp.static(uniform), 0, subtrees.first[s]))
+        g, mask = forces(x, q, h, mirror, turn, mu, lam, wp.where(wp.static(uniform), 0, subtrees.first[s]))
         if wp.static(not given):
-            flagged[s] = wp.where(trusted, wp.uint8(0), wp.uint8(1))
+            flagged[s] = wp.uint8(mask)
+            if wp.static(listed):
+                if mask != 0:
+                    append(left_out, s, mask)
         add(subtrees, s, g, f)
 
     return scatter_subtrees_shared
+
+
+# --- all of a body in one launch ---------------------------------------------------------------------------------------
+
+
+@wp.func
+def flat_stress(g: wp.mat33, q: wp.mat33, mu: float, lam: float):
+    """First Piola-Kirchhoff stress times Q of a leaf with its own rotation, and whether it may be trusted."""
+    p = wp.mat33()
+    trusted = bool(True)
+    far = wp.max(wp.abs(g[0]))
+    far = wp.max(far, wp.max(wp.abs(g[1])))
+    far = wp.max(far, wp.max(wp.abs(g[2])))
+    if far < SMALL:
+        w = wp.transpose(q) * g
+        p = q * small_strain_stress(w + wp.transpose(w) + wp.transpose(g) * g, w, mu, lam)
+    else:
+        f = q + g
+        z0, z1, z2, trusted = newton_rotation(column(f, 0), column(f, 1), column(f, 2), 1.0)
+        r = wp.static(0.5**ITERATIONS) * wp.matrix_from_cols(z0, z1, z2)
+        p = (2.0 * mu) * f + (lam * (wp.ddot(r, f) - 3.0) - 2.0 * mu) * r
+    return p, trusted
+
+
+@functools.cache
+def _scatter_subtree(shape: int, uniform: bool) -> wp.Function:
+    """One subtree of a stretch; all shapes share the memory that groups meet in."""
+    load_group, merge_group = _group_memory((0, 1, 2))
+    forces = own_forces(shape, uniform)
+
+    @wp.func
+    def scatter_subtree(
+        subtrees: Subtrees,
+        s: int,
+        grouped: bool,
+        mu: wp.array[wp.float32],
+        lam: wp.array[wp.float32],
+        u: wp.array[wp.vec4],
+        f: wp.array[wp.vec4],
+    ):
+        code = subtrees.code[s]
+        h = 0.5 * subtrees.size[(code & LEVEL_MASK) // 3]
+        q = subtrees.frames[code >> FRAME_SHIFT]
+        x = mat10()
+        if grouped:
+            x = load_group(subtrees.nodes, s // 8, wp.static(shape), u)
+        else:
+            x = load_single(subtrees, s, u)
+        material = wp.where(wp.static(uniform), 0, subtrees.first[s])
+        g, mask = forces(x, q, h, mirror_sign(code), mu, lam, material)
+        if grouped:
+            merge_group(subtrees.targets, s // 8, wp.static(shape), g, f)
+        else:
+            add_single(subtrees, s, g, f)
+        return mask
+
+    return scatter_subtree
+
+
+@functools.cache
+def scatter_stretches(uniform: bool) -> wp.Kernel:
+    """Corotated forces of all subtrees and other leaves of a body, every leaf with its own rotation.
+
+    Launch with block_dim BLOCK and whole blocks.
+    """
+    subtree0, subtree1, subtree2 = (_scatter_subtree(shape, uniform) for shape in range(3))
+    add_neighbours = add_four_forces(2)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, min(RESIDENT)))
+    def scatter_stretches(
+        # In
+        stretches: wp.array[Stretch],
+        flat: ForestElements,
+        flat_leaves: wp.array[wp.int32],
+        mu: wp.array[wp.float32],
+        lam: wp.array[wp.float32],
+        u: wp.array[wp.vec4],
+        # Out
+        f: wp.array[wp.vec4],
+        left_out: LeftOut,
+    ):
+        block = wp.tid() // BLOCK
+        k = int(stretches.shape[0] - 1)
+        while stretches[k].begin > block:
+            k -= 1
+        s = wp.tid() - stretches[k].begin * BLOCK
+        if s >= stretches[k].count:
+            return
+        shape = stretches[k].shape
+        if shape == FLAT:
+            m = int(0)
+            if wp.static(not uniform):
+                m = flat_leaves[s]
+            u0, u1, u2, u3 = node_displacements(flat.nodes[s], u)
+            p, trusted = flat_stress(gradient_of(flat, s, u0, u1, u2, u3), frame(flat, s), mu[m], lam[m])
+            if not trusted:
+                p = wp.mat33()
+                append(left_out, flat_leaves[s], 1)
+            f0, f1, f2, f3 = nodal_forces(flat, s, p)
+            add_neighbours(f, flat.targets[s], f0, f1, f2, f3)
+            return
+        subtrees = stretches[k].subtrees
+        grouped = stretches[k].grouped != 0
+        mask = int(0)
+        if shape == 0:
+            mask = subtree0(subtrees, s, grouped, mu, lam, u, f)
+        elif shape == 1:
+            mask = subtree1(subtrees, s, grouped, mu, lam, u, f)
+        else:
+            mask = subtree2(subtrees, s, grouped, mu, lam, u, f)
+        stretches[k].flagged[s] = wp.uint8(mask)
+        if mask != 0:
+            append(left_out, subtrees.first[s], mask)
+
+    return scatter_stretches

@@ -1,8 +1,11 @@
 """Corotated forces of one complete subtree in registers: ten displacements in, ten nodal forces out.
 
 What kernels share that read and write their nodes each in its own way (``subtree_cuda``, ``block``). Rotations are
-found by four unscaled iterations (``rotation.newton_rotation``); a subtree with a leaf that these do not turn, strongly
-stretched, flat or inverted, gets no force and is reported.
+found by unscaled iterations (``rotation.newton_rotation``); a leaf that these do not turn, flat, inverted or far from
+order one, is left out and reported: bit k stands for leaf k in tree order.
+
+A strain that is a difference of numbers near one has an error of 1.5e-7 however small it is. So a subtree whose nodes
+have hardly moved takes ``small_forces``, which works from displacements alone and needs no rotation.
 """
 
 import functools
@@ -17,6 +20,14 @@ from .subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS
 wp.set_module_options({"enable_backward": False})
 
 mat10 = wp.types.matrix(shape=(10, 3), dtype=wp.float32)
+
+#: What a mask of left-out leaves is where the whole subtree is.
+ALL_LEAVES = wp.constant(255)
+
+#: Largest component of a displacement relative to the first node's, in edge lengths of a leaf, for ``small_forces``. Its
+#: series is then right to 1e-5 of the stress where neighbouring nodes move against each other, to 1e-8 where strain is
+#: smooth. Beyond, the error of 1.5e-7 is at most 1e-4 of the strain.
+SMALL = wp.constant(0.01)
 
 
 @functools.cache
@@ -88,10 +99,113 @@ def deformed_of(shape: int) -> wp.Function:
 
 
 @functools.cache
-def own_forces(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Function:
-    """Forces of the chosen leaves, each with its own rotation, and whether they may be trusted.
+def is_small(shape: int, chosen: range) -> wp.Function:
+    """Whether the nodes of the chosen leaves have moved by at most ``bound`` from the first one's displacement."""
+    used = sorted({node for leaf in chosen for node in LEAVES[shape][leaf]} - {0})
 
-    ``h`` is a leaf's edge length, ``first`` where its material stands, and that of the other leaves unless uniform.
+    @wp.func
+    def is_small(x: mat10, bound: float):
+        _generated_from = wp.static(fingerprint(used))
+        origin = x[0]
+        far = float(0.0)
+        for k in range(wp.static(len(used))):
+            d = wp.abs(x[wp.static(used[k])] - origin)
+            far = wp.max(far, wp.max(wp.max(d[0], d[1]), d[2]))
+        return far < bound
+
+    return is_small
+
+
+@wp.func
+def small_strain_stress(e: wp.mat33, h: wp.mat33, mu: float, lam: float):
+    """First Piola-Kirchhoff stress from E = C - I and the displacement gradient H, both small, in one frame.
+
+    With U = sqrt(I + E) the second stress is S = U^-1 (2 mu (U - I) + lambda tr(U - I)) = 2 mu N + lambda tr(U - I)
+    (I - N) with N = I - U^-1 = E/2 - 3/8 E^2 + 5/16 E^3 - 35/128 E^4 + ..., and P = S + H S.
+    """
+    e2 = e * e
+    n = 0.5 * e - 0.375 * e2 + e2 * (0.3125 * e - 0.2734375 * e2)
+    trace = 0.5 * wp.trace(e) - 0.125 * wp.trace(e2) + 0.0625 * wp.ddot(e, e2) - 0.0390625 * wp.ddot(e2, e2)
+    pressure = lam * trace
+    s = (2.0 * mu - pressure) * n
+    s[0, 0] += pressure
+    s[1, 1] += pressure
+    s[2, 2] += pressure
+    return s + h * s
+
+
+@functools.cache
+def small_forces_of(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Function:
+    """Forces of the chosen leaves from small displacements, without a rotation and with the digits of the strain.
+
+    Ten displacements are turned into the subtree's Maubach frame once; leaves' frames are tables there.
+    """
+    columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
+    leaves, frames = LEAVES[shape], FRAMES[shape]
+    begin, end = chosen.start, chosen.stop
+    volume = VOLUME[shape]
+
+    @wp.func
+    def small_forces(
+        x: mat10, q: wp.mat33, h: float, mirror: float, mu: wp.array[wp.float32], lam: wp.array[wp.float32], first: int
+    ):
+        _generated_from = wp.static(fingerprint(leaves, frames, begin, end))
+        q0 = column(q, 0)
+        q1 = column(q, 1)
+        q2 = column(q, 2) * mirror
+        inv_h = 1.0 / h
+        origin = x[0]
+        y = mat10()
+        for n in range(10):
+            d = (x[n] - origin) * inv_h
+            y[n] = wp.vec3(wp.dot(q0, d), wp.dot(q1, d), wp.dot(q2, d))
+        m = mu[first]
+        k = lam[first]
+        area = wp.static(volume) * h * h
+        g = mat10()
+        for leaf in range(wp.static(begin), wp.static(end)):
+            if wp.static(not uniform):
+                m = mu[first + leaf]
+                k = lam[first + leaf]
+            b0, b1, b2 = columns(
+                y[wp.static(leaves[leaf][0])],
+                y[wp.static(leaves[leaf][1])],
+                y[wp.static(leaves[leaf][2])],
+                y[wp.static(leaves[leaf][3])],
+            )
+            c = wp.matrix_from_cols(b0, b1, b2)
+            # The displacement gradient in the leaf's frame B: B^T C, zeros of B left out.
+            w = wp.mat33()
+            for i in range(3):
+                for j in range(3):
+                    for axis in range(3):
+                        if wp.static(abs(frames[leaf][i][axis]) > 1e-9):
+                            w[i, j] += wp.static(frames[leaf][i][axis]) * c[axis, j]
+            sigma = small_strain_stress(w + wp.transpose(w) + wp.transpose(w) * w, w, m * area, k * area)
+            p = wp.mat33()
+            for axis in range(3):
+                for j in range(3):
+                    for i in range(3):
+                        if wp.static(abs(frames[leaf][i][axis]) > 1e-9):
+                            p[axis, j] += wp.static(frames[leaf][i][axis]) * sigma[i, j]
+            f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
+            g[wp.static(leaves[leaf][0])] += f0
+            g[wp.static(leaves[leaf][1])] += f1
+            g[wp.static(leaves[leaf][2])] += f2
+            g[wp.static(leaves[leaf][3])] += f3
+        for n in range(10):
+            force = g[n]
+            g[n] = force[0] * q0 + force[1] * q1 + force[2] * q2
+        return g
+
+    return small_forces
+
+
+@functools.cache
+def turned_forces_of(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Function:
+    """Forces of the chosen leaves from positions (``deformed_of``), each with its own rotation, and which leaves are
+    left out.
+
     With a rotation, R sym(R^T F) = F, so P = 2 mu (F - R) + lambda tr(R^T F - I) R: no matrix is multiplied.
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
@@ -100,7 +214,9 @@ def own_forces(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Functi
     volume = VOLUME[shape]
 
     @wp.func
-    def own_forces(x: mat10, h: float, mirror: float, mu: wp.array[wp.float32], lam: wp.array[wp.float32], first: int):
+    def turned_forces(
+        x: mat10, h: float, mirror: float, mu: wp.array[wp.float32], lam: wp.array[wp.float32], first: int
+    ):
         _generated_from = wp.static(fingerprint(leaves, handed, begin, end))
         m = mu[first]
         k = lam[first]
@@ -108,7 +224,7 @@ def own_forces(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Functi
         area = wp.static(volume) * h * h
         area_z = wp.static(0.5**ITERATIONS) * area
         g = mat10()
-        trusted = bool(True)
+        left_out = int(0)
         for leaf in range(wp.static(begin), wp.static(end)):
             if wp.static(not uniform):
                 m = mu[first + leaf]
@@ -120,41 +236,106 @@ def own_forces(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Functi
                 x[wp.static(leaves[leaf][2])],
                 x[wp.static(leaves[leaf][3])],
             )
-            z0, z1, z2, converged = newton_rotation(c0, c1, c2, hand)
-            trusted = trusted and converged
-            trace = wp.static(0.5**ITERATIONS) * (wp.dot(z0, c0) + wp.dot(z1, c1) + wp.dot(z2, c2))
-            from_f = 2.0 * m * area
-            from_z = (k * (trace - 3.0) - 2.0 * m) * area_z
-            f0, f1, f2, f3 = leaf_forces(
-                from_f * c0 + from_z * z0, from_f * c1 + from_z * z1, from_f * c2 + from_z * z2
-            )
-            g[wp.static(leaves[leaf][0])] += f0
-            g[wp.static(leaves[leaf][1])] += f1
-            g[wp.static(leaves[leaf][2])] += f2
-            g[wp.static(leaves[leaf][3])] += f3
-        if not trusted:
-            g = mat10()
-        return g, trusted
+            z0, z1, z2, trusted = newton_rotation(c0, c1, c2, hand)
+            if trusted:
+                trace = wp.static(0.5**ITERATIONS) * (wp.dot(z0, c0) + wp.dot(z1, c1) + wp.dot(z2, c2))
+                from_f = 2.0 * m * area
+                from_z = (k * (trace - 3.0) - 2.0 * m) * area_z
+                f0, f1, f2, f3 = leaf_forces(
+                    from_f * c0 + from_z * z0, from_f * c1 + from_z * z1, from_f * c2 + from_z * z2
+                )
+                g[wp.static(leaves[leaf][0])] += f0
+                g[wp.static(leaves[leaf][1])] += f1
+                g[wp.static(leaves[leaf][2])] += f2
+                g[wp.static(leaves[leaf][3])] += f3
+            else:
+                left_out |= wp.static(1 << leaf)
+        return g, left_out
+
+    return turned_forces
+
+
+@functools.cache
+def own_forces(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Function:
+    """Forces of the chosen leaves from ten displacements, each leaf with its own rotation, and which are left out.
+
+    ``q`` is the subtree's frame, ``h`` a leaf's edge length, ``first`` where its material stands, and that of the other
+    leaves unless uniform.
+    """
+    small, deformed = is_small(shape, chosen), deformed_of(shape)
+    small_forces, turned_forces = (of(shape, uniform, chosen) for of in (small_forces_of, turned_forces_of))
+
+    @wp.func
+    def own_forces(
+        x: mat10, q: wp.mat33, h: float, mirror: float, mu: wp.array[wp.float32], lam: wp.array[wp.float32], first: int
+    ):
+        g = mat10()
+        left_out = int(0)
+        if small(x, SMALL * h):
+            g = small_forces(x, q, h, mirror, mu, lam, first)
+        else:
+            g, left_out = turned_forces(deformed(x, q, 1.0 / h, mirror), h, mirror, mu, lam, first)
+        return g, left_out
 
     return own_forces
 
 
 @functools.cache
-def shared_forces(shape: int, uniform: bool, given: bool, chosen: range = range(8)) -> wp.Function:
-    """Forces of the chosen leaves, all with one rotation, the subtree root's or a given one, and whether it may be
-    trusted.
+def turned_back_of(shape: int) -> wp.Function:
+    """Displacements R^T x - x0 in the subtree's Maubach frame q, in edge lengths of a leaf; r = R q.
 
-    The ten positions are turned back once; in the subtree's own frame the leaves are linear elements. ``turn`` is the
-    given rotation times the subtree's frame.
+    They are R^T u + (R^T - I) x0. With D = R - I, which is small where the rotation is, sym(R^T - I) = -D^T D / 2 for a
+    rotation: so R^T - I keeps the digits of D, and the strain those of the displacements.
+    """
+    at = [[2.0 * c for c in point] for point in POSITIONS[shape]]
+
+    @wp.func
+    def turned_back(
+        x: mat10, inv_h: float, q0: wp.vec3, q1: wp.vec3, q2: wp.vec3, r0: wp.vec3, r1: wp.vec3, r2: wp.vec3
+    ):
+        _generated_from = wp.static(fingerprint(at))
+        d0 = r0 - q0
+        d1 = r1 - q1
+        d2 = r2 - q2
+        # The skew part, and half of the symmetric one.
+        w01 = 0.5 * (wp.dot(d0, q1) - wp.dot(d1, q0))
+        w02 = 0.5 * (wp.dot(d0, q2) - wp.dot(d2, q0))
+        w12 = 0.5 * (wp.dot(d1, q2) - wp.dot(d2, q1))
+        s01 = -0.5 * wp.dot(d0, d1)
+        s02 = -0.5 * wp.dot(d0, d2)
+        s12 = -0.5 * wp.dot(d1, d2)
+        t0 = wp.vec3(-0.5 * wp.dot(d0, d0), s01 - w01, s02 - w02)
+        t1 = wp.vec3(s01 + w01, -0.5 * wp.dot(d1, d1), s12 - w12)
+        t2 = wp.vec3(s02 + w02, s12 + w12, -0.5 * wp.dot(d2, d2))
+        origin = x[0]
+        y = mat10()
+        for n in range(10):
+            d = (x[n] - origin) * inv_h
+            y[n] = wp.vec3(wp.dot(r0, d), wp.dot(r1, d), wp.dot(r2, d)) + (
+                wp.static(at[n][0]) * t0 + wp.static(at[n][1]) * t1 + wp.static(at[n][2]) * t2
+            )
+        return y
+
+    return turned_back
+
+
+@functools.cache
+def shared_forces(shape: int, uniform: bool, given: bool, chosen: range = range(8)) -> wp.Function:
+    """Forces of the chosen leaves from ten displacements, all with one rotation, and which are left out: none or all.
+
+    The rotation is the subtree root's or a given one; ``turn`` is the given one times the subtree's frame ``q``. The ten
+    displacements are turned back once; in the subtree's own frame the leaves are linear elements.
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
     leaves, frames, at = LEAVES[shape], FRAMES[shape], POSITIONS[shape]
+    turned_back = turned_back_of(shape)
     begin, end = chosen.start, chosen.stop
     volume = VOLUME[shape]
 
     @wp.func
     def shared_forces(
         x: mat10,
+        q: wp.mat33,
         h: float,
         mirror: float,
         turn: wp.mat33,
@@ -163,7 +344,11 @@ def shared_forces(shape: int, uniform: bool, given: bool, chosen: range = range(
         first: int,
     ):
         _generated_from = wp.static(fingerprint(leaves, frames, at, begin, end))
-        trusted = bool(True)
+        left_out = int(0)
+        q0 = column(q, 0)
+        q1 = column(q, 1)
+        q2 = column(q, 2) * mirror
+        inv_h = 1.0 / h
         r0 = wp.vec3()
         r1 = wp.vec3()
         r2 = wp.vec3()
@@ -172,21 +357,16 @@ def shared_forces(shape: int, uniform: bool, given: bool, chosen: range = range(
             r1 = column(turn, 1)
             r2 = column(turn, 2) * mirror
         else:
-            c0, c1, c2 = columns(x[0], x[1], x[2], x[3])
             # The subtree's edge is two of a leaf's.
-            z0, z1, z2, converged = newton_rotation(0.5 * c0, 0.5 * c1, 0.5 * c2, mirror)
-            trusted = converged
+            c0, c1, c2 = columns(x[0], x[1], x[2], x[3])
+            half = 0.5 * inv_h
+            z0, z1, z2, trusted = newton_rotation(q0 + half * c0, q1 + half * c1, q2 + half * c2, mirror)
+            if not trusted:
+                left_out = ALL_LEAVES
             r0 = wp.static(0.5**ITERATIONS) * z0
             r1 = wp.static(0.5**ITERATIONS) * z1
             r2 = wp.static(0.5**ITERATIONS) * z2
-        y = mat10()
-        for n in range(10):
-            # Displacement in the subtree's Maubach frame.
-            y[n] = wp.vec3(
-                wp.dot(r0, x[n]) - wp.static(2.0 * at[n][0]),
-                wp.dot(r1, x[n]) - wp.static(2.0 * at[n][1]),
-                wp.dot(r2, x[n]) - wp.static(2.0 * at[n][2]),
-            )
+        y = turned_back(x, inv_h, q0, q1, q2, r0, r1, r2)
         m = mu[first]
         k = lam[first]
         area = wp.static(volume) * h * h
@@ -239,8 +419,8 @@ def shared_forces(shape: int, uniform: bool, given: bool, chosen: range = range(
         for n in range(10):
             force = g[n]
             g[n] = force[0] * r0 + force[1] * r1 + force[2] * r2
-        if not trusted:
+        if left_out != 0:
             g = mat10()
-        return g, trusted
+        return g, left_out
 
     return shared_forces

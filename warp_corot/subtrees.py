@@ -44,7 +44,8 @@ class Batch:
         subtrees: ``kernels.elements.Subtrees``.
         roots: Their roots as forest elements where leaves share the root's rotation, else None.
         unit: Which of ``Units`` each uses where leaves share one from further up, int32 [count], else None.
-        flagged: Set by the kernel where a subtree was left out, uint8 [count, rounded up to eights].
+        flagged: Set by the kernel: bit k of a subtree's byte where its leaf k, in tree order, was left out; uint8
+            [count, rounded up to eights].
     """
 
     shape: int

@@ -1,4 +1,7 @@
-"""The fast path of the corotated model: complete subtrees of a forest as units of work; see ``plan``."""
+"""The fast path of the corotated model: complete subtrees of a forest as units of work; see ``plan``.
+
+On CUDA with own rotations a body is two launches: its forces, and the leaves that these left out.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,8 @@ from ..plan import FlatLeaves, ForcePlan, Plan
 from ..subtrees import Batch, Sharing
 from .corotated_field import CorotatedField, Rotations
 from .lanes import Lanes, as_general
+from .left_out import LeftOutLeaves
+from .stretches import Stretches
 
 if TYPE_CHECKING:
     from ..body import SoftBody
@@ -49,9 +54,13 @@ class SubtreeField(CorotatedField):
         for shape, grouped, sharing in plan.kinds:
             kernel = self._kernel(shape, grouped, sharing)
             wp.load_module(kernel.module, self.device, block_dim=self._block)
-        single = (self._forces, self._own, self._extract, repair_own, repair_shared, scatter_elements, repair_elements)
-        for kernel in single if self.device.is_cpu else single[:-2]:
+        single = [self._forces, self._own, self._extract, repair_own]
+        if self.device.is_cpu:
+            single += [scatter_elements, repair_elements]
+        for kernel in single:
             wp.load_module(kernel.module, self.device)
+        if self.device.is_cuda:
+            Stretches.load(self._uniform, self.device)
 
     @property
     def _block(self) -> int:
@@ -70,6 +79,12 @@ class SubtreeField(CorotatedField):
             self._rotations = self._shared.rotations
         elif self.rotation_level is not None:
             self._sharing()
+        self._left_out = self._stretches = None
+        if self._listed:
+            self._left_out = LeftOutLeaves.of(plan, self.device)
+            if Stretches.suit(plan):
+                self._stretches = Stretches(plan, self._uniform, self.device)
+                return
         self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]
         self._flat_material = self.material_inputs
         self._flat_lanes: Lanes | None = None
@@ -87,7 +102,17 @@ class SubtreeField(CorotatedField):
             general = flat.general or as_general(flat.elements, rest_matrices, [flat.elements])
             self._flat_lanes = Lanes(general, general, scatter=scatter_elements, repair=repair_elements)
 
+    @property
+    def _listed(self) -> bool:
+        """Whether leaves that are left out stand in a list; the order of its entries is any."""
+        return self.device.is_cuda and not self.deterministic
+
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        if self._stretches is not None:
+            assert self._left_out is not None
+            self._stretches.scatter_forces(self.body.mu, self.body.lam, u, f, self._left_out.own)
+            self._left_out.repair(self.elements, self.material_inputs, u, f)
+            return
         if self.plan.units is not None:
             self.extract_rotations(u)
         for batch, kernel in zip(self.plan.batches, self._kernels, strict=True):
@@ -101,30 +126,34 @@ class SubtreeField(CorotatedField):
                 self.launch(self._forces, len(flat), [*inputs, self._rotations, flat.unit], [f])
             else:
                 self.launch(self._own, len(flat), inputs, [f])
+        if self._left_out is not None:
+            self._left_out.repair(self.elements, self.material_inputs, u, f)
 
     def _kernel(self, shape: int, grouped: bool, sharing: Sharing) -> wp.Kernel:
         given = sharing is Sharing.ABOVE
         if self.device.is_cuda:
             if sharing is Sharing.OWN:
-                return subtree_cuda.scatter_subtrees_own(shape, grouped, self._uniform)
-            return subtree_cuda.scatter_subtrees_shared(shape, grouped, self._uniform, given)
+                return subtree_cuda.scatter_subtrees_own(shape, grouped, self._uniform, self._listed)
+            return subtree_cuda.scatter_subtrees_shared(shape, grouped, self._uniform, given, self._listed)
         if sharing is Sharing.OWN:
             return subtree_cpu.scatter_subtrees_own(shape)
         return subtree_cpu.scatter_subtrees_shared(shape, given)
 
     def _launch_batch(self, batch: Batch, kernel: wp.Kernel, u: wp.array, f: wp.array) -> None:
         body = self.body
+        outputs = [f, batch.flagged]
         if self.device.is_cuda:
             threads = batch.count
             inputs = [batch.subtrees, body.mu, body.lam, u]
+            outputs.append(LeftOutLeaves.NONE if self._left_out is None else self._left_out.list_of(batch))
         else:
             threads = -(-batch.count // LANES)
             inputs = [batch.subtrees, batch.count, *self.material_inputs, u]
         if batch.sharing is not Sharing.OWN:
             inputs += [self._rotations, self._no_unit if batch.unit is None else batch.unit]
-        wp.launch(
-            kernel, dim=threads, inputs=inputs, outputs=[f, batch.flagged], device=self.device, block_dim=self._block
-        )
+        wp.launch(kernel, dim=threads, inputs=inputs, outputs=outputs, device=self.device, block_dim=self._block)
+        if self._left_out is not None:
+            return
         flags = batch.flags_by_eights
         inputs = [self.elements, *self.material_inputs, u]
         if batch.sharing is Sharing.OWN:

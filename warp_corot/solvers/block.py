@@ -43,8 +43,6 @@ class BlockSteps:
         device = body.device
         of_block = BlockBody()
         of_block.subtrees = batch.subtrees
-        of_block.elements = body.elements
-        of_block.roots = body.elements if batch.roots is None else batch.roots
         of_block.subtree_count = batch.count
         of_block.node_count = body.world_node_count
         of_block.element_count = len(body.mesh.tets)
