@@ -23,6 +23,12 @@ def is_flagged(flags: wp.uint64, member: int):
 
 
 @wp.func
+def is_left_out(flags: wp.uint64, leaf: int):
+    """Whether the ``leaf``-th of the 64 leaves of eight subtrees was."""
+    return ((flags >> wp.uint64(leaf)) & wp.uint64(1)) != wp.uint64(0)
+
+
+@wp.func
 def scatter_turned(
     elements: ForestElements, t: int, r: wp.mat33, mu: float, lam: float, u: wp.array[wp.vec4], f: wp.array[wp.vec4]
 ):
@@ -52,7 +58,7 @@ def repair_own(
     leaf = int(0)
     while leaf < SUBTREES * LEAVES:
         member = leaf // LEAVES
-        if is_flagged(flags, member):
+        if is_left_out(flags, leaf):
             t = first[SUBTREES * i + member] + leaf % LEAVES
             r = byers_xu(frame(elements, t) + local_gradient(elements, t, u))
             scatter_turned(elements, t, r, mu[t * stride], lam[t * stride], u, f)
