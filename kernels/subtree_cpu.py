@@ -76,8 +76,8 @@ _MATERIAL = """
 """
 
 
-# The columns of R - I in the subtree's frame: of a rotation that is less than a right angle from its axial vector, which
-# has its digits however small it is, by Rodrigues' formula; and turn, the columns of R times the frame, of the same R.
+# The columns of R - I in the subtree's frame: of a rotation by less than a right angle from its axial vector, which has
+# its digits however small it is, by Rodrigues' formula; and turn, the columns of R times the frame, of the same R.
 _RELATIVE = """
     triple turned[3];
     {
@@ -323,6 +323,39 @@ def scatter_subtrees_own(shape: int) -> wp.Kernel:
         eight_subtrees(subtrees, wp.tid(), count, mu, lam, stride, u, f, flagged)
 
     return scatter_subtrees_own
+
+
+@functools.cache
+def scatter_law_subtrees(shape: int, law: str) -> wp.Kernel:
+    """Forces of subtrees under a law of ``law_lanes`` that needs no rotation; a thread is eight subtrees."""
+
+    @wp.func_native(_law_snippet(shape, law))
+    def eight_subtrees(
+        subtrees: Subtrees,
+        block: int,
+        count: int,
+        mu: wp.array[wp.float32],
+        lam: wp.array[wp.float32],
+        stride: int,
+        u: wp.array[wp.vec4],
+        f: wp.array[wp.vec4],
+    ): ...
+
+    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": COMPILER_FLAGS})
+    def scatter_law_subtrees(
+        # In
+        subtrees: Subtrees,
+        mu: wp.array[wp.float32],
+        lam: wp.array[wp.float32],
+        stride: int,
+        count: int,
+        u: wp.array[wp.vec4],
+        # Out
+        f: wp.array[wp.vec4],
+    ):
+        eight_subtrees(subtrees, wp.tid(), count, mu, lam, stride, u, f)
+
+    return scatter_law_subtrees
 
 
 @functools.cache

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from ..kernels.constitutive import linear_cauchy, linear_energy, linear_stress
-from .model import ForceField, LawField, Model
+from .law_lanes import law_field
+from .model import ForceField, Model
 
 if TYPE_CHECKING:
     from ..body import SoftBody
@@ -19,7 +20,7 @@ class Linear(Model):
     step_safety: ClassVar[float] = 0.8
 
     def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
-        return LawField(
+        return law_field(body, "linear")(
             body,
             stress=linear_stress,
             energy=linear_energy,

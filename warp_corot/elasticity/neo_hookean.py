@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ..kernels.constitutive import neo_hookean_cauchy, neo_hookean_energy, neo_hookean_stress
-from .model import ForceField, LawField, Model
+from .law_lanes import law_field
+from .model import ForceField, Model
 
 if TYPE_CHECKING:
     from ..body import SoftBody
@@ -22,7 +23,7 @@ class NeoHookean(Model):
     """
 
     def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
-        return LawField(
+        return law_field(body, "neo-hookean")(
             body,
             stress=neo_hookean_stress,
             energy=neo_hookean_energy,

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ..kernels.constitutive import stvk_cauchy, stvk_energy, stvk_stress
-from .model import ForceField, LawField, Model
+from .law_lanes import law_field
+from .model import ForceField, Model
 
 if TYPE_CHECKING:
     from ..body import SoftBody
@@ -21,7 +22,7 @@ class StVenantKirchhoff(Model):
     """
 
     def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
-        return LawField(
+        return law_field(body, "stvk")(
             body,
             stress=stvk_stress,
             energy=stvk_energy,
