@@ -12,7 +12,7 @@ import warp as wp
 
 from .anisotropic import OrthotropicMaterial, axes_of, element_forces, filled
 from .elements import ForestElements, GeneralElements, frame, rest_volume
-from .general_cpu import ADD_FORCES, FLAG, gather_elements, rest_inverse_of
+from .general_cpu import ADD_FORCES, FLAG, GATHER, rest_inverse_of
 from .lanes import COMPILER_FLAGS, PRELUDE, on_cpu
 from .law_lanes import ROTATION, STRETCH
 from .remesh_plan import Plan, extent, leaf_row
@@ -20,19 +20,11 @@ from .rotation import byers_xu
 
 wp.set_module_options({"enable_backward": False})
 
-_GATHER = gather_elements("""
-        axes[lane] = material.axes.data[material.axes_stride * t].data[0];
-        stiffness[lane] = &material.stiffness.data[material.stride * t][0];
-        if (is_active) active[lane] = activation.data[t];
-""")
-
-_FORCES = f"""{PRELUDE}{STRETCH}{ROTATION}
-    const float* axes[8];
-    const float* stiffness[8];
-    lanes8 m[9], k[9], active = spread(0.0f);
-{_GATHER}
-    gather_matrix(axes, m);
-    gather_matrix(stiffness, k);
+_FORCES = f"""{PRELUDE}{STRETCH}{ROTATION}{GATHER}
+    lanes8 m[9], k[9];
+    gather_matrix([&](int lane) {{ return material.axes.data[material.axes_stride * element(lane)].data[0]; }}, m);
+    gather_matrix([&](int lane) {{ return &material.stiffness.data[material.stride * element(lane)][0]; }}, k);
+    const lanes8 active = is_active ? values_of(activation.data) : spread(0.0f);
     // Columns of M, G M and F M, and E in the material's axes.
     triple axis[3], a[3], c[3], r[3];
     for (int j = 0; j < 3; ++j) {{

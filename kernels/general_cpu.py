@@ -27,32 +27,27 @@ from .rotation import byers_xu
 wp.set_module_options({"enable_backward": False})
 
 
-def gather_elements(reads: str) -> str:
-    """Fill the lanes with eight elements, the last one again where there are no more: displacements d1, d2, d3 of the
-    last three nodes from the first, rest matrices b and volumes, and what ``reads`` reads of element t into ``lane``."""
-    return f"""
-    lanes8 b[9], volume, corner[4][4];
-    const int first_element = 8 * block;
-    int node_of[4][8];
-    const float* from[8];
-    for (int lane = 0; lane < 8; ++lane) {{
-        const int t = wp::min(first_element + lane, count - 1);
-        const wp::vec_t<4, wp::int32>& node = elements.nodes.data[t];
-        for (int n = 0; n < 4; ++n) node_of[n][lane] = node[n];
-        from[lane] = elements.rest_inverse.data[t].data[0];
-        volume[lane] = elements.volume.data[t];
-        {reads}
-    }}
-    gather_matrix(from, b);
-    for (int n = 0; n < 4; ++n) {{
-        for (int lane = 0; lane < 8; ++lane) from[lane] = &u.data[node_of[n][lane]][0];
-        gather(from, corner[n]);
-    }}
+#: Eight elements in the lanes, the last one again where there are no more: displacements d1, d2, d3 of the last three
+#: nodes from the first, rest matrices b and volumes.
+GATHER = """
+    const int first_element = 8 * block, end = wp::min(8, count - first_element);
+    const auto element = [&](int lane) { return wp::min(first_element + lane, count - 1); };
+    const auto node = [&](int lane, int n) { return &u.data[elements.nodes.data[element(lane)][n]][0]; };
+    lanes8 b[9], corner[4][4];
+    gather_matrix([&](int lane) { return elements.rest_inverse.data[element(lane)].data[0]; }, b);
+    gather([&](int lane) { return node(lane, 0); }, corner[0]);
+    gather([&](int lane) { return node(lane, 1); }, corner[1]);
+    gather([&](int lane) { return node(lane, 2); }, corner[2]);
+    gather([&](int lane) { return node(lane, 3); }, corner[3]);
     const triple d0 = get(corner[0], 0);
     const triple d1 = minus(get(corner[1], 0), d0), d2 = minus(get(corner[2], 0), d0), d3 = minus(get(corner[3], 0), d0);
-    const int end = wp::min(8, count - first_element);
+    // Values of elements, side by side.
+    const auto values_of = [&](const float* values) {
+        return end == 8 ? *reinterpret_cast<const lanes8*>(values + first_element)
+            : gather_one([&](int lane) { return values + element(lane); });
+    };
+    const lanes8 volume = values_of(elements.volume.data);
 """
-
 
 #: Columns a of the displacement gradient (d1 d2 d3) B, and f of F = I + (d1 d2 d3) B.
 GRADIENT = """
@@ -73,8 +68,8 @@ ADD_FORCES = """
     }
     part(rest, &parts[0][0], 4);
     for (int lane = 0; lane < end; ++lane) {
-        const wp::vec_t<4, wp::int32>& node = elements.nodes.data[first_element + lane];
-        for (int n = 0; n < 4; ++n) *reinterpret_cast<four*>(&f.data[node[n]][0]) += parts[lane][n];
+        const wp::vec_t<4, wp::int32>& to = elements.nodes.data[first_element + lane];
+        for (int n = 0; n < 4; ++n) *reinterpret_cast<four*>(&f.data[to[n]][0]) += parts[lane][n];
     }
 """
 
@@ -83,8 +78,11 @@ FLAG = """
     for (int lane = 0; lane < end; ++lane) flagged.data[first_element + lane] = sound[lane] ? 0 : 1;
 """
 
-#: mu and lambda of element t, by a stride.
-MATERIAL = "m[lane] = mu.data[stride * t]; k[lane] = lam.data[stride * t];"
+#: mu and lambda, one for all or by element.
+MATERIAL = """
+    const lanes8 m = stride ? values_of(mu.data) : spread(mu.data[0]);
+    const lanes8 k = stride ? values_of(lam.data) : spread(lam.data[0]);
+"""
 
 
 def _forces(law: str) -> str:
@@ -100,8 +98,7 @@ def _forces(law: str) -> str:
     stretching_there(a, e);
 """
     return on_cpu(f"""{PRELUDE}{STRESSES[law]}
-    lanes8 m, k;
-{gather_elements(MATERIAL)}{GRADIENT}{strain}
+{GATHER}{MATERIAL}{GRADIENT}{strain}
     triple p[3];
     {"const masks8 sound = " if flags else ""}stress(f_, e, spread(1.0f), -volume * m, -volume * k, p);
 {ADD_FORCES}{FLAG if flags else ""}""")

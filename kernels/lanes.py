@@ -48,10 +48,10 @@ PRELUDE = """
         const four a = *reinterpret_cast<const four*>(low), b = *reinterpret_cast<const four*>(high);
         return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7);
     };
-    // Four floats in each lane, from eight places.
-    const auto gather = [&](const float* const* from, lanes8* to) {
-        const auto r0 = halves(from[0], from[4]), r1 = halves(from[1], from[5]);
-        const auto r2 = halves(from[2], from[6]), r3 = halves(from[3], from[7]);
+    // Four floats in each lane, which begin at at(lane).
+    const auto gather = [&](const auto& at, lanes8* to) {
+        const auto r0 = halves(at(0), at(4)), r1 = halves(at(1), at(5));
+        const auto r2 = halves(at(2), at(6)), r3 = halves(at(3), at(7));
         const auto a = __builtin_shufflevector(r0, r1, 0, 8, 1, 9, 4, 12, 5, 13);
         const auto b = __builtin_shufflevector(r2, r3, 0, 8, 1, 9, 4, 12, 5, 13);
         const auto c = __builtin_shufflevector(r0, r1, 2, 10, 3, 11, 6, 14, 7, 15);
@@ -61,13 +61,15 @@ PRELUDE = """
         to[2] = __builtin_shufflevector(c, d, 0, 1, 8, 9, 4, 5, 12, 13);
         to[3] = __builtin_shufflevector(c, d, 2, 3, 10, 11, 6, 7, 14, 15);
     };
+    // One float in each lane.
+    const auto gather_one = [](const auto& at) {
+        return lanes8{*at(0), *at(1), *at(2), *at(3), *at(4), *at(5), *at(6), *at(7)};
+    };
     // The nine entries of a matrix in each lane, row by row.
-    const auto gather_matrix = [&](const float* const* from, lanes8* to) {
-        const float* rest[8];
-        for (int lane = 0; lane < 8; ++lane) rest[lane] = from[lane] + 4;
-        gather(from, to);
-        gather(rest, to + 4);
-        to[8] = lanes8{rest[0][4], rest[1][4], rest[2][4], rest[3][4], rest[4][4], rest[5][4], rest[6][4], rest[7][4]};
+    const auto gather_matrix = [&](const auto& at, lanes8* to) {
+        gather(at, to);
+        gather([&](int lane) { return at(lane) + 4; }, to + 4);
+        to[8] = gather_one([&](int lane) { return at(lane) + 8; });
     };
     // The triple of each lane as four floats, lanes ``stride`` apart.
     const auto part = [](const triple& a, four* to, int stride) {

@@ -10,7 +10,7 @@ import warp as wp
 
 from .constitutive import corotated_strain, hooke
 from .elements import GeneralElements, load_node, scatter_stress
-from .general_cpu import ADD_FORCES, FLAG, gather_elements
+from .general_cpu import ADD_FORCES, FLAG, GATHER
 from .lanes import COMPILER_FLAGS, PRELUDE, on_cpu
 from .law_lanes import STRESSES
 from .newton_merging import add_four_forces
@@ -166,11 +166,9 @@ def scatter_posed_warm(
 
 # --- the same on the CPU, eight elements in the lanes of vector registers; see ``lanes`` -----------------------------
 
-_GATHER = gather_elements("m[lane] = mu.data[t]; k[lane] = lam.data[t];")
-
 _FORCES = f"""{PRELUDE}{STRESSES["corotated"]}
-    lanes8 m, k;
-{_GATHER}
+{GATHER}
+    const lanes8 m = values_of(mu.data), k = values_of(lam.data);
     // Columns of F = (x1-x0 x2-x0 x3-x0) B and of F - I.
     triple a[3], f_[3];
     for (int j = 0; j < 3; ++j) a[j] = f_[j] = combined(b[j], d1, b[3 + j], d2, b[6 + j], d3);

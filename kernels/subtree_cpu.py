@@ -20,30 +20,27 @@ from .subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS, stiffness
 
 wp.set_module_options({"enable_backward": False})
 
-# Displacements x of the ten nodes from the first, in edge lengths of a leaf, and the subtree's Maubach frame. Lanes past
-# the last subtree repeat it.
+# Displacements x of the ten nodes from the first, in edge lengths of a leaf, and the subtree's Maubach frame. Lanes
+# past the last subtree repeat it.
 _GATHER = f"""
-    lanes8 x[30], g[30], h, inv_h, mirror, axes[9], origin[4], node_of[4];
-    const int first_subtree = 8 * block;
-    int place[8];
-    const float* from[8];
-    for (int lane = 0; lane < 8; ++lane) {{
-        const int s = place[lane] = wp::min(first_subtree + lane, count - 1);
-        const int code = subtrees.code.data[s];
-        const float edge = 0.5f * subtrees.size.data[(code & {int(LEVEL_MASK)}) / 3];
-        h[lane] = edge; inv_h[lane] = 1.0f / edge;
-        mirror[lane] = (code >> {MIRROR_BIT}) & 1 ? -1.0f : 1.0f;
-        from[lane] = subtrees.frames.data[code >> {FRAME_SHIFT}].data[0];
-    }}
-    gather_matrix(from, axes);
+    const int first_subtree = 8 * block, end = wp::min(8, count - first_subtree);
+    const auto place = [&](int lane) {{ return wp::min(first_subtree + lane, count - 1); }};
+    const auto code = [&](int lane) {{ return subtrees.code.data[place(lane)]; }};
+    lanes8 x[30], g[30], axes[9], origin[4], corner[4];
+    gather_matrix([&](int lane) {{ return subtrees.frames.data[code(lane) >> {FRAME_SHIFT}].data[0]; }}, axes);
     triple frame[3];
     for (int j = 0; j < 3; ++j) frame[j] = triple{{axes[j], axes[3 + j], axes[6 + j]}};
+    static const float signs[2] = {{1.0f, -1.0f}};
+    const lanes8 mirror = gather_one([&](int lane) {{ return signs + ((code(lane) >> {MIRROR_BIT}) & 1); }});
+    const lanes8 h = 0.5f * gather_one([&](int lane) {{
+        return &subtrees.size.data[(code(lane) & {int(LEVEL_MASK)}) / 3];
+    }});
+    const lanes8 inv_h = 1.0f / h;
     frame[2] = scaled(mirror, frame[2]);
     for (int k = 0; k < 10; ++k) {{
-        for (int lane = 0; lane < 8; ++lane) from[lane] = &u.data[subtrees.nodes.data[10 * place[lane] + k]][0];
-        gather(from, k ? node_of : origin);
+        gather([&](int lane) {{ return &u.data[subtrees.nodes.data[10 * place(lane) + k]][0]; }}, k ? corner : origin);
         for (int axis = 0; axis < 3; ++axis) {{
-            x[3 * k + axis] = k ? (node_of[axis] - origin[axis]) * inv_h : spread(0.0f);
+            x[3 * k + axis] = k ? (corner[axis] - origin[axis]) * inv_h : spread(0.0f);
             g[3 * k + axis] = spread(0.0f);
         }}
     }}
@@ -53,9 +50,8 @@ _GATHER = f"""
 _SCATTER = """
     four parts[8][10];
     for (int k = 0; k < 10; ++k) part(get(g, k), &parts[0][k], 10);
-    const int end = wp::min(8, count - first_subtree);
     for (int lane = 0; lane < end; ++lane) {
-        const int* node = subtrees.nodes.data + 10 * place[lane];
+        const int* node = subtrees.nodes.data + 10 * (first_subtree + lane);
         for (int k = 0; k < 10; ++k) *reinterpret_cast<four*>(&f.data[node[k]][0]) += parts[lane][k];
     }
 """
@@ -68,10 +64,9 @@ _FLAG = """
 # Per-element material of one leaf of each of the eight subtrees.
 _MATERIAL = """
         if (stride) {
-            for (int lane = 0; lane < 8; ++lane) {
-                const int t = subtrees.first.data[place[lane]] + leaf;
-                m[lane] = mu.data[t]; k[lane] = lam.data[t];
-            }
+            const auto element = [&](int lane) { return subtrees.first.data[place(lane)] + leaf; };
+            m = gather_one([&](int lane) { return mu.data + element(lane); });
+            k = gather_one([&](int lane) { return lam.data + element(lane); });
         }
 """
 
@@ -220,8 +215,7 @@ def _shared_snippet(shape: int, given: bool) -> str:
     """All leaves with one rotation, the root's or a given one."""
     if given:
         rotation = """
-    for (int lane = 0; lane < 8; ++lane) from[lane] = rotations.data[unit.data[place[lane]]].data[0];
-    gather_matrix(from, axes);
+    gather_matrix([&](int lane) { return rotations.data[unit.data[place(lane)]].data[0]; }, axes);
     const triple rotation[3] = {
         {axes[0], axes[3], axes[6]}, {axes[1], axes[4], axes[7]}, {axes[2], axes[5], axes[8]}};
     for (int j = 0; j < 3; ++j) {
