@@ -1,9 +1,8 @@
 """Corotated forces of orthotropic elements on the CPU, eight to the lanes of vector registers; see ``lanes``.
 
 Both kinds of elements come as general ones, with M multiplied into their rest matrix: F M = M + (d1 d2 d3) B. An
-element that the unscaled iteration does not turn adds nothing and is flagged; ``repair_anisotropic`` does those. Among
-them are all that are near having no definite rotation (see ``anisotropic``): the iteration turns none whose stretches
-are not within 0.44 and 2.27, and with these det(tr(S) I - S) / |S|^3 is above 0.5.
+element of which no rotation is found adds nothing and is flagged; ``repair_anisotropic`` does those. Flagged are also
+all that are near having no definite rotation (see ``anisotropic``): det(tr(S) I - S) = q / 2 below 0.41 |S|^3.
 """
 
 import functools
@@ -13,38 +12,56 @@ import warp as wp
 
 from .anisotropic import OrthotropicMaterial, axes_of, element_forces, filled
 from .elements import ForestElements, GeneralElements, frame, rest_volume
-from .general_cpu import ADD_FORCES, gather_elements, rest_inverse_of
-from .lanes import COMPILER_FLAGS, NEWTON, PRELUDE, on_cpu
+from .general_cpu import ADD_FORCES, FLAG, GATHER, rest_inverse_of
+from .lanes import COMPILER_FLAGS, PRELUDE, on_cpu
+from .law_lanes import ROTATION, STRETCH
 from .remesh_plan import Plan, extent, leaf_row
-from .rotation import ITERATIONS, byers_xu
+from .rotation import byers_xu
 
 wp.set_module_options({"enable_backward": False})
 
-_GATHER = gather_elements("""
-        const wp::mat_t<3, 3, wp::float32>& axes = material.axes.data[material.axes_stride * t];
-        const wp::vec_t<9, wp::float32>& stiffness = material.stiffness.data[material.stride * t];
-        for (int i = 0; i < 9; ++i) {
-            m[i][lane] = axes.data[i / 3][i % 3];
-            k[i][lane] = stiffness[i];
-        }
-        if (is_active) active[lane] = activation.data[t];
-""")
-
-_FORCES = f"""{PRELUDE}{NEWTON}
-    lanes8 m[9], k[9], active = spread(0.0f);
-{_GATHER}
-    // Columns of F M and of its rotation.
-    triple c[3], r[3];
+_FORCES = f"""{PRELUDE}{STRETCH}{ROTATION}{GATHER}
+    lanes8 m[9], k[9];
+    gather_matrix([&](int lane) {{ return material.axes.data[material.axes_stride * element(lane)].data[0]; }}, m);
+    gather_matrix([&](int lane) {{ return &material.stiffness.data[material.stride * element(lane)][0]; }}, k);
+    const lanes8 active = is_active ? values_of(activation.data) : spread(0.0f);
+    // Columns of M, G M and F M, and E in the material's axes.
+    triple axis[3], a[3], c[3], r[3];
     for (int j = 0; j < 3; ++j) {{
-        const triple axis = {{m[j], m[3 + j], m[6 + j]}};
-        c[j] = plus(plus(axis, scaled(b[j], d1)), plus(scaled(b[3 + j], d2), scaled(b[6 + j], d3)));
+        axis[j] = triple{{m[j], m[3 + j], m[6 + j]}};
+        a[j] = combined(b[j], d1, b[3 + j], d2, b[6 + j], d3);
+        c[j] = plus(axis[j], a[j]);
     }}
-    const masks8 trusted = newton(c[0], c[1], c[2], spread(1.0f), r);
-    for (int j = 0; j < 3; ++j) r[j] = scaled(spread({0.5**ITERATIONS!r}f), r[j]);
-    const lanes8 e0 = dot(r[0], c[0]) - 1.0f, e1 = dot(r[1], c[1]) - 1.0f, e2 = dot(r[2], c[2]) - 1.0f;
-    const lanes8 e01 = 0.5f * (dot(r[0], c[1]) + dot(r[1], c[0]));
-    const lanes8 e02 = 0.5f * (dot(r[0], c[2]) + dot(r[2], c[0]));
-    const lanes8 e12 = 0.5f * (dot(r[1], c[2]) + dot(r[2], c[1]));
+    lanes8 e[6];
+    stretching(a, axis, e);
+    // Where E is small, S - I is a polynomial of it, with its digits, and R = F (I - (I - S^-1)); elsewhere R^T F - I.
+    const stretch s = stretch_of(e, dot(c[0], cross(c[1], c[2])));
+    const masks8 small = s.of.small;
+    const lanes8 &ia = s.of.a, &ib = s.of.b, &ic = s.of.c, &ij = s.of.j, &it = s.t;
+    const lanes8 y = (2.0f * it - 6.0f * ij) / (1.0f + ij), over_q = 1.0f / s.q;
+    const lanes8 n0 = over_q * (it * (18.0f + it * (8.0f + it)) - ia * (10.0f + it) - 2.0f * ij - y * (1.0f + ia));
+    const lanes8 n1 = over_q * (8.0f + y), n2 = -over_q * (6.0f + y);
+    lanes8 sigma[6], strain[6];
+    for (int i = 0; i < 6; ++i) {{
+        sigma[i] = -n1 * e[i] - n2 * s.of.adjugate[i];
+        strain[i] = (1.0f - n1 - n0 - n1 * ia) * e[i] - (n1 + n2) * s.of.adjugate[i];
+    }}
+    for (int i = 0; i < 3; ++i) {{ sigma[i] += 1.0f - n0; strain[i] += n1 * ib - n2 * ic - n0; }}
+    times(c, sigma, r);
+    masks8 sound = s.sound & (s.q * s.q > {(2 * 0.41) ** 2!r}f * (3.0f + ia) * (3.0f + ia) * (3.0f + ia));
+    if (any(~small)) {{
+        triple other[3];
+        rotation_of(c, e, spread(1.0f), other);
+        for (int j = 0; j < 3; ++j) {{
+            r[j].x = small ? r[j].x : other[j].x; r[j].y = small ? r[j].y : other[j].y;
+            r[j].z = small ? r[j].z : other[j].z;
+            strain[j] = small ? strain[j] : dot(other[j], c[j]) - 1.0f;
+        }}
+        strain[3] = small ? strain[3] : 0.5f * (dot(other[0], c[1]) + dot(other[1], c[0]));
+        strain[4] = small ? strain[4] : 0.5f * (dot(other[0], c[2]) + dot(other[2], c[0]));
+        strain[5] = small ? strain[5] : 0.5f * (dot(other[1], c[2]) + dot(other[2], c[1]));
+    }}
+    const lanes8 &e0 = strain[0], &e1 = strain[1], &e2 = strain[2], &e01 = strain[3], &e02 = strain[4], &e12 = strain[5];
     const lanes8 s0 = k[0] * e0 + k[3] * e1 + k[4] * e2;
     const lanes8 s1 = k[3] * e0 + k[1] * e1 + k[5] * e2;
     const lanes8 s2 = k[4] * e0 + k[5] * e1 + k[2] * e2;
@@ -67,8 +84,13 @@ _FORCES = f"""{PRELUDE}{NEWTON}
     p[1] = plus(scaled(s01 - t2, r[0]), plus(scaled(s1, r[1]), scaled(s12 + t0, r[2])));
     p[2] = plus(scaled(s02 + t1, r[0]), plus(scaled(s12 - t0, r[1]), scaled(s2, r[2])));
     p[0] = plus(p[0], scaled(active, c[0]));
-    for (int j = 0; j < 3; ++j) p[j] = scaled(-volume, p[j]);
-{ADD_FORCES}"""
+    const lanes8 zero = spread(0.0f);
+    for (int j = 0; j < 3; ++j) {{
+        p[j].x = sound ? -volume * p[j].x : zero;
+        p[j].y = sound ? -volume * p[j].y : zero;
+        p[j].z = sound ? -volume * p[j].z : zero;
+    }}
+{ADD_FORCES}{FLAG}"""
 
 
 @wp.func_native(on_cpu(_FORCES))

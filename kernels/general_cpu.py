@@ -1,10 +1,11 @@
-"""Corotated forces of tetrahedra one by one on the CPU, eight to the lanes of vector registers; see ``lanes``.
+"""Forces of tetrahedra one by one on the CPU, eight to the lanes of vector registers; see ``lanes``.
 
 General tetrahedra, and those of a forest that are in no complete subtree, for which a rest matrix is worked out once.
 
-An element that the unscaled iteration does not turn adds nothing and is flagged; ``repair_elements`` does those.
+An element of which the corotated law finds no rotation adds nothing and is flagged; ``repair_elements`` does those.
 """
 
+import functools
 from typing import Any
 
 import warp as wp
@@ -19,79 +20,91 @@ from .elements import (
     rest_volume,
     scatter_stress,
 )
-from .lanes import COMPILER_FLAGS, NEWTON, PRELUDE, on_cpu
-from .rotation import ITERATIONS, byers_xu
+from .lanes import COMPILER_FLAGS, PRELUDE, on_cpu
+from .law_lanes import STRESSES
+from .rotation import byers_xu
 
 wp.set_module_options({"enable_backward": False})
 
 
-def gather_elements(reads: str) -> str:
-    """Fill the lanes with eight elements, the last one again where there are no more: displacements d of the last three
-    nodes from the first, rest matrices b and volumes, and what ``reads`` reads of element t into ``lane``."""
-    return f"""
-    lanes8 d[9], b[9], volume;
-    const int first_element = 8 * block;
-    for (int lane = 0; lane < 8; ++lane) {{
-        const int t = wp::min(first_element + lane, count - 1);
-        const wp::vec_t<4, wp::int32> node = elements.nodes.data[t];
-        const wp::vec_t<4, wp::float32> origin = u.data[node[0]];
-        for (int n = 0; n < 3; ++n) {{
-            const wp::vec_t<4, wp::float32>& a = u.data[node[n + 1]];
-            for (int axis = 0; axis < 3; ++axis) d[3 * n + axis][lane] = a[axis] - origin[axis];
-        }}
-        {reads}
-        const wp::mat_t<3, 3, wp::float32>& inverse = elements.rest_inverse.data[t];
-        for (int i = 0; i < 9; ++i) b[i][lane] = inverse.data[i / 3][i % 3];
-        volume[lane] = elements.volume.data[t];
-    }}
-    const triple d1 = get(d, 0), d2 = get(d, 1), d3 = get(d, 2);
+#: Eight elements in the lanes, the last one again where there are no more: displacements d1, d2, d3 of the last three
+#: nodes from the first, rest matrices b and volumes.
+GATHER = """
+    const int first_element = 8 * block, end = wp::min(8, count - first_element);
+    const auto element = [&](int lane) { return wp::min(first_element + lane, count - 1); };
+    const auto node = [&](int lane, int n) { return &u.data[elements.nodes.data[element(lane)][n]][0]; };
+    lanes8 b[9], corner[4][4];
+    gather_matrix([&](int lane) { return elements.rest_inverse.data[element(lane)].data[0]; }, b);
+    gather([&](int lane) { return node(lane, 0); }, corner[0]);
+    gather([&](int lane) { return node(lane, 1); }, corner[1]);
+    gather([&](int lane) { return node(lane, 2); }, corner[2]);
+    gather([&](int lane) { return node(lane, 3); }, corner[3]);
+    const triple d0 = get(corner[0], 0);
+    const triple d1 = minus(get(corner[1], 0), d0), d2 = minus(get(corner[2], 0), d0), d3 = minus(get(corner[3], 0), d0);
+    // Values of elements, side by side.
+    const auto values_of = [&](const float* values) {
+        return end == 8 ? *reinterpret_cast<const lanes8*>(values + first_element)
+            : gather_one([&](int lane) { return values + element(lane); });
+    };
+    const lanes8 volume = values_of(elements.volume.data);
 """
 
+#: Columns a of the displacement gradient (d1 d2 d3) B, and f of F = I + (d1 d2 d3) B.
+GRADIENT = """
+    triple a[3], f_[3];
+    for (int j = 0; j < 3; ++j) f_[j] = a[j] = combined(b[j], d1, b[3 + j], d2, b[6 + j], d3);
+    f_[0].x += 1.0f; f_[1].y += 1.0f; f_[2].z += 1.0f;
+"""
 
-#: Adds the forces of eight elements from their stresses p times -V, columns, and flags those that are not ``trusted``.
+#: Adds the forces of eight elements, one after the other, from their stresses p times -V, columns.
 ADD_FORCES = """
-    lanes8 g[12];
+    four parts[8][4];
     triple rest = triple{spread(0.0f), spread(0.0f), spread(0.0f)};
     for (int n = 1; n < 4; ++n) {
         const lanes8* row = b + 3 * (n - 1);
-        const triple force = plus(scaled(row[0], p[0]), plus(scaled(row[1], p[1]), scaled(row[2], p[2])));
-        g[3 * n] = force.x; g[3 * n + 1] = force.y; g[3 * n + 2] = force.z;
+        const triple force = combined(row[0], p[0], row[1], p[1], row[2], p[2]);
         rest = minus(rest, force);
+        part(force, &parts[0][n], 4);
     }
-    g[0] = rest.x; g[1] = rest.y; g[2] = rest.z;
-    const int end = wp::min(8, count - first_element);
+    part(rest, &parts[0][0], 4);
     for (int lane = 0; lane < end; ++lane) {
-        const int t = first_element + lane;
-        flagged.data[t] = trusted[lane] ? 0 : 1;
-        if (!trusted[lane]) continue;
-        const wp::vec_t<4, wp::int32> node = elements.nodes.data[t];
-        for (int n = 0; n < 4; ++n) {
-            wp::vec_t<4, wp::float32>& sum = f.data[node[n]];
-            for (int axis = 0; axis < 3; ++axis) sum[axis] += g[3 * n + axis][lane];
-        }
+        const wp::vec_t<4, wp::int32>& to = elements.nodes.data[first_element + lane];
+        for (int n = 0; n < 4; ++n) *reinterpret_cast<four*>(&f.data[to[n]][0]) += parts[lane][n];
     }
 """
 
-_GATHER = gather_elements("m[lane] = mu.data[stride * t]; k[lane] = lam.data[stride * t];")
+#: Flags elements that are not ``sound``.
+FLAG = """
+    for (int lane = 0; lane < end; ++lane) flagged.data[first_element + lane] = sound[lane] ? 0 : 1;
+"""
 
-_FORCES = f"""{PRELUDE}{NEWTON}
-    lanes8 m, k;
-{_GATHER}
-    // Columns of F = I + (d1 d2 d3) B.
-    triple c[3], z[3];
-    for (int j = 0; j < 3; ++j) c[j] = plus(scaled(b[j], d1), plus(scaled(b[3 + j], d2), scaled(b[6 + j], d3)));
-    c[0].x += 1.0f; c[1].y += 1.0f; c[2].z += 1.0f;
-    const masks8 trusted = newton(c[0], c[1], c[2], spread(1.0f), z);
-    // With a rotation, R sym(R^T F) = F: P = 2 mu (F - R) + lambda tr(R^T F - I) R.
-    const lanes8 trace = {0.5**ITERATIONS!r}f * (dot(z[0], c[0]) + dot(z[1], c[1]) + dot(z[2], c[2]));
-    const lanes8 from_f = -2.0f * m * volume;
-    const lanes8 from_z = (k * (trace - 3.0f) - 2.0f * m) * (-{0.5**ITERATIONS!r}f * volume);
+#: mu and lambda, one for all or by element.
+MATERIAL = """
+    const lanes8 m = stride ? values_of(mu.data) : spread(mu.data[0]);
+    const lanes8 k = stride ? values_of(lam.data) : spread(lam.data[0]);
+"""
+
+
+def _forces(law: str) -> str:
+    flags = law == "corotated"
+    if law == "linear":
+        strain = """
+    lanes8 e[6] = {a[0].x, a[1].y, a[2].z, 0.5f * (a[0].y + a[1].x), 0.5f * (a[0].z + a[2].x), 0.5f * (a[1].z + a[2].y)};
+    for (int j = 0; j < 3; ++j) f_[j] = minus(f_[j], a[j]);
+"""
+    else:
+        strain = """
+    lanes8 e[6];
+    stretching_there(a, e);
+"""
+    return on_cpu(f"""{PRELUDE}{STRESSES[law]}
+{GATHER}{MATERIAL}{GRADIENT}{strain}
     triple p[3];
-    for (int j = 0; j < 3; ++j) p[j] = plus(scaled(from_f, c[j]), scaled(from_z, z[j]));
-{ADD_FORCES}"""
+    {"const masks8 sound = " if flags else ""}stress(f_, e, spread(1.0f), -volume * m, -volume * k, p);
+{ADD_FORCES}{FLAG if flags else ""}""")
 
 
-@wp.func_native(on_cpu(_FORCES))
+@wp.func_native(_forces("corotated"))
 def eight_elements(
     elements: GeneralElements,
     block: int,
@@ -120,6 +133,39 @@ def scatter_elements(
 ):
     """Corotated forces, each element with its own rotation; a thread is eight elements."""
     eight_elements(elements, wp.tid(), count, mu, lam, stride, u, f, flagged)
+
+
+@functools.cache
+def scatter_law_elements(law: str) -> wp.Kernel:
+    """Forces of a law of ``law_lanes`` that needs no rotation; a thread is eight elements."""
+
+    @wp.func_native(_forces(law))
+    def eight_elements(
+        elements: GeneralElements,
+        block: int,
+        count: int,
+        mu: wp.array[wp.float32],
+        lam: wp.array[wp.float32],
+        stride: int,
+        u: wp.array[wp.vec4],
+        f: wp.array[wp.vec4],
+    ): ...
+
+    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": COMPILER_FLAGS})
+    def scatter_law_elements(
+        # In
+        elements: GeneralElements,
+        mu: wp.array[wp.float32],
+        lam: wp.array[wp.float32],
+        stride: int,
+        count: int,
+        u: wp.array[wp.vec4],
+        # Out
+        f: wp.array[wp.vec4],
+    ):
+        eight_elements(elements, wp.tid(), count, mu, lam, stride, u, f)
+
+    return scatter_law_elements
 
 
 @wp.kernel(module="unique", enable_backward=False)

@@ -10,10 +10,11 @@ import warp as wp
 
 from .constitutive import corotated_strain, hooke
 from .elements import GeneralElements, load_node, scatter_stress
-from .general_cpu import ADD_FORCES, gather_elements
+from .general_cpu import ADD_FORCES, FLAG, GATHER
 from .general_cuda import PosedElements, add_stress, edge_differences, load_four, rest_inverse_of
-from .lanes import COMPILER_FLAGS, NEWTON, PRELUDE, on_cpu
-from .rotation import ITERATIONS, byers_xu, cofactor, identity3, warm_rotation
+from .lanes import COMPILER_FLAGS, PRELUDE, on_cpu
+from .law_lanes import STRESSES
+from .rotation import byers_xu, cofactor, identity3, warm_rotation
 
 wp.set_module_options({"enable_backward": False})
 
@@ -132,22 +133,18 @@ def scatter_posed_warm(
 
 # --- the same on the CPU, eight elements in the lanes of vector registers; see ``lanes`` -----------------------------
 
-_GATHER = gather_elements("m[lane] = mu.data[t]; k[lane] = lam.data[t];")
-
-_FORCES = f"""{PRELUDE}{NEWTON}
-    lanes8 m, k;
-{_GATHER}
-    // Columns of F = (x1-x0 x2-x0 x3-x0) B.
-    triple c[3], z[3];
-    for (int j = 0; j < 3; ++j) c[j] = plus(scaled(b[j], d1), plus(scaled(b[3 + j], d2), scaled(b[6 + j], d3)));
-    const masks8 trusted = newton(c[0], c[1], c[2], spread(1.0f), z);
-    // With a rotation, R sym(R^T F) = F: P = 2 mu (F - R) + lambda tr(R^T F - I) R.
-    const lanes8 trace = {0.5**ITERATIONS!r}f * (dot(z[0], c[0]) + dot(z[1], c[1]) + dot(z[2], c[2]));
-    const lanes8 from_f = -2.0f * m * volume;
-    const lanes8 from_z = (k * (trace - 3.0f) - 2.0f * m) * (-{0.5**ITERATIONS!r}f * volume);
+_FORCES = f"""{PRELUDE}{STRESSES["corotated"]}
+{GATHER}
+    const lanes8 m = values_of(mu.data), k = values_of(lam.data);
+    // Columns of F = (x1-x0 x2-x0 x3-x0) B and of F - I.
+    triple a[3], f_[3];
+    for (int j = 0; j < 3; ++j) a[j] = f_[j] = combined(b[j], d1, b[3 + j], d2, b[6 + j], d3);
+    a[0].x -= 1.0f; a[1].y -= 1.0f; a[2].z -= 1.0f;
+    lanes8 e[6];
+    stretching_there(a, e);
     triple p[3];
-    for (int j = 0; j < 3; ++j) p[j] = plus(scaled(from_f, c[j]), scaled(from_z, z[j]));
-{ADD_FORCES}"""
+    const masks8 sound = stress(f_, e, spread(1.0f), -volume * m, -volume * k, p);
+{ADD_FORCES}{FLAG}"""
 
 
 @wp.func_native(on_cpu(_FORCES))

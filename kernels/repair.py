@@ -70,6 +70,12 @@ def leave(list: LeftOut, blocks: int):
 
 
 @wp.func
+def is_left_out(flags: wp.uint64, leaf: int):
+    """Whether the ``leaf``-th of the 64 leaves of eight subtrees was."""
+    return ((flags >> wp.uint64(leaf)) & wp.uint64(1)) != wp.uint64(0)
+
+
+@wp.func
 def scatter_turned(
     elements: ForestElements, t: int, r: wp.mat33, mu: float, lam: float, u: wp.array[wp.vec4], f: wp.array[wp.vec4]
 ):

@@ -11,16 +11,16 @@ from ..kernels.lanes import LANES
 
 
 class Lanes:
-    """Two launches that add the forces of elements: eight at a time, then one by one those that were left out.
+    """Launches that add the forces of elements: eight at a time, then one by one those that were left out.
 
     Args:
         elements: The elements, of either kind.
         general: The same as general ones.
         scatter: Kernel that goes through the general ones eight at a time and flags those that it leaves out.
-        repair: Kernel that does the flagged ones among ``elements``.
+        repair: Kernel that does the flagged ones among ``elements``; None where none are left out or flagged.
     """
 
-    def __init__(self, elements: Any, general: GeneralElements, *, scatter: wp.Kernel, repair: wp.Kernel):
+    def __init__(self, elements: Any, general: GeneralElements, *, scatter: wp.Kernel, repair: wp.Kernel | None = None):
         self.count = len(elements.nodes)
         self._elements = elements
         self._general = general
@@ -32,7 +32,10 @@ class Lanes:
     def scatter_forces(self, material: list, u: wp.array, f: wp.array) -> None:
         """Add the forces of displacements u to f, both vec4 [N]; ``material`` are kernel arguments."""
         inputs = [self._general, *material, self.count, u]
-        wp.launch(self._scatter, -(-self.count // LANES), inputs, [f, self._flagged], device="cpu")
+        outputs = [f] if self._repair is None else [f, self._flagged]
+        wp.launch(self._scatter, -(-self.count // LANES), inputs, outputs, device="cpu")
+        if self._repair is None:
+            return
         inputs = [self._flagged, self._elements, *material, u]
         wp.launch(self._repair, self.count, inputs, [f], device="cpu")
 

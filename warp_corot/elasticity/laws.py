@@ -8,6 +8,7 @@ import warp as wp
 
 from ..mesh import TetForest
 from .law_general import LawGeneralField
+from .law_lanes import LawLanesField
 from .law_subtrees import LawSubtreeField
 from .model import LawField
 
@@ -16,19 +17,22 @@ if TYPE_CHECKING:
 
 
 def law_field(
-    body: SoftBody, *, stress: wp.Function, energy: wp.Function, cauchy: wp.Function, deterministic: bool = False
+    law: str, body: SoftBody, *, stress: wp.Function, energy: wp.Function, cauchy: wp.Function, deterministic: bool = False
 ) -> LawField:
     """The fastest force field of a law on a body.
 
     Args:
+        law: Its name among those that run in lanes on the CPU, a key of ``kernels.law_lanes.STRESSES``.
         body: The body.
         stress, energy, cauchy: The law, functions of ``kernels.constitutive``.
         deterministic: As for every field.
     """
+    functions = {"stress": stress, "energy": energy, "cauchy": cauchy}
+    if body.device.is_cpu:
+        return LawLanesField(body, law=law, **functions, deterministic=deterministic)
     kind = LawField
-    if body.device.is_cuda:
-        if isinstance(body.mesh, TetForest):
-            kind = LawSubtreeField
-        elif not deterministic:
-            kind = LawGeneralField
-    return kind(body, stress=stress, energy=energy, cauchy=cauchy, deterministic=deterministic)
+    if isinstance(body.mesh, TetForest):
+        kind = LawSubtreeField
+    elif not deterministic:
+        kind = LawGeneralField
+    return kind(body, **functions, deterministic=deterministic)

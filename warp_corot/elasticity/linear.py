@@ -21,6 +21,7 @@ class Linear(Model):
 
     def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
         return law_field(
+            "linear",
             body,
             stress=linear_stress,
             energy=linear_energy,

@@ -28,6 +28,7 @@ class NeoHookean(Model):
 
     def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
         return law_field(
+            "neo-hookean",
             body,
             stress=neo_hookean_stress,
             energy=neo_hookean_energy,

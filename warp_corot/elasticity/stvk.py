@@ -23,6 +23,7 @@ class StVenantKirchhoff(Model):
 
     def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
         return law_field(
+            "stvk",
             body,
             stress=stvk_stress,
             energy=stvk_energy,

@@ -9,6 +9,7 @@ from ..errors import InputError, UnstableError
 from ..kernels import newton_particles as kernels
 from ..kernels import newton_worlds as worlds
 from ..kernels.newton_contacts import add_wrenches
+from ..subnormals import FlushedSubnormals
 from .contact import Contacts
 from .library import newton
 from .others import Others
@@ -29,6 +30,7 @@ class Steps:
         self.model, self.tetrahedra, self.contacts, self.others = model, tetrahedra, contacts, others
         self.damping = damping
         self.device = model.device
+        self._flushed = FlushedSubnormals(self.device)
         p, b = model.particle_count, model.body_count
         self._f = wp.zeros(p, dtype=wp.vec4, device=self.device)
         self._places = max(int(model.world_count), 1) + 1
@@ -60,6 +62,18 @@ class Steps:
         count: int,
     ) -> None:
         """Launch a step of ``count`` substeps. What goes wrong in a world in one of them undoes all, and ends it."""
+        with self._flushed():
+            self._launch_step(state_in, state_out, control, contacts, dt, count)
+
+    def _launch_step(
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        control: newton.Control | None,
+        contacts: newton.Contacts | None,
+        dt: float,
+        count: int,
+    ) -> None:
         model = self.model
         activation = model.tet_activations
         if control is not None and control.tet_activations is not None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from ..kernels.integrate import advance_clock
+from ..subnormals import FlushedSubnormals
 from .integrator import Stepper
 
 if TYPE_CHECKING:
@@ -31,11 +32,16 @@ class RecordedSteps:
         self._bodies = bodies
         self._steppers = steppers
         self._clock = clock
+        self._flushed = FlushedSubnormals(clock.device)
         self._graphs: dict[tuple[int, bool], wp.Graph] = {}
         self._revisions: tuple[int, ...] = ()
 
     def launch(self, count: int, *, whole: bool) -> None:
         """Launch steps; ``whole`` ones take over positions first and publish them after."""
+        with self._flushed():
+            self._launch(count, whole)
+
+    def _launch(self, count: int, whole: bool) -> None:
         if whole:
             for body in self._bodies:
                 body.adopt_positions()
