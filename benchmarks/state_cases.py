@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 from measure import WRONG, Case, kind
-from problem import SUBTREE_LEVELS, Sample, oracle, padded
+from problem import SUBTREE_LEVELS, Sample, drawn_nodes, oracle, padded
 from solver_cases import put_back
 from state_bodies import GRAVITY, MATERIAL, State, Subject
 
@@ -21,7 +21,8 @@ from warp_corot.errors import InputError
 
 #: Fibres along y, three times as stiff as across.
 FIBRES = (3 * MATERIAL["young"], MATERIAL["young"], 0.4, MATERIAL["poisson"], MATERIAL["young"] / 3)
-#: Nodes whose forces are checked, and anisotropic ones, which the oracle takes as differences of differences.
+#: Nodes whose forces are checked, and anisotropic ones, which the oracle takes as differences of differences. Nodes
+#: that a state has moved alone are checked, too.
 NODES, FIBRE_NODES = 300, 30
 #: Elements are left out of the check where s2 + s3 is below this share of s1: their rotation is any.
 DEFINITE = 0.02
@@ -55,7 +56,7 @@ class Row:
 
 def rows_of(subject: Subject, states: list[State], device: wp.Device, laws: tuple[str, ...] | None) -> list[Row]:
     """Every law on every path in every state."""
-    bench = Bench(subject, device)
+    bench = Bench(subject, states, device)
     found = []
     for law, paths in bench.fields().items():
         if laws is None or law in laws:
@@ -96,13 +97,17 @@ def flagged_share(field: ForceField) -> float | None:
 class Bench:
     """The bodies that one subject is: a forest and a general mesh, isotropic and with fibres."""
 
-    def __init__(self, subject: Subject, device: wp.Device):
+    def __init__(self, subject: Subject, states: list[State], device: wp.Device):
         self.subject, self.device = subject, device
         mesh = subject.mesh
         self.fill = 1.0 if mesh.fill is None else mesh.fill
         self.level = int(np.bincount(mesh.levels).argmax())
-        drawn = Sample(mesh.points, mesh.tets)
-        self.sample, self.few = (Few(drawn, count) for count in (NODES, FIBRE_NODES))
+        moved = [np.flatnonzero(state.u.any(axis=1)) for state in states]
+        single = np.concatenate([nodes for nodes in moved if len(nodes) < FIBRE_NODES])
+        self.sample, self.few = (
+            Sample(mesh.points, mesh.tets, nodes=np.append(drawn_nodes(len(mesh.points), count), single))
+            for count in (NODES, FIBRE_NODES)
+        )
         self.mu, self.lam = (float(value) for value in oracle.lame(MATERIAL["young"], MATERIAL["poisson"]))
         self.C = oracle.elasticity(*oracle.transverse(*FIBRES), axes=np.roll(np.eye(3), 2, axis=0))
         #: Where forces are added up.
@@ -247,7 +252,7 @@ class Bench:
         least = LEAST_STRAIN * MATERIAL["young"] * float(np.max(sample.mesh.volumes)) ** (2 / 3)
         return float(np.abs(found[nodes] - wanted).max() / max(np.abs(wanted).max(), least))
 
-    def definite(self, state: State, reference: str, sample: Few) -> np.ndarray:
+    def definite(self, state: State, reference: str, sample: Sample) -> np.ndarray:
         """Which nodes of a sample are only in elements whose rotation is definite, bool [n]."""
         key = id(state), reference
         if key not in self._definite:
@@ -260,7 +265,7 @@ class Bench:
             self._definite[key] = ~near[sample.rows]
         return self._definite[key]
 
-    def x(self, state: State, sample: Few) -> np.ndarray:
+    def x(self, state: State, sample: Sample) -> np.ndarray:
         """Positions of the nodes that a sample uses, float64."""
         return self.subject.points[sample.used] + state.u[sample.used].astype(float)
 
@@ -285,7 +290,7 @@ class Bench:
         found = oracle.continuum(law, sample.mesh, self.x(state, sample), mu, lam, **options)
         return found[1][sample.rows]
 
-    def _shares(self, sample: Few) -> np.ndarray:
+    def _shares(self, sample: Sample) -> np.ndarray:
         """What share of each element of a sample the body fills [m]."""
         return np.broadcast_to(self.fill, len(self.subject.mesh.tets))[sample.elements]
 
@@ -303,18 +308,3 @@ def is_indefinite(F: np.ndarray) -> np.ndarray:
     """Where rotations of F [m, 3, 3] hang on their last digits, bool [m]."""
     s = np.linalg.svd(F, compute_uv=False)
     return s[:, 1] + np.sign(np.linalg.det(F)) * s[:, 2] < DEFINITE * s[:, 0]
-
-
-class Few:
-    """Some nodes of a sample, as a sample."""
-
-    def __init__(self, sample: Sample, count: int):
-        chosen = np.random.default_rng(2).permutation(len(sample.nodes))[:count]
-        chosen.sort()
-        self.nodes, rows = sample.nodes[chosen], sample.rows[chosen]
-        here = np.isin(sample.mesh.tets, rows).any(axis=1)
-        self.elements = sample.elements[here]
-        local, tets = np.unique(sample.mesh.tets[here], return_inverse=True)
-        self.used = sample.used[local]
-        self.mesh = oracle.Mesh(sample.mesh.points[local], tets.reshape(-1, 4))
-        self.rows = np.searchsorted(self.used, self.nodes)
