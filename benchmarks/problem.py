@@ -47,6 +47,12 @@ def padded(vectors: np.ndarray) -> np.ndarray:
     return np.concatenate([vectors, np.zeros((len(vectors), 1), np.float32)], axis=1)
 
 
+def drawn_nodes(count: int, wanted: int, seed: int = 1) -> np.ndarray:
+    """About so many of ``count`` nodes, or all."""
+    drawn = np.random.default_rng(seed).integers(0, count, wanted)
+    return np.unique(drawn) if count > wanted else np.arange(count)
+
+
 class Sample:
     """Some nodes with all the elements around them.
 
@@ -58,10 +64,9 @@ class Sample:
         rows: Where in ``used`` the drawn nodes are [n].
     """
 
-    def __init__(self, points: np.ndarray, tets: np.ndarray, seed: int = 1):
+    def __init__(self, points: np.ndarray, tets: np.ndarray, seed: int = 1, nodes: np.ndarray | None = None):
         count = len(points)
-        rng = np.random.default_rng(seed)
-        self.nodes = np.unique(rng.integers(0, count, SAMPLE_NODES)) if count > SAMPLE_NODES else np.arange(count)
+        self.nodes = drawn_nodes(count, SAMPLE_NODES, seed) if nodes is None else np.unique(nodes)
         drawn = np.zeros(count, bool)
         drawn[self.nodes] = True
         self.elements = np.flatnonzero(drawn[tets].any(axis=1))

@@ -32,6 +32,9 @@ SHARES = (0.5, 0.25, 0.1)
 #: Bodies of at most so many elements are stepped.
 STEPPED_ELEMENTS = {"cuda": 700_000, "cpu": 30_000}
 
+#: The share of subtrees that have a flat or turned leaf where there are such.
+BAD = 0.1
+
 #: Cube levels of organs, as the command line has them.
 ORGAN_LEVEL = 7
 
@@ -282,11 +285,13 @@ def _tenth_bad(subject: Subject, device: wp.Device) -> tuple[str, np.ndarray]:
     drawn[nodes] = rng.random(len(nodes))
     _, subtree = np.unique(_three_up(subject.mesh), return_inverse=True)
     subtree = subtree.ravel()
-    share = 0.004
-    for _ in range(3):
+    share = 0.02
+    for _ in range(12):
         u = np.where(drawn[:, None] < share, moves, 0.0)
         bad = np.bincount(subtree, subject.volume_ratios(u) < 0.05) > 0
-        share *= math.log(1 - 0.1) / math.log(1 - min(bad.mean(), 0.9)) if bad.any() else 2.0
+        if abs(bad.mean() - BAD) < 0.1 * BAD:
+            break
+        share *= math.log(1 - BAD) / math.log(1 - min(bad.mean(), 0.9)) if bad.any() else 2.0
     return f"{bad.mean():.3f} of subtrees", u
 
 

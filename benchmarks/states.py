@@ -9,6 +9,7 @@ against float64. Young's modulus is 5 kPa, density 1000 kg/m^3; state_bodies.py 
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import sys
 import time
@@ -104,7 +105,13 @@ def timed(subject: Subject, device: wp.Device, options: Any) -> tuple[list[dict]
     by_case = {id(case): result for case, result in zip(cases, results, strict=True)}
     rests = {row.law: by_case[id(row.paths[DEFAULT])] for row in rows if row.state is states[0]}
     lines = [line(subject, row, by_case, rests[row.law]) for row in rows]
-    return [look(subject, state) for state in states], lines, results
+    return [look(subject, state) for state in states], lines, [without_arrays(result) for result in results]
+
+
+def without_arrays(result: Result) -> Result:
+    """The same without what holds on to the device's memory."""
+    case = dataclasses.replace(result.case, run=lambda: None, error=lambda error=result.error: error, reset=None)
+    return dataclasses.replace(result, case=case)
 
 
 def show(looks: list[dict], lines: list[dict], seconds: float) -> None:

@@ -56,7 +56,7 @@ def test_violations_are_seen():
     (said,) = violations(drop(kinetic=drop().kinetic * np.where(late, 1.02, 1.0)))
     assert "energy" in said
     assert "0.70 s" in said
-    (said,) = violations(drop(farthest=drop().farthest * np.where(late, 2.0, 1.0)))
+    (said,) = violations(drop(farthest=drop().farthest * np.where(late, 3.0, 1.0)))
     assert "moved" in said
     (said,) = violations(drop(farthest=drop().farthest * np.where(late, np.nan, 1.0)))
     assert said == "not finite at 0.70 s"
