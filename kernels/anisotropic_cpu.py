@@ -1,8 +1,9 @@
 """Corotated forces of orthotropic elements on the CPU, eight to the lanes of vector registers; see ``lanes``.
 
 Both kinds of elements come as general ones, with M multiplied into their rest matrix: F M = M + (d1 d2 d3) B. An
-element of which no rotation is found adds nothing and is flagged; ``repair_anisotropic`` does those. Flagged are also
-all that are near having no definite rotation (see ``anisotropic``): det(tr(S) I - S) = q / 2 below 0.41 |S|^3.
+element of which no rotation is found adds nothing and is put on a list, which ``repair_anisotropic`` goes through. Left
+out are also all that are near having no definite rotation (see ``anisotropic``): det(tr(S) I - S) = q / 2 below
+0.41 |S|^3.
 """
 
 import functools
@@ -12,7 +13,7 @@ import warp as wp
 
 from .anisotropic import OrthotropicMaterial, axes_of, element_forces, filled
 from .elements import ForestElements, GeneralElements, frame, rest_volume
-from .general_cpu import ADD_FORCES, FLAG, GATHER, rest_inverse_of
+from .general_cpu import ADD_FORCES, GATHER, LEAVE_OUT, rest_inverse_of
 from .lanes import COMPILER_FLAGS, PRELUDE, on_cpu
 from .law_lanes import ROTATION, STRETCH
 from .remesh_plan import Plan, extent, leaf_row
@@ -90,7 +91,7 @@ _FORCES = f"""{PRELUDE}{STRETCH}{ROTATION}{GATHER}
         p[j].y = sound ? -volume * p[j].y : zero;
         p[j].z = sound ? -volume * p[j].z : zero;
     }}
-{ADD_FORCES}{FLAG}"""
+{ADD_FORCES}{LEAVE_OUT}"""
 
 
 @wp.func_native(on_cpu(_FORCES))
@@ -103,7 +104,7 @@ def eight_anisotropic(
     count: int,
     u: wp.array[wp.vec4],
     f: wp.array[wp.vec4],
-    flagged: wp.array[wp.uint8],
+    left_out: wp.array[wp.int32],
 ): ...
 
 
@@ -118,13 +119,13 @@ def scatter_anisotropic_lanes(
     u: wp.array[wp.vec4],
     # Out
     f: wp.array[wp.vec4],
-    flagged: wp.array[wp.uint8],
+    left_out: wp.array[wp.int32],
 ):
     """Corotated forces of orthotropic elements and of their active stress; a thread is eight elements.
 
     ``elements`` have Dm^-1 M in place of their rest matrix' inverse.
     """
-    eight_anisotropic(elements, material, is_active, activation, wp.tid(), count, u, f, flagged)
+    eight_anisotropic(elements, material, is_active, activation, wp.tid(), count, u, f, left_out)
 
 
 @wp.func
@@ -175,23 +176,24 @@ def turn_changed(
 
 @functools.cache
 def repair_anisotropic(Elements: Any) -> wp.Kernel:
-    """Forces of flagged elements, in a way that is right for every F."""
+    """Forces of the elements on the list, in a way that is right for every F, by one thread; empties it."""
     forces = element_forces(byers_xu)
 
     @wp.kernel(module="unique", enable_backward=False)
     def repair_anisotropic(
         # In
-        flagged: wp.array[wp.uint8],
         elements: Elements,
         material: OrthotropicMaterial,
         is_active: int,
         activation: wp.array[wp.float32],
         u: wp.array[wp.vec4],
+        # In and out
+        left_out: wp.array[wp.int32],
         # Out
         f: wp.array[wp.vec4],
     ):
-        t = wp.tid()
-        if flagged[t] != wp.uint8(0):
-            forces(elements, material, is_active, activation, t, u, f)
+        for i in range(left_out[0]):
+            forces(elements, material, is_active, activation, left_out[i + 1], u, f)
+        left_out[0] = 0
 
     return repair_anisotropic
