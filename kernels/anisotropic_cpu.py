@@ -49,20 +49,20 @@ _FORCES = f"""{PRELUDE}{STRETCH}{ROTATION}{GATHER}
     }}
     for (int i = 0; i < 3; ++i) {{ sigma[i] += 1.0f - n0; strain[i] += n1 * ib - n2 * ic - n0; }}
     times(c, sigma, r);
-    masks8 sound = s.sound & (s.q * s.q > {(2 * 0.41) ** 2!r}f * (3.0f + ia) * (3.0f + ia) * (3.0f + ia));
+    const masks8 sound = s.sound & (s.q * s.q > {(2 * 0.41) ** 2!r}f * (3.0f + ia) * (3.0f + ia) * (3.0f + ia));
     if (any(~small)) {{
         triple other[3];
         rotation_of(c, e, spread(1.0f), other);
         for (int j = 0; j < 3; ++j) {{
-            r[j].x = small ? r[j].x : other[j].x; r[j].y = small ? r[j].y : other[j].y;
-            r[j].z = small ? r[j].z : other[j].z;
+            r[j] = chosen(small, r[j], other[j]);
             strain[j] = small ? strain[j] : dot(other[j], c[j]) - 1.0f;
         }}
         strain[3] = small ? strain[3] : 0.5f * (dot(other[0], c[1]) + dot(other[1], c[0]));
         strain[4] = small ? strain[4] : 0.5f * (dot(other[0], c[2]) + dot(other[2], c[0]));
         strain[5] = small ? strain[5] : 0.5f * (dot(other[1], c[2]) + dot(other[2], c[1]));
     }}
-    const lanes8 &e0 = strain[0], &e1 = strain[1], &e2 = strain[2], &e01 = strain[3], &e02 = strain[4], &e12 = strain[5];
+    const lanes8 &e0 = strain[0], &e1 = strain[1], &e2 = strain[2];
+    const lanes8 &e01 = strain[3], &e02 = strain[4], &e12 = strain[5];
     const lanes8 s0 = k[0] * e0 + k[3] * e1 + k[4] * e2;
     const lanes8 s1 = k[3] * e0 + k[1] * e1 + k[5] * e2;
     const lanes8 s2 = k[4] * e0 + k[5] * e1 + k[2] * e2;
@@ -85,12 +85,7 @@ _FORCES = f"""{PRELUDE}{STRETCH}{ROTATION}{GATHER}
     p[1] = plus(scaled(s01 - t2, r[0]), plus(scaled(s1, r[1]), scaled(s12 + t0, r[2])));
     p[2] = plus(scaled(s02 + t1, r[0]), plus(scaled(s12 - t0, r[1]), scaled(s2, r[2])));
     p[0] = plus(p[0], scaled(active, c[0]));
-    const lanes8 zero = spread(0.0f);
-    for (int j = 0; j < 3; ++j) {{
-        p[j].x = sound ? -volume * p[j].x : zero;
-        p[j].y = sound ? -volume * p[j].y : zero;
-        p[j].z = sound ? -volume * p[j].z : zero;
-    }}
+    for (int j = 0; j < 3; ++j) p[j] = chosen(sound, scaled(-volume, p[j]), nothing);
 {ADD_FORCES}{LEAVE_OUT}"""
 
 

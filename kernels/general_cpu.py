@@ -40,8 +40,8 @@ GATHER = """
     gather([&](int lane) { return node(lane, 1); }, corner[1]);
     gather([&](int lane) { return node(lane, 2); }, corner[2]);
     gather([&](int lane) { return node(lane, 3); }, corner[3]);
-    const triple d0 = get(corner[0], 0);
-    const triple d1 = minus(get(corner[1], 0), d0), d2 = minus(get(corner[2], 0), d0), d3 = minus(get(corner[3], 0), d0);
+    const triple d1 = minus(get(corner[1], 0), get(corner[0], 0)), d2 = minus(get(corner[2], 0), get(corner[0], 0));
+    const triple d3 = minus(get(corner[3], 0), get(corner[0], 0));
     // Values of elements, side by side.
     const auto values_of = [&](const float* values) {
         return end == 8 ? *reinterpret_cast<const lanes8*>(values + first_element)
@@ -60,7 +60,7 @@ GRADIENT = """
 #: Adds the forces of eight elements, one after the other, from their stresses p times -V, columns.
 ADD_FORCES = """
     four parts[8][4];
-    triple rest = triple{spread(0.0f), spread(0.0f), spread(0.0f)};
+    triple rest = nothing;
     for (int n = 1; n < 4; ++n) {
         const lanes8* row = b + 3 * (n - 1);
         const triple force = combined(row[0], p[0], row[1], p[1], row[2], p[2]);
@@ -94,7 +94,8 @@ def _forces(law: str) -> str:
     leaves_out = law == "corotated"
     if law == "linear":
         strain = """
-    lanes8 e[6] = {a[0].x, a[1].y, a[2].z, 0.5f * (a[0].y + a[1].x), 0.5f * (a[0].z + a[2].x), 0.5f * (a[1].z + a[2].y)};
+    const lanes8 e[6] = {a[0].x, a[1].y, a[2].z,
+        0.5f * (a[0].y + a[1].x), 0.5f * (a[0].z + a[2].x), 0.5f * (a[1].z + a[2].y)};
     for (int j = 0; j < 3; ++j) f_[j] = minus(f_[j], a[j]);
 """
     else:

@@ -43,6 +43,10 @@ PRELUDE = """
     const auto add = [](lanes8* a, int node, const triple& b) {
         a[3 * node] += b.x; a[3 * node + 1] += b.y; a[3 * node + 2] += b.z;
     };
+    const auto chosen = [](const masks8& which, const triple& a, const triple& b) {
+        return triple{which ? a.x : b.x, which ? a.y : b.y, which ? a.z : b.z};
+    };
+    const triple nothing = {spread(0.0f), spread(0.0f), spread(0.0f)};
     const auto any = [](const masks8& a) { return __builtin_reduce_or(a) != 0; };
     const auto halves = [](const float* low, const float* high) {
         const four a = *reinterpret_cast<const four*>(low), b = *reinterpret_cast<const four*>(high);

@@ -92,12 +92,7 @@ _COROTATED = f"""{STRETCH}
             p[0] = added(p[0], v, cross(f[1], f[2]));
             p[1] = added(p[1], v, cross(f[2], f[0]));
             p[2] = added(p[2], v, last);
-            if (any(~s.sound)) {{
-                const lanes8 zero = spread(0.0f);
-                for (int i = 0; i < 3; ++i) {{
-                    p[i].x = s.sound ? p[i].x : zero; p[i].y = s.sound ? p[i].y : zero; p[i].z = s.sound ? p[i].z : zero;
-                }}
-            }}
+            for (int i = 0; i < 3; ++i) p[i] = chosen(s.sound, p[i], nothing);
         }}
         return s.sound;
     }};
@@ -156,9 +151,7 @@ _NEO_HOOKEAN = f"""
             const lanes8 slope = handedness * ((k * log0 - m) / j0
                 + (m + k * (1.0f - log0)) / (j0 * j0) * (j + (1.0f - j0)));
             for (int i = 0; i < 3; ++i) {{
-                const triple other = added(scaled(m, f[i]), slope, cofactor[i]);
-                p[i].x = crushed ? other.x : p[i].x; p[i].y = crushed ? other.y : p[i].y;
-                p[i].z = crushed ? other.z : p[i].z;
+                p[i] = chosen(crushed, added(scaled(m, f[i]), slope, cofactor[i]), p[i]);
             }}
         }}
     }};

@@ -27,7 +27,7 @@ def error(sim, expected):
     return np.abs(sim.forces().numpy() - expected).max() / np.abs(expected).max()
 
 
-@pytest.mark.parametrize("size", [1e-1, 1e-3, 1e-5, 1e-8])
+@pytest.mark.parametrize("size", [1e-1, 1e-3, 1e-6])
 @pytest.mark.parametrize("name", MESHES)
 @pytest.mark.parametrize("law", LAWS)
 def test_small_strains_keep_their_digits(law, name, size, rng):
