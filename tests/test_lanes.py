@@ -12,7 +12,7 @@ from test_miscompile import MATERIAL, MESHES, meshed, shared_rotations
 import warp_corot as wc
 
 MU, LAM = oracle.lame(MATERIAL["young"], MATERIAL["poisson"])
-#: Of the largest force. Displacements are exact here; an operation rounds by 6e-8, and some ten of them add up at random.
+#: Of the largest force. Displacements are exact here; an operation rounds by 6e-8, and some ten add up at random.
 DIGITS = 1e-6
 LAWS = {
     "linear": wc.Linear(),
