@@ -96,7 +96,8 @@ def _forces(law: str) -> str:
         strain = """
     const lanes8 e[6] = {a[0].x, a[1].y, a[2].z,
         0.5f * (a[0].y + a[1].x), 0.5f * (a[0].z + a[2].x), 0.5f * (a[1].z + a[2].y)};
-    for (int j = 0; j < 3; ++j) f_[j] = minus(f_[j], a[j]);
+    f_[0] = f_[1] = f_[2] = nothing;
+    f_[0].x = f_[1].y = f_[2].z = spread(1.0f);
 """
     else:
         strain = """
