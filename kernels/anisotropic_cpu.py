@@ -1,8 +1,9 @@
 """Corotated forces of orthotropic elements on the CPU, eight to the lanes of vector registers; see ``lanes``.
 
 Both kinds of elements come as general ones, with M multiplied into their rest matrix: F M = M + (d1 d2 d3) B. An
-element of which no rotation is found adds nothing and is flagged; ``repair_anisotropic`` does those. Flagged are also
-all that are near having no definite rotation (see ``anisotropic``): det(tr(S) I - S) = q / 2 below 0.41 |S|^3.
+element of which no rotation is found adds nothing and is put on a list, which ``repair_anisotropic`` goes through. Left
+out are also all that are near having no definite rotation (see ``anisotropic``): det(tr(S) I - S) = q / 2 below
+0.41 |S|^3.
 """
 
 import functools
@@ -12,7 +13,7 @@ import warp as wp
 
 from .anisotropic import OrthotropicMaterial, axes_of, element_forces, filled
 from .elements import ForestElements, GeneralElements, frame, rest_volume
-from .general_cpu import ADD_FORCES, FLAG, GATHER, rest_inverse_of
+from .general_cpu import ADD_FORCES, GATHER, LEAVE_OUT, rest_inverse_of
 from .lanes import COMPILER_FLAGS, PRELUDE, on_cpu
 from .law_lanes import ROTATION, STRETCH
 from .remesh_plan import Plan, extent, leaf_row
@@ -48,20 +49,20 @@ _FORCES = f"""{PRELUDE}{STRETCH}{ROTATION}{GATHER}
     }}
     for (int i = 0; i < 3; ++i) {{ sigma[i] += 1.0f - n0; strain[i] += n1 * ib - n2 * ic - n0; }}
     times(c, sigma, r);
-    masks8 sound = s.sound & (s.q * s.q > {(2 * 0.41) ** 2!r}f * (3.0f + ia) * (3.0f + ia) * (3.0f + ia));
+    const masks8 sound = s.sound & (s.q * s.q > {(2 * 0.41) ** 2!r}f * (3.0f + ia) * (3.0f + ia) * (3.0f + ia));
     if (any(~small)) {{
         triple other[3];
         rotation_of(c, e, spread(1.0f), other);
         for (int j = 0; j < 3; ++j) {{
-            r[j].x = small ? r[j].x : other[j].x; r[j].y = small ? r[j].y : other[j].y;
-            r[j].z = small ? r[j].z : other[j].z;
+            r[j] = chosen(small, r[j], other[j]);
             strain[j] = small ? strain[j] : dot(other[j], c[j]) - 1.0f;
         }}
         strain[3] = small ? strain[3] : 0.5f * (dot(other[0], c[1]) + dot(other[1], c[0]));
         strain[4] = small ? strain[4] : 0.5f * (dot(other[0], c[2]) + dot(other[2], c[0]));
         strain[5] = small ? strain[5] : 0.5f * (dot(other[1], c[2]) + dot(other[2], c[1]));
     }}
-    const lanes8 &e0 = strain[0], &e1 = strain[1], &e2 = strain[2], &e01 = strain[3], &e02 = strain[4], &e12 = strain[5];
+    const lanes8 &e0 = strain[0], &e1 = strain[1], &e2 = strain[2];
+    const lanes8 &e01 = strain[3], &e02 = strain[4], &e12 = strain[5];
     const lanes8 s0 = k[0] * e0 + k[3] * e1 + k[4] * e2;
     const lanes8 s1 = k[3] * e0 + k[1] * e1 + k[5] * e2;
     const lanes8 s2 = k[4] * e0 + k[5] * e1 + k[2] * e2;
@@ -84,13 +85,8 @@ _FORCES = f"""{PRELUDE}{STRETCH}{ROTATION}{GATHER}
     p[1] = plus(scaled(s01 - t2, r[0]), plus(scaled(s1, r[1]), scaled(s12 + t0, r[2])));
     p[2] = plus(scaled(s02 + t1, r[0]), plus(scaled(s12 - t0, r[1]), scaled(s2, r[2])));
     p[0] = plus(p[0], scaled(active, c[0]));
-    const lanes8 zero = spread(0.0f);
-    for (int j = 0; j < 3; ++j) {{
-        p[j].x = sound ? -volume * p[j].x : zero;
-        p[j].y = sound ? -volume * p[j].y : zero;
-        p[j].z = sound ? -volume * p[j].z : zero;
-    }}
-{ADD_FORCES}{FLAG}"""
+    for (int j = 0; j < 3; ++j) p[j] = chosen(sound, scaled(-volume, p[j]), nothing);
+{ADD_FORCES}{LEAVE_OUT}"""
 
 
 @wp.func_native(on_cpu(_FORCES))
@@ -103,7 +99,7 @@ def eight_anisotropic(
     count: int,
     u: wp.array[wp.vec4],
     f: wp.array[wp.vec4],
-    flagged: wp.array[wp.uint8],
+    left_out: wp.array[wp.int32],
 ): ...
 
 
@@ -118,13 +114,13 @@ def scatter_anisotropic_lanes(
     u: wp.array[wp.vec4],
     # Out
     f: wp.array[wp.vec4],
-    flagged: wp.array[wp.uint8],
+    left_out: wp.array[wp.int32],
 ):
     """Corotated forces of orthotropic elements and of their active stress; a thread is eight elements.
 
     ``elements`` have Dm^-1 M in place of their rest matrix' inverse.
     """
-    eight_anisotropic(elements, material, is_active, activation, wp.tid(), count, u, f, flagged)
+    eight_anisotropic(elements, material, is_active, activation, wp.tid(), count, u, f, left_out)
 
 
 @wp.func
@@ -175,23 +171,24 @@ def turn_changed(
 
 @functools.cache
 def repair_anisotropic(Elements: Any) -> wp.Kernel:
-    """Forces of flagged elements, in a way that is right for every F."""
+    """Forces of the elements on the list, in a way that is right for every F, by one thread; empties it."""
     forces = element_forces(byers_xu)
 
     @wp.kernel(module="unique", enable_backward=False)
     def repair_anisotropic(
         # In
-        flagged: wp.array[wp.uint8],
         elements: Elements,
         material: OrthotropicMaterial,
         is_active: int,
         activation: wp.array[wp.float32],
         u: wp.array[wp.vec4],
+        # In and out
+        left_out: wp.array[wp.int32],
         # Out
         f: wp.array[wp.vec4],
     ):
-        t = wp.tid()
-        if flagged[t] != wp.uint8(0):
-            forces(elements, material, is_active, activation, t, u, f)
+        for i in range(left_out[0]):
+            forces(elements, material, is_active, activation, left_out[i + 1], u, f)
+        left_out[0] = 0
 
     return repair_anisotropic

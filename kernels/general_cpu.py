@@ -2,7 +2,8 @@
 
 General tetrahedra, and those of a forest that are in no complete subtree, for which a rest matrix is worked out once.
 
-An element of which the corotated law finds no rotation adds nothing and is flagged; ``repair_elements`` does those.
+An element of which the corotated law finds no rotation adds nothing and is put on a list, which ``repair_elements``
+goes through.
 """
 
 import functools
@@ -39,8 +40,8 @@ GATHER = """
     gather([&](int lane) { return node(lane, 1); }, corner[1]);
     gather([&](int lane) { return node(lane, 2); }, corner[2]);
     gather([&](int lane) { return node(lane, 3); }, corner[3]);
-    const triple d0 = get(corner[0], 0);
-    const triple d1 = minus(get(corner[1], 0), d0), d2 = minus(get(corner[2], 0), d0), d3 = minus(get(corner[3], 0), d0);
+    const triple d1 = minus(get(corner[1], 0), get(corner[0], 0)), d2 = minus(get(corner[2], 0), get(corner[0], 0));
+    const triple d3 = minus(get(corner[3], 0), get(corner[0], 0));
     // Values of elements, side by side.
     const auto values_of = [&](const float* values) {
         return end == 8 ? *reinterpret_cast<const lanes8*>(values + first_element)
@@ -59,7 +60,7 @@ GRADIENT = """
 #: Adds the forces of eight elements, one after the other, from their stresses p times -V, columns.
 ADD_FORCES = """
     four parts[8][4];
-    triple rest = triple{spread(0.0f), spread(0.0f), spread(0.0f)};
+    triple rest = nothing;
     for (int n = 1; n < 4; ++n) {
         const lanes8* row = b + 3 * (n - 1);
         const triple force = combined(row[0], p[0], row[1], p[1], row[2], p[2]);
@@ -73,9 +74,13 @@ ADD_FORCES = """
     }
 """
 
-#: Flags elements that are not ``sound``.
-FLAG = """
-    for (int lane = 0; lane < end; ++lane) flagged.data[first_element + lane] = sound[lane] ? 0 : 1;
+#: Puts elements that are not ``sound`` on the list of those left out: how many, then which.
+LEAVE_OUT = """
+    if (any(~sound)) {
+        for (int lane = 0; lane < end; ++lane) {
+            if (!sound[lane]) left_out.data[++left_out.data[0]] = first_element + lane;
+        }
+    }
 """
 
 #: mu and lambda, one for all or by element.
@@ -86,11 +91,13 @@ MATERIAL = """
 
 
 def _forces(law: str) -> str:
-    flags = law == "corotated"
+    leaves_out = law == "corotated"
     if law == "linear":
         strain = """
-    lanes8 e[6] = {a[0].x, a[1].y, a[2].z, 0.5f * (a[0].y + a[1].x), 0.5f * (a[0].z + a[2].x), 0.5f * (a[1].z + a[2].y)};
-    for (int j = 0; j < 3; ++j) f_[j] = minus(f_[j], a[j]);
+    const lanes8 e[6] = {a[0].x, a[1].y, a[2].z,
+        0.5f * (a[0].y + a[1].x), 0.5f * (a[0].z + a[2].x), 0.5f * (a[1].z + a[2].y)};
+    f_[0] = f_[1] = f_[2] = nothing;
+    f_[0].x = f_[1].y = f_[2].z = spread(1.0f);
 """
     else:
         strain = """
@@ -100,8 +107,8 @@ def _forces(law: str) -> str:
     return on_cpu(f"""{PRELUDE}{STRESSES[law]}
 {GATHER}{MATERIAL}{GRADIENT}{strain}
     triple p[3];
-    {"const masks8 sound = " if flags else ""}stress(f_, e, spread(1.0f), -volume * m, -volume * k, p);
-{ADD_FORCES}{FLAG if flags else ""}""")
+    {"const masks8 sound = " if leaves_out else ""}stress(f_, e, spread(1.0f), -volume * m, -volume * k, p);
+{ADD_FORCES}{LEAVE_OUT if leaves_out else ""}""")
 
 
 @wp.func_native(_forces("corotated"))
@@ -114,7 +121,7 @@ def eight_elements(
     stride: int,
     u: wp.array[wp.vec4],
     f: wp.array[wp.vec4],
-    flagged: wp.array[wp.uint8],
+    left_out: wp.array[wp.int32],
 ): ...
 
 
@@ -129,10 +136,10 @@ def scatter_elements(
     u: wp.array[wp.vec4],
     # Out
     f: wp.array[wp.vec4],
-    flagged: wp.array[wp.uint8],
+    left_out: wp.array[wp.int32],
 ):
     """Corotated forces, each element with its own rotation; a thread is eight elements."""
-    eight_elements(elements, wp.tid(), count, mu, lam, stride, u, f, flagged)
+    eight_elements(elements, wp.tid(), count, mu, lam, stride, u, f, left_out)
 
 
 @functools.cache
@@ -171,23 +178,24 @@ def scatter_law_elements(law: str) -> wp.Kernel:
 @wp.kernel(module="unique", enable_backward=False)
 def repair_elements(
     # In
-    flagged: wp.array[wp.uint8],
     elements: GeneralElements,
     mu: wp.array[wp.float32],
     lam: wp.array[wp.float32],
     stride: int,
     u: wp.array[wp.vec4],
+    # In and out
+    left_out: wp.array[wp.int32],
     # Out
     f: wp.array[wp.vec4],
 ):
-    """Forces of flagged elements with the rotation that is right for every F."""
-    t = wp.tid()
-    if flagged[t] == wp.uint8(0):
-        return
-    g = local_gradient(elements, t, u)
-    q = frame(elements, t)
-    r = byers_xu(q + g)
-    scatter_stress(elements, t, r * hooke(corotated_strain(g, q, r), mu[t * stride], lam[t * stride]), f)
+    """Forces of the elements on the list, with the rotation that is right for every F, by one thread; empties it."""
+    for i in range(left_out[0]):
+        t = left_out[i + 1]
+        g = local_gradient(elements, t, u)
+        q = frame(elements, t)
+        r = byers_xu(q + g)
+        scatter_stress(elements, t, r * hooke(corotated_strain(g, q, r), mu[t * stride], lam[t * stride]), f)
+    left_out[0] = 0
 
 
 @wp.func

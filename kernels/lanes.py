@@ -43,6 +43,10 @@ PRELUDE = """
     const auto add = [](lanes8* a, int node, const triple& b) {
         a[3 * node] += b.x; a[3 * node + 1] += b.y; a[3 * node + 2] += b.z;
     };
+    const auto chosen = [](const masks8& which, const triple& a, const triple& b) {
+        return triple{which ? a.x : b.x, which ? a.y : b.y, which ? a.z : b.z};
+    };
+    const triple nothing = {spread(0.0f), spread(0.0f), spread(0.0f)};
     const auto any = [](const masks8& a) { return __builtin_reduce_or(a) != 0; };
     const auto halves = [](const float* low, const float* high) {
         const four a = *reinterpret_cast<const four*>(low), b = *reinterpret_cast<const four*>(high);
@@ -111,7 +115,7 @@ PRELUDE = """
         e[4] = a[0].z + a[2].x + dot(a[0], a[2]);
         e[5] = a[1].z + a[2].y + dot(a[1], a[2]);
     };
-    // Adjugate and invariants of E, and J - 1 by these where E is small: |E|^2 < 0.1.
+    // Adjugate and invariants of E, and J - 1 by these where E is small: |E|^2 < 0.4.
     struct invariants { lanes8 adjugate[6], a, b, c, squared, j; masks8 small; };
     const auto invariants_of = [&](const lanes8* e, const lanes8& det) {
         invariants i;
@@ -125,7 +129,7 @@ PRELUDE = """
         i.b = i.adjugate[0] + i.adjugate[1] + i.adjugate[2];
         i.c = e[0] * i.adjugate[0] + e[3] * i.adjugate[3] + e[4] * i.adjugate[4];
         i.squared = i.a * i.a - 2.0f * i.b;
-        i.small = (i.squared < 0.1f) & (det > 0.0f);
+        i.small = (i.squared < 0.4f) & (det > 0.0f);
         i.j = i.small ? (i.a + i.b + i.c) / (1.0f + det) : det - 1.0f;
         return i;
     };

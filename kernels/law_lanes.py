@@ -5,10 +5,10 @@ and of mu and lambda, which come times the weight that P shall have. It writes t
 lanes these may be trusted. E has its digits however small it is, and all is worked out from E: so P keeps them.
 
 The corotated law needs no rotation for that. With t = tr S - 3, j = J - 1 and the invariants a, b, c of E, t is the
-largest root of the quartic (Cayley-Hamilton for S; as for the largest eigenvalue of Horn's matrix)
+largest root of the quartic (Cayley-Hamilton for S; x = t + 3 is the largest eigenvalue of Horn's 4x4 matrix)
     t^4 + 12 t^3 + (48 - 2a) t^2 + (64 - 12a - 8j) t + a^2 - 20a - 24j - 4b = 0
 whose slope is 4q, q = 2 (s1 + s2)(s1 + s3)(s2 + s3) of the principal stretches: no root is better defined. From it come
-R = ((x^2 + I_C) F + 2 x cof F - 2 F C) / q, x = t + 3, for every F of which q is not small, flattened and turned over
+R = ((x^2 + tr C) F + 2 x cof F - 2 F C) / q, for every F of which q is not small, flattened and turned over
 too; and where E is small, with its digits,
     I - S^-1 = (n0 I + (8 + y) E - (6 + y) adj E) / q,  y = (2t - 6j) / J,
     n0 = t (18 + t (8 + t)) - a (10 + t) - 2j - y (1 + a),  and  P = F (2 mu (I - S^-1) + lambda t S^-1).
@@ -31,7 +31,9 @@ STRETCH = f"""
         const lanes8 c2 = 48.0f - 2.0f * a;
         // The series of tr sqrt(I + E), or from above, where the iteration cannot miss the root.
         lanes8 t = 0.5f * a;
-        t = s.of.small ? t - 0.125f * s.of.squared + 0.0625f * (a * (a * a - 3.0f * b) + 3.0f * c) : t;
+        const lanes8 &p2 = s.of.squared, p3 = a * p2 - b * a + 3.0f * c, p4 = a * p3 - b * p2 + c * a;
+        const lanes8 p5 = a * p4 - b * p3 + c * p2;
+        t = s.of.small ? t - 0.125f * p2 + 0.0625f * p3 - 0.0390625f * p4 + 0.02734375f * p5 : t;
         masks8 open = t == t;
         for (int iteration = 0; iteration < 24; ++iteration) {{
             const lanes8 value = (((t + 12.0f) * t + c2) * t + c1) * t + c0;
@@ -92,12 +94,7 @@ _COROTATED = f"""{STRETCH}
             p[0] = added(p[0], v, cross(f[1], f[2]));
             p[1] = added(p[1], v, cross(f[2], f[0]));
             p[2] = added(p[2], v, last);
-            if (any(~s.sound)) {{
-                const lanes8 zero = spread(0.0f);
-                for (int i = 0; i < 3; ++i) {{
-                    p[i].x = s.sound ? p[i].x : zero; p[i].y = s.sound ? p[i].y : zero; p[i].z = s.sound ? p[i].z : zero;
-                }}
-            }}
+            for (int i = 0; i < 3; ++i) p[i] = chosen(s.sound, p[i], nothing);
         }}
         return s.sound;
     }};
@@ -156,9 +153,7 @@ _NEO_HOOKEAN = f"""
             const lanes8 slope = handedness * ((k * log0 - m) / j0
                 + (m + k * (1.0f - log0)) / (j0 * j0) * (j + (1.0f - j0)));
             for (int i = 0; i < 3; ++i) {{
-                const triple other = added(scaled(m, f[i]), slope, cofactor[i]);
-                p[i].x = crushed ? other.x : p[i].x; p[i].y = crushed ? other.y : p[i].y;
-                p[i].z = crushed ? other.z : p[i].z;
+                p[i] = chosen(crushed, added(scaled(m, f[i]), slope, cofactor[i]), p[i]);
             }}
         }}
     }};

@@ -10,7 +10,7 @@ import warp as wp
 
 from .constitutive import corotated_strain, hooke
 from .elements import GeneralElements, load_node, scatter_stress
-from .general_cpu import ADD_FORCES, FLAG, GATHER
+from .general_cpu import ADD_FORCES, GATHER, LEAVE_OUT
 from .general_cuda import PosedElements, add_stress, edge_differences, load_four, rest_inverse_of
 from .lanes import COMPILER_FLAGS, PRELUDE, on_cpu
 from .law_lanes import STRESSES
@@ -144,7 +144,7 @@ _FORCES = f"""{PRELUDE}{STRESSES["corotated"]}
     stretching_there(a, e);
     triple p[3];
     const masks8 sound = stress(f_, e, spread(1.0f), -volume * m, -volume * k, p);
-{ADD_FORCES}{FLAG}"""
+{ADD_FORCES}{LEAVE_OUT}"""
 
 
 @wp.func_native(on_cpu(_FORCES))
@@ -156,7 +156,7 @@ def eight_posed(
     lam: wp.array[wp.float32],
     u: wp.array[wp.vec4],
     f: wp.array[wp.vec4],
-    flagged: wp.array[wp.uint8],
+    left_out: wp.array[wp.int32],
 ): ...
 
 
@@ -170,29 +170,30 @@ def scatter_posed_lanes(
     x: wp.array[wp.vec4],
     # Out
     f: wp.array[wp.vec4],
-    flagged: wp.array[wp.uint8],
+    left_out: wp.array[wp.int32],
 ):
     """Corotated forces, each element with its own rotation; a thread is eight elements."""
-    eight_posed(elements, wp.tid(), count, mu, lam, x, f, flagged)
+    eight_posed(elements, wp.tid(), count, mu, lam, x, f, left_out)
 
 
 @wp.kernel(enable_backward=False)
 def repair_posed(
     # In
-    flagged: wp.array[wp.uint8],
     elements: GeneralElements,
     mu: wp.array[wp.float32],
     lam: wp.array[wp.float32],
     x: wp.array[wp.vec4],
+    # In and out
+    left_out: wp.array[wp.int32],
     # Out
     f: wp.array[wp.vec4],
 ):
-    """Forces of flagged elements with the rotation that is right for every F."""
-    t = wp.tid()
-    if flagged[t] == wp.uint8(0):
-        return
-    gradient = deformation_gradient(elements, t, x)
-    scatter_stress(elements, t, corotated_stress(gradient, byers_xu(gradient), mu[t], lam[t]), f)
+    """Forces of the elements on the list, with the rotation that is right for every F, by one thread; empties it."""
+    for i in range(left_out[0]):
+        t = left_out[i + 1]
+        gradient = deformation_gradient(elements, t, x)
+        scatter_stress(elements, t, corotated_stress(gradient, byers_xu(gradient), mu[t], lam[t]), f)
+    left_out[0] = 0
 
 
 # --- what is Newton's own, whatever the elastic model ----------------------------------------------------------------

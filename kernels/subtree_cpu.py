@@ -129,9 +129,8 @@ def _columns(shape: int, nodes: str) -> str:
 
 def _add_leaf(shape: int) -> str:
     """Add the forces on a leaf's nodes from the columns p of P V / h."""
-    zero = "triple{spread(0.0f), spread(0.0f), spread(0.0f)}"
     forces = {
-        0: ["p[0]", "minus(p[1], p[0])", "minus(p[2], p[1])", f"minus({zero}, p[2])"],
+        0: ["p[0]", "minus(p[1], p[0])", "minus(p[2], p[1])", "minus(nothing, p[2])"],
         1: ["plus(p[0], p[2])", "minus(p[1], p[0])", "minus(p[2], p[1])", "scaled(spread(-2.0f), p[2])"],
         2: [
             f"scaled(spread({-SQRT2!r}f), p[0])",
@@ -275,10 +274,8 @@ def _shared_snippet(shape: int, given: bool) -> str:
     }}
     for (int node = 0; node < 10; ++node) {{
         const triple d = get(g, node);
-        triple force = combined(d.x, turn[0], d.y, turn[1], d.z, turn[2]);
-        g[3 * node] = left_out ? spread(0.0f) : force.x;
-        g[3 * node + 1] = left_out ? spread(0.0f) : force.y;
-        g[3 * node + 2] = left_out ? spread(0.0f) : force.z;
+        const triple force = chosen(left_out, nothing, combined(d.x, turn[0], d.y, turn[1], d.z, turn[2]));
+        g[3 * node] = force.x; g[3 * node + 1] = force.y; g[3 * node + 2] = force.z;
     }}
 {_SCATTER}{_FLAG}"""
     )

@@ -16,8 +16,8 @@ class Lanes:
     Args:
         elements: The elements, of either kind.
         general: The same as general ones.
-        scatter: Kernel that goes through the general ones eight at a time and flags those that it leaves out.
-        repair: Kernel that does the flagged ones among ``elements``; None where none are left out or flagged.
+        scatter: Kernel that goes through the general ones eight at a time and lists those that it leaves out.
+        repair: Kernel that does the listed ones among ``elements``; None where none are left out or listed.
     """
 
     def __init__(self, elements: Any, general: GeneralElements, *, scatter: wp.Kernel, repair: wp.Kernel | None = None):
@@ -26,18 +26,16 @@ class Lanes:
         self._general = general
         self._scatter = scatter
         self._repair = repair
-        # Bytes one by one: looking at eight in one go was slower.
-        self._flagged = wp.zeros(self.count, dtype=wp.uint8, device="cpu")
+        #: How many, then which.
+        self._left_out = wp.zeros(self.count + 1, dtype=wp.int32, device="cpu")
 
     def scatter_forces(self, material: list, u: wp.array, f: wp.array) -> None:
         """Add the forces of displacements u to f, both vec4 [N]; ``material`` are kernel arguments."""
         inputs = [self._general, *material, self.count, u]
-        outputs = [f] if self._repair is None else [f, self._flagged]
+        outputs = [f] if self._repair is None else [f, self._left_out]
         wp.launch(self._scatter, -(-self.count // LANES), inputs, outputs, device="cpu")
-        if self._repair is None:
-            return
-        inputs = [self._flagged, self._elements, *material, u]
-        wp.launch(self._repair, self.count, inputs, [f], device="cpu")
+        if self._repair is not None:
+            wp.launch(self._repair, 1, [self._elements, *material, u], [self._left_out, f], device="cpu")
 
 
 def as_general(elements: Any, kernel: wp.Kernel, inputs: list) -> GeneralElements:

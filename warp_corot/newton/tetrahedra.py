@@ -137,8 +137,8 @@ class Tetrahedra:
                 self._launch(scatter_posed(quick_rotation, self.damped), self.single_count, inputs, [f], BLOCK)
             else:
                 inputs = [self._single, self.single_count, *elastic[1:], self.x]
-                self._launch(scatter_posed_lanes, -(-self.single_count // LANES), inputs, [f, self._flagged])
-                self._launch(repair_posed, self.single_count, [self._flagged, *elastic, self.x], [f])
+                self._launch(scatter_posed_lanes, -(-self.single_count // LANES), inputs, [f, self._left_out])
+                self._launch(repair_posed, 1, [*elastic, self.x], [self._left_out, f])
         for group in self.groups:
             group.add_forces(self.x, self.u, f)
         # On the CPU a look costs less than a launch; a recorded step must be ready for what comes.
@@ -175,7 +175,7 @@ class Tetrahedra:
         """Tetrahedra that go one by one."""
         self.single_count = len(ids)
         self._no_ids = wp.empty(0, dtype=wp.int32, device=self.device)
-        self._flagged = wp.zeros(len(ids), dtype=wp.uint8, device=self.device)
+        self._left_out = wp.zeros(len(ids) + 1, dtype=wp.int32, device=self.device)
         everything = len(ids) == self.model.tet_count
         if self._fused:
             self._single = self.posed(ids)
