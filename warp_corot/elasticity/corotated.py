@@ -14,6 +14,7 @@ from ..mesh import TetForest
 from ..mesh.forest import MAX_LEVEL
 from ..rotations import METHODS, rotation_function
 from .anisotropic import AnisotropicField, AnisotropicLanesField
+from .anisotropic_subtrees import AnisotropicSubtreeField
 from .corotated_field import CorotatedField, LanesField, LeafField
 from .model import Model
 from .subtree_field import SubtreeField
@@ -99,6 +100,9 @@ class Corotated(Model):
         if self.rotation == "warm":
             raise InputError("rotation is 'warm'; with an anisotropic material it must be 'byers-xu' or 'svd'")
         lanes = body.device.is_cpu and self.own_rotation is quick_rotation
+        if body.device.is_cuda and self.own_rotation is quick_rotation and not deterministic:
+            if isinstance(body.mesh, TetForest):
+                return AnisotropicSubtreeField(body)
         return (AnisotropicLanesField if lanes else AnisotropicField)(body, self.own_rotation, deterministic)
 
     @property
