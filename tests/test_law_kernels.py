@@ -26,6 +26,7 @@ from warp_corot.kernels.subtree_laws import scatter_subtrees
 
 import warp_corot as wc
 from warp_corot.elasticity.anisotropic import AnisotropicField
+from warp_corot.elasticity.anisotropic_subtrees import as_bytes
 from warp_corot.elasticity.law_general import GeneralScatter
 from warp_corot.plan import ForcePlan
 
@@ -102,7 +103,7 @@ def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
     """Every hundredth node is displaced by an edge and more, so that some leaves are left to the robust rotation; and
     active stress."""
     mesh = meshed(name)
-    material, tensor = made(kind, mesh, rng)
+    material, _ = made(kind, mesh, rng)
     body = wc.SoftBody(mesh, material, device=device)
     chosen = rng.random((len(mesh.points), 1)) < 0.01
     u, _ = state(mesh, "corotated", rng)
@@ -117,13 +118,13 @@ def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
     f, flags = wp.zeros_like(on_device), 0
     for batch in plan.batches:
         by_node(batch.subtrees, body.device)
-        flagged = wp.zeros(len(batch.flagged), dtype=wp.uint8, device=device)
+        left = wp.zeros(-(-batch.count // 8), dtype=wp.uint64, device=device)
         kernel = scatter_anisotropic_subtrees(batch.shape, False, *options)
         inputs = [batch.subtrees, whole.material, axes, 1, active, on_device]
-        wp.launch(kernel, batch.count, inputs=inputs, outputs=[f, flagged], device=device, block_dim=BLOCK)
-        inputs = [flagged.view(wp.uint64), batch.subtrees.first, body.elements, whole.material, 1, active, on_device]
-        wp.launch(repair_leaves, len(flagged), inputs=inputs, outputs=[f], device=device)
-        flags += np.unpackbits(flagged.numpy()).sum()
+        wp.launch(kernel, batch.count, inputs=inputs, outputs=[f, as_bytes(left)], device=device, block_dim=BLOCK)
+        inputs = [left, batch.subtrees.first, body.elements, whole.material, 1, active, on_device]
+        wp.launch(repair_leaves, 8 * len(left), inputs=inputs, outputs=[f], device=device)
+        flags += np.unpackbits(as_bytes(left).numpy()).sum()
     flat = plan.flat
     if len(flat):
         inputs = [flat.elements, flat.leaves, whole.material, 1, active, on_device]

@@ -58,12 +58,12 @@ class AnisotropicSubtreeField(AnisotropicField):
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         material, plan = [self.material, *self._activation], self.plan
-        for batch, kernel, flagged in zip(plan.batches, self._kernels, self._flagged, strict=True):
+        for batch, kernel, flags in zip(plan.batches, self._kernels, self._flags, strict=True):
             inputs = [batch.subtrees, self.material, self._quaternions, *self._activation, u]
-            wp.launch(kernel, batch.count, inputs=inputs, outputs=[f, flagged], device=self.device, block_dim=BLOCK)
-            by_eights = flagged.view(wp.uint64)
-            inputs = [by_eights, batch.subtrees.first, self.elements, *material, u]
-            self.launch(repair_leaves, 8 * len(by_eights), inputs, [f])
+            outputs = [f, as_bytes(flags)]
+            wp.launch(kernel, batch.count, inputs=inputs, outputs=outputs, device=self.device, block_dim=BLOCK)
+            inputs = [flags, batch.subtrees.first, self.elements, *material, u]
+            self.launch(repair_leaves, 8 * len(flags), inputs, [f])
         if len(plan.flat):
             inputs = [plan.flat.elements, plan.flat.leaves, *material, u]
             self.launch(scatter_flat, len(plan.flat), inputs, [f])
@@ -71,9 +71,7 @@ class AnisotropicSubtreeField(AnisotropicField):
     def _go_through(self, plan: Plan) -> None:
         self.plan = plan
         self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in plan.batches]
-        self._flagged = [
-            wp.zeros(-(-batch.count // 8) * 8, dtype=wp.uint8, device=self.device) for batch in plan.batches
-        ]
+        self._flags = [wp.zeros(-(-b.count // 8), dtype=wp.uint64, device=self.device) for b in plan.batches]
 
     def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
         one_axes, one_stiffness = self.material.axes_stride == 0, self.material.stride == 0
@@ -86,3 +84,8 @@ class AnisotropicSubtreeField(AnisotropicField):
 
     def _turn_axes(self, quaternions: wp.array) -> None:
         self.launch(quaternions_of, len(quaternions), [self.material.axes], [quaternions])
+
+
+def as_bytes(flags: wp.array) -> wp.array:
+    """The same memory, uint8 [8 n] of uint64 [n]."""
+    return wp.array(ptr=flags.ptr, dtype=wp.uint8, shape=8 * len(flags), device=flags.device)

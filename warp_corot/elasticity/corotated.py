@@ -99,10 +99,10 @@ class Corotated(Model):
                 raise InputError(f"{name} is {given!r}; with an anisotropic material it must be {wanted!r}")
         if self.rotation == "warm":
             raise InputError("rotation is 'warm'; with an anisotropic material it must be 'byers-xu' or 'svd'")
-        lanes = body.device.is_cpu and self.own_rotation is quick_rotation
-        if body.device.is_cuda and self.own_rotation is quick_rotation and not deterministic:
-            if isinstance(body.mesh, TetForest):
-                return AnisotropicSubtreeField(body)
+        quick = self.own_rotation is quick_rotation
+        if quick and body.device.is_cuda and isinstance(body.mesh, TetForest) and not deterministic:
+            return AnisotropicSubtreeField(body)
+        lanes = quick and body.device.is_cpu
         return (AnisotropicLanesField if lanes else AnisotropicField)(body, self.own_rotation, deterministic)
 
     @property
