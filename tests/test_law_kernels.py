@@ -13,19 +13,16 @@ from test_anisotropy import made
 from test_miscompile import FORESTS, TOLERANCE, materials, meshed, turned
 from warp_corot.kernels import constitutive
 from warp_corot.kernels.anisotropic import scatter_anisotropic
+from warp_corot.kernels.definite import quaternions_of
 from warp_corot.kernels.general_cuda import corotated_law
 from warp_corot.kernels.rotation import byers_xu, quick_rotation
-from warp_corot.kernels.subtree_anisotropic import (
-    quaternions_of,
-    repair_leaves,
-    scatter_anisotropic_subtrees,
-    scatter_flat,
-)
+from warp_corot.kernels.subtree_anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
 from warp_corot.kernels.subtree_cuda import BLOCK
 from warp_corot.kernels.subtree_laws import scatter_subtrees
 
 import warp_corot as wc
 from warp_corot.elasticity.anisotropic import AnisotropicField
+from warp_corot.elasticity.anisotropic_general import GeneralAnisotropicField
 from warp_corot.elasticity.anisotropic_subtrees import as_bytes
 from warp_corot.elasticity.law_general import GeneralScatter
 from warp_corot.plan import ForcePlan
@@ -105,14 +102,10 @@ def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
     mesh = meshed(name)
     material, _ = made(kind, mesh, rng)
     body = wc.SoftBody(mesh, material, device=device)
-    chosen = rng.random((len(mesh.points), 1)) < 0.01
-    u, _ = state(mesh, "corotated", rng)
-    u[:, :3] += np.where(chosen, random_displacement(mesh, rng, 1.2), 0)
-    on_device = wp.array(u, dtype=wp.vec4, device=device)
+    on_device, active = strained(mesh, rng, device)
     whole = AnisotropicField(body, byers_xu, False)
     axes = wp.empty(len(whole.material.axes), dtype=wp.quat, device=device)
     wp.launch(quaternions_of, len(axes), inputs=[whole.material.axes], outputs=[axes], device=device)
-    active = wp.array(rng.uniform(0, 1e4, len(mesh.tets)), dtype=wp.float32, device=device)
     options = ("muscle" in kind, whole.material.axes_stride == 0, whole.material.stride == 0)
     plan = ForcePlan.of_forest(mesh, None, wp.get_device(device), grouped=False)
     f, flags = wp.zeros_like(on_device), 0
@@ -130,9 +123,35 @@ def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
         inputs = [flat.elements, flat.leaves, whole.material, 1, active, on_device]
         wp.launch(scatter_flat, len(flat), inputs=inputs, outputs=[f], device=device)
     assert 0 < flags < 0.3 * len(mesh.tets)
-    # The kernel that goes leaf by leaf is compared with the oracle in test_anisotropy.
-    expected = wp.zeros_like(f)
-    leaf_by_leaf = scatter_anisotropic(body.element_kind, byers_xu)
-    inputs = [body.elements, whole.material, 1, active, on_device]
-    wp.launch(leaf_by_leaf, len(mesh.tets), inputs=inputs, outputs=[expected], device=device)
-    assert_right(f.numpy()[:, :3], expected.numpy()[:, :3])
+    assert_right(f.numpy()[:, :3], leaf_by_leaf(whole, active, on_device))
+
+
+@pytest.mark.parametrize("kind", ["muscle", "wood", "muscle field", "wood field"])
+def test_anisotropic_general_elements(kind, device, rng):
+    mesh = meshed("general")
+    material, _ = made(kind, mesh, rng)
+    body = wc.SoftBody(mesh, material, device=device)
+    on_device, active = strained(mesh, rng, device)
+    f = wp.zeros_like(on_device)
+    field = GeneralAnisotropicField(body)
+    body.has_activation = True
+    body.element_activation = active
+    field.scatter_forces(on_device, f)
+    assert_right(f.numpy()[:, :3], leaf_by_leaf(field, active, on_device))
+
+
+def strained(mesh, rng, device):
+    """Displacements, every hundredth node's by an edge and more; and active stress."""
+    u, _ = state(mesh, "corotated", rng)
+    u[:, :3] += np.where(rng.random((len(mesh.points), 1)) < 0.01, random_displacement(mesh, rng, 1.2), 0)
+    active = rng.uniform(0, 1e4, len(mesh.tets))
+    return wp.array(u, dtype=wp.vec4, device=device), wp.array(active, dtype=wp.float32, device=device)
+
+
+def leaf_by_leaf(field, active, u):
+    """Forces [N, 3] of the kernel that test_anisotropy compares with the oracle."""
+    f = wp.zeros_like(u)
+    kernel = scatter_anisotropic(field.body.element_kind, byers_xu)
+    inputs = [field.body.elements, field.material, 1, active, u]
+    wp.launch(kernel, field.element_count, inputs=inputs, outputs=[f], device=u.device)
+    return f.numpy()[:, :3]

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from ..anisotropy import TransverselyIsotropic
+from ..kernels.definite import quaternions_of
 from ..kernels.rotation import quick_rotation
-from ..kernels.subtree_anisotropic import quaternions_of, repair_leaves, scatter_anisotropic_subtrees, scatter_flat
+from ..kernels.subtree_anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
 from ..kernels.subtree_cuda import BLOCK
 from ..mesh import TetForest
 from ..plan import ForcePlan, Plan

@@ -14,8 +14,10 @@ from ..mesh import TetForest
 from ..mesh.forest import MAX_LEVEL
 from ..rotations import METHODS, rotation_function
 from .anisotropic import AnisotropicField, AnisotropicLanesField
+from .anisotropic_general import GeneralAnisotropicField
 from .anisotropic_subtrees import AnisotropicSubtreeField
 from .corotated_field import CorotatedField, LanesField, LeafField
+from .law_general import CorotatedGeneralField
 from .model import Model
 from .subtree_field import SubtreeField
 
@@ -88,6 +90,8 @@ class Corotated(Model):
             raise InputError(f"stiffness {self.stiffness!r} needs a forest; general elements have no three shapes")
         elif fast and body.device.is_cpu:
             return LanesField(body, self, deterministic)
+        elif fast and not deterministic:
+            return CorotatedGeneralField(body, self)
         return LeafField(body, self, deterministic)
 
     def _bind_anisotropic(self, body: SoftBody, deterministic: bool) -> AnisotropicField:
@@ -100,8 +104,8 @@ class Corotated(Model):
         if self.rotation == "warm":
             raise InputError("rotation is 'warm'; with an anisotropic material it must be 'byers-xu' or 'svd'")
         quick = self.own_rotation is quick_rotation
-        if quick and body.device.is_cuda and isinstance(body.mesh, TetForest) and not deterministic:
-            return AnisotropicSubtreeField(body)
+        if quick and body.device.is_cuda and not deterministic:
+            return (AnisotropicSubtreeField if isinstance(body.mesh, TetForest) else GeneralAnisotropicField)(body)
         lanes = quick and body.device.is_cpu
         return (AnisotropicLanesField if lanes else AnisotropicField)(body, self.own_rotation, deterministic)
 
