@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..elasticity.subtree_field import SubtreeField
 from ..errors import InputError
 from ..kernels.integrate import set_start
 from ..kernels.remesh_mark import elongation, marking_kernel
@@ -122,8 +121,7 @@ class Changing:
     def serve(self, field: ForceField) -> None:
         """Let a force field go through what the leaves are, now and after each pass."""
         self.field = field
-        level = getattr(field, "rotation_level", None)
-        self.plan = DevicePlan(self.forest, level, subtrees=isinstance(field, SubtreeField))
+        self.plan = field.plan_of(self.forest)
         body = self.body
         body.elements = self.plan.elements
         self.carried_material.serve(body, self.plan)
