@@ -34,7 +34,7 @@ class Corotated(Model):
     With every element's own rotation the force is the gradient of W and conserves linear and angular momentum. Shared
     rotations are cheaper; they conserve linear momentum only.
 
-    Anisotropic materials keep both momenta too (see ``AnisotropicField``); they go leaf by leaf with own rotations.
+    Anisotropic materials keep both momenta too (see ``AnisotropicField``), always with own rotations.
 
     With the defaults, forests take the fast path: complete three-level subtrees as units of work. Any other rotation,
     iterations or stiffness goes leaf by leaf.
