@@ -140,6 +140,7 @@ def material_strain(g: wp.mat33, m: wp.mat33, r: wp.mat33):
 @functools.cache
 def element_forces(rotation: wp.Function) -> wp.Function:
     """What adds the forces of element t."""
+    forces = listed_forces(rotation)
 
     @wp.func
     def element_forces(
@@ -151,8 +152,28 @@ def element_forces(rotation: wp.Function) -> wp.Function:
         u: wp.array[wp.vec4],
         f: wp.array[wp.vec4],
     ):
+        forces(elements, t, material, is_active, activation, t, u, f)
+
+    return element_forces
+
+
+@functools.cache
+def listed_forces(rotation: wp.Function) -> wp.Function:
+    """What adds the forces of element k of a list that has the material and activation of the mesh's element t."""
+
+    @wp.func
+    def listed_forces(
+        elements: Any,
+        k: int,
+        material: OrthotropicMaterial,
+        is_active: int,
+        activation: wp.array[wp.float32],
+        t: int,
+        u: wp.array[wp.vec4],
+        f: wp.array[wp.vec4],
+    ):
         m = axes_of(material, t)
-        g, turn = material_gradient(elements, t, m, u)
+        g, turn = material_gradient(elements, k, m, u)
         r = rotation(m + g)
         stress, a = turned_stress(material_strain(g, m, r), material, t)
         p = r * (stress + wp.skew(a))
@@ -160,9 +181,9 @@ def element_forces(rotation: wp.Function) -> wp.Function:
             # s (F d) d^T, and d is the first axis.
             pull = activation[t] * column(m + g, 0)
             p += wp.outer(pull, wp.vec3(1.0, 0.0, 0.0))
-        scatter_stress(elements, t, (filled(material, t) * p) * wp.transpose(turn), f)
+        scatter_stress(elements, k, (filled(material, t) * p) * wp.transpose(turn), f)
 
-    return element_forces
+    return listed_forces
 
 
 @functools.cache

@@ -6,6 +6,7 @@ and negates entries (types 0 and 1; four leaves of type 2 also mix them), and P 
 """
 
 import functools
+from collections.abc import Sequence
 
 import warp as wp
 
@@ -19,7 +20,7 @@ from .subtree_forces import columns_of, leaf_forces_of, mat10
 wp.set_module_options({"enable_backward": False})
 
 
-def _first(weights: list[float]) -> int:
+def first_of(weights: Sequence[float]) -> int:
     """The first of a list that is not zero."""
     return next(i for i, weight in enumerate(weights) if abs(weight) > 1e-9)
 
@@ -52,8 +53,8 @@ def law_forces(shape: int, uniform: bool, stress: wp.Function) -> wp.Function:
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
     leaves, frames = LEAVES[shape], FRAMES[shape]
-    rows = [[_first(list(axis)) for axis in frame] for frame in frames]
-    backs = [[_first([frame[i][axis] for i in range(3)]) for axis in range(3)] for frame in frames]
+    rows = [[first_of(axis) for axis in frame] for frame in frames]
+    backs = [[first_of([frame[i][axis] for i in range(3)]) for axis in range(3)] for frame in frames]
     volume = VOLUME[shape]
 
     @wp.func

@@ -9,14 +9,21 @@ import oracle
 import pytest
 import warp as wp
 from cases import oracle_mesh, random_displacement
+from test_anisotropy import made
 from test_miscompile import FORESTS, TOLERANCE, materials, meshed, turned
 from warp_corot.kernels import constitutive
+from warp_corot.kernels.anisotropic import scatter_anisotropic
+from warp_corot.kernels.definite import quaternions_of
 from warp_corot.kernels.general_cuda import corotated_law
-from warp_corot.kernels.rotation import quick_rotation
+from warp_corot.kernels.rotation import byers_xu, quick_rotation
+from warp_corot.kernels.subtree_anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
 from warp_corot.kernels.subtree_cuda import BLOCK
 from warp_corot.kernels.subtree_laws import scatter_subtrees
 
 import warp_corot as wc
+from warp_corot.elasticity.anisotropic import AnisotropicField
+from warp_corot.elasticity.anisotropic_general import GeneralAnisotropicField
+from warp_corot.elasticity.anisotropic_subtrees import as_bytes
 from warp_corot.elasticity.law_general import GeneralScatter
 from warp_corot.plan import ForcePlan
 
@@ -33,13 +40,23 @@ def state(mesh, law, rng):
     return np.pad(u, ((0, 0), (0, 1))), mesh.points + u.astype(float)
 
 
+def by_node(subtrees, device):
+    """Node numbers as kernels for CUDA read them, [10, subtrees]."""
+    if device.is_cpu:
+        transposed = np.ascontiguousarray(subtrees.nodes.numpy().T)
+        subtrees.nodes = subtrees.targets = wp.array(transposed, dtype=wp.int32, device=device)
+
+
 def assert_right(forces, expected):
     wrong = np.abs(forces - expected).max(axis=1) > TOLERANCE * np.abs(expected).max()
     assert not wrong.any(), f"{wrong.sum()} of {wrong.size} nodes"
 
 
-@pytest.mark.parametrize("uniform", [True, False], ids=["one material", "material per element"])
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(
+    ("law", "uniform"),
+    [*((law, False) for law in LAWS), ("neo_hookean", True)],
+    ids=[*LAWS, "neo_hookean, one material"],
+)
 @pytest.mark.parametrize("name", FORESTS)
 def test_subtrees_one_by_one(name, law, uniform, device, rng):
     """All subtrees of a forest, without the leaves that are in none."""
@@ -51,16 +68,13 @@ def test_subtrees_one_by_one(name, law, uniform, device, rng):
     f = wp.zeros_like(on_device)
     plan = ForcePlan.of_forest(mesh, None, wp.get_device(device), grouped=False)
     for batch in plan.batches:
-        subtrees = batch.subtrees
-        if body.device.is_cpu:
-            by_node = np.ascontiguousarray(subtrees.nodes.numpy().T)
-            subtrees.nodes = subtrees.targets = wp.array(by_node, dtype=wp.int32, device=device)
+        by_node(batch.subtrees, body.device)
         kernel = scatter_subtrees(batch.shape, False, uniform, LAWS[law])
-        inputs = [subtrees, body.mu, body.lam, on_device]
+        inputs = [batch.subtrees, body.mu, body.lam, on_device]
         wp.launch(kernel, batch.count, inputs=inputs, outputs=[f], device=device, block_dim=BLOCK)
     inside = np.ones(len(mesh.tets), bool)
     inside[plan.flat.leaves.numpy()] = False
-    assert inside.sum() > 1000
+    assert inside.sum() > 100
     mu, lam = (np.broadcast_to(value, inside.shape)[inside] for value in (mu, lam))
     _, expected = oracle.evaluate(law, oracle.Mesh(mesh.points, mesh.tets[inside]), x, mu, lam)
     assert_right(f.numpy()[:, :3], expected)
@@ -78,3 +92,66 @@ def test_general_elements(law, uniform, device, rng):
     stress = LAWS.get(law) or corotated_law(quick_rotation)
     GeneralScatter(body.elements, stress)([body.mu, body.lam, body.material_stride], on_device, f)
     assert_right(f.numpy()[:, :3], oracle.evaluate(law, oracle_mesh(mesh), x, mu, lam)[1])
+
+
+@pytest.mark.parametrize("kind", ["muscle", "wood", "muscle field", "wood field"])
+@pytest.mark.parametrize("name", FORESTS)
+def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
+    """Every hundredth node is displaced by an edge and more, so that some leaves are left to the robust rotation; and
+    active stress."""
+    mesh = meshed(name)
+    material, _ = made(kind, mesh, rng)
+    body = wc.SoftBody(mesh, material, device=device)
+    on_device, active = strained(mesh, rng, device)
+    whole = AnisotropicField(body, byers_xu, False)
+    axes = wp.empty(len(whole.material.axes), dtype=wp.quat, device=device)
+    wp.launch(quaternions_of, len(axes), inputs=[whole.material.axes], outputs=[axes], device=device)
+    options = ("muscle" in kind, whole.material.axes_stride == 0, whole.material.stride == 0)
+    plan = ForcePlan.of_forest(mesh, None, wp.get_device(device), grouped=False)
+    f, flags = wp.zeros_like(on_device), 0
+    for batch in plan.batches:
+        by_node(batch.subtrees, body.device)
+        left = wp.zeros(-(-batch.count // 8), dtype=wp.uint64, device=device)
+        kernel = scatter_anisotropic_subtrees(batch.shape, False, *options)
+        inputs = [batch.subtrees, whole.material, axes, 1, active, on_device]
+        wp.launch(kernel, batch.count, inputs=inputs, outputs=[f, as_bytes(left)], device=device, block_dim=BLOCK)
+        inputs = [left, batch.subtrees.first, body.elements, whole.material, 1, active, on_device]
+        wp.launch(repair_leaves, 8 * len(left), inputs=inputs, outputs=[f], device=device)
+        flags += np.unpackbits(as_bytes(left).numpy()).sum()
+    flat = plan.flat
+    if len(flat):
+        inputs = [flat.elements, flat.leaves, whole.material, 1, active, on_device]
+        wp.launch(scatter_flat, len(flat), inputs=inputs, outputs=[f], device=device)
+    assert 0 < flags < 0.3 * len(mesh.tets)
+    assert_right(f.numpy()[:, :3], leaf_by_leaf(whole, active, on_device))
+
+
+@pytest.mark.parametrize("kind", ["muscle", "wood", "muscle field", "wood field"])
+def test_anisotropic_general_elements(kind, device, rng):
+    mesh = meshed("general")
+    material, _ = made(kind, mesh, rng)
+    body = wc.SoftBody(mesh, material, device=device)
+    on_device, active = strained(mesh, rng, device)
+    f = wp.zeros_like(on_device)
+    field = GeneralAnisotropicField(body)
+    body.has_activation = True
+    body.element_activation = active
+    field.scatter_forces(on_device, f)
+    assert_right(f.numpy()[:, :3], leaf_by_leaf(field, active, on_device))
+
+
+def strained(mesh, rng, device):
+    """Displacements, every hundredth node's by an edge and more; and active stress."""
+    u, _ = state(mesh, "corotated", rng)
+    u[:, :3] += np.where(rng.random((len(mesh.points), 1)) < 0.01, random_displacement(mesh, rng, 1.2), 0)
+    active = rng.uniform(0, 1e4, len(mesh.tets))
+    return wp.array(u, dtype=wp.vec4, device=device), wp.array(active, dtype=wp.float32, device=device)
+
+
+def leaf_by_leaf(field, active, u):
+    """Forces [N, 3] of the kernel that test_anisotropy compares with the oracle."""
+    f = wp.zeros_like(u)
+    kernel = scatter_anisotropic(field.body.element_kind, byers_xu)
+    inputs = [field.body.elements, field.material, 1, active, u]
+    wp.launch(kernel, field.element_count, inputs=inputs, outputs=[f], device=u.device)
+    return f.numpy()[:, :3]

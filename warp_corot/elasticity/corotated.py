@@ -14,7 +14,10 @@ from ..mesh import TetForest
 from ..mesh.forest import MAX_LEVEL
 from ..rotations import METHODS, rotation_function
 from .anisotropic import AnisotropicField, AnisotropicLanesField
+from .anisotropic_general import GeneralAnisotropicField
+from .anisotropic_subtrees import AnisotropicSubtreeField
 from .corotated_field import CorotatedField, LanesField, LeafField
+from .law_general import CorotatedGeneralField
 from .model import Model
 from .subtree_field import SubtreeField
 
@@ -31,7 +34,7 @@ class Corotated(Model):
     With every element's own rotation the force is the gradient of W and conserves linear and angular momentum. Shared
     rotations are cheaper; they conserve linear momentum only.
 
-    Anisotropic materials keep both momenta too (see ``AnisotropicField``); they go leaf by leaf with own rotations.
+    Anisotropic materials keep both momenta too (see ``AnisotropicField``), always with own rotations.
 
     With the defaults, forests take the fast path: complete three-level subtrees as units of work. Any other rotation,
     iterations or stiffness goes leaf by leaf.
@@ -87,6 +90,8 @@ class Corotated(Model):
             raise InputError(f"stiffness {self.stiffness!r} needs a forest; general elements have no three shapes")
         elif fast and body.device.is_cpu:
             return LanesField(body, self, deterministic)
+        elif fast and not deterministic:
+            return CorotatedGeneralField(body, self)
         return LeafField(body, self, deterministic)
 
     def _bind_anisotropic(self, body: SoftBody, deterministic: bool) -> AnisotropicField:
@@ -98,7 +103,10 @@ class Corotated(Model):
                 raise InputError(f"{name} is {given!r}; with an anisotropic material it must be {wanted!r}")
         if self.rotation == "warm":
             raise InputError("rotation is 'warm'; with an anisotropic material it must be 'byers-xu' or 'svd'")
-        lanes = body.device.is_cpu and self.own_rotation is quick_rotation
+        quick = self.own_rotation is quick_rotation
+        if quick and body.device.is_cuda and not deterministic:
+            return (AnisotropicSubtreeField if isinstance(body.mesh, TetForest) else GeneralAnisotropicField)(body)
+        lanes = quick and body.device.is_cpu
         return (AnisotropicLanesField if lanes else AnisotropicField)(body, self.own_rotation, deterministic)
 
     @property

@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from ..kernels.general_cuda import BLOCK, PosedElements, scatter_general
+from ..kernels.general_cuda import BLOCK, PosedElements, corotated_law, scatter_general
+from .corotated_field import LeafField
 from .model import LawField
 
 if TYPE_CHECKING:
     from ..body import SoftBody
+    from .corotated import Corotated
 
 
 class LawGeneralField(LawField):
@@ -34,6 +36,17 @@ class LawGeneralField(LawField):
     ):
         super().__init__(body, stress=stress, energy=energy, cauchy=cauchy, deterministic=deterministic)
         self._scatter = GeneralScatter(self.elements, stress)
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        self._scatter(self.material_inputs, u, f)
+
+
+class CorotatedGeneralField(LeafField):
+    """The corotated law with own rotations on general elements whose forces need no settled order."""
+
+    def __init__(self, body: SoftBody, model: Corotated):
+        super().__init__(body, model, deterministic=False)
+        self._scatter = GeneralScatter(self.elements, corotated_law(model.own_rotation))
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         self._scatter(self.material_inputs, u, f)
