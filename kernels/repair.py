@@ -99,7 +99,7 @@ def root_rotation(roots: ForestElements, s: int, u: wp.array[wp.vec4]):
     return robust_rotation(q + local_gradient(roots, s, u)) * wp.transpose(q)
 
 
-# --- by a list -------------------------------------------------------------------------------------------------------
+# --- by a list ------------------------------------------------------------------------------------------------------
 
 
 @wp.kernel(enable_backward=False, grid_stride=False)
@@ -169,7 +169,7 @@ def repair_listed_shared(
     leave(listed, threads // LIST_BLOCK)
 
 
-# --- by bytes, in order ------------------------------------------------------------------------------------------------
+# --- by bytes, in order ---------------------------------------------------------------------------------------------
 
 
 @wp.func

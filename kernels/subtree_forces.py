@@ -24,9 +24,9 @@ mat10 = wp.types.matrix(shape=(10, 3), dtype=wp.float32)
 #: What a mask of left-out leaves is where the whole subtree is.
 ALL_LEAVES = wp.constant(255)
 
-#: Largest component of a displacement relative to the first node's, in edge lengths of a leaf, for ``small_forces``. Its
-#: series is then right to 1e-5 of the stress where neighbouring nodes move against each other, to 1e-8 where strain is
-#: smooth. Beyond, the error of 1.5e-7 is at most 1e-4 of the strain.
+#: Largest component of a displacement relative to the first node's, in edge lengths of a leaf, for ``small_forces``.
+#: Its series is then right to 2e-5 of the stress where neighbouring nodes move against each other, to 1e-8 where strain
+#: is smooth. Beyond, the error of 1.5e-7 is at most 1e-4 of the strain.
 SMALL = wp.constant(0.01)
 
 
@@ -132,6 +132,25 @@ def small_strain_stress(e: wp.mat33, h: wp.mat33, mu: float, lam: float):
     s[1, 1] += pressure
     s[2, 2] += pressure
     return s + h * s
+
+
+@wp.func
+def leaf_stress(g: wp.mat33, q: wp.mat33, mu: float, lam: float):
+    """First Piola-Kirchhoff stress times Q of one leaf with its own rotation, and whether it may be trusted."""
+    p = wp.mat33()
+    trusted = bool(True)
+    far = wp.max(wp.abs(g[0]))
+    far = wp.max(far, wp.max(wp.abs(g[1])))
+    far = wp.max(far, wp.max(wp.abs(g[2])))
+    if far < SMALL:
+        w = wp.transpose(q) * g
+        p = q * small_strain_stress(w + wp.transpose(w) + wp.transpose(g) * g, w, mu, lam)
+    else:
+        f = q + g
+        z0, z1, z2, trusted = newton_rotation(column(f, 0), column(f, 1), column(f, 2), 1.0)
+        r = wp.static(0.5**ITERATIONS) * wp.matrix_from_cols(z0, z1, z2)
+        p = (2.0 * mu) * f + (lam * (wp.ddot(r, f) - 3.0) - 2.0 * mu) * r
+    return p, trusted
 
 
 @functools.cache
@@ -323,7 +342,7 @@ def turned_back_of(shape: int) -> wp.Function:
 def shared_forces(shape: int, uniform: bool, given: bool, chosen: range = range(8)) -> wp.Function:
     """Forces of the chosen leaves from ten displacements, all with one rotation, and which are left out: none or all.
 
-    The rotation is the subtree root's or a given one; ``turn`` is the given one times the subtree's frame ``q``. The ten
+    The rotation is the subtree root's or a given one; ``turn`` is the given one times the subtree's frame ``q``. Ten
     displacements are turned back once; in the subtree's own frame the leaves are linear elements.
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
