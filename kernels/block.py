@@ -19,7 +19,7 @@ from .integrate import is_finite, symplectic_euler_velocity, vector_at
 from .rotation import column, identity3, robust_rotation
 from .shapes import VOLUME, fingerprint
 from .subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS
-from .subtree_forces import columns_of, leaf_forces_of, mat10, own_forces, shared_forces
+from .subtree_forces import columns_of, leaf_forces_of, mat10, near_forces, shared_forces
 
 wp.set_module_options({"enable_backward": False})
 
@@ -227,7 +227,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
     """
     shape, shared, uniform, parts = layout.shape, layout.shared, layout.uniform, layout.parts
     capacity, threads, zero_slot = layout.subtrees, layout.threads, layout.slot_count
-    own = [own_forces(shape, uniform, layout.leaves(part)) for part in range(parts)]
+    own = [near_forces(shape, uniform, layout.tolerance, layout.leaves(part)) for part in range(parts)]
     turned = [shared_forces(shape, uniform, False, layout.leaves(part)) for part in range(parts)]
     needs, places = [layout.needs(part) for part in range(parts)], layout.places
     displacement, velocity = shared_vectors(layout.nodes, "displacements"), shared_vectors(layout.nodes, "velocities")

@@ -31,7 +31,7 @@ from .elements import (
 from .newton_merging import add_four_forces
 from .repair import LeftOut, append
 from .subtree import GROUP_NODES, SLOT_STRIDE, group_slots, group_sources
-from .subtree_forces import leaf_stress, mat10, own_forces, shared_forces
+from .subtree_forces import leaf_stress, mat10, near_forces, shared_forces
 
 wp.set_module_options({"enable_backward": False})
 
@@ -176,15 +176,24 @@ def _memory(shape: int, grouped: bool) -> tuple[wp.Function, wp.Function]:
 
 
 @functools.cache
-def scatter_subtrees_own(shape: int, grouped: bool, uniform: bool, listed: bool) -> wp.Kernel:
+def scatter_subtrees_own(
+    shape: int, grouped: bool, uniform: bool, listed: bool, tolerance: float | None = None
+) -> wp.Kernel:
     """Corotated forces of subtrees of one type, every leaf with its own rotation. Launch with block_dim BLOCK.
 
-    ``listed`` says whether subtrees with leaves that are left out are put on a list.
+    ``listed`` says whether subtrees with leaves that are left out are put on a list; with a ``tolerance`` the root's
+    rotation is taken where it is near enough (``subtree_forces.shared_forces``).
     """
     load, add = _memory(shape, grouped)
-    forces = own_forces(shape, uniform)
+    forces = near_forces(shape, uniform, tolerance)
+    resident = RESIDENT[shape] if uniform and tolerance is None else min(RESIDENT)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, RESIDENT[shape]))
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        grid_stride=False,
+        launch_bounds=(BLOCK, resident),
+    )
     def scatter_subtrees_own(
         # In
         subtrees: Subtrees,
@@ -257,10 +266,10 @@ def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: boo
 
 
 @functools.cache
-def _scatter_subtree(shape: int, uniform: bool) -> wp.Function:
+def _scatter_subtree(shape: int, uniform: bool, tolerance: float | None) -> wp.Function:
     """One subtree of a stretch; all shapes share the memory that groups meet in."""
     load_group, merge_group = _group_memory((0, 1, 2))
-    forces = own_forces(shape, uniform)
+    forces = near_forces(shape, uniform, tolerance)
 
     @wp.func
     def scatter_subtree(
@@ -292,12 +301,12 @@ def _scatter_subtree(shape: int, uniform: bool) -> wp.Function:
 
 
 @functools.cache
-def scatter_stretches(uniform: bool) -> wp.Kernel:
+def scatter_stretches(uniform: bool, tolerance: float | None = None) -> wp.Kernel:
     """Corotated forces of all subtrees and other leaves of a body, every leaf with its own rotation.
 
     Launch with block_dim BLOCK and whole blocks.
     """
-    subtree0, subtree1, subtree2 = (_scatter_subtree(shape, uniform) for shape in range(3))
+    subtree0, subtree1, subtree2 = (_scatter_subtree(shape, uniform, tolerance) for shape in range(3))
     add_neighbours = add_four_forces(2)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, min(RESIDENT)))

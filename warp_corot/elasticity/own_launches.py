@@ -26,11 +26,12 @@ class OwnLaunches:
     Args:
         elements: The leaves of all worlds, ``kernels.elements.ForestElements``.
         material: mu, lambda and their stride.
+        tolerance: How near a subtree root's rotation must be to be used in place of own ones [rad]; None: never.
     """
 
-    def __init__(self, plan: Plan, elements: Any, material: list):
+    def __init__(self, plan: Plan, elements: Any, material: list, tolerance: float | None = None):
         self._device = elements.nodes.device
-        self._elements, self._material = elements, material
+        self._elements, self._material, self._tolerance = elements, material, tolerance
         batches, self._flat = list(plan.batches), plan.flat
         self._clusters: Any = None
         if isinstance(plan, ForcePlan) and len(plan.flat):
@@ -47,14 +48,14 @@ class OwnLaunches:
 
     @staticmethod
     def suit(plan: Plan) -> bool:
-        """Whether all rotations are own ones, and there is more than one batch or leaves in none."""
+        """Whether all rotations are own ones, and there is more than one batch, or may come to be."""
         own = all(batch.sharing is Sharing.OWN for batch in plan.batches) and plan.units is None
-        return own and (len(plan.batches) > 1 or len(plan.flat) > 0)
+        return own and (not isinstance(plan, ForcePlan) or len(plan.batches) > 1 or len(plan.flat) > 0)
 
     @staticmethod
-    def load(uniform: bool, device: wp.Device) -> None:
+    def load(uniform: bool, tolerance: float | None, device: wp.Device) -> None:
         """Compile now what launches over a mesh that changes will need."""
-        wp.load_module(scatter_stretches(uniform).module, device, block_dim=BLOCK)
+        wp.load_module(scatter_stretches(uniform, tolerance).module, device, block_dim=BLOCK)
         wp.load_module(repair_listed_own.module, device, block_dim=LIST_BLOCK)
 
     def scatter_forces(self, u: wp.array, f: wp.array, left_out: Any) -> None:
@@ -62,7 +63,7 @@ class OwnLaunches:
         mu, lam, stride = self._material
         if self._stretches is not None:
             wp.launch(
-                scatter_stretches(stride == 0),
+                scatter_stretches(stride == 0, self._tolerance),
                 dim=self._blocks * BLOCK,
                 inputs=[self._stretches, self._flat.elements, self._flat.leaves, mu, lam, u],
                 outputs=[f, left_out],

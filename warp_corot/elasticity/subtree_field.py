@@ -40,7 +40,7 @@ class SubtreeField(CorotatedField):
             assert isinstance(body.mesh, TetForest)
             self._go_through(
                 ForcePlan.of_forest(
-                    body.mesh, model.rotation_level, self.device, worlds=body.worlds, deterministic=self.deterministic
+                    body.mesh, model.level, self.device, worlds=body.worlds, deterministic=self.deterministic
                 )
             )
 
@@ -51,7 +51,7 @@ class SubtreeField(CorotatedField):
 
     def _load_kernels(self, plan: DevicePlan) -> None:
         """Everything that any mesh may come to need, so that nothing is compiled once steps are made."""
-        for shape, grouped, sharing in plan.kinds:
+        for shape, grouped, sharing in () if self._listed and not plan.rotation_shared else plan.kinds:
             kernel = self._kernel(shape, grouped, sharing)
             wp.load_module(kernel.module, self.device, block_dim=self._block)
         single = [self._forces, self._own, self._extract, repair_own]
@@ -60,7 +60,7 @@ class SubtreeField(CorotatedField):
         for kernel in single:
             wp.load_module(kernel.module, self.device)
         if self.device.is_cuda:
-            OwnLaunches.load(self._uniform, self.device)
+            OwnLaunches.load(self._uniform, self.model.tolerance, self.device)
 
     @property
     def _block(self) -> int:
@@ -84,7 +84,7 @@ class SubtreeField(CorotatedField):
         if self._listed:
             self._left_out = LeftOutLeaves.of(plan, self.device)
             if OwnLaunches.suit(plan):
-                self._own_launches = OwnLaunches(plan, self.elements, self.material_inputs)
+                self._own_launches = OwnLaunches(plan, self.elements, self.material_inputs, self.model.tolerance)
                 return
         self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]
         self._flat_material = self.material_inputs
@@ -134,7 +134,9 @@ class SubtreeField(CorotatedField):
         given = sharing is Sharing.ABOVE
         if self.device.is_cuda:
             if sharing is Sharing.OWN:
-                return subtree_cuda.scatter_subtrees_own(shape, grouped, self._uniform, self._listed)
+                return subtree_cuda.scatter_subtrees_own(
+                    shape, grouped, self._uniform, self._listed, self.model.tolerance
+                )
             return subtree_cuda.scatter_subtrees_shared(shape, grouped, self._uniform, given, self._listed)
         if sharing is Sharing.OWN:
             return subtree_cpu.scatter_subtrees_own(shape)
