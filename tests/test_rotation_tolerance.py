@@ -50,7 +50,7 @@ def own(forest, u):
     return reference, F, oracle.evaluate("corotated", reference, x, MU, LAM)[1]
 
 
-@pytest.mark.parametrize("tolerance", [0.01, AUTO_TOLERANCE, 0.2])
+@pytest.mark.parametrize("tolerance", [0.01, AUTO_TOLERANCE, 0.3])
 @pytest.mark.parametrize("radius", [10.0, 1.0, 0.3])
 @pytest.mark.parametrize("level", [6, 7, 8])
 def test_error_of_the_force_is_bounded(level, radius, tolerance, device):
@@ -77,7 +77,7 @@ def test_both_kinds_are_used(device):
     u = np.where(
         (z > 0.15)[:, None], bent(forest.points - [0, 0, 0.15], 0.15), bent(forest.points - [0, 0, 0.15], 20.0)
     )
-    found, _ = forces(forest, u, AUTO_TOLERANCE, device)
+    found, _ = forces(forest, u, 0.05, device)
     _, _, expected = own(forest, u)
     error = np.linalg.norm(found - expected, axis=1) / np.abs(expected).max()
     assert error[z < 0.1].max() > 1e-6  # shared
