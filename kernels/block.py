@@ -19,7 +19,7 @@ from .integrate import is_finite, symplectic_euler_velocity, vector_at
 from .rotation import column, identity3, robust_rotation
 from .shapes import VOLUME, fingerprint
 from .subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS
-from .subtree_forces import columns_of, leaf_forces_of, mat10, own_forces, shared_forces
+from .subtree_forces import columns_of, leaf_forces_of, mat10, near_forces, shared_forces
 
 wp.set_module_options({"enable_backward": False})
 
@@ -68,7 +68,7 @@ def lowest_bit(bits: int) -> int: ...
 def shuffle_down(value: wp.vec3, distance: int) -> wp.vec3: ...
 
 
-def _memory(count: int, tag: str) -> wp.Function:
+def shared_vectors(count: int, tag: str) -> wp.Function:
     """An array of vectors in shared memory, as one function that reads or writes it; ``LOAD_BYTES`` counts in bytes."""
 
     snippet = f"""
@@ -168,7 +168,7 @@ def _repair_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -> 
     ):
         """Add the forces of the leaves that were left out, one by one with the robust rotation, to the part's slots.
 
-        ``maubach`` is the subtree's frame, left-handed if ``mirror`` is -1; ``material`` is where the first leaf's stands.
+        ``maubach`` is the subtree's frame, left-handed if ``mirror`` is -1; ``material`` is the first leaf's place.
         """
         inv_h = 1.0 / h
         area = wp.static(VOLUME[shape]) * h * h
@@ -227,11 +227,11 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
     """
     shape, shared, uniform, parts = layout.shape, layout.shared, layout.uniform, layout.parts
     capacity, threads, zero_slot = layout.subtrees, layout.threads, layout.slot_count
-    own = [own_forces(shape, uniform, layout.leaves(part)) for part in range(parts)]
+    own = [near_forces(shape, uniform, layout.tolerance, layout.leaves(part)) for part in range(parts)]
     turned = [shared_forces(shape, uniform, False, layout.leaves(part)) for part in range(parts)]
     needs, places = [layout.needs(part) for part in range(parts)], layout.places
-    displacement, velocity = _memory(layout.nodes, "displacements"), _memory(layout.nodes, "velocities")
-    slot = _memory(zero_slot + 1, "forces")
+    displacement, velocity = shared_vectors(layout.nodes, "displacements"), shared_vectors(layout.nodes, "velocities")
+    slot = shared_vectors(zero_slot + 1, "forces")
     repair = _repair_of(layout, displacement, slot)
 
     @wp.kernel(

@@ -38,6 +38,7 @@ class Layout:
         subtrees: Room for subtrees, whole warps of them.
         nodes: Room for nodes.
         tasks: Sums that make up the nodes' forces, whole warps of them; see ``TASK_SLOTS``.
+        tolerance: How near the subtree root's rotation must be to be used in place of own ones [rad]; None: never.
     """
 
     shape: int
@@ -47,6 +48,7 @@ class Layout:
     subtrees: int
     nodes: int
     tasks: int = 0
+    tolerance: float | None = None
 
     @property
     def threads(self) -> int:
@@ -91,4 +93,5 @@ class Layout:
     def needs(self, part: int) -> list[bool]:
         """Which of a subtree's ten nodes a part reads: the first, from which all is measured, and the root's for a
         shared rotation."""
-        return [place >= 0 or node == 0 or (self.shared and node < 4) for node, place in enumerate(self.places[part])]
+        needs_root = self.shared or self.tolerance is not None
+        return [place >= 0 or node == 0 or (needs_root and node < 4) for node, place in enumerate(self.places[part])]

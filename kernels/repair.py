@@ -105,7 +105,7 @@ def root_rotation(roots: ForestElements, s: int, u: wp.array[wp.vec4]):
     return robust_rotation(q + local_gradient(roots, s, u)) * wp.transpose(q)
 
 
-# --- by a list -------------------------------------------------------------------------------------------------------
+# --- by a list ------------------------------------------------------------------------------------------------------
 
 
 @wp.kernel(enable_backward=False, grid_stride=False)
@@ -175,7 +175,7 @@ def repair_listed_shared(
     leave(listed, threads // LIST_BLOCK)
 
 
-# --- by bytes, in order ------------------------------------------------------------------------------------------------
+# --- by bytes, in order ---------------------------------------------------------------------------------------------
 
 
 @wp.func

@@ -9,9 +9,9 @@ step, and that is what is tested here against the paper's 3.85e-5.
 is positive definite (Kugelstadt, Koschier and Bender 2018).
 
 Newton's iteration has no answer for a singular F and gives a reflection for an inverted one. Both are left to
-``robust_rotation``: tr(R^T F) = q^T K q for the quaternion q of R and a symmetric 4x4 matrix K of F's entries (Davenport;
-Horn 1987; Higham and Noferini 2016), so the quaternion sought is K's dominant eigenvector for every F. It takes a fixed
-number of operations and no SVD.
+``robust_rotation``: tr(R^T F) = q^T K q for the quaternion q of R and a symmetric 4x4 matrix K of F's entries
+(Davenport; Horn 1987; Higham and Noferini 2016), so the quaternion sought is K's dominant eigenvector for every F. It
+takes a fixed number of operations and no SVD.
 """
 
 import warp as wp
@@ -37,9 +37,10 @@ UNCONVERGED = wp.constant(1.0e-3)
 # Iterations that may follow them: enough for principal stretches of 1e4 or 1e-4, each halves what is far from one.
 MORE_ITERATIONS = wp.constant(12)
 
-# Of the dominant eigenvector of K: Newton steps on the quartic, the least slope over |F|^3 for one, what is added to the
-# root over |F|, squarings of the resolvent, and quaternion steps. Chosen on 1e5 matrices, a tenth mirrored: where
-# (sigma_2 + sign(det F) sigma_3) / sigma_1 > 0.1 the largest error was 3e-6; tr(R^T F) was never 0.5 % below its maximum.
+# Of the dominant eigenvector of K: Newton steps on the quartic, the least slope over |F|^3 for one, what is added to
+# the root over |F|, squarings of the resolvent, and quaternion steps. Chosen on 1e5 matrices, a tenth mirrored: where
+# (sigma_2 + sign(det F) sigma_3) / sigma_1 > 0.1 the largest error was 3e-6, and tr(R^T F) was never 0.5 % below its
+# maximum.
 ROOT_STEPS = wp.constant(6)
 LEAST_SLOPE = wp.constant(0.01)
 ROOT_MARGIN = wp.constant(2.0e-3)
@@ -206,8 +207,8 @@ def davenport(f: wp.mat33):
 def largest_root(f: wp.mat33):
     """The largest eigenvalue of K, sigma_1 + sigma_2 + sign(det F) sigma_3, a little too large, for F of order one.
 
-    Newton's iteration on the characteristic polynomial, whose roots are all real, descends from above; where two of them
-    nearly meet it stays that far above, and where its slope vanishes it stays.
+    Newton's iteration on the characteristic polynomial, whose roots are all real, descends from above. Where roots
+    nearly meet it ends that far above them, and where the slope vanishes it stops.
     """
     c = cofactor(f)
     n2 = wp.ddot(f, f)
@@ -255,8 +256,8 @@ def symmetric_adjugate(m: wp.mat44):
 def dominant_quaternion(f: wp.mat33):
     """The quaternion of the rotation of F, for F of order one.
 
-    The adjugate of (root I - K) is its inverse but for a factor, and exists where eigenvalues meet; its powers leave the
-    dominant eigenvector alone.
+    The adjugate of (root I - K) is its inverse but for a factor, and exists where eigenvalues meet. In its powers the
+    dominant eigenvector outgrows the others.
     """
     k = davenport(f)
     root = largest_root(f)

@@ -2,8 +2,8 @@
 
 Three things make it fast. Forces are summed over the eight leaves in registers, and over a group of eight subtrees in
 shared memory, by a table that tells each lane which slots to add up, so that nothing is added atomically twice. What
-leaves for global memory are 16-byte vector reductions where the card has them. And rotations are found by a few unscaled
-iterations.
+leaves for global memory are 16-byte vector reductions where the card has them. And rotations are found by a few
+unscaled iterations.
 
 A leaf that these do not turn adds nothing. Its bit is set in its subtree's byte, and the subtree is put on a list;
 ``repair`` does those leaves. Bodies of one type of subtree alone have a kernel of their own; all others are one launch,
@@ -30,14 +30,13 @@ from .elements import (
 )
 from .newton_merging import add_four_forces
 from .repair import LeftOut, append
-from .rotation import ITERATIONS, column, newton_rotation
 from .subtree import GROUP_NODES, SLOT_STRIDE, group_slots, group_sources
-from .subtree_forces import SMALL, mat10, own_forces, shared_forces, small_strain_stress
+from .subtree_forces import leaf_stress, mat10, near_forces, shared_forces
 
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 128
-#: Blocks of a multiprocessor that registers must leave room for, by type: as many as forces without ``small_forces`` do.
+#: Blocks that a multiprocessor's registers must have room for, by type: as many as without ``small_forces``.
 RESIDENT = (6, 5, 5)
 #: What ``Stretch.shape`` is for leaves in no subtree.
 FLAT = 3
@@ -177,15 +176,24 @@ def memory_of(shape: int, grouped: bool) -> tuple[wp.Function, wp.Function]:
 
 
 @functools.cache
-def scatter_subtrees_own(shape: int, grouped: bool, uniform: bool, listed: bool) -> wp.Kernel:
+def scatter_subtrees_own(
+    shape: int, grouped: bool, uniform: bool, listed: bool, tolerance: float | None = None
+) -> wp.Kernel:
     """Corotated forces of subtrees of one type, every leaf with its own rotation. Launch with block_dim BLOCK.
 
-    ``listed`` says whether subtrees with leaves that are left out are put on a list.
+    ``listed`` says whether subtrees with leaves that are left out are put on a list; with a ``tolerance`` the root's
+    rotation is taken where it is near enough (``subtree_forces.shared_forces``).
     """
     load, add = memory_of(shape, grouped)
-    forces = own_forces(shape, uniform)
+    forces = near_forces(shape, uniform, tolerance)
+    resident = RESIDENT[shape] if uniform and tolerance is None else min(RESIDENT)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, RESIDENT[shape]))
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        grid_stride=False,
+        launch_bounds=(BLOCK, resident),
+    )
     def scatter_subtrees_own(
         # In
         subtrees: Subtrees,
@@ -205,9 +213,8 @@ def scatter_subtrees_own(shape: int, grouped: bool, uniform: bool, listed: bool)
         x = load(subtrees, s, u)
         g, mask = forces(x, q, h, mirror, mu, lam, wp.where(wp.static(uniform), 0, subtrees.first[s]))
         flagged[s] = wp.uint8(mask)
-        if wp.static(listed):
-            if mask != 0:
-                append(left_out, subtrees.first[s], mask)
+        if wp.static(listed) and mask != 0:
+            append(left_out, subtrees.first[s], mask)
         add(subtrees, s, g, f)
 
     return scatter_subtrees_own
@@ -248,41 +255,21 @@ def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: boo
         g, mask = forces(x, q, h, mirror, turn, mu, lam, wp.where(wp.static(uniform), 0, subtrees.first[s]))
         if wp.static(not given):
             flagged[s] = wp.uint8(mask)
-            if wp.static(listed):
-                if mask != 0:
-                    append(left_out, s, mask)
+        if wp.static(listed and not given) and mask != 0:
+            append(left_out, s, mask)
         add(subtrees, s, g, f)
 
     return scatter_subtrees_shared
 
 
-# --- all of a body in one launch ---------------------------------------------------------------------------------------
-
-
-@wp.func
-def flat_stress(g: wp.mat33, q: wp.mat33, mu: float, lam: float):
-    """First Piola-Kirchhoff stress times Q of a leaf with its own rotation, and whether it may be trusted."""
-    p = wp.mat33()
-    trusted = bool(True)
-    far = wp.max(wp.abs(g[0]))
-    far = wp.max(far, wp.max(wp.abs(g[1])))
-    far = wp.max(far, wp.max(wp.abs(g[2])))
-    if far < SMALL:
-        w = wp.transpose(q) * g
-        p = q * small_strain_stress(w + wp.transpose(w) + wp.transpose(g) * g, w, mu, lam)
-    else:
-        f = q + g
-        z0, z1, z2, trusted = newton_rotation(column(f, 0), column(f, 1), column(f, 2), 1.0)
-        r = wp.static(0.5**ITERATIONS) * wp.matrix_from_cols(z0, z1, z2)
-        p = (2.0 * mu) * f + (lam * (wp.ddot(r, f) - 3.0) - 2.0 * mu) * r
-    return p, trusted
+# --- all of a body in one launch ------------------------------------------------------------------------------------
 
 
 @functools.cache
-def _scatter_subtree(shape: int, uniform: bool) -> wp.Function:
+def _scatter_subtree(shape: int, uniform: bool, tolerance: float | None) -> wp.Function:
     """One subtree of a stretch; all shapes share the memory that groups meet in."""
     load_group, merge_group = _group_memory((0, 1, 2))
-    forces = own_forces(shape, uniform)
+    forces = near_forces(shape, uniform, tolerance)
 
     @wp.func
     def scatter_subtree(
@@ -300,7 +287,7 @@ def _scatter_subtree(shape: int, uniform: bool) -> wp.Function:
         x = mat10()
         if grouped:
             x = load_group(subtrees.nodes, s // 8, wp.static(shape), u)
-        else:
+        if not grouped:
             x = load_single(subtrees, s, u)
         material = wp.where(wp.static(uniform), 0, subtrees.first[s])
         g, mask = forces(x, q, h, mirror_sign(code), mu, lam, material)
@@ -314,12 +301,12 @@ def _scatter_subtree(shape: int, uniform: bool) -> wp.Function:
 
 
 @functools.cache
-def scatter_stretches(uniform: bool) -> wp.Kernel:
+def scatter_stretches(uniform: bool, tolerance: float | None = None) -> wp.Kernel:
     """Corotated forces of all subtrees and other leaves of a body, every leaf with its own rotation.
 
     Launch with block_dim BLOCK and whole blocks.
     """
-    subtree0, subtree1, subtree2 = (_scatter_subtree(shape, uniform) for shape in range(3))
+    subtree0, subtree1, subtree2 = (_scatter_subtree(shape, uniform, tolerance) for shape in range(3))
     add_neighbours = add_four_forces(2)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, min(RESIDENT)))
@@ -348,7 +335,7 @@ def scatter_stretches(uniform: bool) -> wp.Kernel:
             if wp.static(not uniform):
                 m = flat_leaves[s]
             u0, u1, u2, u3 = node_displacements(flat.nodes[s], u)
-            p, trusted = flat_stress(gradient_of(flat, s, u0, u1, u2, u3), frame(flat, s), mu[m], lam[m])
+            p, trusted = leaf_stress(gradient_of(flat, s, u0, u1, u2, u3), frame(flat, s), mu[m], lam[m])
             if not trusted:
                 p = wp.mat33()
                 append(left_out, flat_leaves[s], 1)

@@ -24,9 +24,9 @@ mat10 = wp.types.matrix(shape=(10, 3), dtype=wp.float32)
 #: What a mask of left-out leaves is where the whole subtree is.
 ALL_LEAVES = wp.constant(255)
 
-#: Largest component of a displacement relative to the first node's, in edge lengths of a leaf, for ``small_forces``. Its
-#: series is then right to 1e-5 of the stress where neighbouring nodes move against each other, to 1e-8 where strain is
-#: smooth. Beyond, the error of 1.5e-7 is at most 1e-4 of the strain.
+#: Largest component of a displacement relative to the first node's, in edge lengths of a leaf, for ``small_forces``.
+#: Its series is then right to 2e-5 of the stress where neighbouring nodes move against each other, to 1e-8 where strain
+#: is smooth. Beyond, the error of 1.5e-7 is at most 1e-4 of the strain.
 SMALL = wp.constant(0.01)
 
 
@@ -132,6 +132,25 @@ def small_strain_stress(e: wp.mat33, h: wp.mat33, mu: float, lam: float):
     s[1, 1] += pressure
     s[2, 2] += pressure
     return s + h * s
+
+
+@wp.func
+def leaf_stress(g: wp.mat33, q: wp.mat33, mu: float, lam: float):
+    """First Piola-Kirchhoff stress times Q of one leaf with its own rotation, and whether it may be trusted."""
+    p = wp.mat33()
+    trusted = bool(True)
+    far = wp.max(wp.abs(g[0]))
+    far = wp.max(far, wp.max(wp.abs(g[1])))
+    far = wp.max(far, wp.max(wp.abs(g[2])))
+    if far < SMALL:
+        w = wp.transpose(q) * g
+        p = q * small_strain_stress(w + wp.transpose(w) + wp.transpose(g) * g, w, mu, lam)
+    else:
+        f = q + g
+        z0, z1, z2, trusted = newton_rotation(column(f, 0), column(f, 1), column(f, 2), 1.0)
+        r = wp.static(0.5**ITERATIONS) * wp.matrix_from_cols(z0, z1, z2)
+        p = (2.0 * mu) * f + (lam * (wp.ddot(r, f) - 3.0) - 2.0 * mu) * r
+    return p, trusted
 
 
 @functools.cache
@@ -320,15 +339,25 @@ def turned_back_of(shape: int) -> wp.Function:
 
 
 @functools.cache
-def shared_forces(shape: int, uniform: bool, given: bool, chosen: range = range(8)) -> wp.Function:
+def shared_forces(
+    shape: int, uniform: bool, given: bool, chosen: range = range(8), tolerance: float | None = None
+) -> wp.Function:
     """Forces of the chosen leaves from ten displacements, all with one rotation, and which are left out: none or all.
 
-    The rotation is the subtree root's or a given one; ``turn`` is the given one times the subtree's frame ``q``. The ten
+    The rotation is the subtree root's or a given one; ``turn`` is the given one times the subtree's frame ``q``. Ten
     displacements are turned back once; in the subtree's own frame the leaves are linear elements.
+
+    With a ``tolerance`` [rad] the chosen leaves share the root's rotation only where that is near their own ones: where
+    the displacement gradients E that are left have |skew E| <= tolerance and |sym E| <= 1/2. Then F = I + E = exp(w) U
+    with |w| <= 2 tolerance, and the stress is wrong by at most (2 mu + 3 lambda) (3 |w| |U - I| + |w|^2 |U|). Elsewhere
+    each has its own rotation.
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
     leaves, frames, at = LEAVES[shape], FRAMES[shape], POSITIONS[shape]
     turned_back = turned_back_of(shape)
+    turned_forces = turned_forces_of(shape, uniform, chosen)
+    adaptive = tolerance is not None
+    inverse_square = 0.0 if tolerance is None else 1.0 / tolerance**2
     begin, end = chosen.start, chosen.stop
     volume = VOLUME[shape]
 
@@ -361,16 +390,21 @@ def shared_forces(shape: int, uniform: bool, given: bool, chosen: range = range(
             c0, c1, c2 = columns(x[0], x[1], x[2], x[3])
             half = 0.5 * inv_h
             z0, z1, z2, trusted = newton_rotation(q0 + half * c0, q1 + half * c1, q2 + half * c2, mirror)
-            if not trusted:
-                left_out = ALL_LEAVES
             r0 = wp.static(0.5**ITERATIONS) * z0
             r1 = wp.static(0.5**ITERATIONS) * z1
             r2 = wp.static(0.5**ITERATIONS) * z2
+            if not trusted:
+                left_out = ALL_LEAVES
+                if wp.static(adaptive):
+                    r0 = q0
+                    r1 = q1
+                    r2 = q2
         y = turned_back(x, inv_h, q0, q1, q2, r0, r1, r2)
         m = mu[first]
         k = lam[first]
         area = wp.static(volume) * h * h
         g = mat10()
+        apart = float(0.0)
         for leaf in range(wp.static(begin), wp.static(end)):
             if wp.static(not uniform):
                 m = mu[first + leaf]
@@ -389,6 +423,11 @@ def shared_forces(shape: int, uniform: bool, given: bool, chosen: range = range(
                     for axis in range(3):
                         if wp.static(abs(frames[leaf][i][axis]) > 1e-9):
                             e[i, j] += wp.static(frames[leaf][i][axis]) * c[axis, j]
+            if wp.static(adaptive):
+                axial = wp.vec3(e[0, 1] - e[1, 0], e[0, 2] - e[2, 0], e[1, 2] - e[2, 1])
+                # Of the Frobenius norm, |E|^2 = |sym E|^2 + |skew E|^2.
+                skew = 0.5 * wp.dot(axial, axial)
+                apart = wp.max(apart, wp.max(wp.static(inverse_square) * skew, 4.0 * (wp.ddot(e, e) - skew)))
             double_mu = 2.0 * m * area
             pressure = k * area * (e[0, 0] + e[1, 1] + e[2, 2])
             s01 = m * area * (e[0, 1] + e[1, 0])
@@ -416,11 +455,36 @@ def shared_forces(shape: int, uniform: bool, given: bool, chosen: range = range(
             g[wp.static(leaves[leaf][1])] += f1
             g[wp.static(leaves[leaf][2])] += f2
             g[wp.static(leaves[leaf][3])] += f3
+        if wp.static(adaptive):
+            # A comparison with NaN is false.
+            if left_out == 0 and apart <= 1.0:
+                left_out = 0
+            else:
+                for n in range(10):
+                    y[n] += wp.vec3(wp.static(2.0 * at[n][0]), wp.static(2.0 * at[n][1]), wp.static(2.0 * at[n][2]))
+                g, left_out = turned_forces(y, h, 1.0, mu, lam, first)
         for n in range(10):
             force = g[n]
             g[n] = force[0] * r0 + force[1] * r1 + force[2] * r2
-        if left_out != 0:
+        if wp.static(not adaptive) and left_out != 0:
             g = mat10()
         return g, left_out
 
     return shared_forces
+
+
+@functools.cache
+def near_forces(shape: int, uniform: bool, tolerance: float | None, chosen: range = range(8)) -> wp.Function:
+    """As ``own_forces``, which it is without a tolerance; with one, see ``shared_forces``."""
+    if tolerance is None:
+        return own_forces(shape, uniform, chosen)
+    forces = shared_forces(shape, uniform, False, chosen, tolerance)
+
+    @wp.func
+    def near_forces(
+        x: mat10, q: wp.mat33, h: float, mirror: float, mu: wp.array[wp.float32], lam: wp.array[wp.float32], first: int
+    ):
+        g, left_out = forces(x, q, h, mirror, wp.mat33(), mu, lam, first)
+        return g, left_out
+
+    return near_forces

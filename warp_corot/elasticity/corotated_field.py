@@ -54,7 +54,7 @@ class CorotatedField(ForceField):
         kind = body.element_kind
         self._shared: Rotations | None = None
         self._followed: DevicePlan | None = None
-        self._fused = model.rotation_level is None and model.rotation != "warm" and model.stiffness == "factored"
+        self._fused = model.level is None and model.rotation != "warm" and model.stiffness == "factored"
         self._state: dict[str, wp.array] = {}
         if model.rotation == "warm":
             self._state["quaternions"] = wp.empty(self.unit_count, dtype=wp.quat, device=self.device)
@@ -82,7 +82,7 @@ class CorotatedField(ForceField):
     @property
     def rotation_level(self) -> int | None:
         """Level of the tree at which rotations are shared, if they are."""
-        return self.model.rotation_level
+        return self.model.level
 
     def plan_of(self, forest: DeviceForest) -> DevicePlan:
         from ..remesh.plan import DevicePlan

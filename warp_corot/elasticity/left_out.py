@@ -34,9 +34,10 @@ class LeftOutLeaves:
 
     @classmethod
     def of(cls, plan: Plan, device: wp.Device) -> LeftOutLeaves:
-        own = sum(batch.count for batch in plan.batches if batch.sharing is Sharing.OWN)
-        shared = [batch for batch in plan.batches if batch.sharing is Sharing.ROOT]
-        return cls(own + len(plan.flat), shared, device)
+        # Of a subtree in no group each leaf may be listed by itself.
+        own = [batch for batch in plan.batches if batch.sharing is Sharing.OWN]
+        places = sum(batch.count * (1 if batch.grouped else 8) for batch in own) + len(plan.flat)
+        return cls(places, [batch for batch in plan.batches if batch.sharing is Sharing.ROOT], device)
 
     def list_of(self, batch: Batch) -> Any:
         """The list that a batch's kernel appends to."""

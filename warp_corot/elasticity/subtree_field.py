@@ -20,7 +20,7 @@ from ..subtrees import Batch, Sharing
 from .corotated_field import CorotatedField, Rotations
 from .lanes import Lanes, as_general
 from .left_out import LeftOutLeaves
-from .stretches import Stretches
+from .own_launches import OwnLaunches
 
 if TYPE_CHECKING:
     from ..body import SoftBody
@@ -40,7 +40,7 @@ class SubtreeField(CorotatedField):
             assert isinstance(body.mesh, TetForest)
             self._go_through(
                 ForcePlan.of_forest(
-                    body.mesh, model.rotation_level, self.device, worlds=body.worlds, deterministic=self.deterministic
+                    body.mesh, model.level, self.device, worlds=body.worlds, deterministic=self.deterministic
                 )
             )
 
@@ -51,7 +51,7 @@ class SubtreeField(CorotatedField):
 
     def _load_kernels(self, plan: DevicePlan) -> None:
         """Everything that any mesh may come to need, so that nothing is compiled once steps are made."""
-        for shape, grouped, sharing in plan.kinds:
+        for shape, grouped, sharing in () if self._listed and not plan.rotation_shared else plan.kinds:
             kernel = self._kernel(shape, grouped, sharing)
             wp.load_module(kernel.module, self.device, block_dim=self._block)
         single = [self._forces, self._own, self._extract, repair_own]
@@ -60,7 +60,7 @@ class SubtreeField(CorotatedField):
         for kernel in single:
             wp.load_module(kernel.module, self.device)
         if self.device.is_cuda:
-            Stretches.load(self._uniform, self.device)
+            OwnLaunches.load(self._uniform, self.model.tolerance, self.device)
 
     @property
     def _block(self) -> int:
@@ -79,11 +79,12 @@ class SubtreeField(CorotatedField):
             self._rotations = self._shared.rotations
         elif self.rotation_level is not None:
             self._sharing()
-        self._left_out = self._stretches = None
+        self._left_out: LeftOutLeaves | None = None
+        self._own_launches: OwnLaunches | None = None
         if self._listed:
             self._left_out = LeftOutLeaves.of(plan, self.device)
-            if Stretches.suit(plan):
-                self._stretches = Stretches(plan, self._uniform, self.device)
+            if OwnLaunches.suit(plan):
+                self._own_launches = OwnLaunches(plan, self.elements, self.material_inputs, self.model.tolerance)
                 return
         self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]
         self._flat_material = self.material_inputs
@@ -108,9 +109,9 @@ class SubtreeField(CorotatedField):
         return self.device.is_cuda and not self.deterministic
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        if self._stretches is not None:
+        if self._own_launches is not None:
             assert self._left_out is not None
-            self._stretches.scatter_forces(self.body.mu, self.body.lam, u, f, self._left_out.own)
+            self._own_launches.scatter_forces(u, f, self._left_out.own)
             self._left_out.repair(self.elements, self.material_inputs, u, f)
             return
         if self.plan.units is not None:
@@ -133,7 +134,9 @@ class SubtreeField(CorotatedField):
         given = sharing is Sharing.ABOVE
         if self.device.is_cuda:
             if sharing is Sharing.OWN:
-                return subtree_cuda.scatter_subtrees_own(shape, grouped, self._uniform, self._listed)
+                return subtree_cuda.scatter_subtrees_own(
+                    shape, grouped, self._uniform, self._listed, self.model.tolerance
+                )
             return subtree_cuda.scatter_subtrees_shared(shape, grouped, self._uniform, given, self._listed)
         if sharing is Sharing.OWN:
             return subtree_cpu.scatter_subtrees_own(shape)

@@ -61,11 +61,11 @@ class BlockSteps:
             return None
         if not any(layout.fits for layout in _layouts(body, 0, False, len(body.mesh.tets) // 8)):
             return None
-        plan = ForcePlan.of_forest(body.mesh, field.model.rotation_level, body.device, grouped=False)
+        plan = ForcePlan.of_forest(body.mesh, field.rotation_level, body.device, grouped=False)
         if len(plan.batches) != 1 or len(plan.flat) or plan.batches[0].sharing is Sharing.ABOVE:
             return None
         batch = plan.batches[0]
-        layouts = _layouts(body, batch.shape, batch.sharing is Sharing.ROOT, batch.count)
+        layouts = _layouts(body, batch.shape, batch.sharing is Sharing.ROOT, batch.count, field.model.tolerance)
         layout = next(layout for layout in layouts if layout.fits)
         slots = _slots_by_node(layout, batch.subtrees.nodes.numpy(), body.world_node_count)
         if max(map(len, slots)) > MOST_SLOTS:
@@ -101,7 +101,7 @@ class BlockSteps:
         )
 
 
-def _layouts(body: SoftBody, shape: int, shared: bool, subtrees: int) -> list[Layout]:
+def _layouts(body: SoftBody, shape: int, shared: bool, subtrees: int, tolerance: float | None = None) -> list[Layout]:
     """The ways to deal a body out, the fastest first.
 
     A world is soonest done with the leaves of a subtree dealt to two threads; where there are more worlds than
@@ -110,7 +110,9 @@ def _layouts(body: SoftBody, shape: int, shared: bool, subtrees: int) -> list[La
     parts = (2, 1) if body.worlds <= body.device.sm_count else (1,)
     capacity = -(-subtrees // WARP) * WARP
     uniform = body.is_uniform
-    return [Layout(shape, shared, uniform, count, capacity, body.world_node_count) for count in parts]
+    return [
+        Layout(shape, shared, uniform, count, capacity, body.world_node_count, tolerance=tolerance) for count in parts
+    ]
 
 
 def _tasks(layout: Layout, slots: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
