@@ -50,7 +50,6 @@ class Corotated(Model):
         InputError: An option is none of these.
     """
 
-    step_safety: ClassVar[float] = 0.8
 
     rotation_level: int | None = None
     rotation: str = "byers-xu"
