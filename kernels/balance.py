@@ -11,8 +11,8 @@ from .pace import DT, Pace
 wp.set_module_options({"enable_backward": False})
 
 #: Columns of ``sums``.
-KINETIC, GRAVITATIONAL, LOADS, REACH, ELASTIC = (wp.constant(k) for k in range(5))
-COLUMNS = 5
+KINETIC, AHEAD, GRAVITATIONAL, LOADS, SUPPORTS, REACH, ELASTIC = (wp.constant(k) for k in range(7))
+COLUMNS = 7
 
 
 @wp.func
@@ -44,37 +44,42 @@ def sum_nodes(
     """Add what free nodes have: kinetic and gravitational energy, the work of loads since ``u_before``, the farthest.
 
     Velocities are half a step behind displacements. With the elastic forces f of these displacements, velocities half a
-    step ahead are known too, and v_behind . M v_ahead / 2 is the kinetic energy that, with the elastic one, symplectic
-    Euler keeps exactly where forces are linear. Without f (zero) the two differ by the share omega dt.
+    step ahead are known too, and v_behind . M v_ahead / 2, kinetic energy and ``AHEAD``, is what symplectic Euler keeps
+    exactly with the elastic energy where forces are linear: also beyond the stable step, where it need not be positive.
+    The work of supports that ``add_support_work`` has added up counts half of f's share too early; that half is ``SUPPORTS``.
     """
     world, part = wp.tid()
     kinetic = wp.float64(0.0)
+    ahead = wp.float64(0.0)
     gravitational = wp.float64(0.0)
     work = wp.float64(0.0)
+    supports = wp.float64(0.0)
     reach = wp.float64(0.0)
     k = part
     while k < count:
         i = world * count + k
         x = load_node(u, i)
         reach = wp.max(reach, wp.sqrt(dot64(x, x)))
-        if inverse_mass[i] > 0.0:
+        velocity = load_node(v, i)
+        force = load_node(f, i)
+        if inverse_mass[i] == 0.0:
+            supports -= wp.float64(0.5) * pace.seconds[DT] * dot64(force, velocity)
+        else:
             m = wp.float64(mass[i])
-            velocity = load_node(v, i)
-            force = load_node(f, i)
             power = dot64(force, velocity) + m * dot64(gravity, velocity)
             if has_load != 0:
                 external = vector_at(load, i)
                 power += dot64(external, velocity)
                 work += dot64(external, x) - dot64(external, load_node(u_before, i))
-            ahead = wp.float64(0.0)
-            if dot64(force, force) > wp.float64(0.0):
-                ahead = pace.seconds[DT] * power
-            kinetic += wp.float64(0.5) * (m * dot64(velocity, velocity) + ahead)
+            ahead += wp.float64(0.5) * pace.seconds[DT] * power
+            kinetic += wp.float64(0.5) * m * dot64(velocity, velocity)
             gravitational -= m * dot64(gravity, x)
         k += sums.shape[1]
     sums[world, part, KINETIC] = sums[world, part, KINETIC] + kinetic
+    sums[world, part, AHEAD] = sums[world, part, AHEAD] + ahead
     sums[world, part, GRAVITATIONAL] = sums[world, part, GRAVITATIONAL] + gravitational
     sums[world, part, LOADS] = sums[world, part, LOADS] + work
+    sums[world, part, SUPPORTS] = sums[world, part, SUPPORTS] + supports
     sums[world, part, REACH] = wp.max(sums[world, part, REACH], reach)
 
 

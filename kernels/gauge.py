@@ -22,7 +22,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel(enable_backward=False)
 def probe_directions(
     # In
-    scale: float,
+    scale: wp.array[wp.float32],
     inverse_mass: wp.array[wp.float32],
     u: wp.array[wp.vec4],
     # In and out
@@ -40,7 +40,7 @@ def probe_directions(
             state = wp.rand_init(20130705, i)
             a = wp.normalize(wp.vec3(wp.randn(state), wp.randn(state), wp.randn(state)))
             store_node(q, i, a)
-        a = (scale * wp.sqrt(w)) * a
+        a = (scale[0] * wp.sqrt(w)) * a
     else:
         a = wp.vec3()
     store_node(probed, i, load_node(u, i) + a)

@@ -130,11 +130,17 @@ def follow_trajectory(
     world_starts: wp.array[wp.float64],
     world_node_count: int,
     offset: int,
+    f: wp.array[wp.vec4],
     u: wp.array[wp.vec4],
     # Out
     v: wp.array[wp.vec4],
+    support_work: wp.array[wp.float64],
 ):
-    """Give prescribed nodes the velocity that takes them to their keyframed displacement at the end of the step."""
+    """Give prescribed nodes the velocity that takes them to their keyframed displacement at the end of the step.
+
+    The work of a step is that of the mean of the forces f at its two ends, by the trapezoidal rule: each force counts
+    with half the motion before it and half the motion after. The step itself counts the latter as a whole.
+    """
     k = wp.tid()
     i = nodes[k]
     start = world_starts[i // world_node_count]
@@ -143,7 +149,10 @@ def follow_trajectory(
     row = wp.min(k, displacements.shape[1] - 1)
     a = displacements[key, row]
     target = a + s * (displacements[key + 1, row] - a)
-    store_node(v, i, (target - load_node(u, i)) / float(pace.seconds[DT]))
+    dt = float(pace.seconds[DT])
+    velocity = (target - load_node(u, i)) / dt
+    add_support_work(load_node(f, i), (0.5 * dt) * (load_node(v, i) - velocity), support_work)
+    store_node(v, i, velocity)
 
 
 @wp.kernel(enable_backward=False)

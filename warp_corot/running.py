@@ -102,7 +102,7 @@ class Running:
             return False
         if due:
             sim.follow_motion()
-            sim.guard.mesh_changed()
+            sim.guard.forget()
             sim.guard.begin()
         if sim.hook_intervals and sim.total_steps > self._steps_called:
             self._steps_called = sim.total_steps
@@ -223,6 +223,8 @@ class Running:
         """
         sim = self._sim
         if sim.safe_step is None or self._returns >= MOST_RETURNS:
+            self._returns = 0
+            sim.guard.forget()
             raise UnstableError(self._message(fault))
         if not self._returns:
             self._wrong_until = sim.time

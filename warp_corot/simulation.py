@@ -103,7 +103,7 @@ class Simulation:
         self.fields = tuple(m.bind(body, deterministic=self.deterministic) for m, body in bound)
         self.remeshing.serve(self.fields)
         self.time_before_reset = 0.0
-        self._steps_before_reset = 0
+        self.steps_before_reset = 0
         self._hooks: list[_Hook] = []
         stable = self._find_stable_steps()
         given = self.integrator.dt
@@ -116,9 +116,9 @@ class Simulation:
         bound = zip(self.bodies, self.fields, strict=True)
         steppers = [self.integrator.bind(body, field, self._context) for body, field in bound]
         self.recorded = RecordedSteps(self.bodies, steppers, self.pace, self.safe_step)
-        parts = (self.pace, self.safe_step)
-        state = [array for part in parts if part is not None for array in part.state.values()]
-        self.guard = Guard(self.bodies, self.fields, self._context, state)
+        #: What is to be kept besides the states of bodies and fields for a run to go on as it would have.
+        self.kept = self.pace.state | ({} if self.safe_step is None else self.safe_step.state)
+        self.guard = Guard(self.bodies, self.fields, self._context, tuple(self.kept.values()))
         self._running = Running(self)
 
     # --- stepping --------------------------------------------------------------------------------------------------
@@ -151,7 +151,7 @@ class Simulation:
     @property
     def total_steps(self) -> int:
         """Time steps done, whatever has been reset since."""
-        return self._steps_before_reset + self.steps
+        return self.steps_before_reset + self.steps
 
     @property
     def time(self) -> float:
@@ -255,7 +255,7 @@ class Simulation:
             mask[slice(None) if worlds is None else checked_indices(worlds, self.worlds, "world")] = 1
             chosen = wp.array(mask, dtype=wp.int32, device=self.device)
         if worlds is None:
-            self._steps_before_reset, self.time_before_reset = self.total_steps, self.total_time
+            self.steps_before_reset, self.time_before_reset = self.total_steps, self.total_time
             self.pace.restart()
             self._context.bad_step.fill_(NEVER)
             self.guard.restart()

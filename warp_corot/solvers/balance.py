@@ -29,17 +29,22 @@ class Energies:
     """What free nodes have at one time, of each world [worlds].
 
     Attributes:
-        kinetic, gravitational, elastic: [J]; gravitational about the rest shape; elastic is zero if not asked for.
+        kinetic, gravitational: [J]; gravitational about the rest shape.
+        elastic: [J]; zero if not asked for.
+        exact: With symplectic Euler's own kinetic energy, velocities behind times those ahead, and the elastic energy:
+            what a linear body keeps to rounding [J]; means nothing if elastic energies were not asked for.
         loads: Work of loads since the displacements that were kept [J].
-        supports, supports_absolute: Work of all moving supports since the beginning [J], and that of its absolute values.
+        supports: Work of all moving supports since the beginning [J].
+        supports_absolute: The sum of its absolute values [J].
         reach: The largest displacement [m].
     """
 
     kinetic: Floats
     gravitational: Floats
     elastic: Floats
+    exact: Floats
     loads: Floats
-    supports: float
+    supports: Floats
     supports_absolute: float
     reach: Floats
 
@@ -81,8 +86,18 @@ class Balance:
         sums = self._sums.numpy()
         total, reach = sums.sum(axis=1), sums[:, :, kernels.REACH].max(axis=1)
         supports = self.context.support_work.numpy()
-        columns = (total[:, int(c)] for c in (kernels.KINETIC, kernels.GRAVITATIONAL, kernels.ELASTIC, kernels.LOADS))
-        return Energies(*columns, float(supports[0]), float(supports[1]), reach)
+        kinetic, ahead, elastic = (total[:, int(c)] for c in (kernels.KINETIC, kernels.AHEAD, kernels.ELASTIC))
+        done = np.full(self.worlds, supports[0] + total[:, kernels.SUPPORTS].sum())
+        return Energies(
+            kinetic=kinetic,
+            gravitational=total[:, kernels.GRAVITATIONAL],
+            elastic=elastic,
+            exact=kinetic + ahead + elastic,
+            loads=total[:, kernels.LOADS],
+            supports=done,
+            supports_absolute=float(supports[1]),
+            reach=reach,
+        )
 
     def rounding(self) -> Floats:
         """Energies that float32 cannot tell from none [J], of each world: of strains of about 4e-4."""

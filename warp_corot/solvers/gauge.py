@@ -36,14 +36,16 @@ class Gauge:
         places = body.node_displacements.shape
         self.directions = wp.zeros(places, dtype=wp.vec4, device=body.device)
         self._probed, self._forces = (wp.zeros(places, dtype=wp.vec4, device=body.device) for _ in range(2))
-        self._scale = 0.0
+        #: Of the probing motion, float32 [1].
+        self.scale = wp.zeros(1, dtype=wp.float32, device=body.device)
         self.rescale()
 
     def rescale(self) -> None:
         """Fit the probing motion to the present mesh: the lightest free node moves a share of the smallest element."""
         inverse = self.body.node_inverse_mass[: self.body.node_count].numpy()
         lightest = float(inverse.max())
-        self._scale = PROBE * self.body.smallest_volume ** (1.0 / 3.0) / np.sqrt(lightest) if lightest > 0 else 0.0
+        size = self.body.smallest_volume ** (1.0 / 3.0)
+        self.scale.fill_(PROBE * size / np.sqrt(lightest) if lightest > 0 else 0.0)
 
     def launch(self, pace: Pace, ahead: int) -> None:
         """Measure about the present state, whose elastic forces are in ``body.node_forces``.
@@ -64,8 +66,6 @@ class Gauge:
 
     def curvature_at_rest(self) -> float:
         """The largest curvature about the rest shape [1/s^2]; waits for the device."""
-        if self._scale == 0.0:
-            return 0.0
         u, f = (wp.zeros_like(self.body.node_displacements) for _ in range(2))
         with self.field.state_kept():
             self.field.add_forces(u, f)
@@ -78,7 +78,8 @@ class Gauge:
 
     def _find_curvature(self, u: wp.array, f: wp.array) -> None:
         inverse_mass = self.body.node_inverse_mass
-        self._launch(kernels.probe_directions, [self._scale, inverse_mass, u], [self.directions, self._probed, self._forces])
+        outputs = [self.directions, self._probed, self._forces]
+        self._launch(kernels.probe_directions, [self.scale, inverse_mass, u], outputs)
         self.field.add_forces(self._probed, self._forces)
         inputs = [inverse_mass, u, self._probed, f, self._forces]
         self._launch(kernels.find_curvatures, inputs, [self.directions, self.found])

@@ -79,14 +79,15 @@ class Guard:
         self._scale, self._drift = np.zeros(self.worlds), np.zeros(self.worlds)
         self._floor: Floats | None = None
 
-    def mesh_changed(self) -> None:
-        """The next state is taken for good: it is one of another mesh."""
+    def forget(self) -> None:
+        """The next state is taken for good: it does not follow from the last one."""
         self._reference = None
 
     def begin(self) -> None:
         """Take the present state for good if it is not the one that was checked last: a user may have written to it."""
         if self._reference is None or self._has_changed():
             self._reference = None
+            self.context.support_work.zero_()
             self._keep(self._find(whole=True))
 
     def check(self, *, whole: bool) -> Fault | None:
@@ -102,6 +103,9 @@ class Guard:
         assert self._reference is not None
         found = self._find(whole=whole)
         fault = self._beyond_reach(found) or self._from_nowhere(found, whole)
+        if fault is not None and not whole:  # supports may have moved in the last step
+            whole, found = True, self._find(whole=True)
+            fault = self._beyond_reach(found) or self._from_nowhere(found, whole)
         if fault is None:
             self._keep(found if whole else None)
         return fault
@@ -200,24 +204,23 @@ class Guard:
             return None
         if self._floor is None:
             self._floor = self._balance.rounding()
-        supports = found.supports - before.supports
         fallen = before.gravitational - found.gravitational
-        gain = (found.kinetic + found.elastic) - (before.kinetic + before.elastic) - fallen - found.loads - supports
-        activity = before.kinetic + before.elastic + np.abs(fallen) + np.abs(found.loads)
-        activity = activity + (found.supports_absolute - before.supports_absolute)
-        # Of what is there now only what came from somewhere counts.
-        scale = np.maximum(self._scale, activity)
-        drift = np.maximum(self._drift + gain, 0.0) if whole else self._drift
-        bad = np.flatnonzero(
-            ~(gain <= self._gain * scale + self._floor) | ~(drift <= self._drift_limit * scale + 10.0 * self._floor)
-        )
-        if len(bad):
-            worst = bad[np.argmax(np.maximum(gain, drift)[bad])]
-            more = max(gain[worst], drift[worst])
-            return Fault(
-                f"there are {more:.3g} J more than gravity, loads and supports put in, at most {scale[worst]:.3g} J of "
-                "which were in motion",
-                bad,
-            )
+        given = before.exact + fallen + found.loads + found.supports - before.supports
+        moved = np.abs(before.exact) + np.abs(fallen) + np.abs(found.loads)
+        scale = np.maximum(self._scale, moved + found.supports_absolute - before.supports_absolute)
+        # Elastic energies are never negative.
+        gain = found.kinetic - given
+        bad = ~(gain <= 2.0 * self._gain * scale + self._floor)
+        drift = self._drift
+        if whole:
+            drift = np.maximum(self._drift + found.exact - given, 0.0)
+            gain = np.maximum(np.maximum(gain, found.exact - given), drift)
+            bad |= ~(found.exact - given <= self._gain * scale + self._floor)
+            bad |= ~(drift <= self._drift_limit * scale + 10.0 * self._floor)
+        if bad.any():
+            worlds = np.flatnonzero(bad)
+            worst = worlds[np.argmax(gain[worlds])]
+            most = f"gravity, loads and supports have moved {scale[worst]:.3g} J at most"
+            return Fault(f"{gain[worst]:.3g} J of energy came from nowhere ({most})", worlds)
         self._scale, self._drift = scale, drift
         return None

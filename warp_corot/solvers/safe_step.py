@@ -129,5 +129,9 @@ class SafeStep:
     @property
     def state(self) -> dict[str, wp.array]:
         """Arrays from which it goes on."""
-        directions = {f"directions{k}": gauge.directions for k, gauge in enumerate(self.gauges)}
-        return {"control": self._control, "at_rest": self._at_rest, **directions}
+        gauges = {
+            f"{name}{k}": array
+            for k, gauge in enumerate(self.gauges)
+            for name, array in (("directions", gauge.directions), ("scale", gauge.scale))
+        }
+        return {"control": self._control, "at_rest": self._at_rest, **gauges}

@@ -93,9 +93,10 @@ class SymplecticEulerStepper(Stepper):
                     body.world_starts,
                     body.world_node_count,
                     offset,
+                    body.node_forces,
                     body.node_displacements,
                 ],
-                outputs=[body.node_velocities],
+                outputs=[body.node_velocities, context.support_work],
                 device=body.device,
             )
         wp.launch(
