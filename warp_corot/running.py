@@ -232,6 +232,7 @@ class Running:
         share = sim.safe_step.share
         sim.guard.go_back()
         sim.safe_step.share = 0.5 * share
+        sim.guard.settle()
         self._since_check = 0
         if not self._has_warned:
             self._has_warned = True

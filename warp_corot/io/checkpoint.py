@@ -220,7 +220,7 @@ def _rebuilt_simulation(
             field.state[name].assign(arrays[f"body{number}.field.{name}"])
     for name in header["kept"]:
         sim.kept[name].assign(arrays[f"kept.{name}"])
-    sim.guard.resume(arrays["guard.scale"], arrays["guard.drift"])
+    sim.guard.resume(scale=arrays["guard.scale"], drift=arrays["guard.drift"])
     return sim
 
 

@@ -18,13 +18,17 @@ if TYPE_CHECKING:
     from ..body import SoftBody
     from ..elasticity import ForceField
 
-#: Energy that may come from nowhere between two checks, and in all, as shares of the most that was ever in motion
-#: (kinetic, elastic, from gravity, loads and supports): a stable step errs by less than a tenth, one that is not by
-#: many times as much within tens of steps.
+#: Energy that may come from nowhere between two checks, and in all, as shares of the most that gravity, loads and
+#: supports ever moved or a user gave. A stable step errs by less than a tenth, and by up to a half while elements are
+#: crushed and turned over; one that is not stable by more and more, many times within tens of steps.
 GAIN = 0.25
 DRIFT = 0.5
-#: The same where rotations are shared, which have no energy.
-SHARED = 2.0
+#: By how much the kinetic energy may exceed the whole, since fast vibrations are not in time with their displacements;
+#: and from which excess on elastic energies are looked at.
+MOTION = 0.5
+LITTLE = 0.1
+#: So many times as much is let pass where rotations are shared, which have no energy.
+SHARED = 4.0
 #: Displacements beyond so many sizes of the body leave no digit of float32 for its strains.
 REACH = 1e6
 
@@ -70,13 +74,14 @@ class Guard:
         self._reference: Energies | None = None
         self._inverse_mass: list[wp.array] = []
         shared = any(getattr(field, "rotation_level", None) is not None for field in fields)
-        self._gain, self._drift_limit = (SHARED, 4.0 * SHARED) if shared else (GAIN, DRIFT)
+        self._leave = SHARED if shared else 1.0
         self.restart()
 
     def restart(self) -> None:
         """Forget all: the next state is taken for good."""
         self._reference = None
-        self._scale, self._drift = np.zeros(self.worlds), np.zeros(self.worlds)
+        self._scale, self._drift, self._loads = (np.zeros(self.worlds) for _ in range(3))
+        self._height = np.zeros(self.worlds)
         self._floor: Floats | None = None
 
     def forget(self) -> None:
@@ -88,7 +93,10 @@ class Guard:
         if self._reference is None or self._has_changed():
             self._reference = None
             self.context.support_work.zero_()
-            self._keep(self._find(whole=True))
+            found = self._find(whole=True)
+            self._loads, self._height = np.zeros(self.worlds), found.gravitational
+            self._scale = np.maximum(self._scale, np.abs(found.exact))
+            self._keep(found)
 
     def check(self, *, whole: bool) -> Fault | None:
         """Look at the present state; a good one is kept.
@@ -103,7 +111,7 @@ class Guard:
         assert self._reference is not None
         found = self._find(whole=whole)
         fault = self._beyond_reach(found) or self._from_nowhere(found, whole)
-        if fault is not None and not whole:  # supports may have moved in the last step
+        if fault is not None and not whole:
             whole, found = True, self._find(whole=True)
             fault = self._beyond_reach(found) or self._from_nowhere(found, whole)
         if fault is None:
@@ -119,6 +127,10 @@ class Guard:
             body.publish_positions()
         self.context.bad_step.fill_(NEVER)
 
+    def settle(self) -> None:
+        """Count from the present energies, whose kinetic one depends on the step, which is another now."""
+        self._keep(self._find(whole=True))
+
     def not_finite(self) -> Fault | None:
         """Whether the state is not finite: the least that there is to look at."""
         return self._not_finite()
@@ -128,7 +140,7 @@ class Guard:
         """What a run that goes on needs besides the present state."""
         return {"scale": self._scale, "drift": self._drift}
 
-    def resume(self, scale: Floats, drift: Floats) -> None:
+    def resume(self, *, scale: Floats, drift: Floats) -> None:
         """Go on from what ``state`` gave."""
         self._scale, self._drift = np.array(scale, float), np.array(drift, float)
 
@@ -206,21 +218,24 @@ class Guard:
             self._floor = self._balance.rounding()
         fallen = before.gravitational - found.gravitational
         given = before.exact + fallen + found.loads + found.supports - before.supports
-        moved = np.abs(before.exact) + np.abs(fallen) + np.abs(found.loads)
-        scale = np.maximum(self._scale, moved + found.supports_absolute - before.supports_absolute)
+        # What has come from nowhere is no measure of what may.
+        moved = np.abs(self._height - found.gravitational) + np.abs(self._loads + found.loads)
+        scale = np.maximum(self._scale, moved + found.supports_absolute)
         # Elastic energies are never negative.
         gain = found.kinetic - given
-        bad = ~(gain <= 2.0 * self._gain * scale + self._floor)
+        bad = ~(gain <= (MOTION if whole else LITTLE) * self._leave * scale + self._floor)
         drift = self._drift
         if whole:
             drift = np.maximum(self._drift + found.exact - given, 0.0)
             gain = np.maximum(np.maximum(gain, found.exact - given), drift)
-            bad |= ~(found.exact - given <= self._gain * scale + self._floor)
-            bad |= ~(drift <= self._drift_limit * scale + 10.0 * self._floor)
+            bad |= ~(found.exact - given <= GAIN * self._leave * scale + self._floor)
+            bad |= ~(drift <= DRIFT * self._leave * scale + 10.0 * self._floor)
         if bad.any():
             worlds = np.flatnonzero(bad)
             worst = worlds[np.argmax(gain[worlds])]
             most = f"gravity, loads and supports have moved {scale[worst]:.3g} J at most"
             return Fault(f"{gain[worst]:.3g} J of energy came from nowhere ({most})", worlds)
         self._scale, self._drift = scale, drift
+        if whole:
+            self._loads = self._loads + found.loads
         return None

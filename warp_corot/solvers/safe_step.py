@@ -105,15 +105,6 @@ class SafeStep:
         """Take the step that the state allows, after one that ended a run in time."""
         wp.launch(kernels.resume_step, dim=1, inputs=[self._control, self.pace.arrays], device=self.device)
 
-    def halve(self) -> None:
-        """Take half the step from now on; by and by it becomes longer again."""
-        control = self._control.numpy().copy()
-        control[kernels.SHARE] *= 0.5
-        dt = control[kernels.SHARE] * control[kernels.ALLOWED]
-        control[kernels.SHORTEST] = min(control[kernels.SHORTEST], dt)
-        self._control.assign(control)
-        self.resume()
-
     @property
     def share(self) -> float:
         """The share of what the state allows that is taken after going back; waits for the device."""
@@ -123,6 +114,7 @@ class SafeStep:
     def share(self, value: float) -> None:
         control = self._control.numpy().copy()
         control[kernels.SHARE] = value
+        control[kernels.SHORTEST] = min(control[kernels.SHORTEST], value * control[kernels.ALLOWED])
         self._control.assign(control)
         self.resume()
 
