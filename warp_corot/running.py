@@ -21,6 +21,8 @@ BLOCK_CHECK_STEPS = 2048
 LEAST_CHECKED = 16
 #: How often the step is halved to come over one place.
 MOST_RETURNS = 6
+#: How often it is halved for a little energy from nowhere, as comes with crushed elements also of the shortest steps.
+STRICT_RETURNS = 2
 #: Longer runs are looked after in between.
 MOST_INTERVALS = 1000
 
@@ -206,7 +208,7 @@ class Running:
             if fault is None:
                 return True
         else:
-            fault = sim.guard.check(whole=whole)
+            fault = sim.guard.check(whole=whole, strict=sim.safe_step is not None and self._returns < STRICT_RETURNS)
             self._since_check = 0
         if fault is not None:
             self._go_back(fault)

@@ -27,6 +27,8 @@ DRIFT = 0.5
 #: and from which excess on elastic energies are looked at.
 MOTION = 0.5
 LITTLE = 0.1
+#: So much of it is let pass where the step may be made shorter.
+STRICT = 0.2
 #: So many times as much is let pass where rotations are shared, which have no energy.
 SHARED = 4.0
 #: Displacements beyond so many sizes of the body leave no digit of float32 for its strains.
@@ -98,10 +100,11 @@ class Guard:
             self._scale = np.maximum(self._scale, np.abs(found.exact))
             self._keep(found)
 
-    def check(self, *, whole: bool) -> Fault | None:
+    def check(self, *, whole: bool, strict: bool = False) -> Fault | None:
         """Look at the present state; a good one is kept.
 
         Args:
+            strict: Whether less energy from nowhere is let pass than would be taken for an error.
             whole: Whether elastic energies are found too. Without them the sum of the others must not exceed what there
                 was and came in: elastic energies are never negative.
         """
@@ -110,10 +113,11 @@ class Guard:
             return fault
         assert self._reference is not None
         found = self._find(whole=whole)
-        fault = self._beyond_reach(found) or self._from_nowhere(found, whole)
+        leave = self._leave * (STRICT if strict else 1.0)
+        fault = self._beyond_reach(found) or self._from_nowhere(found, whole, leave)
         if fault is not None and not whole:
             whole, found = True, self._find(whole=True)
-            fault = self._beyond_reach(found) or self._from_nowhere(found, whole)
+            fault = self._beyond_reach(found) or self._from_nowhere(found, whole, leave)
         if fault is None:
             self._keep(found if whole else None)
         return fault
@@ -209,7 +213,7 @@ class Guard:
             return None
         return Fault(f"nodes are {found.reach[bad].max():.3g} m from where they were at rest", bad)
 
-    def _from_nowhere(self, found: Energies, whole: bool) -> Fault | None:
+    def _from_nowhere(self, found: Energies, whole: bool, leave: float) -> Fault | None:
         before = self._reference
         assert before is not None
         if not self._balance.is_closed:
@@ -228,7 +232,7 @@ class Guard:
         if whole:
             drift = np.maximum(self._drift + found.exact - given, 0.0)
             gain = np.maximum(np.maximum(gain, found.exact - given), drift)
-            bad |= ~(found.exact - given <= GAIN * self._leave * scale + self._floor)
+            bad |= ~(found.exact - given <= GAIN * leave * scale + self._floor)
             bad |= ~(drift <= DRIFT * self._leave * scale + 10.0 * self._floor)
         if bad.any():
             worlds = np.flatnonzero(bad)
