@@ -21,7 +21,7 @@ def follow_activation(
     # Out
     activation: wp.array[wp.float32],
 ):
-    """Active stress by its keyframes at the beginning of a step, ``offset`` steps after the last that the clock counts."""
+    """Active stress by its keyframes at the beginning of a step, ``offset`` steps after the last that is counted."""
     k = wp.tid()
     t = elements[k]
     start = world_starts[t // world_element_count]

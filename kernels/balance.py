@@ -18,9 +18,7 @@ COLUMNS = 7
 @wp.func
 def dot64(a: wp.vec3, b: wp.vec3):
     return (
-        wp.float64(a[0]) * wp.float64(b[0])
-        + wp.float64(a[1]) * wp.float64(b[1])
-        + wp.float64(a[2]) * wp.float64(b[2])
+        wp.float64(a[0]) * wp.float64(b[0]) + wp.float64(a[1]) * wp.float64(b[1]) + wp.float64(a[2]) * wp.float64(b[2])
     )
 
 
@@ -46,7 +44,8 @@ def sum_nodes(
     Velocities are half a step behind displacements. With the elastic forces f of these displacements, velocities half a
     step ahead are known too, and v_behind . M v_ahead / 2, kinetic energy and ``AHEAD``, is what symplectic Euler keeps
     exactly with the elastic energy where forces are linear: also beyond the stable step, where it need not be positive.
-    The work of supports that ``add_support_work`` has added up counts half of f's share too early; that half is ``SUPPORTS``.
+    The work of supports that ``add_support_work`` has added up counts half of f's share too early; that half is
+    ``SUPPORTS``.
     """
     world, part = wp.tid()
     kinetic = wp.float64(0.0)
@@ -109,7 +108,7 @@ def find_changes(
     i = wp.tid()
     du = load_node(u, i) - load_node(u_kept, i)
     dv = load_node(v, i) - load_node(v_kept, i)
-    if not (wp.dot(du, du) + wp.dot(dv, dv) == 0.0) or inverse_mass[i] != inverse_mass_kept[i]:
+    if wp.dot(du, du) + wp.dot(dv, dv) != 0.0 or inverse_mass[i] != inverse_mass_kept[i]:
         changed[0] = 1
 
 

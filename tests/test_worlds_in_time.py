@@ -1,13 +1,11 @@
 """Worlds in time: keyframes, resets, worlds that come to grief, checkpoints and recordings."""
 
-import json
-
 import numpy as np
 import pytest
 import warp as wp
 from cases import random_displacement
-from pxr import Usd, UsdGeom
 from older_checkpoints import as_version
+from pxr import Usd, UsdGeom
 from worlds import CUBE, DT, MESHES, WORLDS, Scene, assert_same, beam, simulated, states
 
 import warp_corot as wc

@@ -1,4 +1,4 @@
-"""Runs of a simulation: how many steps are made before something else is due, and what becomes of a state gone wrong."""
+"""Runs of a simulation: how many steps come before something else is due, and what becomes of a state gone wrong."""
 
 from __future__ import annotations
 

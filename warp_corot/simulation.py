@@ -113,8 +113,8 @@ class Simulation:
         self.safe_step: SafeStep | None = None
         if given is None:
             self.safe_step = SafeStep(self.bodies, self.fields, self.models, self.pace, stable)
-        bound = zip(self.bodies, self.fields, strict=True)
-        steppers = [self.integrator.bind(body, field, self._context) for body, field in bound]
+        moved = zip(self.bodies, self.fields, strict=True)
+        steppers = [self.integrator.bind(body, field, self._context) for body, field in moved]
         self.recorded = RecordedSteps(self.bodies, steppers, self.pace, self.safe_step)
         #: What is to be kept besides the states of bodies and fields for a run to go on as it would have.
         self.kept = self.pace.state | ({} if self.safe_step is None else self.safe_step.state)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import warp as wp
 
@@ -49,7 +49,6 @@ class Corotated(Model):
     Raises:
         InputError: An option is none of these.
     """
-
 
     rotation_level: int | None = None
     rotation: str = "byers-xu"
