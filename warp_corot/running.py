@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 #: Steps from one check with elastic energies to the next, and the same where many steps are one launch.
 CHECK_STEPS = 512
 BLOCK_CHECK_STEPS = 2048
-#: Steps that a check before a hook or a pass is worth.
-LEAST_CHECKED = 16
 #: How often the step is halved to come over one place.
 MOST_RETURNS = 6
 #: How often it is halved for a little energy from nowhere, as comes with crushed elements also of the shortest steps.
@@ -36,7 +34,6 @@ class Running:
 
     def __init__(self, sim: Simulation):
         self._sim = sim
-        self._since_check = 0
         self._returns = 0
         #: The time at which the state was found to be wrong, while it has not been passed.
         self._wrong_until = -math.inf
@@ -61,7 +58,7 @@ class Running:
         end = sim.total_steps + count
         self._begin()
         while (left := end - sim.total_steps) > 0:
-            self._go(left, None, last=left)
+            self._go(left, None)
 
     def make_until(self, total_time: float) -> None:
         """Make steps until a time [s], exactly; only if the step is the simulation's to choose."""
@@ -88,7 +85,7 @@ class Running:
         sim.recorded.adopt_positions()
         sim.guard.begin()
 
-    def _go(self, most: int, end: float | None, last: int | None = None) -> bool:
+    def _go(self, most: int, end: float | None) -> bool:
         """Make steps until something is due, and do it; whether the end is reached."""
         sim = self._sim
         sim.recorded.adopt_positions()
@@ -96,17 +93,14 @@ class Running:
         most = min(most, self._until_due(done))
         reached = self._advance(done, most, end)
         sim.recorded.publish_positions()
-        now = sim.steps
-        self._since_check += now - done
-        reached = reached or now - done == last
-        due = sim.remeshing.is_due(now)
-        if not self._check(now, due=due, ends=reached):
+        now = self._steps_made = sim.steps
+        if not self._check(now):
             return False
-        if due:
+        if sim.remeshing.is_due(now):
             sim.follow_motion()
             sim.guard.forget()
             sim.guard.begin()
-        if sim.hook_intervals and sim.total_steps > self._steps_called:
+        if any(now % every == 0 for every in sim.hook_intervals) and sim.total_steps > self._steps_called:
             self._steps_called = sim.total_steps
             sim.call_hooks()
             sim.recorded.adopt_positions()
@@ -199,17 +193,12 @@ class Running:
             self._sim.safe_step.resume()
         self._shortened = False
 
-    def _check(self, now: int, *, due: bool, ends: bool) -> bool:
-        """Check the state where that is worth it; False if it was put back."""
+    def _check(self, now: int) -> bool:
+        """Check the state; False if it was put back."""
         sim = self._sim
         whole = now % self._check_steps == 0 or bool(self._returns)
-        if not (whole or ends or self._since_check >= LEAST_CHECKED or due):
-            fault = sim.guard.not_finite()
-            if fault is None:
-                return True
-        else:
-            fault = sim.guard.check(whole=whole, strict=sim.safe_step is not None and self._returns < STRICT_RETURNS)
-            self._since_check = 0
+        strict = sim.safe_step is not None and self._returns < STRICT_RETURNS
+        fault = sim.guard.check(whole=whole, strict=strict)
         if fault is not None:
             self._go_back(fault)
             return False
@@ -235,7 +224,6 @@ class Running:
         sim.guard.go_back()
         sim.safe_step.share = 0.5 * share
         sim.guard.settle()
-        self._since_check = 0
         if not self._has_warned:
             self._has_warned = True
             message = (

@@ -39,6 +39,8 @@ class Gauge:
         #: Of the probing motion, float32 [1].
         self.scale = wp.zeros(1, dtype=wp.float32, device=body.device)
         self.rescale()
+        # Loading within a recording would end it on some drivers.
+        wp.load_module(kernels.find_strains(body.element_kind).module, body.device)
 
     def rescale(self) -> None:
         """Fit the probing motion to the present mesh: the lightest free node moves a share of the smallest element."""
