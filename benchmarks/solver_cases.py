@@ -14,6 +14,7 @@ import warp_corot as wc
 from warp_corot.elasticity import ForceField, Model
 from warp_corot.experiments import paper
 from warp_corot.solvers.integrator import StepContext
+from warp_corot.solvers.pace import Pace
 from warp_corot.worlds import World
 
 #: Steps of one sample of a whole-step row.
@@ -139,9 +140,7 @@ def integration_case(problem: Problem) -> Case:
     v, f = (rng.uniform(-1, 1, problem.u.shape).astype(np.float32) for _ in range(2))
     v[body.constrained] = 0
     f *= np.float32(body.masses.mean() * 10.0)
-    clock = wp.zeros(1, dtype=wp.int64, device=problem.device)
-    bad_step = wp.array([np.iinfo(np.int64).max], dtype=wp.int64, device=problem.device)
-    context = StepContext(dt, wp.vec3(0.0, 0.0, 0.0), clock, bad_step)
+    context = StepContext.of(Pace(dt, problem.device), wp.vec3(0.0, 0.0, 0.0))
     stepper = wc.SymplecticEuler(dt, DAMPING).bind(body, _NoForces(body), context)
 
     def error() -> float:

@@ -3,6 +3,7 @@
 import warp as wp
 
 from .keyframes import key_before
+from .pace import Pace, time_after
 
 wp.set_module_options({"enable_backward": False})
 
@@ -13,19 +14,18 @@ def follow_activation(
     elements: wp.array[wp.int32],
     times: wp.array[wp.float64],
     stress: wp.array2d[wp.float32],
-    dt: float,
-    clock: wp.array[wp.int64],
+    pace: Pace,
     world_starts: wp.array[wp.float64],
     world_element_count: int,
     offset: int,
     # Out
     activation: wp.array[wp.float32],
 ):
-    """Active stress by its keyframes at the beginning of a step, ``offset`` steps after the clock's last count."""
+    """Active stress by its keyframes at the beginning of a step, ``offset`` steps after the last that is counted."""
     k = wp.tid()
     t = elements[k]
     start = world_starts[t // world_element_count]
-    now = (wp.float64(clock[0] + wp.int64(offset)) - start) * wp.float64(dt)
+    now = time_after(pace, offset) - start
     key, s = key_before(times, now)
     row = wp.min(k, stress.shape[1] - 1)
     a = stress[key, row]

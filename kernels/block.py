@@ -15,7 +15,8 @@ import warp as wp
 from .block_layout import FIRST_SHIFT, FOLLOWING_SHIFT, NEIGHBOURS, NO_NODE, NODE_WORDS, NUMBERS, WARP, Layout
 from .constitutive import hooke, symmetric
 from .elements import FRAME_SHIFT, LEVEL_MASK, Subtrees, load_node, mirror_sign, store_node
-from .integrate import is_finite, symplectic_euler_velocity, vector_at
+from .integrate import add_support_work, is_finite, symplectic_euler_velocity, vector_at
+from .pace import DONE, DT, Pace
 from .rotation import column, identity3, robust_rotation
 from .shapes import VOLUME, fingerprint
 from .subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS
@@ -244,7 +245,6 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
         # In
         body: BlockBody,
         steps: int,
-        dt: float,
         damping: float,
         gravity: wp.vec3,
         mu: wp.array[wp.float32],
@@ -254,15 +254,17 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
         inverse_mass: wp.array[wp.float32],
         has_load: int,
         load: wp.array[load_vectors],
-        clock: wp.array[wp.int64],
+        pace: Pace,
         # In and out
         u: wp.array[wp.vec4],
         v: wp.array[wp.vec4],
         # Out
         reactions: wp.array[wp.vec4],
+        support_work: wp.array[wp.float64],
         bad_step: wp.array[wp.int64],
     ):
         _generated_from = wp.static(fingerprint(needs, places))
+        dt = float(pace.seconds[DT])
         world = wp.tid() // wp.static(threads)
         thread = wp.tid() % wp.static(threads)
         base = world * body.node_count
@@ -339,6 +341,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
                 if (about >> wp.static(FIRST_SHIFT)) == 1:
                     place = about & wp.static(NO_NODE)
                     i = base + place
+                    elastic = force
                     if has_load != 0:
                         force += vector_at(load, i)
                     w = inverse_mass[i]
@@ -346,12 +349,14 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
                     if w > 0.0:
                         moving = symplectic_euler_velocity(moving, force, w, gravity, dt, damped)
                         velocity(wp.static(STORE), place, moving)
-                    elif step == steps - 1:
-                        store_node(reactions, i, -(force + mass[i] * gravity))
+                    else:
+                        add_support_work(elastic, dt * moving, support_work)
+                        if step == steps - 1:
+                            store_node(reactions, i, -(force + mass[i] * gravity))
                     moved = displacement(wp.static(LOAD), place, force) + dt * moving
                     displacement(wp.static(STORE), place, moved)
                     if not is_finite(moved):
-                        wp.atomic_min(bad_step, 0, clock[0] + wp.int64(step + 1))
+                        wp.atomic_min(bad_step, 0, pace.counts[DONE] + wp.int64(step + 1))
                 task += wp.static(threads)
             synchronize_block()
             step += 1

@@ -13,6 +13,7 @@ import warp as wp
 
 from .elements import load_node, store_node
 from .keyframes import key_before
+from .pace import DONE, DT, Pace, time_after
 
 wp.set_module_options({"enable_backward": False})
 
@@ -56,17 +57,25 @@ def symplectic_euler_velocity(
     return (v + dt * (inverse_mass * force + gravity)) * damped
 
 
+@wp.func
+def add_support_work(elastic: wp.vec3, moved: wp.vec3, work: wp.array[wp.float64]):
+    """What a support puts in that moves a node against its elastic force; only where supports move at all."""
+    added = wp.float64(-wp.dot(elastic, moved))
+    if added != wp.float64(0.0):
+        wp.atomic_add(work, 0, added)
+        wp.atomic_add(work, 1, wp.abs(added))
+
+
 @wp.kernel(enable_backward=False)
 def step_symplectic_euler(
     # In
-    dt: float,
     damping: float,
     gravity: wp.vec3,
     mass: wp.array[wp.float32],
     inverse_mass: wp.array[wp.float32],
     has_load: int,
     load: wp.array[Any],
-    clock: wp.array[wp.int64],
+    pace: Pace,
     offset: int,
     # In and out
     f: wp.array[wp.vec4],
@@ -74,16 +83,20 @@ def step_symplectic_euler(
     v: wp.array[wp.vec4],
     # Out
     reactions: wp.array[wp.vec4],
+    support_work: wp.array[wp.float64],
     bad_step: wp.array[wp.int64],
 ):
     """v <- (v + dt (f/m + g)) / (1 + dt damping); u <- u + dt v; f <- 0 for the next step to add to.
 
-    ``clock`` counts the steps before this run of recorded ones and ``offset`` this one's place in the run.
+    ``offset`` is this step's place in a run of recorded ones, whose steps ``pace`` does not count before its end.
+    ``support_work`` adds up what moving supports put in against the elastic forces, and its absolute value [J].
     A node without inverse mass moves with the velocity it has (zero if fixed), and its support takes what is left of
     Newton's second law: the weight, the elastic force and the load.
     """
     i = wp.tid()
-    force = load_node(f, i)
+    dt = float(pace.seconds[DT])
+    elastic = load_node(f, i)
+    force = elastic
     if has_load != 0:
         force += vector_at(load, i)
     w = inverse_mass[i]
@@ -93,23 +106,18 @@ def step_symplectic_euler(
         store_node(v, i, velocity)
     else:
         store_node(reactions, i, -(force + mass[i] * gravity))
+        add_support_work(elastic, dt * velocity, support_work)
     displacement = load_node(u, i) + dt * velocity
     store_node(u, i, displacement)
     store_node(f, i, wp.vec3())
     if not is_finite(displacement):
-        wp.atomic_min(bad_step, 0, clock[0] + wp.int64(offset + 1))
+        wp.atomic_min(bad_step, 0, pace.counts[DONE] + wp.int64(offset + 1))
 
 
 @wp.kernel(enable_backward=False)
-def advance_clock(steps: int, clock: wp.array[wp.int64]):
-    """Count a run of recorded steps; within the run each step carries its offset."""
-    clock[0] = clock[0] + wp.int64(steps)
-
-
-@wp.kernel(enable_backward=False)
-def set_start(clock: wp.array[wp.int64], world_starts: wp.array[wp.float64]):
+def set_start(pace: Pace, world_starts: wp.array[wp.float64]):
     """Let the time of the one world there is begin now."""
-    world_starts[0] = wp.float64(clock[0])
+    world_starts[0] = time_after(pace, 0)
 
 
 @wp.kernel(enable_backward=False)
@@ -118,25 +126,33 @@ def follow_trajectory(
     nodes: wp.array[wp.int32],
     times: wp.array[wp.float64],
     displacements: wp.array2d[wp.vec3],
-    dt: float,
-    clock: wp.array[wp.int64],
+    pace: Pace,
     world_starts: wp.array[wp.float64],
     world_node_count: int,
     offset: int,
+    f: wp.array[wp.vec4],
     u: wp.array[wp.vec4],
     # Out
     v: wp.array[wp.vec4],
+    support_work: wp.array[wp.float64],
 ):
-    """Give prescribed nodes the velocity that takes them to their keyframed displacement at the end of the step."""
+    """Give prescribed nodes the velocity that takes them to their keyframed displacement at the end of the step.
+
+    The work of a step is that of the mean of the forces f at its two ends, by the trapezoidal rule: each force counts
+    with half the motion before it and half the motion after. The step itself counts the latter as a whole.
+    """
     k = wp.tid()
     i = nodes[k]
     start = world_starts[i // world_node_count]
-    t = (wp.float64(clock[0] + wp.int64(offset + 1)) - start) * wp.float64(dt)
+    t = time_after(pace, offset + 1) - start
     key, s = key_before(times, t)
     row = wp.min(k, displacements.shape[1] - 1)
     a = displacements[key, row]
     target = a + s * (displacements[key + 1, row] - a)
-    store_node(v, i, (target - load_node(u, i)) / dt)
+    dt = float(pace.seconds[DT])
+    velocity = (target - load_node(u, i)) / dt
+    add_support_work(load_node(f, i), (0.5 * dt) * (load_node(v, i) - velocity), support_work)
+    store_node(v, i, velocity)
 
 
 @wp.kernel(enable_backward=False)
@@ -178,7 +194,7 @@ def reset_nodes(
     initial_v: wp.array[wp.vec4],
     rest: wp.array[wp.vec4],
     inverse_mass: wp.array[wp.float32],
-    clock: wp.array[wp.int64],
+    pace: Pace,
     # Out
     u: wp.array[wp.vec4],
     v: wp.array[wp.vec4],
@@ -195,7 +211,7 @@ def reset_nodes(
     if chosen[world] == 0:
         return
     if i % world_node_count == 0:
-        world_starts[world] = wp.float64(clock[0])
+        world_starts[world] = time_after(pace, 0)
     displacement = wp.vec3()
     velocity = wp.vec3()
     if has_initial != 0:

@@ -35,6 +35,10 @@ def general_body(device):
     return body
 
 
+def given(dt):
+    return wc.SymplecticEuler(dt=dt, damping=2.0)
+
+
 @pytest.mark.parametrize(
     ("make", "model"),
     [
@@ -51,16 +55,18 @@ def general_body(device):
 def test_a_resumed_run_is_the_uninterrupted_one(device, tmp_path, make, model):
     integrator = wc.SymplecticEuler(damping=2.0)
     whole = wc.Simulation(make(device), model=model, integrator=integrator, gravity=(0.1, -9.8, 0))
-    # The found step is measured by sums in any order on CUDA; both runs must take the same.
-    integrator = wc.SymplecticEuler(dt=whole.dt, damping=2.0)
+    if whole.device.is_cuda:  # where forces come in any order, the step that follows them is never quite the same
+        whole = wc.Simulation(make(device), model=model, integrator=given(whole.dt), gravity=(0.1, -9.8, 0))
+        integrator = given(whole.dt)
     parted = wc.Simulation(make(device), model=model, integrator=integrator, gravity=(0.1, -9.8, 0))
     whole.advance_steps(150)
     parted.advance_steps(70)
     parted.save(tmp_path / "state.npz")
     resumed = wc.Simulation.load(tmp_path / "state.npz")
-    assert resumed.dt == whole.dt
+    assert resumed.dt == parted.dt
     assert resumed.steps == 70
     resumed.advance_steps(80)
+    assert resumed.dt == whole.dt
     assert resumed.time == whole.time
     for name in ("positions", "displacements", "velocities", "reactions"):
         a, b = getattr(whole.body, name).numpy(), getattr(resumed.body, name).numpy()

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from .mesh.bound import DeviceBinding
     from .remesh.changing import Changing
     from .remesh.following import FollowingBinding
+    from .solvers.pace import Pace
 
 #: Elements, and with them nodes, are numbered in 32 bits.
 MOST_ELEMENTS = 2**31 - 1
@@ -109,8 +110,7 @@ class SoftBody(Controls, SharedArrays):
         self.element_activation = wp.zeros(1, dtype=wp.float32, device=self.device)
         self.has_activation = False
         self.activations: list[ElementActivation] = []
-        #: Time steps done when each world was last reset, float64 [worlds]; where steps were of other lengths before,
-        #: as many of the present ones as would have taken as long.
+        #: The time when each world was last reset [s], float64 [worlds].
         self.world_starts = wp.zeros(self.worlds, dtype=wp.float64, device=self.device)
         #: Changes whenever the launches of a step do, so that recorded steps can be recorded anew.
         self.revision = 0
@@ -279,19 +279,19 @@ class SoftBody(Controls, SharedArrays):
             return
         self.initial_state = (wp.clone(self.node_displacements), wp.clone(self.node_velocities))
 
-    def reset(self, chosen: wp.array, clock: wp.array) -> None:
+    def reset(self, chosen: wp.array, pace: Pace) -> None:
         """Put chosen worlds back to their initial state; ``Simulation.reset`` does more and is what to call.
 
         Args:
             chosen: Not zero for worlds to be reset, int32 [worlds].
-            clock: Time steps done, int64 [1].
+            pace: The clock.
         """
         if self.changing is not None:
-            self.changing.reset(chosen, clock)
+            self.changing.reset(chosen, pace)
             return
         kept = self.initial_state is not None
         u, v = self.initial_state or (self.node_displacements, self.node_velocities)
-        inputs = [chosen, self.world_node_count, int(kept), u, v, self.node_rest, self.node_inverse_mass, clock]
+        inputs = [chosen, self.world_node_count, int(kept), u, v, self.node_rest, self.node_inverse_mass, pace.arrays]
         outputs = [self.node_displacements, self.node_velocities, self.node_positions, self.node_reactions]
         self._launch(RESET_NODES[self.node_positions.dtype], inputs, [*outputs, self.world_starts])
 

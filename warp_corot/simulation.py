@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,20 +16,19 @@ import warp as wp
 from .body import SoftBody
 from .checks import checked_count
 from .elasticity import Corotated, Model
-from .errors import InputError, StabilityWarning, UnstableError, depth_of_user
+from .errors import InputError, StabilityWarning, depth_of_user
 from .indices import checked_indices
 from .nodal import vec3_view
 from .parts import checked_bodies, checked_gravity, checked_integrator, checked_models
 from .remesh.online import OnlineRemesh
 from .remesh.remeshing import Remeshing
+from .running import Running
 from .solvers import Integrator, SymplecticEuler, largest_frequency
-from .solvers.integrator import StepContext
-from .solvers.recorded import GRAPH_STEPS, RecordedSteps
-
-#: About how long a run goes on before it looks whether its state is still finite [s].
-CHECK_SECONDS = 0.1
-
-_NEVER = np.iinfo(np.int64).max
+from .solvers.guard import Guard
+from .solvers.integrator import NEVER, StepContext
+from .solvers.pace import Pace
+from .solvers.recorded import RecordedSteps
+from .solvers.safe_step import ANY_STEP, SafeStep
 
 
 class Energy(NamedTuple):
@@ -57,7 +55,9 @@ class Simulation:
     Args:
         bodies: A ``SoftBody`` or several on one device; they do not touch one another.
         model: Elastic model, or one for each body.
-        integrator: Time integrator; with ``dt=None`` a stable step is found.
+        integrator: Time integrator. With ``dt=None`` the step follows the state: it is measured again during the run,
+            and a state that goes wrong all the same is made again with half the step. A step that is given stays, and a
+            run in which it is too long ends with an error.
         gravity: [m/s^2]; None for 9.81 down the up axis of the first body's mesh.
         deterministic: Whether a run must come out the same bit by bit every time. On the CPU it always does; on CUDA
             forces are then added up in one order, which takes time and memory (``benchmarks/README.md``).
@@ -67,7 +67,6 @@ class Simulation:
     Attributes:
         bodies: Tuple of the bodies.
         worlds: Copies of the bodies, the same number for each.
-        dt: Time step [s]; with ``remesh`` and no step given it follows what the finest elements hold.
         stable_dt: Largest linearly stable step at rest [s], estimated; infinite where nothing can vibrate.
         gravity: Tuple [m/s^2].
 
@@ -103,16 +102,24 @@ class Simulation:
         bound = zip(self.models, self.bodies, strict=True)
         self.fields = tuple(m.bind(body, deterministic=self.deterministic) for m, body in bound)
         self.remeshing.serve(self.fields)
-        self.clock = wp.zeros(1, dtype=wp.int64, device=self.device)
-        self._bad_step = wp.array([_NEVER], dtype=wp.int64, device=self.device)
-        #: Steps that would have taken as long as the time before the first one of the present length.
-        self._epoch = 0.0
-        self.dt = self._found_step()
-        self._bind_steppers()
-        self._steps_before_reset = 0
-        self._time_before_reset = 0.0
-        self._check_steps = GRAPH_STEPS
+        self.time_before_reset = 0.0
+        self.steps_before_reset = 0
         self._hooks: list[_Hook] = []
+        stable = self._find_stable_steps()
+        given = self.integrator.dt
+        self.pace = Pace(ANY_STEP if given is None else float(given), self.device)
+        self._context = StepContext.of(self.pace, wp.vec3(*self.gravity))
+        #: What chooses the step, if none was given.
+        self.safe_step: SafeStep | None = None
+        if given is None:
+            self.safe_step = SafeStep(self.bodies, self.fields, self.models, self.pace, stable)
+        moved = zip(self.bodies, self.fields, strict=True)
+        steppers = [self.integrator.bind(body, field, self._context) for body, field in moved]
+        self.recorded = RecordedSteps(self.bodies, steppers, self.pace, self.safe_step)
+        #: What is to be kept besides the states of bodies and fields for a run to go on as it would have.
+        self.kept = self.pace.state | ({} if self.safe_step is None else self.safe_step.state)
+        self.guard = Guard(self.bodies, self.fields, self._context, tuple(self.kept.values()))
+        self._running = Running(self)
 
     # --- stepping --------------------------------------------------------------------------------------------------
 
@@ -127,98 +134,89 @@ class Simulation:
         return tuple(None if each is None else each.options for each in self.remeshing.changing)
 
     @property
+    def dt(self) -> float:
+        """The time step [s]; if none was given, the one that the present state allows."""
+        return self.pace.dt if self.safe_step is None else self.safe_step.allowed
+
+    @property
+    def dt_range(self) -> tuple[float, float]:
+        """The shortest and the longest time step so far [s]."""
+        return (self.dt, self.dt) if self.safe_step is None else self.safe_step.range
+
+    @property
     def steps(self) -> int:
         """Time steps done, since the last ``reset()`` if there was one."""
-        return int(self.clock.numpy()[0])
+        return self.pace.steps
 
     @property
     def total_steps(self) -> int:
         """Time steps done, whatever has been reset since."""
-        return self._steps_before_reset + self.steps
+        return self.steps_before_reset + self.steps
 
     @property
     def time(self) -> float:
         """Simulated time [s], since the last ``reset()`` if there was one."""
-        return (self.steps - self._epoch) * self.dt
+        return self.pace.time
 
     @property
     def total_time(self) -> float:
         """Simulated time [s], whatever has been reset since."""
-        return self._time_before_reset + self.time
+        return self.time_before_reset + self.time
 
     def step(self) -> None:
         """Advance by one time step.
 
         Inside somebody else's capture on this device the step's launches are recorded, nothing else: no hooks are
-        called and nothing is checked. On CUDA the call does not wait for the device unless hooks are set or bodies are
-        remeshed.
+        called, nothing is checked, and the step has the length that the last run left. On CUDA the call does not wait
+        for the device unless hooks are set or bodies are remeshed.
 
         Raises:
             InputError: Somebody is capturing, and there are bodies to be remeshed.
-            UnstableError: On the CPU: the state is not finite any more.
+            UnstableError: On the CPU: the state is not finite any more. Nothing is made again here: ``advance`` does.
         """
         if self.device.is_capturing:
             if self.remeshing.every:
                 raise InputError("a simulation with remesh cannot be recorded by others: launches change with the mesh")
-            self._recorded.launch(1, whole=True)
+            self.recorded.launch(1, whole=True)
             return
-        self._recorded.replay(1, whole=True)
+        self._running.step()
         if self.device.is_cpu or self._hooks or self.remeshing.every:
-            self._check_finite()
+            self._running.look()
             if self.remeshing.every:
-                self._remesh()
-            self._call_hooks()
+                self.follow_motion()
+            self.call_hooks()
 
     def advance(self, seconds: float) -> None:
-        """Advance by the whole number of steps nearest to ``seconds``; the state is there when the call returns.
+        """Advance by ``seconds``; the state is there when the call returns.
+
+        Exactly, in steps that are a little shorter at the end; if the step was given, by the whole number of steps that
+        comes nearest.
 
         Raises:
             InputError: Negative or non-finite time.
-            UnstableError: The state is not finite any more; the message says since which step.
+            UnstableError: The state went wrong: it is not finite, or it has energy that nothing put in. If no step was
+                given: and shorter ones did not help.
+
+        Warns:
+            StabilityWarning: The state went wrong, and was made again with half the step; once.
         """
         if not (math.isfinite(seconds) and seconds >= 0):
             raise InputError(f"cannot advance by {seconds} s; it must be zero or a positive time")
         if self.device.is_capturing:
             raise InputError("advance cannot be called while its device is capturing; call step, which records")
-        if self.remeshing.every:
-            self.advance_until(self.total_time + seconds)
-        else:
-            self.advance_steps(round(seconds / self.dt))
+        self.advance_until(self.total_time + seconds)
 
     def advance_until(self, total_time: float) -> None:
-        """Advance until ``total_time`` [s] is as near as whole steps bring it; as ``advance``."""
-        count = max(round((total_time - self.total_time) / self.dt), 0)
-        if not self.remeshing.every:
-            self.advance_steps(count)
-            return
-        # A pass may change the step.
-        while count > 0:
-            self.advance_steps(min(count, self.remeshing.every - self.steps % self.remeshing.every))
-            count = max(round((total_time - self.total_time) / self.dt), 0)
+        """Advance until ``total_time`` [s]; as ``advance``."""
+        if self.safe_step is not None:
+            self._running.make_until(total_time)
+        else:
+            self._running.make(max(round((total_time - self.total_time) / self.dt), 0))
+        wp.synchronize_device(self.device)
 
     def advance_steps(self, count: int) -> None:
         """Advance by ``count`` time steps; as ``advance``. Steps that a hook makes count."""
-        count = checked_count(count, "count", least=0)
-        end = self.total_steps + count
-        done, left = self.steps, count
-        while left > 0:
-            rests = [hook.every for hook in self._hooks]
-            if self.remeshing.every:
-                rests.append(self.remeshing.every)
-            due = min([done + left, done + self._check_steps, *((done // every + 1) * every for every in rests)])
-            started = time.perf_counter()
-            self._recorded.replay_runs(due - done)
-            self._check_finite()
-            if self.remeshing.is_due(due):
-                self._remesh()
-            if due - done == self._check_steps:
-                longer = CHECK_SECONDS / (time.perf_counter() - started)
-                self._check_steps = max(int(self._check_steps * min(longer, 4.0)), 1)
-            done, left = due, left - (due - done)
-            if self._hooks:
-                # A hook may make steps itself or set the clock back.
-                self._call_hooks()
-                done, left = self.steps, end - self.total_steps
+        self._running.make(checked_count(count, "count", least=0))
         wp.synchronize_device(self.device)
 
     def on_step(self, callback: Callable[[Simulation], None], every: int = 1) -> None:
@@ -257,12 +255,12 @@ class Simulation:
             mask[slice(None) if worlds is None else checked_indices(worlds, self.worlds, "world")] = 1
             chosen = wp.array(mask, dtype=wp.int32, device=self.device)
         if worlds is None:
-            self._steps_before_reset, self._time_before_reset = self.total_steps, self.total_time
-            self._epoch = 0.0
-            self.clock.zero_()
-            self._bad_step.fill_(_NEVER)
+            self.steps_before_reset, self.time_before_reset = self.total_steps, self.total_time
+            self.pace.restart()
+            self._context.bad_step.fill_(NEVER)
+            self.guard.restart()
         for body, field in zip(self.bodies, self.fields, strict=True):
-            body.reset(chosen, self.clock)
+            body.reset(chosen, self.pace)
             field.reset(chosen)
         self._control_step()
 
@@ -330,30 +328,21 @@ class Simulation:
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
-    def _found_step(self) -> float:
-        """The time step that was given, or one that is stable; ``stable_dt`` is found anew."""
+    def _find_stable_steps(self) -> list[float]:
+        """The largest stable step of each body at rest [s], of which ``stable_dt`` is the smallest."""
         frequencies = [largest_frequency(body, f) for body, f in zip(self.bodies, self.fields, strict=True)]
         steps = [2.0 / w if w > 0 else math.inf for w in frequencies]
         self.stable_dt = min(steps)
-        if self.integrator.dt is not None:
-            given = float(self.integrator.dt)
-            if given > self.stable_dt:
-                warnings.warn(
-                    f"the time step {given:.3g} s is beyond the largest stable one, about {self.stable_dt:.3g} s",
-                    StabilityWarning,
-                    stacklevel=depth_of_user(),
-                )
-            return given
-        safe = min(m.step_safety * dt for m, dt in zip(self.models, steps, strict=True))
-        return safe if math.isfinite(safe) else 1e-3
+        given = self.integrator.dt
+        if given is not None and float(given) > self.stable_dt:
+            warnings.warn(
+                f"the time step {float(given):.3g} s is beyond the largest stable one, about {self.stable_dt:.3g} s",
+                StabilityWarning,
+                stacklevel=depth_of_user(),
+            )
+        return steps
 
-    def _bind_steppers(self) -> None:
-        context = StepContext(self.dt, wp.vec3(*self.gravity), self.clock, self._bad_step)
-        bound = zip(self.bodies, self.fields, strict=True)
-        steppers = [self.integrator.bind(body, field, context) for body, field in bound]
-        self._recorded = RecordedSteps(self.bodies, steppers, self.clock)
-
-    def _remesh(self) -> None:
+    def follow_motion(self) -> None:
         """Let the meshes follow the motion, and the step the meshes, where that is due."""
         if self.remeshing.run(self.steps):
             self._control_step()
@@ -362,16 +351,9 @@ class Simulation:
         """Find the stable step anew where the elements that limit it are others now."""
         if not self.remeshing.step_may_change():
             return
-        before, self.dt = self.dt, self._found_step()
-        if self.dt == before:
-            return
-        # What has been simulated, and how long ago worlds were reset, in steps of the new length.
-        ratio, steps = before / self.dt, self.steps
-        self._epoch = steps - (steps - self._epoch) * ratio
-        for body in self.bodies:
-            starts = body.world_starts.numpy()
-            body.world_starts.assign(steps - (steps - starts) * ratio)
-        self._bind_steppers()
+        stable = self._find_stable_steps()
+        if self.safe_step is not None:
+            self.safe_step.find_rest(stable)
 
     def _index(self, body: SoftBody | None) -> int:
         if body is None:
@@ -380,30 +362,13 @@ class Simulation:
             raise InputError("the body is not one of this simulation's")
         return self.bodies.index(body)
 
-    def _check_finite(self) -> None:
-        step = int(self._bad_step.numpy()[0])
-        if step == _NEVER:
-            return
-        # Said once: who sets a good state again may go on.
-        self._bad_step.fill_(_NEVER)
-        bad = self._bad_worlds()
-        if not len(bad):
-            return  # somebody has set a good state before anybody looked
-        more = f" and {len(bad) - 3} more" if len(bad) > 3 else ""
-        where = f" in world {', '.join(map(str, bad[:3]))}{more}" if self.worlds > 1 else ""
-        hint = f"dt is {self.dt:.3g} s, the largest stable step at rest about {self.stable_dt:.3g} s"
-        when = f"step {step} (t = {(step - self._epoch) * self.dt:.4g} s)"
-        raise UnstableError(f"the state is not finite since {when}{where}; {hint}")
+    @property
+    def hook_intervals(self) -> list[int]:
+        """Steps between the calls of each hook."""
+        return [hook.every for hook in self._hooks]
 
-    def _bad_worlds(self) -> npt.NDArray[np.intp]:
-        """The worlds in which something is not finite, as ``kernels.integrate.is_finite`` has it."""
-        bad = np.zeros(self.worlds, bool)
-        for body in self.bodies:
-            sizes = np.abs(body.node_displacements.numpy().astype(np.float64)).sum(axis=1)
-            bad |= ~(sizes.reshape(self.worlds, -1) <= 3e38).all(axis=1)
-        return np.flatnonzero(bad)
-
-    def _call_hooks(self) -> None:
+    def call_hooks(self) -> None:
+        """Call the hooks that are due now."""
         steps = self.steps if self._hooks else 0
         for hook in tuple(self._hooks):
             if steps % hook.every == 0:

@@ -161,21 +161,20 @@ def _material(args: argparse.Namespace, subject: Subject) -> Isotropic:
 def _make_simulation(
     args: argparse.Namespace, subject: Subject, body: SoftBody, model: Model, remesh: OnlineRemesh | None
 ) -> Simulation:
-    """The simulation, its kernels compiled, with a whole number of steps to a frame if their length is to stay."""
+    """The simulation, its kernels compiled; a given step is shortened until a whole number of them makes a frame."""
     from ..io.animate import steps_per_frame
 
     damping = subject.damping if args.damping is None else args.damping
     gravity = subject.gravity if args.gravity is None else tuple(args.gravity)
     SymplecticEuler(args.dt, damping)  # checks both, the step before it is shortened
-    wanted = _tried_step(body, model, damping, remesh)
-    step = args.dt if remesh else args.dt or wanted
-    dt = None if step is None else 1.0 / (args.fps * steps_per_frame(args.fps, step))
+    _try_step(body, model, damping, remesh)
+    dt = None if args.dt is None else 1.0 / (args.fps * steps_per_frame(args.fps, args.dt))
     with as_remesh_options():
         return Simulation(body, model=model, integrator=SymplecticEuler(dt, damping), gravity=gravity, remesh=remesh)
 
 
-def _tried_step(body: SoftBody, model: Model, damping: float, remesh: OnlineRemesh | None) -> float:
-    """A safe step: at rest and without weight it loads every kernel and moves nothing."""
+def _try_step(body: SoftBody, model: Model, damping: float, remesh: OnlineRemesh | None) -> None:
+    """Make one step: at rest and without weight it loads every kernel and moves nothing."""
     tried = body
     if remesh:
         # The body's own mesh is not to change before it begins.
@@ -184,12 +183,10 @@ def _tried_step(body: SoftBody, model: Model, damping: float, remesh: OnlineReme
     integrator = SymplecticEuler(damping=damping)
     with as_remesh_options():
         trial = Simulation(tried, model=model, integrator=integrator, gravity=(0, 0, 0), remesh=remesh)
-    dt = trial.dt
     trial.step()
     trial.von_mises()
     if tried is body:
         body.displacements = body.velocities = np.zeros_like(body.mesh.points)
-    return dt
 
 
 @contextmanager

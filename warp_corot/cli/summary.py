@@ -47,7 +47,7 @@ def summary(subject: Subject, sim: Simulation, done: Recording, fixed: str, prev
         ("model", model if level is None else f"{model}, rotations of level {level}"),
         ("fixed", fixed),
         ("gravity", f"{' '.join(f'{g:g}' for g in sim.gravity)} m/s^2, damping {damping:g} /s"),
-        ("time step", f"{milliseconds(sim.dt)}, largest stable one about {milliseconds(sim.stable_dt)}{at_last}"),
+        ("time step", f"{_steps(sim)}; largest stable one at rest about {milliseconds(sim.stable_dt)}{at_last}"),
         ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"),
         ("wall time", f"{done.stepping:.2f} s stepping, {done.writing:.2f} s writing"),
         ("displacement", f"{length(done.largest_displacement)} largest, {at_end}"),
@@ -92,6 +92,15 @@ def _materials(subject: Subject, mesh: Mesh, material: Isotropic) -> list[tuple[
 
 def _values(young: float, poisson: float, density: float) -> str:
     return f"E = {pressure(float(young))}, nu = {poisson:g}, rho = {density:g} kg/m^3"
+
+
+def _steps(sim: Simulation) -> str:
+    shortest, longest = sim.dt_range
+    if sim.integrator.dt is not None:
+        return f"{milliseconds(shortest)}, as given"
+    if shortest > 0.99 * longest:
+        return milliseconds(longest)
+    return f"{milliseconds(shortest)} to {milliseconds(longest)}, following the state"
 
 
 def milliseconds(seconds: float) -> str:

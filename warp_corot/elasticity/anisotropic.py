@@ -32,6 +32,7 @@ from .model import ForceField, leaf_slots
 if TYPE_CHECKING:
     from ..body import SoftBody
     from ..remesh.plan import DevicePlan
+    from ..solvers.pace import Pace
 
 
 class AnisotropicField(ForceField):
@@ -85,10 +86,10 @@ class AnisotropicField(ForceField):
         inputs = [self.elements, self.material, *self._activation, u]
         self.launch(self._von_mises, self.element_count, inputs, [stress])
 
-    def begin_step(self, clock: wp.array, offset: int, dt: float) -> None:
+    def begin_step(self, pace: Pace, offset: int) -> None:
         body = self.body
         for activation in body.activations:
-            inputs = [activation.elements, activation.times, activation.stress, dt, clock, body.world_starts]
+            inputs = [activation.elements, activation.times, activation.stress, pace.arrays, body.world_starts]
             inputs += [body.world_element_count, offset]
             self.launch(follow_activation, len(activation.elements), inputs, [body.element_activation])
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from numbers import Integral
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import warp as wp
 
@@ -61,8 +61,6 @@ class Corotated(Model):
     Raises:
         InputError: An option is none of these.
     """
-
-    step_safety: ClassVar[float] = 0.8
 
     rotation_level: int | float | str | None = None
     rotation: str = "byers-xu"

@@ -17,7 +17,13 @@ if TYPE_CHECKING:
 
 
 def law_field(
-    law: str, body: SoftBody, *, stress: wp.Function, energy: wp.Function, cauchy: wp.Function, deterministic: bool = False
+    law: str,
+    body: SoftBody,
+    *,
+    stress: wp.Function,
+    energy: wp.Function,
+    cauchy: wp.Function,
+    deterministic: bool = False,
 ) -> LawField:
     """The fastest force field of a law on a body.
 

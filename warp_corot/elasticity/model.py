@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ..body import SoftBody
     from ..remesh.plan import DevicePlan
     from ..remesh.pools import DeviceForest
+    from ..solvers.pace import Pace
 
 
 class ForceField(ABC):
@@ -79,12 +80,12 @@ class ForceField(ABC):
     def derive(self, plan: DevicePlan) -> None:  # noqa: B027 (most need nothing)
         """Launch what brings up to date what is kept of such elements, if ``plan.goes``; may be recorded."""
 
-    def begin_step(self, clock: wp.array, offset: int, dt: float) -> None:  # noqa: B027 (most do not change)
+    def begin_step(self, pace: Pace, offset: int) -> None:  # noqa: B027 (most do not change)
         """Launch what sets the field for a step, where it changes with time.
 
         Args:
-            clock: Time steps done, int64 [1]; ``offset`` more are launched already.
-            dt: Time step [s].
+            pace: The clock.
+            offset: How many steps are launched that it does not count yet.
         """
 
     @abstractmethod
@@ -162,10 +163,12 @@ class Model(ABC):
     """The description of an elastic model: a frozen dataclass of plain values.
 
     Class attributes:
-        step_safety: Share of the linearly stable step that is taken by default; nonlinear models stiffen when strained.
+        step_safety: Share of the stable step that is taken by default while strains are small.
+        strained_safety: The same for large strains, where stiffness can change before it is measured again.
     """
 
-    step_safety: ClassVar[float] = 0.5
+    step_safety: ClassVar[float] = 0.9
+    strained_safety: ClassVar[float] = 0.6
 
     @abstractmethod
     def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:

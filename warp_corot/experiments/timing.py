@@ -23,6 +23,7 @@ from ..elasticity.corotated import CorotatedField
 from ..simulation import Simulation
 from ..solvers import SymplecticEuler
 from ..solvers.integrator import StepContext
+from ..solvers.pace import Pace
 
 #: Launches of one stage recorded in a graph.
 LAUNCHES = 64
@@ -203,12 +204,10 @@ def _integration(sim: Simulation) -> tuple[wp.Graph, list]:
     body = SoftBody(original.mesh, original.material, device=original.device)
     body.fix(original.constrained)
     body.displacements = original.displacements.numpy()
-    clock = wp.zeros(1, dtype=wp.int64, device=sim.device)
-    bad_step = wp.array([np.iinfo(np.int64).max], dtype=wp.int64, device=sim.device)
     assert isinstance(sim.integrator, SymplecticEuler)
-    context = StepContext(sim.dt, wp.vec3(0.0, 0.0, 0.0), clock, bad_step)
+    context = StepContext.of(Pace(sim.dt, sim.device), wp.vec3(0.0, 0.0, 0.0))
     stepper = sim.integrator.bind(body, _NoForces(body), context)
-    return recorded(lambda: stepper.steps(1), sim.device), [body, stepper, clock, bad_step]
+    return recorded(lambda: stepper.steps(1), sim.device), [body, stepper]
 
 
 def _replays(graph: wp.Graph, device: wp.Device) -> int:

@@ -150,9 +150,9 @@ def record(
 
     Several bodies become one mesh, body after body. Of a mesh made from a domain the smooth marched surface is written
     and not the tetrahedra; of any other mesh the tetrahedra and their boundary. Of a body that is remeshed each frame
-    shows the present mesh; smooth surfaces stay the same and are bound to it. Frame k shows the state after the whole
-    number of steps that comes nearest to k / fps. Whatever ends the run, the frames written stay: Ctrl-C and SIGTERM
-    wait while one is being written.
+    shows the present mesh; smooth surfaces stay the same and are bound to it. Frame k shows the state at k / fps, or,
+    of a simulation with a given step, after the whole number of steps that comes nearest. Whatever ends the run, the
+    frames written stay: Ctrl-C and SIGTERM wait while one is being written.
 
     Args:
         sim: Goes on from where it is.

@@ -32,8 +32,8 @@ Remesh = OnlineRemesh | Sequence[OnlineRemesh | None] | None
 
 FORMAT = "warp-corot checkpoint"
 #: 2: worlds, deterministic runs. 3: anisotropic materials, activation, forests made from domains. 4: meshes that
-#: change, steps of changing length. All are read.
-VERSION = 4
+#: change, steps of changing length. 5: a step that follows the state, starts of worlds in seconds. All are read.
+VERSION = 5
 
 MATERIALS = {kind.__name__: kind for kind in (Isotropic, TransverselyIsotropic, Orthotropic)}
 
@@ -57,18 +57,20 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
         "format": FORMAT,
         "version": VERSION,
         "device": str(sim.device),
-        "dt": sim.dt,
         "stable_dt": sim.stable_dt,
-        "steps": sim.steps,
-        "epoch": sim._epoch,
-        "steps_before_reset": sim._steps_before_reset,
-        "time_before_reset": sim._time_before_reset,
+        "steps_before_reset": sim.steps_before_reset,
+        "time_before_reset": sim.time_before_reset,
         "gravity": sim.gravity,
         "integrator": _described(sim.integrator, INTEGRATORS),
         "deterministic": sim.deterministic,
         "worlds": sim.worlds,
         "bodies": [],
+        "kept": sorted(sim.kept),
     }
+    for name, array in sim.kept.items():
+        arrays[f"kept.{name}"] = array.numpy()
+    for name, values in sim.guard.state.items():
+        arrays[f"guard.{name}"] = values
     for number, (body, model, field) in enumerate(zip(sim.bodies, sim.models, sim.fields, strict=True)):
         header["bodies"].append(_pack_body(body, model, field, f"body{number}.", arrays))
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
@@ -165,8 +167,26 @@ def _upgrade(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
         if header["version"] < 3:
             described |= {"material": Isotropic.__name__, "activations": 0}
             described["mesh"] |= {"of_domain": [], "label_names": []}
-        described["remesh"] = None
-    header |= {"stable_dt": None, "epoch": 0.0, "steps_before_reset": 0, "time_before_reset": 0.0}
+        if header["version"] < 4:
+            described["remesh"] = None
+    if header["version"] < 4:
+        header |= {"stable_dt": None, "epoch": 0.0, "steps_before_reset": 0, "time_before_reset": 0.0}
+    _upgrade_steps(header, arrays)
+
+
+def _upgrade_steps(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    """Steps were of one length, found or given, and the starts of worlds counted in such steps."""
+    dt, epoch = header["dt"], header["epoch"]
+    header["integrator"]["values"]["dt"] = dt
+    header["kept"] = ["counts", "seconds"]
+    # Whole steps since the epoch give the same time as before, digit by digit.
+    arrays["kept.counts"] = np.array([header["steps"], 0], np.int64)
+    arrays["kept.seconds"] = np.array([dt, -epoch * dt])
+    for name in ("scale", "drift"):
+        arrays[f"guard.{name}"] = np.zeros(header["worlds"])
+    for number in range(len(header["bodies"])):
+        starts = arrays[f"body{number}.world_starts"]
+        arrays[f"body{number}.world_starts"] = (starts - epoch) * dt
 
 
 def _rebuilt_simulation(
@@ -183,24 +203,24 @@ def _rebuilt_simulation(
         sim = Simulation(
             bodies,
             model=models,
-            integrator=dataclasses.replace(integrator, dt=header["dt"]),
+            integrator=integrator,
             gravity=header["gravity"],
             deterministic=header["deterministic"],
             remesh=remesh_options(header["bodies"], arrays, place, remesh),
         )
-    sim.clock.fill_(header["steps"])
-    sim._epoch = header["epoch"]
-    sim._steps_before_reset, sim._time_before_reset = header["steps_before_reset"], header["time_before_reset"]
+    sim.steps_before_reset, sim.time_before_reset = header["steps_before_reset"], header["time_before_reset"]
     if header["stable_dt"] is not None:
         sim.stable_dt = header["stable_dt"]
     for number, (described, body, field) in enumerate(zip(header["bodies"], sim.bodies, sim.fields, strict=True)):
         if described["remesh"] is not None:
             assert body.changing is not None
             unpack_changing(body.changing, described["remesh"], f"body{number}.remesh.", arrays)
-            sim.integrator = integrator  # whose step, if none was given, follows the mesh
         body.world_starts.assign(arrays[f"body{number}.world_starts"].astype(np.float64))
         for name in described["field"]:
             field.state[name].assign(arrays[f"body{number}.field.{name}"])
+    for name in header["kept"]:
+        sim.kept[name].assign(arrays[f"kept.{name}"])
+    sim.guard.resume(scale=arrays["guard.scale"], drift=arrays["guard.drift"])
     return sim
 
 

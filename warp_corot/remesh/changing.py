@@ -26,6 +26,7 @@ from .survey import Survey
 if TYPE_CHECKING:
     from ..body import SoftBody
     from ..elasticity import ForceField
+    from ..solvers.pace import Pace
 
 #: Nodes are launched in multiples of this.
 NODE_GRANULE = 256
@@ -154,7 +155,7 @@ class Changing:
         self._launch_derived()
         self._look(anyway=True)
 
-    def reset(self, chosen: wp.array, clock: wp.array) -> None:
+    def reset(self, chosen: wp.array, pace: Pace) -> None:
         """Go back to the mesh and state of the beginning, or of the last ``remember``, if the world is chosen.
 
         Loads and held nodes, and what these follow, are those that this mesh had last.
@@ -164,7 +165,7 @@ class Changing:
         self.conditions.note()
         self.forest.restart()
         self.conditions.put_back()
-        wp.launch(set_start, dim=1, inputs=[clock], outputs=[self.body.world_starts], device=self.device)
+        wp.launch(set_start, dim=1, inputs=[pace.arrays], outputs=[self.body.world_starts], device=self.device)
         self.renew()
         self.conditions.keep()
         self.body.update_inverse_mass()

@@ -82,7 +82,6 @@ class BlockSteps:
             inputs=[
                 self._block,
                 count,
-                context.dt,
                 damping,
                 context.gravity,
                 body.mu,
@@ -92,11 +91,11 @@ class BlockSteps:
                 body.node_inverse_mass,
                 int(body.has_loads),
                 body.node_loads,
-                context.clock,
+                context.pace.arrays,
                 body.node_displacements,
                 body.node_velocities,
             ],
-            outputs=[body.node_reactions, context.bad_step],
+            outputs=[body.node_reactions, context.support_work, context.bad_step],
             device=body.device,
         )
 

@@ -6,12 +6,18 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
 import warp as wp
 
 from ..elasticity import ForceField
+from .pace import Pace
 
 if TYPE_CHECKING:
     from ..body import SoftBody
+
+
+#: No step: later than all.
+NEVER = np.iinfo(np.int64).max
 
 
 @dataclass(frozen=True)
@@ -19,16 +25,23 @@ class StepContext:
     """What the steppers of a simulation share.
 
     Attributes:
-        dt: Time step [s].
+        pace: The clock and the length of a step; steps recorded in one run add their offset.
         gravity: [m/s^2].
-        clock: Number of steps done, int64 [1] on the device; steps recorded in one run add their offset.
+        support_work: What moving supports have put in, and the sum of its absolute values [J], float64 [2].
         bad_step: The first step after which something was not finite, int64 [1] on the device.
     """
 
-    dt: float
+    pace: Pace
     gravity: wp.vec3
-    clock: wp.array
+    support_work: wp.array
     bad_step: wp.array
+
+    @classmethod
+    def of(cls, pace: Pace, gravity: wp.vec3) -> StepContext:
+        """A new one, in which nothing has happened."""
+        work = wp.zeros(2, dtype=wp.float64, device=pace.device)
+        bad_step = wp.array([NEVER], dtype=wp.int64, device=pace.device)
+        return cls(pace, gravity, work, bad_step)
 
 
 class Stepper(ABC):
@@ -40,8 +53,17 @@ class Stepper(ABC):
         return False
 
     @abstractmethod
-    def steps(self, count: int) -> None:
-        """Launch steps, the first ones since the clock was last advanced."""
+    def forces(self, offset: int = 0) -> None:
+        """Launch the elastic forces of the ``offset``-th step since the clock was last advanced."""
+
+    @abstractmethod
+    def steps(self, count: int, *, forces_known: bool = False) -> None:
+        """Launch steps, the first ones since the clock was last advanced.
+
+        Args:
+            count: How many.
+            forces_known: Whether ``forces`` has been launched for the first of them.
+        """
 
 
 class Integrator(ABC):

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from ..kernels.integrate import advance_clock
 from ..subnormals import FlushedSubnormals
 from .integrator import Stepper
+from .pace import Pace
+from .safe_step import BLOCK_INTERVAL, INTERVAL, SafeStep
 
 if TYPE_CHECKING:
     from ..body import SoftBody
@@ -25,54 +26,85 @@ class RecordedSteps:
     Args:
         bodies: On one device.
         steppers: One for each body.
-        clock: Number of steps done, int64 [1].
+        pace: The clock.
+        safe_step: What measures how long a step may be, if none was given.
     """
 
-    def __init__(self, bodies: Sequence[SoftBody], steppers: Sequence[Stepper], clock: wp.array):
+    def __init__(
+        self, bodies: Sequence[SoftBody], steppers: Sequence[Stepper], pace: Pace, safe_step: SafeStep | None = None
+    ):
         self._bodies = bodies
         self._steppers = steppers
-        self._clock = clock
-        self._flushed = FlushedSubnormals(clock.device)
-        self._graphs: dict[tuple[int, bool], wp.Graph] = {}
+        self._pace = pace
+        self._safe_step = safe_step
+        self._flushed = FlushedSubnormals(pace.device)
+        self._graphs: dict[tuple[int, bool, bool], wp.Graph] = {}
         self._revisions: tuple[int, ...] = ()
 
-    def launch(self, count: int, *, whole: bool) -> None:
-        """Launch steps; ``whole`` ones take over positions first and publish them after."""
+    @property
+    def in_blocks(self) -> bool:
+        """Whether many steps are one launch."""
+        return all(stepper.many_a_launch for stepper in self._steppers)
+
+    @property
+    def interval(self) -> int:
+        """Steps from one measurement to the next."""
+        return BLOCK_INTERVAL if self.in_blocks else INTERVAL
+
+    def launch(self, count: int, *, whole: bool = False, measured: bool = False) -> None:
+        """Launch steps.
+
+        Args:
+            count: How many; none with ``measured`` measures only.
+            whole: Whether positions are taken over before and published after.
+            measured: Whether it is measured first how long these steps may be.
+        """
         with self._flushed():
-            self._launch(count, whole)
+            self._launch(count, whole, measured)
 
-    def _launch(self, count: int, whole: bool) -> None:
+    def _launch(self, count: int, whole: bool, measured: bool) -> None:
         if whole:
+            self.adopt_positions()
+        if measured:
+            assert self._safe_step is not None
+            for stepper in self._steppers:
+                stepper.forces()
+            self._safe_step.launch(self.interval)
+        if count:
+            for stepper in self._steppers:
+                stepper.steps(count, forces_known=measured)
+            self._pace.advance(count)
+        else:
             for body in self._bodies:
-                body.adopt_positions()
-        for stepper in self._steppers:
-            stepper.steps(count)
-        wp.launch(advance_clock, dim=1, inputs=[count], outputs=[self._clock], device=self._clock.device)
+                body.node_forces.zero_()
         if whole:
-            for body in self._bodies:
-                body.publish_positions()
+            self.publish_positions()
 
-    def replay(self, count: int, *, whole: bool) -> None:
+    def replay(self, count: int, *, whole: bool = False, measured: bool = False) -> None:
         """Replay recorded steps, recording them first where they are new or the bodies' launches have changed."""
         revisions = tuple(body.revision for body in self._bodies)
         if revisions != self._revisions:
             self._graphs.clear()
             self._revisions = revisions
-        key = (count, whole)
+        key = (count, whole, measured)
         if key not in self._graphs:
-            with wp.ScopedCapture(device=self._clock.device) as capture:
-                self.launch(count, whole=whole)
+            with wp.ScopedCapture(device=self._pace.device) as capture:
+                self.launch(count, whole=whole, measured=measured)
             self._graphs[key] = capture.graph
         wp.capture_launch(self._graphs[key])
 
-    def replay_runs(self, count: int) -> None:
-        """Replay any number of steps as few recordings; positions are taken over before and published after."""
+    def replay_many(self, count: int) -> None:
+        """Replay any number of steps as few recordings."""
+        for size in (BLOCK_STEPS, GRAPH_STEPS, 1) if self.in_blocks else (GRAPH_STEPS, 1):
+            for _ in range(count // size):
+                self.replay(size)
+            count %= size
+
+    def adopt_positions(self) -> None:
+        """Take over what somebody wrote to positions since they were published."""
         for body in self._bodies:
             body.adopt_positions()
-        in_blocks = all(stepper.many_a_launch for stepper in self._steppers)
-        for size in (BLOCK_STEPS, GRAPH_STEPS, 1) if in_blocks else (GRAPH_STEPS, 1):
-            for _ in range(count // size):
-                self.replay(size, whole=False)
-            count %= size
+
+    def publish_positions(self) -> None:
         for body in self._bodies:
             body.publish_positions()

@@ -28,7 +28,7 @@ class SymplecticEuler(Integrator):
     """v <- (v + dt (f/m + g)) / (1 + dt damping); x <- x + dt v, with lumped masses.
 
     Attributes:
-        dt: Time step [s]; None: a stable one is found from mesh and material.
+        dt: Time step [s]; None: one that is stable, found again during the run.
         damping: Rate of mass-proportional damping >= 0 [1/s], taken implicitly, so that it never limits the step.
 
     Raises:
@@ -62,15 +62,24 @@ class SymplecticEulerStepper(Stepper):
     def many_a_launch(self) -> bool:
         return self.block is not None and not self.body.trajectories
 
-    def steps(self, count: int) -> None:
-        if self.block is not None and not self.body.trajectories:
+    def forces(self, offset: int = 0) -> None:
+        self.field.begin_step(self.context.pace, offset)
+        self.field.add_forces(self.body.node_displacements, self.body.node_forces)
+
+    def steps(self, count: int, *, forces_known: bool = False) -> None:
+        if self.many_a_launch:
+            assert self.block is not None
+            if forces_known:
+                self.body.node_forces.zero_()  # a block finds its own
             self.block.launch(count, self.damping, self.context)
             return
         for offset in range(count):
-            self._step(offset)
+            if offset > 0 or not forces_known:
+                self.forces(offset)
+            self._move(offset)
 
-    def _step(self, offset: int) -> None:
-        """Launch the ``offset``-th step since the clock was last advanced."""
+    def _move(self, offset: int) -> None:
+        """Launch the motion of the ``offset``-th step since the clock was last advanced."""
         body, context = self.body, self.context
         for trajectory in body.trajectories:
             wp.launch(
@@ -80,35 +89,32 @@ class SymplecticEulerStepper(Stepper):
                     trajectory.nodes,
                     trajectory.times,
                     trajectory.displacements,
-                    context.dt,
-                    context.clock,
+                    context.pace.arrays,
                     body.world_starts,
                     body.world_node_count,
                     offset,
+                    body.node_forces,
                     body.node_displacements,
                 ],
-                outputs=[body.node_velocities],
+                outputs=[body.node_velocities, context.support_work],
                 device=body.device,
             )
-        self.field.begin_step(context.clock, offset, context.dt)
-        self.field.add_forces(body.node_displacements, body.node_forces)
         wp.launch(
             STEP_SYMPLECTIC_EULER[body.node_loads.dtype],
             dim=body.launch_nodes,
             inputs=[
-                context.dt,
                 self.damping,
                 context.gravity,
                 body.node_mass,
                 body.node_inverse_mass,
                 int(body.has_loads),
                 body.node_loads,
-                context.clock,
+                context.pace.arrays,
                 offset,
                 body.node_forces,
                 body.node_displacements,
                 body.node_velocities,
             ],
-            outputs=[body.node_reactions, context.bad_step],
+            outputs=[body.node_reactions, context.support_work, context.bad_step],
             device=body.device,
         )

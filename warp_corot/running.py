@@ -1,0 +1,254 @@
+"""Runs of a simulation: how many steps come before something else is due, and what becomes of a state gone wrong."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import TYPE_CHECKING
+
+from .elasticity import StVenantKirchhoff
+from .errors import StabilityWarning, UnstableError, depth_of_user
+from .kernels.pace import GROWTH, RECOVERY
+from .solvers.guard import Fault
+
+if TYPE_CHECKING:
+    from .simulation import Simulation
+
+#: Steps from one check with elastic energies to the next, and the same where many steps are one launch.
+CHECK_STEPS = 512
+BLOCK_CHECK_STEPS = 2048
+#: How often the step is halved to come over one place.
+MOST_RETURNS = 6
+#: How often it is halved for a little energy from nowhere, as comes with crushed elements also of the shortest steps.
+STRICT_RETURNS = 2
+#: Longer runs are looked after in between.
+MOST_INTERVALS = 1000
+
+
+class Running:
+    """Makes the steps of a simulation.
+
+    Args:
+        sim: The simulation.
+    """
+
+    def __init__(self, sim: Simulation):
+        self._sim = sim
+        self._returns = 0
+        #: The time at which the state was found to be wrong, while it has not been passed.
+        self._wrong_until = -math.inf
+        self._has_warned = False
+        self._steps_called = 0
+        #: Whether the last run ended with steps shorter than what the state allows.
+        self._shortened = False
+        self._steps_made = 0
+
+    def step(self) -> None:
+        """Make one step, with a measurement before it where one is due."""
+        sim = self._sim
+        self._resume()
+        position = sim.steps if sim.device.is_cpu else self._steps_made
+        self._steps_made = position + 1
+        measured = sim.safe_step is not None and position % sim.recorded.interval == 0
+        sim.recorded.replay(1, whole=True, measured=measured)
+
+    def make(self, count: int) -> None:
+        """Make so many steps, with hooks and passes."""
+        sim = self._sim
+        end = sim.total_steps + count
+        self._begin()
+        while (left := end - sim.total_steps) > 0:
+            self._go(left, None)
+
+    def make_until(self, total_time: float) -> None:
+        """Make steps until a time [s], exactly; only if the step is the simulation's to choose."""
+        sim = self._sim
+        self._begin()
+        while sim.total_time < total_time:
+            if self._go(MOST_INTERVALS * sim.recorded.interval, total_time - sim.time_before_reset):
+                break
+
+    def look(self) -> None:
+        """See that the state is finite.
+
+        Raises:
+            UnstableError: It is not.
+        """
+        fault = self._sim.guard.not_finite()
+        if fault is not None:
+            raise UnstableError(self._message(fault))
+
+    # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _begin(self) -> None:
+        sim = self._sim
+        sim.recorded.adopt_positions()
+        sim.guard.begin()
+
+    def _go(self, most: int, end: float | None) -> bool:
+        """Make steps until something is due, and do it; whether the end is reached."""
+        sim = self._sim
+        sim.recorded.adopt_positions()
+        done = sim.steps
+        most = min(most, self._until_due(done))
+        reached = self._advance(done, most, end)
+        sim.recorded.publish_positions()
+        now = self._steps_made = sim.steps
+        if not self._check(now):
+            return False
+        if sim.remeshing.is_due(now):
+            sim.follow_motion()
+            sim.guard.forget()
+            sim.guard.begin()
+        if any(now % every == 0 for every in sim.hook_intervals) and sim.total_steps > self._steps_called:
+            self._steps_called = sim.total_steps
+            sim.call_hooks()
+            sim.recorded.adopt_positions()
+            sim.guard.begin()
+        return reached
+
+    def _until_due(self, done: int) -> int:
+        """Steps until a check, a pass or a hook is due."""
+        sim = self._sim
+        every = [sim.recorded.interval if self._returns else self._check_steps, *sim.hook_intervals]
+        if sim.remeshing.every:
+            every.append(sim.remeshing.every)
+        return min(n - done % n for n in every)
+
+    @property
+    def _check_steps(self) -> int:
+        return BLOCK_CHECK_STEPS if self._sim.recorded.in_blocks else CHECK_STEPS
+
+    def _advance(self, done: int, most: int, end: float | None) -> bool:
+        """Make at most so many steps; whether the end is reached."""
+        sim = self._sim
+        if sim.safe_step is None:
+            sim.recorded.replay_many(most)
+            return False
+        if end is None:
+            self._resume()
+        every, stop = sim.recorded.interval, done + most
+        sure = 0
+        while done < stop:
+            phase = done % every
+            count = min(stop - done, every - phase)
+            if end is not None and phase == 0 and not sure:
+                sure = self._sure_intervals(end - sim.time)
+            if end is None or (phase == 0 and sure and count == every):
+                self._measured(count, phase)
+                sure = max(sure - 1, 0)
+                done += count
+                continue
+            if phase == 0:
+                sim.recorded.replay(0, measured=True)
+            count, reached = self._ending(count, end)
+            done += count
+            if reached:
+                return True
+        return False
+
+    def _measured(self, count: int, phase: int) -> None:
+        recorded = self._sim.recorded
+        if phase == 0 and count == recorded.interval:
+            recorded.replay(count, measured=True)
+            return
+        if phase == 0:
+            recorded.replay(1, measured=True)
+            count -= 1
+        recorded.replay_many(count)
+
+    def _ending(self, count: int, end: float) -> tuple[int, bool]:
+        """Make steps that end in time: the last ones are as long as one another. Returns how many, and whether it is
+        reached."""
+        sim = self._sim
+        assert sim.safe_step is not None
+        left, dt = end - sim.time, sim.safe_step.allowed
+        steps = max(math.ceil(left / dt * (1.0 - 1e-9)), 1)
+        self._shortened = True
+        sim.pace.set_step(left / steps if steps <= 2 * sim.recorded.interval else dt)
+        count = min(count, steps)
+        sim.recorded.replay_many(count)
+        if count == steps:
+            sim.pace.set_time(end)
+        return count, count == steps
+
+    def _sure_intervals(self, left: float) -> int:
+        """Whole intervals after which there is still some time left, even if the step grows as fast as it may."""
+        safe = self._sim.safe_step
+        assert safe is not None
+        interval, longest = self._sim.recorded.interval, safe.at_rest
+        growth = float(GROWTH) * float(RECOVERY)
+        dt = min(growth * safe.allowed, longest)
+        count = 0
+        left -= 2 * interval * dt
+        while count < MOST_INTERVALS and left >= interval * dt:
+            left -= interval * dt
+            dt = min(growth * dt, longest)
+            count += 1
+        return count
+
+    def _resume(self) -> None:
+        """Take the step that the state allows again."""
+        if self._shortened and self._sim.safe_step is not None:
+            self._sim.safe_step.resume()
+        self._shortened = False
+
+    def _check(self, now: int) -> bool:
+        """Check the state; False if it was put back."""
+        sim = self._sim
+        whole = now % self._check_steps == 0 or bool(self._returns)
+        strict = sim.safe_step is not None and self._returns < STRICT_RETURNS
+        fault = sim.guard.check(whole=whole, strict=strict)
+        if fault is not None:
+            self._go_back(fault)
+            return False
+        if self._returns and sim.time > self._wrong_until:
+            self._returns = 0
+        return True
+
+    def _go_back(self, fault: Fault) -> None:
+        """Go on from the last good state with half the step.
+
+        Raises:
+            UnstableError: The step was given, or no shorter one helps.
+        """
+        sim = self._sim
+        if sim.safe_step is None or self._returns >= MOST_RETURNS:
+            self._returns = 0
+            sim.guard.forget()
+            raise UnstableError(self._message(fault))
+        if not self._returns:
+            self._wrong_until = sim.time
+        self._returns += 1
+        share = sim.safe_step.share
+        sim.guard.go_back()
+        sim.safe_step.share = 0.5 * share
+        sim.guard.settle()
+        if not self._has_warned:
+            self._has_warned = True
+            message = (
+                f"the state went wrong by t = {self._wrong_until:.4g} s ({fault.what}); the simulation goes on from "
+                f"t = {sim.time:.4g} s with half the step, and does the same without a word if that happens again"
+            )
+            warnings.warn(message, StabilityWarning, stacklevel=depth_of_user())
+
+    def _message(self, fault: Fault) -> str:
+        sim = self._sim
+        more = f" and {len(fault.worlds) - 3} more" if len(fault.worlds) > 3 else ""
+        where = f" in world {', '.join(map(str, fault.worlds[:3]))}{more}" if sim.worlds > 1 else ""
+        if fault.step is None:
+            when = f"at step {sim.steps} (t = {sim.time:.4g} s)"
+        else:
+            when = f"since step {fault.step} (t = {sim.pace.time_at(fault.step):.4g} s)"
+        steps = f"dt is {sim.pace.dt:.3g} s, the largest stable step at rest about {sim.stable_dt:.3g} s"
+        return f"{fault.what} {when}{where}; {steps}{self._advice()}"
+
+    def _advice(self) -> str:
+        sim = self._sim
+        if any(getattr(model, "rotation_level", None) is not None for model in sim.models):
+            return "; shared rotations have no energy, so that strong bending may need rotation_level=None"
+        if any(isinstance(model, StVenantKirchhoff) for model in sim.models):
+            return "; StVenantKirchhoff does not resist being crushed: take NeoHookean or Corotated, or damping"
+        if sim.safe_step is None:
+            return ": take a shorter step, or dt=None, which follows the state"
+        return f"; {MOST_RETURNS} times half the step did not help: look for loads or motions that crush the body"

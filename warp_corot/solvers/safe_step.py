@@ -1,0 +1,129 @@
+"""A step that stays stable by itself: it follows what gauges find of the bodies, on the device."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from ..kernels import pace as kernels
+from .gauge import Gauge
+from .pace import Pace
+
+if TYPE_CHECKING:
+    from ..body import SoftBody
+    from ..elasticity import ForceField, Model
+
+#: Steps from one measurement to the next, and the same where many steps are one launch, which is cut short by it. A
+#: measurement takes about as long as a step.
+INTERVAL = 32
+BLOCK_INTERVAL = 128
+#: The step where nothing can vibrate [s].
+ANY_STEP = 1e-3
+
+
+class SafeStep:
+    """The step of a simulation that was given none.
+
+    Args:
+        bodies, fields, models: The simulation's.
+        pace: Whose step it sets.
+        stable: The largest stable step of each body at rest [s], infinite where nothing can vibrate.
+    """
+
+    def __init__(
+        self,
+        bodies: Sequence[SoftBody],
+        fields: Sequence[ForceField],
+        models: Sequence[Model],
+        pace: Pace,
+        stable: Sequence[float],
+    ):
+        self.device = pace.device
+        self.pace = pace
+        self._models = models
+        self._found = wp.zeros((len(bodies), 2), dtype=wp.float32, device=self.device)
+        self._at_rest = wp.zeros((len(bodies), 4), dtype=wp.float64, device=self.device)
+        self._control = wp.zeros(int(kernels.CONTROLS), dtype=wp.float64, device=self.device)
+        self.gauges = [
+            Gauge(body, field, self._found[k]) for k, (body, field) in enumerate(zip(bodies, fields, strict=True))
+        ]
+        self.find_rest(stable)
+
+    @property
+    def allowed(self) -> float:
+        """The step that is taken while no end of a run shortens it [s]; waits for the device."""
+        control = self._control.numpy()
+        return float(control[kernels.SHARE] * control[kernels.ALLOWED])
+
+    @property
+    def at_rest(self) -> float:
+        """The longest step there is, that of the bodies at rest [s]; waits for the device."""
+        return float(self._control.numpy()[kernels.AT_REST])
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """The shortest and the longest of the steps that were allowed so far [s]; waits for the device."""
+        control = self._control.numpy()
+        return float(control[kernels.SHORTEST]), float(control[kernels.LONGEST])
+
+    def find_rest(self, stable: Sequence[float]) -> None:
+        """Take the largest stable steps of the bodies at rest [s] for what measurements are compared with."""
+        rows = []
+        for gauge, model, step in zip(self.gauges, self._models, stable, strict=True):
+            gauge.rescale()
+            curvature = gauge.curvature_at_rest()
+            longest = step if math.isfinite(step) else ANY_STEP / model.step_safety
+            rows.append([longest, curvature, model.step_safety, model.strained_safety])
+        longest = min(row[0] * row[2] for row in rows)
+        self._at_rest.assign(np.array(rows))
+        control = self._control.numpy().copy()
+        before = control[kernels.AT_REST]
+        if before > 0.0:
+            control[kernels.ALLOWED] *= longest / before
+        else:
+            control[:] = longest
+            control[kernels.SHARE] = 1.0
+        control[kernels.AT_REST] = longest
+        self._control.assign(control)
+        self.resume()
+
+    def launch(self, ahead: int) -> None:
+        """Measure, and take a step that is safe for ``ahead`` steps; may be recorded.
+
+        The elastic forces of the present displacements are in ``node_forces`` of each body.
+        """
+        for gauge in self.gauges:
+            gauge.launch(self.pace, ahead)
+        inputs = [self._at_rest, self._found, self._control, self.pace.arrays]
+        wp.launch(kernels.take_safe_step, dim=1, inputs=inputs, device=self.device)
+
+    def resume(self) -> None:
+        """Take the step that the state allows, after one that ended a run in time."""
+        wp.launch(kernels.resume_step, dim=1, inputs=[self._control, self.pace.arrays], device=self.device)
+
+    @property
+    def share(self) -> float:
+        """The share of what the state allows that is taken after going back; waits for the device."""
+        return float(self._control.numpy()[kernels.SHARE])
+
+    @share.setter
+    def share(self, value: float) -> None:
+        control = self._control.numpy().copy()
+        control[kernels.SHARE] = value
+        control[kernels.SHORTEST] = min(control[kernels.SHORTEST], value * control[kernels.ALLOWED])
+        self._control.assign(control)
+        self.resume()
+
+    @property
+    def state(self) -> dict[str, wp.array]:
+        """Arrays from which it goes on."""
+        gauges = {
+            f"{name}{k}": array
+            for k, gauge in enumerate(self.gauges)
+            for name, array in (("directions", gauge.directions), ("scale", gauge.scale))
+        }
+        return {"control": self._control, "at_rest": self._at_rest, **gauges}
