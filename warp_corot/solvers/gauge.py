@@ -65,8 +65,15 @@ class Gauge:
         self._find_curvature(body.node_displacements, body.node_forces)
         wp.launch(
             kernels.find_strains(body.element_kind),
-            dim=body.launch_elements,
-            inputs=[body.elements, body.node_displacements, body.node_velocities, pace.arrays, ahead],
+            dim=-(-body.launch_elements // int(kernels.TURNS)),
+            inputs=[
+                body.elements,
+                body.node_displacements,
+                body.node_velocities,
+                pace.arrays,
+                ahead,
+                body.launch_elements,
+            ],
             outputs=[self.found],
             device=body.device,
         )
