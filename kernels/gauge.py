@@ -14,9 +14,12 @@ from typing import Any
 import warp as wp
 
 from .elements import frame, load_node, local_gradient, store_node
-from .pace import CURVATURE, DT, STRAIN, Pace
+from .pace import CURVATURE, DONE, DT, STRAIN, Pace
 
 wp.set_module_options({"enable_backward": False})
+
+#: Measurements in which every element's strain is looked at once.
+TURNS = wp.constant(4)
 
 
 @wp.kernel(enable_backward=False)
@@ -83,7 +86,10 @@ def find_curvatures(
 
 @functools.cache
 def find_strains(Elements: Any) -> wp.Kernel:
-    """The largest entry of C - I = F^T F - I among elements, now and after ``steps`` more at the present rate."""
+    """The largest entry of C - I = F^T F - I among elements, now and after ``steps`` more at the present rate.
+
+    One element of ``TURNS`` is looked at, others the next time: neighbours, which share nodes, are strained too.
+    """
 
     @wp.kernel(module="unique", enable_backward=False)
     def find_strains(
@@ -93,10 +99,15 @@ def find_strains(Elements: Any) -> wp.Kernel:
         v: wp.array[wp.vec4],
         pace: Pace,
         steps: int,
+        count: int,
         # Out
         found: wp.array[wp.float32],
     ):
-        t = wp.tid()
+        measurement = int(pace.counts[DONE] / wp.int64(steps))
+        i = wp.tid()
+        t = i * TURNS + measurement % TURNS
+        if t >= count:
+            return
         g = local_gradient(elements, t, u)
         rate = local_gradient(elements, t, v)
         q = frame(elements, t)

@@ -83,6 +83,19 @@ def test_single_steps_follow_the_state_too():
     np.testing.assert_array_equal(one.body.positions.numpy(), many.body.positions.numpy())
 
 
+def test_a_simulation_that_is_reset_repeats_its_steps():
+    sim = wc.Simulation(beam())
+    stretched(sim.body, 0.3)
+    sim.body.set_initial_state()
+    ends = []
+    for _ in range(2):
+        sim.reset()
+        sim.advance(0.1)
+        ends.append((sim.steps, sim.body.positions.numpy().copy()))
+    assert ends[0][0] == ends[1][0]
+    np.testing.assert_array_equal(ends[0][1], ends[1][1])
+
+
 # --- the step ------------------------------------------------------------------------------------------------------
 
 

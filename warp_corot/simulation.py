@@ -257,6 +257,8 @@ class Simulation:
         if worlds is None:
             self.steps_before_reset, self.time_before_reset = self.total_steps, self.total_time
             self.pace.restart()
+            if self.safe_step is not None:
+                self.safe_step.restart()
             self._context.bad_step.fill_(NEVER)
             self.guard.restart()
         for body, field in zip(self.bodies, self.fields, strict=True):

@@ -36,6 +36,7 @@ class Gauge:
         places = body.node_displacements.shape
         self.directions = wp.zeros(places, dtype=wp.vec4, device=body.device)
         self._probed, self._forces = (wp.zeros(places, dtype=wp.vec4, device=body.device) for _ in range(2))
+        self._rest_directions = self.directions
         #: Of the probing motion, float32 [1].
         self.scale = wp.zeros(1, dtype=wp.float32, device=body.device)
         self.rescale()
@@ -49,6 +50,10 @@ class Gauge:
         size = self.body.smallest_volume ** (1.0 / 3.0)
         self.scale.fill_(PROBE * size / np.sqrt(lightest) if lightest > 0 else 0.0)
 
+    def restart(self) -> None:
+        """Go on from the directions that were found at rest."""
+        wp.copy(self.directions, self._rest_directions)
+
     def launch(self, pace: Pace, ahead: int) -> None:
         """Measure about the present state, whose elastic forces are in ``body.node_forces``.
 
@@ -60,8 +65,15 @@ class Gauge:
         self._find_curvature(body.node_displacements, body.node_forces)
         wp.launch(
             kernels.find_strains(body.element_kind),
-            dim=body.launch_elements,
-            inputs=[body.elements, body.node_displacements, body.node_velocities, pace.arrays, ahead],
+            dim=-(-body.launch_elements // int(kernels.TURNS)),
+            inputs=[
+                body.elements,
+                body.node_displacements,
+                body.node_velocities,
+                pace.arrays,
+                ahead,
+                body.launch_elements,
+            ],
             outputs=[self.found],
             device=body.device,
         )
@@ -74,6 +86,7 @@ class Gauge:
             for _ in range(REST_TURNS):
                 self.found.zero_()
                 self._find_curvature(u, f)
+        self._rest_directions = wp.clone(self.directions)
         value = float(self.found.numpy()[0])
         self.found.zero_()
         return value

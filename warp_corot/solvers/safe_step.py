@@ -91,6 +91,15 @@ class SafeStep:
         self._control.assign(control)
         self.resume()
 
+    def restart(self) -> None:
+        """Begin again with the step at rest."""
+        for gauge in self.gauges:
+            gauge.restart()
+        control = self._control.numpy().copy()
+        control[kernels.ALLOWED], control[kernels.SHARE] = control[kernels.AT_REST], 1.0
+        self._control.assign(control)
+        self.resume()
+
     def launch(self, ahead: int) -> None:
         """Measure, and take a step that is safe for ``ahead`` steps; may be recorded.
 
