@@ -11,7 +11,7 @@ import warp as wp
 from .constitutive import corotated_strain, hooke
 from .elements import ForestElements, frame, local_gradient, nodal_forces, scatter_stress
 from .newton_merging import add_four_forces
-from .rotation import robust_rotation
+from .quaternion import robust_rotation
 
 wp.set_module_options({"enable_backward": False})
 
