@@ -16,8 +16,9 @@ from .block_layout import FIRST_SHIFT, FOLLOWING_SHIFT, NEIGHBOURS, NO_NODE, NOD
 from .constitutive import hooke, symmetric
 from .elements import FRAME_SHIFT, LEVEL_MASK, Subtrees, load_node, mirror_sign, store_node
 from .integrate import add_support_work, is_finite, symplectic_euler_velocity, vector_at
+from .matrices import column, identity3
 from .pace import DONE, DT, Pace
-from .rotation import column, identity3, robust_rotation
+from .quaternion import robust_rotation
 from .shapes import VOLUME, fingerprint
 from .subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS
 from .subtree_forces import columns_of, leaf_forces_of, mat10, near_forces, shared_forces

@@ -9,16 +9,22 @@ the bytes of eight subtrees at a time, nearly always all zero, and goes through 
 import warp as wp
 
 from .constitutive import corotated_strain, hooke
-from .elements import ForestElements, frame, local_gradient, scatter_stress
-from .rotation import robust_rotation
+from .elements import ForestElements, frame, local_gradient, nodal_forces, scatter_stress
+from .newton_merging import add_four_forces
+from .quaternion import robust_rotation
 
 wp.set_module_options({"enable_backward": False})
 
 #: Subtrees that one thread looks after; ``flagged`` has a multiple of these.
 SUBTREES = 8
 LEAVES = 8
+#: The mask of a subtree that is left out whole.
+WHOLE = wp.constant(255)
 #: Threads of a block that goes through a list.
 LIST_BLOCK = 128
+
+
+add_neighbours = add_four_forces(2)
 
 
 @wp.struct
@@ -85,6 +91,22 @@ def scatter_turned(
 
 
 @wp.func
+def own_stress(
+    elements: ForestElements,
+    t: int,
+    mu: wp.array[wp.float32],
+    lam: wp.array[wp.float32],
+    stride: int,
+    u: wp.array[wp.vec4],
+):
+    """First Piola-Kirchhoff stress times Q of element t with its own rotation."""
+    q = frame(elements, t)
+    g = local_gradient(elements, t, u)
+    r = robust_rotation(q + g)
+    return r * hooke(corotated_strain(g, q, r), mu[t * stride], lam[t * stride])
+
+
+@wp.func
 def scatter_own(
     elements: ForestElements,
     t: int,
@@ -95,8 +117,7 @@ def scatter_own(
     f: wp.array[wp.vec4],
 ):
     """Add the forces of element t with its own rotation."""
-    r = robust_rotation(frame(elements, t) + local_gradient(elements, t, u))
-    scatter_turned(elements, t, r, mu[t * stride], lam[t * stride], u, f)
+    scatter_stress(elements, t, own_stress(elements, t, mu, lam, stride, u), f)
 
 
 @wp.func
@@ -122,9 +143,11 @@ def repair_listed_own(
     # Out
     f: wp.array[wp.vec4],
 ):
-    """Every leaf with its own rotation. A thread a leaf, or where there are more a thread a subtree.
+    """Every leaf with its own rotation.
 
-    Launch with block_dim LIST_BLOCK and as many ``threads``, a multiple of it.
+    A thread a leaf, or where there are more a thread a subtree: most have one leaf on the list. Subtrees that are there
+    whole then come last, a thread a leaf, and neighbours' forces are added up before they go to memory. Launch with
+    block_dim LIST_BLOCK and as many ``threads``, a multiple of it.
     """
     count = listed.counts[0]
     if count == 0:
@@ -136,12 +159,23 @@ def repair_listed_own(
         mask = entry[1]
         if each > 1:
             mask = mask & (1 << (i % each))
+        elif mask == WHOLE:
+            mask = 0
         leaf = int(0)
         while mask >= (1 << leaf):
             if (mask >> leaf) & 1 == 1:
                 scatter_own(elements, entry[0] + leaf, mu, lam, stride, u, f)
             leaf += 1
         i += threads
+    if each == 1:
+        i = wp.tid()
+        while i < count * LEAVES:
+            entry = listed.entries[i // LEAVES]
+            if entry[1] == WHOLE:
+                t = entry[0] + i % LEAVES
+                f0, f1, f2, f3 = nodal_forces(elements, t, own_stress(elements, t, mu, lam, stride, u))
+                add_neighbours(f, elements.targets[t], f0, f1, f2, f3)
+            i += threads
     leave(listed, threads // LIST_BLOCK)
 
 

@@ -33,7 +33,8 @@ class Launches:
                 nodes = np.ascontiguousarray(batch.subtrees.nodes.numpy().T)
                 batch.subtrees.nodes = batch.subtrees.targets = wp.array(nodes, dtype=wp.int32, device=self.device)
             self._add(batch.count, batch.shape, batch.subtrees, batch.flagged)
-        self._add(len(plan.flat), FLAT)
+        if len(plan.flat):
+            self._add(len(plan.flat), FLAT)
         self.stretches = wp.array(self.rows, dtype=Stretch, device=self.device)
 
     def _add(self, count, shape, subtrees=None, flagged=None):
@@ -91,6 +92,20 @@ def test_listed_leaves_get_their_forces(share, uniform, device, rng):
         assert error < TOLERANCE * np.abs(forces).max()
         assert (launches.count > 0) == (share > 0)
         assert (launches.listed.own.counts.numpy() == 0).all()
+
+
+def test_whole_subtrees_get_their_forces(device, rng):
+    """A body turned over, and pressed so that it has definite rotations: every subtree is left out whole."""
+    forest = wc.TetForest.box((2, 1, 1), 0.1, 9)
+    body = wc.SoftBody(forest, wc.Isotropic(1e4, 0.4, 1000.0), device=device)
+    u = 0.02 * edge_scale(forest) * rng.uniform(-1, 1, forest.points.shape) - [0, 0, 1.6] * forest.points
+    body.displacements = u
+    launches = Launches(body)
+    forces, sound = expected(forest, u, 1e4)
+    assert sound.all()
+    assert np.abs(launches.forces() - forces).max() < TOLERANCE * np.abs(forces).max()
+    (batch,) = launches.plan.batches
+    assert (batch.flagged.numpy()[: batch.count] == 255).all()
 
 
 def test_one_bad_leaf_is_left_out_alone(device, rng):

@@ -39,6 +39,11 @@ class LeftOutLeaves:
         places = sum(batch.count * (1 if batch.grouped else 8) for batch in own) + len(plan.flat)
         return cls(places, [batch for batch in plan.batches if batch.sharing is Sharing.ROOT], device)
 
+    @staticmethod
+    def load(device: wp.Device) -> None:
+        """Compile now what launches will need."""
+        wp.load_module(repair_listed_own.module, device, block_dim=LIST_BLOCK)
+
     def list_of(self, batch: Batch) -> Any:
         """The list that a batch's kernel appends to."""
         if batch.sharing is Sharing.OWN:

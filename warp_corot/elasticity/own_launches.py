@@ -10,11 +10,10 @@ import warp as wp
 from ..clusters import clusters_of
 from ..kernels.clusters import CLUSTER, scatter_clusters
 from ..kernels.elements import ForestElements
-from ..kernels.repair import LIST_BLOCK, repair_listed_own
 from ..kernels.subtree_cuda import BLOCK, FLAT, Stretch, scatter_stretches
 from ..kernels.subtree_forces import leaf_stress
 from ..plan import FlatLeaves, ForcePlan, Plan
-from ..subtrees import Batch, Sharing
+from ..subtrees import Batch
 
 
 class OwnLaunches:
@@ -48,15 +47,13 @@ class OwnLaunches:
 
     @staticmethod
     def suit(plan: Plan) -> bool:
-        """Whether all rotations are own ones, and there is more than one batch, or may come to be."""
-        own = all(batch.sharing is Sharing.OWN for batch in plan.batches) and plan.units is None
-        return own and (not isinstance(plan, ForcePlan) or len(plan.batches) > 1 or len(plan.flat) > 0)
+        """Whether a plan of own rotations has more than one batch, or may come to have."""
+        return not isinstance(plan, ForcePlan) or len(plan.batches) > 1 or len(plan.flat) > 0
 
     @staticmethod
     def load(uniform: bool, tolerance: float | None, device: wp.Device) -> None:
         """Compile now what launches over a mesh that changes will need."""
         wp.load_module(scatter_stretches(uniform, tolerance).module, device, block_dim=BLOCK)
-        wp.load_module(repair_listed_own.module, device, block_dim=LIST_BLOCK)
 
     def scatter_forces(self, u: wp.array, f: wp.array, left_out: Any) -> None:
         """Add the forces of displacements u to f, both vec4, and put what is left out on a list."""

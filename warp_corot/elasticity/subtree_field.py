@@ -51,7 +51,8 @@ class SubtreeField(CorotatedField):
 
     def _load_kernels(self, plan: DevicePlan) -> None:
         """Everything that any mesh may come to need, so that nothing is compiled once steps are made."""
-        for shape, grouped, sharing in () if self._listed and not plan.rotation_shared else plan.kinds:
+        one_launch = self._listed and self.rotation_level is None
+        for shape, grouped, sharing in () if one_launch else plan.kinds:
             kernel = self._kernel(shape, grouped, sharing)
             wp.load_module(kernel.module, self.device, block_dim=self._block)
         single = [self._forces, self._own, self._extract, repair_own]
@@ -59,7 +60,9 @@ class SubtreeField(CorotatedField):
             single += [scatter_elements, repair_elements]
         for kernel in single:
             wp.load_module(kernel.module, self.device)
-        if self.device.is_cuda:
+        if self._listed:
+            LeftOutLeaves.load(self.device)
+        if one_launch:
             OwnLaunches.load(self._uniform, self.model.tolerance, self.device)
 
     @property
@@ -83,7 +86,7 @@ class SubtreeField(CorotatedField):
         self._own_launches: OwnLaunches | None = None
         if self._listed:
             self._left_out = LeftOutLeaves.of(plan, self.device)
-            if OwnLaunches.suit(plan):
+            if self.rotation_level is None and OwnLaunches.suit(plan):
                 self._own_launches = OwnLaunches(plan, self.elements, self.material_inputs, self.model.tolerance)
                 return
         self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]

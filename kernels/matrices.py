@@ -1,0 +1,50 @@
+"""Small matrices: what rotations and constitutive laws are made of."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+MAX_FLOAT = wp.constant(3.4028234e38)
+
+
+@wp.func
+def identity3():
+    return wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+
+@wp.func
+def column(a: wp.mat33, j: int):
+    return wp.vec3(a[0, j], a[1, j], a[2, j])
+
+
+@wp.func
+def cofactor(a: wp.mat33):
+    """det(A) A^-T, which exists for every A."""
+    a0 = column(a, 0)
+    a1 = column(a, 1)
+    a2 = column(a, 2)
+    return wp.matrix_from_cols(wp.cross(a1, a2), wp.cross(a2, a0), wp.cross(a0, a1))
+
+
+@wp.func
+def frobenius(a: wp.mat33):
+    return wp.sqrt(wp.ddot(a, a))
+
+
+@wp.func
+def largest_entry(a: wp.mat33):
+    m = float(0.0)
+    for i in range(3):
+        for j in range(3):
+            m = wp.max(m, wp.abs(a[i, j]))
+    return m
+
+
+@wp.func
+def all_finite(a: wp.mat33):
+    ok = bool(True)
+    for i in range(3):
+        for j in range(3):
+            # A comparison with NaN is false, and so is one with an infinity beyond the largest float.
+            ok = ok and (wp.abs(a[i, j]) <= MAX_FLOAT)
+    return ok
