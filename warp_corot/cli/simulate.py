@@ -167,14 +167,15 @@ def _make_simulation(
     damping = subject.damping if args.damping is None else args.damping
     gravity = subject.gravity if args.gravity is None else tuple(args.gravity)
     SymplecticEuler(args.dt, damping)  # checks both, the step before it is shortened
-    _try_step(body, model, damping, remesh)
-    dt = None if args.dt is None else 1.0 / (args.fps * steps_per_frame(args.fps, args.dt))
+    tried = _tried_step(body, model, damping, remesh)
+    steps = steps_per_frame(args.fps, args.dt or tried)  # refuses more than anybody can wait for
+    dt = None if args.dt is None else 1.0 / (args.fps * steps)
     with as_remesh_options():
         return Simulation(body, model=model, integrator=SymplecticEuler(dt, damping), gravity=gravity, remesh=remesh)
 
 
-def _try_step(body: SoftBody, model: Model, damping: float, remesh: OnlineRemesh | None) -> None:
-    """Make one step: at rest and without weight it loads every kernel and moves nothing."""
+def _tried_step(body: SoftBody, model: Model, damping: float, remesh: OnlineRemesh | None) -> float:
+    """The length of a step [s] that was made at rest and without weight: it loads every kernel and moves nothing."""
     tried = body
     if remesh:
         # The body's own mesh is not to change before it begins.
@@ -183,10 +184,12 @@ def _try_step(body: SoftBody, model: Model, damping: float, remesh: OnlineRemesh
     integrator = SymplecticEuler(damping=damping)
     with as_remesh_options():
         trial = Simulation(tried, model=model, integrator=integrator, gravity=(0, 0, 0), remesh=remesh)
+    dt = trial.dt
     trial.step()
     trial.von_mises()
     if tried is body:
         body.displacements = body.velocities = np.zeros_like(body.mesh.points)
+    return dt
 
 
 @contextmanager
