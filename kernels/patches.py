@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from .block import LOAD, STORE, number_in, shared_vectors, shuffle_down, synchronize_block
+from .block import LOAD, STORE, number_in, shuffle_down, synchronize_block
 from .elements import load_node, store_node
 from .general_cuda import corotated_law
 from .integrate import add_support_work, is_finite, symplectic_euler_velocity, vector_at
@@ -50,6 +50,11 @@ class Layout:
     lanes: int
     nodes: int
     slots: int
+
+    @property
+    def floats(self) -> int:
+        """What all of that takes of shared memory, in numbers of four bytes."""
+        return 3 * (self.nodes + self.slots + 1)
 
 
 @wp.struct
@@ -128,6 +133,31 @@ def synchronize_any(flag: int) -> int:
     ...
 
 
+def vectors_at(first: int) -> wp.Function:
+    """An array of vectors in the block's dynamic shared memory from the ``first`` one on; see ``block.shared_vectors``.
+
+    The kernel reserves the memory as a tile, with which Warp asks for more than 48 KB where it takes that.
+    """
+    snippet = f"""
+#if defined(__CUDA_ARCH__)
+    extern __shared__ char dynamic_smem_base[];
+    float* at = (float*)dynamic_smem_base + 3 * (i + {first});
+    if (access == {STORE}) {{
+        at[0] = value[0]; at[1] = value[1]; at[2] = value[2];
+        return value;
+    }}
+    return wp::vec_t<3, wp::float32>(at[0], at[1], at[2]);
+#else
+    return value;
+#endif
+"""
+
+    @wp.func_native(snippet)
+    def memory(access: int, i: int, value: wp.vec3) -> wp.vec3: ...
+
+    return memory
+
+
 @wp.func
 def key_from(times: wp.array[wp.float64], key: int, last: int, t: wp.float64):
     """As ``keyframes.key_before``, from an earlier key on, where the last but one is ``last``."""
@@ -146,7 +176,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         load_vectors: What loads are an array of, vec3 or vec4.
     """
     threads, each, halo_each, lanes = layout.threads, layout.elements, layout.halo, layout.lanes
-    displacement, slot = shared_vectors(layout.nodes, "displacements"), shared_vectors(layout.slots + 1, "forces")
+    slot, displacement = vectors_at(0), vectors_at(layout.slots + 1)
     stress = corotated_law(quick_rotation)
     words = wp.types.vector(length=each, dtype=wp.uint64)
     numbers = wp.types.matrix(shape=(each, 11), dtype=wp.float32)
@@ -234,11 +264,8 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                 constants[k, 9] = volume * mu[t]
                 constants[k, 10] = volume * lam[t]
 
-        # Places that no corner has are read too.
-        at = thread
-        while at < wp.static(layout.slots + 1):
-            slot(wp.static(STORE), at, wp.vec3())
-            at += wp.static(threads)
+        # ``slot`` and ``displacement``; places that no corner has are read too, and stay zero.
+        _memory = wp.tile_zeros(shape=wp.static(layout.floats), dtype=wp.float32, storage="shared")
         if moves:
             displacement(wp.static(STORE), place, x)
             publish(exchange.published, int(number & wp.uint32(1)) * node_count + i, x, number)

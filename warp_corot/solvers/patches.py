@@ -11,7 +11,6 @@ import warp as wp
 from ..anisotropy import Anisotropic
 from ..elasticity.law_general import CorotatedGeneralField
 from ..elasticity.subtree_field import SubtreeField
-from ..kernels.block_layout import SHARED_BYTES, VECTOR_BYTES
 from ..kernels.patches import Exchange, Layout, PatchBody, step_patches
 from ..kernels.rotation import quick_rotation
 from ..trajectory import Trajectory
@@ -30,6 +29,8 @@ THREADS, MORE_THREADS = 256, 512
 FEW_ELEMENTS = 512
 #: Elements whose constants a thread keeps in registers, and nodes of the halo that it waits for.
 MOST_ELEMENTS, MOST_HALO = 4, 2
+#: What Warp keeps of a block's shared memory for its tiles.
+TILE_BYTES = 8192
 #: Kernels are made for rooms of whole multiples, so that bodies share them.
 NODE_ROOM, SLOT_ROOM = 128, 512
 
@@ -70,7 +71,7 @@ class PatchSteps:
             patches = Patches.of(body.mesh.points, body.mesh.tets, count, each)
             if threads is None and each == THREADS and patches.most_elements > FEW_ELEMENTS:
                 continue
-            layout = layout_of(patches, each)
+            layout = layout_of(patches, each, body.device.max_shared_memory_per_block - TILE_BYTES)
             if layout is not None:
                 return cls(body, patches, layout)
         return None
@@ -116,18 +117,15 @@ class PatchSteps:
         )
 
 
-def layout_of(patches: Patches, threads: int) -> Layout | None:
-    """What the kernel for these patches is generated for, or None if they do not fit into blocks."""
+def layout_of(patches: Patches, threads: int, most_bytes: int) -> Layout | None:
+    """What the kernel for these patches is generated for, or None if they do not fit into blocks of so much memory."""
     elements = -(-patches.most_elements // threads)
     halo = max(-(-patches.most_halo // threads), 1)
     nodes = -(-patches.most_nodes // NODE_ROOM) * NODE_ROOM
     slots = -(-(patches.most_slots + 1) // SLOT_ROOM) * SLOT_ROOM - 1
-    if (nodes + slots + 1) * VECTOR_BYTES > SHARED_BYTES:
-        nodes, slots = patches.most_nodes, patches.most_slots
-    fits = (nodes + slots + 1) * VECTOR_BYTES <= SHARED_BYTES and patches.most_own * patches.lanes <= threads
-    if not fits or elements > MOST_ELEMENTS or halo > MOST_HALO:
-        return None
-    return Layout(threads, elements, halo, patches.lanes, nodes, slots)
+    layout = Layout(threads, elements, halo, patches.lanes, nodes, slots)
+    fits = 4 * layout.floats <= most_bytes and patches.most_own * patches.lanes <= threads
+    return layout if fits and elements <= MOST_ELEMENTS and halo <= MOST_HALO else None
 
 
 def _suits(body: SoftBody, field: ForceField) -> bool:
