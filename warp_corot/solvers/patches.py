@@ -24,11 +24,10 @@ if TYPE_CHECKING:
 
 #: Elements of the bodies for which it pays: below, a launch has nothing to spread; above, patches outgrow their blocks.
 FEWEST, MOST = 1_500, 150_000
-#: Threads a block, up to so many elements of the largest patch, and beyond.
-THREADS, MORE_THREADS = 256, 512
-FEW_ELEMENTS = 512
+#: Threads a block, each up to so many elements of the largest patch; more threads have fewer registers.
+THREADS = ((256, 512), (512, 1024), (384, 1536), (512, 2048))
 #: Elements whose constants a thread keeps in registers, and nodes of the halo that it waits for.
-MOST_ELEMENTS, MOST_HALO = 4, 2
+MOST_ELEMENTS, MOST_HALO = 4, 3
 #: What Warp keeps of a block's shared memory for its tiles.
 TILE_BYTES = 8192
 #: Kernels are made for rooms of whole multiples, so that bodies share them.
@@ -67,9 +66,9 @@ class PatchSteps:
         if not _suits(body, field):
             return None
         count = min(count or body.device.sm_count, body.device.sm_count)
-        for each in (THREADS, MORE_THREADS) if threads is None else (threads,):
+        for each, most in THREADS if threads is None else ((threads, MOST_ELEMENTS * threads),):
             patches = Patches.of(body.mesh.points, body.mesh.tets, count, each)
-            if threads is None and each == THREADS and patches.most_elements > FEW_ELEMENTS:
+            if patches.most_elements > most:
                 continue
             layout = layout_of(patches, each, body.device.max_shared_memory_per_block - TILE_BYTES)
             if layout is not None:
@@ -154,16 +153,17 @@ def _device_patches(body: SoftBody, patches: Patches, layout: Layout) -> PatchBo
     slots = np.where(patches.slots == NO_SLOT, layout.slots, patches.slots)
     tables.corners = wp.array(_packed(patches.corners), dtype=wp.uint64, device=device)
     tables.slots = wp.array(_packed(slots), dtype=wp.uint64, device=device)
-    tables.rest = wp.array(rest_rows(body.mesh.points, body.mesh.tets)[:, patches.elements], wp.float32, device=device)
+    rest = np.ascontiguousarray(rest_rows(body.mesh.points, body.mesh.tets)[:, patches.elements])
+    tables.rest = wp.array(rest, dtype=wp.float32, device=device)
     return tables
 
 
 def rest_rows(points: np.ndarray, tets: np.ndarray) -> np.ndarray:
-    """The inverses of the rest edges, row by row, and the volumes of elements: float32 [10, T]."""
+    """The inverses of the rest edges, row by row, and the volumes of elements, either way wound: float32 [10, T]."""
     x = points[tets]
     edges = np.swapaxes(x[:, 1:] - x[:, :1], 1, 2)
     inverse = np.linalg.inv(edges).reshape(-1, 9)
-    volume = np.linalg.det(edges) / 6.0
+    volume = np.abs(np.linalg.det(edges)) / 6.0
     return np.column_stack([inverse, volume]).T.astype(np.float32)
 
 
