@@ -266,6 +266,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
 
         # ``slot`` and ``displacement``; places that no corner has are read too, and stay zero.
         _memory = wp.tile_zeros(shape=wp.static(layout.floats), dtype=wp.float32, storage="shared")
+        synchronize_block()
         if moves:
             displacement(wp.static(STORE), place, x)
             publish(exchange.published, int(number & wp.uint32(1)) * node_count + i, x, number)

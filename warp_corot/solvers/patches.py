@@ -83,7 +83,7 @@ class PatchSteps:
 
     @property
     def is_prepared(self) -> bool:
-        """Whether the keyframes on the device are the body's."""
+        """Whether the keyframes on the device are the body's; not if others came while somebody records."""
         return self._trajectories == self.body.trajectories
 
     def launch(self, count: int, damping: float, context: StepContext) -> None:

@@ -81,8 +81,7 @@ class SymplecticEulerStepper(Stepper):
 
     def steps(self, count: int, *, forces_known: bool = False) -> None:
         many = self._launched
-        # Keyframes that came while others record are not on the device yet.
-        if many is not None and (many is self.block or self.patches.is_prepared):
+        if many is not None and many.is_prepared:
             if forces_known:
                 self.body.node_forces.zero_()  # a block finds its own
             many.launch(count, self.damping, self.context)
