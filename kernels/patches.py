@@ -42,6 +42,7 @@ class Layout:
         elements, halo: Elements, and nodes of the halo, a thread.
         lanes: Threads that add up one node.
         nodes, slots: Room for displacements and for forces in shared memory; one more slot takes what nobody adds up.
+        overlaps: Whether a block computes the elements that need no halo before it waits for that.
     """
 
     threads: int
@@ -50,6 +51,7 @@ class Layout:
     lanes: int
     nodes: int
     slots: int
+    overlaps: bool = True
 
     @property
     def floats(self) -> int:
@@ -67,6 +69,7 @@ class PatchBody:
     halo_start: wp.array[wp.int32]
     elements: wp.array[wp.int32]  # [E]
     element_start: wp.array[wp.int32]
+    interior: wp.array[wp.int32]  # [patches] how many of a patch's elements need no halo; they come first
     corners: wp.array[wp.uint64]  # [E] the four corners' places among the patch's nodes, 16 bits each
     slots: wp.array[wp.uint64]  # [E] the same of their forces
     bases: wp.array[wp.int32]
@@ -248,6 +251,9 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
 
         first_element = body.element_start[block]
         element_count = body.element_start[block + 1] - first_element
+        interior_count = int(0)
+        if wp.static(layout.overlaps):
+            interior_count = body.interior[block]
         corners = words()
         targets = words()
         constants = numbers()
@@ -275,43 +281,54 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         step = int(0)
         while step < steps:
             buffer = int(number & wp.uint32(1)) * node_count
-            for k in range(wp.static(halo_each)):
-                at = thread + k * wp.static(threads)
-                if at < halo_count:
-                    told = await_displacement(exchange.published, buffer + halo[k], number)
-                    displacement(wp.static(STORE), own_count + at, wp.vec3(told[0], told[1], told[2]))
-                    if told[3] != 0.0:
-                        gave_up = 1
-            gave_up = synchronize_any(gave_up)
+            # First the elements between own nodes, while the halo is on its way, then the others.
+            begin = int(0)
+            end = int(interior_count)
+            phase = int(wp.static(0 if layout.overlaps else 1))
+            while phase < 2:
+                if phase == 0:
+                    synchronize_block()
+                else:
+                    begin = interior_count
+                    end = element_count
+                    for k in range(wp.static(halo_each)):
+                        at = thread + k * wp.static(threads)
+                        if at < halo_count:
+                            told = await_displacement(exchange.published, buffer + halo[k], number)
+                            displacement(wp.static(STORE), own_count + at, wp.vec3(told[0], told[1], told[2]))
+                            if told[3] != 0.0:
+                                gave_up = 1
+                    gave_up = synchronize_any(gave_up)
+                for k in range(wp.static(each)):
+                    at = thread + k * wp.static(threads)
+                    if at >= begin and at < end:
+                        x0 = displacement(wp.static(LOAD), number_in(corners[k], 0), wp.vec3())
+                        x1 = displacement(wp.static(LOAD), number_in(corners[k], 1), wp.vec3())
+                        x2 = displacement(wp.static(LOAD), number_in(corners[k], 2), wp.vec3())
+                        x3 = displacement(wp.static(LOAD), number_in(corners[k], 3), wp.vec3())
+                        b = wp.mat33(
+                            constants[k, 0],
+                            constants[k, 1],
+                            constants[k, 2],
+                            constants[k, 3],
+                            constants[k, 4],
+                            constants[k, 5],
+                            constants[k, 6],
+                            constants[k, 7],
+                            constants[k, 8],
+                        )
+                        a = wp.matrix_from_cols(x1 - x0, x2 - x0, x3 - x0) * b
+                        h = stress(a, constants[k, 9], constants[k, 10]) * wp.transpose(b)
+                        f1 = -column(h, 0)
+                        f2 = -column(h, 1)
+                        f3 = -column(h, 2)
+                        slot(wp.static(STORE), number_in(targets[k], 0), -(f1 + f2 + f3))
+                        slot(wp.static(STORE), number_in(targets[k], 1), f1)
+                        slot(wp.static(STORE), number_in(targets[k], 2), f2)
+                        slot(wp.static(STORE), number_in(targets[k], 3), f3)
+                phase += 1
             if gave_up != 0:
                 break
-
-            for k in range(wp.static(each)):
-                if thread + k * wp.static(threads) < element_count:
-                    x0 = displacement(wp.static(LOAD), number_in(corners[k], 0), wp.vec3())
-                    x1 = displacement(wp.static(LOAD), number_in(corners[k], 1), wp.vec3())
-                    x2 = displacement(wp.static(LOAD), number_in(corners[k], 2), wp.vec3())
-                    x3 = displacement(wp.static(LOAD), number_in(corners[k], 3), wp.vec3())
-                    b = wp.mat33(
-                        constants[k, 0],
-                        constants[k, 1],
-                        constants[k, 2],
-                        constants[k, 3],
-                        constants[k, 4],
-                        constants[k, 5],
-                        constants[k, 6],
-                        constants[k, 7],
-                        constants[k, 8],
-                    )
-                    a = wp.matrix_from_cols(x1 - x0, x2 - x0, x3 - x0) * b
-                    h = stress(a, constants[k, 9], constants[k, 10]) * wp.transpose(b)
-                    f1 = -column(h, 0)
-                    f2 = -column(h, 1)
-                    f3 = -column(h, 2)
-                    slot(wp.static(STORE), number_in(targets[k], 0), -(f1 + f2 + f3))
-                    slot(wp.static(STORE), number_in(targets[k], 1), f1)
-                    slot(wp.static(STORE), number_in(targets[k], 2), f2)
-                    slot(wp.static(STORE), number_in(targets[k], 3), f3)
             synchronize_block()
 
             elastic = wp.vec3()

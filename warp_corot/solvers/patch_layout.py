@@ -32,7 +32,8 @@ class Patches:
         lanes: Threads that add up one node: 1, 2, 4, 8, 16 or 32.
         own, own_start: Nodes that patches own, int32 [N].
         halo, halo_start: Nodes that patches read of others, int32 [H].
-        elements, element_start: Elements that patches compute, int32 [E].
+        elements, element_start: Elements that patches compute, those without halo first, int32 [E].
+        interior: How many elements of each patch have no corner in the halo, int32 [patches].
         corners: The four nodes of each of these, numbered in the patch, int32 [E, 4].
         slots: Where each corner's force goes; ``NO_SLOT`` at corners of the halo; int32 [E, 4].
         bases, base_start: Where each warp's slots begin, and past its last warp's the number of the patch's slots,
@@ -46,6 +47,7 @@ class Patches:
     halo_start: np.ndarray
     elements: np.ndarray
     element_start: np.ndarray
+    interior: np.ndarray
     corners: np.ndarray
     slots: np.ndarray
     bases: np.ndarray
@@ -73,7 +75,7 @@ class Patches:
         place[own] = np.arange(n)
         place -= own_start[owner]
 
-        patch, element, element_start = _elements_by_patch(owner[tets], count)
+        patch, element, element_start, interior = _elements_by_patch(owner[tets], count)
         nodes = tets[element]
         foreign = owner[nodes] != patch[:, None]
         halo, inverse = np.unique((patch[:, None] * n + nodes)[foreign], return_inverse=True)
@@ -89,7 +91,19 @@ class Patches:
         thread = place[mine] * lanes + rank % lanes
         warp = base_start[owner[mine]] + thread // WARP
         slots[~foreign] = bases[warp] + rank // lanes * WARP + thread % WARP
-        arrays = (own, own_start, halo % n, halo_start, element, element_start, corners, slots, bases, base_start)
+        arrays = (
+            own,
+            own_start,
+            halo % n,
+            halo_start,
+            element,
+            element_start,
+            interior,
+            corners,
+            slots,
+            bases,
+            base_start,
+        )
         return cls(lanes, *(array.astype(np.int32) for array in arrays))
 
     @property
@@ -143,16 +157,23 @@ def patch_of_nodes(points: np.ndarray, weight: np.ndarray, count: int) -> np.nda
     return patch
 
 
-def _elements_by_patch(owners: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Each patch with each element that has a corner there, patch by patch: both [E], and where each begins."""
+def _elements_by_patch(owners: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Each patch with each element that has a corner there, patch by patch, inner ones first: both [E]; where each
+    patch begins, and how many are inner ones.
+
+    Args:
+        owners: The patches of the elements' nodes, [T, 4].
+    """
     new = np.ones(owners.shape, bool)
     for k in range(1, 4):
         for earlier in range(k):
             new[:, k] &= owners[:, k] != owners[:, earlier]
     element, corner = np.nonzero(new)
     patch = owners[element, corner]
-    order = np.argsort(patch, kind="stable")
-    return patch[order], element[order], _starts(np.bincount(patch, minlength=count))
+    shared = (new.sum(axis=1) > 1)[element]
+    order = np.lexsort((element, shared, patch))
+    interior = np.bincount(patch[~shared], minlength=count)
+    return patch[order], element[order], _starts(np.bincount(patch, minlength=count)), interior
 
 
 def _slot_bases(valence: np.ndarray, own_start: np.ndarray, lanes: int) -> tuple[np.ndarray, np.ndarray]:

@@ -148,7 +148,17 @@ def _device_patches(body: SoftBody, patches: Patches, layout: Layout) -> PatchBo
     """The patches as the kernel reads them, still without keyframes."""
     device = body.device
     tables = PatchBody()
-    for name in ("own", "own_start", "halo", "halo_start", "elements", "element_start", "bases", "base_start"):
+    for name in (
+        "own",
+        "own_start",
+        "halo",
+        "halo_start",
+        "elements",
+        "element_start",
+        "interior",
+        "bases",
+        "base_start",
+    ):
         setattr(tables, name, wp.array(getattr(patches, name), dtype=wp.int32, device=device))
     slots = np.where(patches.slots == NO_SLOT, layout.slots, patches.slots)
     tables.corners = wp.array(_packed(patches.corners), dtype=wp.uint64, device=device)
