@@ -1,5 +1,6 @@
 """Steps by patches: what each block is dealt, on the host; on CUDA the same steps as launch by launch."""
 
+import itertools
 import warnings
 
 import numpy as np
@@ -32,7 +33,7 @@ def patches(request, mesh):
 
 
 def parts(array, start):
-    return [array[a:b] for a, b in zip(start[:-1], start[1:], strict=True)]
+    return [array[a:b] for a, b in itertools.pairwise(start)]
 
 
 def nodes_of(patches, patch):
@@ -151,7 +152,7 @@ def run(general, steps, by_patches, *, keyframes=False, loads=False):
     low, high = np.flatnonzero(y < y.min() + 1e-9), np.flatnonzero(y > y.max() - 1e-9)
     body.fix(low)
     if keyframes:
-        turned = 0.05 * CUBE * rng.normal(size=(3, len(high), 3))
+        turned = 0.01 * CUBE * rng.normal(size=(3, len(high), 3))
         body.prescribe(high, times=[0.0, 0.004, 0.02], displacements=turned)
     if loads:
         body.load(np.arange(len(y)), 1e-4 * rng.normal(size=(len(y), 3)))

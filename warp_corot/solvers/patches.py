@@ -28,6 +28,8 @@ FEWEST, MOST = 1_500, 150_000
 THREADS = ((256, 512), (512, 1024), (384, 1536), (512, 2048))
 #: Elements whose constants a thread keeps in registers, and nodes of the halo that it waits for.
 MOST_ELEMENTS, MOST_HALO = 4, 3
+#: The first cards that read and write 16 bytes at once for all to see.
+LEAST_ARCH = 70
 #: What Warp keeps of a block's shared memory for its tiles.
 TILE_BYTES = 8192
 #: Kernels are made for rooms of whole multiples, so that bodies share them.
@@ -128,7 +130,9 @@ def layout_of(patches: Patches, threads: int, most_bytes: int) -> Layout | None:
 
 
 def _suits(body: SoftBody, field: ForceField) -> bool:
-    if body.changing is not None or not body.device.is_cuda or body.worlds != 1:
+    if body.changing is not None or body.worlds != 1:
+        return False
+    if not body.device.is_cuda or body.device.arch < LEAST_ARCH:
         return False
     if isinstance(body.material, Anisotropic) or field.deterministic:
         return False
