@@ -72,6 +72,9 @@ class BlockSteps:
             return None
         return cls(body, batch, layout, slots)
 
+    #: Whether the device has all that a launch reads of the body's controls.
+    is_prepared = True
+
     def launch(self, count: int, damping: float, context: StepContext) -> None:
         """Launch ``count`` steps, the first ones since the clock was last advanced."""
         body = self.body

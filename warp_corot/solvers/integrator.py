@@ -52,6 +52,9 @@ class Stepper(ABC):
         """Whether many steps are one launch."""
         return False
 
+    def prepare(self) -> None:  # noqa: B027 (most need nothing)
+        """Bring up to date what launches read of the body's controls; called before steps are recorded."""
+
     @abstractmethod
     def forces(self, offset: int = 0) -> None:
         """Launch the elastic forces of the ``offset``-th step since the clock was last advanced."""

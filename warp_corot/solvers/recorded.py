@@ -86,6 +86,8 @@ class RecordedSteps:
         if revisions != self._revisions:
             self._graphs.clear()
             self._revisions = revisions
+            for stepper in self._steppers:
+                stepper.prepare()
         key = (count, whole, measured)
         if key not in self._graphs:
             with wp.ScopedCapture(device=self._pace.device) as capture:

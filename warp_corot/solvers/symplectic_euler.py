@@ -14,6 +14,7 @@ from ..errors import InputError
 from ..kernels.integrate import STEP_SYMPLECTIC_EULER, follow_trajectory
 from .block import BlockSteps
 from .integrator import Integrator, StepContext, Stepper
+from .patches import PatchSteps
 
 if TYPE_CHECKING:
     from ..body import SoftBody
@@ -57,21 +58,33 @@ class SymplecticEulerStepper(Stepper):
         self.context = context
         self.damping = damping
         self.block = BlockSteps.of(body, field)
+        self.patches = PatchSteps.of(body, field) if self.block is None else None
 
     @property
     def many_a_launch(self) -> bool:
-        return self.block is not None and not self.body.trajectories
+        return self._launched is not None
+
+    @property
+    def _launched(self) -> BlockSteps | PatchSteps | None:
+        """What makes many steps in one launch, if anything does."""
+        if self.block is not None:
+            return None if self.body.trajectories else self.block
+        return self.patches
+
+    def prepare(self) -> None:
+        if self.patches is not None:
+            self.patches.prepare()
 
     def forces(self, offset: int = 0) -> None:
         self.field.begin_step(self.context.pace, offset)
         self.field.add_forces(self.body.node_displacements, self.body.node_forces)
 
     def steps(self, count: int, *, forces_known: bool = False) -> None:
-        if self.many_a_launch:
-            assert self.block is not None
+        many = self._launched
+        if many is not None and many.is_prepared:
             if forces_known:
                 self.body.node_forces.zero_()  # a block finds its own
-            self.block.launch(count, self.damping, self.context)
+            many.launch(count, self.damping, self.context)
             return
         for offset in range(count):
             if offset > 0 or not forces_known:
