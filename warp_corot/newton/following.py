@@ -7,6 +7,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 import warp as wp
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from ..elasticity import Corotated
 from ..kernels import gauge, newton_gauge
@@ -37,7 +39,7 @@ class Following:
 
     Attributes:
         share: The share of the safe substep that is taken; less than one after a step that went wrong.
-        reach: The size of the largest world [m]: what moves farther in a substep has gone wrong.
+        reach: The size of the largest body [m]: what moves farther in a substep has gone wrong.
         made: Substeps of the last step.
         was_recorded: Whether the last step was recorded.
     """
@@ -185,12 +187,12 @@ class Following:
 
 
 def _size(model: newton.Model, tets: npt.NDArray[np.integer]) -> float:
-    """The diagonal of the largest world's box about its tetrahedra [m]."""
-    particles = np.unique(tets)
-    x, world = model.particle_q.numpy()[particles], model.particle_world.numpy()[particles]
-    places = world - world.min()
-    low, high = (np.full((places.max() + 1, 3), value) for value in (np.inf, -np.inf))
-    np.minimum.at(low, places, x)
-    np.maximum.at(high, places, x)
-    there = low[:, 0] <= high[:, 0]
-    return float(np.linalg.norm(high[there] - low[there], axis=1).max())
+    """The diagonal of the box about the largest body of tetrahedra that hang together [m]."""
+    count = model.particle_count
+    edges = csr_array((np.ones(3 * len(tets), bool), (np.repeat(tets[:, 0], 3), tets[:, 1:].ravel())), (count, count))
+    number, body = connected_components(edges, directed=False)
+    x = model.particle_q.numpy()
+    low, high = (np.full((number, 3), value) for value in (np.inf, -np.inf))
+    np.minimum.at(low, body, x)
+    np.maximum.at(high, body, x)
+    return float(np.linalg.norm(high - low, axis=1).max())

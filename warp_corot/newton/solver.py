@@ -48,7 +48,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
     where that was too few.
 
     A step is taken for a world or not at all: where something is not finite, or a particle moves farther in a substep
-    than the model is large, the state stays what it was. On the CPU the step is then tried again with up to 16 times
+    than the largest body is long, the state stays what it was. On the CPU the step is then tried again with up to 16 times
     the substeps, and ``step`` says so if that does not help. On CUDA a later ``step`` warns, and has twice the substeps;
     that world has stood still for one step. ``check`` says it as an error, as both do where substeps are given.
     There are no gradients.
