@@ -58,7 +58,8 @@ class Example:
             setattr(self.model, f"soft_contact_{name}", value)
             getattr(self.model, f"shape_material_{name}").fill_(value)
         self.solver = wn.SolverCorotated(self.model)
-        self.substeps = 2 * int(np.ceil(self.frame_dt / (1.4 * self.solver.contact_dt)))
+        # Fingers move and contacts are found in every substep: each step has one.
+        self.substeps = 2 * int(np.ceil(self.frame_dt / (2.0 * self.solver.recorded_dt)))
         self.pipeline = newton.CollisionPipeline(self.model)
         self.contacts = self.pipeline.contacts()
         self.time = wp.zeros(1, dtype=wp.float32)

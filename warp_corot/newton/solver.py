@@ -22,6 +22,9 @@ from .tetrahedra import LAME, Tetrahedra
 #: Share of the largest stable step that errors suggest: elements stiffen when strained.
 SAFETY = 0.7
 
+#: By what factor a recorded substep may be longer than is safe, less than the smallest margin of what is safe.
+EXCESS = 1.1
+
 ROTATIONS = ("byers-xu", "warm")
 
 
@@ -200,7 +203,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
             UnstableError: A step's result was not finite, or beyond reason.
         """
         excess = 0.0 if self._following is None else self._following.take_excess()
-        if excess > 1.0:
+        if excess > EXCESS:
             warnings.warn(
                 f"a recorded step has fewer substeps than are safe: {excess:.2g} times as many would be; "
                 "record it again in the present state, or give SolverCorotated more substeps",
