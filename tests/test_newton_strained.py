@@ -1,5 +1,7 @@
 """Soft bodies under load through Newton's solver, by its defaults: finite, and no energy out of nothing."""
 
+import warnings
+
 import loaded
 import numpy as np
 import pytest
@@ -101,3 +103,78 @@ def test_a_soft_block_falls_for_long(device, kind):
 @pytest.mark.parametrize("kind", ["general", "forest"])
 def test_a_leaning_capsule_swings_for_long(device, kind):
     followed(leaning_capsule(kind, 5000, device), 120, up=1, contact=False)
+
+
+class TestWhatWentWrong:
+    """A body whose substep is thought to be eight times as long as what is stable."""
+
+    def solver(self, device):
+        made = builder(gravity=(0.0, 0.0, 0.0))
+        add_grid(made, (4, 2, 2), vel=(0.0, 0.0, 0.0))
+        model = made.finalize(device=device)
+        truth = wn.SolverCorotated(model)
+        solver = wn.SolverCorotated(model, stable_dt=8.0 * truth.stable_dt)
+        pushed = model.state()
+        rng = np.random.default_rng(20130705)
+        v = 0.1 * rng.standard_normal((model.particle_count, 3))
+        pushed.particle_qd.assign(v.astype(np.float32))
+        return model, solver, pushed, 64 * truth.stable_dt
+
+    @pytest.mark.parametrize("in_place", [False, True])
+    def test_is_tried_again_with_more_substeps(self, in_place):
+        """On CPUs at once: the whole time is stepped, as little as a smaller step would have moved it."""
+        model, solver, before, dt = self.solver("cpu")
+        after = before if in_place else model.state()
+        start = energy(before, model.particle_mass.numpy(), 2, 0.0)
+        for _ in range(2):
+            solver.step(before, after, None, None, dt)
+            before, after = after, before
+        assert solver.substeps_made >= 64
+        assert energy(before, model.particle_mass.numpy(), 2, 0.0) < 2.0 * start
+
+    def test_is_said_when_recorded(self, device):
+        """A recorded step cannot change; the next recording has more substeps."""
+        model, solver, before, dt = self.solver(device)
+        with wp.ScopedCapture(device=device) as capture:
+            solver.step(before, before, None, None, dt)
+        first = solver.substeps_made
+        kept = before.particle_q.numpy()
+        with pytest.raises(wc.UnstableError, match="recorded again"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            for _ in range(20):
+                wp.capture_launch(capture.graph)
+            solver.check()
+        assert np.isfinite(before.particle_q.numpy()).all()
+        assert np.abs(before.particle_q.numpy() - kept).max() < 100.0
+        with wp.ScopedCapture(device=device):
+            solver.step(before, before, None, None, dt)
+        # Twice as many, less what the measurement that is recorded gives back.
+        assert solver.substeps_made > 1.8 * first
+
+    def test_a_recorded_step_with_too_few_substeps(self, device):
+        """Recorded at rest, it steps a body that is drawn out to a thread.
+
+        With stretches s, turning about the long axis is held by (lambda tr(S - I) - 2 mu) / (s_2 + s_3), which is
+        twice the stiffness at rest.
+        """
+        made = builder(gravity=(0.0, 0.0, 0.0))
+        add_grid(made, (4, 2, 2))
+        model = made.finalize(device=device)
+        solver = wn.SolverCorotated(model)
+        state, after = model.state(), model.state()
+        dt = 10.0 * solver.stable_dt
+        solver.step(state, after, None, None, dt)
+        with wp.ScopedCapture(device=device) as capture:
+            solver.step(state, after, None, None, dt)
+        wp.capture_launch(capture.graph)
+        solver.check()
+        drawn = state.particle_q.numpy() * np.float32([6.0, 0.3, 0.2])
+        for _ in range(4):
+            state.particle_q.assign(drawn)
+            wp.capture_launch(capture.graph)
+        with pytest.warns(UserWarning, match="record it again"):
+            solver.check()
+        with wp.ScopedCapture(device=device):
+            solver.step(state, after, None, None, dt)
+        # More than the half as many again that a recording at rest has.
+        assert solver.substeps_made > 1.1 * 1.5 * 10.0 / 0.9

@@ -150,6 +150,10 @@ class Following:
         inputs = [self._at_rest, wp.float64(recorded)]
         outputs = [self._found, self._allowed, self._turn, self._excess, self._seen_by_device]
         self._launch(newton_gauge.take_safe_substep, inputs, outputs, 1)
+        self.recover()
+
+    def recover(self) -> None:
+        """Take a little more of the safe substep again, after one that went wrong."""
         self.share = min(1.0, RECOVERY * self.share)
 
     def take_excess(self) -> float:

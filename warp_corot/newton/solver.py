@@ -211,6 +211,8 @@ class SolverCorotated(SolverBase, CouplingInterface):
                 stacklevel=2,
             )
         self._steps.check(self.stable_dt, self._following)
+        if self._following is not None and self._following.was_recorded:
+            self._following.recover()
 
     def reset(
         self,

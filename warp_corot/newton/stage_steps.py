@@ -18,21 +18,17 @@ from ..io.animate import steps_per_frame
 from ..io.usd_over import SceneWriter, State
 from ..io.usd_scene import open_scene
 from .library import newton
-from .following import RECOVERY
+from .following import INTERVAL, RETRIES
 from .solver import SolverCorotated
 from .stage import StageOptions, stage_model
 from .stage_start import warn_of_overlaps
 
-#: Steps that are recorded and replayed together; a frame is a whole number of such chunks.
-CHUNK = 16
+#: Most steps that are recorded and replayed together, one measurement with them; a frame is a whole number of chunks.
+CHUNK = INTERVAL
 #: What can step rigid bodies.
 RIGID = ("semi-implicit", "xpbd", "none")
 #: Longest step where rigid bodies touch something [s].
 RIGID_STEP = 5e-4
-#: The smallest share of a safe step at which a frame is tried again that went wrong.
-LEAST_SHARE = 1.0 / 16.0
-
-
 class StageSimulation:
     """A USD stage as a scene, stepped by ``SolverCorotated``.
 
@@ -82,13 +78,12 @@ class StageSimulation:
             raise InputError(f"fps is {self.fps:g}; it must be a positive number")
         self.parts = stage_model(self.scene, options or StageOptions(), checked_device(device))
         model = self.parts.model
-        self._follows = dt is None
+        self._given_dt, self.steps = dt, 0
         self.solver = self._new_solver(rigid, damping)
         self._pipeline = newton.CollisionPipeline(model, soft_contact_gap=self.parts.margin)
         self._contacts = self._pipeline.contacts()
         self._pipeline.collide(model.state(), self._contacts)
         warn_of_overlaps(self.parts, self._contacts)
-        self._given_dt, self._share, self.steps = dt, 1.0, 0
         self.state, self._kept = self._new_state(), self._new_state()
         # Shares its positions with the state, and has stresses, which are wanted once a frame and not once a step.
         self._shown = model.state()
@@ -108,7 +103,7 @@ class StageSimulation:
         """
         self._record_steps()
         self._kept.assign(self.state)
-        while True:
+        for attempt in range(RETRIES + 1):
             for _ in range(self.steps // self._chunk):
                 wp.capture_launch(self._graph)
             try:
@@ -117,12 +112,11 @@ class StageSimulation:
             except InputError as error:
                 raise UnstableError(f"after {self.time:.3g} s: {error}") from None
             except UnstableError:
-                if self._given_dt is not None or self._share <= LEAST_SHARE:
+                if self._given_dt is not None or attempt == RETRIES:
                     raise
-            self._share *= 0.5
+            # From here on the solver takes half the step.
             self.state.assign(self._kept)
             self._record_steps()
-        self._share = min(1.0, RECOVERY * self._share)
         self.frames += 1
         self.time = self.frames / self.fps
 
@@ -200,7 +194,7 @@ class StageSimulation:
                 self.parts.notes.append(f"stay where they are (--rigid none): {', '.join(standing)}")
             if rigid == "xpbd":
                 solver = newton.solvers.SolverXPBD(model)
-            substeps = None if self._follows else 1
+            substeps = None if self._given_dt is None else 1
             return SolverCorotated(model, damping=damping, substeps=substeps, rigid_solver=solver)
         except ValueError as error:  # Newton's, and InputError, which is one
             said = str(error).replace(" Give another rigid_solver, or None.", "").rstrip(".")
@@ -216,14 +210,15 @@ class StageSimulation:
             if dt > stable:
                 raise InputError(f"dt is {dt:g} s; the largest stable step is about {stable:.3g} s")
             return dt
-        longest = min(self._share * self.solver.recorded_dt, 1.0 / self.fps)
+        longest = min(self.solver.recorded_dt, 1.0 / self.fps)
         return min(longest, RIGID_STEP) if self.parts.rigid else longest
 
     def _record_steps(self) -> None:
         """Record a chunk of steps that are safe in the present state, where there are not as many as before."""
         count = steps_per_frame(self.fps, self._longest_step())
-        self._chunk = min(count, CHUNK)
-        count = -(-count // self._chunk) * self._chunk
+        chunks = -(-count // CHUNK)
+        self._chunk = -(-count // chunks)
+        count = chunks * self._chunk
         if count != self.steps:
             self.steps = count
             self.dt = 1.0 / (self.fps * count)
