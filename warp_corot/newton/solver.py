@@ -44,19 +44,20 @@ class SolverCorotated(SolverBase, CouplingInterface):
     and throws light bodies out. Particles do not collide with one another unless asked to, soft bodies not with
     themselves.
 
-    Steps are divided into substeps that follow the state: every 32 of them, one more force evaluation finds how stiff the
-    elements are now, and their strains and strain rates how soon that may change. All worlds share the substep. On the
-    CPU a step takes up what it finds at once; on CUDA, where it waits for nothing, a later step does. A recorded step
-    has the substeps that it needed when it was recorded, and at least half as many more as at rest; ``check`` warns
-    where that was too few.
+    Substeps follow the state: every 32 of them, two force evaluations find how stiff the elements are now, and their
+    strains and strain rates tell how soon that may change. All worlds share the substep. On the CPU a step takes up
+    what it finds at once; on CUDA, where it waits for nothing, a later step does. A recorded step has the substeps that
+    it needed when it was recorded, and at least half as many more as at rest; ``check`` warns where that was too few.
 
     A step is taken for a world or not at all: where something is not finite, or a particle moves farther in a substep
-    than the largest body is long, the state stays what it was. On the CPU the step is then tried again with up to 16 times
-    the substeps, and ``step`` says so if that does not help. On CUDA a later ``step`` warns, and has twice the substeps;
-    that world has stood still for one step. ``check`` says it as an error, as both do where substeps are given.
-    There are no gradients.
+    than the largest body is long, the state stays what it was. On the CPU the step is then tried again, with up to 16
+    times the substeps, and ``step`` says so if that does not help. On CUDA, where the world has stood still for a step
+    by then, a later ``step`` warns, and has twice the substeps; ``check`` raises an error. With given substeps it is an
+    error at once, on CUDA from a later ``step`` or ``check``. There are no gradients.
 
-    Newton's positions are float32, so that small motions are lost in them: PLACEHOLDER.
+    Newton's positions are float32, and small motions drown in their rounding. An undamped beam of 19 cm, 5 kPa and
+    1000 kg/m^3, set off with v = a (z/L)^2, keeps its energy to 1 % over 20,000 steps down to a = 0.012 m/s; at
+    1 mm/s it doubles it. ``Simulation`` holds displacements, and does better.
 
     Example::
 
@@ -117,7 +118,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         if stable_dt is not None and not (isinstance(stable_dt, Real) and stable_dt > 0):
             raise InputError(f"stable_dt is {stable_dt!r}; it must be a positive number of seconds or None")
         super().__init__(model)
-        self.substeps = substeps
+        self._substeps = None if substeps is None else int(substeps)
         self._given_stable_dt = stable_dt
         self.tetrahedra = Tetrahedra(model, lame, rotation == "warm", rotation_level)
         self._contacts = Contacts(model)
@@ -126,6 +127,11 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self._following = Following(model, self.tetrahedra) if substeps is None else None
         self._all_worlds = wp.ones(max(int(model.world_count), 1) + 1, dtype=wp.bool, device=self.device)
         self._find_stable_steps()
+
+    @property
+    def substeps(self) -> int | None:
+        """Into how many steps a step is divided; None where that follows the state."""
+        return self._substeps
 
     @property
     def safe_dt(self) -> float:
@@ -144,7 +150,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
     @property
     def substeps_made(self) -> int:
         """Substeps of the last step that was launched or recorded."""
-        return int(self.substeps or 1) if self._following is None else self._following.made
+        return self._substeps or 1 if self._following is None else self._following.made
 
     @property
     def body_reactions(self) -> wp.array:
@@ -292,14 +298,15 @@ class SolverCorotated(SolverBase, CouplingInterface):
             raise InputError(f"dt is {dt!r}; it must be a positive number of seconds")
         if self._following is not None:
             return self._following.count_for(dt)
-        if dt / self.substeps > self.stable_dt:
-            each = f", {self.substeps} substeps of {dt / self.substeps:.3g} s" if self.substeps > 1 else ""
+        count = self._substeps or 1
+        if dt / count > self.stable_dt:
+            each = f", {count} substeps of {dt / count:.3g} s" if count > 1 else ""
             needed = math.ceil(dt / (SAFETY * self.contact_dt))
             raise InputError(
                 f"dt is {dt:.3g} s{each}; the largest stable step is about {self.stable_dt:.3g} s: "
                 f"make shorter steps, or SolverCorotated(..., substeps={needed}), or substeps=None"
             )
-        return int(self.substeps)
+        return count
 
     def _check_arguments(
         self,

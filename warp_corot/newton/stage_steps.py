@@ -17,8 +17,8 @@ from ..errors import InputError, UnstableError
 from ..io.animate import steps_per_frame
 from ..io.usd_over import SceneWriter, State
 from ..io.usd_scene import open_scene
-from .library import newton
 from .following import INTERVAL, RETRIES
+from .library import newton
 from .solver import SolverCorotated
 from .stage import StageOptions, stage_model
 from .stage_start import warn_of_overlaps
@@ -29,6 +29,8 @@ CHUNK = INTERVAL
 RIGID = ("semi-implicit", "xpbd", "none")
 #: Longest step where rigid bodies touch something [s].
 RIGID_STEP = 5e-4
+
+
 class StageSimulation:
     """A USD stage as a scene, stepped by ``SolverCorotated``.
 
