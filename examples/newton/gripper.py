@@ -58,7 +58,6 @@ class Example:
             setattr(self.model, f"soft_contact_{name}", value)
             getattr(self.model, f"shape_material_{name}").fill_(value)
         self.solver = wn.SolverCorotated(self.model)
-        # Fingers move and contacts are found in every substep: each step has one.
         self.substeps = 2 * int(np.ceil(self.frame_dt / (2.0 * self.solver.recorded_dt)))
         self.pipeline = newton.CollisionPipeline(self.model)
         self.contacts = self.pipeline.contacts()
@@ -76,7 +75,7 @@ class Example:
         self.graph = capture.graph
 
     def simulate(self):
-        dt = self.frame_dt / self.substeps
+        dt = self.frame_dt / self.substeps  # short enough for the solver not to divide it
         for _ in range(self.substeps):
             self.state_0.clear_forces()
             wp.launch(move_fingers, dim=2, inputs=[self.time, dt, self.state_0.body_q, self.state_0.body_qd])

@@ -17,8 +17,8 @@ from ..solvers.stable_step import PROBE
 from .library import newton
 from .tetrahedra import Tetrahedra
 
-#: Substeps from one measurement to the next. A measurement takes about as long as three substeps.
-INTERVAL = 32
+#: Substeps from one measurement to the next. A measurement takes about as long as four substeps.
+INTERVAL = 64
 #: A recorded step has at least so many times the substeps that the model needs at rest, since they stay as many.
 HEADROOM = 1.5
 #: How often a step that went wrong is tried again, each time with twice the substeps.

@@ -44,7 +44,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
     and throws light bodies out. Particles do not collide with one another unless asked to, soft bodies not with
     themselves.
 
-    Substeps follow the state: every 32 of them, two force evaluations find how stiff the elements are now, and their
+    Substeps follow the state: every 64 of them, two force evaluations find how stiff the elements are now, and their
     strains and strain rates tell how soon that may change. All worlds share the substep. On the CPU a step takes up
     what it finds at once; on CUDA, where it waits for nothing, a later step does. A recorded step has the substeps that
     it needed when it was recorded, and at least half as many more as at rest; ``check`` warns where that was too few.
