@@ -4,11 +4,10 @@ import functools
 
 import warp as wp
 
-from .constitutive import corotated_strain, hooke
 from .elements import GeneralElements
 from .forces import von_mises
-from .newton_elements import difference_gradient, place_in_model
-from .rotation import byers_xu, identity3, warm_rotation
+from .newton_elements import difference_gradient, place_in_model, rotated_stress
+from .rotation import byers_xu, warm_rotation
 
 wp.set_module_options({"enable_backward": False})
 
@@ -69,7 +68,7 @@ def write_attributes(has_rotation: bool, has_stress: bool, has_von_mises: bool, 
             if wp.static(has_rotation):
                 rotations[t] = wp.normalize(wp.quat_from_matrix(r))
         share = 1.0 / fill[t * fill_stride]
-        stress = share * hooke(corotated_strain(gradient - identity3(), identity3(), r), mu[t], lam[t])
+        stress = share * rotated_stress(gradient, r, mu[t], lam[t])
         if wp.static(has_stress):
             stresses[t] = r * stress * wp.transpose(r)
         if wp.static(has_von_mises):

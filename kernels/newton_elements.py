@@ -39,9 +39,15 @@ def difference_gradient(elements: GeneralElements, t: int, a: wp.array[wp.vec3])
 
 
 @wp.func
+def rotated_stress(f: wp.mat33, r: wp.mat33, mu: float, lam: float):
+    """Stress [Pa] of F in the axes that its rotation turns."""
+    return hooke(corotated_strain(f - identity3(), identity3(), r), mu, lam)
+
+
+@wp.func
 def corotated_stress(f: wp.mat33, r: wp.mat33, mu: float, lam: float):
     """First Piola-Kirchhoff stress [Pa] of F and its rotation."""
-    return r * hooke(corotated_strain(f - identity3(), identity3(), r), mu, lam)
+    return r * rotated_stress(f, r, mu, lam)
 
 
 @wp.func

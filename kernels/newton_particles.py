@@ -8,7 +8,7 @@ import warp as wp
 
 from .elements import load_node, store_node
 from .integrate import is_finite
-from .newton_worlds import BAD_INPUT, RUNAWAY, SOUND, UNSTABLE, place_of
+from .newton_worlds import BAD_INPUT, SOUND, UNSTABLE, place_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -113,6 +113,7 @@ def step_particles(
     dt: float,
     damping: float,
     most: float,
+    fastest: float,
     gravity: wp.array[wp.vec3],
     inverse_mass: wp.array[wp.float32],
     flags: wp.array[wp.int32],
@@ -128,7 +129,7 @@ def step_particles(
     """v <- (v + dt (f/m + g)) / (1 + dt damping), no faster than ``most``; x <- x + dt v.
 
     A particle of no mass is kinematic: it keeps its velocity. One that is not active is frozen. What would be faster
-    than ``RUNAWAY`` marks its world as what is not finite does; in worlds marked before nothing moves.
+    than ``fastest`` marks its world as what is not finite does; in worlds marked before nothing moves.
     """
     i = wp.tid()
     place = place_of(world[i], trouble.shape[0])
@@ -145,7 +146,7 @@ def step_particles(
         # Scaled, so that nothing is out of range.
         size = wp.max(wp.max(wp.abs(velocity)), 1.0)
         speed = size * wp.length(velocity / size)
-        runs_away = speed >= RUNAWAY
+        runs_away = speed >= fastest
         if speed > most:
             velocity = velocity * (most / speed)
         at += dt * velocity

@@ -47,12 +47,13 @@ def check_particles(
     # In
     q: wp.array[wp.vec3],
     qd: wp.array[wp.vec3],
+    fastest: float,
     world: wp.array[wp.int32],
     # Out
     trouble: wp.array[wp.int32],
 ):
     i = wp.tid()
-    if not (is_finite(q[i]) and wp.max(wp.abs(qd[i])) < 0.5 * RUNAWAY):
+    if not (is_finite(q[i]) and wp.max(wp.abs(qd[i])) < 0.5 * fastest):
         wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), UNSTABLE)
 
 

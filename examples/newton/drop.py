@@ -55,7 +55,8 @@ class Example:
         self.model.shape_material_ke.fill_(4e4)
         self.model.shape_material_kd.fill_(400.0)
         self.solver = wn.SolverCorotated(self.model, damping=2.0)  # 1/s, so that the ball comes to rest
-        self.substeps = 2 * int(np.ceil(self.frame_dt / (1.4 * self.solver.contact_dt)))
+        # How often contacts are found in a frame; the solver divides steps further, as it takes to be stable.
+        self.steps = 8
         self.pipeline = newton.CollisionPipeline(self.model)
         self.contacts = self.pipeline.contacts()
 
@@ -70,12 +71,11 @@ class Example:
         self.graph = capture.graph
 
     def simulate(self):
-        for _ in range(self.substeps):
+        for _ in range(self.steps):
             self.state_0.clear_forces()
             self.viewer.apply_forces(self.state_0)
             self.pipeline.collide(self.state_0, self.contacts)
-            dt = self.frame_dt / self.substeps
-            self.solver.step(self.state_0, self.state_1, self.control, self.contacts, dt)
+            self.solver.step(self.state_0, self.state_1, self.control, self.contacts, self.frame_dt / self.steps)
             self.state_0, self.state_1 = self.state_1, self.state_0
 
     def step(self):

@@ -58,7 +58,7 @@ class Example:
             setattr(self.model, f"soft_contact_{name}", value)
             getattr(self.model, f"shape_material_{name}").fill_(value)
         self.solver = wn.SolverCorotated(self.model)
-        self.substeps = 2 * int(np.ceil(self.frame_dt / (1.4 * self.solver.contact_dt)))
+        self.substeps = 2 * int(np.ceil(self.frame_dt / (2.0 * self.solver.recorded_dt)))
         self.pipeline = newton.CollisionPipeline(self.model)
         self.contacts = self.pipeline.contacts()
         self.time = wp.zeros(1, dtype=wp.float32)
@@ -75,7 +75,7 @@ class Example:
         self.graph = capture.graph
 
     def simulate(self):
-        dt = self.frame_dt / self.substeps
+        dt = self.frame_dt / self.substeps  # short enough for the solver not to divide it
         for _ in range(self.substeps):
             self.state_0.clear_forces()
             wp.launch(move_fingers, dim=2, inputs=[self.time, dt, self.state_0.body_q, self.state_0.body_qd])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -16,13 +17,14 @@ from ..errors import InputError, UnstableError
 from ..io.animate import steps_per_frame
 from ..io.usd_over import SceneWriter, State
 from ..io.usd_scene import open_scene
+from .following import INTERVAL, RETRIES
 from .library import newton
-from .solver import SAFETY, SolverCorotated
+from .solver import SolverCorotated
 from .stage import StageOptions, stage_model
 from .stage_start import warn_of_overlaps
 
-#: Steps that are recorded and replayed together; a frame is a whole number of such chunks.
-CHUNK = 16
+#: Most steps that are recorded and replayed together, one measurement with them; a frame is a whole number of chunks.
+CHUNK = INTERVAL
 #: What can step rigid bodies.
 RIGID = ("semi-implicit", "xpbd", "none")
 #: Longest step where rigid bodies touch something [s].
@@ -38,7 +40,7 @@ class StageSimulation:
     Args:
         path: A stage with TetMesh prims.
         fps: Frames per second of simulated time; None: time codes per second of the stage if it says so, else 24.
-        dt: Longest time step [s]; None: a safe one.
+        dt: Longest time step [s]; None: a safe one, which follows the state from frame to frame.
         options: What the stage does not say.
         damping: Rate of mass-proportional damping [1/s], of free fall, too.
         rigid: Which of Newton's solvers steps rigid bodies and joints: "semi-implicit", "xpbd", or "none".
@@ -50,7 +52,7 @@ class StageSimulation:
         solver: The solver.
         state: ``newton.State``, in the stage's units.
         dt: The time step [s].
-        steps: How many make a frame.
+        steps: How many make a frame, the last one so far.
         time: Simulated so far [s].
 
     Raises:
@@ -78,34 +80,45 @@ class StageSimulation:
             raise InputError(f"fps is {self.fps:g}; it must be a positive number")
         self.parts = stage_model(self.scene, options or StageOptions(), checked_device(device))
         model = self.parts.model
+        self._given_dt, self.steps = dt, 0
         self.solver = self._new_solver(rigid, damping)
         self._pipeline = newton.CollisionPipeline(model, soft_contact_gap=self.parts.margin)
         self._contacts = self._pipeline.contacts()
         self._pipeline.collide(model.state(), self._contacts)
         warn_of_overlaps(self.parts, self._contacts)
-        self._choose_step(dt)
-        self.state = self._new_state()
+        self.state, self._kept = self._new_state(), self._new_state()
         # Shares its positions with the state, and has stresses, which are wanted once a frame and not once a step.
         self._shown = model.state()
         self._shown.particle_q = self.state.particle_q
         self._visuals = newton.geometry.DeformableVisuals(model) if self.parts.surface_points else None
-        self._graph = self._recorded()
+        self._load_kernels()
+        self._record_steps()
         self.time = 0.0
         self.frames = 0
 
     def advance(self) -> None:
-        """Simulate one frame.
+        """Simulate one frame. What goes wrong without a given step is tried again with shorter ones.
 
         Raises:
             UnstableError: The state would not be finite, or there are more contacts than there is room for; it stays
                 what it was before that.
         """
-        for _ in range(self.steps // self._chunk):
-            wp.capture_launch(self._graph)
-        try:
-            self.solver.check()
-        except InputError as error:
-            raise UnstableError(f"after {self.time:.3g} s: {error}") from None
+        self._record_steps()
+        self._kept.assign(self.state)
+        for attempt in range(RETRIES + 1):
+            for _ in range(self.steps // self._chunk):
+                wp.capture_launch(self._graph)
+            try:
+                self._check()
+                break
+            except InputError as error:
+                raise UnstableError(f"after {self.time:.3g} s: {error}") from None
+            except UnstableError:
+                if self._given_dt is not None or attempt == RETRIES:
+                    raise
+            # From here on the solver takes half the step.
+            self.state.assign(self._kept)
+            self._record_steps()
         self.frames += 1
         self.time = self.frames / self.fps
 
@@ -183,7 +196,8 @@ class StageSimulation:
                 self.parts.notes.append(f"stay where they are (--rigid none): {', '.join(standing)}")
             if rigid == "xpbd":
                 solver = newton.solvers.SolverXPBD(model)
-            return SolverCorotated(model, damping=damping, rigid_solver=solver)
+            substeps = None if self._given_dt is None else 1
+            return SolverCorotated(model, damping=damping, substeps=substeps, rigid_solver=solver)
         except ValueError as error:  # Newton's, and InputError, which is one
             said = str(error).replace(" Give another rigid_solver, or None.", "").rstrip(".")
             hint = f"; another than {rigid} can be chosen (--rigid)" if "does not support" in said else ""
@@ -192,19 +206,31 @@ class StageSimulation:
                 hint = "; --rigid none leaves cables and rigid bodies where they are"
             raise InputError(f"{self.scene.path}: {said}{hint}") from None
 
-    def _choose_step(self, dt: float | None) -> None:
-        stable = self.solver.stable_dt
-        if dt is not None and dt > stable:
-            raise InputError(f"dt is {dt:g} s; the largest stable step is about {stable:.3g} s")
-        longest = dt
-        if longest is None:
-            longest = min(SAFETY * self.solver.contact_dt, 1.0 / self.fps)
-            if self.parts.rigid:
-                longest = min(longest, RIGID_STEP)
-        count = steps_per_frame(self.fps, longest)
-        self._chunk = min(count, CHUNK)
-        self.steps = -(-count // self._chunk) * self._chunk
-        self.dt = 1.0 / (self.fps * self.steps)
+    def _longest_step(self) -> float:
+        stable, dt = self.solver.stable_dt, self._given_dt
+        if dt is not None:
+            if dt > stable:
+                raise InputError(f"dt is {dt:g} s; the largest stable step is about {stable:.3g} s")
+            return dt
+        longest = min(self.solver.recorded_dt, 1.0 / self.fps)
+        return min(longest, RIGID_STEP) if self.parts.rigid else longest
+
+    def _record_steps(self) -> None:
+        """Record a chunk of steps that are safe in the present state, where there are not as many as before."""
+        count = steps_per_frame(self.fps, self._longest_step())
+        chunks = -(-count // CHUNK)
+        self._chunk = -(-count // chunks)
+        count = chunks * self._chunk
+        if count != self.steps:
+            self.steps = count
+            self.dt = 1.0 / (self.fps * count)
+            self._graph = self._recorded()
+
+    def _check(self) -> None:
+        with warnings.catch_warnings():
+            # The next frame has the steps that this one lacked.
+            warnings.filterwarnings("ignore", "a recorded step has fewer substeps")
+            self.solver.check()
 
     def _new_state(self) -> newton.State:
         state = self.parts.model.state()
@@ -216,11 +242,14 @@ class StageSimulation:
         self._pipeline.collide(state, self._contacts)
         self.solver.step(state, state, None, self._contacts, self.dt)
 
-    def _recorded(self) -> Any:
-        """The steps of a chunk, as a graph; kernels are loaded on a state that is thrown away."""
-        scratch = self._new_state()
-        self._step(scratch)
+    def _load_kernels(self) -> None:
+        """Make a step of a state that is thrown away: loading within a recording would end it on some drivers."""
+        self.dt = min(self._longest_step(), 1e-6)
+        self._step(self._new_state())
         self.solver.check()
+
+    def _recorded(self) -> Any:
+        """The steps of a chunk, as a graph."""
         with wp.ScopedCapture(device=self.parts.model.device) as capture:
             for _ in range(self._chunk):
                 self._step(self.state)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import warp as wp
 
@@ -11,10 +13,14 @@ from ..kernels import newton_worlds as worlds
 from ..kernels.newton_contacts import add_wrenches
 from ..subnormals import FlushedSubnormals
 from .contact import Contacts
+from .following import RETRIES, Following
 from .library import newton
 from .others import Others
 from .state import attribute_of
 from .tetrahedra import Tetrahedra
+
+#: Particles of this speed [m/s] have gone wrong, however long the step is.
+RUNAWAY = float(worlds.RUNAWAY)
 
 
 class Steps:
@@ -60,10 +66,45 @@ class Steps:
         contacts: newton.Contacts | None,
         dt: float,
         count: int,
+        following: Following | None = None,
     ) -> None:
-        """Launch a step of ``count`` substeps. What goes wrong in a world in one of them undoes all, and ends it."""
+        """Launch a step of ``count`` substeps. What goes wrong in a world in one of them undoes all, and ends it.
+
+        Args:
+            state_in, state_out, control, contacts, dt: As ``SolverCorotated.step`` has them.
+            count: Into how many substeps the step is divided.
+            following: What measures how many that should be; None: so many and no others.
+        """
         with self._flushed():
-            self._launch_step(state_in, state_out, control, contacts, dt, count)
+            self._launch_step(state_in, state_out, control, contacts, dt, count, following)
+
+    def launch_retried(
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        control: newton.Control | None,
+        contacts: newton.Contacts | None,
+        dt: float,
+        following: Following,
+    ) -> None:
+        """The same on the CPU, where what went wrong is tried again, each time with twice the substeps."""
+        arguments = state_in, state_out, control, contacts, dt
+        kept = self.model.body_count and not self.others.has_bodies
+        if kept:
+            wp.copy(self._body_f, state_in.body_f)
+        share = following.share
+        for attempt in range(RETRIES + 1):
+            self.launch(*arguments, following.count_for(dt), following)
+            if not self._report.numpy()[worlds.UNSTABLE]:
+                return
+            if attempt == RETRIES:
+                break
+            following.share *= 0.5
+            self._report[worlds.UNSTABLE : worlds.UNSTABLE + 1].zero_()
+            self._bring_back(state_in, state_out)
+            if kept:
+                wp.copy(state_in.body_f, self._body_f)
+        following.share = share
 
     def _launch_step(
         self,
@@ -73,6 +114,7 @@ class Steps:
         contacts: newton.Contacts | None,
         dt: float,
         count: int,
+        following: Following | None,
     ) -> None:
         model = self.model
         activation = model.tet_activations
@@ -80,19 +122,30 @@ class Steps:
             activation = control.tet_activations
         before = self._launch_begin(state_in, state_out, contacts)
         now = state_in
-        for number in range(count):
+        number, left, done, substep = 0, count, 0.0, dt / count
+        while left:
             copied = number == 0 and before[0] is self._particles_before
-            self._launch_forces(now, state_in, activation, contacts, dt / count, number, copied)
+            self._launch_gathering(now, state_in, number, copied)
+            if following is not None and following.is_due():
+                following.measure(now, dt - done, substep)
+                if self.device.is_cpu and not self.device.is_capturing:
+                    left = following.count_for(dt - done)
+                    substep = (dt - done) / left
+            self._launch_forces(now, state_in, activation, contacts, substep)
             if self.others.has_bodies:
                 wp.copy(self._body_f, state_in.body_f)
                 self._add_wrenches(1.0, self._body_f)
             elif model.body_count:
-                self._add_wrenches(1.0 / count, state_in.body_f)
-            self._launch_motion(now, state_out, control, contacts, dt / count)
+                self._add_wrenches(substep / dt, state_in.body_f)
+            fastest = RUNAWAY if following is None else min(RUNAWAY, following.reach / substep)
+            self._launch_motion(now, state_out, control, contacts, substep, fastest)
             self._launch_undoing(state_out, *before)
-            if self.tetrahedra.warm or number == count - 1:
+            number, left, done = number + 1, left - 1, done + substep
+            if self.tetrahedra.warm or not left:
                 self.tetrahedra.write_attributes(state_out, now)
             now = state_out
+        if following is not None:
+            following.made = number
         if self._may_be_wrong():
             inputs, outputs = [self._trouble], [self._report, self._seen_by_device]
             self._launch(worlds.report_trouble, self._places, inputs, outputs)
@@ -101,12 +154,21 @@ class Steps:
         # On the CPU a look costs less than a launch; a recorded step must be ready for what comes.
         return self.device.is_cuda or self.device.is_capturing or bool(self._trouble.numpy().any())
 
-    def check_earlier(self) -> None:
-        """Say what a step that is done already has reported. On CUDA, outside of captures; waits for nothing."""
-        if self.device.is_cuda and not self.device.is_capturing and self._seen.numpy()[0]:
-            self.check(None)
+    def check_earlier(self, following: Following | None) -> None:
+        """Say what a step that is done already has reported. On CUDA, outside of captures; waits for nothing.
 
-    def check(self, stable_dt: float | None) -> None:
+        Where substeps follow the state, a world that went wrong goes on with twice as many, and a warning says so.
+        """
+        if self.device.is_cpu or self.device.is_capturing or not self._seen.numpy()[0]:
+            return
+        try:
+            self.check(None, following)
+        except UnstableError as error:
+            if following is None or following.share < 0.5**RETRIES:
+                raise
+            warnings.warn(str(error), UserWarning, stacklevel=3)
+
+    def check(self, stable_dt: float | None, following: Following | None) -> None:
         """See ``SolverCorotated.check``."""
         report = self._report.numpy().copy()
         if not report.any():
@@ -129,7 +191,13 @@ class Steps:
                 "larger soft_contact_max; no step was made"
             )
         hint = "" if stable_dt is None else f"; the largest stable step at rest is about {stable_dt:.3g} s"
-        raise UnstableError(f"the step's result is not finite{where}; that state stayed as it was{hint}")
+        wrong = "not finite" if following is None else "not finite or beyond reason"
+        if following is not None and self.device.is_cpu and not following.was_recorded:
+            hint += f"; {2**RETRIES} times the substeps did not help"
+        elif following is not None:
+            following.share *= 0.5
+            hint += "; from now on steps have twice the substeps, recorded ones when they are recorded again"
+        raise UnstableError(f"the step's result is {wrong}{where}; that state stayed as it was{hint}")
 
     def reset(self, state: newton.State, mask: wp.array, flags: int) -> None:
         model, bits = self.model, newton.StateFlags
@@ -176,17 +244,19 @@ class Steps:
         self.contacts.check_count(contacts, self._trouble)
         return particles, bodies
 
-    def _launch_forces(
-        self,
-        now: newton.State,
-        state_in: newton.State,
-        activation: wp.array,
-        contacts: newton.Contacts | None,
-        dt: float,
-        number: int,
-        copied: bool,
-    ) -> None:
-        """All forces on particles, which are copied if the step begins with them and writes over them."""
+    def _bring_back(self, state_in: newton.State, state_out: newton.State) -> None:
+        """Undo a step that was made in place."""
+        particles = [state_in.particle_q, state_in.particle_qd]
+        if _overlap(particles, [state_out.particle_q, state_out.particle_qd]):
+            _copy(particles, self._particles_before)
+        if self.others.has_bodies:
+            bodies = [state_in.body_q, state_in.body_qd]
+            if _overlap(bodies, [state_out.body_q, state_out.body_qd]):
+                _copy(bodies, self._bodies_before)
+
+    def _launch_gathering(self, now: newton.State, state_in: newton.State, number: int, copied: bool) -> None:
+        """Forces from outside, and places of particles, which are copied if the step begins with them and writes over
+        them."""
         model, tets = self.model, self.tetrahedra
         # Where this was finite before, it has become what it is by the step.
         wrong = int(worlds.UNSTABLE if number else worlds.BAD_INPUT)
@@ -194,6 +264,17 @@ class Steps:
         copies = self._particles_before if copied else self._nothing
         outputs = [tets.x, tets.u, self._f, *copies, self._trouble]
         self._launch(kernels.gather_particles, model.particle_count, inputs, outputs)
+
+    def _launch_forces(
+        self,
+        now: newton.State,
+        state_in: newton.State,
+        activation: wp.array,
+        contacts: newton.Contacts | None,
+        dt: float,
+    ) -> None:
+        """All other forces on particles."""
+        tets = self.tetrahedra
         tets.add_forces(now, activation, self._f)
         of_bodies = now if self.others.has_bodies else state_in
         self.contacts.add_forces(now, of_bodies, contacts, dt, self._f, self._trouble)
@@ -205,13 +286,14 @@ class Steps:
         control: newton.Control | None,
         contacts: newton.Contacts | None,
         dt: float,
+        fastest: float,
     ) -> None:
         model, others = self.model, self.others
         particle_world = model.particle_world
         if others.has_particles:
             self._launch(kernels.unpad, model.particle_count, [self._f], [others.particle_forces])
         else:
-            inputs = [dt, self.damping, model.particle_max_velocity, model.gravity, model.particle_inv_mass]
+            inputs = [dt, self.damping, model.particle_max_velocity, fastest, model.gravity, model.particle_inv_mass]
             inputs += [model.particle_flags, particle_world, self._f, now.particle_q, now.particle_qd]
             outputs = [out.particle_q, out.particle_qd, self._trouble]
             self._launch(kernels.step_particles, model.particle_count, inputs, outputs)
@@ -224,7 +306,7 @@ class Steps:
             inputs = [out.body_q, out.body_qd, model.body_world, int(worlds.UNSTABLE)]
             self._launch(worlds.check_bodies, model.body_count, inputs, [self._trouble])
         if others.has_particles:
-            inputs = [out.particle_q, out.particle_qd, particle_world]
+            inputs = [out.particle_q, out.particle_qd, fastest, particle_world]
             self._launch(worlds.check_particles, model.particle_count, inputs, [self._trouble])
 
     def _launch_undoing(self, out: newton.State, particles: list[wp.array], bodies: list[wp.array]) -> None:

@@ -9,7 +9,9 @@ import numpy.typing as npt
 import warp as wp
 
 from ..errors import InputError
+from ..kernels.constitutive import linear_stress
 from ..kernels.elements import GeneralElements
+from ..kernels.forces import scatter_forces
 from ..kernels.general_cuda import BLOCK, PosedElements
 from ..kernels.lanes import LANES
 from ..kernels.newton_attributes import split_materials, write_attributes
@@ -127,20 +129,7 @@ class Tetrahedra:
     def add_forces(self, state: newton.State, activation: wp.array, f: wp.array) -> None:
         """Add the forces [N] of a state, of which positions have been gathered, to f, vec4 [P]."""
         q, v = state.particle_q, state.particle_qd
-        if self.single_count:
-            elastic = [self._single, *self._single_materials[:2]]
-            if self.warm:
-                inputs = [*elastic, self._single_ids, self.x, attribute_of(state, "rotation")]
-                self._launch(scatter_posed_warm, self.single_count, inputs, [f])
-            elif self._fused:
-                inputs = [self._single, *self._single_materials, self._single_ids, activation, self.x, v]
-                self._launch(scatter_posed(quick_rotation, self.damped), self.single_count, inputs, [f], BLOCK)
-            else:
-                inputs = [self._single, self.single_count, *elastic[1:], self.x]
-                self._launch(scatter_posed_lanes, -(-self.single_count // LANES), inputs, [f, self._left_out])
-                self._launch(repair_posed, 1, [*elastic, self.x], [self._left_out, f])
-        for group in self.groups:
-            group.add_forces(self.x, self.u, f)
+        self._add_forces(state, self.x, self.u, activation, v, f)
         # On the CPU a look costs less than a launch; a recorded step must be ready for what comes.
         looks = self.device.is_cpu and not self.device.is_capturing and not self.damped
         if looks and not activation.numpy().any():
@@ -149,6 +138,31 @@ class Tetrahedra:
             inputs = [self.elements, *self._materials[2:], part.ids, part.first, part.count, activation, q, v]
             threads = -(-part.count // int(EACH))
             self._launch(scatter_damping_and_activation(self.damped), threads, inputs, [f])
+
+    def add_elastic_forces(self, state: newton.State, x: wp.array | None, u: wp.array | None, f: wp.array) -> None:
+        """Add the elastic forces [N] of some places to f, vec4 [P].
+
+        Args:
+            state: Has the rotations from which warm ones are found.
+            x: Positions; None: those elements are left out of which positions are taken.
+            u: Displacements; None: the same of displacements.
+        """
+        self._add_forces(state, x, u, self._no_activation, self._no_velocities, f)
+
+    def add_linear_forces(self, u: wp.array, f: wp.array) -> None:
+        """Add the elastic forces of small displacements from rest shapes [N] to f, vec4 [P]."""
+        kernel = scatter_forces(GeneralElements, linear_stress)
+        self._launch(kernel, self.model.tet_count, [self.elements, self.mu, self.lam, 1, u], [f])
+
+    @property
+    def nodes_by_positions(self) -> npt.NDArray[np.integer]:
+        """Particles of elements whose forces are found from positions."""
+        return self._nodes[0]
+
+    @property
+    def nodes_by_displacements(self) -> npt.NDArray[np.integer]:
+        """Particles of elements whose forces are found from displacements."""
+        return self._nodes[1]
 
     def write_attributes(self, state: newton.State, before: newton.State) -> None:
         """Write rotations and stresses of a state's positions, where it has room for them."""
@@ -171,10 +185,41 @@ class Tetrahedra:
         posed.volume = wp.array(self.elements.volume.numpy()[ids], dtype=wp.float32, device=self.device)
         return posed
 
+    def _add_forces(
+        self,
+        state: newton.State,
+        x: wp.array | None,
+        u: wp.array | None,
+        activation: wp.array,
+        v: wp.array,
+        f: wp.array,
+    ) -> None:
+        """Elastic forces, with what else is in the same kernel."""
+        if self.single_count and x is not None:
+            elastic = [self._single, *self._single_materials[:2]]
+            if self.warm:
+                inputs = [*elastic, self._single_ids, x, attribute_of(state, "rotation")]
+                self._launch(scatter_posed_warm, self.single_count, inputs, [f])
+            elif self._fused:
+                inputs = [self._single, *self._single_materials, self._single_ids, activation, x, v]
+                self._launch(scatter_posed(quick_rotation, self.damped), self.single_count, inputs, [f], BLOCK)
+            else:
+                inputs = [self._single, self.single_count, *elastic[1:], x]
+                self._launch(scatter_posed_lanes, -(-self.single_count // LANES), inputs, [f, self._left_out])
+                self._launch(repair_posed, 1, [*elastic, x], [self._left_out, f])
+        for group in self.groups:
+            at = u if group.follow_one_another else x
+            if at is not None:
+                group.add_forces(at, at, f)
+
     def _take_single(self, ids: npt.NDArray[np.integer]) -> None:
         """Tetrahedra that go one by one."""
-        self.single_count = len(ids)
+        self.single_count, self._single_places = len(ids), ids
         self._no_ids = wp.empty(0, dtype=wp.int32, device=self.device)
+        # Read by the kernel that has damping and activation, too.
+        room = (self.model.tet_count, self.model.particle_count) if self._fused else (0, 0)
+        self._no_activation = wp.zeros(room[0], dtype=wp.float32, device=self.device)
+        self._no_velocities = wp.zeros(room[1], dtype=wp.vec3, device=self.device)
         self._left_out = wp.zeros(len(ids) + 1, dtype=wp.int32, device=self.device)
         everything = len(ids) == self.model.tet_count
         if self._fused:
@@ -195,6 +240,13 @@ class Tetrahedra:
         rest = np.zeros((len(self.u), 4), np.float32)
         for group in ranges:
             rest[group.nodes] = group.rest
+        of_positions = [group.nodes for group in self.groups if not group.follow_one_another]
+        if self.single_count:
+            of_positions.append(np.unique(self.tets[self._single_places]))
+        nobody = np.empty(0, int)
+        self._nodes = tuple(
+            np.concatenate([nobody, *nodes]) for nodes in (of_positions, [group.nodes for group in ranges])
+        )
         self.rest = wp.array(rest, dtype=wp.vec4, device=self.device)
 
     def _room_for_materials(self, count: int) -> list[wp.array]:
