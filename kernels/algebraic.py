@@ -19,11 +19,11 @@ wp.set_module_options({"enable_backward": False})
 
 # J up to which an element counts as flat or turned over, and the trace of E up to which F counts as of order one.
 FLAT = wp.constant(0.03)
-FAR = wp.constant(1000.0)
+FAR = wp.constant(50.0)
 # |E|^2 below which the series for t is a better start than the bound above it.
 NEAR = wp.constant(0.4)
 # A step from which Newton's iteration leaves at most some 1e-7, over x; and how many there may be.
-LAST_STEP = wp.constant(1.0e-8)
+LAST_STEP = wp.constant(1.0e-4)
 MAX_STEPS = wp.constant(24)
 # q over |F|^3, 3.1 at rest, below which the rotation has lost digits or is about to be no longer defined.
 INDEFINITE = wp.constant(0.2)
@@ -42,6 +42,13 @@ def reciprocal(x: float) -> float: ...
 
 
 @wp.func
+def newton_step_of(t: float, c0: float, c1: float, c2: float):
+    value = (((t + 12.0) * t + c2) * t + c1) * t + c0
+    slope = ((4.0 * t + 36.0) * t + 2.0 * c2) * t + c1
+    return value * reciprocal(slope)
+
+
+@wp.func
 def stretch_trace(a: float, b: float, c: float, j: float):
     """t = tr S - 3 of the invariants of E and j = J - 1, where J > 0."""
     c0 = a * (a - 20.0) - 24.0 * j - 4.0 * b
@@ -54,14 +61,12 @@ def stretch_trace(a: float, b: float, c: float, j: float):
     t = 0.5 * a
     if p2 < NEAR:
         t += 0.0625 * p3 - 0.125 * p2 - 0.0390625 * p4
-    square = float(1.0)
-    steps = int(0)
-    while square > LAST_STEP and steps < MAX_STEPS:
-        value = (((t + 12.0) * t + c2) * t + c1) * t + c0
-        slope = ((4.0 * t + 36.0) * t + 2.0 * c2) * t + c1
-        step = value * reciprocal(slope)
+    step = newton_step_of(t, c0, c1, c2)
+    t -= step
+    steps = int(1)
+    while wp.abs(step) > LAST_STEP * (t + 3.0) and steps < MAX_STEPS:
+        step = newton_step_of(t, c0, c1, c2)
         t -= step
-        square = step * step * reciprocal((t + 3.0) * (t + 3.0))
         steps += 1
     return t
 
@@ -149,16 +154,15 @@ def algebraic_rotation(f: wp.mat33):
         # one term alone is positive.
         x = wp.sqrt(1.0 + wp.where(det > 0.0, 3.4641016, 2.0) * wp.sqrt(c2))
         slope = float(0.0)
-        square = float(1.0)
+        step = float(1.0)
         steps = int(0)
-        while square > LAST_STEP and steps < MAX_STEPS:
+        while wp.abs(step) > LAST_STEP and steps < MAX_STEPS:
             slope = 4.0 * (x * x - 1.0) * x - 8.0 * det
             step = (((x * x - 2.0) * x - 8.0 * det) * x + (1.0 - 4.0 * c2)) / slope
             x -= step
-            square = step * step
             steps += 1
         q = (x * x - 1.0) * x - 2.0 * det
-        sound = q > INDEFINITE and square <= LAST_STEP
+        sound = q > INDEFINITE and wp.abs(step) <= LAST_STEP
         gc = g * (wp.transpose(g) * g)
         r = ((x * x + 1.0) / q) * g + (2.0 * x / q) * cof - (2.0 / q) * gc
     if not sound:

@@ -8,10 +8,11 @@ import functools
 
 import warp as wp
 
+from .algebraic import corotated_stress
 from .constitutive import corotated_strain, hooke, stretch_strain
 from .elements import load_node
 from .newton_merging import add_four_forces
-from .rotation import column, identity3
+from .rotation import column, identity3, quick_rotation
 
 wp.set_module_options({"enable_backward": False})
 
@@ -73,14 +74,19 @@ def add_stress(rounds: int) -> wp.Function:
 
 @functools.cache
 def corotated_law(rotation: wp.Function) -> wp.Function:
-    """The corotated stress of each element's own rotation, as a law of its displacement gradient."""
+    """The corotated stress of each element's own rotation, as a law of its displacement gradient.
+
+    That of ``quick_rotation`` needs none.
+    """
+    if rotation is quick_rotation:
+        return corotated_stress
 
     @wp.func
-    def corotated_stress(a: wp.mat33, mu: float, lam: float):
+    def stress_of_rotation(a: wp.mat33, mu: float, lam: float):
         r = rotation(identity3() + a)
         return r * hooke(stretch_strain(corotated_strain(a, identity3(), r), a), mu, lam)
 
-    return corotated_stress
+    return stress_of_rotation
 
 
 @functools.cache

@@ -6,6 +6,7 @@ that is flat, turned over or far from order one is left out and reported: bit k 
 """
 
 import functools
+from collections.abc import Sequence
 
 import warp as wp
 
@@ -21,6 +22,11 @@ mat10 = wp.types.matrix(shape=(10, 3), dtype=wp.float32)
 
 #: What a mask of left-out leaves is where the whole subtree is.
 ALL_LEAVES = wp.constant(255)
+
+
+def first_of(weights: Sequence[float]) -> int:
+    """The first of a list that is not zero."""
+    return next(i for i, weight in enumerate(weights) if abs(weight) > 1e-9)
 
 
 @functools.cache
@@ -82,6 +88,8 @@ def turned_forces_of(shape: int, uniform: bool, chosen: range) -> wp.Function:
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
     leaves, frames = LEAVES[shape], FRAMES[shape]
+    rows = [[first_of(axis) for axis in frame] for frame in frames]
+    backs = [[first_of([frame[i][axis] for i in range(3)]) for axis in range(3)] for frame in frames]
     begin, end = chosen.start, chosen.stop
     volume = VOLUME[shape]
 
@@ -108,24 +116,31 @@ def turned_forces_of(shape: int, uniform: bool, chosen: range) -> wp.Function:
             # The displacement gradient in the leaf's frame: B^T C, zeros of B left out.
             w = wp.mat33()
             for i in range(3):
-                for j in range(3):
-                    for axis in range(3):
-                        if wp.static(abs(frames[leaf][i][axis]) > 1e-9):
+                for axis in range(3):
+                    if wp.static(axis == rows[leaf][i]):
+                        for j in range(3):
+                            w[i, j] = wp.static(frames[leaf][i][axis]) * c[axis, j]
+                    elif wp.static(abs(frames[leaf][i][axis]) > 1e-9):
+                        for j in range(3):
                             w[i, j] += wp.static(frames[leaf][i][axis]) * c[axis, j]
             sigma, trusted = stretch_stress(w, m, k)
-            if not trusted:
-                left_out |= wp.static(1 << leaf)
-            p = wp.mat33()
-            for axis in range(3):
-                for j in range(3):
+            if trusted:
+                p = wp.mat33()
+                for axis in range(3):
                     for i in range(3):
-                        if wp.static(abs(frames[leaf][i][axis]) > 1e-9):
-                            p[axis, j] += wp.static(frames[leaf][i][axis]) * sigma[i, j]
-            f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
-            g[wp.static(leaves[leaf][0])] += f0
-            g[wp.static(leaves[leaf][1])] += f1
-            g[wp.static(leaves[leaf][2])] += f2
-            g[wp.static(leaves[leaf][3])] += f3
+                        if wp.static(i == backs[leaf][axis]):
+                            for j in range(3):
+                                p[axis, j] = wp.static(frames[leaf][i][axis]) * sigma[i, j]
+                        elif wp.static(abs(frames[leaf][i][axis]) > 1e-9):
+                            for j in range(3):
+                                p[axis, j] += wp.static(frames[leaf][i][axis]) * sigma[i, j]
+                f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
+                g[wp.static(leaves[leaf][0])] += f0
+                g[wp.static(leaves[leaf][1])] += f1
+                g[wp.static(leaves[leaf][2])] += f2
+                g[wp.static(leaves[leaf][3])] += f3
+            else:
+                left_out |= wp.static(1 << leaf)
         return g, left_out
 
     return turned_forces
@@ -148,11 +163,14 @@ def own_forces(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Functi
         q1 = column(q, 1)
         q2 = column(q, 2) * mirror
         inv_h = 1.0 / h
+        h0 = inv_h * q0
+        h1 = inv_h * q1
+        h2 = inv_h * q2
         origin = x[0]
         y = mat10()
         for n in range(1, 10):
-            d = (x[n] - origin) * inv_h
-            y[n] = wp.vec3(wp.dot(q0, d), wp.dot(q1, d), wp.dot(q2, d))
+            d = x[n] - origin
+            y[n] = wp.vec3(wp.dot(h0, d), wp.dot(h1, d), wp.dot(h2, d))
         g, left_out = turned_forces(y, h, mu, lam, first)
         for n in range(10):
             force = g[n]
