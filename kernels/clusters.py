@@ -13,13 +13,14 @@ import warp as wp
 from .block import LOAD, LOAD_BYTES, STORE, number_in, shared_vectors, synchronize_block
 from .block_layout import NUMBERS
 from .elements import add_force, frame, gradient_of, load_node, nodal_forces
-from .repair import LeftOut, append
 
 wp.set_module_options({"enable_backward": False})
 
 #: Elements of a cluster, and threads of its block.
 CLUSTER = 128
 CORNERS = 4 * CLUSTER
+#: Blocks that a multiprocessor's registers must have room for.
+RESIDENT = 8
 
 
 @wp.struct
@@ -35,13 +36,11 @@ class Clusters:
 
 @functools.cache
 def scatter_clusters(Elements: Any, stress: wp.Function) -> wp.Kernel:
-    """Add the elastic nodal forces of a law to f; launch with block_dim CLUSTER and whole blocks.
-
-    ``stress`` gives P Q and whether it may be trusted; elements where it may not are put on a list.
-    """
+    """Add the nodal forces of a law of ``constitutive`` to f; launch with block_dim CLUSTER and whole blocks."""
     displacement, slot = shared_vectors(CORNERS, "displacements"), shared_vectors(CORNERS + 1, "forces")
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    # What is out of line is rarely run, and shall not take registers from all.
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(CLUSTER, RESIDENT))
     def scatter_clusters(
         # In
         clusters: Clusters,
@@ -52,7 +51,6 @@ def scatter_clusters(Elements: Any, stress: wp.Function) -> wp.Kernel:
         u: wp.array[wp.vec4],
         # Out
         f: wp.array[wp.vec4],
-        left_out: LeftOut,
     ):
         i = wp.tid()
         cluster = i // CLUSTER
@@ -83,10 +81,8 @@ def scatter_clusters(Elements: Any, stress: wp.Function) -> wp.Kernel:
                 displacement(wp.static(LOAD), number_in(word, 2), wp.vec3()),
                 displacement(wp.static(LOAD), number_in(word, 3), wp.vec3()),
             )
-            p, trusted = stress(g, frame(elements, t), mu[t * stride], lam[t * stride])
-            if not trusted:
-                p = wp.mat33()
-                append(left_out, t, 1)
+            q = frame(elements, t)
+            p = q * stress(wp.transpose(q) * g, mu[t * stride], lam[t * stride])
             f0, f1, f2, f3 = nodal_forces(elements, t, p)
             slot(wp.static(STORE), thread, f0)
             slot(wp.static(STORE), thread + CLUSTER, f1)

@@ -20,6 +20,8 @@ wp.set_module_options({"enable_backward": False})
 BLOCK = 64
 #: How often neighbours' forces are added up; see ``add_four_forces``.
 ROUNDS = 1
+#: Blocks that a multiprocessor's registers must have room for: what is rarely run shall not take registers from all.
+RESIDENT = 16
 
 
 @wp.struct
@@ -94,7 +96,7 @@ def scatter_general(stress: wp.Function) -> wp.Kernel:
     """Add the forces of a law of ``constitutive``. Launch with block_dim BLOCK."""
     add = add_stress(ROUNDS)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, RESIDENT))
     def scatter_general(
         # In
         elements: PosedElements,
