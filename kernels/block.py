@@ -12,13 +12,13 @@ import functools
 
 import warp as wp
 
+from .algebraic import algebraic_rotation, turned_stress
 from .block_layout import FIRST_SHIFT, FOLLOWING_SHIFT, NEIGHBOURS, NO_NODE, NODE_WORDS, NUMBERS, WARP, Layout
 from .constitutive import hooke, symmetric
 from .elements import FRAME_SHIFT, LEVEL_MASK, Subtrees, load_node, mirror_sign, store_node
 from .integrate import add_support_work, is_finite, symplectic_euler_velocity, vector_at
 from .matrices import column, identity3
 from .pace import DONE, DT, Pace
-from .quaternion import robust_rotation
 from .shapes import VOLUME, fingerprint
 from .subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS
 from .subtree_forces import columns_of, leaf_forces_of, mat10, near_forces, shared_forces
@@ -182,7 +182,7 @@ def _repair_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -> 
                 position(words, 2, maubach, inv_h),
                 position(words, 3, maubach, inv_h),
             )
-            r = robust_rotation(wp.matrix_from_cols(c0, c1, c2 * mirror))
+            r = algebraic_rotation(wp.matrix_from_cols(c0, c1, c2 * mirror))
             turned = wp.matrix_from_cols(column(r, 0), column(r, 1), column(r, 2) * mirror)
         left = left_out & (wp.static((1 << leaves_each) - 1) << (part * wp.static(leaves_each)))
         while left != 0:
@@ -194,17 +194,18 @@ def _repair_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -> 
                 position(words, node_of(leaf, 2), maubach, inv_h),
                 position(words, node_of(leaf, 3), maubach, inv_h),
             )
-            # R times the leaf's Maubach frame.
-            z = wp.mat33()
+            i = material + leaf * stride
+            m = area * mu[i]
+            k = area * lam[i]
+            p = wp.mat33()
             if wp.static(layout.shared):
+                # R times the leaf's Maubach frame.
                 z = turned * wp.matrix_from_cols(frame_of(3 * leaf), frame_of(3 * leaf + 1), frame_of(3 * leaf + 2))
+                p = z * hooke(symmetric(wp.transpose(z) * wp.matrix_from_cols(c0, c1, c2)) - identity3(), m, k)
             else:
                 hand = mirror * float(handed(leaf, 0))
-                r = robust_rotation(wp.matrix_from_cols(c0, c1, c2 * hand))
-                z = wp.matrix_from_cols(column(r, 0), column(r, 1), column(r, 2) * hand)
-            i = material + leaf * stride
-            strain = symmetric(wp.transpose(z) * wp.matrix_from_cols(c0, c1, c2)) - identity3()
-            p = z * hooke(strain, area * mu[i], area * lam[i])
+                p = turned_stress(wp.matrix_from_cols(c0, c1, c2 * hand), m, k)
+                p = wp.matrix_from_cols(column(p, 0), column(p, 1), hand * column(p, 2))
             f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
             for n in range(4):
                 force = f0

@@ -8,10 +8,11 @@ import functools
 
 import warp as wp
 
+from .algebraic import corotated_stress
 from .constitutive import corotated_strain, hooke, stretch_strain
 from .elements import load_node
 from .newton_merging import add_four_forces
-from .rotation import column, identity3
+from .rotation import column, identity3, quick_rotation
 
 wp.set_module_options({"enable_backward": False})
 
@@ -19,6 +20,8 @@ wp.set_module_options({"enable_backward": False})
 BLOCK = 64
 #: How often neighbours' forces are added up; see ``add_four_forces``.
 ROUNDS = 1
+#: Blocks that a multiprocessor's registers must have room for: what is rarely run shall not take registers from all.
+RESIDENT = 16
 
 
 @wp.struct
@@ -73,14 +76,19 @@ def add_stress(rounds: int) -> wp.Function:
 
 @functools.cache
 def corotated_law(rotation: wp.Function) -> wp.Function:
-    """The corotated stress of each element's own rotation, as a law of its displacement gradient."""
+    """The corotated stress of each element's own rotation, as a law of its displacement gradient.
+
+    That of ``quick_rotation`` needs none.
+    """
+    if rotation is quick_rotation:
+        return corotated_stress
 
     @wp.func
-    def corotated_stress(a: wp.mat33, mu: float, lam: float):
+    def stress_of_rotation(a: wp.mat33, mu: float, lam: float):
         r = rotation(identity3() + a)
         return r * hooke(stretch_strain(corotated_strain(a, identity3(), r), a), mu, lam)
 
-    return corotated_stress
+    return stress_of_rotation
 
 
 @functools.cache
@@ -88,7 +96,7 @@ def scatter_general(stress: wp.Function) -> wp.Kernel:
     """Add the forces of a law of ``constitutive``. Launch with block_dim BLOCK."""
     add = add_stress(ROUNDS)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, RESIDENT))
     def scatter_general(
         # In
         elements: PosedElements,

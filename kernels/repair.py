@@ -8,18 +8,16 @@ the bytes of eight subtrees at a time, nearly always all zero, and goes through 
 
 import warp as wp
 
+from .algebraic import algebraic_rotation, turned_stress
 from .constitutive import corotated_strain, hooke
 from .elements import ForestElements, frame, local_gradient, nodal_forces, scatter_stress
 from .newton_merging import add_four_forces
-from .quaternion import robust_rotation
 
 wp.set_module_options({"enable_backward": False})
 
 #: Subtrees that one thread looks after; ``flagged`` has a multiple of these.
 SUBTREES = 8
 LEAVES = 8
-#: The mask of a subtree that is left out whole.
-WHOLE = wp.constant(255)
 #: Threads of a block that goes through a list.
 LIST_BLOCK = 128
 
@@ -100,10 +98,7 @@ def own_stress(
     u: wp.array[wp.vec4],
 ):
     """First Piola-Kirchhoff stress times Q of element t with its own rotation."""
-    q = frame(elements, t)
-    g = local_gradient(elements, t, u)
-    r = robust_rotation(q + g)
-    return r * hooke(corotated_strain(g, q, r), mu[t * stride], lam[t * stride])
+    return turned_stress(frame(elements, t) + local_gradient(elements, t, u), mu[t * stride], lam[t * stride])
 
 
 @wp.func
@@ -123,7 +118,7 @@ def scatter_own(
 @wp.func
 def root_rotation(roots: ForestElements, s: int, u: wp.array[wp.vec4]):
     q = frame(roots, s)
-    return robust_rotation(q + local_gradient(roots, s, u)) * wp.transpose(q)
+    return algebraic_rotation(q + local_gradient(roots, s, u)) * wp.transpose(q)
 
 
 # --- by a list ------------------------------------------------------------------------------------------------------
@@ -143,39 +138,28 @@ def repair_listed_own(
     # Out
     f: wp.array[wp.vec4],
 ):
-    """Every leaf with its own rotation.
+    """Every leaf with its own rotation, eight threads an entry, of which those do something whose leaf was left out.
 
-    A thread a leaf, or where there are more a thread a subtree: most have one leaf on the list. Subtrees that are there
-    whole then come last, a thread a leaf, and neighbours' forces are added up before they go to memory. Launch with
-    block_dim LIST_BLOCK and as many ``threads``, a multiple of it.
+    Neighbours' forces are added up before they go to memory. Launch with block_dim LIST_BLOCK and as many ``threads``,
+    a multiple of it.
     """
     count = listed.counts[0]
     if count == 0:
         return
-    each = wp.where(LEAVES * count <= threads, LEAVES, 1)
     i = wp.tid()
-    while i < count * each:
-        entry = listed.entries[i // each]
-        mask = entry[1]
-        if each > 1:
-            mask = mask & (1 << (i % each))
-        elif mask == WHOLE:
-            mask = 0
-        leaf = int(0)
-        while mask >= (1 << leaf):
-            if (mask >> leaf) & 1 == 1:
-                scatter_own(elements, entry[0] + leaf, mu, lam, stride, u, f)
-            leaf += 1
+    while i < count * LEAVES:
+        entry = listed.entries[i // LEAVES]
+        leaf = i % LEAVES
+        targets = wp.vec4i(-1, -1, -1, -1)
+        p = wp.mat33()
+        t = entry[0]
+        if (entry[1] >> leaf) & 1 == 1:
+            t += leaf
+            targets = elements.targets[t]
+            p = own_stress(elements, t, mu, lam, stride, u)
+        f0, f1, f2, f3 = nodal_forces(elements, t, p)
+        add_neighbours(f, targets, f0, f1, f2, f3)
         i += threads
-    if each == 1:
-        i = wp.tid()
-        while i < count * LEAVES:
-            entry = listed.entries[i // LEAVES]
-            if entry[1] == WHOLE:
-                t = entry[0] + i % LEAVES
-                f0, f1, f2, f3 = nodal_forces(elements, t, own_stress(elements, t, mu, lam, stride, u))
-                add_neighbours(f, elements.targets[t], f0, f1, f2, f3)
-            i += threads
     leave(listed, threads // LIST_BLOCK)
 
 
@@ -210,12 +194,6 @@ def repair_listed_shared(
 
 
 # --- by bytes, in order ---------------------------------------------------------------------------------------------
-
-
-@wp.func
-def is_left_out(flags: wp.uint64, leaf: int):
-    """Whether leaf 0 to 63 of eight subtrees is."""
-    return ((flags >> wp.uint64(leaf)) & wp.uint64(1)) != wp.uint64(0)
 
 
 @wp.kernel(enable_backward=False)

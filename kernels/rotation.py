@@ -12,6 +12,7 @@ Newton's iteration has no answer for a singular F and gives a reflection for an 
 
 import warp as wp
 
+from .algebraic import algebraic_rotation, reciprocal
 from .matrices import all_finite, cofactor, column, frobenius, identity3, largest_entry
 from .quaternion import robust_rotation, warm_rotation  # noqa: F401 (others find it here)
 
@@ -102,18 +103,6 @@ def byers_xu(f: wp.mat33):
     return r
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    float r;
-    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x));
-    return r;
-#else
-    return 1.0f / x;
-#endif
-""")
-def reciprocal(x: float) -> float: ...
-
-
 @wp.func
 def newton_rotation(c0: wp.vec3, c1: wp.vec3, c2: wp.vec3, handedness: float):
     """Z = 2^ITERATIONS R of the columns of F, and whether it may be trusted: F neither flat, inverted nor far from one.
@@ -156,8 +145,8 @@ def newton_rotation(c0: wp.vec3, c1: wp.vec3, c2: wp.vec3, handedness: float):
 
 
 @wp.func(inline=False)
-def robust_rotation_outlined(f: wp.mat33):
-    return robust_rotation(f)
+def rotation_out_of_line(f: wp.mat33):
+    return algebraic_rotation(f)
 
 
 @wp.func
@@ -166,7 +155,7 @@ def quick_rotation(f: wp.mat33):
     z0, z1, z2, trusted = newton_rotation(column(f, 0), column(f, 1), column(f, 2), 1.0)
     r = wp.static(0.5**ITERATIONS) * wp.matrix_from_cols(z0, z1, z2)
     if not trusted:
-        r = robust_rotation_outlined(f)
+        r = rotation_out_of_line(f)
     return r
 
 

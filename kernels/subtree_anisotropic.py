@@ -17,8 +17,8 @@ from .rotation import ITERATIONS, byers_xu, column, newton_rotation, quick_rotat
 from .shapes import VOLUME, fingerprint
 from .subtree import FRAMES, HANDEDNESS, LEAVES
 from .subtree_cuda import memory_of
-from .subtree_forces import columns_of, leaf_forces_of, mat10
-from .subtree_laws import first_of, turn_in, turn_out
+from .subtree_forces import columns_of, first_of, leaf_forces_of, mat10
+from .subtree_laws import turn_in, turn_out
 
 wp.set_module_options({"enable_backward": False})
 

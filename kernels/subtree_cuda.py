@@ -2,12 +2,12 @@
 
 Three things make it fast. Forces are summed over the eight leaves in registers, and over a group of eight subtrees in
 shared memory, by a table that tells each lane which slots to add up, so that nothing is added atomically twice. What
-leaves for global memory are 16-byte vector reductions where the card has them. And rotations are found by a few
-unscaled iterations.
+leaves for global memory are 16-byte vector reductions where the card has them. And the stress comes of a root of one
+polynomial (``algebraic``), the same way for small strains and large ones.
 
-A leaf that these do not turn adds nothing. Its bit is set in its subtree's byte, and the subtree is put on a list;
-``repair`` does those leaves. Bodies of one type of subtree alone have a kernel of their own; all others are one launch,
-in which each thread block looks up what it is to do.
+A leaf that is flat, turned over or far from order one adds nothing. Its bit is set in its subtree's byte, and the
+subtree is put on a list; ``repair`` does those leaves. Bodies of one type of subtree alone have a kernel of their own;
+all others are one launch, in which each thread block looks up what it is to do.
 """
 
 import functools
@@ -36,7 +36,7 @@ from .subtree_forces import leaf_stress, mat10, near_forces, shared_forces
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 128
-#: Blocks that a multiprocessor's registers must have room for, by type: as many as without ``small_forces``.
+#: Blocks that a multiprocessor's registers must have room for, by type.
 RESIDENT = (6, 5, 5)
 #: What ``Stretch.shape`` is for leaves in no subtree.
 FLAT = 3

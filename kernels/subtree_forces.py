@@ -1,21 +1,20 @@
 """Corotated forces of one complete subtree in registers: ten displacements in, ten nodal forces out.
 
-What kernels share that read and write their nodes each in its own way (``subtree_cuda``, ``block``). Rotations are
-found by unscaled iterations (``rotation.newton_rotation``); a leaf that these do not turn, flat, inverted or far from
-order one, is left out and reported: bit k stands for leaf k in tree order.
-
-A strain that is a difference of numbers near one has an error of 1.5e-7 however small it is. So a subtree whose nodes
-have hardly moved takes ``small_forces``, which works from displacements alone and needs no rotation.
+What kernels share that read and write their nodes each in its own way (``subtree_cuda``, ``block``). Stresses are
+worked out from displacement gradients, so that small strains keep their digits (``algebraic.stretch_stress``); a leaf
+that is flat, turned over or far from order one is left out and reported: bit k stands for leaf k in tree order.
 """
 
 import functools
+from collections.abc import Sequence
 
 import warp as wp
 
+from .algebraic import stretch_stress
 from .elements import ROOT2
 from .rotation import ITERATIONS, column, newton_rotation
 from .shapes import VOLUME, fingerprint
-from .subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS
+from .subtree import FRAMES, LEAVES, POSITIONS
 
 wp.set_module_options({"enable_backward": False})
 
@@ -24,10 +23,10 @@ mat10 = wp.types.matrix(shape=(10, 3), dtype=wp.float32)
 #: What a mask of left-out leaves is where the whole subtree is.
 ALL_LEAVES = wp.constant(255)
 
-#: Largest component of a displacement relative to the first node's, in edge lengths of a leaf, for ``small_forces``.
-#: Its series is then right to 2e-5 of the stress where neighbouring nodes move against each other, to 1e-8 where strain
-#: is smooth. Beyond, the error of 1.5e-7 is at most 1e-4 of the strain.
-SMALL = wp.constant(0.01)
+
+def first_of(weights: Sequence[float]) -> int:
+    """The first of a list that is not zero."""
+    return next(i for i, weight in enumerate(weights) if abs(weight) > 1e-9)
 
 
 @functools.cache
@@ -73,119 +72,40 @@ def leaf_forces_of(shape: int) -> wp.Function:
     return leaf_forces
 
 
-@functools.cache
-def deformed_of(shape: int) -> wp.Function:
-    """Turn ten displacements into ten positions relative to the first node's displacement, in edge lengths of a leaf.
-
-    In that unit a subtree at rest has whole numbers for columns, and its forces vanish exactly.
-    """
-    at = [[2.0 * c for c in point] for point in POSITIONS[shape]]
-
-    @wp.func
-    def deformed(x: mat10, q: wp.mat33, inv_h: float, mirror: float):
-        _generated_from = wp.static(fingerprint(at))
-        q0 = column(q, 0)
-        q1 = column(q, 1)
-        q2 = column(q, 2) * mirror
-        origin = x[0]
-        y = mat10()
-        for k in range(10):
-            y[k] = (x[k] - origin) * inv_h + (
-                wp.static(at[k][0]) * q0 + wp.static(at[k][1]) * q1 + wp.static(at[k][2]) * q2
-            )
-        return y
-
-    return deformed
-
-
-@functools.cache
-def is_small(shape: int, chosen: range) -> wp.Function:
-    """Whether the nodes of the chosen leaves have moved by at most ``bound`` from the first one's displacement."""
-    used = sorted({node for leaf in chosen for node in LEAVES[shape][leaf]} - {0})
-
-    @wp.func
-    def is_small(x: mat10, bound: float):
-        _generated_from = wp.static(fingerprint(used))
-        origin = x[0]
-        far = float(0.0)
-        for k in range(wp.static(len(used))):
-            d = wp.abs(x[wp.static(used[k])] - origin)
-            far = wp.max(far, wp.max(wp.max(d[0], d[1]), d[2]))
-        return far < bound
-
-    return is_small
-
-
-@wp.func
-def small_strain_stress(e: wp.mat33, h: wp.mat33, mu: float, lam: float):
-    """First Piola-Kirchhoff stress from E = C - I and the displacement gradient H, both small, in one frame.
-
-    With U = sqrt(I + E) the second stress is S = U^-1 (2 mu (U - I) + lambda tr(U - I)) = 2 mu N + lambda tr(U - I)
-    (I - N) with N = I - U^-1 = E/2 - 3/8 E^2 + 5/16 E^3 - 35/128 E^4 + ..., and P = S + H S.
-    """
-    e2 = e * e
-    n = 0.5 * e - 0.375 * e2 + e2 * (0.3125 * e - 0.2734375 * e2)
-    trace = 0.5 * wp.trace(e) - 0.125 * wp.trace(e2) + 0.0625 * wp.ddot(e, e2) - 0.0390625 * wp.ddot(e2, e2)
-    pressure = lam * trace
-    s = (2.0 * mu - pressure) * n
-    s[0, 0] += pressure
-    s[1, 1] += pressure
-    s[2, 2] += pressure
-    return s + h * s
-
-
 @wp.func
 def leaf_stress(g: wp.mat33, q: wp.mat33, mu: float, lam: float):
     """First Piola-Kirchhoff stress times Q of one leaf with its own rotation, and whether it may be trusted."""
-    p = wp.mat33()
-    trusted = bool(True)
-    far = wp.max(wp.abs(g[0]))
-    far = wp.max(far, wp.max(wp.abs(g[1])))
-    far = wp.max(far, wp.max(wp.abs(g[2])))
-    if far < SMALL:
-        w = wp.transpose(q) * g
-        p = q * small_strain_stress(w + wp.transpose(w) + wp.transpose(g) * g, w, mu, lam)
-    else:
-        f = q + g
-        z0, z1, z2, trusted = newton_rotation(column(f, 0), column(f, 1), column(f, 2), 1.0)
-        r = wp.static(0.5**ITERATIONS) * wp.matrix_from_cols(z0, z1, z2)
-        p = (2.0 * mu) * f + (lam * (wp.ddot(r, f) - 3.0) - 2.0 * mu) * r
-    return p, trusted
+    p, trusted = stretch_stress(wp.transpose(q) * g, mu, lam)
+    return q * p, trusted
 
 
 @functools.cache
-def small_forces_of(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Function:
-    """Forces of the chosen leaves from small displacements, without a rotation and with the digits of the strain.
+def turned_forces_of(shape: int, uniform: bool, chosen: range) -> wp.Function:
+    """Forces of the chosen leaves, each with its own rotation, and which are left out: in the subtree's Maubach frame,
+    or in one that is turned along with the subtree.
 
-    Ten displacements are turned into the subtree's Maubach frame once; leaves' frames are tables there.
+    ``y`` are ten displacements there, in edge lengths h of a leaf; leaves' frames B are tables.
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
     leaves, frames = LEAVES[shape], FRAMES[shape]
+    rows = [[first_of(axis) for axis in frame] for frame in frames]
+    backs = [[first_of([frame[i][axis] for i in range(3)]) for axis in range(3)] for frame in frames]
     begin, end = chosen.start, chosen.stop
     volume = VOLUME[shape]
 
     @wp.func
-    def small_forces(
-        x: mat10, q: wp.mat33, h: float, mirror: float, mu: wp.array[wp.float32], lam: wp.array[wp.float32], first: int
-    ):
+    def turned_forces(y: mat10, h: float, mu: wp.array[wp.float32], lam: wp.array[wp.float32], first: int):
         _generated_from = wp.static(fingerprint(leaves, frames, begin, end))
-        q0 = column(q, 0)
-        q1 = column(q, 1)
-        q2 = column(q, 2) * mirror
-        inv_h = 1.0 / h
-        origin = x[0]
-        y = mat10()
-        for n in range(10):
-            d = (x[n] - origin) * inv_h
-            y[n] = wp.vec3(wp.dot(q0, d), wp.dot(q1, d), wp.dot(q2, d))
-        m = mu[first]
-        k = lam[first]
+        # P V / h.
         area = wp.static(volume) * h * h
+        m = area * mu[first]
+        k = area * lam[first]
         g = mat10()
+        left_out = int(0)
         for leaf in range(wp.static(begin), wp.static(end)):
             if wp.static(not uniform):
-                m = mu[first + leaf]
-                k = lam[first + leaf]
+                m = area * mu[first + leaf]
+                k = area * lam[first + leaf]
             b0, b1, b2 = columns(
                 y[wp.static(leaves[leaf][0])],
                 y[wp.static(leaves[leaf][1])],
@@ -193,76 +113,28 @@ def small_forces_of(shape: int, uniform: bool, chosen: range = range(8)) -> wp.F
                 y[wp.static(leaves[leaf][3])],
             )
             c = wp.matrix_from_cols(b0, b1, b2)
-            # The displacement gradient in the leaf's frame B: B^T C, zeros of B left out.
+            # The displacement gradient in the leaf's frame: B^T C, zeros of B left out.
             w = wp.mat33()
             for i in range(3):
-                for j in range(3):
-                    for axis in range(3):
-                        if wp.static(abs(frames[leaf][i][axis]) > 1e-9):
+                for axis in range(3):
+                    if wp.static(axis == rows[leaf][i]):
+                        for j in range(3):
+                            w[i, j] = wp.static(frames[leaf][i][axis]) * c[axis, j]
+                    elif wp.static(abs(frames[leaf][i][axis]) > 1e-9):
+                        for j in range(3):
                             w[i, j] += wp.static(frames[leaf][i][axis]) * c[axis, j]
-            sigma = small_strain_stress(w + wp.transpose(w) + wp.transpose(w) * w, w, m * area, k * area)
-            p = wp.mat33()
-            for axis in range(3):
-                for j in range(3):
-                    for i in range(3):
-                        if wp.static(abs(frames[leaf][i][axis]) > 1e-9):
-                            p[axis, j] += wp.static(frames[leaf][i][axis]) * sigma[i, j]
-            f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
-            g[wp.static(leaves[leaf][0])] += f0
-            g[wp.static(leaves[leaf][1])] += f1
-            g[wp.static(leaves[leaf][2])] += f2
-            g[wp.static(leaves[leaf][3])] += f3
-        for n in range(10):
-            force = g[n]
-            g[n] = force[0] * q0 + force[1] * q1 + force[2] * q2
-        return g
-
-    return small_forces
-
-
-@functools.cache
-def turned_forces_of(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Function:
-    """Forces of the chosen leaves from positions (``deformed_of``), each with its own rotation, and which leaves are
-    left out.
-
-    With a rotation, R sym(R^T F) = F, so P = 2 mu (F - R) + lambda tr(R^T F - I) R: no matrix is multiplied.
-    """
-    columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
-    leaves, handed = LEAVES[shape], HANDEDNESS[shape]
-    begin, end = chosen.start, chosen.stop
-    volume = VOLUME[shape]
-
-    @wp.func
-    def turned_forces(
-        x: mat10, h: float, mirror: float, mu: wp.array[wp.float32], lam: wp.array[wp.float32], first: int
-    ):
-        _generated_from = wp.static(fingerprint(leaves, handed, begin, end))
-        m = mu[first]
-        k = lam[first]
-        # P V/h = from_f F + from_z Z with Z = 2^ITERATIONS R.
-        area = wp.static(volume) * h * h
-        area_z = wp.static(0.5**ITERATIONS) * area
-        g = mat10()
-        left_out = int(0)
-        for leaf in range(wp.static(begin), wp.static(end)):
-            if wp.static(not uniform):
-                m = mu[first + leaf]
-                k = lam[first + leaf]
-            hand = mirror * wp.static(handed[leaf])
-            c0, c1, c2 = columns(
-                x[wp.static(leaves[leaf][0])],
-                x[wp.static(leaves[leaf][1])],
-                x[wp.static(leaves[leaf][2])],
-                x[wp.static(leaves[leaf][3])],
-            )
-            z0, z1, z2, trusted = newton_rotation(c0, c1, c2, hand)
+            sigma, trusted = stretch_stress(w, m, k)
             if trusted:
-                trace = wp.static(0.5**ITERATIONS) * (wp.dot(z0, c0) + wp.dot(z1, c1) + wp.dot(z2, c2))
-                from_f = 2.0 * m * area
-                from_z = (k * (trace - 3.0) - 2.0 * m) * area_z
-                f0, f1, f2, f3 = leaf_forces(
-                    from_f * c0 + from_z * z0, from_f * c1 + from_z * z1, from_f * c2 + from_z * z2
-                )
+                p = wp.mat33()
+                for axis in range(3):
+                    for i in range(3):
+                        if wp.static(i == backs[leaf][axis]):
+                            for j in range(3):
+                                p[axis, j] = wp.static(frames[leaf][i][axis]) * sigma[i, j]
+                        elif wp.static(abs(frames[leaf][i][axis]) > 1e-9):
+                            for j in range(3):
+                                p[axis, j] += wp.static(frames[leaf][i][axis]) * sigma[i, j]
+                f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
                 g[wp.static(leaves[leaf][0])] += f0
                 g[wp.static(leaves[leaf][1])] += f1
                 g[wp.static(leaves[leaf][2])] += f2
@@ -281,19 +153,28 @@ def own_forces(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Functi
     ``q`` is the subtree's frame, ``h`` a leaf's edge length, ``first`` where its material stands, and that of the other
     leaves unless uniform.
     """
-    small, deformed = is_small(shape, chosen), deformed_of(shape)
-    small_forces, turned_forces = (of(shape, uniform, chosen) for of in (small_forces_of, turned_forces_of))
+    turned_forces = turned_forces_of(shape, uniform, chosen)
 
     @wp.func
     def own_forces(
         x: mat10, q: wp.mat33, h: float, mirror: float, mu: wp.array[wp.float32], lam: wp.array[wp.float32], first: int
     ):
-        g = mat10()
-        left_out = int(0)
-        if small(x, SMALL * h):
-            g = small_forces(x, q, h, mirror, mu, lam, first)
-        else:
-            g, left_out = turned_forces(deformed(x, q, 1.0 / h, mirror), h, mirror, mu, lam, first)
+        q0 = column(q, 0)
+        q1 = column(q, 1)
+        q2 = column(q, 2) * mirror
+        inv_h = 1.0 / h
+        h0 = inv_h * q0
+        h1 = inv_h * q1
+        h2 = inv_h * q2
+        origin = x[0]
+        y = mat10()
+        for n in range(1, 10):
+            d = x[n] - origin
+            y[n] = wp.vec3(wp.dot(h0, d), wp.dot(h1, d), wp.dot(h2, d))
+        g, left_out = turned_forces(y, h, mu, lam, first)
+        for n in range(10):
+            force = g[n]
+            g[n] = force[0] * q0 + force[1] * q1 + force[2] * q2
         return g, left_out
 
     return own_forces
@@ -460,9 +341,8 @@ def shared_forces(
             if left_out == 0 and apart <= 1.0:
                 left_out = 0
             else:
-                for n in range(10):
-                    y[n] += wp.vec3(wp.static(2.0 * at[n][0]), wp.static(2.0 * at[n][1]), wp.static(2.0 * at[n][2]))
-                g, left_out = turned_forces(y, h, 1.0, mu, lam, first)
+                # In the frame that is turned along, y is in the place of displacements.
+                g, left_out = turned_forces(y, h, mu, lam, first)
         for n in range(10):
             force = g[n]
             g[n] = force[0] * r0 + force[1] * r1 + force[2] * r2

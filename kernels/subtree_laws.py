@@ -6,7 +6,6 @@ and negates entries (types 0 and 1; four leaves of type 2 also mix them), and P 
 """
 
 import functools
-from collections.abc import Sequence
 
 import warp as wp
 
@@ -15,14 +14,9 @@ from .rotation import column
 from .shapes import VOLUME, fingerprint
 from .subtree import FRAMES, LEAVES
 from .subtree_cuda import memory_of
-from .subtree_forces import columns_of, leaf_forces_of, mat10
+from .subtree_forces import columns_of, first_of, leaf_forces_of, mat10
 
 wp.set_module_options({"enable_backward": False})
-
-
-def first_of(weights: Sequence[float]) -> int:
-    """The first of a list that is not zero."""
-    return next(i for i, weight in enumerate(weights) if abs(weight) > 1e-9)
 
 
 @wp.func

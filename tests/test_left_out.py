@@ -9,6 +9,7 @@ import oracle
 import pytest
 import warp as wp
 from cases import edge_scale, mixed_forest, oracle_mesh
+from warp_corot.kernels.block_layout import VECTOR_BYTES
 from warp_corot.kernels.repair import LIST_BLOCK
 from warp_corot.kernels.subtree_cuda import BLOCK, FLAT, Stretch, scatter_stretches
 
@@ -145,13 +146,13 @@ def test_clusters_add_up_every_corner_once(rng):
     assert np.array_equal(nodes[begin[there // LIST_BLOCK][:, None] + corners], forest.tets[chosen])
     values = np.zeros((count * LIST_BLOCK, 4))
     values[there] = rng.random((len(there), 4))
-    slots, sums = clusters.slots.numpy().reshape(count, -1), clusters.sums.numpy()
+    # Slots hold a corner after another's, one element after another; past the last of a task's slots is the zero one.
+    slots = np.ascontiguousarray(clusters.slots.numpy().T).view("<u2").astype(int) // VECTOR_BYTES
     total = np.zeros(len(forest.points))
     for cluster in range(count):
-        own = values.reshape(count, -1)[cluster]
-        for k in range(begin[cluster], begin[cluster + 1]):
-            first, length = sums[k] & 0xFFFF, sums[k] >> 16
-            total[nodes[k]] += own[slots[cluster, first : first + length]].sum()
+        own = np.append(values.reshape(count, -1, 4)[cluster].T.ravel(), 0.0)
+        tasks = slice(begin[cluster], begin[cluster + 1])
+        np.add.at(total, nodes[tasks], own[slots[tasks]].sum(1))
     plain = np.zeros(len(forest.points))
     np.add.at(plain, forest.tets[chosen], values[there])
     assert np.allclose(total, plain, rtol=1e-13)

@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from .kernels.clusters import CLUSTER, CORNERS, FIRST_BITS, Clusters
+from .kernels.block_layout import TASK_SLOTS, VECTOR_BYTES
+from .kernels.clusters import CLUSTER, CORNERS, Clusters
 
 
 def clusters_of(chosen: npt.NDArray[np.int32], nodes: npt.NDArray[np.int32], device: wp.Device) -> tuple[Any, int]:
@@ -33,23 +34,28 @@ def clusters_of(chosen: npt.NDArray[np.int32], nodes: npt.NDArray[np.int32], dev
     starts = np.flatnonzero(is_first)
     degree = np.diff(starts, append=len(key))
     owner = cluster[order][starts]
-    # Busy nodes first, so that the threads of a warp have about as much to add up.
-    rank = np.lexsort((-degree, owner))
-    begin = np.searchsorted(owner, np.arange(count + 1)).astype(np.int32)
+    # Up to TASK_SLOTS of a node's corners a task. A node's first task is its place in the cluster, so these come first,
+    # busy ones at their head: then the threads of a warp have about as much to add up.
+    pieces = -(-degree // TASK_SLOTS)
+    node = np.repeat(np.arange(len(starts)), pieces)
+    piece = np.arange(len(node)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    rank = np.lexsort((-degree[node], piece > 0, owner[node]))
+    node, piece = node[rank], piece[rank]
+    begin = np.searchsorted(owner[node], np.arange(count + 1)).astype(np.int32)
     local = np.empty(len(starts), np.int64)
-    local[rank] = np.arange(len(starts)) - begin[owner[rank]]
+    local[node[piece == 0]] = (np.arange(len(node)) - begin[owner[node]])[piece == 0]
     of_corner = np.empty(len(key), np.int64)
     of_corner[order] = local[np.cumsum(is_first) - 1]
     packed = np.zeros((count * CLUSTER, 4), "<u2")
     packed[: len(chosen)] = of_corner.reshape(-1, 4)
-    slots = np.zeros(count * CORNERS, np.uint16)
-    slots[: len(order)] = order % CORNERS
-    sums = (starts % CORNERS | degree << FIRST_BITS)[rank]
+    at = TASK_SLOTS * piece[:, None] + np.arange(TASK_SLOTS)
+    corner = order[np.minimum(starts[node, None] + at, len(order) - 1)] % CORNERS
+    slots = np.where(at < degree[node, None], corner % 4 * CLUSTER + corner // 4, CORNERS)
     clusters = Clusters()
     clusters.elements = wp.array(elements, dtype=wp.int32, device=device)
     clusters.corners = wp.array(packed.view("<u8").ravel(), dtype=wp.uint64, device=device)
     clusters.begin = wp.array(begin, dtype=wp.int32, device=device)
-    clusters.nodes = wp.array(corners[order][starts][rank].astype(np.int32), dtype=wp.int32, device=device)
-    clusters.sums = wp.array(sums.astype(np.int32), dtype=wp.int32, device=device)
-    clusters.slots = wp.array(slots, dtype=wp.uint16, device=device)
+    clusters.nodes = wp.array(corners[order][starts][node].astype(np.int32), dtype=wp.int32, device=device)
+    words = np.ascontiguousarray((VECTOR_BYTES * slots).astype("<u2").view("<u8").T)
+    clusters.slots = wp.array(words, dtype=wp.uint64, device=device)
     return clusters, count

@@ -34,9 +34,8 @@ class LeftOutLeaves:
 
     @classmethod
     def of(cls, plan: Plan, device: wp.Device) -> LeftOutLeaves:
-        # Of a subtree in no group each leaf may be listed by itself.
         own = [batch for batch in plan.batches if batch.sharing is Sharing.OWN]
-        places = sum(batch.count * (1 if batch.grouped else 8) for batch in own) + len(plan.flat)
+        places = sum(batch.count for batch in own) + len(plan.flat)
         return cls(places, [batch for batch in plan.batches if batch.sharing is Sharing.ROOT], device)
 
     @staticmethod

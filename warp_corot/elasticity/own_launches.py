@@ -8,19 +8,22 @@ import numpy as np
 import warp as wp
 
 from ..clusters import clusters_of
+from ..kernels.algebraic import corotated_stress
 from ..kernels.clusters import CLUSTER, scatter_clusters
 from ..kernels.elements import ForestElements
 from ..kernels.subtree_cuda import BLOCK, FLAT, Stretch, scatter_stretches
-from ..kernels.subtree_forces import leaf_stress
 from ..plan import FlatLeaves, ForcePlan, Plan
 from ..subtrees import Batch
+
+#: Leaves in groups from which these have a launch of their own: what that takes off the time is more than it costs.
+GROUPED_LEAVES = 1 << 16
 
 
 class OwnLaunches:
     """The launches of a plan whose leaves all have their own rotations.
 
-    Where the mesh stays as it is, leaves in no subtree, and those of subtrees in no group beside them, go in clusters.
-    Where it changes, one launch is all.
+    Where the mesh stays as it is, leaves in no subtree, and those of subtrees in no group beside them, go in clusters;
+    where few are in groups, all leaves. Where the mesh changes, one launch is all.
 
     Args:
         elements: The leaves of all worlds, ``kernels.elements.ForestElements``.
@@ -34,13 +37,18 @@ class OwnLaunches:
         batches, self._flat = list(plan.batches), plan.flat
         self._clusters: Any = None
         if isinstance(plan, ForcePlan) and len(plan.flat):
-            single = [batch for batch in batches if not batch.grouped]
-            batches = [batch for batch in batches if batch.grouped]
+            worth = 8 * sum(batch.count for batch in batches if batch.grouped) >= GROUPED_LEAVES
+            single = [batch for batch in batches if not (batch.grouped and worth)]
+            batches = [batch for batch in batches if batch.grouped and worth]
             first = np.concatenate([np.empty(0, np.int32), *(batch.subtrees.first.numpy() for batch in single)])
             leaves = np.concatenate([plan.flat.leaves.numpy(), (first[:, None] + np.arange(8)).ravel()])
             self._clusters, self._cluster_count = clusters_of(
                 np.sort(leaves).astype(np.int32), elements.nodes.numpy(), self._device
             )
+        #: How many subtrees and single leaves can be on the list of those left out.
+        self.places = sum(batch.count for batch in batches)
+        if self._clusters is None:
+            self.places += len(plan.flat)
         # The structs hold addresses alone: what these stand for must live as long as they do.
         self._rows, self._blocks = _stretches(batches, None if self._clusters is not None else plan.flat)
         self._stretches = wp.array(self._rows, dtype=Stretch, device=self._device) if self._rows else None
@@ -56,7 +64,7 @@ class OwnLaunches:
         wp.load_module(scatter_stretches(uniform, tolerance).module, device, block_dim=BLOCK)
 
     def scatter_forces(self, u: wp.array, f: wp.array, left_out: Any) -> None:
-        """Add the forces of displacements u to f, both vec4, and put what is left out on a list."""
+        """Add the forces of displacements u to f, both vec4, and put subtrees with leaves left out on a list."""
         mu, lam, stride = self._material
         if self._stretches is not None:
             wp.launch(
@@ -69,10 +77,10 @@ class OwnLaunches:
             )
         if self._clusters is not None:
             wp.launch(
-                scatter_clusters(ForestElements, leaf_stress),
+                scatter_clusters(ForestElements, corotated_stress),
                 dim=self._cluster_count * CLUSTER,
                 inputs=[self._clusters, self._elements, mu, lam, stride, u],
-                outputs=[f, left_out],
+                outputs=[f],
                 device=self._device,
                 block_dim=CLUSTER,
             )

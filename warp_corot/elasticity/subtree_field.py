@@ -1,6 +1,7 @@
 """The fast path of the corotated model: complete subtrees of a forest as units of work; see ``plan``.
 
-On CUDA with own rotations a body is two launches: its forces, and the leaves that these left out.
+On CUDA with own rotations a body is at most three launches: subtrees, other leaves, and the leaves that the first
+left out.
 """
 
 from __future__ import annotations
@@ -85,10 +86,11 @@ class SubtreeField(CorotatedField):
         self._left_out: LeftOutLeaves | None = None
         self._own_launches: OwnLaunches | None = None
         if self._listed:
-            self._left_out = LeftOutLeaves.of(plan, self.device)
             if self.rotation_level is None and OwnLaunches.suit(plan):
                 self._own_launches = OwnLaunches(plan, self.elements, self.material_inputs, self.model.tolerance)
+                self._left_out = LeftOutLeaves(self._own_launches.places, [], self.device)
                 return
+            self._left_out = LeftOutLeaves.of(plan, self.device)
         self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]
         self._flat_material = self.material_inputs
         self._flat_lanes: Lanes | None = None
