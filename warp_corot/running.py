@@ -8,15 +8,21 @@ from typing import TYPE_CHECKING
 
 from .elasticity import StVenantKirchhoff
 from .errors import StabilityWarning, UnstableError, depth_of_user
-from .kernels.pace import GROWTH, RECOVERY
+from .kernels.pace import GROWTH
 from .solvers.guard import Fault
 
 if TYPE_CHECKING:
     from .simulation import Simulation
 
-#: Steps from one check with elastic energies to the next, and the same where many steps are one launch.
-CHECK_STEPS = 512
-BLOCK_CHECK_STEPS = 2048
+#: Measurements from one check with elastic energies to the next, and the same while the step is in trouble.
+CHECK_INTERVALS = 16
+CLOSE_INTERVALS = 4
+#: Energy from nowhere that is let pass between two checks, and in all, as shares of what gravity, loads and supports
+#: have moved: the step is made shorter for more than the first, and not longer again before both are kept.
+GAIN = 0.001
+SURPLUS = 0.004
+#: Growth of the step's share from one measurement to the next: from a half to the whole in 35 of them.
+RECOVERY = 1.02
 #: How often the step is halved to come over one place.
 MOST_RETURNS = 6
 #: How often it is halved for a little energy from nowhere, as comes with crushed elements also of the shortest steps.
@@ -42,6 +48,8 @@ class Running:
         #: Whether the last run ended with steps shorter than what the state allows.
         self._shortened = False
         self._steps_made = 0
+        #: Steps done when the share of the step was last looked at.
+        self._followed = 0
 
     def step(self) -> None:
         """Make one step, with a measurement before it where one is due."""
@@ -110,14 +118,16 @@ class Running:
     def _until_due(self, done: int) -> int:
         """Steps until a check, a pass or a hook is due."""
         sim = self._sim
-        every = [sim.recorded.interval if self._returns else self._check_steps, *sim.hook_intervals]
+        every = [self._check_steps, *sim.hook_intervals]
         if sim.remeshing.every:
             every.append(sim.remeshing.every)
         return min(n - done % n for n in every)
 
     @property
     def _check_steps(self) -> int:
-        return BLOCK_CHECK_STEPS if self._sim.recorded.in_blocks else CHECK_STEPS
+        if self._returns:
+            return self._sim.recorded.interval
+        return (CLOSE_INTERVALS if self._share < 1.0 else CHECK_INTERVALS) * self._sim.recorded.interval
 
     def _advance(self, done: int, most: int, end: float | None) -> bool:
         """Make at most so many steps; whether the end is reached."""
@@ -177,7 +187,7 @@ class Running:
         safe = self._sim.safe_step
         assert safe is not None
         interval, longest = self._sim.recorded.interval, safe.at_rest
-        growth = float(GROWTH) * float(RECOVERY)
+        growth = float(GROWTH)
         dt = min(growth * safe.allowed, longest)
         count = 0
         left -= 2 * interval * dt
@@ -198,13 +208,41 @@ class Running:
         sim = self._sim
         whole = now % self._check_steps == 0 or bool(self._returns)
         strict = sim.safe_step is not None and self._returns < STRICT_RETURNS
-        fault = sim.guard.check(whole=whole, strict=strict)
+        fault = sim.guard.check(whole=whole, strict=strict, lenient=sim.safe_step is not None)
         if fault is not None:
             self._go_back(fault)
             return False
         if self._returns and sim.time > self._wrong_until:
             self._returns = 0
+        if whole and sim.safe_step is not None:
+            self._follow_energy(now)
         return True
+
+    def _follow_energy(self, now: int) -> None:
+        """Make the step shorter where energy came from nowhere, and longer again where none did."""
+        sim = self._sim
+        assert sim.safe_step is not None
+        share = self._share
+        intervals = (now - self._followed) / sim.recorded.interval
+        self._followed = now
+        if sim.guard.gain > GAIN:
+            share *= max(math.sqrt(GAIN / sim.guard.gain), 0.5)
+        elif sim.guard.surplus <= SURPLUS:
+            share = min(share * RECOVERY**intervals, 1.0)
+        if share != self._share:
+            self._set_share(share)
+
+    @property
+    def _share(self) -> float:
+        return 1.0 if self._sim.safe_step is None else self._sim.safe_step.share
+
+    def _set_share(self, share: float) -> None:
+        """Take another share of the step that the state allows from here on."""
+        sim = self._sim
+        assert sim.safe_step is not None
+        sim.safe_step.share = share
+        sim.recorded.retime()
+        sim.guard.settle()
 
     def _go_back(self, fault: Fault) -> None:
         """Go on from the last good state with half the step.
@@ -222,8 +260,8 @@ class Running:
         self._returns += 1
         share = sim.safe_step.share
         sim.guard.go_back()
-        sim.safe_step.share = 0.5 * share
-        sim.guard.settle()
+        self._followed = sim.steps
+        self._set_share(0.5 * share)
         if not self._has_warned:
             self._has_warned = True
             message = (

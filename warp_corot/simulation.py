@@ -112,7 +112,7 @@ class Simulation:
         #: What chooses the step, if none was given.
         self.safe_step: SafeStep | None = None
         if given is None:
-            self.safe_step = SafeStep(self.bodies, self.fields, self.models, self.pace, stable)
+            self.safe_step = SafeStep(self.bodies, self.fields, self.models, self.pace, stable, self._context.gravity)
         moved = zip(self.bodies, self.fields, strict=True)
         steppers = [self.integrator.bind(body, field, self._context) for body, field in moved]
         self.recorded = RecordedSteps(self.bodies, steppers, self.pace, self.safe_step)

@@ -93,6 +93,16 @@ class RecordedSteps:
             self._graphs[key] = capture.graph
         wp.capture_launch(self._graphs[key])
 
+    def retime(self) -> None:
+        """Take the step that the state allows now, also where it is another at once."""
+        assert self._safe_step is not None
+        with self._flushed():
+            for stepper in self._steppers:
+                stepper.forces()
+            self._safe_step.retime()
+        for body in self._bodies:
+            body.node_forces.zero_()
+
     def replay_many(self, count: int) -> None:
         """Replay any number of steps as few recordings."""
         for size in (BLOCK_STEPS, GRAPH_STEPS, 1) if self.in_blocks else (GRAPH_STEPS, 1):

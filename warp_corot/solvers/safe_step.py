@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from ..kernels import pace as kernels
+from ..kernels.gauge import SHIFT_VELOCITIES
 from .gauge import Gauge
 from .pace import Pace
 
@@ -32,6 +33,7 @@ class SafeStep:
         bodies, fields, models: The simulation's.
         pace: Whose step it sets.
         stable: The largest stable step of each body at rest [s], infinite where nothing can vibrate.
+        gravity: [m/s^2].
     """
 
     def __init__(
@@ -41,10 +43,11 @@ class SafeStep:
         models: Sequence[Model],
         pace: Pace,
         stable: Sequence[float],
+        gravity: wp.vec3,
     ):
         self.device = pace.device
         self.pace = pace
-        self._models = models
+        self._bodies, self._models, self._gravity = bodies, models, gravity
         self._found = wp.zeros((len(bodies), 2), dtype=wp.float32, device=self.device)
         self._at_rest = wp.zeros((len(bodies), 4), dtype=wp.float64, device=self.device)
         self._control = wp.zeros(int(kernels.CONTROLS), dtype=wp.float64, device=self.device)
@@ -109,10 +112,29 @@ class SafeStep:
             gauge.launch(self.pace, ahead)
         inputs = [self._at_rest, self._found, self._control, self.pace.arrays]
         wp.launch(kernels.take_safe_step, dim=1, inputs=inputs, device=self.device)
+        self._shift_velocities()
 
     def resume(self) -> None:
-        """Take the step that the state allows, after one that ended a run in time."""
+        """Take the step that the state allows, after one that ended a run in time; velocities stay as they are."""
         wp.launch(kernels.resume_step, dim=1, inputs=[self._control, self.pace.arrays], device=self.device)
+
+    def retime(self) -> None:
+        """Take the step that the state allows and shift velocities to it; ``node_forces`` as for ``launch``."""
+        self.resume()
+        self._shift_velocities()
+
+    def _shift_velocities(self) -> None:
+        for body in self._bodies:
+            inputs = [
+                self._gravity,
+                body.node_inverse_mass,
+                int(body.has_loads),
+                body.node_loads,
+                body.node_forces,
+                self._control,
+            ]
+            kernel = SHIFT_VELOCITIES[body.node_loads.dtype]
+            wp.launch(kernel, body.launch_nodes, inputs, [body.node_velocities], device=self.device)
 
     @property
     def share(self) -> float:
@@ -125,7 +147,6 @@ class SafeStep:
         control[kernels.SHARE] = value
         control[kernels.SHORTEST] = min(control[kernels.SHORTEST], value * control[kernels.ALLOWED])
         self._control.assign(control)
-        self.resume()
 
     @property
     def state(self) -> dict[str, wp.array]:
