@@ -14,19 +14,24 @@ from .solvers.guard import Fault
 if TYPE_CHECKING:
     from .simulation import Simulation
 
-#: Measurements from one check with elastic energies to the next, and the same while the step is in trouble.
+#: Measurements from one check with elastic energies to the next: for a body that stays as stiff as at rest, for one
+#: that is strained so that its step is less than a share of that at rest, and while less than what is stable is taken.
 CHECK_INTERVALS = 16
-CLOSE_INTERVALS = 4
+STRAINED_INTERVALS = 4
+CLOSE_INTERVALS = 2
+STRAINED = 0.7
 #: Energy from nowhere that is let pass between two checks, and in all, as shares of what gravity, loads and supports
-#: have moved: the step is made shorter for more than the first, and not longer again before both are kept.
+#: have moved: the step is made shorter for more than the first, and not longer again before both are kept. Less is let
+#: pass the nearer it is in all to the most there should be.
 GAIN = 0.001
 SURPLUS = 0.004
+MOST_SURPLUS = 0.008
 #: Growth of the step's share from one measurement to the next: from a half to the whole in 35 of them.
 RECOVERY = 1.02
 #: How often the step is halved to come over one place.
 MOST_RETURNS = 6
 #: How often it is halved for a little energy from nowhere, as comes with crushed elements also of the shortest steps.
-STRICT_RETURNS = 2
+STRICT_RETURNS = 4
 #: Longer runs are looked after in between.
 MOST_INTERVALS = 1000
 
@@ -50,6 +55,7 @@ class Running:
         self._steps_made = 0
         #: Steps done when the share of the step was last looked at.
         self._followed = 0
+        self._check_intervals = CHECK_INTERVALS
 
     def step(self) -> None:
         """Make one step, with a measurement before it where one is due."""
@@ -102,7 +108,9 @@ class Running:
         reached = self._advance(done, most, end)
         sim.recorded.publish_positions()
         now = self._steps_made = sim.steps
-        if not self._check(now):
+        passed = self._check(now)
+        self._choose_check_intervals()
+        if not passed:
             return False
         if sim.remeshing.is_due(now):
             sim.follow_motion()
@@ -127,7 +135,7 @@ class Running:
     def _check_steps(self) -> int:
         if self._returns:
             return self._sim.recorded.interval
-        return (CLOSE_INTERVALS if self._share < 1.0 else CHECK_INTERVALS) * self._sim.recorded.interval
+        return self._check_intervals * self._sim.recorded.interval
 
     def _advance(self, done: int, most: int, end: float | None) -> bool:
         """Make at most so many steps; whether the end is reached."""
@@ -225,12 +233,25 @@ class Running:
         share = self._share
         intervals = (now - self._followed) / sim.recorded.interval
         self._followed = now
-        if sim.guard.gain > GAIN:
-            share *= max(math.sqrt(GAIN / sim.guard.gain), 0.5)
-        elif sim.guard.surplus <= SURPLUS:
+        gain = GAIN * max(1.0 - sim.guard.surplus / MOST_SURPLUS, 0.1)
+        excess = max(sim.guard.gain / gain, sim.guard.untimely / SURPLUS)
+        if excess > 1.0:
+            share *= max(1.0 / math.sqrt(excess), 0.5)
+        elif sim.guard.surplus + sim.guard.untimely <= SURPLUS:
             share = min(share * RECOVERY**intervals, 1.0)
         if share != self._share:
             self._set_share(share)
+
+    def _choose_check_intervals(self) -> None:
+        if self._sim.safe_step is None:
+            return
+        share, allowed, at_rest = self._sim.safe_step.shares
+        if share < 1.0:
+            self._check_intervals = CLOSE_INTERVALS
+        elif allowed < STRAINED * at_rest:
+            self._check_intervals = STRAINED_INTERVALS
+        else:
+            self._check_intervals = CHECK_INTERVALS
 
     @property
     def _share(self) -> float:
@@ -262,7 +283,7 @@ class Running:
         sim.guard.go_back()
         self._followed = sim.steps
         self._set_share(0.5 * share)
-        if not self._has_warned:
+        if not self._has_warned and not fault.is_slight:
             self._has_warned = True
             message = (
                 f"the state went wrong by t = {self._wrong_until:.4g} s ({fault.what}); the simulation goes on from "

@@ -28,7 +28,7 @@ DRIFT = 0.5
 MOTION = 0.5
 LITTLE = 0.1
 #: So much of it is let pass where the step may be made shorter.
-STRICT = 0.2
+STRICT = 0.02
 #: So many times as much is let pass where rotations are shared, which have no energy.
 SHARED = 4.0
 #: Displacements beyond so many sizes of the body leave no digit of float32 for its strains.
@@ -43,11 +43,13 @@ class Fault:
         what: In words.
         worlds: In which worlds.
         step: The first step after which it was seen, if that is known.
+        is_slight: Whether the state may still be true, roughly.
     """
 
     what: str
     worlds: npt.NDArray[np.intp]
     step: int | None = None
+    is_slight: bool = False
 
 
 class Guard:
@@ -78,8 +80,8 @@ class Guard:
         shared = any(getattr(field, "rotation_level", None) is not None for field in fields)
         self._leave = SHARED if shared else 1.0
         #: Energy from nowhere between the last two checks on elastic energies, and in all, as shares of what was moved;
-        #: of the world that has most.
-        self.gain, self.surplus = 0.0, 0.0
+        #: of the world that has most; and the same for what fast vibrations err by at any one time.
+        self.gain, self.surplus, self.untimely = 0.0, 0.0, 0.0
         self.restart()
 
     def restart(self) -> None:
@@ -243,11 +245,13 @@ class Guard:
             worlds = np.flatnonzero(bad)
             worst = worlds[np.argmax(gain[worlds])]
             most = f"gravity, loads and supports have moved {scale[worst]:.3g} J at most"
-            return Fault(f"{gain[worst]:.3g} J of energy came from nowhere ({most})", worlds)
+            is_slight = bool((gain[worlds] <= GAIN * self._leave * scale[worlds] + self._floor).all())
+            return Fault(f"{gain[worst]:.3g} J of energy came from nowhere ({most})", worlds, is_slight=is_slight)
         if whole:
             known = 1.0 / np.maximum(scale, 1e-300)
             self.gain = float(np.max(np.maximum(found.exact - given - self._floor, 0.0) * known)) / self._leave
             self.surplus = float(np.max(np.maximum(drift - 10.0 * self._floor, 0.0) * known)) / self._leave
+            self.untimely = float(np.max(np.maximum(found.untimely - self._floor, 0.0) * known)) / self._leave
         self._scale, self._drift = scale, drift
         if whole:
             self._loads = self._loads + found.loads

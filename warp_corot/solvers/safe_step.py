@@ -141,6 +141,12 @@ class SafeStep:
         """The share of what the state allows that is taken after going back; waits for the device."""
         return float(self._control.numpy()[kernels.SHARE])
 
+    @property
+    def shares(self) -> tuple[float, float, float]:
+        """``share``, the step that the state allows and that at rest [s], read at once; waits for the device."""
+        control = self._control.numpy()
+        return float(control[kernels.SHARE]), float(control[kernels.ALLOWED]), float(control[kernels.AT_REST])
+
     @share.setter
     def share(self, value: float) -> None:
         control = self._control.numpy().copy()
