@@ -51,11 +51,27 @@ def probe_directions(
     store_node(f, i, wp.vec3())
 
 
-@wp.func
+#: Bits of floats that are not negative are ordered as the floats are. Threads of a warp find their largest first:
+#: thousands of atomic operations on one address would take longer than all else here.
+_KEEP_LARGEST = """
+    if (!(value > wp::index(largest, place))) return;
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+    const unsigned int together = __activemask();
+    const int most = __reduce_max_sync(together, __float_as_int(value));
+    if (__popc(together & ((1u << (threadIdx.x & 31)) - 1u)) == 0)
+        atomicMax(reinterpret_cast<int*>(&wp::index(largest, place)), most);
+#elif defined(__CUDA_ARCH__)
+    atomicMax(reinterpret_cast<int*>(&wp::index(largest, place)), __float_as_int(value));
+#else
+    wp::index(largest, place) = value;
+#endif
+"""
+
+
+@wp.func_native(_KEEP_LARGEST)
 def keep_largest(value: float, place: int, largest: wp.array[wp.float32]):
-    """Few threads find more than there is, so that few get in one another's way."""
-    if value > largest[place]:
-        wp.atomic_max(largest, place, value)
+    """Let a place hold the largest value, at least zero, that any thread has for it; NaN is left out."""
+    ...
 
 
 @wp.kernel(enable_backward=False)

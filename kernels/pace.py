@@ -12,9 +12,10 @@ wp.set_module_options({"enable_backward": False})
 DONE, DONE_THEN = wp.constant(0), wp.constant(1)
 DT, THEN = wp.constant(0), wp.constant(1)
 #: Places in ``control``: the step that the state allows, the share of it that is taken, the longest step at rest, the
-#: shortest and longest that were taken, and by how much the last change made the step shorter [s].
-ALLOWED, SHARE, AT_REST, SHORTEST, LONGEST, SHORTENED = (wp.constant(k) for k in range(6))
-CONTROLS = 6
+#: shortest and longest that were taken, by how much the last change made the step shorter [s], and how many checks in a
+#: row found the bodies calm.
+ALLOWED, SHARE, AT_REST, SHORTEST, LONGEST, SHORTENED, CALM = (wp.constant(k) for k in range(7))
+CONTROLS = 7
 #: What a gauge finds of a body: the largest curvature [1/s^2], and the largest strain until the next measurement.
 CURVATURE, STRAIN = wp.constant(0), wp.constant(1)
 #: What is known of a body at rest: the largest stable step [s], the curvature that was found there, and the shares of a

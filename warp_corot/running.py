@@ -20,6 +20,9 @@ CHECK_INTERVALS = 16
 STRAINED_INTERVALS = 4
 CLOSE_INTERVALS = 2
 STRAINED = 0.7
+#: Measurements are fewer once the step has been this share of the one at rest, or more, at two checks in a row.
+CALM = 0.95
+CALM_CHECKS = 2
 #: Energy from nowhere that is let pass between two checks, and in all, as shares of what gravity, loads and supports
 #: have moved: the step is made shorter for more than the first, and not longer again before both are kept. Less is let
 #: pass the nearer it is in all to the most there should be.
@@ -32,6 +35,8 @@ RECOVERY = 1.02
 MOST_RETURNS = 6
 #: How often it is halved for a little energy from nowhere, as comes with crushed elements also of the shortest steps.
 STRICT_RETURNS = 4
+#: Steps made one at a time from one look at where nodes are to the next.
+LOOK_STEPS = 256
 #: Longer runs are looked after in between.
 MOST_INTERVALS = 1000
 
@@ -83,12 +88,15 @@ class Running:
                 break
 
     def look(self) -> None:
-        """See that the state is finite.
+        """See that the state is finite, and now and then that nodes are within reach.
 
         Raises:
-            UnstableError: It is not.
+            UnstableError: They are not.
         """
-        fault = self._sim.guard.not_finite()
+        guard = self._sim.guard
+        fault = guard.not_finite()
+        if fault is None and self._sim.steps % LOOK_STEPS == 0:
+            fault = guard.beyond_reach()
         if fault is not None:
             raise UnstableError(self._message(fault))
 
@@ -98,6 +106,7 @@ class Running:
         sim = self._sim
         sim.recorded.adopt_positions()
         sim.guard.begin()
+        self._choose_intervals(checked=False)
 
     def _go(self, most: int, end: float | None) -> bool:
         """Make steps until something is due, and do it; whether the end is reached."""
@@ -108,8 +117,9 @@ class Running:
         reached = self._advance(done, most, end)
         sim.recorded.publish_positions()
         now = self._steps_made = sim.steps
-        passed = self._check(now)
-        self._choose_check_intervals()
+        whole = now % self._check_steps == 0 or bool(self._returns)
+        passed = self._check(now, whole)
+        self._choose_intervals(checked=whole and passed)
         if not passed:
             return False
         if sim.remeshing.is_due(now):
@@ -143,8 +153,7 @@ class Running:
         if sim.safe_step is None:
             sim.recorded.replay_many(most)
             return False
-        if end is None:
-            self._resume()
+        self._resume()
         every, stop = sim.recorded.interval, done + most
         sure = 0
         while done < stop:
@@ -158,6 +167,7 @@ class Running:
                 done += count
                 continue
             if phase == 0:
+                self._resume()
                 sim.recorded.replay(0, measured=True)
             count, reached = self._ending(count, end)
             done += count
@@ -206,15 +216,17 @@ class Running:
         return count
 
     def _resume(self) -> None:
-        """Take the step that the state allows again."""
+        """Take the step that the state allows again.
+
+        Velocities shift neither here nor where the end of a run made the step shorter, so that the two cancel.
+        """
         if self._shortened and self._sim.safe_step is not None:
             self._sim.safe_step.resume()
         self._shortened = False
 
-    def _check(self, now: int) -> bool:
-        """Check the state; False if it was put back."""
+    def _check(self, now: int, whole: bool) -> bool:
+        """Check the state, elastic energies too if asked to; False if it was put back."""
         sim = self._sim
-        whole = now % self._check_steps == 0 or bool(self._returns)
         strict = sim.safe_step is not None and self._returns < STRICT_RETURNS
         fault = sim.guard.check(whole=whole, strict=strict, lenient=sim.safe_step is not None)
         if fault is not None:
@@ -242,10 +254,16 @@ class Running:
         if share != self._share:
             self._set_share(share)
 
-    def _choose_check_intervals(self) -> None:
-        if self._sim.safe_step is None:
+    def _choose_intervals(self, *, checked: bool) -> None:
+        """Look more often where a body is strained, less often where checks on elastic energies have found it calm."""
+        sim = self._sim
+        if sim.safe_step is None:
             return
-        share, allowed, at_rest = self._sim.safe_step.shares
+        share, allowed, at_rest, calm_checks = sim.safe_step.shares
+        calm = min(calm_checks + checked, CALM_CHECKS) if share == 1.0 and allowed >= CALM * at_rest else 0
+        if calm != calm_checks:
+            sim.safe_step.count_calm(calm)
+        sim.recorded.is_calm = calm == CALM_CHECKS
         if share < 1.0:
             self._check_intervals = CLOSE_INTERVALS
         elif allowed < STRAINED * at_rest:
@@ -307,7 +325,7 @@ class Running:
         if any(getattr(model, "rotation_level", None) is not None for model in sim.models):
             return "; shared rotations have no energy, so that strong bending may need rotation_level=None"
         if any(isinstance(model, StVenantKirchhoff) for model in sim.models):
-            return "; StVenantKirchhoff does not resist being crushed: take NeoHookean or Corotated, or damping"
+            return "; StVenantKirchhoff has no energy barrier against being crushed: take NeoHookean or Corotated"
         if sim.safe_step is None:
             return ": take a shorter step, or dt=None, which follows the state"
         return f"; {MOST_RETURNS} times half the step did not help: look for loads or motions that crush the body"

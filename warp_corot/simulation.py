@@ -172,7 +172,9 @@ class Simulation:
 
         Raises:
             InputError: Somebody is capturing, and there are bodies to be remeshed.
-            UnstableError: On the CPU: the state is not finite any more. Nothing is made again here: ``advance`` does.
+            UnstableError: On the CPU: the state is not finite any more, or nodes are far beyond reach, which is looked
+                at every few hundred steps. No step is made again here, as ``advance`` does, and energies are not looked
+                at, since users may write to the state between steps.
         """
         if self.device.is_capturing:
             if self.remeshing.every:

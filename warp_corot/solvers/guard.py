@@ -145,6 +145,10 @@ class Guard:
         """Whether the state is not finite: the least that there is to look at."""
         return self._not_finite()
 
+    def beyond_reach(self) -> Fault | None:
+        """Whether nodes are where they cannot be: what can be seen of a state that users may write to."""
+        return self._beyond_reach(self._find(whole=False))
+
     @property
     def state(self) -> dict[str, Floats]:
         """What a run that goes on needs besides the present state."""

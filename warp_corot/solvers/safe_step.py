@@ -89,7 +89,7 @@ class SafeStep:
             control[kernels.ALLOWED] *= longest / before
         else:
             control[:] = longest
-            control[kernels.SHARE] = 1.0
+            control[kernels.SHARE], control[kernels.SHORTENED], control[kernels.CALM] = 1.0, 0.0, 0.0
         control[kernels.AT_REST] = longest
         self._control.assign(control)
         self.resume()
@@ -100,6 +100,7 @@ class SafeStep:
             gauge.restart()
         control = self._control.numpy().copy()
         control[kernels.ALLOWED], control[kernels.SHARE] = control[kernels.AT_REST], 1.0
+        control[kernels.CALM] = 0.0
         self._control.assign(control)
         self.resume()
 
@@ -142,10 +143,16 @@ class SafeStep:
         return float(self._control.numpy()[kernels.SHARE])
 
     @property
-    def shares(self) -> tuple[float, float, float]:
-        """``share``, the step that the state allows and that at rest [s], read at once; waits for the device."""
+    def shares(self) -> tuple[float, float, float, int]:
+        """``share``, the step that the state allows and that at rest [s], and how many checks in a row found the bodies
+        calm, read at once; waits for the device."""
         control = self._control.numpy()
-        return float(control[kernels.SHARE]), float(control[kernels.ALLOWED]), float(control[kernels.AT_REST])
+        share, allowed, at_rest = (float(control[k]) for k in (kernels.SHARE, kernels.ALLOWED, kernels.AT_REST))
+        return share, allowed, at_rest, int(control[kernels.CALM])
+
+    def count_calm(self, checks: int) -> None:
+        """Note how many checks in a row found the bodies calm."""
+        self._control[kernels.CALM : kernels.CALM + 1].fill_(float(checks))
 
     @share.setter
     def share(self, value: float) -> None:
