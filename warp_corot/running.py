@@ -15,11 +15,13 @@ if TYPE_CHECKING:
     from .simulation import Simulation
 
 #: Measurements from one check with elastic energies to the next: for a body that stays as stiff as at rest, for one
-#: that is strained so that its step is less than a share of that at rest, and while less than what is stable is taken.
+#: that is strained so that its step is less than a share of that at rest, and while less than what is stable is taken
+#: or a strained body errs by more than QUIET of what is let pass.
 CHECK_INTERVALS = 16
 STRAINED_INTERVALS = 4
 CLOSE_INTERVALS = 2
 STRAINED = 0.7
+QUIET = 0.25
 #: Measurements are fewer once the step has been this share of the one at rest, or more, at two checks in a row.
 CALM = 0.95
 CALM_CHECKS = 2
@@ -267,7 +269,8 @@ class Running:
         if share < 1.0:
             self._check_intervals = CLOSE_INTERVALS
         elif allowed < STRAINED * at_rest:
-            self._check_intervals = STRAINED_INTERVALS
+            quiet = max(sim.guard.gain / GAIN, sim.guard.untimely / SURPLUS) < QUIET
+            self._check_intervals = STRAINED_INTERVALS if quiet else CLOSE_INTERVALS
         else:
             self._check_intervals = CHECK_INTERVALS
 

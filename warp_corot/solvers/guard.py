@@ -80,8 +80,9 @@ class Guard:
         shared = any(getattr(field, "rotation_level", None) is not None for field in fields)
         self._leave = SHARED if shared else 1.0
         #: Energy from nowhere between the last two checks on elastic energies, and in all, as shares of what was moved;
-        #: of the world that has most; and the same for what fast vibrations err by at any one time.
-        self.gain, self.surplus, self.untimely = 0.0, 0.0, 0.0
+        #: of the world that has most; and the same for what fast vibrations err by at any one time. Infinite while no
+        #: check has found them.
+        self.gain = self.surplus = self.untimely = np.inf
         self.restart()
 
     def restart(self) -> None:
@@ -89,6 +90,7 @@ class Guard:
         self._reference = None
         self._scale, self._drift, self._loads = (np.zeros(self.worlds) for _ in range(3))
         self._height = np.zeros(self.worlds)
+        self.gain = self.surplus = self.untimely = np.inf
         self._floor: Floats | None = None
 
     def forget(self) -> None:
@@ -227,6 +229,7 @@ class Guard:
         before = self._reference
         assert before is not None
         if not self._balance.is_closed:
+            self.gain = self.surplus = self.untimely = 0.0
             return None
         if self._floor is None:
             self._floor = self._balance.rounding()

@@ -142,6 +142,13 @@ class SafeStep:
         """The share of what the state allows that is taken after going back; waits for the device."""
         return float(self._control.numpy()[kernels.SHARE])
 
+    @share.setter
+    def share(self, value: float) -> None:
+        control = self._control.numpy().copy()
+        control[kernels.SHARE] = value
+        control[kernels.SHORTEST] = min(control[kernels.SHORTEST], value * control[kernels.ALLOWED])
+        self._control.assign(control)
+
     @property
     def shares(self) -> tuple[float, float, float, int]:
         """``share``, the step that the state allows and that at rest [s], and how many checks in a row found the bodies
@@ -153,13 +160,6 @@ class SafeStep:
     def count_calm(self, checks: int) -> None:
         """Note how many checks in a row found the bodies calm."""
         self._control[kernels.CALM : kernels.CALM + 1].fill_(float(checks))
-
-    @share.setter
-    def share(self, value: float) -> None:
-        control = self._control.numpy().copy()
-        control[kernels.SHARE] = value
-        control[kernels.SHORTEST] = min(control[kernels.SHORTEST], value * control[kernels.ALLOWED])
-        self._control.assign(control)
 
     @property
     def state(self) -> dict[str, wp.array]:
