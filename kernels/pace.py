@@ -12,10 +12,10 @@ wp.set_module_options({"enable_backward": False})
 DONE, DONE_THEN = wp.constant(0), wp.constant(1)
 DT, THEN = wp.constant(0), wp.constant(1)
 #: Places in ``control``: the step that the state allows, the share of it that is taken, the longest step at rest, the
-#: shortest and longest that were taken, by how much the last change made the step shorter [s], and how many checks in a
-#: row found the bodies calm.
-ALLOWED, SHARE, AT_REST, SHORTEST, LONGEST, SHORTENED, CALM = (wp.constant(k) for k in range(7))
-CONTROLS = 7
+#: shortest and longest that were taken, by how much the last change made the step shorter [s], how many checks in a row
+#: found the bodies calm, and whether velocities are a user's, which belong to no step before.
+ALLOWED, SHARE, AT_REST, SHORTEST, LONGEST, SHORTENED, CALM, GIVEN = (wp.constant(k) for k in range(8))
+CONTROLS = 8
 #: What a gauge finds of a body: the largest curvature [1/s^2], and the largest strain until the next measurement.
 CURVATURE, STRAIN = wp.constant(0), wp.constant(1)
 #: What is known of a body at rest: the largest stable step [s], the curvature that was found there, and the shares of a
@@ -86,6 +86,8 @@ def safe_step(at_rest: wp.array2d[wp.float64], found: wp.array2d[wp.float32], bo
 def take_allowed_step(control: wp.array[wp.float64], pace: Pace):
     dt = wp.max(control[SHARE] * control[ALLOWED], LEAST * control[AT_REST])
     control[SHORTENED] = pace.seconds[DT] - dt
+    if control[GIVEN] != wp.float64(0.0):
+        control[SHORTENED] = wp.float64(0.0)
     control[SHORTEST] = wp.min(control[SHORTEST], dt)
     control[LONGEST] = wp.max(control[LONGEST], dt)
     change_step(pace, dt)
@@ -109,6 +111,7 @@ def take_safe_step(
         found[body, STRAIN] = 0.0
     control[ALLOWED] = wp.min(wp.max(safe, LEAST * longest), GROWTH * control[ALLOWED])
     take_allowed_step(control, pace)
+    control[GIVEN] = wp.float64(0.0)
 
 
 @wp.kernel(enable_backward=False)

@@ -62,7 +62,7 @@ class Running:
         self._steps_made = 0
         #: Steps done when the share of the step was last looked at.
         self._followed = 0
-        self._check_intervals = CHECK_INTERVALS
+        self._check_intervals = CLOSE_INTERVALS
 
     def step(self) -> None:
         """Make one step, with a measurement before it where one is due."""
@@ -107,8 +107,18 @@ class Running:
     def _begin(self) -> None:
         sim = self._sim
         sim.recorded.adopt_positions()
-        sim.guard.begin()
-        self._choose_intervals(checked=False)
+        self._take()
+        if sim.safe_step is not None and math.isinf(sim.guard.gain):
+            # New, reset or loaded: nothing is known of it but how calm it was.
+            self._followed = sim.steps
+            self._check_intervals = CLOSE_INTERVALS
+            sim.recorded.is_calm = sim.safe_step.shares[3] == CALM_CHECKS
+
+    def _take(self) -> None:
+        """Take the present state for good, which a user may have written."""
+        sim = self._sim
+        if sim.guard.begin() and sim.safe_step is not None:
+            sim.safe_step.take_given()
 
     def _go(self, most: int, end: float | None) -> bool:
         """Make steps until something is due, and do it; whether the end is reached."""
@@ -121,18 +131,20 @@ class Running:
         now = self._steps_made = sim.steps
         whole = now % self._check_steps == 0 or bool(self._returns)
         passed = self._check(now, whole)
-        self._choose_intervals(checked=whole and passed)
+        # Where short runs end does not count: the same run in one would take other steps.
+        if whole or not passed:
+            self._choose_intervals(checked=passed)
         if not passed:
             return False
         if sim.remeshing.is_due(now):
             sim.follow_motion()
             sim.guard.forget()
-            sim.guard.begin()
+            self._take()
         if any(now % every == 0 for every in sim.hook_intervals) and sim.total_steps > self._steps_called:
             self._steps_called = sim.total_steps
             sim.call_hooks()
             sim.recorded.adopt_positions()
-            sim.guard.begin()
+            self._take()
         return reached
 
     def _until_due(self, done: int) -> int:

@@ -28,7 +28,7 @@ DRIFT = 0.5
 MOTION = 0.5
 LITTLE = 0.1
 #: So much of it is let pass where the step may be made shorter.
-STRICT = 0.02
+STRICT = 0.1
 #: So many times as much is let pass where rotations are shared, which have no energy.
 SHARED = 4.0
 #: Displacements beyond so many sizes of the body leave no digit of float32 for its strains.
@@ -97,15 +97,20 @@ class Guard:
         """The next state is taken for good: it does not follow from the last one."""
         self._reference = None
 
-    def begin(self) -> None:
-        """Take the present state for good if it is not the one that was checked last: a user may have written to it."""
-        if self._reference is None or self._has_changed():
+    def begin(self) -> bool:
+        """Take the present state for good if it is not the one that was checked last: a user may have written to it.
+
+        Returns whether it is another.
+        """
+        changed = self._reference is None or self._has_changed()
+        if changed:
             self._reference = None
             self.context.support_work.zero_()
             found = self._find(whole=True)
             self._loads, self._height = np.zeros(self.worlds), found.gravitational
             self._scale = np.maximum(self._scale, np.abs(found.exact))
             self._keep(found)
+        return changed
 
     def check(self, *, whole: bool, strict: bool = False, lenient: bool = False) -> Fault | None:
         """Look at the present state; a good one is kept.
@@ -121,7 +126,8 @@ class Guard:
             return fault
         assert self._reference is not None
         found = self._find(whole=whole)
-        leave = self._leave * (STRICT if strict else 1.0)
+        # What is looked at besides, at the end of a short run, must not change where that run was made in one.
+        leave = self._leave * (STRICT if strict and whole else 1.0)
         fault = self._beyond_reach(found) or self._from_nowhere(found, whole, leave, lenient)
         if fault is not None and not whole:
             whole, found = True, self._find(whole=True)

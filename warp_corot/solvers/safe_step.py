@@ -90,9 +90,11 @@ class SafeStep:
         else:
             control[:] = longest
             control[kernels.SHARE], control[kernels.SHORTENED], control[kernels.CALM] = 1.0, 0.0, 0.0
+            control[kernels.GIVEN] = 0.0
         control[kernels.AT_REST] = longest
         self._control.assign(control)
         self.resume()
+        self.take_given()
 
     def restart(self) -> None:
         """Begin again with the step at rest."""
@@ -103,6 +105,7 @@ class SafeStep:
         control[kernels.CALM] = 0.0
         self._control.assign(control)
         self.resume()
+        self.take_given()
 
     def launch(self, ahead: int) -> None:
         """Measure, and take a step that is safe for ``ahead`` steps; may be recorded.
@@ -156,6 +159,10 @@ class SafeStep:
         control = self._control.numpy()
         share, allowed, at_rest = (float(control[k]) for k in (kernels.SHARE, kernels.ALLOWED, kernels.AT_REST))
         return share, allowed, at_rest, int(control[kernels.CALM])
+
+    def take_given(self) -> None:
+        """Let the next change of the step leave velocities as they are: a user gave them."""
+        self._control[kernels.GIVEN : kernels.GIVEN + 1].fill_(1.0)
 
     def count_calm(self, checks: int) -> None:
         """Note how many checks in a row found the bodies calm."""
