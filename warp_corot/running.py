@@ -31,6 +31,7 @@ CALM_CHECKS = 2
 GAIN = 0.001
 SURPLUS = 0.004
 MOST_SURPLUS = 0.008
+LEAST_LEAVE = 0.02
 #: Growth of the step's share from one measurement to the next: from a half to the whole in 35 of them.
 RECOVERY = 1.02
 #: How often the step is halved to come over one place.
@@ -259,7 +260,7 @@ class Running:
         share = self._share
         intervals = (now - self._followed) / sim.recorded.interval
         self._followed = now
-        gain = GAIN * max(1.0 - sim.guard.surplus / MOST_SURPLUS, 0.1)
+        gain = GAIN * max(1.0 - sim.guard.surplus / MOST_SURPLUS, LEAST_LEAVE)
         excess = max(sim.guard.gain / gain, sim.guard.untimely / SURPLUS)
         if excess > 1.0:
             share *= max(1.0 / math.sqrt(excess), 0.5)

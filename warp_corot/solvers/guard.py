@@ -28,7 +28,7 @@ DRIFT = 0.5
 MOTION = 0.5
 LITTLE = 0.1
 #: So much of it is let pass where the step may be made shorter.
-STRICT = 0.1
+STRICT = 0.2
 #: So many times as much is let pass where rotations are shared, which have no energy.
 SHARED = 4.0
 #: Displacements beyond so many sizes of the body leave no digit of float32 for its strains.
