@@ -13,9 +13,12 @@ DONE, DONE_THEN = wp.constant(0), wp.constant(1)
 DT, THEN = wp.constant(0), wp.constant(1)
 #: Places in ``control``: the step that the state allows, the share of it that is taken, the longest step at rest, the
 #: shortest and longest that were taken, by how much the last change made the step shorter [s], how many checks in a row
-#: found the bodies calm, and whether velocities are a user's, which belong to no step before.
-ALLOWED, SHARE, AT_REST, SHORTEST, LONGEST, SHORTENED, CALM, GIVEN = (wp.constant(k) for k in range(8))
-CONTROLS = 8
+#: found the bodies calm, whether velocities are a user's, which belong to no step before, how many
+#: intervals there are from one check on energies to the next, and the steps done at the last one.
+ALLOWED, SHARE, AT_REST, SHORTEST, LONGEST, SHORTENED, CALM, GIVEN, CLOSENESS, FOLLOWED = (
+    wp.constant(k) for k in range(10)
+)
+CONTROLS = 10
 #: What a gauge finds of a body: the largest curvature [1/s^2], and the largest strain until the next measurement.
 CURVATURE, STRAIN = wp.constant(0), wp.constant(1)
 #: What is known of a body at rest: the largest stable step [s], the curvature that was found there, and the shares of a

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from .elasticity import StVenantKirchhoff
 from .errors import StabilityWarning, UnstableError, depth_of_user
-from .kernels.pace import GROWTH
+from .kernels.pace import GROWTH, LEAST
 from .solvers.guard import Fault
 
 if TYPE_CHECKING:
@@ -109,11 +109,10 @@ class Running:
         sim = self._sim
         sim.recorded.adopt_positions()
         self._take()
-        if sim.safe_step is not None and math.isinf(sim.guard.gain):
-            # New, reset or loaded: nothing is known of it but how calm it was.
-            self._followed = sim.steps
-            self._check_intervals = CLOSE_INTERVALS
-            sim.recorded.is_calm = sim.safe_step.shares[3] == CALM_CHECKS
+        if sim.safe_step is not None:
+            calm, intervals, self._followed = sim.safe_step.schedule
+            self._check_intervals = intervals or CLOSE_INTERVALS
+            sim.recorded.is_calm = calm == CALM_CHECKS
 
     def _take(self) -> None:
         """Take the present state for good, which a user may have written."""
@@ -274,10 +273,9 @@ class Running:
         sim = self._sim
         if sim.safe_step is None:
             return
-        share, allowed, at_rest, calm_checks = sim.safe_step.shares
-        calm = min(calm_checks + checked, CALM_CHECKS) if share == 1.0 and allowed >= CALM * at_rest else 0
-        if calm != calm_checks:
-            sim.safe_step.count_calm(calm)
+        share, allowed, at_rest = sim.safe_step.shares
+        before = sim.safe_step.schedule
+        calm = min(before[0] + checked, CALM_CHECKS) if share == 1.0 and allowed >= CALM * at_rest else 0
         sim.recorded.is_calm = calm == CALM_CHECKS
         if share < 1.0:
             self._check_intervals = CLOSE_INTERVALS
@@ -286,6 +284,8 @@ class Running:
             self._check_intervals = STRAINED_INTERVALS if quiet else CLOSE_INTERVALS
         else:
             self._check_intervals = CHECK_INTERVALS
+        if before != (chosen := (calm, self._check_intervals, self._followed)):
+            sim.safe_step.schedule = chosen
 
     @property
     def _share(self) -> float:
@@ -295,7 +295,7 @@ class Running:
         """Take another share of the step that the state allows from here on."""
         sim = self._sim
         assert sim.safe_step is not None
-        sim.safe_step.share = share
+        sim.safe_step.share = max(share, float(LEAST))
         sim.recorded.retime()
         sim.guard.settle()
 

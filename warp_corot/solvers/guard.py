@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,7 +28,7 @@ DRIFT = 0.5
 MOTION = 0.5
 LITTLE = 0.1
 #: So much of it is let pass where the step may be made shorter.
-STRICT = 0.2
+STRICT = 0.02
 #: So many times as much is let pass where rotations are shared, which have no energy.
 SHARED = 4.0
 #: Displacements beyond so many sizes of the body leave no digit of float32 for its strains.
@@ -89,7 +89,8 @@ class Guard:
         """Forget all: the next state is taken for good."""
         self._reference = None
         self._scale, self._drift, self._loads = (np.zeros(self.worlds) for _ in range(3))
-        self._height = np.zeros(self.worlds)
+        self._height, self._loads_before = np.zeros(self.worlds), np.zeros(self.worlds)
+        self._counted: Floats | None = None
         self.gain = self.surplus = self.untimely = np.inf
         self._floor: Floats | None = None
 
@@ -107,10 +108,20 @@ class Guard:
             self._reference = None
             self.context.support_work.zero_()
             found = self._find(whole=True)
-            self._loads, self._height = np.zeros(self.worlds), found.gravitational
-            self._scale = np.maximum(self._scale, np.abs(found.exact))
+            if self._counted is not None:
+                found, changed = self._counted_on(found, self._counted), False
+            else:
+                self._loads, self._height = np.zeros(self.worlds), found.gravitational
+                self._loads_before = np.zeros(self.worlds)
+                self._scale = np.maximum(self._scale, np.abs(found.exact))
+            self._counted = None
             self._keep(found)
         return changed
+
+    def _counted_on(self, found: Energies, counted: Floats) -> Energies:
+        """What a run that goes on counts from, which a checkpoint brought."""
+        exact, gravitational, supports, self._loads_before, self._height, self._loads = counted
+        return replace(found, exact=exact, gravitational=gravitational, supports=supports)
 
     def check(self, *, whole: bool, strict: bool = False, lenient: bool = False) -> Fault | None:
         """Look at the present state; a good one is kept.
@@ -160,11 +171,20 @@ class Guard:
     @property
     def state(self) -> dict[str, Floats]:
         """What a run that goes on needs besides the present state."""
-        return {"scale": self._scale, "drift": self._drift}
+        counted = np.full((6, self.worlds), np.nan)
+        before = self._reference
+        if before is not None and not self._has_changed():
+            now = self._find(whole=False)
+            supports = before.supports - now.supports
+            loads = self._loads_before + now.loads
+            counted[:] = before.exact, before.gravitational, supports, loads, self._height, self._loads
+        return {"scale": self._scale, "drift": self._drift, "counted": counted}
 
-    def resume(self, *, scale: Floats, drift: Floats) -> None:
+    def resume(self, *, scale: Floats, drift: Floats, counted: Floats) -> None:
         """Go on from what ``state`` gave."""
         self._scale, self._drift = np.array(scale, float), np.array(drift, float)
+        if np.isfinite(counted).all():
+            self._counted = np.array(counted, float)
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
@@ -240,9 +260,10 @@ class Guard:
         if self._floor is None:
             self._floor = self._balance.rounding()
         fallen = before.gravitational - found.gravitational
-        given = before.exact + fallen + found.loads + found.supports - before.supports
+        loads = self._loads_before + found.loads
+        given = before.exact + fallen + loads + found.supports - before.supports
         # What has come from nowhere is no measure of what may.
-        moved = np.abs(self._height - found.gravitational) + np.abs(self._loads + found.loads)
+        moved = np.abs(self._height - found.gravitational) + np.abs(self._loads + loads)
         scale = np.maximum(self._scale, moved + found.supports_absolute)
         # Elastic energies are never negative.
         gain = found.kinetic - given
@@ -267,5 +288,6 @@ class Guard:
             self.untimely = float(np.max(np.maximum(found.untimely - self._floor, 0.0) * known)) / self._leave
         self._scale, self._drift = scale, drift
         if whole:
-            self._loads = self._loads + found.loads
+            self._loads = self._loads + loads
+            self._loads_before = np.zeros(self.worlds)
         return None

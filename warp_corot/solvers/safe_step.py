@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 #: measurement takes about as long as a step.
 INTERVAL = 32
 BLOCK_INTERVAL = 128
+_SCHEDULE = [int(kernels.CALM), int(kernels.CLOSENESS), int(kernels.FOLLOWED)]
 #: The step where nothing can vibrate [s].
 ANY_STEP = 1e-3
 
@@ -89,8 +90,8 @@ class SafeStep:
             control[kernels.ALLOWED] *= longest / before
         else:
             control[:] = longest
-            control[kernels.SHARE], control[kernels.SHORTENED], control[kernels.CALM] = 1.0, 0.0, 0.0
-            control[kernels.GIVEN] = 0.0
+            control[kernels.SHARE], control[kernels.SHORTENED], control[kernels.GIVEN] = 1.0, 0.0, 0.0
+            control[_SCHEDULE] = 0.0
         control[kernels.AT_REST] = longest
         self._control.assign(control)
         self.resume()
@@ -102,7 +103,7 @@ class SafeStep:
             gauge.restart()
         control = self._control.numpy().copy()
         control[kernels.ALLOWED], control[kernels.SHARE] = control[kernels.AT_REST], 1.0
-        control[kernels.CALM] = 0.0
+        control[_SCHEDULE] = 0.0
         self._control.assign(control)
         self.resume()
         self.take_given()
@@ -153,20 +154,27 @@ class SafeStep:
         self._control.assign(control)
 
     @property
-    def shares(self) -> tuple[float, float, float, int]:
-        """``share``, the step that the state allows and that at rest [s], and how many checks in a row found the bodies
-        calm, read at once; waits for the device."""
+    def shares(self) -> tuple[float, float, float]:
+        """``share``, the step that the state allows and that at rest [s], read at once; waits for the device."""
         control = self._control.numpy()
-        share, allowed, at_rest = (float(control[k]) for k in (kernels.SHARE, kernels.ALLOWED, kernels.AT_REST))
-        return share, allowed, at_rest, int(control[kernels.CALM])
+        return float(control[kernels.SHARE]), float(control[kernels.ALLOWED]), float(control[kernels.AT_REST])
+
+    @property
+    def schedule(self) -> tuple[int, int, int]:
+        """How many checks in a row found the bodies calm, measurements from one check on energies to the next (zero if
+        none was chosen), and steps done at the last one; waits for the device."""
+        calm, intervals, steps = self._control.numpy()[_SCHEDULE]
+        return int(calm), int(intervals), int(steps)
+
+    @schedule.setter
+    def schedule(self, value: tuple[int, int, int]) -> None:
+        control = self._control.numpy().copy()
+        control[_SCHEDULE] = value
+        self._control.assign(control)
 
     def take_given(self) -> None:
         """Let the next change of the step leave velocities as they are: a user gave them."""
         self._control[kernels.GIVEN : kernels.GIVEN + 1].fill_(1.0)
-
-    def count_calm(self, checks: int) -> None:
-        """Note how many checks in a row found the bodies calm."""
-        self._control[kernels.CALM : kernels.CALM + 1].fill_(float(checks))
 
     @property
     def state(self) -> dict[str, wp.array]:
