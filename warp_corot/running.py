@@ -32,6 +32,8 @@ GAIN = 0.001
 SURPLUS = 0.004
 MOST_SURPLUS = 0.008
 LEAST_LEAVE = 0.02
+#: What vibrations err by at any one time does not add up: it alone makes the share no smaller than this.
+RINGING = 0.3
 #: Growth of the step's share from one measurement to the next: from a half to the whole in 35 of them.
 RECOVERY = 1.02
 #: How often the step is halved to come over one place.
@@ -260,9 +262,11 @@ class Running:
         intervals = (now - self._followed) / sim.recorded.interval
         self._followed = now
         gain = GAIN * max(1.0 - sim.guard.surplus / MOST_SURPLUS, LEAST_LEAVE)
-        excess = max(sim.guard.gain / gain, sim.guard.untimely / SURPLUS)
-        if excess > 1.0:
-            share *= max(1.0 / math.sqrt(excess), 0.5)
+        late, more = sim.guard.untimely / SURPLUS, sim.guard.gain / gain
+        if late > 1.0 or more > 1.0:
+            least = min(share, RINGING)
+            share *= max(1.0 / math.sqrt(max(more, 1.0)), 0.5)
+            share = min(share, max(share / math.sqrt(max(late, 1.0)), least))
         elif sim.guard.surplus + sim.guard.untimely <= SURPLUS:
             share = min(share * RECOVERY**intervals, 1.0)
         if share != self._share:
