@@ -11,8 +11,8 @@ from .pace import DT, Pace
 wp.set_module_options({"enable_backward": False})
 
 #: Columns of ``sums``.
-KINETIC, AHEAD, GRAVITATIONAL, LOADS, SUPPORTS, REACH, ELASTIC = (wp.constant(k) for k in range(7))
-COLUMNS = 7
+KINETIC, AHEAD, GRAVITATIONAL, LOADS, SUPPORTS, REACH, ELASTIC, UNTIMELY = (wp.constant(k) for k in range(8))
+COLUMNS = 8
 
 
 @wp.func
@@ -45,7 +45,7 @@ def sum_nodes(
     step ahead are known too, and v_behind . M v_ahead / 2, kinetic energy and ``AHEAD``, is what symplectic Euler keeps
     exactly with the elastic energy where forces are linear: also beyond the stable step, where it need not be positive.
     The work of supports that ``add_support_work`` has added up counts half of f's share too early; that half is
-    ``SUPPORTS``.
+    ``SUPPORTS``. Velocities at the time of the displacements, halfway, have ``UNTIMELY`` more than that product.
     """
     world, part = wp.tid()
     kinetic = wp.float64(0.0)
@@ -53,6 +53,7 @@ def sum_nodes(
     gravitational = wp.float64(0.0)
     work = wp.float64(0.0)
     supports = wp.float64(0.0)
+    untimely = wp.float64(0.0)
     reach = wp.float64(0.0)
     k = part
     while k < count:
@@ -65,12 +66,15 @@ def sum_nodes(
             supports -= wp.float64(0.5) * pace.seconds[DT] * dot64(force, velocity)
         else:
             m = wp.float64(mass[i])
+            pull = wp.vec3d(force) + m * wp.vec3d(gravity)
             power = dot64(force, velocity) + m * dot64(gravity, velocity)
             if has_load != 0:
                 external = vector_at(load, i)
+                pull += wp.vec3d(external)
                 power += dot64(external, velocity)
                 work += dot64(external, x) - dot64(external, load_node(u_before, i))
             ahead += wp.float64(0.5) * pace.seconds[DT] * power
+            untimely += wp.dot(pull, pull) / m
             kinetic += wp.float64(0.5) * m * dot64(velocity, velocity)
             gravitational -= m * dot64(gravity, x)
         k += sums.shape[1]
@@ -79,6 +83,8 @@ def sum_nodes(
     sums[world, part, GRAVITATIONAL] = sums[world, part, GRAVITATIONAL] + gravitational
     sums[world, part, LOADS] = sums[world, part, LOADS] + work
     sums[world, part, SUPPORTS] = sums[world, part, SUPPORTS] + supports
+    untimely *= wp.float64(0.125) * pace.seconds[DT] * pace.seconds[DT]
+    sums[world, part, UNTIMELY] = sums[world, part, UNTIMELY] + untimely
     sums[world, part, REACH] = wp.max(sums[world, part, REACH], reach)
 
 

@@ -14,7 +14,8 @@ from typing import Any
 import warp as wp
 
 from .elements import frame, load_node, local_gradient, store_node
-from .pace import CURVATURE, DONE, DT, STRAIN, Pace
+from .integrate import by_vectors, vector_at
+from .pace import CURVATURE, DONE, DT, SHORTENED, STRAIN, Pace
 
 wp.set_module_options({"enable_backward": False})
 
@@ -50,11 +51,27 @@ def probe_directions(
     store_node(f, i, wp.vec3())
 
 
-@wp.func
+#: Bits of floats that are not negative are ordered as the floats are. Threads of a warp find their largest first:
+#: thousands of atomic operations on one address would take longer than all else here.
+_KEEP_LARGEST = """
+    if (!(value > wp::index(largest, place))) return;
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+    const unsigned int together = __activemask();
+    const int most = __reduce_max_sync(together, __float_as_int(value));
+    if (__popc(together & ((1u << (threadIdx.x & 31)) - 1u)) == 0)
+        atomicMax(reinterpret_cast<int*>(&wp::index(largest, place)), most);
+#elif defined(__CUDA_ARCH__)
+    atomicMax(reinterpret_cast<int*>(&wp::index(largest, place)), __float_as_int(value));
+#else
+    wp::index(largest, place) = value;
+#endif
+"""
+
+
+@wp.func_native(_KEEP_LARGEST)
 def keep_largest(value: float, place: int, largest: wp.array[wp.float32]):
-    """Few threads find more than there is, so that few get in one another's way."""
-    if value > largest[place]:
-        wp.atomic_max(largest, place, value)
+    """Let a place hold the largest value, at least zero, that any thread has for it; NaN is left out."""
+    ...
 
 
 @wp.kernel(enable_backward=False)
@@ -122,3 +139,34 @@ def find_strains(Elements: Any) -> wp.Kernel:
         keep_largest(most, STRAIN, found)
 
     return find_strains
+
+
+@wp.kernel(enable_backward=False)
+def shift_velocities(
+    # In
+    gravity: wp.vec3,
+    inverse_mass: wp.array[wp.float32],
+    has_load: int,
+    load: wp.array[Any],
+    f: wp.array[wp.vec4],
+    control: wp.array[wp.float64],
+    # In and out
+    v: wp.array[wp.vec4],
+):
+    """Let velocities, which are half a step behind, be half of the new step behind.
+
+    The scheme stays of second order where the step changes. Without this, steps that get shorter as a body stiffens and
+    longer as it springs back give it energy at every bounce.
+    """
+    i = wp.tid()
+    w = inverse_mass[i]
+    shortened = float(control[SHORTENED])
+    if w == 0.0 or shortened == 0.0:
+        return
+    force = load_node(f, i)
+    if has_load != 0:
+        force += vector_at(load, i)
+    store_node(v, i, load_node(v, i) + 0.5 * shortened * (w * force + gravity))
+
+
+SHIFT_VELOCITIES = by_vectors(shift_velocities, "load")

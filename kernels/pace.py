@@ -11,10 +11,14 @@ wp.set_module_options({"enable_backward": False})
 #: Places in ``Pace.counts`` and ``Pace.seconds``.
 DONE, DONE_THEN = wp.constant(0), wp.constant(1)
 DT, THEN = wp.constant(0), wp.constant(1)
-#: Places in ``control``: the step that the state allows, the share of it that is taken after going back, the longest
-#: step at rest, and the shortest and longest that were taken [s].
-ALLOWED, SHARE, AT_REST, SHORTEST, LONGEST = (wp.constant(k) for k in range(5))
-CONTROLS = 5
+#: Places in ``control``: the step that the state allows, the share of it that is taken, the longest step at rest, the
+#: shortest and longest that were taken, by how much the last change made the step shorter [s], how many checks in a row
+#: found the bodies calm, whether velocities are a user's, which belong to no step before, how many
+#: intervals there are from one check on energies to the next, and the steps done at the last one.
+ALLOWED, SHARE, AT_REST, SHORTEST, LONGEST, SHORTENED, CALM, GIVEN, CLOSENESS, FOLLOWED = (
+    wp.constant(k) for k in range(10)
+)
+CONTROLS = 10
 #: What a gauge finds of a body: the largest curvature [1/s^2], and the largest strain until the next measurement.
 CURVATURE, STRAIN = wp.constant(0), wp.constant(1)
 #: What is known of a body at rest: the largest stable step [s], the curvature that was found there, and the shares of a
@@ -25,10 +29,8 @@ STABLE, REST_CURVATURE, SAFE, SAFE_STRAINED = (wp.constant(k) for k in range(4))
 SMALL, LARGE = wp.constant(wp.float64(0.1)), wp.constant(wp.float64(0.4))
 #: Growth of the step from one measurement to the next at most: what was stiff a moment ago may soon be so again.
 GROWTH = wp.constant(wp.float64(1.05))
-#: The same for the share: from a half to the whole in 35 measurements.
-RECOVERY = wp.constant(wp.float64(1.02))
-#: The step that the state allows is at least this share of that at rest.
-LEAST = wp.constant(wp.float64(0.02))
+#: No step is shorter than this share of that at rest.
+LEAST = wp.constant(wp.float64(0.002))
 
 
 @wp.struct
@@ -85,7 +87,10 @@ def safe_step(at_rest: wp.array2d[wp.float64], found: wp.array2d[wp.float32], bo
 
 @wp.func
 def take_allowed_step(control: wp.array[wp.float64], pace: Pace):
-    dt = control[SHARE] * control[ALLOWED]
+    dt = wp.max(control[SHARE] * control[ALLOWED], LEAST * control[AT_REST])
+    control[SHORTENED] = pace.seconds[DT] - dt
+    if control[GIVEN] != wp.float64(0.0):
+        control[SHORTENED] = wp.float64(0.0)
     control[SHORTEST] = wp.min(control[SHORTEST], dt)
     control[LONGEST] = wp.max(control[LONGEST], dt)
     change_step(pace, dt)
@@ -108,11 +113,11 @@ def take_safe_step(
         found[body, CURVATURE] = 0.0
         found[body, STRAIN] = 0.0
     control[ALLOWED] = wp.min(wp.max(safe, LEAST * longest), GROWTH * control[ALLOWED])
-    control[SHARE] = wp.min(RECOVERY * control[SHARE], wp.float64(1.0))
     take_allowed_step(control, pace)
+    control[GIVEN] = wp.float64(0.0)
 
 
 @wp.kernel(enable_backward=False)
 def resume_step(control: wp.array[wp.float64], pace: Pace):
     """Take the step that the state allows again, after others that ended at a given time."""
-    change_step(pace, control[SHARE] * control[ALLOWED])
+    take_allowed_step(control, pace)

@@ -18,8 +18,9 @@ wp.set_module_options({"enable_backward": False})
 #: Subtrees that one thread looks after; ``flagged`` has a multiple of these.
 SUBTREES = 8
 LEAVES = 8
-#: Threads of a block that goes through a list.
+#: Threads of a block that goes through a list, and of a warp.
 LIST_BLOCK = 128
+WARP = 32
 
 
 add_neighbours = add_four_forces(2)
@@ -124,6 +125,48 @@ def root_rotation(roots: ForestElements, s: int, u: wp.array[wp.vec4]):
 # --- by a list ------------------------------------------------------------------------------------------------------
 
 
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    __shared__ int places[{LIST_BLOCK // WARP}][{WARP * LEAVES}];
+    int* const own = places[threadIdx.x / {WARP}];
+    if (k >= 0) return own[k];
+    const int lane = threadIdx.x % {WARP};
+    int place = 0, mask = 0;
+    if (lane < entries) {{
+        place = wp::index(list.entries, begin + lane)[0];
+        mask = wp::index(list.entries, begin + lane)[1];
+    }}
+    int end = __popc(mask);
+    int at = -end;
+    for (int step = 1; step < {WARP}; step *= 2) {{
+        const int before = __shfl_up_sync(0xffffffff, end, step);
+        if (lane >= step) end += before;
+    }}
+    at += end;
+    __syncwarp();
+    for (; mask != 0; mask &= mask - 1) own[at++] = place + __ffs(mask) - 1;
+    __syncwarp();
+    return __shfl_sync(0xffffffff, end, {WARP - 1});
+#else
+    static int own[{WARP * LEAVES}];
+    if (k >= 0) return own[k];
+    int at = 0;
+    for (int entry = begin; entry < begin + entries; ++entry) {{
+        const int mask = wp::index(list.entries, entry)[1];
+        for (int leaf = 0; leaf < {LEAVES}; ++leaf)
+            if ((mask >> leaf) & 1) own[at++] = wp::index(list.entries, entry)[0] + leaf;
+    }}
+    return at;
+#endif
+""")
+def leaves_of_entries(list: LeftOut, begin: int, entries: int, k: int) -> int:
+    """Write down the leaves of up to 32 entries for the threads of a warp, and how many there are; or the k-th of them.
+
+    Where few leaves of each entry were left out, every thread has one to do all the same.
+    """
+    ...
+
+
 @wp.kernel(enable_backward=False, grid_stride=False)
 def repair_listed_own(
     # In
@@ -138,28 +181,34 @@ def repair_listed_own(
     # Out
     f: wp.array[wp.vec4],
 ):
-    """Every leaf with its own rotation, eight threads an entry, of which those do something whose leaf was left out.
+    """Every leaf with its own rotation, a thread a leaf.
 
     Neighbours' forces are added up before they go to memory. Launch with block_dim LIST_BLOCK and as many ``threads``,
-    a multiple of it.
+    a multiple of it; or with one.
     """
     count = listed.counts[0]
     if count == 0:
         return
-    i = wp.tid()
-    while i < count * LEAVES:
-        entry = listed.entries[i // LEAVES]
-        leaf = i % LEAVES
-        targets = wp.vec4i(-1, -1, -1, -1)
-        p = wp.mat33()
-        t = entry[0]
-        if (entry[1] >> leaf) & 1 == 1:
-            t += leaf
-            targets = elements.targets[t]
-            p = own_stress(elements, t, mu, lam, stride, u)
-        f0, f1, f2, f3 = nodal_forces(elements, t, p)
-        add_neighbours(f, targets, f0, f1, f2, f3)
-        i += threads
+    lanes = wp.min(threads, WARP)
+    warps = threads // lanes
+    each = wp.clamp((count + warps - 1) // warps, 1, WARP)
+    begin = (wp.tid() // lanes) * each
+    while begin < count:
+        total = leaves_of_entries(listed, begin, wp.min(each, count - begin), -1)
+        k = wp.tid() % lanes
+        # All threads of a warp stay together, for their neighbours'.
+        while k - k % lanes < total:
+            t = int(0)
+            targets = wp.vec4i(-1, -1, -1, -1)
+            p = wp.mat33()
+            if k < total:
+                t = leaves_of_entries(listed, 0, 0, k)
+                targets = elements.targets[t]
+                p = own_stress(elements, t, mu, lam, stride, u)
+            f0, f1, f2, f3 = nodal_forces(elements, t, p)
+            add_neighbours(f, targets, f0, f1, f2, f3)
+            k += lanes
+        begin += warps * each
     leave(listed, threads // LIST_BLOCK)
 
 

@@ -8,19 +8,40 @@ from typing import TYPE_CHECKING
 
 from .elasticity import StVenantKirchhoff
 from .errors import StabilityWarning, UnstableError, depth_of_user
-from .kernels.pace import GROWTH, RECOVERY
+from .kernels.pace import GROWTH, LEAST
 from .solvers.guard import Fault
 
 if TYPE_CHECKING:
     from .simulation import Simulation
 
-#: Steps from one check with elastic energies to the next, and the same where many steps are one launch.
-CHECK_STEPS = 512
-BLOCK_CHECK_STEPS = 2048
+#: Measurements from one check with elastic energies to the next: for a body that stays as stiff as at rest, for one
+#: that is strained so that its step is less than a share of that at rest, and while less than what is stable is taken
+#: or a strained body errs by more than QUIET of what is let pass.
+CHECK_INTERVALS = 16
+STRAINED_INTERVALS = 4
+CLOSE_INTERVALS = 2
+STRAINED = 0.7
+QUIET = 0.25
+#: Measurements are fewer once the step has been this share of the one at rest, or more, at two checks in a row.
+CALM = 0.95
+CALM_CHECKS = 2
+#: Energy from nowhere that is let pass between two checks, and in all, as shares of what gravity, loads and supports
+#: have moved: the step is made shorter for more than the first, and not longer again before both are kept. Less is let
+#: pass the nearer it is in all to the most there should be.
+GAIN = 0.001
+SURPLUS = 0.004
+MOST_SURPLUS = 0.008
+LEAST_LEAVE = 0.02
+#: What vibrations err by at any one time does not add up: it alone makes the share no smaller than this.
+RINGING = 0.3
+#: Growth of the step's share from one measurement to the next: from a half to the whole in 35 of them.
+RECOVERY = 1.02
 #: How often the step is halved to come over one place.
 MOST_RETURNS = 6
 #: How often it is halved for a little energy from nowhere, as comes with crushed elements also of the shortest steps.
-STRICT_RETURNS = 2
+STRICT_RETURNS = 4
+#: Steps made one at a time from one look at where nodes are to the next.
+LOOK_STEPS = 256
 #: Longer runs are looked after in between.
 MOST_INTERVALS = 1000
 
@@ -42,6 +63,9 @@ class Running:
         #: Whether the last run ended with steps shorter than what the state allows.
         self._shortened = False
         self._steps_made = 0
+        #: Steps done when the share of the step was last looked at.
+        self._followed = 0
+        self._check_intervals = CLOSE_INTERVALS
 
     def step(self) -> None:
         """Make one step, with a measurement before it where one is due."""
@@ -69,12 +93,15 @@ class Running:
                 break
 
     def look(self) -> None:
-        """See that the state is finite.
+        """See that the state is finite, and now and then that nodes are within reach.
 
         Raises:
-            UnstableError: It is not.
+            UnstableError: They are not.
         """
-        fault = self._sim.guard.not_finite()
+        guard = self._sim.guard
+        fault = guard.not_finite()
+        if fault is None and self._sim.steps % LOOK_STEPS == 0:
+            fault = guard.beyond_reach()
         if fault is not None:
             raise UnstableError(self._message(fault))
 
@@ -83,7 +110,17 @@ class Running:
     def _begin(self) -> None:
         sim = self._sim
         sim.recorded.adopt_positions()
-        sim.guard.begin()
+        self._take()
+        if sim.safe_step is not None:
+            calm, intervals, self._followed = sim.safe_step.schedule
+            self._check_intervals = intervals or CLOSE_INTERVALS
+            sim.recorded.is_calm = calm == CALM_CHECKS
+
+    def _take(self) -> None:
+        """Take the present state for good, which a user may have written."""
+        sim = self._sim
+        if sim.guard.begin() and sim.safe_step is not None:
+            sim.safe_step.take_given()
 
     def _go(self, most: int, end: float | None) -> bool:
         """Make steps until something is due, and do it; whether the end is reached."""
@@ -94,30 +131,37 @@ class Running:
         reached = self._advance(done, most, end)
         sim.recorded.publish_positions()
         now = self._steps_made = sim.steps
-        if not self._check(now):
+        whole = now % self._check_steps == 0 or bool(self._returns)
+        passed = self._check(now, whole)
+        # Where short runs end does not count: the same run in one would take other steps.
+        if whole or not passed:
+            self._choose_intervals(checked=passed)
+        if not passed:
             return False
         if sim.remeshing.is_due(now):
             sim.follow_motion()
             sim.guard.forget()
-            sim.guard.begin()
+            self._take()
         if any(now % every == 0 for every in sim.hook_intervals) and sim.total_steps > self._steps_called:
             self._steps_called = sim.total_steps
             sim.call_hooks()
             sim.recorded.adopt_positions()
-            sim.guard.begin()
+            self._take()
         return reached
 
     def _until_due(self, done: int) -> int:
         """Steps until a check, a pass or a hook is due."""
         sim = self._sim
-        every = [sim.recorded.interval if self._returns else self._check_steps, *sim.hook_intervals]
+        every = [self._check_steps, *sim.hook_intervals]
         if sim.remeshing.every:
             every.append(sim.remeshing.every)
         return min(n - done % n for n in every)
 
     @property
     def _check_steps(self) -> int:
-        return BLOCK_CHECK_STEPS if self._sim.recorded.in_blocks else CHECK_STEPS
+        if self._returns:
+            return self._sim.recorded.interval
+        return self._check_intervals * self._sim.recorded.interval
 
     def _advance(self, done: int, most: int, end: float | None) -> bool:
         """Make at most so many steps; whether the end is reached."""
@@ -125,8 +169,7 @@ class Running:
         if sim.safe_step is None:
             sim.recorded.replay_many(most)
             return False
-        if end is None:
-            self._resume()
+        self._resume()
         every, stop = sim.recorded.interval, done + most
         sure = 0
         while done < stop:
@@ -140,6 +183,7 @@ class Running:
                 done += count
                 continue
             if phase == 0:
+                self._resume()
                 sim.recorded.replay(0, measured=True)
             count, reached = self._ending(count, end)
             done += count
@@ -177,7 +221,7 @@ class Running:
         safe = self._sim.safe_step
         assert safe is not None
         interval, longest = self._sim.recorded.interval, safe.at_rest
-        growth = float(GROWTH) * float(RECOVERY)
+        growth = float(GROWTH)
         dt = min(growth * safe.allowed, longest)
         count = 0
         left -= 2 * interval * dt
@@ -188,23 +232,76 @@ class Running:
         return count
 
     def _resume(self) -> None:
-        """Take the step that the state allows again."""
+        """Take the step that the state allows again.
+
+        Velocities shift neither here nor where the end of a run made the step shorter, so that the two cancel.
+        """
         if self._shortened and self._sim.safe_step is not None:
             self._sim.safe_step.resume()
         self._shortened = False
 
-    def _check(self, now: int) -> bool:
-        """Check the state; False if it was put back."""
+    def _check(self, now: int, whole: bool) -> bool:
+        """Check the state, elastic energies too if asked to; False if it was put back."""
         sim = self._sim
-        whole = now % self._check_steps == 0 or bool(self._returns)
         strict = sim.safe_step is not None and self._returns < STRICT_RETURNS
-        fault = sim.guard.check(whole=whole, strict=strict)
+        fault = sim.guard.check(whole=whole, strict=strict, lenient=sim.safe_step is not None)
         if fault is not None:
             self._go_back(fault)
             return False
         if self._returns and sim.time > self._wrong_until:
             self._returns = 0
+        if whole and sim.safe_step is not None:
+            self._follow_energy(now)
         return True
+
+    def _follow_energy(self, now: int) -> None:
+        """Make the step shorter where energy came from nowhere, and longer again where none did."""
+        sim = self._sim
+        assert sim.safe_step is not None
+        share = self._share
+        intervals = (now - self._followed) / sim.recorded.interval
+        self._followed = now
+        gain = GAIN * max(1.0 - sim.guard.surplus / MOST_SURPLUS, LEAST_LEAVE)
+        late, more = sim.guard.untimely / SURPLUS, sim.guard.gain / gain
+        if late > 1.0 or more > 1.0:
+            least = min(share, RINGING)
+            share *= max(1.0 / math.sqrt(max(more, 1.0)), 0.5)
+            share = min(share, max(share / math.sqrt(max(late, 1.0)), least))
+        elif sim.guard.surplus + sim.guard.untimely <= SURPLUS:
+            share = min(share * RECOVERY**intervals, 1.0)
+        if share != self._share:
+            self._set_share(share)
+
+    def _choose_intervals(self, *, checked: bool) -> None:
+        """Look more often where a body is strained, less often where checks on elastic energies have found it calm."""
+        sim = self._sim
+        if sim.safe_step is None:
+            return
+        share, allowed, at_rest = sim.safe_step.shares
+        before = sim.safe_step.schedule
+        calm = min(before[0] + checked, CALM_CHECKS) if share == 1.0 and allowed >= CALM * at_rest else 0
+        sim.recorded.is_calm = calm == CALM_CHECKS
+        if share < 1.0:
+            self._check_intervals = CLOSE_INTERVALS
+        elif allowed < STRAINED * at_rest:
+            quiet = max(sim.guard.gain / GAIN, sim.guard.untimely / SURPLUS) < QUIET
+            self._check_intervals = STRAINED_INTERVALS if quiet else CLOSE_INTERVALS
+        else:
+            self._check_intervals = CHECK_INTERVALS
+        if before != (chosen := (calm, self._check_intervals, self._followed)):
+            sim.safe_step.schedule = chosen
+
+    @property
+    def _share(self) -> float:
+        return 1.0 if self._sim.safe_step is None else self._sim.safe_step.share
+
+    def _set_share(self, share: float) -> None:
+        """Take another share of the step that the state allows from here on."""
+        sim = self._sim
+        assert sim.safe_step is not None
+        sim.safe_step.share = max(share, float(LEAST))
+        sim.recorded.retime()
+        sim.guard.settle()
 
     def _go_back(self, fault: Fault) -> None:
         """Go on from the last good state with half the step.
@@ -222,9 +319,9 @@ class Running:
         self._returns += 1
         share = sim.safe_step.share
         sim.guard.go_back()
-        sim.safe_step.share = 0.5 * share
-        sim.guard.settle()
-        if not self._has_warned:
+        self._followed = sim.steps
+        self._set_share(0.5 * share)
+        if not self._has_warned and not fault.is_slight:
             self._has_warned = True
             message = (
                 f"the state went wrong by t = {self._wrong_until:.4g} s ({fault.what}); the simulation goes on from "
@@ -248,7 +345,7 @@ class Running:
         if any(getattr(model, "rotation_level", None) is not None for model in sim.models):
             return "; shared rotations have no energy, so that strong bending may need rotation_level=None"
         if any(isinstance(model, StVenantKirchhoff) for model in sim.models):
-            return "; StVenantKirchhoff does not resist being crushed: take NeoHookean or Corotated, or damping"
+            return "; StVenantKirchhoff has no energy barrier against being crushed: take NeoHookean or Corotated"
         if sim.safe_step is None:
             return ": take a shorter step, or dt=None, which follows the state"
         return f"; {MOST_RETURNS} times half the step did not help: look for loads or motions that crush the body"

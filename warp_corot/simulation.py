@@ -112,7 +112,7 @@ class Simulation:
         #: What chooses the step, if none was given.
         self.safe_step: SafeStep | None = None
         if given is None:
-            self.safe_step = SafeStep(self.bodies, self.fields, self.models, self.pace, stable)
+            self.safe_step = SafeStep(self.bodies, self.fields, self.models, self.pace, stable, self._context.gravity)
         moved = zip(self.bodies, self.fields, strict=True)
         steppers = [self.integrator.bind(body, field, self._context) for body, field in moved]
         self.recorded = RecordedSteps(self.bodies, steppers, self.pace, self.safe_step)
@@ -172,7 +172,9 @@ class Simulation:
 
         Raises:
             InputError: Somebody is capturing, and there are bodies to be remeshed.
-            UnstableError: On the CPU: the state is not finite any more. Nothing is made again here: ``advance`` does.
+            UnstableError: On the CPU: the state is not finite any more, or nodes are far beyond reach, which is looked
+                at every few hundred steps. No step is made again here, as ``advance`` does, and energies are not looked
+                at, since users may write to the state between steps.
         """
         if self.device.is_capturing:
             if self.remeshing.every:

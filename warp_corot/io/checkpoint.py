@@ -184,6 +184,7 @@ def _upgrade_steps(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Non
     arrays["kept.seconds"] = np.array([dt, -epoch * dt])
     for name in ("scale", "drift"):
         arrays[f"guard.{name}"] = np.zeros(header["worlds"])
+    arrays["guard.counted"] = np.full((6, header["worlds"]), np.nan)
     for number in range(len(header["bodies"])):
         starts = arrays[f"body{number}.world_starts"]
         arrays[f"body{number}.world_starts"] = (starts - epoch) * dt
@@ -220,7 +221,7 @@ def _rebuilt_simulation(
             field.state[name].assign(arrays[f"body{number}.field.{name}"])
     for name in header["kept"]:
         sim.kept[name].assign(arrays[f"kept.{name}"])
-    sim.guard.resume(scale=arrays["guard.scale"], drift=arrays["guard.drift"])
+    sim.guard.resume(**{name: arrays[f"guard.{name}"] for name in ("scale", "drift", "counted")})
     return sim
 
 

@@ -33,6 +33,7 @@ class Energies:
         elastic: [J]; zero if not asked for.
         exact: With symplectic Euler's own kinetic energy, velocities behind times those ahead, and the elastic energy:
             what a linear body keeps to rounding [J]; means nothing if elastic energies were not asked for.
+        untimely: What the kinetic energy at the time of the displacements has more than that of ``exact`` [J].
         loads: Work of loads since the displacements that were kept [J].
         supports: Work of all moving supports since the beginning [J].
         supports_absolute: The sum of its absolute values [J].
@@ -43,6 +44,7 @@ class Energies:
     gravitational: Floats
     elastic: Floats
     exact: Floats
+    untimely: Floats
     loads: Floats
     supports: Floats
     supports_absolute: float
@@ -93,6 +95,7 @@ class Balance:
             gravitational=total[:, kernels.GRAVITATIONAL],
             elastic=elastic,
             exact=kinetic + ahead + elastic,
+            untimely=total[:, kernels.UNTIMELY],
             loads=total[:, kernels.LOADS],
             supports=done,
             supports_absolute=float(supports[1]),

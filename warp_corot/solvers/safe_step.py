@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from ..kernels import pace as kernels
+from ..kernels.gauge import SHIFT_VELOCITIES
 from .gauge import Gauge
 from .pace import Pace
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 #: measurement takes about as long as a step.
 INTERVAL = 32
 BLOCK_INTERVAL = 128
+_SCHEDULE = [int(kernels.CALM), int(kernels.CLOSENESS), int(kernels.FOLLOWED)]
 #: The step where nothing can vibrate [s].
 ANY_STEP = 1e-3
 
@@ -32,6 +34,7 @@ class SafeStep:
         bodies, fields, models: The simulation's.
         pace: Whose step it sets.
         stable: The largest stable step of each body at rest [s], infinite where nothing can vibrate.
+        gravity: [m/s^2].
     """
 
     def __init__(
@@ -41,10 +44,11 @@ class SafeStep:
         models: Sequence[Model],
         pace: Pace,
         stable: Sequence[float],
+        gravity: wp.vec3,
     ):
         self.device = pace.device
         self.pace = pace
-        self._models = models
+        self._bodies, self._models, self._gravity = bodies, models, gravity
         self._found = wp.zeros((len(bodies), 2), dtype=wp.float32, device=self.device)
         self._at_rest = wp.zeros((len(bodies), 4), dtype=wp.float64, device=self.device)
         self._control = wp.zeros(int(kernels.CONTROLS), dtype=wp.float64, device=self.device)
@@ -86,10 +90,12 @@ class SafeStep:
             control[kernels.ALLOWED] *= longest / before
         else:
             control[:] = longest
-            control[kernels.SHARE] = 1.0
+            control[kernels.SHARE], control[kernels.SHORTENED], control[kernels.GIVEN] = 1.0, 0.0, 0.0
+            control[_SCHEDULE] = 0.0
         control[kernels.AT_REST] = longest
         self._control.assign(control)
         self.resume()
+        self.take_given()
 
     def restart(self) -> None:
         """Begin again with the step at rest."""
@@ -97,8 +103,10 @@ class SafeStep:
             gauge.restart()
         control = self._control.numpy().copy()
         control[kernels.ALLOWED], control[kernels.SHARE] = control[kernels.AT_REST], 1.0
+        control[_SCHEDULE] = 0.0
         self._control.assign(control)
         self.resume()
+        self.take_given()
 
     def launch(self, ahead: int) -> None:
         """Measure, and take a step that is safe for ``ahead`` steps; may be recorded.
@@ -109,10 +117,29 @@ class SafeStep:
             gauge.launch(self.pace, ahead)
         inputs = [self._at_rest, self._found, self._control, self.pace.arrays]
         wp.launch(kernels.take_safe_step, dim=1, inputs=inputs, device=self.device)
+        self._shift_velocities()
 
     def resume(self) -> None:
-        """Take the step that the state allows, after one that ended a run in time."""
+        """Take the step that the state allows, after one that ended a run in time; velocities stay as they are."""
         wp.launch(kernels.resume_step, dim=1, inputs=[self._control, self.pace.arrays], device=self.device)
+
+    def retime(self) -> None:
+        """Take the step that the state allows and shift velocities to it; ``node_forces`` as for ``launch``."""
+        self.resume()
+        self._shift_velocities()
+
+    def _shift_velocities(self) -> None:
+        for body in self._bodies:
+            inputs = [
+                self._gravity,
+                body.node_inverse_mass,
+                int(body.has_loads),
+                body.node_loads,
+                body.node_forces,
+                self._control,
+            ]
+            kernel = SHIFT_VELOCITIES[body.node_loads.dtype]
+            wp.launch(kernel, body.launch_nodes, inputs, [body.node_velocities], device=self.device)
 
     @property
     def share(self) -> float:
@@ -125,7 +152,29 @@ class SafeStep:
         control[kernels.SHARE] = value
         control[kernels.SHORTEST] = min(control[kernels.SHORTEST], value * control[kernels.ALLOWED])
         self._control.assign(control)
-        self.resume()
+
+    @property
+    def shares(self) -> tuple[float, float, float]:
+        """``share``, the step that the state allows and that at rest [s], read at once; waits for the device."""
+        control = self._control.numpy()
+        return float(control[kernels.SHARE]), float(control[kernels.ALLOWED]), float(control[kernels.AT_REST])
+
+    @property
+    def schedule(self) -> tuple[int, int, int]:
+        """How many checks in a row found the bodies calm, measurements from one check on energies to the next (zero if
+        none was chosen), and steps done at the last one; waits for the device."""
+        calm, intervals, steps = self._control.numpy()[_SCHEDULE]
+        return int(calm), int(intervals), int(steps)
+
+    @schedule.setter
+    def schedule(self, value: tuple[int, int, int]) -> None:
+        control = self._control.numpy().copy()
+        control[_SCHEDULE] = value
+        self._control.assign(control)
+
+    def take_given(self) -> None:
+        """Let the next change of the step leave velocities as they are: a user gave them."""
+        self._control[kernels.GIVEN : kernels.GIVEN + 1].fill_(1.0)
 
     @property
     def state(self) -> dict[str, wp.array]:
