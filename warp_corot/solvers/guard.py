@@ -70,6 +70,7 @@ class Guard:
     ):
         self.bodies, self.fields, self.context = tuple(bodies), tuple(fields), context
         self.worlds = bodies[0].worlds
+        self._size = max(float(np.ptp(body.mesh.points, axis=0).max()) for body in bodies)
         self._balance = Balance(bodies, fields, context)
         self._more = tuple(state)
         self._kept: list[wp.array] = []
@@ -245,8 +246,7 @@ class Guard:
         return np.flatnonzero(bad)
 
     def _beyond_reach(self, found: Energies) -> Fault | None:
-        size = max(float(np.ptp(body.mesh.points, axis=0).max()) for body in self.bodies)
-        bad = np.flatnonzero(~(found.reach <= REACH * size))
+        bad = np.flatnonzero(~(found.reach <= REACH * self._size))
         if not len(bad):
             return None
         return Fault(f"nodes are {found.reach[bad].max():.3g} m from where they were at rest", bad)
