@@ -65,7 +65,7 @@ class Running:
         self._steps_made = 0
         #: Steps done when the share of the step was last looked at.
         self._followed = 0
-        self._check_intervals = CLOSE_INTERVALS
+        self._check_intervals = CHECK_INTERVALS if sim.safe_step is None else CLOSE_INTERVALS
 
     def step(self) -> None:
         """Make one step, with a measurement before it where one is due."""
