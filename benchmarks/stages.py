@@ -8,7 +8,6 @@ The scatters add a constant, so that the exact result is a count.
 import functools
 
 import warp as wp
-
 from warp_corot.kernels.constitutive import corotated_strain, hooke
 from warp_corot.kernels.corotated import rest_shape
 from warp_corot.kernels.elements import (

@@ -8,7 +8,6 @@ import warp as wp
 from bodies import ball, ring, turned_box
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-
 from warp_corot.kernels.embedding import nearest_faces
 
 PAIRS = list(itertools.combinations(range(4), 2))

@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 import pytest
 from sequential import Bisection
+from warp_corot.kernels.shapes import FRAME_SHIFT
 
 from warp_corot.elements import shape_codes
-from warp_corot.kernels.shapes import FRAME_SHIFT
 from warp_corot.mesh.lattice import LATTICE_BITS
 from warp_corot.remesh.fields import CARRIED_BY_NODES
 from warp_corot.remesh.pools import DeviceForest

@@ -1,9 +1,9 @@
 """Bodies whose meshes follow the motion, and what they are compared with."""
 
 import warp as wp
+from warp_corot.kernels.remesh_mark import ElementState
 
 import warp_corot as wc
-from warp_corot.kernels.remesh_mark import ElementState
 
 SOFT = wc.Isotropic(young=3e4, poisson=0.4, density=1000.0)
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import warp as wp
 from remesh_cases import assert_conforming, leaf_list
+from warp_corot.kernels.remesh_mark import ElementState
 
 import warp_corot as wc
 from warp_corot.io.checkpoint import load_checkpoint
-from warp_corot.kernels.remesh_mark import ElementState
 
 END = 0.2
 

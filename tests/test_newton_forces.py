@@ -17,7 +17,6 @@ from newton_scenes import (
     wc,
     wn,
 )
-
 from warp_corot.kernels.newton_elements import scatter_posed
 from warp_corot.kernels.rotation import quick_rotation
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import warp as wp
-
-import warp_corot as wc
 from warp_corot.kernels import subtree
 from warp_corot.kernels.stiffness import STIFFNESS_LAMBDA, STIFFNESS_MU
+
+import warp_corot as wc
 from warp_corot.plan import ForcePlan
 from warp_corot.subtrees import Sharing, complete_subtrees
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import warp as wp
 from remesh_cases import CUBE, DENSITY, PAIRS, assert_sound, leaf_list, momentum, random_marks
+from warp_corot.kernels.remesh_mark import ElementState
 
 import warp_corot as wc
-from warp_corot.kernels.remesh_mark import ElementState
 from warp_corot.remesh.passes import RemeshPass
 from warp_corot.remesh.pools import DeviceForest
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import warp as wp
 from remesh_cases import assert_sound
+from warp_corot.kernels.remesh_criteria import strain
 
 import warp_corot as wc
-from warp_corot.kernels.remesh_criteria import strain
 
 SIDE = 0.5  # of a root cube [m]; large and soft, so that steps are long
 CELLS = (4, 1, 4)

@@ -5,10 +5,10 @@ import functools
 import numpy as np
 import pytest
 import warp as wp
+from warp_corot.kernels.remesh_criteria import nearness, strain, von_mises_stress
 
 import warp_corot as wc
 from warp_corot.experiments.remeshing import CELL, SCENES, TISSUE, run, table
-from warp_corot.kernels.remesh_criteria import nearness, strain, von_mises_stress
 from warp_corot.remesh.passes import RemeshPass
 from warp_corot.remesh.pools import DeviceForest
 

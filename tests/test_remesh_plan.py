@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import warp as wp
 from remesh_cases import CUBE, random_marks
-
-import warp_corot as wc
 from warp_corot.kernels.remesh import SINKS
 from warp_corot.kernels.shapes import FRAME_SHIFT
+
+import warp_corot as wc
 from warp_corot.plan import ForcePlan, Units
 from warp_corot.remesh.passes import RemeshPass
 from warp_corot.remesh.plan import DevicePlan

@@ -3,10 +3,10 @@
 import pytest
 import warp as wp
 from remeshed import SOFT, bar, near
-
-import warp_corot as wc
 from warp_corot.kernels.remesh_criteria import nearness, strain, von_mises_stress
 from warp_corot.kernels.remesh_mark import ElementState
+
+import warp_corot as wc
 
 
 @wp.func

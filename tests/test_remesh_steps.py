@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import warp as wp
 from remeshed import SOFT, near, twin
+from warp_corot.kernels.remesh_mark import ElementState
 
 import warp_corot as wc
-from warp_corot.kernels.remesh_mark import ElementState
 
 
 @wp.func

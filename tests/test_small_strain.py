@@ -10,10 +10,10 @@ import pytest
 import warp as wp
 from cases import edge_scale, mixed_forest, oracle_mesh, place, random_displacement, simulation
 from test_left_out import Launches
+from warp_corot.kernels.repair import LeftOut
 from warp_corot.kernels.subtree_cuda import scatter_subtrees_shared
 
 import warp_corot as wc
-from warp_corot.kernels.repair import LeftOut
 from warp_corot.plan import ForcePlan
 
 LAME = oracle.lame(1e4, 0.4)

@@ -4,9 +4,9 @@ import numpy as np
 import oracle
 import pytest
 from cases import CUBE, oracle_mesh, place, random_displacement, simulation
+from warp_corot.kernels.stiffness import STIFFNESS_LAMBDA, STIFFNESS_MU
 
 import warp_corot as wc
-from warp_corot.kernels.stiffness import STIFFNESS_LAMBDA, STIFFNESS_MU
 
 ZEROS_OF_THE_TABLE = (70, 44, 72)
 ZEROS_OF_THE_AXES = (70, 44, 56)
