@@ -285,15 +285,17 @@ def test_an_unstable_step_is_named(share, up, device):
         sims[0].advance_steps(2000)
     step = int(str(caught.value).split("since step ")[1].split(" ")[0])
     assert step > 5
-    sims[1].advance_steps(step - 1)
-    assert np.isfinite(sims[1].body.positions.numpy()).all()
-    with pytest.raises(wc.UnstableError, match=f"since step {step} "):
-        sims[1].advance_steps(1)
+    # Without checks, which would end the run before.
+    sims[1].recorded.replay_many(step - 1)
+    assert np.isfinite(sims[1].body.node_displacements.numpy()).all()
+    sims[1].recorded.replay_many(1)
+    assert not np.isfinite(sims[1].body.node_displacements.numpy()).all()
 
 
 def test_a_world_that_is_not_finite_leaves_the_others(device):
     mesh = forest("type 1")
-    sims = [made(device, mesh, 0, launches=False, worlds=3) for _ in range(2)]
+    dt = 0.8 * made(device, mesh, 0, launches=False).stable_dt  # of all worlds, whatever becomes of one
+    sims = [made(device, mesh, 0, launches=False, worlds=3, dt=dt) for _ in range(2)]
     for sim in sims:
         sim.body.set_initial_state()
     free = np.flatnonzero(~sims[0].body.constrained[: len(mesh.points)])

@@ -98,8 +98,8 @@ def test_general_elements(law, uniform, device, rng):
 @pytest.mark.parametrize("kind", ["muscle field", "wood", "stiffness field"])
 @pytest.mark.parametrize("name", FORESTS)
 def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
-    """Every hundredth node is displaced by an edge and more, so that some leaves are left to the robust rotation; and
-    active stress."""
+    """Every hundredth node is displaced by an edge and more, so that some leaves of uniform forests are left to the
+    robust rotation; and active stress."""
     mesh = meshed(name)
     material = anisotropic(kind, mesh, rng)
     body = wc.SoftBody(mesh, material, device=device)
@@ -123,7 +123,8 @@ def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
     if len(flat):
         inputs = [flat.elements, flat.leaves, whole.material, 1, active, on_device]
         wp.launch(scatter_flat, len(flat), inputs=inputs, outputs=[f], device=device)
-    assert 0 < flags < 0.3 * len(mesh.tets)
+    assert flags < 0.3 * len(mesh.tets)
+    assert flags > 0 or name == "mixed levels"
     assert_right(f.numpy()[:, :3], leaf_by_leaf(whole, active, on_device))
 
 

@@ -67,7 +67,7 @@ def test_time_is_exact_with_hooks_that_make_steps_themselves(device):
 def test_frames_are_the_same_in_one_run_or_many():
     """On the CPU bit by bit: measurements come at whole intervals, wherever calls begin and end.
 
-    Only a run that goes back is another: it goes back to where a call ended. A beam that bends under gravity has no need.
+    Only a run that goes back is another: it goes back to where a call ended. A beam that bends under gravity does not.
     """
     whole, parted = (wc.Simulation(beam()) for _ in range(2))
     whole.advance_steps(4 * INTERVAL)

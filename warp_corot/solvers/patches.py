@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from .integrator import StepContext
 
 #: Elements of the bodies for which it pays: below, a launch has nothing to spread; above, patches outgrow their blocks.
-FEWEST, MOST = 1_500, 150_000
+FEWEST, MOST = 500, 150_000
+#: Elements of a patch at least: with fewer, blocks of the smallest bodies only wait for one another.
+PATCH_ELEMENTS = 32
 #: Threads a block, each up to so many elements of the largest patch; more threads have fewer registers.
 THREADS = ((256, 512), (512, 1024), (384, 1536), (512, 2048))
 #: Elements whose constants a thread keeps in registers, and nodes of the halo that it waits for.
@@ -62,12 +64,12 @@ class PatchSteps:
         rotations.
 
         Args:
-            count: Patches, at most as many as multiprocessors; None: as many.
+            count: Patches, at most as many as multiprocessors; None: as many, or fewer of small bodies.
             threads: A block; None: as many as suit its elements.
         """
         if not _suits(body, field):
             return None
-        count = min(count or body.device.sm_count, body.device.sm_count)
+        count = min(count or max(len(body.mesh.tets) // PATCH_ELEMENTS, 1), body.device.sm_count)
         for each, most in THREADS if threads is None else ((threads, MOST_ELEMENTS * threads),):
             patches = Patches.of(body.mesh.points, body.mesh.tets, count, each)
             if patches.most_elements > most:

@@ -57,8 +57,9 @@ class SymplecticEulerStepper(Stepper):
         self.field = field
         self.context = context
         self.damping = damping
-        self.block = BlockSteps.of(body, field)
-        self.patches = PatchSteps.of(body, field) if self.block is None else None
+        # One body is sooner done by all multiprocessors, many small ones by one each.
+        self.patches = PatchSteps.of(body, field)
+        self.block = BlockSteps.of(body, field) if self.patches is None else None
 
     @property
     def many_a_launch(self) -> bool:
