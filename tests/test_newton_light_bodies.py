@@ -213,7 +213,7 @@ class TestGivingWay:
         model = thrown(device, mass=0.05, aside=0.017, cell=0.025, height=-0.0031, speed=0.0)
         contact_parameters(model, ke=1e5, kd=0.0, kf=0.0, mu=0.0)
         pipeline, dt = newton.CollisionPipeline(model), 1e-3
-        solver = wn.SolverCorotated(model)
+        solver = wn.SolverCorotated(model, substeps=1)
         before, after = model.state(), model.state()
         pose = before.body_q.numpy()
         pose[0, 3:] = wp.quat_rpy(0.02, -0.01, 0.3)
