@@ -114,7 +114,9 @@ class Guard:
             else:
                 self._loads, self._height = np.zeros(self.worlds), found.gravitational
                 self._loads_before = np.zeros(self.worlds)
-                self._scale = np.maximum(self._scale, np.abs(found.exact))
+                # A world that begins wrong may be set right later.
+            known = np.where(np.isfinite(found.exact), np.abs(found.exact), 0.0)
+            self._scale = np.maximum(self._scale, known)
             self._counted = None
             self._keep(found)
         return changed
