@@ -22,6 +22,8 @@ from .mesh.tree import UniformTree
 
 SUBTREE_LEVELS = 3
 GROUP_LEVELS = 6
+#: Leaves in groups from which these have a launch of their own: what that takes off the time is more than it costs.
+GROUPED_LEAVES = 1 << 16
 
 
 class Sharing(Enum):
@@ -175,6 +177,11 @@ def complete_subtrees(forest: TetForest, depth: int) -> npt.NDArray[np.int32]:
     change = np.flatnonzero(np.diff(ancestor, prepend=-2))
     length = np.diff(change, append=len(ancestor))
     return change[(length == size) & (ancestor[change] >= 0)].astype(np.int32)
+
+
+def pays_in_groups(forest: TetForest, worlds: int) -> bool:
+    """Whether so many leaves are in groups that launches of subtrees are faster than one of single elements (CUDA)."""
+    return worlds * 8**2 * len(complete_subtrees(forest, GROUP_LEVELS)) >= GROUPED_LEAVES
 
 
 def subtree_nodes(shape: int) -> list[tuple[int, int]]:

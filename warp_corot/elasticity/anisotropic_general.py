@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 
 class GeneralAnisotropicField(AnisotropicField):
-    """Elements whose forces need no settled order.
+    """Single elements whose forces need no settled order.
 
     Args:
-        body: A general mesh's, of an ``Anisotropic`` material.
+        body: Of an ``Anisotropic`` material; a general mesh's, or of a forest that has few groups of subtrees.
     """
 
     def __init__(self, body: SoftBody):

@@ -14,6 +14,7 @@ from ..kernels.rotation import byers_xu, quick_rotation
 from ..mesh import TetForest
 from ..mesh.forest import MAX_LEVEL
 from ..rotations import METHODS, rotation_function
+from ..subtrees import pays_in_groups
 from .anisotropic import AnisotropicField, AnisotropicLanesField
 from .anisotropic_general import GeneralAnisotropicField
 from .anisotropic_subtrees import AnisotropicSubtreeField
@@ -124,7 +125,9 @@ class Corotated(Model):
             raise InputError("rotation is 'warm'; with an anisotropic material it must be 'byers-xu' or 'svd'")
         quick = self.own_rotation is quick_rotation
         if quick and body.device.is_cuda and not deterministic:
-            return (AnisotropicSubtreeField if isinstance(body.mesh, TetForest) else GeneralAnisotropicField)(body)
+            forest = body.mesh if isinstance(body.mesh, TetForest) else None
+            subtrees = forest and (body.changing is not None or pays_in_groups(forest, body.worlds))
+            return (AnisotropicSubtreeField if subtrees else GeneralAnisotropicField)(body)
         lanes = quick and body.device.is_cpu
         return (AnisotropicLanesField if lanes else AnisotropicField)(body, self.own_rotation, deterministic)
 

@@ -40,9 +40,9 @@ class Lanes:
 
 def as_general(elements: Any, kernel: wp.Kernel, inputs: list) -> GeneralElements:
     """Elements of either kind as general ones; ``kernel`` finds their rest matrices and volumes from ``inputs``."""
-    count, general = len(elements.nodes), GeneralElements()
+    count, device, general = len(elements.nodes), elements.nodes.device, GeneralElements()
     general.nodes = general.targets = elements.nodes
-    general.rest_inverse = wp.empty(count, dtype=wp.mat33, device="cpu")
-    general.volume = wp.empty(count, dtype=wp.float32, device="cpu")
-    wp.launch(kernel, count, inputs, [general.rest_inverse, general.volume], device="cpu")
+    general.rest_inverse = wp.empty(count, dtype=wp.mat33, device=device)
+    general.volume = wp.empty(count, dtype=wp.float32, device=device)
+    wp.launch(kernel, count, inputs, [general.rest_inverse, general.volume], device=device)
     return general

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from ..kernels.general_cpu import rest_matrices
 from ..kernels.general_cuda import BLOCK, PosedElements, corotated_law, scatter_general
 from .corotated_field import LeafField
+from .lanes import as_general
 from .model import LawField
 
 if TYPE_CHECKING:
@@ -17,10 +19,10 @@ if TYPE_CHECKING:
 
 
 class LawGeneralField(LawField):
-    """A law on general elements whose forces need no settled order.
+    """A law on single elements whose forces need no settled order.
 
     Args:
-        body: A general mesh's.
+        body: A general mesh's, or of a forest that has few groups of subtrees.
         stress, energy, cauchy: The law, functions of ``kernels.constitutive``.
         deterministic: False; slots of elements are not shared, so there is nothing to add up.
     """
@@ -72,9 +74,10 @@ class GeneralScatter:
 
 
 def posed_elements(elements: Any) -> Any:
-    """General elements as ``kernels.general_cuda`` takes them."""
+    """Elements of either kind as ``kernels.general_cuda`` takes them."""
+    general = elements if hasattr(elements, "rest_inverse") else as_general(elements, rest_matrices, [elements])
     posed = PosedElements()
-    posed.nodes, posed.volume = elements.nodes, elements.volume
-    rows = np.ascontiguousarray(elements.rest_inverse.numpy().reshape(-1, 9).T)
+    posed.nodes, posed.volume = general.nodes, general.volume
+    rows = np.ascontiguousarray(general.rest_inverse.numpy().reshape(-1, 9).T)
     posed.rest_inverse = wp.array(rows, dtype=wp.float32, device=elements.nodes.device)
     return posed

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from ..mesh import TetForest
+from ..subtrees import pays_in_groups
 from .law_general import LawGeneralField
 from .law_lanes import LawLanesField
 from .law_subtrees import LawSubtreeField
@@ -37,7 +38,9 @@ def law_field(
     if body.device.is_cpu:
         return LawLanesField(body, law=law, **functions, deterministic=deterministic)
     kind = LawField
-    if isinstance(body.mesh, TetForest):
+    if isinstance(body.mesh, TetForest) and (
+        deterministic or body.changing is not None or pays_in_groups(body.mesh, body.worlds)
+    ):
         kind = LawSubtreeField
     elif not deterministic:
         kind = LawGeneralField

@@ -13,10 +13,7 @@ from ..kernels.clusters import CLUSTER, scatter_clusters
 from ..kernels.elements import ForestElements
 from ..kernels.subtree_cuda import BLOCK, FLAT, Stretch, scatter_stretches
 from ..plan import FlatLeaves, ForcePlan, Plan
-from ..subtrees import Batch
-
-#: Leaves in groups from which these have a launch of their own: what that takes off the time is more than it costs.
-GROUPED_LEAVES = 1 << 16
+from ..subtrees import GROUPED_LEAVES, Batch
 
 
 class OwnLaunches:
