@@ -1,13 +1,13 @@
 """The anisotropic corotated law where an element's rotation is definite, with as little arithmetic as it takes.
 
 What kernels for CUDA share: the law of ``anisotropic``, in any frame that the columns of F come in, for elements that
-four unscaled iterations turn. Those are far from where the law goes over to the isotropic one; see ``anisotropic_cpu``.
+the unscaled iteration turns and that are far from where the law goes over to the isotropic one (``is_definite``).
 """
 
 import warp as wp
 
-from .anisotropic import vec9
-from .rotation import ITERATIONS, column, reciprocal
+from .anisotropic import INDEFINITE, vec9
+from .rotation import ITERATIONS, column, identity3, reciprocal
 
 wp.set_module_options({"enable_backward": False})
 
@@ -23,6 +23,14 @@ wp.set_module_options({"enable_backward": False})
 def load_axes(axes: wp.array[wp.quat], t: int) -> wp.quat:
     """The axes of element t by one 16-byte load; see ``load_node``."""
     ...
+
+
+@wp.func
+def is_definite(e: wp.mat33):
+    """Whether the law is the anisotropic one alone at the strain e: det(tr(S) I - S) / |S|^3 is large enough."""
+    s = e + identity3()
+    n2 = wp.ddot(s, s)
+    return wp.determinant(wp.trace(s) * identity3() - s) >= INDEFINITE * n2 * wp.sqrt(n2)
 
 
 @wp.func

@@ -5,7 +5,7 @@ import functools
 import warp as wp
 
 from .anisotropic import OrthotropicMaterial, axes_of, filled, material_strain, turned_stress
-from .definite import definite_law, definite_strain, load_axes
+from .definite import definite_law, definite_strain, is_definite, load_axes
 from .general_cuda import ROUNDS, PosedElements, add_stress, edge_differences, load_four, rest_inverse_of
 from .rotation import ITERATIONS, byers_xu, column, identity3, newton_rotation
 
@@ -14,7 +14,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func(inline=False)
 def robust_stress(g: wp.mat33, material: OrthotropicMaterial, t: int):
-    """P of an F = I + g that the unscaled iteration does not turn."""
+    """P of an F = I + g that the unscaled iteration does not turn, or whose rotation is hardly definite."""
     m = axes_of(material, t)
     turned_gradient = g * m
     r = byers_xu(m + turned_gradient)
@@ -48,9 +48,9 @@ def scatter_general_anisotropic(transverse: bool) -> wp.Kernel:
         f1 = column(gradient, 1)
         f2 = column(gradient, 2)
         z0, z1, z2, trusted = newton_rotation(f0, f1, f2, 1.0)
+        e = definite_strain(z0, z1, z2, f0, f1, f2, g, g)
         p = wp.mat33()
-        if trusted:
-            e = definite_strain(z0, z1, z2, f0, f1, f2, g, g)
+        if trusted and is_definite(e):
             scale = wp.static(0.5**ITERATIONS) * filled(material, t)
             p = wp.matrix_from_cols(z0, z1, z2) * law(e, n, material.stiffness[t * material.stride], scale)
         else:

@@ -11,7 +11,7 @@ import functools
 import warp as wp
 
 from .anisotropic import OrthotropicMaterial, element_forces, filled, listed_forces
-from .definite import definite_law, definite_strain, load_axes
+from .definite import definite_law, definite_strain, is_definite, load_axes
 from .elements import FRAME_SHIFT, LEVEL_MASK, ForestElements, Subtrees, mirror_sign
 from .rotation import ITERATIONS, byers_xu, column, newton_rotation, quick_rotation
 from .shapes import VOLUME, fingerprint
@@ -94,7 +94,7 @@ def anisotropic_forces(shape: int, transverse: bool, one_axes: bool, one_stiffne
                 p0 += d[0] * pull
                 p1 += d[1] * pull
                 p2 += d[2] * pull
-            if not trusted:
+            if not (trusted and is_definite(e)):
                 p0 = wp.vec3()
                 p1 = wp.vec3()
                 p2 = wp.vec3()
