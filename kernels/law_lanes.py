@@ -14,8 +14,7 @@ too; and where E is small, with its digits,
     n0 = t (18 + t (8 + t)) - a (10 + t) - 2j - y (1 + a),  and  P = F (2 mu (I - S^-1) + lambda t S^-1).
 """
 
-#: Below this J the volumetric energy of neo-Hookean material is continued by its second-order Taylor expansion.
-CONTINUED_BELOW = 0.5
+from .constitutive import CONTINUED_BELOW
 
 #: q, 16 at rest, below which R is not trusted: the root has lost digits, or is about to meet another.
 INDEFINITE = 1.0
