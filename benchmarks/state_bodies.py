@@ -154,7 +154,7 @@ def cube(level: int) -> Subject:
     return Subject(f"cube {level}", mesh, mesh.points[:, 1] < 1e-9, states)
 
 
-def organ(name: str, count: int) -> Subject:
+def organ(name: str, count: int, worlds: int = 1) -> Subject:
     """A ball of 10 cm or the bunny, of about so many elements, its lowest tenth held."""
     domain = wc.Domain.sphere(0.05) if name == "ball" else wc.Domain.from_surface("warp:bunny")
     size = float(np.ptp(domain.bounds, axis=0).max()) * 1.001 / max(1, round((count / 30) ** (1 / 3)))
@@ -163,7 +163,8 @@ def organ(name: str, count: int) -> Subject:
     y = mesh.points[:, 1]
     states = ("under its weight", "a tenth of subtrees bad")
     held = y < y.min() + 0.1 * np.ptp(y)
-    return Subject(f"{name} {len(mesh.tets)}", mesh, held, states, lambda: organ(name, count // 8))
+    title = f"{name} {len(mesh.tets)}" if worlds == 1 else f"{worlds} {name}s {len(mesh.tets)}"
+    return Subject(title, mesh, held, states, lambda: organ(name, count // 8, worlds), worlds=worlds)
 
 
 # --- states by physics ------------------------------------------------------------------------------------------------

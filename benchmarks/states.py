@@ -28,9 +28,11 @@ import warp_corot as wc
 LEVELS = {"cuda": [6, 9, 12, 15, 18], "cpu": [6, 12]}
 ORGANS = {"cuda": [20_000, 100_000, 1_000_000], "cpu": [20_000]}
 ROUNDS = {"cuda": 9, "cpu": 5}
-BODIES = ("beam", "beams", "notch", "cube", "ball", "bunny")
+BODIES = ("beam", "beams", "notch", "cube", "ball", "bunny", "balls")
 #: Copies of the level-6 beam that are stepped together.
 WORLDS = {"cuda": 1024, "cpu": 16}
+#: Copies of a ball that are stepped together, and about how many elements each has.
+BALLS = {"cuda": (64, 10_000), "cpu": (4, 1_000)}
 #: Of more elements than these, some drawn at random are looked at.
 LOOKED_AT = 200_000
 
@@ -47,6 +49,9 @@ def subjects(options: Any, where: str) -> Iterator[Subject]:
                 yield make(level)
     if "beams" in options.bodies:
         yield beam(options.levels[0], WORLDS[where])
+    if "balls" in options.bodies and options.organs:
+        worlds, count = BALLS[where]
+        yield organ("ball", count, worlds)
     for count in options.organs:
         for name in ("ball", "bunny"):
             if name in options.bodies:

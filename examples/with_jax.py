@@ -1,18 +1,22 @@
 """A soft blade in a gusty wind, as a part of a JAX program: steps are an operation inside `jit` and `scan`.
 
 The wind, a JAX function of place and time, becomes forces, and these the positions some steps later, in buffers of JAX
-and without a copy. Velocities stay in the simulation; the operation has no gradient. It takes `pip install jax`.
+and without a copy. Velocities stay in the simulation; the operation has no gradient.
 """
 
 import argparse
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import warp as wp
 
 import warp_corot as wc
 from warp_corot.io.usd_writer import UsdWriter
+
+try:
+    import jax
+    import jax.numpy as jnp
+except ImportError:
+    raise SystemExit('this takes JAX: pip install "warp-corot[jax]"') from None
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--device", help="cpu or cuda:0")

@@ -1,15 +1,19 @@
 """PyTorch holds up sixteen soft beams: forces that steps read are its tensor, and so are the positions they write.
 
 Nothing is copied and no value passes through the host. Each beam has a spring of another stiffness at its tip, with a
-damper, written as tensor code for all of them at once. It takes `pip install torch`.
+damper, written as tensor code for all of them at once. It takes `pip install "warp-corot[torch]"`.
 """
 
 import argparse
 
-import torch
 import warp as wp
 
 import warp_corot as wc
+
+try:
+    import torch
+except ImportError:
+    raise SystemExit('this takes PyTorch: pip install "warp-corot[torch]"') from None
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--device", help="cpu or cuda:0")

@@ -5,14 +5,14 @@ With E = F^T F - I, its invariants a = tr E, b = tr adj E, c = det E, and j = J 
 (Cayley-Hamilton for S), whose slope is 4q, q = 2 (s1 + s2)(s1 + s3)(s2 + s3) of the principal stretches. From t follow
     I - S^-1 = (n0 I + (8 + y) E - (6 + y) adj E) / q,  y = (2t - 6j) / J,
     n0 = t (18 + t (8 + t)) - a (10 + t) - 2j - y (1 + a),  and  P = F (2 mu (I - S^-1) + lambda t S^-1),
-with the digits of E however small it is, and for J > 0
-    R = ((x^2 + tr C) F + 2 x cof F - 2 F C) / q,  x = t + 3,
-for every F where q is not small, flattened and turned over too. ``law_lanes`` does the same for eight elements at once.
+with the digits of E however small it is, for J > 0.
+Flat and turned over elements have their rotations from ``robust_rotation``. ``law_lanes`` does the same for eight
+elements at once.
 """
 
 import warp as wp
 
-from .matrices import cofactor, column, identity3
+from .matrices import identity3, reciprocal, square_root
 from .quaternion import robust_rotation
 
 wp.set_module_options({"enable_backward": False})
@@ -20,25 +20,10 @@ wp.set_module_options({"enable_backward": False})
 # J up to which an element counts as flat or turned over, and the trace of E up to which F counts as of order one.
 FLAT = wp.constant(0.03)
 FAR = wp.constant(50.0)
-# |E|^2 below which the series for t is a better start than the bound above it.
+# |E|^2 below which the series for t is the start.
 NEAR = wp.constant(0.4)
-# A step from which Newton's iteration leaves at most some 1e-7, over x; and how many there may be.
+# A step from which Newton's iteration leaves at most some 1e-7, over x.
 LAST_STEP = wp.constant(1.0e-4)
-MAX_STEPS = wp.constant(24)
-# q over |F|^3, 3.1 at rest, below which the rotation has lost digits or is about to be no longer defined.
-INDEFINITE = wp.constant(0.2)
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    float r;
-    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x));
-    return r;
-#else
-    return 1.0f / x;
-#endif
-""")
-def reciprocal(x: float) -> float: ...
 
 
 @wp.func
@@ -51,23 +36,28 @@ def newton_step_of(t: float, c0: float, c1: float, c2: float):
 @wp.func
 def stretch_trace(a: float, b: float, c: float, j: float):
     """t = tr S - 3 of the invariants of E and j = J - 1, where J > 0."""
-    c0 = a * (a - 20.0) - 24.0 * j - 4.0 * b
-    c1 = 64.0 - 12.0 * a - 8.0 * j
-    c2 = 48.0 - 2.0 * a
-    # The series of tr sqrt(I + E); where it ends too early a / 2, which is never below: there the iteration descends.
+    # The series of tr sqrt(I + E).
     p2 = a * a - 2.0 * b
     p3 = a * (p2 - b) + 3.0 * c
     p4 = a * (p3 + c) - b * p2
-    t = 0.5 * a
-    if p2 < NEAR:
-        t += 0.0625 * p3 - 0.125 * p2 - 0.0390625 * p4
+    t = 0.5 * a + 0.0625 * p3 - 0.125 * p2 - 0.0390625 * p4
+    if p2 >= NEAR:
+        # Where it ends too early: x = tr S from x^2 = tr C + 2 y, y^2 = tr adj C + 2 J x, from x <= sqrt(3 tr C) on. In
+        # each round the error shrinks to a ninth or less.
+        first = a + 3.0
+        second = b + 2.0 * a + 3.0
+        twice = 2.0 + 2.0 * j
+        x = square_root(3.0 * first)
+        for _ in range(2):
+            x = square_root(first + 2.0 * square_root(second + twice * x))
+        t = x - 3.0
+    c0 = a * (a - 20.0) - 24.0 * j - 4.0 * b
+    c1 = 64.0 - 12.0 * a - 8.0 * j
+    c2 = 48.0 - 2.0 * a
     step = newton_step_of(t, c0, c1, c2)
     t -= step
-    steps = int(1)
-    while wp.abs(step) > LAST_STEP * (t + 3.0) and steps < MAX_STEPS:
-        step = newton_step_of(t, c0, c1, c2)
-        t -= step
-        steps += 1
+    if wp.abs(step) > LAST_STEP * (t + 3.0):
+        t -= newton_step_of(t, c0, c1, c2)
     return t
 
 
@@ -133,47 +123,10 @@ def stretch_stress(w: wp.mat33, mu: float, lam: float):
     return p, trusted
 
 
-@wp.func(inline=False)
-def robust_rotation_out_of_line(f: wp.mat33):
-    return robust_rotation(f)
-
-
-@wp.func
-def algebraic_rotation(f: wp.mat33):
-    """The rotation of an F of any rank, sign and size, as ``robust_rotation``."""
-    n2 = wp.ddot(f, f)
-    r = wp.mat33()
-    sound = n2 > 1.0e-10 and n2 < 1.0e10
-    if sound:
-        scale = 1.0 / wp.sqrt(n2)
-        g = scale * f
-        cof = cofactor(g)
-        det = wp.dot(column(g, 0), column(cof, 0))
-        c2 = wp.ddot(cof, cof)
-        # Of F with |F| = 1. sigma_2 sigma_3 + ... of positive terms is at most sqrt(3) |cof F|; where F is turned over
-        # one term alone is positive.
-        x = wp.sqrt(1.0 + wp.where(det > 0.0, 3.4641016, 2.0) * wp.sqrt(c2))
-        slope = float(0.0)
-        step = float(1.0)
-        steps = int(0)
-        while wp.abs(step) > LAST_STEP and steps < MAX_STEPS:
-            slope = 4.0 * (x * x - 1.0) * x - 8.0 * det
-            step = (((x * x - 2.0) * x - 8.0 * det) * x + (1.0 - 4.0 * c2)) / slope
-            x -= step
-            steps += 1
-        q = (x * x - 1.0) * x - 2.0 * det
-        sound = q > INDEFINITE and wp.abs(step) <= LAST_STEP
-        gc = g * (wp.transpose(g) * g)
-        r = ((x * x + 1.0) / q) * g + (2.0 * x / q) * cof - (2.0 / q) * gc
-    if not sound:
-        r = robust_rotation_out_of_line(f)
-    return r
-
-
 @wp.func
 def turned_stress(f: wp.mat33, mu: float, lam: float):
     """As ``stretch_stress``, of F, for every F; where E is small it has not its digits."""
-    r = algebraic_rotation(f)
+    r = robust_rotation(f)
     return (2.0 * mu) * f + (lam * (wp.ddot(r, f) - 3.0) - 2.0 * mu) * r
 
 

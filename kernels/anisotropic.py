@@ -99,12 +99,19 @@ def definiteness(strain: wp.mat33):
 def turned_stress(strain: wp.mat33, material: OrthotropicMaterial, t: int):
     """R^T P: its symmetric part and the axial vector of the other one."""
     i = t * material.stride
-    stress = orthotropic_stress(strain, material.stiffness[i])
+    stress, a = turned_stress_of(strain, material.stiffness[i], material.mu[i], material.lam[i])
+    return stress, a
+
+
+@wp.func
+def turned_stress_of(strain: wp.mat33, c: vec9, mu: float, lam: float):
+    """The same of a stiffness and the nearest isotropic material."""
+    stress = orthotropic_stress(strain, c)
     share, slope, scale, adjugate, det = definiteness(strain)
     e = strain * scale
     turning = stress
     if share < 1.0:
-        isotropic = hooke(strain, material.mu[i], material.lam[i])
+        isotropic = hooke(strain, mu, lam)
         excess = stress - isotropic
         turning = share * excess
         stress = isotropic + turning + (0.5 * wp.ddot(e, excess)) * slope

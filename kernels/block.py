@@ -12,23 +12,27 @@ import functools
 
 import warp as wp
 
-from .algebraic import algebraic_rotation, turned_stress
+from .algebraic import turned_stress
 from .block_layout import FIRST_SHIFT, FOLLOWING_SHIFT, NEIGHBOURS, NO_NODE, NODE_WORDS, NUMBERS, WARP, Layout
 from .constitutive import hooke, symmetric
 from .elements import FRAME_SHIFT, LEVEL_MASK, Subtrees, load_node, mirror_sign, store_node
 from .integrate import add_support_work, is_finite, symplectic_euler_velocity, vector_at
 from .matrices import column, identity3
-from .pace import DONE, DT, Pace
+from .pace import DONE, DT, Pace, length_before
+from .quaternion import robust_rotation
 from .shapes import VOLUME, fingerprint
 from .subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS
 from .subtree_forces import columns_of, leaf_forces_of, mat10, near_forces, shared_forces
 
 wp.set_module_options({"enable_backward": False})
 
-#: Threads of a multiprocessor that the registers of a whole subtree's forces leave room for.
-BUSY_THREADS = 512
+#: Threads of a multiprocessor that registers must have room for.
+BUSY_THREADS = 640
 
 LOAD, STORE, LOAD_BYTES = 0, 1, 2
+RESERVE, WRITE, READ, COUNT, CLEAR = 0, 1, 2, 3, 4
+#: What an entry of a block's list is: which thread left it out, and which leaf it is.
+LEAF_SHIFT = 16
 
 vec3u = wp.types.vector(length=NODE_WORDS, dtype=wp.uint64)
 
@@ -41,10 +45,32 @@ vec3u = wp.types.vector(length=NODE_WORDS, dtype=wp.uint64)
 def synchronize_block(): ...
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __syncthreads_or(flag);
+#else
+    return flag;
+#endif
+""")
+def synchronize_any(flag: int) -> int:
+    """Wait for the block's threads; whether any has a flag."""
+    ...
+
+
 @wp.func
 def number_in(word: wp.uint64, k: int):
     """The k-th of the four 16-bit numbers in a word."""
     return int((word >> wp.uint64(16 * k)) & wp.uint64(0xFFFF))
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __popc(bits);
+#else
+    return __builtin_popcount(bits);
+#endif
+""")
+def bit_count(bits: int) -> int: ...
 
 
 @wp.func_native("""
@@ -68,6 +94,30 @@ def lowest_bit(bits: int) -> int: ...
 #endif
 """)
 def shuffle_down(value: wp.vec3, distance: int) -> wp.vec3: ...
+
+
+def shared_list(room: int) -> wp.Function:
+    """A list of integers in shared memory, as one function.
+
+    It makes room for some and returns where, writes or reads one, returns how many there are, or forgets all.
+    """
+    snippet = f"""
+#if defined(__CUDA_ARCH__)
+    __shared__ int count;
+    __shared__ int entries[{room}];
+    if (access == {RESERVE}) return atomicAdd(&count, value);
+    if (access == {WRITE}) entries[i] = value;
+    if (access == {READ}) return entries[i];
+    if (access == {COUNT}) return count < {room} ? count : {room};
+    if (access == {CLEAR}) count = 0;
+#endif
+    return 0;
+"""
+
+    @wp.func_native(snippet)
+    def list_of(access: int, i: int, value: int) -> int: ...
+
+    return list_of
 
 
 def shared_vectors(count: int, tag: str) -> wp.Function:
@@ -135,90 +185,108 @@ def _vectors(rows: list) -> wp.Function:
     return look_up
 
 
-def _repair_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -> wp.Function:
-    """What does the leaves of a part that the fast iteration left out.
+def _left_out_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -> tuple[wp.Function, ...]:
+    """What does the leaves that the subtrees' threads leave out.
 
-    It takes numbers, not the body: a struct that a function which is not inlined takes is copied for every call.
+    These list them, any thread finds the forces of one, and who left it out adds them up, so that sums have one order.
     """
-    shape, leaves_each = layout.shape, 8 // layout.parts
+    shape, room = layout.shape, layout.room
     node_of, place_of = _table([list(leaf) for leaf in LEAVES[shape]]), _table(layout.places)
     handed = _table([[int(h)] for h in HANDEDNESS[shape]])
     rest_of = _vectors([[2.0 * c for c in point] for point in POSITIONS[shape]])
     frame_of = _vectors([column for leaf in FRAMES[shape] for column in leaf])
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
+    waiting, force = shared_list(room), shared_vectors(4 * room, "forces of single leaves")
+
+    @wp.func
+    def enlist(thread: int, left_out: int):
+        """List a thread's leaves as far as there is room; where the first of them stands."""
+        first = int(0)
+        if left_out != 0:
+            first = waiting(wp.static(RESERVE), 0, bit_count(left_out))
+            i = int(first)
+            left = int(left_out)
+            while left != 0 and i < wp.static(room):
+                waiting(wp.static(WRITE), i, thread | (lowest_bit(left) << wp.static(LEAF_SHIFT)))
+                left = left & (left - 1)
+                i += 1
+        return first
 
     @wp.func
     def position(words: vec3u, k: int, q: wp.mat33, inv_h: float):
         """Of node k, relative to the first's displacement, in edge lengths of a leaf."""
-        moved = displacement(wp.static(LOAD_BYTES), number_in(words[k // NUMBERS], k % NUMBERS), wp.vec3())
+        # An index that is not known would put the words into memory.
+        word = wp.where(k < NUMBERS, words[0], wp.where(k < wp.static(2 * NUMBERS), words[1], words[2]))
+        moved = displacement(wp.static(LOAD_BYTES), number_in(word, k % NUMBERS), wp.vec3())
         origin = displacement(wp.static(LOAD_BYTES), number_in(words[0], 0), wp.vec3())
         return (moved - origin) * inv_h + q * rest_of(k)
 
-    @wp.func(inline=False)
-    def repair(
-        words: vec3u,
-        s: int,
-        part: int,
-        left_out: int,
-        maubach: wp.mat33,
-        h: float,
-        mirror: float,
-        mu: wp.array[wp.float32],
-        lam: wp.array[wp.float32],
-        material: int,
-        stride: int,
+    @wp.func
+    def do_one(
+        body: BlockBody, i: int, mu: wp.array[wp.float32], lam: wp.array[wp.float32], material: int, stride: int
     ):
-        """Add the forces of the leaves that were left out, one by one with the robust rotation, to the part's slots.
-
-        ``maubach`` is the subtree's frame, left-handed if ``mirror`` is -1; ``material`` is the first leaf's place.
-        """
+        """Find the forces of the i-th listed leaf, for any F; ``material`` is the world's first."""
+        entry = waiting(wp.static(READ), i, 0)
+        leaf = entry >> wp.static(LEAF_SHIFT)
+        warp = (entry & wp.static((1 << LEAF_SHIFT) - 1)) // wp.static(WARP)
+        s = (warp // wp.static(layout.parts)) * wp.static(WARP) + entry % wp.static(WARP)
+        code = body.subtrees.code[s]
+        h = 0.5 * body.subtrees.size[(code & LEVEL_MASK) // 3]
+        mirror = mirror_sign(code)
+        q = body.subtrees.frames[code >> FRAME_SHIFT]
+        # Left-handed if ``mirror`` is -1.
+        maubach = wp.matrix_from_cols(column(q, 0), column(q, 1), column(q, 2) * mirror)
+        words = vec3u(body.nodes[0, s], body.nodes[1, s], body.nodes[2, s])
         inv_h = 1.0 / h
         area = wp.static(VOLUME[shape]) * h * h
-        turned = wp.mat33()
+        at = material + (body.subtrees.first[s] + leaf) * stride
+        m = area * mu[at]
+        k = area * lam[at]
+        c0, c1, c2 = columns(
+            position(words, node_of(leaf, 0), maubach, inv_h),
+            position(words, node_of(leaf, 1), maubach, inv_h),
+            position(words, node_of(leaf, 2), maubach, inv_h),
+            position(words, node_of(leaf, 3), maubach, inv_h),
+        )
+        p = wp.mat33()
         if wp.static(layout.shared):
-            c0, c1, c2 = columns(
+            d0, d1, d2 = columns(
                 position(words, 0, maubach, inv_h),
                 position(words, 1, maubach, inv_h),
                 position(words, 2, maubach, inv_h),
                 position(words, 3, maubach, inv_h),
             )
-            r = algebraic_rotation(wp.matrix_from_cols(c0, c1, c2 * mirror))
+            r = robust_rotation(wp.matrix_from_cols(d0, d1, d2 * mirror))
             turned = wp.matrix_from_cols(column(r, 0), column(r, 1), column(r, 2) * mirror)
-        left = left_out & (wp.static((1 << leaves_each) - 1) << (part * wp.static(leaves_each)))
-        while left != 0:
+            # R times the leaf's Maubach frame.
+            z = turned * wp.matrix_from_cols(frame_of(3 * leaf), frame_of(3 * leaf + 1), frame_of(3 * leaf + 2))
+            p = z * hooke(symmetric(wp.transpose(z) * wp.matrix_from_cols(c0, c1, c2)) - identity3(), m, k)
+        else:
+            hand = mirror * float(handed(leaf, 0))
+            p = turned_stress(wp.matrix_from_cols(c0, c1, c2 * hand), m, k)
+            p = wp.matrix_from_cols(column(p, 0), column(p, 1), hand * column(p, 2))
+        f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
+        force(wp.static(STORE), 4 * i, f0)
+        force(wp.static(STORE), 4 * i + 1, f1)
+        force(wp.static(STORE), 4 * i + 2, f2)
+        force(wp.static(STORE), 4 * i + 3, f3)
+
+    @wp.func
+    def collect(s: int, part: int, first: int, left_out: int):
+        """Add the forces of a thread's listed leaves to its slots; the leaves for which there was no room."""
+        left = int(left_out)
+        i = int(first)
+        while left != 0 and i < wp.static(room):
             leaf = lowest_bit(left)
             left = left & (left - 1)
-            c0, c1, c2 = columns(
-                position(words, node_of(leaf, 0), maubach, inv_h),
-                position(words, node_of(leaf, 1), maubach, inv_h),
-                position(words, node_of(leaf, 2), maubach, inv_h),
-                position(words, node_of(leaf, 3), maubach, inv_h),
-            )
-            i = material + leaf * stride
-            m = area * mu[i]
-            k = area * lam[i]
-            p = wp.mat33()
-            if wp.static(layout.shared):
-                # R times the leaf's Maubach frame.
-                z = turned * wp.matrix_from_cols(frame_of(3 * leaf), frame_of(3 * leaf + 1), frame_of(3 * leaf + 2))
-                p = z * hooke(symmetric(wp.transpose(z) * wp.matrix_from_cols(c0, c1, c2)) - identity3(), m, k)
-            else:
-                hand = mirror * float(handed(leaf, 0))
-                p = turned_stress(wp.matrix_from_cols(c0, c1, c2 * hand), m, k)
-                p = wp.matrix_from_cols(column(p, 0), column(p, 1), hand * column(p, 2))
-            f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
             for n in range(4):
-                force = f0
-                if n == 1:
-                    force = f1
-                if n == 2:
-                    force = f2
-                if n == 3:
-                    force = f3
                 at = s + place_of(part, node_of(leaf, n)) * wp.static(layout.subtrees)
-                slot(wp.static(STORE), at, slot(wp.static(LOAD), at, force) + force)
+                added = force(wp.static(LOAD), 4 * i + n, wp.vec3())
+                slot(wp.static(STORE), at, slot(wp.static(LOAD), at, added) + added)
+            i += 1
+        return left
 
-    return repair
+    return waiting, enlist, do_one, collect
 
 
 @functools.cache
@@ -235,7 +303,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
     needs, places = [layout.needs(part) for part in range(parts)], layout.places
     displacement, velocity = shared_vectors(layout.nodes, "displacements"), shared_vectors(layout.nodes, "velocities")
     slot = shared_vectors(zero_slot + 1, "forces")
-    repair = _repair_of(layout, displacement, slot)
+    waiting, enlist, do_one, collect = _left_out_of(layout, displacement, slot)
 
     @wp.kernel(
         module="unique",
@@ -267,6 +335,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
     ):
         _generated_from = wp.static(fingerprint(needs, places))
         dt = float(pace.seconds[DT])
+        kick = 0.5 * (float(length_before(pace)) + dt)
         world = wp.tid() // wp.static(threads)
         thread = wp.tid() % wp.static(threads)
         base = world * body.node_count
@@ -277,6 +346,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
             place += wp.static(threads)
         if thread == 0:
             slot(wp.static(STORE), wp.static(zero_slot), wp.vec3())
+            waiting(wp.static(CLEAR), 0, 0)
         synchronize_block()
         warp = thread // wp.static(WARP)
         part = warp % wp.static(parts)
@@ -286,7 +356,8 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
         h = 0.5 * body.subtrees.size[(code & LEVEL_MASK) // 3]
         mirror = mirror_sign(code)
         q = body.subtrees.frames[code >> FRAME_SHIFT]
-        material = (world * body.element_count + body.subtrees.first[mine]) * stride
+        material_of_world = world * body.element_count * stride
+        material = material_of_world + body.subtrees.first[mine] * stride
         damped = 1.0 / (1.0 + dt * damping)
         # In registers from here on, two nodes each.
         words = vec3u()
@@ -298,8 +369,8 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
         numbers1 = body.slots[1, task]
         step = int(0)
         while step < steps:
+            left_out = int(0)
             if s < body.subtree_count:
-                left_out = int(0)
                 for p in range(wp.static(parts)):
                     if part == p:
                         x = mat10()
@@ -318,10 +389,16 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
                         for k in range(10):
                             if wp.static(places[p][k] >= 0):
                                 slot(wp.static(STORE), s + wp.static(places[p][k] * capacity), g[k])
-                if left_out != 0:
-                    maubach = wp.matrix_from_cols(column(q, 0), column(q, 1), column(q, 2) * mirror)
-                    repair(words, s, part, left_out, maubach, h, mirror, mu, lam, material, stride)
-            synchronize_block()
+            listed = enlist(thread, left_out)
+            while synchronize_any(left_out) != 0:
+                if thread < waiting(wp.static(COUNT), 0, 0):
+                    do_one(body, thread, mu, lam, material_of_world, stride)
+                synchronize_block()
+                left_out = collect(s, part, listed, left_out)
+                if thread == 0:
+                    waiting(wp.static(CLEAR), 0, 0)
+                synchronize_block()
+                listed = enlist(thread, left_out)
             task = thread
             while task < wp.static(layout.tasks):
                 if wp.static(layout.tasks > threads):
@@ -349,7 +426,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
                     w = inverse_mass[i]
                     moving = velocity(wp.static(LOAD), place, force)
                     if w > 0.0:
-                        moving = symplectic_euler_velocity(moving, force, w, gravity, dt, damped)
+                        moving = symplectic_euler_velocity(moving, force, w, gravity, kick, damped)
                         velocity(wp.static(STORE), place, moving)
                     else:
                         add_support_work(elastic, dt * moving, support_work)
@@ -361,6 +438,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
                         wp.atomic_min(bad_step, 0, pace.counts[DONE] + wp.int64(step + 1))
                 task += wp.static(threads)
             synchronize_block()
+            kick = dt
             step += 1
         place = thread
         while place < body.node_count:

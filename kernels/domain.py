@@ -12,6 +12,14 @@ FAR = 1.0e15
 #: quarter on closed surfaces (thin plates and shells among them), at 1.0 a few were; 2.0 takes half as long again.
 ACCURACY = 1.5
 
+#: A closest point whose barycentric coordinate at a corner is below this lies on the edge across from it.
+AT_EDGE = wp.constant(1.0e-4)
+
+# What is on the sides of a triangle: the body behind it alone, or on both, or it must be found out for each point.
+UNSURE = wp.constant(0)
+BOUNDARY = wp.constant(1)
+BURIED = wp.constant(2)
+
 
 @wp.kernel(enable_backward=False)
 def evaluate_sphere(
@@ -110,19 +118,64 @@ def sampler(function: wp.Function) -> wp.Kernel:
     return evaluate_function
 
 
+@wp.func
+def pseudo_normal(
+    face: int,
+    u: float,
+    v: float,
+    indices: wp.array[wp.int32],
+    edge_normals: wp.array2d[wp.vec3],
+    corner_normals: wp.array[wp.vec3],
+    normal: wp.vec3,
+):
+    """The normal at a closest point that tells inside from outside: the triangle's own within it, at an edge the sum of
+    its two triangles', at a corner that of all around it weighted by their angles (Baerentzen and Aanaes 2005)."""
+    w = 1.0 - u - v
+    near = wp.vec3(u, v, w)
+    count = int(0)
+    last = int(0)
+    kept = int(0)
+    for n in range(3):
+        if near[n] < AT_EDGE:
+            count += 1
+            last = n
+        else:
+            kept = n
+    found = normal
+    if count == 1:
+        found = edge_normals[face, last]
+    elif count == 2:
+        found = corner_normals[indices[3 * face + kept]]
+    return found
+
+
 @wp.kernel(enable_backward=False)
 def evaluate_surface(
     # In
     points: wp.array[wp.vec3],
     mesh: wp.uint64,
+    indices: wp.array[wp.int32],
+    sides: wp.array[wp.uint8],
+    edge_normals: wp.array2d[wp.vec3],
+    corner_normals: wp.array[wp.vec3],
     # Out
     phi: wp.array[wp.float32],
 ):
-    """Distance to the closest triangle, negative where the winding number is above one half."""
+    """Distance to the closest triangle, negative where the winding number is above one half. Where that triangle is
+    known to have the outside in front of it and the inside behind, its normal tells the same, ten times as fast."""
     i = wp.tid()
     p = points[i]
-    found = wp.mesh_query_point_sign_winding_number(mesh, p, FAR, ACCURACY)
-    phi[i] = found.sign * wp.length(wp.mesh_eval_position(mesh, found.face, found.u, found.v) - p)
+    found = wp.mesh_query_point_no_sign(mesh, p, FAR)
+    apart = p - wp.mesh_eval_position(mesh, found.face, found.u, found.v)
+    side = int(sides[found.face])
+    sign = float(-1.0)
+    if side == UNSURE:
+        sign = wp.mesh_query_point_sign_winding_number(mesh, p, FAR, ACCURACY).sign
+    elif side == BOUNDARY:
+        normal = wp.mesh_eval_face_normal(mesh, found.face)
+        normal = pseudo_normal(found.face, found.u, found.v, indices, edge_normals, corner_normals, normal)
+        sign = wp.where(wp.dot(apart, normal) < 0.0, -1.0, 1.0)
+    phi[i] = sign * wp.length(apart)
 
 
 @wp.kernel(enable_backward=False)
@@ -250,3 +303,34 @@ def clear_labels_outside(
     i = wp.tid()
     if phi[i] > 0.0:
         labels[i] = 0
+
+
+@wp.kernel(enable_backward=False)
+def evaluate_thickness(
+    # In
+    points: wp.array[wp.vec3],
+    inward: wp.array[wp.vec3],
+    reach: float,
+    side: float,
+    mesh: wp.uint64,
+    # Out
+    thickness: wp.array[wp.float32],
+):
+    """How far it is along a direction to where a ray leaves the body (``side`` 1) or what is around it (-1).
+
+    ``reach`` if it is farther. A triangle that looks the other way is where one enters: a part that overlaps this one.
+    """
+    i = wp.tid()
+    direction = inward[i]
+    at = float(0.0)
+    thickness[i] = reach
+    for _ in range(4):
+        if at < reach:
+            found = wp.mesh_query_ray(mesh, points[i] + at * direction, direction, reach - at)
+            if not found.result:
+                at = reach
+            elif side * wp.dot(wp.mesh_eval_face_normal(mesh, found.face), direction) > 0.0:
+                thickness[i] = at + found.t
+                at = reach
+            else:
+                at += found.t + 1.0e-4 * reach

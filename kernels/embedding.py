@@ -100,3 +100,30 @@ def nearest_faces(
     i = wp.tid()
     found = wp.mesh_query_point_no_sign(mesh, points[i], far)
     faces[i] = wp.where(found.result, found.face, -1)
+
+
+@wp.kernel(enable_backward=False)
+def find_holders(
+    # In
+    tree: wp.uint64,
+    points: wp.array[wp.vec3d],
+    corners: wp.array[wp.vec3d],
+    inverses: wp.array[wp.mat33d],
+    # Out
+    holders: wp.array[wp.int32],
+):
+    """The tetrahedron that holds a point, -1 where none does; of several the one in whose middle it is the most."""
+    i = wp.tid()
+    p = points[i]
+    at = wp.vec3(float(p[0]), float(p[1]), float(p[2]))
+    query = wp.bvh_query_aabb(tree, at, at)
+    best = wp.float64(-1.0e-9)
+    holder = int(-1)
+    candidate = int(0)
+    while wp.bvh_query_next(query, candidate):
+        w = inverses[candidate] * (p - corners[candidate])
+        least = wp.min(wp.min(w), wp.float64(1.0) - w[0] - w[1] - w[2])
+        if least > best:
+            best = least
+            holder = candidate
+    holders[i] = holder

@@ -14,8 +14,7 @@ from typing import Any
 import warp as wp
 
 from .elements import frame, load_node, local_gradient, store_node
-from .integrate import by_vectors, vector_at
-from .pace import CURVATURE, DONE, DT, SHORTENED, STRAIN, Pace
+from .pace import CURVATURE, DONE, DT, STRAIN, Pace
 
 wp.set_module_options({"enable_backward": False})
 
@@ -139,34 +138,3 @@ def find_strains(Elements: Any) -> wp.Kernel:
         keep_largest(most, STRAIN, found)
 
     return find_strains
-
-
-@wp.kernel(enable_backward=False)
-def shift_velocities(
-    # In
-    gravity: wp.vec3,
-    inverse_mass: wp.array[wp.float32],
-    has_load: int,
-    load: wp.array[Any],
-    f: wp.array[wp.vec4],
-    control: wp.array[wp.float64],
-    # In and out
-    v: wp.array[wp.vec4],
-):
-    """Let velocities, which are half a step behind, be half of the new step behind.
-
-    The scheme stays of second order where the step changes. Without this, steps that get shorter as a body stiffens and
-    longer as it springs back give it energy at every bounce.
-    """
-    i = wp.tid()
-    w = inverse_mass[i]
-    shortened = float(control[SHORTENED])
-    if w == 0.0 or shortened == 0.0:
-        return
-    force = load_node(f, i)
-    if has_load != 0:
-        force += vector_at(load, i)
-    store_node(v, i, load_node(v, i) + 0.5 * shortened * (w * force + gravity))
-
-
-SHIFT_VELOCITIES = by_vectors(shift_velocities, "load")

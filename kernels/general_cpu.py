@@ -21,94 +21,16 @@ from .elements import (
     rest_volume,
     scatter_stress,
 )
-from .lanes import COMPILER_FLAGS, PRELUDE, on_cpu
-from .law_lanes import STRESSES
+from .lanes import COMPILER_FLAGS, native, on_cpu
+from .law_lanes import LAWS
 from .rotation import byers_xu
 
 wp.set_module_options({"enable_backward": False})
 
 
-#: Eight elements in the lanes, the last one again where there are no more: displacements d1, d2, d3 of the last three
-#: nodes from the first, rest matrices b and volumes.
-GATHER = """
-    const int first_element = 8 * block, end = wp::min(8, count - first_element);
-    const auto element = [&](int lane) { return wp::min(first_element + lane, count - 1); };
-    const auto node = [&](int lane, int n) { return &u.data[elements.nodes.data[element(lane)][n]][0]; };
-    lanes8 b[9], corner[4][4];
-    gather_matrix([&](int lane) { return elements.rest_inverse.data[element(lane)].data[0]; }, b);
-    gather([&](int lane) { return node(lane, 0); }, corner[0]);
-    gather([&](int lane) { return node(lane, 1); }, corner[1]);
-    gather([&](int lane) { return node(lane, 2); }, corner[2]);
-    gather([&](int lane) { return node(lane, 3); }, corner[3]);
-    const triple d1 = minus(get(corner[1], 0), get(corner[0], 0)), d2 = minus(get(corner[2], 0), get(corner[0], 0));
-    const triple d3 = minus(get(corner[3], 0), get(corner[0], 0));
-    // Values of elements, side by side.
-    const auto values_of = [&](const float* values) {
-        return end == 8 ? *reinterpret_cast<const lanes8*>(values + first_element)
-            : gather_one([&](int lane) { return values + element(lane); });
-    };
-    const lanes8 volume = values_of(elements.volume.data);
-"""
-
-#: Columns a of the displacement gradient (d1 d2 d3) B, and f of F = I + (d1 d2 d3) B.
-GRADIENT = """
-    triple a[3], f_[3];
-    for (int j = 0; j < 3; ++j) f_[j] = a[j] = combined(b[j], d1, b[3 + j], d2, b[6 + j], d3);
-    f_[0].x += 1.0f; f_[1].y += 1.0f; f_[2].z += 1.0f;
-"""
-
-#: Adds the forces of eight elements, one after the other, from their stresses p times -V, columns.
-ADD_FORCES = """
-    four parts[8][4];
-    triple rest = nothing;
-    for (int n = 1; n < 4; ++n) {
-        const lanes8* row = b + 3 * (n - 1);
-        const triple force = combined(row[0], p[0], row[1], p[1], row[2], p[2]);
-        rest = minus(rest, force);
-        part(force, &parts[0][n], 4);
-    }
-    part(rest, &parts[0][0], 4);
-    for (int lane = 0; lane < end; ++lane) {
-        const wp::vec_t<4, wp::int32>& to = elements.nodes.data[first_element + lane];
-        for (int n = 0; n < 4; ++n) *reinterpret_cast<four*>(&f.data[to[n]][0]) += parts[lane][n];
-    }
-"""
-
-#: Puts elements that are not ``sound`` on the list of those left out: how many, then which.
-LEAVE_OUT = """
-    if (any(~sound)) {
-        for (int lane = 0; lane < end; ++lane) {
-            if (!sound[lane]) left_out.data[++left_out.data[0]] = first_element + lane;
-        }
-    }
-"""
-
-#: mu and lambda, one for all or by element.
-MATERIAL = """
-    const lanes8 m = stride ? values_of(mu.data) : spread(mu.data[0]);
-    const lanes8 k = stride ? values_of(lam.data) : spread(lam.data[0]);
-"""
-
-
 def _forces(law: str) -> str:
-    leaves_out = law == "corotated"
-    if law == "linear":
-        strain = """
-    const lanes8 e[6] = {a[0].x, a[1].y, a[2].z,
-        0.5f * (a[0].y + a[1].x), 0.5f * (a[0].z + a[2].x), 0.5f * (a[1].z + a[2].y)};
-    f_[0] = f_[1] = f_[2] = nothing;
-    f_[0].x = f_[1].y = f_[2].z = spread(1.0f);
-"""
-    else:
-        strain = """
-    lanes8 e[6];
-    stretching_there(a, e);
-"""
-    return on_cpu(f"""{PRELUDE}{STRESSES[law]}
-{GATHER}{MATERIAL}{GRADIENT}{strain}
-    triple p[3];
-    {"const masks8 sound = " if leaves_out else ""}stress(f_, e, spread(1.0f), -volume * m, -volume * k, p);
-{ADD_FORCES}{LEAVE_OUT if leaves_out else ""}""")
+    leaves_out = ["left_out_elements"] if law == "corotated" else []
+    return on_cpu(LAWS[law], native("elements", "isotropic_elements", "element_forces", *leaves_out))
 
 
 @wp.func_native(_forces("corotated"))

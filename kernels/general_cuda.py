@@ -1,7 +1,8 @@
-"""Forces of general tetrahedra on CUDA, one thread an element.
+"""What forces of general tetrahedra are made of on CUDA, one thread an element, as the solver for Newton has them.
 
-Two things make it fast: rest matrices are read component by component, so that the threads of a warp read what is side
-by side, and neighbouring elements' forces are added up before they go to memory. Blocks of 64 threads were the fastest.
+Two things make that fast: rest matrices are read component by component, so that the threads of a warp read what is
+side by side, and neighbouring elements' forces are added up before they go to memory. Blocks of 64 threads were the
+fastest.
 """
 
 import functools
@@ -18,10 +19,6 @@ wp.set_module_options({"enable_backward": False})
 
 #: Threads of a block: more wait longer for one another (H200: 64 takes 0.86 of 256).
 BLOCK = 64
-#: How often neighbours' forces are added up; see ``add_four_forces``.
-ROUNDS = 1
-#: Blocks that a multiprocessor's registers must have room for: what is rarely run shall not take registers from all.
-RESIDENT = 16
 
 
 @wp.struct
@@ -89,27 +86,3 @@ def corotated_law(rotation: wp.Function) -> wp.Function:
         return r * hooke(stretch_strain(corotated_strain(a, identity3(), r), a), mu, lam)
 
     return stress_of_rotation
-
-
-@functools.cache
-def scatter_general(stress: wp.Function) -> wp.Kernel:
-    """Add the forces of a law of ``constitutive``. Launch with block_dim BLOCK."""
-    add = add_stress(ROUNDS)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, RESIDENT))
-    def scatter_general(
-        # In
-        elements: PosedElements,
-        mu: wp.array[wp.float32],
-        lam: wp.array[wp.float32],
-        stride: int,
-        u: wp.array[wp.vec4],
-        # Out
-        f: wp.array[wp.vec4],
-    ):
-        t = wp.tid()
-        nodes = load_four(elements.nodes, t)
-        a = edge_differences(nodes, u) * rest_inverse_of(elements, t)
-        add(elements, t, nodes, stress(a, mu[t * stride], lam[t * stride]), f)
-
-    return scatter_general

@@ -13,7 +13,7 @@ import warp as wp
 
 from .elements import load_node, store_node
 from .keyframes import key_before
-from .pace import DONE, DT, Pace, time_after
+from .pace import DONE, DT, Pace, length_before, time_after
 
 wp.set_module_options({"enable_backward": False})
 
@@ -88,6 +88,8 @@ def step_symplectic_euler(
 ):
     """v <- (v + dt (f/m + g)) / (1 + dt damping); u <- u + dt v; f <- 0 for the next step to add to.
 
+    After a change of the step forces act for half of the old one and half of the new one.
+
     ``offset`` is this step's place in a run of recorded ones, whose steps ``pace`` does not count before its end.
     ``support_work`` adds up what moving supports put in against the elastic forces, and its absolute value [J].
     A node without inverse mass moves with the velocity it has (zero if fixed), and its support takes what is left of
@@ -95,6 +97,9 @@ def step_symplectic_euler(
     """
     i = wp.tid()
     dt = float(pace.seconds[DT])
+    kick = dt
+    if offset == 0:
+        kick = 0.5 * (float(length_before(pace)) + dt)
     elastic = load_node(f, i)
     force = elastic
     if has_load != 0:
@@ -102,7 +107,7 @@ def step_symplectic_euler(
     w = inverse_mass[i]
     velocity = load_node(v, i)
     if w > 0.0:
-        velocity = symplectic_euler_velocity(velocity, force, w, gravity, dt, 1.0 / (1.0 + dt * damping))
+        velocity = symplectic_euler_velocity(velocity, force, w, gravity, kick, 1.0 / (1.0 + dt * damping))
         store_node(v, i, velocity)
     else:
         store_node(reactions, i, -(force + mass[i] * gravity))
@@ -150,8 +155,11 @@ def follow_trajectory(
     a = displacements[key, row]
     target = a + s * (displacements[key + 1, row] - a)
     dt = float(pace.seconds[DT])
+    before = dt
+    if offset == 0:
+        before = float(length_before(pace))
     velocity = (target - load_node(u, i)) / dt
-    add_support_work(load_node(f, i), (0.5 * dt) * (load_node(v, i) - velocity), support_work)
+    add_support_work(load_node(f, i), 0.5 * (before * load_node(v, i) - dt * velocity), support_work)
     store_node(v, i, velocity)
 
 

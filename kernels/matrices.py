@@ -7,6 +7,48 @@ wp.set_module_options({"enable_backward": False})
 MAX_FLOAT = wp.constant(3.4028234e38)
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float r;
+    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x));
+    return r;
+#else
+    return 1.0f / x;
+#endif
+""")
+def reciprocal(x: float) -> float:
+    """1 / x to the last digit but one, in one instruction."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float r;
+    asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x));
+    return r;
+#else
+    return sqrtf(x);
+#endif
+""")
+def square_root(x: float) -> float:
+    """The root of x >= 0 to the last digit but one."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float r;
+    asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x));
+    return r;
+#else
+    return 1.0f / sqrtf(x);
+#endif
+""")
+def reciprocal_root(x: float) -> float:
+    """1 / sqrt(x) to the last digit but one."""
+    ...
+
+
 @wp.func
 def identity3():
     return wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)

@@ -13,6 +13,9 @@ DONE = wp.constant(0)
 SPLIT = wp.constant(1)
 OPEN = wp.constant(2)
 
+#: The need of an element that must be bisected, whatever is wished [m].
+MUST = wp.constant(1.0e30)
+
 #: A gradient below this share of the steepest possible is taken for that much.
 FLATTEST = wp.constant(0.1)
 
@@ -89,6 +92,7 @@ def judge_by_corners(
     first_child: wp.array[wp.int32],
     # Out
     states: wp.array[wp.int32],
+    needs: wp.array[wp.float32],
 ):
     """No surface is where values are beyond what the function can change over the distance from them.
 
@@ -115,13 +119,16 @@ def judge_by_corners(
         lowest = wp.min(lowest, wp.max(a, b) - change)
         highest = wp.max(highest, wp.min(a, b) + change)
     state = DONE
+    need = float(0.0)
     if outside or lowest > 0.5 * near:
         first_child[first + i] = VOID
     elif own_level < min_level:
         state = SPLIT
+        need = MUST
     elif own_level < max_level and not (inside or highest < -0.5 * near):
         state = OPEN
     states[i] = state
+    needs[first + i] = need
 
 
 @wp.func
@@ -194,10 +201,11 @@ def judge_by_edges(
     spacing: wp.float64,
     circumradius: wp.array[wp.float32],
     lipschitz: float,
-    tolerance: float,
+    tolerances: wp.array[wp.float32],
     # In and out
     first_child: wp.array[wp.int32],
     states: wp.array[wp.int32],
+    needs: wp.array[wp.float32],
     # Out
     unsure: wp.array[wp.int32],
     probes: wp.array[wp.vec3],
@@ -207,11 +215,13 @@ def judge_by_edges(
     """Compare the midpoints of the six edges with the linear interpolant: of a quadratic function they tell all.
 
     What barely passes is unsure, and looked at once more, in the middle of its piece of the surface or at its centroid:
-    what the quadratic function has there is ``expected``.
+    what the quadratic function has there is ``expected``. An element's need is how far off its piece of the surface
+    is [m].
     """
     i = wp.tid()
     element = elements[i]
     tet = tets[element]
+    tolerance = tolerances[level[element]]
     deviation = vec6()
     lowest = phi[tet[0]]
     highest = phi[tet[0]]
@@ -227,6 +237,7 @@ def judge_by_edges(
     worst = worst_deviation(deviation)
 
     state = OPEN
+    need = float(0.0)
     near = 0.5 * lipschitz * circumradius[level[element]]
     if lowest > near:
         first_child[element] = VOID
@@ -234,14 +245,19 @@ def judge_by_edges(
     elif highest < -near:
         state = DONE
     elif crossed:
-        tolerance *= gradient_size(tet, phi, lattice, float(spacing), lipschitz)
+        slope = gradient_size(tet, phi, lattice, float(spacing), lipschitz)
+        tolerance *= slope
+        need = worst / slope
         if worst > tolerance:
             state = SPLIT
-    elif worst > tolerance and wp.max(lowest, -highest) <= 2.0 * worst:
-        state = SPLIT
+    elif wp.max(lowest, -highest) <= 2.0 * worst:
+        need = worst
+        if worst > tolerance:
+            state = SPLIT
     if state == OPEN and (worst < 0.25 * tolerance or wp.max(lowest, -highest) > 4.0 * worst):
         state = DONE
     states[element - first] = state
+    needs[element] = wp.min(need, circumradius[level[element]])
     unsure[i] = wp.where(state == OPEN, 1, 0)
 
     place = wp.vec4(0.25)
@@ -271,13 +287,15 @@ def judge_by_probes(
     expected: wp.array[wp.float32],
     deviations: wp.array[wp.float32],
     tets: wp.array[wp.vec4i],
+    level: wp.array[wp.int32],
     phi: wp.array[wp.float32],
     lattice: wp.array[wp.vec3i],
     spacing: float,
     lipschitz: float,
-    tolerance: float,
+    tolerances: wp.array[wp.float32],
     # Out
     states: wp.array[wp.int32],
+    needs: wp.array[wp.float32],
 ):
     """The last look. Where the function is not the quadratic one of its ten values, as at a crease, it deviates between
     the points looked at by more than at them: by half as much again where three faces meet."""
@@ -293,15 +311,17 @@ def judge_by_probes(
     if surprise > 0.1 * deviation:
         deviation = 1.5 * deviation + surprise
     state = DONE
+    need = needs[element]
     if inside > 0 and inside < 4:
-        if deviation > tolerance * gradient_size(tet, phi, lattice, spacing, lipschitz):
-            state = SPLIT
+        need = deviation / gradient_size(tet, phi, lattice, spacing, lipschitz)
     elif (found[i] < 0.0) != (inside == 4):
-        if wp.max(wp.abs(found[i]), deviation) > tolerance:
-            state = SPLIT
-    elif deviation > tolerance and wp.abs(found[i]) <= 2.0 * deviation:
+        need = wp.max(wp.abs(found[i]), deviation)
+    elif wp.abs(found[i]) <= 2.0 * deviation:
+        need = deviation
+    if need > tolerances[level[element]]:
         state = SPLIT
     states[element - first] = state
+    needs[element] = need
 
 
 @wp.kernel(enable_backward=False)

@@ -10,10 +10,9 @@ import warp as wp
 
 from .constitutive import corotated_strain, hooke
 from .elements import GeneralElements, load_node, scatter_stress
-from .general_cpu import ADD_FORCES, GATHER, LEAVE_OUT
 from .general_cuda import PosedElements, add_stress, edge_differences, load_four, rest_inverse_of
-from .lanes import COMPILER_FLAGS, PRELUDE, on_cpu
-from .law_lanes import STRESSES
+from .lanes import COMPILER_FLAGS, native, on_cpu
+from .law_lanes import LAWS
 from .rotation import byers_xu, cofactor, identity3, warm_rotation
 
 wp.set_module_options({"enable_backward": False})
@@ -139,21 +138,10 @@ def scatter_posed_warm(
 
 # --- the same on the CPU, eight elements in the lanes of vector registers; see ``lanes`` -----------------------------
 
-_FORCES = f"""{PRELUDE}{STRESSES["corotated"]}
-{GATHER}
-    const lanes8 m = values_of(mu.data), k = values_of(lam.data);
-    // Columns of F = (x1-x0 x2-x0 x3-x0) B and of F - I.
-    triple a[3], f_[3];
-    for (int j = 0; j < 3; ++j) a[j] = f_[j] = combined(b[j], d1, b[3 + j], d2, b[6 + j], d3);
-    a[0].x -= 1.0f; a[1].y -= 1.0f; a[2].z -= 1.0f;
-    lanes8 e[6];
-    stretching_there(a, e);
-    triple p[3];
-    const masks8 sound = stress(f_, e, spread(1.0f), -volume * m, -volume * k, p);
-{ADD_FORCES}{LEAVE_OUT}"""
+_FORCES = on_cpu(LAWS["corotated"], native("elements", "posed_elements", "element_forces", "left_out_elements"))
 
 
-@wp.func_native(on_cpu(_FORCES))
+@wp.func_native(_FORCES)
 def eight_posed(
     elements: GeneralElements,
     block: int,

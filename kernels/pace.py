@@ -10,15 +10,18 @@ wp.set_module_options({"enable_backward": False})
 
 #: Places in ``Pace.counts`` and ``Pace.seconds``.
 DONE, DONE_THEN = wp.constant(0), wp.constant(1)
-DT, THEN = wp.constant(0), wp.constant(1)
+DT, THEN, BEFORE = wp.constant(0), wp.constant(1), wp.constant(2)
 #: Places in ``control``: the step that the state allows, the share of it that is taken, the longest step at rest, the
-#: shortest and longest that were taken, by how much the last change made the step shorter [s], how many checks in a row
-#: found the bodies calm, whether velocities are a user's, which belong to no step before, how many
-#: intervals there are from one check on energies to the next, and the steps done at the last one.
-ALLOWED, SHARE, AT_REST, SHORTEST, LONGEST, SHORTENED, CALM, GIVEN, CLOSENESS, FOLLOWED = (
-    wp.constant(k) for k in range(10)
-)
-CONTROLS = 10
+#: shortest and longest that were taken, how many checks in a row found the bodies calm, how many intervals there are
+#: from one check on energies to the next, the steps done at the last one, and the step that the state allowed then.
+ALLOWED, SHARE, AT_REST, SHORTEST, LONGEST, CALM, CLOSENESS, FOLLOWED, CHECKED = (wp.constant(k) for k in range(9))
+CONTROLS = 9
+#: Places in ``orders``, what the host asks of a run: when it ends [s], which is NEVER without an end; the steps done by
+#: then; and which of the two copies of the state is the last good one.
+END, STOP, SLOT = (wp.constant(k) for k in range(3))
+ORDERS = 3
+#: Later than all ends [s].
+NEVER = 1e300
 #: What a gauge finds of a body: the largest curvature [1/s^2], and the largest strain until the next measurement.
 CURVATURE, STRAIN = wp.constant(0), wp.constant(1)
 #: What is known of a body at rest: the largest stable step [s], the curvature that was found there, and the shares of a
@@ -38,7 +41,9 @@ class Pace:
     """The clock, on the device."""
 
     counts: wp.array[wp.int64]  # [2] steps done; steps done when their length changed last
-    seconds: wp.array[wp.float64]  # [2] length of a step; time when it changed last
+    # [3] length of a step; time when it changed last; length of the step that velocities are half of behind
+    # displacements, zero if a user gave them, who knows of one length only
+    seconds: wp.array[wp.float64]
 
 
 @wp.func
@@ -46,6 +51,17 @@ def time_after(pace: Pace, steps: int):
     """The time some steps after those that are done [s], float64."""
     made = pace.counts[DONE] + wp.int64(steps) - pace.counts[DONE_THEN]
     return pace.seconds[THEN] + wp.float64(made) * pace.seconds[DT]
+
+
+@wp.func
+def length_before(pace: Pace):
+    """The length of the last step [s], float64: velocities are half of it behind displacements.
+
+    Where the next one is longer or shorter, forces act for half of each. Without this, steps that get shorter as a body
+    stiffens and longer as it springs back give it energy at every bounce, and so do steps fitted to the end of a run.
+    """
+    before = pace.seconds[BEFORE]
+    return wp.where(before > wp.float64(0.0), before, pace.seconds[DT])
 
 
 @wp.func
@@ -60,11 +76,7 @@ def change_step(pace: Pace, dt: wp.float64):
 def advance_clock(steps: int, pace: Pace):
     """Count a run of recorded steps; within the run each step carries its offset."""
     pace.counts[DONE] = pace.counts[DONE] + wp.int64(steps)
-
-
-@wp.kernel(enable_backward=False)
-def set_step(dt: wp.float64, pace: Pace):
-    change_step(pace, dt)
+    pace.seconds[BEFORE] = pace.seconds[DT]
 
 
 @wp.kernel(enable_backward=False)
@@ -86,11 +98,13 @@ def safe_step(at_rest: wp.array2d[wp.float64], found: wp.array2d[wp.float32], bo
 
 
 @wp.func
+def allowed_step(control: wp.array[wp.float64]):
+    return wp.max(control[SHARE] * control[ALLOWED], LEAST * control[AT_REST])
+
+
+@wp.func
 def take_allowed_step(control: wp.array[wp.float64], pace: Pace):
-    dt = wp.max(control[SHARE] * control[ALLOWED], LEAST * control[AT_REST])
-    control[SHORTENED] = pace.seconds[DT] - dt
-    if control[GIVEN] != wp.float64(0.0):
-        control[SHORTENED] = wp.float64(0.0)
+    dt = allowed_step(control)
     control[SHORTEST] = wp.min(control[SHORTEST], dt)
     control[LONGEST] = wp.max(control[LONGEST], dt)
     change_step(pace, dt)
@@ -114,10 +128,47 @@ def take_safe_step(
         found[body, STRAIN] = 0.0
     control[ALLOWED] = wp.min(wp.max(safe, LEAST * longest), GROWTH * control[ALLOWED])
     take_allowed_step(control, pace)
-    control[GIVEN] = wp.float64(0.0)
 
 
 @wp.kernel(enable_backward=False)
 def resume_step(control: wp.array[wp.float64], pace: Pace):
     """Take the step that the state allows again, after others that ended at a given time."""
     take_allowed_step(control, pace)
+
+
+@wp.kernel(enable_backward=False)
+def take_orders(given: wp.array[wp.float64], orders: wp.array[wp.float64], changed: wp.array[wp.int32]):
+    """Begin a run: what the host asks of it lies in the host's own memory, which few threads should read."""
+    for k in range(ORDERS):
+        orders[k] = given[k]
+    changed[0] = 0
+
+
+@wp.kernel(enable_backward=False)
+def fit_step(orders: wp.array[wp.float64], control: wp.array[wp.float64], pace: Pace):
+    """Let the steps that are left end in time.
+
+    They are as long as one another, and no longer than what the state allows: where that is less than the host knew,
+    they end before, and the host asks for more.
+    """
+    dt = allowed_step(control)
+    left = orders[END] - time_after(pace, 0)
+    steps = orders[STOP] - wp.float64(pace.counts[DONE])
+    if left > wp.float64(0.0) and left <= steps * dt * wp.float64(1.0 + 1e-9):
+        dt = left / steps
+    change_step(pace, dt)
+
+
+@wp.kernel(enable_backward=False)
+def set_schedule(
+    calm: wp.float64,
+    closeness: wp.float64,
+    followed: wp.float64,
+    checked: wp.float64,
+    control: wp.array[wp.float64],
+):
+    """Note what the last check has found and when the next one is due; see ``CALM``."""
+    control[CALM] = calm
+    control[CLOSENESS] = closeness
+    control[FOLLOWED] = followed
+    control[CHECKED] = checked

@@ -15,13 +15,12 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from .block import LOAD, STORE, number_in, shuffle_down, synchronize_block
+from .algebraic import stretch_stress, turned_stress
+from .block import LOAD, STORE, lowest_bit, number_in, shuffle_down, synchronize_any, synchronize_block
 from .elements import load_node, store_node
-from .general_cuda import corotated_law
 from .integrate import add_support_work, is_finite, symplectic_euler_velocity, vector_at
-from .matrices import column
-from .pace import DONE, DT, Pace, time_after
-from .rotation import quick_rotation
+from .matrices import column, identity3
+from .pace import DONE, DT, Pace, length_before, time_after
 from .shapes import fingerprint
 
 wp.set_module_options({"enable_backward": False})
@@ -31,6 +30,10 @@ WARP = 32
 MOST_LOOKS = 1 << 22
 #: What a row of ``PatchBody.rest`` is: the inverse of the rest edges, row by row, then the volume.
 VOLUME_ROW = 9
+#: What a thread keeps of an element: the same, with the volume times mu and times lambda.
+CONSTANTS = 11
+
+row = wp.types.vector(length=CONSTANTS, dtype=wp.float32)
 
 
 @dataclass(frozen=True)
@@ -124,18 +127,6 @@ def await_displacement(published: wp.array[wp.vec4], i: int, number: wp.uint32) 
     ...
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return __syncthreads_or(flag);
-#else
-    return flag;
-#endif
-""")
-def synchronize_any(flag: int) -> int:
-    """Wait for the block's threads; whether any has a flag."""
-    ...
-
-
 def vectors_at(first: int) -> wp.Function:
     """An array of vectors in the block's dynamic shared memory from the ``first`` one on; see ``block.shared_vectors``.
 
@@ -162,6 +153,11 @@ def vectors_at(first: int) -> wp.Function:
 
 
 @wp.func
+def rest_inverse(c: row):
+    return wp.mat33(c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8])
+
+
+@wp.func
 def key_from(times: wp.array[wp.float64], key: int, last: int, t: wp.float64):
     """As ``keyframes.key_before``, from an earlier key on, where the last but one is ``last``."""
     found = key
@@ -180,10 +176,28 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
     """
     threads, each, halo_each, lanes = layout.threads, layout.elements, layout.halo, layout.lanes
     slot, displacement = vectors_at(0), vectors_at(layout.slots + 1)
-    stress = corotated_law(quick_rotation)
     words = wp.types.vector(length=each, dtype=wp.uint64)
-    numbers = wp.types.matrix(shape=(each, 11), dtype=wp.float32)
+    numbers = wp.types.matrix(shape=(each, CONSTANTS), dtype=wp.float32)
     places = wp.types.vector(length=halo_each, dtype=wp.int32)
+
+    @wp.func
+    def displacement_gradient(corners: wp.uint64, c: row):
+        x0 = displacement(wp.static(LOAD), number_in(corners, 0), wp.vec3())
+        x1 = displacement(wp.static(LOAD), number_in(corners, 1), wp.vec3())
+        x2 = displacement(wp.static(LOAD), number_in(corners, 2), wp.vec3())
+        x3 = displacement(wp.static(LOAD), number_in(corners, 3), wp.vec3())
+        return wp.matrix_from_cols(x1 - x0, x2 - x0, x3 - x0) * rest_inverse(c)
+
+    @wp.func
+    def store_forces(targets: wp.uint64, c: row, p: wp.mat33):
+        h = p * wp.transpose(rest_inverse(c))
+        f1 = -column(h, 0)
+        f2 = -column(h, 1)
+        f3 = -column(h, 2)
+        slot(wp.static(STORE), number_in(targets, 0), -(f1 + f2 + f3))
+        slot(wp.static(STORE), number_in(targets, 1), f1)
+        slot(wp.static(STORE), number_in(targets, 2), f2)
+        slot(wp.static(STORE), number_in(targets, 3), f3)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(threads, 1))
     def step_patches(
@@ -215,6 +229,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         thread = wp.tid() % wp.static(threads)
         node_count = body.own.shape[0]
         dt = float(pace.seconds[DT])
+        before = float(length_before(pace))
         damped = 1.0 / (1.0 + dt * damping)
         number = exchange.begun[block]
 
@@ -285,6 +300,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
             begin = int(0)
             end = int(interior_count)
             phase = int(wp.static(0 if layout.overlaps else 1))
+            left_out = int(0)
             while phase < 2:
                 if phase == 0:
                     synchronize_block()
@@ -302,33 +318,29 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                 for k in range(wp.static(each)):
                     at = thread + k * wp.static(threads)
                     if at >= begin and at < end:
-                        x0 = displacement(wp.static(LOAD), number_in(corners[k], 0), wp.vec3())
-                        x1 = displacement(wp.static(LOAD), number_in(corners[k], 1), wp.vec3())
-                        x2 = displacement(wp.static(LOAD), number_in(corners[k], 2), wp.vec3())
-                        x3 = displacement(wp.static(LOAD), number_in(corners[k], 3), wp.vec3())
-                        b = wp.mat33(
-                            constants[k, 0],
-                            constants[k, 1],
-                            constants[k, 2],
-                            constants[k, 3],
-                            constants[k, 4],
-                            constants[k, 5],
-                            constants[k, 6],
-                            constants[k, 7],
-                            constants[k, 8],
-                        )
-                        a = wp.matrix_from_cols(x1 - x0, x2 - x0, x3 - x0) * b
-                        h = stress(a, constants[k, 9], constants[k, 10]) * wp.transpose(b)
-                        f1 = -column(h, 0)
-                        f2 = -column(h, 1)
-                        f3 = -column(h, 2)
-                        slot(wp.static(STORE), number_in(targets[k], 0), -(f1 + f2 + f3))
-                        slot(wp.static(STORE), number_in(targets[k], 1), f1)
-                        slot(wp.static(STORE), number_in(targets[k], 2), f2)
-                        slot(wp.static(STORE), number_in(targets[k], 3), f3)
+                        c = constants[k]
+                        p, trusted = stretch_stress(displacement_gradient(corners[k], c), c[9], c[10])
+                        if trusted:
+                            store_forces(targets[k], c, p)
+                        else:
+                            left_out |= wp.static(1 << k)
                 phase += 1
             if gave_up != 0:
                 break
+            # Elements that were left out, once a step and in one place: a warp's threads do theirs at the same time.
+            while left_out != 0:
+                chosen = lowest_bit(left_out)
+                left_out = left_out & (left_out - 1)
+                its_corners = corners[0]
+                its_targets = targets[0]
+                c = constants[0]
+                for k in range(1, wp.static(each)):
+                    if chosen == k:
+                        its_corners = corners[k]
+                        its_targets = targets[k]
+                        c = constants[k]
+                f = identity3() + displacement_gradient(its_corners, c)
+                store_forces(its_targets, c, turned_stress(f, c[9], c[10]))
             synchronize_block()
 
             elastic = wp.vec3()
@@ -352,11 +364,11 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                     target = value + share * (body.values[at + columns] - value)
                     towards = (target - x) / dt
                     # As ``follow_trajectory``: each force counts with half the motion before it and half after.
-                    add_support_work(elastic, (0.5 * dt) * (velocity - towards), support_work)
+                    add_support_work(elastic, 0.5 * (before * velocity - dt * towards), support_work)
                     velocity = towards
                 force = elastic + load_here
                 if w > 0.0:
-                    velocity = symplectic_euler_velocity(velocity, force, w, gravity, dt, damped)
+                    velocity = symplectic_euler_velocity(velocity, force, w, gravity, 0.5 * (before + dt), damped)
                 else:
                     add_support_work(elastic, dt * velocity, support_work)
                     if step == steps - 1:
@@ -366,6 +378,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                 publish(exchange.published, int(number & wp.uint32(1)) * node_count + i, x, number)
                 if not is_finite(x):
                     wp.atomic_min(bad_step, 0, pace.counts[DONE] + wp.int64(step + 1))
+            before = dt
             step += 1
 
         if gave_up != 0:

@@ -35,7 +35,7 @@ def add_block(node: int, block: int, blocks: Blocks):
     blocks.latest[node] = block
     for n in range(LAST):
         before = wp.atomic_cas(blocks.of_node, node, n, NONE, block)
-        if before == NONE or before == block:  # noqa: SIM109
+        if before == NONE or before == block:
             return
     blocks.of_node[node, LAST] = MORE
 

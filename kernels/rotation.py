@@ -12,8 +12,7 @@ Newton's iteration has no answer for a singular F and gives a reflection for an 
 
 import warp as wp
 
-from .algebraic import algebraic_rotation, reciprocal
-from .matrices import all_finite, cofactor, column, frobenius, identity3, largest_entry
+from .matrices import all_finite, cofactor, column, frobenius, identity3, largest_entry, reciprocal
 from .quaternion import robust_rotation, warm_rotation  # noqa: F401 (others find it here)
 
 wp.set_module_options({"enable_backward": False})
@@ -146,7 +145,7 @@ def newton_rotation(c0: wp.vec3, c1: wp.vec3, c2: wp.vec3, handedness: float):
 
 @wp.func(inline=False)
 def rotation_out_of_line(f: wp.mat33):
-    return algebraic_rotation(f)
+    return robust_rotation(f)
 
 
 @wp.func

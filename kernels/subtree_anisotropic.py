@@ -16,7 +16,7 @@ from .elements import FRAME_SHIFT, LEVEL_MASK, ForestElements, Subtrees, mirror_
 from .rotation import ITERATIONS, byers_xu, column, newton_rotation, quick_rotation
 from .shapes import VOLUME, fingerprint
 from .subtree import FRAMES, HANDEDNESS, LEAVES
-from .subtree_cuda import memory_of
+from .subtree_cuda import BLOCK, memory_of
 from .subtree_forces import columns_of, first_of, leaf_forces_of, mat10
 from .subtree_laws import turn_in, turn_out
 
@@ -111,7 +111,7 @@ def anisotropic_forces(shape: int, transverse: bool, one_axes: bool, one_stiffne
 
 @functools.cache
 def scatter_anisotropic_subtrees(
-    shape: int, grouped: bool, transverse: bool, one_axes: bool, one_stiffness: bool
+    shape: int, grouped: bool, transverse: bool, one_axes: bool, one_stiffness: bool, resident: int = 0
 ) -> wp.Kernel:
     """Add the forces of subtrees. Launch with block_dim BLOCK.
 
@@ -120,7 +120,9 @@ def scatter_anisotropic_subtrees(
     load, add = memory_of(shape, grouped)
     forces = anisotropic_forces(shape, transverse, one_axes, one_stiffness)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    options = {"launch_bounds": (BLOCK, resident)} if resident else {}
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, **options)
     def scatter_anisotropic_subtrees(
         # In
         subtrees: Subtrees,

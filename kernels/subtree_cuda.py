@@ -6,8 +6,9 @@ leaves for global memory are 16-byte vector reductions where the card has them. 
 polynomial (``algebraic``), the same way for small strains and large ones.
 
 A leaf that is flat, turned over or far from order one adds nothing. Its bit is set in its subtree's byte, and the
-subtree is put on a list; ``repair`` does those leaves. Bodies of one type of subtree alone have a kernel of their own;
-all others are one launch, in which each thread block looks up what it is to do.
+subtree is put on a list; ``repair`` does those leaves. A warp most of whose leaves were left out before puts all of
+them on the list untried, but for now and then. Bodies of one type of subtree alone have a kernel of their own; all
+others are one launch, in which each thread block looks up what it is to do.
 """
 
 import functools
@@ -29,9 +30,9 @@ from .elements import (
     node_displacements,
 )
 from .newton_merging import add_four_forces
-from .repair import LeftOut, append
+from .repair import LeftOut, append, is_hopeless, list_of, reserve
 from .subtree import GROUP_NODES, SLOT_STRIDE, group_slots, group_sources
-from .subtree_forces import leaf_stress, mat10, near_forces, shared_forces
+from .subtree_forces import ALL_LEAVES, leaf_stress, mat10, near_forces, shared_forces
 
 wp.set_module_options({"enable_backward": False})
 
@@ -181,8 +182,9 @@ def scatter_subtrees_own(
 ) -> wp.Kernel:
     """Corotated forces of subtrees of one type, every leaf with its own rotation. Launch with block_dim BLOCK.
 
-    ``listed`` says whether subtrees with leaves that are left out are put on a list; with a ``tolerance`` the root's
-    rotation is taken where it is near enough (``subtree_forces.shared_forces``).
+    ``listed`` says whether subtrees with leaves that are left out are put on a list, and whether what ``flagged`` has
+    from before may tell how to go about it. With a ``tolerance`` the root's rotation is taken where it is near enough
+    (``subtree_forces.shared_forces``).
     """
     load, add = memory_of(shape, grouped)
     forces = near_forces(shape, uniform, tolerance)
@@ -200,22 +202,36 @@ def scatter_subtrees_own(
         mu: wp.array[wp.float32],
         lam: wp.array[wp.float32],
         u: wp.array[wp.vec4],
-        # Out
+        # In and out
         f: wp.array[wp.vec4],
         flagged: wp.array[wp.uint8],
         left_out: LeftOut,
     ):
         s = wp.tid()
+        before = int(0)
+        if wp.static(listed):
+            before = int(flagged[s])
         code = subtrees.code[s]
         h = 0.5 * subtrees.size[(code & LEVEL_MASK) // 3]
         mirror = mirror_sign(code)
         q = subtrees.frames[code >> FRAME_SHIFT]
         x = load(subtrees, s, u)
+        hopeless = bool(False)
+        if wp.static(listed):
+            hopeless = is_hopeless(left_out, s, before)
+        if hopeless:
+            to_come = subtrees.code.shape[0] - s
+            place = reserve(left_out, list_of(s // BLOCK), True, to_come)
+            append(left_out, list_of(s // BLOCK), place, subtrees.first[s], ALL_LEAVES, to_come)
+            return
         g, mask = forces(x, q, h, mirror, mu, lam, wp.where(wp.static(uniform), 0, subtrees.first[s]))
         flagged[s] = wp.uint8(mask)
-        if wp.static(listed) and mask != 0:
-            append(left_out, subtrees.first[s], mask)
+        reserved = int(0)
+        if wp.static(listed):
+            reserved = reserve(left_out, list_of(s // BLOCK), mask != 0, subtrees.code.shape[0] - s)
         add(subtrees, s, g, f)
+        if wp.static(listed):
+            append(left_out, list_of(s // BLOCK), reserved, subtrees.first[s], mask, subtrees.code.shape[0] - s)
 
     return scatter_subtrees_own
 
@@ -255,9 +271,12 @@ def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: boo
         g, mask = forces(x, q, h, mirror, turn, mu, lam, wp.where(wp.static(uniform), 0, subtrees.first[s]))
         if wp.static(not given):
             flagged[s] = wp.uint8(mask)
-        if wp.static(listed and not given) and mask != 0:
-            append(left_out, s, mask)
+        reserved = int(0)
+        if wp.static(listed and not given):
+            reserved = reserve(left_out, list_of(s // BLOCK), mask != 0, subtrees.code.shape[0] - s)
         add(subtrees, s, g, f)
+        if wp.static(listed and not given):
+            append(left_out, list_of(s // BLOCK), reserved, s, mask, subtrees.code.shape[0] - s)
 
     return scatter_subtrees_shared
 
@@ -338,9 +357,10 @@ def scatter_stretches(uniform: bool, tolerance: float | None = None) -> wp.Kerne
             p, trusted = leaf_stress(gradient_of(flat, s, u0, u1, u2, u3), frame(flat, s), mu[m], lam[m])
             if not trusted:
                 p = wp.mat33()
-                append(left_out, flat_leaves[s], 1)
+            reserved = reserve(left_out, list_of(block), not trusted, stretches[k].count - s)
             f0, f1, f2, f3 = nodal_forces(flat, s, p)
             add_neighbours(f, flat.targets[s], f0, f1, f2, f3)
+            append(left_out, list_of(block), reserved, flat_leaves[s], wp.where(trusted, 0, 1), stretches[k].count - s)
             return
         subtrees = stretches[k].subtrees
         grouped = stretches[k].grouped != 0
@@ -352,7 +372,8 @@ def scatter_stretches(uniform: bool, tolerance: float | None = None) -> wp.Kerne
         else:
             mask = subtree2(subtrees, s, grouped, mu, lam, u, f)
         stretches[k].flagged[s] = wp.uint8(mask)
-        if mask != 0:
-            append(left_out, subtrees.first[s], mask)
+        to_come = stretches[k].count - s
+        reserved = reserve(left_out, list_of(block), mask != 0, to_come)
+        append(left_out, list_of(block), reserved, subtrees.first[s], mask, to_come)
 
     return scatter_stretches

@@ -275,7 +275,7 @@ def shared_forces(
             r1 = wp.static(0.5**ITERATIONS) * z1
             r2 = wp.static(0.5**ITERATIONS) * z2
             if not trusted:
-                left_out = ALL_LEAVES
+                left_out = wp.static(sum(1 << leaf for leaf in chosen))
                 if wp.static(adaptive):
                     r0 = q0
                     r1 = q1

@@ -3,18 +3,15 @@
 import numpy as np
 import warp as wp
 
+from warp_corot.domain import Domain
 
-class Body:
+
+class Body(Domain):
     """A signed function of points [n, 3], negative inside, in float64, rounded once."""
 
-    up_axis = "Y"
-    device = "cpu"
-
     def __init__(self, function, bounds, lipschitz=1.0, labels=None, label_names=()):
+        super().__init__(bounds, lipschitz, label_names=label_names, device="cpu")
         self.function = function
-        self.bounds = np.array(bounds, dtype=float)
-        self.lipschitz = lipschitz
-        self.label_names = label_names
         self.labels = labels
         self.asked = []
 

@@ -1,10 +1,23 @@
 """Every test that takes ``device`` runs on every device there is."""
 
+import os
+
 import pytest
 import warp as wp
 
+#: Each takes some gigabytes in the end, and compiles what it needs first.
+MOST_WORKERS = 4
+
 wp.config.quiet = True
 wp.init()
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """A worker for each core, up to four; none where one file or test is named, which is done before workers start."""
+    if len(config.args) == 1 and ".py" in config.args[0]:
+        return 0
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(cores, MOST_WORKERS)
 
 
 @pytest.fixture(params=["cpu", *(str(device) for device in wp.get_cuda_devices())])

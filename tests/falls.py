@@ -78,10 +78,10 @@ AHEAD = 0.1
 
 
 def kinetic_energy(sim):
-    """Kinetic energy [J] at the time of the positions; velocities belong to half a step before."""
+    """Kinetic energy [J] at the time of the positions; velocities belong to half a step, as the last was, before."""
     body = sim.body
     masses, forces = body.masses[:, None], sim.forces().numpy().astype(float)
-    later = body.velocities.numpy() + 0.5 * sim.dt * (forces / np.maximum(masses, 1e-30) + np.array(sim.gravity))
+    later = body.velocities.numpy() + 0.5 * sim.pace.dt * (forces / np.maximum(masses, 1e-30) + np.array(sim.gravity))
     return 0.5 * float(np.sum(masses * later**2 * ~body.constrained[:, None]))
 
 

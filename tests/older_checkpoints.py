@@ -10,12 +10,12 @@ def as_version(path, older, version):
     with np.load(path) as archive:
         arrays = dict(archive)
     header = json.loads(arrays["header"].tobytes()) | {"version": version}
-    counts, (dt, then) = arrays.pop("kept.counts"), arrays.pop("kept.seconds")
+    counts, (dt, then, _) = arrays.pop("kept.counts"), arrays.pop("kept.seconds")
     assert header.pop("kept") == ["counts", "seconds"]
     assert not counts[1]
     assert not then
     header |= {"dt": dt, "steps": int(counts[0]), "epoch": 0.0}
-    for name in ("scale", "drift"):
+    for name in ("scale", "drift", "lately"):
         del arrays[f"guard.{name}"]
     for number, described in enumerate(header["bodies"]):
         starts = f"body{number}.world_starts"

@@ -37,7 +37,8 @@ def drawn(stage: Usd.Stage, path: str = SURFACE, frame: float = 0.0) -> trimesh.
 
 
 def prims(stage: Usd.Stage) -> list[str]:
-    return [str(prim.GetPath()) for prim in stage.Traverse()][1:]
+    """Paths of what is drawn or could be."""
+    return [str(prim.GetPath()) for prim in stage.Traverse() if prim.IsA(UsdGeom.PointBased)]
 
 
 def faults(path: Path) -> list[str]:

@@ -5,6 +5,7 @@ import importlib.util
 import json
 import math
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -31,7 +32,7 @@ def run(script, *arguments, path=None):
 def report(done, path):
     """The JSON of a run that went well, whose table has a line for every row."""
     assert done.returncode == 0, done.stderr
-    found = json.loads(path.read_text())
+    found = json.loads(path.read_text(encoding="utf-8"))
     for row in found["rows"]:
         named = [line.startswith(row["stage"]) and row["variant"] in line for line in done.stdout.splitlines()]
         assert any(named), row
@@ -40,6 +41,11 @@ def report(done, path):
         assert row["gtet_per_s"] == pytest.approx(1 / row["ns_per_tet"])
         assert row["spread"] >= 0
     return found
+
+
+@pytest.fixture
+def benchmarks(monkeypatch):
+    monkeypatch.syspath_prepend(BENCHMARKS)
 
 
 def test_kernels(device, tmp_path):
@@ -119,20 +125,19 @@ def test_peers(package, rows, device, tmp_path):
         ("--json", "nowhere/at/all.json", "nowhere/at"),
     ],
 )
-def test_bad_options_are_said_in_one_line(script, option, value, said):
-    done = run(script, option, value)
-    assert done.returncode == 2
-    (line,) = (line for line in done.stderr.splitlines() if not line.startswith("Warp"))
+@pytest.mark.usefixtures("benchmarks")
+def test_bad_options_are_said_in_one_line(script, option, value, said, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [script, option, value])
+    monkeypatch.setattr(wp.config, "log_level", wp.config.log_level)  # which the script changes
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(BENCHMARKS / script), run_name="__main__")
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"{script}: error: ")
     assert said in line
 
 
 # --- the pieces -------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def benchmarks(monkeypatch):
-    monkeypatch.syspath_prepend(BENCHMARKS)
 
 
 @pytest.mark.usefixtures("benchmarks")
@@ -230,3 +235,22 @@ def test_states(device, tmp_path):
         assert row["over_general"] > 0
         if row["stage"].endswith("at rest") and row["variant"] == "corotated":
             assert row["flagged"] == 0.0
+
+
+def test_bodies(tmp_path):
+    """A body that is meshed, one that is refused, and an earlier run beside them."""
+    pytest.importorskip("trimesh")
+    table, numbers = tmp_path / "bodies.md", tmp_path / "bodies.json"
+    command = ("bodies.py", "cube-askew", "open-bowl", "--tets", 500, "--json", numbers, "-o", table)
+    done = run(*command)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(numbers.read_text(encoding="utf-8"))
+    assert found["cube-askew"]["volume"] == pytest.approx(1.0, abs=0.1)
+    assert 0 < found["cube-askew"]["elements"] <= 500
+    assert "the surface is open" in found["open-bowl"]["refused"]
+    lines = table.read_text(encoding="utf-8").splitlines()
+    assert any(line.startswith("| cube-askew | ") for line in lines)
+    assert lines[0].startswith("2 bodies at 500 elements; 1 meshed")
+    listed = run("bodies.py", "--list").stdout.split()
+    assert len(listed) >= 44
+    assert {"cube", "windpipe", "rough-ball-1-7-million"} <= set(listed)

@@ -1,5 +1,7 @@
 """Checkpoints of older versions go on as they would have."""
 
+import json
+
 import numpy as np
 import pytest
 from older_checkpoints import as_version
@@ -30,6 +32,27 @@ def test_versions_of_one_step_go_on_with_it(tmp_path, version):
         each.advance_steps(15)
     np.testing.assert_array_equal(old.body.positions.numpy(), sim.body.positions.numpy())
     assert old.time == old.total_time == sim.time
+
+
+def test_version_5_goes_on_with_the_step_that_it_had(tmp_path):
+    """It knew neither what the state allowed at the last check nor how long the last step was; it noted how the step
+    had changed, and whether a user had written velocities, among the rest."""
+    sim = wc.Simulation(beam(worlds=1))
+    sim.advance(0.2)
+    sim.save(tmp_path / "now.npz")
+    with np.load(tmp_path / "now.npz") as archive:
+        arrays = dict(archive)
+    header = json.loads(arrays["header"].tobytes()) | {"version": 5}
+    arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    arrays["kept.control"] = np.insert(arrays["kept.control"][:-1], (5, 6), 0.0)
+    arrays["kept.seconds"] = arrays["kept.seconds"][:2]
+    arrays["guard.counted"] = arrays["guard.counted"][:6]
+    del arrays["guard.lately"]
+    np.savez(tmp_path / "old.npz", **arrays)
+    old = wc.Simulation.load(tmp_path / "old.npz")
+    assert (old.steps, old.time, old.dt) == (sim.steps, sim.time, sim.dt)
+    old.advance(0.1)
+    assert old.time == pytest.approx(0.3)
 
 
 def test_time_from_before_a_reset_is_kept(tmp_path):

@@ -111,15 +111,15 @@ def test_any_mesh_needs_no_options(folder, capsys):
     write_vtk(folder / "cube.vtk", 1e3 * points, tets)
     assert simulate("cube.vtk", "-o", "a.usd", *SHORT) == 0
     out, err = capsys.readouterr()
-    assert "--scale 0.001" in err
+    assert "the coordinates are taken to be in mm: the file names no unit" in err
     assert simulate("cube.vtk", "-o", "a.usd", "--scale", 0.001, *SHORT) == 0
     out, err = capsys.readouterr()
     repaired = int((np.linalg.det(points[tets[:, 1:]] - points[tets[:, :1]]) < 0).sum())
     assert repaired > 0
     assert f"{repaired} wound wrongly and repaired, 1 nodes in no tetrahedron" in out
-    assert "the lowest 2 % of the height is held" in err
+    assert "the body stands on its lowest 10 %" in err
     assert "Young's modulus is" in err
-    assert "--scale" not in err
+    assert "coordinates" not in err
     first, *_, last = frames(folder / "a.usd")
     bottom = np.append(CUBE.points[:, 2] == 0, False)  # meshio's formats name no up axis: Z
     np.testing.assert_array_equal(last[bottom], first[bottom])

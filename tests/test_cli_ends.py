@@ -1,8 +1,11 @@
 """How commands end: what is said, and with which exit status."""
 
 import functools
+import importlib
 import re
 import signal
+import sys
+import time
 from contextlib import nullcontext
 
 import numpy as np
@@ -11,7 +14,7 @@ from command_line import SHORT, run, simulate
 from stages import frames
 
 from warp_corot.cli.say import interrupt_status
-from warp_corot.cli.signals import signals_waiting, terminable
+from warp_corot.cli.signals import terminable
 
 OPTIONS = ["young", "poisson", "density", "model", "rotation-level", "fix", "scale", "gravity", "duration", "fps", "dt"]
 OPTIONS += ["damping", "device", "preview", "unit", "tets", "cell-size", "max-level", "surface-error", "labels"]
@@ -85,22 +88,32 @@ def test_interrupted_before_anything_runs(stage, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_signals_wait_while_modules_are_imported(number, status, request):
+def test_signals_wait_for_the_end_of_an_import(number, status, request, tmp_path, monkeypatch):
     """An exception in the middle is swallowed by some modules; after them it is not."""
     # A shell has its background jobs ignore Ctrl-C.
     request.addfinalizer(functools.partial(signal.signal, number, signal.getsignal(number)))
     signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
-    came_to = []
+    (tmp_path / "swallowing.py").write_text(f"""
+import signal, time
+came_to = ["the signal"]
+try:
+    signal.raise_signal({int(number)})
+    time.sleep(0.1)
+except BaseException:
+    came_to.append("an exception")
+came_to.append("the end")
+""")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "swallowing", raising=False)
 
-    def imports():
-        with signals_waiting():
-            came_to.append("the signal")
-            signal.raise_signal(number)
-            came_to.append("the end")
+    def run():
+        importlib.import_module("swallowing")
+        time.sleep(5.0)
 
     with terminable(), pytest.raises(KeyboardInterrupt) as raised:
-        imports()
-    assert came_to == ["the signal", "the end"]
+        run()
+    swallowing = sys.modules["swallowing"]
+    assert swallowing.came_to == ["the signal", "the end"]
     assert interrupt_status(raised.value) == status
 
 

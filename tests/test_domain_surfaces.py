@@ -200,8 +200,10 @@ def test_units_and_unlikely_sizes():
         Domain.from_surface((300 * CUBE[0], CUBE[1]))
     with pytest.warns(UserWarning, match=r"300 um long.*in m, say unit='m'.*1000: 300 mm"):
         Domain.from_surface((0.3 * CUBE[0], CUBE[1]), unit="mm")
-    with pytest.raises(InputError, match="unit is 'inch'; it must be one of 'm', 'cm', 'mm'"):
-        Domain.from_surface(CUBE, unit="inch")
+    assert np.allclose(Domain.from_surface(CUBE, unit="inch").bounds, 0.0254 * metres)
+    for unit in ("kg", "inches of rope", "-3mm", 0.0):
+        with pytest.raises(InputError, match=f"unit is {unit!r}; it must be a length such as 'mm'"):
+            Domain.from_surface(CUBE, unit=unit)
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".stl", ".ply", ".off", ".glb"])

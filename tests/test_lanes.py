@@ -94,16 +94,16 @@ def test_a_bit_names_the_leaf_that_is_left_out(name):
         assert np.count_nonzero(flagged) == 1
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", [*LAWS.values(), wc.Corotated(rotation_level="auto")], ids=repr)
 def test_what_a_lane_comes_to_does_not_depend_on_the_others(law, rng):
     """Three worlds of subtrees and elements that eight do not divide: each to the bit as alone."""
     mesh = MESHES["mixed levels"]()
     u = [random_displacement(mesh, rng, size) for size in (0.2, 1e-4, 0.6)]
     body = wc.SoftBody(mesh, wc.Isotropic(**MATERIAL), device=CPU, worlds=3)
-    sim = wc.Simulation(body, model=LAWS[law], integrator=wc.SymplecticEuler(dt=1e-5), gravity=(0, 0, 0))
+    sim = wc.Simulation(body, model=law, integrator=wc.SymplecticEuler(dt=1e-5), gravity=(0, 0, 0))
     place(body, np.concatenate(u))
     together = sim.forces().numpy().reshape(3, -1, 3)
     for world in range(3):
-        sim, body = simulation(mesh, LAWS[law], CPU, dt=1e-5, material=MATERIAL)
+        sim, body = simulation(mesh, law, CPU, dt=1e-5, material=MATERIAL)
         place(body, u[world])
         np.testing.assert_array_equal(together[world], sim.forces().numpy())

@@ -10,10 +10,12 @@ import pytest
 import warp as wp
 from cases import oracle_mesh, random_displacement
 from fibres import WOOD, random_axes, wood
+from pairs import add_forces
 from test_anisotropy import made
 from test_miscompile import FORESTS, TOLERANCE, materials, meshed, turned
 from warp_corot.kernels import constitutive
 from warp_corot.kernels.anisotropic import scatter_anisotropic
+from warp_corot.kernels.cluster_laws import isotropic_law
 from warp_corot.kernels.definite import quaternions_of
 from warp_corot.kernels.general_cuda import corotated_law
 from warp_corot.kernels.rotation import byers_xu, quick_rotation
@@ -22,10 +24,11 @@ from warp_corot.kernels.subtree_cuda import BLOCK
 from warp_corot.kernels.subtree_laws import scatter_subtrees
 
 import warp_corot as wc
+from warp_corot.clusters import isotropic_material
 from warp_corot.elasticity.anisotropic import AnisotropicField
 from warp_corot.elasticity.anisotropic_general import GeneralAnisotropicField
 from warp_corot.elasticity.anisotropic_subtrees import as_bytes
-from warp_corot.elasticity.law_general import GeneralScatter
+from warp_corot.elasticity.cluster_scatter import ClusterScatter
 from warp_corot.plan import ForcePlan
 
 LAWS = {
@@ -53,14 +56,32 @@ def assert_right(forces, expected):
     assert not wrong.any(), f"{wrong.sum()} of {wrong.size} nodes"
 
 
-@pytest.mark.parametrize(
-    ("law", "uniform"),
-    [*((law, False) for law in LAWS), ("neo_hookean", True)],
-    ids=[*LAWS, "neo_hookean, one material"],
-)
-@pytest.mark.parametrize("name", FORESTS)
-def test_subtrees_one_by_one(name, law, uniform, device, rng):
-    """All subtrees of a forest, without the leaves that are in none."""
+def _of_subtrees(chosen, others):
+    """Pairs of a forest and something of its kernels: each compiles for a second or two, so ``others`` are slow."""
+    pairs = [(name, other) for other in others for name in FORESTS]
+    return [pytest.param(*pair, marks=() if pair in chosen else pytest.mark.slow, id=", ".join(pair)) for pair in pairs]
+
+
+#: Every type of a law's kernel, and every law.
+OF_LAWS = [
+    *((name, "neo_hookean") for name in FORESTS),
+    ("type 0", "one material"),
+    ("type 1", "linear"),
+    ("type 2", "stvk"),
+]
+OF_KINDS = [
+    ("type 0", "muscle field"),
+    ("mixed levels", "muscle field"),
+    ("type 1", "wood"),
+    ("type 2", "stiffness field"),
+]
+
+
+@pytest.mark.parametrize(("name", "law"), _of_subtrees(OF_LAWS, [*LAWS, "one material"]))
+def test_subtrees_one_by_one(name, law, device, rng):
+    """All subtrees of a forest, without the leaves that are in none; of one material under the last of the laws."""
+    uniform = law == "one material"
+    law = "neo_hookean" if uniform else law
     mesh = meshed(name)
     given, (mu, lam) = materials(len(mesh.tets), uniform, rng)
     body = wc.SoftBody(mesh, wc.Isotropic(**given), device=device)
@@ -91,12 +112,12 @@ def test_general_elements(law, uniform, device, rng):
     on_device = wp.array(u, dtype=wp.vec4, device=device)
     f = wp.zeros_like(on_device)
     stress = LAWS.get(law) or corotated_law(quick_rotation)
-    GeneralScatter(body.elements, stress)([body.mu, body.lam, body.material_stride], on_device, f)
+    material = isotropic_material([body.mu, body.lam, body.material_stride])
+    add_forces(ClusterScatter(body.elements, isotropic_law(stress)), material, on_device, f)
     assert_right(f.numpy()[:, :3], oracle.evaluate(law, oracle_mesh(mesh), x, mu, lam)[1])
 
 
-@pytest.mark.parametrize("kind", ["muscle field", "wood", "stiffness field"])
-@pytest.mark.parametrize("name", FORESTS)
+@pytest.mark.parametrize(("name", "kind"), _of_subtrees(OF_KINDS, ["muscle field", "wood", "stiffness field"]))
 def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
     """Every hundredth node is displaced by an edge and more, so that some leaves of uniform forests are left to the
     robust rotation; and active stress."""
@@ -138,7 +159,7 @@ def test_anisotropic_general_elements(kind, device, rng):
     field = GeneralAnisotropicField(body)
     body.has_activation = True
     body.element_activation = active
-    field.scatter_forces(on_device, f)
+    add_forces(field.scatter, field.active_material, on_device, f)
     assert_right(f.numpy()[:, :3], leaf_by_leaf(field, active, on_device))
 
 

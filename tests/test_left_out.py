@@ -9,12 +9,10 @@ import oracle
 import pytest
 import warp as wp
 from cases import edge_scale, mixed_forest, oracle_mesh
-from warp_corot.kernels.block_layout import VECTOR_BYTES
-from warp_corot.kernels.repair import LIST_BLOCK
+from warp_corot.kernels.repair import COUNT_STRIDE, EVALUATIONS, LISTS
 from warp_corot.kernels.subtree_cuda import BLOCK, FLAT, Stretch, scatter_stretches
 
 import warp_corot as wc
-from warp_corot.clusters import clusters_of
 from warp_corot.elasticity.left_out import LeftOutLeaves
 from warp_corot.plan import ForcePlan
 
@@ -57,7 +55,7 @@ class Launches:
             device=self.device,
             block_dim=BLOCK,
         )
-        self.count = int(self.listed.own.counts.numpy()[0])
+        self.count = int(self.listed.own.counts.numpy().sum())
         material = [body.mu, body.lam, body.material_stride]
         self.listed.repair(body.elements, material, body.node_displacements, f)
         return f.numpy()[:, :3]
@@ -92,7 +90,7 @@ def test_listed_leaves_get_their_forces(share, uniform, device, rng):
         error = np.abs(launches.forces() - forces)[sound].max()
         assert error < TOLERANCE * np.abs(forces).max()
         assert (launches.count > 0) == (share > 0)
-        assert (launches.listed.own.counts.numpy() == 0).all()
+        assert (launches.listed.own.counts.numpy()[:EVALUATIONS] == 0).all()
 
 
 def test_whole_subtrees_get_their_forces(device, rng):
@@ -132,27 +130,57 @@ def test_one_bad_leaf_is_left_out_alone(device, rng):
     assert 0 < left_out.sum() < 8
 
 
-def test_clusters_add_up_every_corner_once(rng):
-    """The tables alone: nodes of corners, and sums of slots against a plain sum over elements."""
-    forest = mixed_forest(cells=(2, 1, 1), level=7, passes=3, share=0.05)
-    chosen = np.flatnonzero(rng.random(len(forest.tets)) < 0.7).astype(np.int32)
-    clusters, count = clusters_of(chosen, forest.tets, wp.get_device("cpu"))
-    elements, begin = clusters.elements.numpy(), clusters.begin.numpy()
-    assert len(elements) == count * LIST_BLOCK
-    there = np.flatnonzero(elements >= 0)
-    assert np.array_equal(elements[there], chosen)
-    corners = clusters.corners.numpy().view("<u2").reshape(-1, 4)[there]
-    nodes = clusters.nodes.numpy()
-    assert np.array_equal(nodes[begin[there // LIST_BLOCK][:, None] + corners], forest.tets[chosen])
-    values = np.zeros((count * LIST_BLOCK, 4))
-    values[there] = rng.random((len(there), 4))
-    # Slots hold a corner after another's, one element after another; past the last of a task's slots is the zero one.
-    slots = np.ascontiguousarray(clusters.slots.numpy().T).view("<u2").astype(int) // VECTOR_BYTES
-    total = np.zeros(len(forest.points))
-    for cluster in range(count):
-        own = np.append(values.reshape(count, -1, 4)[cluster].T.ravel(), 0.0)
-        tasks = slice(begin[cluster], begin[cluster + 1])
-        np.add.at(total, nodes[tasks], own[slots[tasks]].sum(1))
-    plain = np.zeros(len(forest.points))
-    np.add.at(plain, forest.tets[chosen], values[there])
-    assert np.allclose(total, plain, rtol=1e-13)
+@pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
+def test_every_leaf_may_be_listed(share, device, rng):
+    """Also those that need not be: the forces of a body all of whose subtrees are put on the lists."""
+    forest = wc.TetForest.box((2, 1, 1), 0.1, 9)
+    young = rng.uniform(5e3, 2e4, len(forest.tets))
+    body = wc.SoftBody(forest, wc.Isotropic(young, 0.4, 1000.0), device=device)
+    far = rng.random((len(forest.points), 1)) < share
+    u = np.where(far, 1.0, 0.08) * edge_scale(forest) * rng.uniform(-1, 1, forest.points.shape)
+    body.displacements = u
+    plan = ForcePlan.of_forest(forest, None, body.device, grouped=False)
+    listed = LeftOutLeaves.of(plan, body.device)
+    # Dealt out to lists of different lengths, some of them empty.
+    (batch,) = plan.batches
+    counts, entries = listed.own.counts.numpy(), listed.own.entries.numpy().reshape(LISTS, listed.own.room, 2)
+    for k, first in enumerate(batch.subtrees.first.numpy()):
+        of = k * k % (LISTS - 1)
+        entries[of, counts[of * COUNT_STRIDE]] = first, 255
+        counts[of * COUNT_STRIDE] += 1
+    listed.own.counts.assign(counts)
+    listed.own.entries.assign(entries.reshape(-1, 2))
+    f = wp.zeros_like(body.node_displacements)
+    listed.repair(body.elements, [body.mu, body.lam, body.material_stride], body.node_displacements, f)
+    forces, sound = expected(forest, u, young)
+    assert np.abs(f.numpy()[:, :3] - forces)[sound].max() < TOLERANCE * np.abs(forces).max()
+    assert (listed.own.counts.numpy()[: LISTS * COUNT_STRIDE] == 0).all()
+
+
+@pytest.mark.skipif(not wp.get_cuda_devices(), reason="on the CPU what is left out is done in order")
+@pytest.mark.parametrize("turned", [1.0, 0.4])
+def test_what_was_left_out_before_changes_nothing(turned, rng):
+    """All of a body, or a part, turned over: the first evaluation knows nothing of that, the next ones do."""
+    device = wp.get_cuda_devices()[0]
+    forest = wc.TetForest.box((1, 1, 1), 0.1, 17)
+    body = wc.SoftBody(forest, wc.Isotropic(1e4, 0.4, 1000.0), device=device)
+    x = forest.points
+    body.displacements = (
+        0.02 * edge_scale(forest) * rng.uniform(-1, 1, x.shape)
+        - np.where(x[:, 2:] < turned * 0.1, 1.6, 0.0) * [0, 0, 1] * x
+    )
+    fast, leaf = (wc.Corotated(subtrees=subtrees).bind(body) for subtrees in (True, False))
+    found, flags = [], []
+    for field in (fast, fast, leaf, *([fast] * 20)):
+        f = wp.zeros_like(body.node_displacements)
+        field.scatter_forces(body.node_displacements, f)
+        found.append(f.numpy()[:, :3])
+        flags.append(fast.plan.batches[0].flagged.numpy())
+    assert (flags[0] == 255).mean() > 0.9 * turned
+    for other in found:
+        assert np.abs(other - found[2]).max() < TOLERANCE * np.abs(found[2]).max()
+    # Once it is the right way round again that is found out.
+    body.displacements = np.zeros_like(x)
+    for _ in range(40):
+        fast.scatter_forces(body.node_displacements, f)
+    assert (fast.plan.batches[0].flagged.numpy() == 0).all()

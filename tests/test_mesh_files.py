@@ -1,6 +1,6 @@
 """Tetrahedra from files, what is said of bad ones, and the surface of a mesh."""
 
-import builtins
+import importlib.util
 import logging
 import re
 
@@ -163,16 +163,13 @@ def test_meshes_without_usable_tetrahedra_are_refused(tmp_path):
 
 
 def test_a_missing_reader_is_named(tmp_path, monkeypatch):
-    def without_meshio(name, *args, **kwargs):
-        if name == "meshio":
-            raise ImportError(name)
-        return original(name, *args, **kwargs)
-
-    original = builtins.__import__
-    monkeypatch.setattr(builtins, "__import__", without_meshio)
-    path = tmp_path / "body.msh"
-    path.write_text("something")
-    refused(path, re.escape('pip install "warp-corot[mesh]"'))
+    original = importlib.util.find_spec
+    missing = ("meshio", "gmsh", "vtkmodules")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in missing else original(name))
+    for suffix, extra in ((".msh", "gmsh"), (".msh", "mesh"), (".vtu", "mesh")):
+        path = tmp_path / f"body{suffix}"
+        path.write_text("something")
+        refused(path, re.escape(f'pip install "warp-corot[{extra}]"'))
 
 
 def cube_tets(n: int, rng) -> tuple[np.ndarray, np.ndarray]:

@@ -33,7 +33,7 @@ def stiffness(F):
 def test_stiffness_is_bounded_however_crushed_and_turned_over(rng):
     """At most mu + 2 s |U'| + U'' |cof F|^2 for stretches up to s = 1 in size, with U'' no more than at J = 0.5 and U'
     steepest at J = -1. (The second derivative of det F is 2 s at most.) At rest it is 2 mu + 3 lambda."""
-    F = random_gradients(rng, 20000, -1.0, 1.0)
+    F = random_gradients(rng, 5000, -1.0, 1.0)
     assert np.linalg.det(F).min() < -0.8
     curvature = 4 * (MU + LAM * (1 + np.log(2)))
     slope = 2 * (MU + LAM * np.log(2)) + 1.5 * curvature

@@ -6,9 +6,6 @@ import warp as wp
 from newton_scenes import add_grid, builder, newton, run, wn
 from test_newton_contacts import contact_parameters, model_without_particles
 
-#: Solvers of bodies that are soon compiled.
-BRIEF = ("semi-implicit", "featherstone")
-
 coupled = pytest.importorskip("newton.solvers.experimental.coupled")
 
 
@@ -38,7 +35,9 @@ def rests(model, state):
 
 
 @pytest.mark.parametrize(
-    "rigid", [*BRIEF, *(pytest.param(name, marks=pytest.mark.slow) for name in ("xpbd", "mujoco"))]
+    "rigid",
+    # The others' own kernels compile for ten seconds and more.
+    ["semi-implicit", *(pytest.param(name, marks=pytest.mark.slow) for name in ("featherstone", "xpbd", "mujoco"))],
 )
 def test_with_another_rigid_solver(device, rigid):
     model, _, _ = drop(device)

@@ -41,7 +41,7 @@ def script(path):
 
 def test_there_are_examples():
     assert {path.stem for path in SCRIPTS} >= {"hanging", "drop", "gripper"}
-    assert all(len(path.read_text().splitlines()) <= 110 for path in SCRIPTS)
+    assert all(len(path.read_text(encoding="utf-8").splitlines()) <= 110 for path in SCRIPTS)
 
 
 @pytest.mark.slow

@@ -449,7 +449,7 @@ def test_a_forest_lives_as_long_as_its_models(device):
 class TestImports:
     def test_only_newtons_public_interface(self):
         for path in [*PACKAGE.glob("*.py"), *PACKAGE.parents[1].glob("kernels/newton*.py")]:
-            text = path.read_text()
+            text = path.read_text(encoding="utf-8")
             assert "_src" not in text, path
             imported = re.search(r"^\s*(import|from) newton\b", text, re.M) is not None
             assert imported == (path.name == "library.py"), path

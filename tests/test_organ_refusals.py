@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import nibabel
+import numpy as np
 import pytest
 import trimesh
 from command_line import assert_refused
@@ -13,7 +15,8 @@ from warp_corot.cli.label_materials import parse_labels, parse_pressure
 def refused_files(folder: Path) -> None:
     write_surface(folder / "organ.obj", False)
     write_scan(folder / "scan.nii.gz")
-    write_scan(folder / "nameless.nii", unit="unknown")
+    grey = nibabel.Nifti1Image(np.resize(np.arange(-20, 281), (12, 12, 12)).astype(np.int16), np.eye(4))
+    nibabel.save(grey, folder / "grey.nii.gz")
     half = trimesh.creation.icosphere(2, 0.05)
     half.update_faces(half.triangles_center[:, 2] > 0)
     half.export(folder / "half.ply")
@@ -34,13 +37,22 @@ REFUSED = [
     (["empty.glb"], "empty.glb: is empty"),
     (["half.ply"], "half.ply: the surface is open"),
     (["flat.off"], "flat.off: the surface has zero thickness"),
-    (["nameless.nii"], "the file names no unit of length; say --unit 'mm'"),
     (["warp:hare"], "warp:hare: no such asset, should be warp:bunny, warp:bear"),
-    (["organ.obj", "--unit", "inch"], "invalid choice: 'inch'"),
-    (["organ.obj", "--scale", "0.1"], "--scale is for meshes of tetrahedra; of organ.obj say --unit"),
+    (
+        ["organ.obj", "--unit", "kPa"],
+        "argument --unit: 'kPa'; it must be a length such as 'mm', 'cm', 'm', 'inch' or '3.2cm'",
+    ),
+    (["organ.obj", "--scale", "0"], "scale is 0; it must be a positive number"),
+    (["organ.obj", "--materials", "a=3kPa"], "--materials is for scans without --labels and meshes"),
+    (["organ.obj", "--up", "q"], "argument --up: invalid choice: 'Q'"),
+    (["organ.obj", "--threshold", "1"], "--threshold is for scans"),
+    (["scan.nii.gz", "--threshold", "3:1"], "'3:1' must be a number or LOW:HIGH"),
+    (["scan.nii.gz", "--threshold", "1", "--labels", "2=3kPa"], "--threshold is for scans without --labels"),
+    (["scan.nii.gz", "--regions-by", "tissue"], "--regions-by is for --materials on meshes"),
+    (["grey.nii.gz"], "grey.nii.gz: has 301 different values or more, -20 to 280, as intensities do"),
     (["organ.obj", "--labels", "liver=3kPa"], "--labels is for scans, and organ.obj is not one"),
     (["organ.obj", "--draw-labels"], "--draw-labels is for scans"),
-    (["box", "--unit", "mm"], "--unit is for surfaces and scans, and box is not one; say --scale"),
+    (["box", "--unit", "mm"], "--unit is for files, and box is not one; say --scale"),
     (["warp:bear", "--tets", "1000"], "--tets is for surfaces and scans"),
     (["box", "--draw-tets"], "--draw-tets is for surfaces and scans"),
     (["organ.obj", "--tets", "0"], "--tets is 0; it must be a whole number, at least 1"),
@@ -57,7 +69,7 @@ REFUSED = [
     (["scan.nii.gz", "--labels", ""], "--labels '': it must be NAME"),
     (["scan.nii.gz", "--labels", "a=3kPa:0.45:1000:2,b=3kPa"], "it must be NAME"),
     (["scan.nii.gz", "--labels", "a=soft,b=3kPa"], "'soft' is no Young's modulus"),
-    (["scan.nii.gz", "--labels", "a=3psi,b=3kPa"], "'3psi' is no Young's modulus"),
+    (["scan.nii.gz", "--labels", "a=3inch,b=3kPa"], "'3inch' is no Young's modulus"),
     (["scan.nii.gz", "--labels", "a=3kPa:half,b=3kPa"], "'half' is no Poisson's ratio"),
     (["scan.nii.gz", "--labels", "a=3kPa:nan,b=3kPa"], "'nan' is no Poisson's ratio"),
     (["scan.nii.gz", "--labels", "a=3kPa:0.5,b=3kPa"], "--labels 'a=3kPa:0.5': poisson is 0.5"),
@@ -70,7 +82,7 @@ REFUSED = [
     (["scan.nii.gz", "--labels", "a@2=3kPa,b=3kPa"], "which label 'b' is"),
     (["scan.nii.gz", "--labels", "2=3kPa,3=3kPa"], "label 3 ('3') is not in the volume"),
     (["scan.nii.gz", "--labels", "2=3kPa", "--young", "500"], "--young is given, but --labels gives each"),
-    (["scan.nii.gz", "--draw-labels"], "--draw-labels draws the labels that --labels names"),
+    (["scan.nii.gz", "--draw-labels"], "--draw-labels draws the labels that --labels or --materials names"),
     (["scan.nii.gz", "--smoothing", "-1"], "--smoothing is -1"),
     (["scan.nii.gz", "--smoothing", "1"], "--smoothing is 1 m and the body"),
     (["out.usda"], "is the input"),
@@ -84,7 +96,15 @@ def test_bad_input_is_one_line_and_touches_nothing(folder, args, said, capsys):
 
 
 def test_pressures():
-    for text, pascals in (("500", 500), ("3kPa", 3e3), (" 3.5 kPa", 3.5e3), ("1e-3GPa", 1e6), (".1MPa", 1e5)):
+    for text, pascals in (
+        ("500", 500),
+        ("3kPa", 3e3),
+        ("1psi", 6894.757),
+        ("2 N/mm2", 2e6),
+        (" 3.5 kPa", 3.5e3),
+        ("1e-3GPa", 1e6),
+        (".1MPa", 1e5),
+    ):
         assert parse_pressure(text) == pytest.approx(pascals)
     (entry,) = parse_labels("grey matter@3+4 = 2kPa:0.49")
     assert (entry.name, entry.numbers, entry.young, entry.poisson, entry.density) == (

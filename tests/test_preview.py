@@ -189,3 +189,15 @@ def test_bad_input_is_refused_and_keeps_the_picture(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r'pip install "warp-corot\[plot\]"'):
         render_preview(path, CUBE, FACES, size=SIZE)
     assert path.read_bytes() == good
+
+
+def test_held_nodes_are_marked_where_they_can_be_seen(tmp_path):
+    """The near corner, and not the one behind the body."""
+    pictures = {}
+    near, far = (int(np.argmax(CUBE @ [1.0, 1.0, 2.0] * sign)) for sign in (1.0, -1.0))
+    for name, node in (("none", None), ("near", near), ("far", far)):
+        held = np.arange(len(CUBE)) == (-1 if node is None else node)
+        render_preview(tmp_path / "a.png", CUBE, FACES, held=held, size=SIZE)
+        pictures[name] = picture_of(tmp_path / "a.png").astype(int)
+    assert np.abs(pictures["near"] - pictures["none"]).max() > 60
+    np.testing.assert_array_equal(pictures["far"], pictures["none"])

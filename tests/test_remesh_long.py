@@ -77,11 +77,11 @@ def resident(device):
     if wp.get_device(device).is_cuda:
         wp.synchronize_device(device)
         return wp.get_mempool_used_mem_current(device)
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads what memory is in use from /proc")
-@pytest.mark.parametrize("seconds", [20, pytest.param(3600, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seconds", [8, pytest.param(3600, marks=pytest.mark.slow)])
 def test_pulled_and_pressed_at_random(seconds, device):
     """Finite, or ``advance`` says so; mass to rounding; pools in balance; the region's volume; memory that stays."""
     ordeal = Ordeal(device, seed=5)

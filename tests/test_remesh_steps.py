@@ -25,6 +25,7 @@ DT = 1e-4
 MODELS = [
     wc.Corotated(),
     wc.Corotated(rotation_level=4),
+    wc.Corotated(rotation_level="auto"),
     wc.Corotated(subtrees=False),
     wc.Linear(),
     wc.StVenantKirchhoff(),

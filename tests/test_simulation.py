@@ -50,8 +50,9 @@ def test_fixed_nodes_stay_and_free_ones_have_no_reaction(device):
     assert np.abs(sim.body.reactions.numpy()[~held]).max() == 0
 
 
-def test_released_nodes_fall(device):
-    sim = bar(device)
+@pytest.mark.parametrize("dt", [None, 5e-4])
+def test_released_nodes_fall(device, dt):
+    sim = bar(device, dt=dt)
     sim.advance(0.05)
     sim.body.release(sim.body.constrained)
     momentum = sim.body.masses @ sim.body.velocities.numpy()
@@ -59,7 +60,9 @@ def test_released_nodes_fall(device):
     sim.advance(0.1)
     gained = sim.body.masses @ sim.body.velocities.numpy() - momentum
     expected = sim.body.masses.sum() * -9.81 * (sim.time - before)
-    np.testing.assert_allclose(gained, [0, expected, 0], atol=2e-4 * abs(expected))
+    # Velocities are half a step behind, of a step that may have become another.
+    late = 0.0 if dt else 0.5 * (sim.dt_range[1] - sim.dt_range[0]) / (sim.time - before)
+    np.testing.assert_allclose(gained, [0, expected, 0], atol=(2e-4 + late) * abs(expected))
     assert np.abs(sim.body.reactions.numpy()).max() == 0
 
 

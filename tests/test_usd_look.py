@@ -98,13 +98,14 @@ def test_prims_that_do_not_fit_are_refused(tmp_path):
     for surface, said in (
         ("cube.usda", r"/World/Cube is 0\.04 m long .* the body, which is 0\.0001 m long"),
         ("none.usd", "no such file"),
-        ("cube.obj", "extension .obj"),
+        ("cube.obj", "no such file"),
+        ("cube.txt", "extension .txt"),
         ("text.usd", "is not a USD file"),
         ("empty.usda", "has no Mesh prim"),
     ):
         with pytest.raises(wc.InputError, match=said):
             still(sim, tmp_path / "a.usd", surface=tmp_path / surface)
-    tets = wc.TetMesh(np.eye(4, 3, k=-1), [[0, 1, 2, 3]])
-    with pytest.raises(wc.InputError, match="only a TetForest can have a surface bound to it, not a TetMesh"):
-        still(simulated(tets), tmp_path / "a.usd", surface=tmp_path / "cube.usda")
     assert not (tmp_path / "a.usd").exists()
+    tets = wc.TetMesh(0.04 * np.eye(4, 3, k=-1), [[0, 1, 2, 3]])
+    still(simulated(tets), tmp_path / "a.usd", surface=tmp_path / "cube.usda")
+    assert (tmp_path / "a.usd").exists()

@@ -1,5 +1,6 @@
 """USD output: what stands in the stage, and that a stage that opens is there whatever ends the run."""
 
+import errno
 import os
 import random
 import signal
@@ -13,6 +14,7 @@ import pytest
 from pxr import Gf, Usd, UsdGeom, UsdValidation
 
 from warp_corot.errors import InputError
+from warp_corot.io import usd_pieces
 from warp_corot.io.colors import color_index, stress_colors
 from warp_corot.io.formats import load_tets
 from warp_corot.io.usd_writer import SURFACE, TETS, UsdWriter
@@ -200,7 +202,7 @@ def test_the_stage_grows_and_what_was_there_stays_until_it_is_safe(tmp_path):
     frames = list(frames_of(Cube, 6))
     writer = UsdWriter(path, Cube, fps=25, flush_seconds=60.0)
     write_frames(writer, frames[:3])
-    assert path.read_text() == "a good file"
+    assert path.read_text(encoding="utf-8") == "a good file"
     writer.flush()
     assert_frames(path, 3)
     assert validation_errors(path) == []
@@ -234,7 +236,7 @@ def test_no_frames_leave_no_file(tmp_path):
     path.write_text("a good file")
     with UsdWriter(path, Cube, fps=25):
         pass
-    assert path.read_text() == "a good file"
+    assert path.read_text(encoding="utf-8") == "a good file"
     assert os.listdir(tmp_path) == [path.name]
 
 
@@ -309,6 +311,10 @@ def test_kill_at_any_moment_leaves_a_stage_that_opens(tmp_path):
         before = out.read_bytes()
         process = start_run(out, flush_every=1 if attempt % 2 else 5)
         time.sleep(moments.uniform(0.0, 0.25))
+        # On a machine with much else to do none of them may have come so far; the last one does.
+        latest = time.monotonic() + 60.0
+        while attempt == 9 and out.read_bytes() == b"a good file" and time.monotonic() < latest:
+            time.sleep(0.01)
         process.send_signal(signal.SIGKILL)
         said = process.communicate()[0].splitlines()
         flushed = int(said[-1]) if said else 0
@@ -340,8 +346,47 @@ def test_a_full_disk_is_one_clear_line_and_keeps_what_is_there(tmp_path, limit, 
         assert validation_errors(out) == []
     else:
         assert "no frame could be kept" in last
-        assert out.read_text() == "a good file"
+        assert out.read_text(encoding="utf-8") == "a good file"
         assert os.listdir(tmp_path) == [out.name]
+
+
+def fill_disk(monkeypatch, folder: Path, room: int) -> None:
+    """Leave room for so many bytes in all files that are there at once."""
+    sync = usd_pieces.sync
+
+    def synced(path: Path) -> None:
+        if path.is_file() and sum(f.stat().st_size for f in folder.rglob("*") if f.is_file()) > room:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        sync(path)
+
+    monkeypatch.setattr(usd_pieces, "sync", synced)
+
+
+@pytest.mark.parametrize("flush_every", [0, 60])
+@pytest.mark.parametrize("room", [25_000, 40_000, 60_000])
+def test_a_full_disk_keeps_the_frames_that_fit(tmp_path, monkeypatch, room, flush_every):
+    """All wait when it fills, or some have been written; many frames go with one another, and not all of them fit."""
+    out = tmp_path / "out.usd"
+    fill_disk(monkeypatch, tmp_path, room)
+    with pytest.raises(OSError, match=r"No space left on device; the frames up to \d+ are kept in .*out.usd plays"):
+        write_all(out, 200, flush_every)
+    kept = frames_in(out)
+    assert 0 < kept < 200
+    assert_frames(out, kept)
+    assert validation_errors(out) == []
+    # There was no room for many more.
+    used = sum(file.stat().st_size for file in tmp_path.rglob("*") if file.is_file())
+    assert used > 0.6 * room
+
+
+def test_a_disk_without_room_for_a_frame_keeps_the_file_that_was_there(tmp_path, monkeypatch):
+    out = tmp_path / "out.usd"
+    out.write_text("a good file")
+    fill_disk(monkeypatch, tmp_path, 3_000)
+    with pytest.raises(OSError, match="no frame could be kept"):
+        write_all(out, 20, 7)
+    assert out.read_text(encoding="utf-8") == "a good file"
+    assert os.listdir(tmp_path) == [out.name]
 
 
 def test_two_writers_on_one_stage_are_refused(tmp_path):

@@ -28,7 +28,12 @@ ALL_MODELS = [
     wc.EdgeStVK(springs="quadratic"),
     wc.MassSpring(),
 ]
-CASES = [(mesh, model) for mesh in MESHES for model in (FOREST_MODELS if mesh != "general" else []) + ALL_MODELS]
+#: Uniform forests are in adaptive ones, but for the grouping of subtrees.
+CASES = [
+    *(("uniform", model) for model in (FOREST_MODELS[0], ALL_MODELS[0], ALL_MODELS[4])),
+    *(("adaptive", model) for model in FOREST_MODELS + ALL_MODELS),
+    *(("general", model) for model in ALL_MODELS),
+]
 
 
 # --- alone or together ---------------------------------------------------------------------------------------------

@@ -4,12 +4,16 @@ After Tagawa, Yamada and Tanaka, *A Rectangular Tetrahedral Adaptive Mesh Based 
 Interactive Soft Tissue Simulation* (IEEE EMBC 2013).
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from __future__ import annotations
 
 __version__ = "0.1.0"
 
+#: As ``typing`` has it, whose import takes a while in which Ctrl-C would end in a traceback.
+TYPE_CHECKING = False
+
 if TYPE_CHECKING:
+    from typing import Any
+
     from .api import *  # noqa: F403
 else:  # hidden from type checkers, to which every name would exist
 
@@ -17,6 +21,8 @@ else:  # hidden from type checkers, to which every name would exist
         """The first name asked for imports all: so that the command line is ready for Ctrl-C before that."""
         if name.startswith("__") and name != "__all__":
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from importlib import import_module
+
         api = import_module(".api", __name__)
         globals().update({"__all__": api.__all__} | {each: getattr(api, each) for each in api.__all__})
         if name not in globals():

@@ -1,7 +1,22 @@
-"""``python -m warp_corot``."""
+"""``python -m warp_corot``, and the command ``warp-corot``: Ctrl-C ends it quietly while Python is still importing."""
 
 import sys
 
-from .cli import main
 
-sys.exit(main())
+def main() -> int:
+    """Run the command line as a process of its own; returns the exit status."""
+    try:
+        from .cli import main as run
+
+        return run()
+    except KeyboardInterrupt:
+        sys.stderr.write("warp-corot: interrupted\n")
+        return 130
+    finally:
+        import signal
+
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # what Python still tidies up takes no time
+
+
+if __name__ == "__main__":
+    sys.exit(main())

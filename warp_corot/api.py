@@ -5,13 +5,14 @@ from .anisotropy import Orthotropic, TransverselyIsotropic
 from .body import SoftBody
 from .domain import Domain
 from .elasticity import Corotated, EdgeStVK, Linear, MassSpring, NeoHookean, StVenantKirchhoff
+from .energy import Energy, WorldEnergies
 from .errors import CapacityWarning, InputError, StabilityWarning, StaleViewError, UnstableError
 from .io.animate import record
 from .materials import Isotropic
 from .mesh import SurfaceMesh, TetForest, TetMesh
 from .remesh.online import OnlineRemesh
 from .rotations import polar_rotation
-from .simulation import Energy, Simulation
+from .simulation import Simulation
 from .solvers import SymplecticEuler
 
 __all__ = [
@@ -39,6 +40,7 @@ __all__ = [
     "TetMesh",
     "TransverselyIsotropic",
     "UnstableError",
+    "WorldEnergies",
     "polar_rotation",
     "record",
 ]

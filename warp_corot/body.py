@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy.typing as npt
 import warp as wp
 
 from .activation import ElementActivation
-from .checks import check_float32, checked_count
+from .checks import check_float32, checked_count, checked_numbers, shown
 from .controls import Controls
 from .device import checked_device
 from .elements import Mesh, device_elements, element_kind, parts, repeated
@@ -62,11 +63,13 @@ class SoftBody(Controls, SharedArrays):
             takes no strided view. After ``use_positions``, the array given there.
 
     Raises:
-        InputError: The device is not there, a material array does not have one value per element, stiffness, mass or
-            size are beyond the range of float32, or there are more than 2**31 elements in all.
+        InputError: The mesh or the material is something else, the device is not there, a material array does not have
+            one value per element, stiffness, mass or size are beyond the range of float32, or there are more than 2**31
+            elements in all.
     """
 
     def __init__(self, mesh: Mesh, material: Material, *, worlds: int = 1, device: str | wp.Device | None = None):
+        _check_made_of(mesh, material)
         #: What remeshes the body, if anything does.
         self.changing: Changing | None = None
         #: What the host knows of the present mesh, by the names of properties.
@@ -310,7 +313,7 @@ class SoftBody(Controls, SharedArrays):
         return wp.array(np.ascontiguousarray(values), dtype=wp.float32, device=self.device)
 
     def _checked_vectors(self, values: npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:
-        given = np.asarray(values.numpy() if isinstance(values, wp.array) else values, dtype=np.float64)
+        given = checked_numbers(values, name, f"[{self.node_count}, 3]")
         n = self.world_node_count
         if given.shape in ((n, 3), (self.worlds, n, 3)):
             given = np.broadcast_to(given, (self.worlds, n, 3)).reshape(-1, 3)
@@ -327,6 +330,23 @@ class SoftBody(Controls, SharedArrays):
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=self.launch_nodes, inputs=inputs, outputs=outputs, device=self.device)
+
+
+def _check_made_of(mesh: Any, material: Any) -> None:
+    """See that a body is made of a mesh and a material.
+
+    Raises:
+        InputError: One of them is something else.
+    """
+    if not isinstance(mesh, Mesh):
+        cure = "TetMesh(points, tets) makes one of arrays"
+        if isinstance(mesh, str | PathLike):
+            cure = f"TetMesh.load({str(mesh)!r}) reads tetrahedra, Domain.from_surface({str(mesh)!r}) a surface"
+        raise InputError(f"mesh is {shown(mesh)}; it must be a TetForest or a TetMesh: {cure}")
+    if not isinstance(material, Material):
+        young = f"{material!r}" if isinstance(material, int | float) else "5e3"
+        cure = f"Isotropic(young={young}, poisson=0.45, density=1000.0)"
+        raise InputError(f"material is {shown(material)}; it must be a material such as {cure}")
 
 
 def centroids(mesh: Mesh) -> npt.NDArray[np.float64]:

@@ -10,12 +10,14 @@ import warp as wp
 
 from .activation import Activation, ElementActivation, activate
 from .anisotropy import Anisotropic
+from .elements import Mesh
 from .errors import InputError
 from .materials import Material
 from .nodal import vec3_view
+from .places import Nodes, nodes_at
 from .trajectory import Trajectory
 from .views import Views
-from .worlds import chosen_nodes
+from .worlds import ChosenNodes, chosen_nodes
 
 
 class Controls:
@@ -43,6 +45,11 @@ class Controls:
 
     @property
     @abstractmethod
+    def mesh(self) -> Mesh:
+        """The mesh."""
+
+    @property
+    @abstractmethod
     def material(self) -> Material:
         """What the body is made of."""
 
@@ -66,21 +73,23 @@ class Controls:
         """Elements of all worlds."""
         return self.worlds * self.world_element_count
 
-    def fix(self, nodes: npt.ArrayLike, *, worlds: npt.ArrayLike | None = None) -> None:
+    def fix(self, nodes: Nodes, *, worlds: npt.ArrayLike | None = None) -> None:
         """Hold nodes where they are.
 
         Args:
-            nodes: Mask bool [N] or indices into one world's nodes; or a mask of all worlds' nodes, bool [worlds, N].
+            nodes: Mask bool [N] or indices into one world's nodes; an expression in the rest position, as
+                ``"z < zmin + 0.01"`` (``selection.select_nodes``), or a function of it, ``f(points [N, 3]) -> bool
+                [N]`` [m]; or a mask of all worlds' nodes, bool [worlds, N].
             worlds: In which worlds: None for all, an index, indices or a mask bool [worlds].
 
         Raises:
-            InputError: Mask of the wrong length or index out of range.
+            InputError: Mask of the wrong length, index out of range, or not such an expression or function.
         """
         chosen = self.node_indices(nodes, worlds)
         self._stop_following(chosen)
         self._constrain(chosen, np.zeros(3))
 
-    def release(self, nodes: npt.ArrayLike, *, worlds: npt.ArrayLike | None = None) -> None:
+    def release(self, nodes: Nodes, *, worlds: npt.ArrayLike | None = None) -> None:
         """Let fixed or prescribed nodes go, with the velocity they have. Nodes and worlds as in ``fix``."""
         chosen = self.node_indices(nodes, worlds)
         self._stop_following(chosen)
@@ -92,7 +101,7 @@ class Controls:
 
     def prescribe(
         self,
-        nodes: npt.ArrayLike,
+        nodes: Nodes,
         *,
         velocity: npt.ArrayLike | None = None,
         times: npt.ArrayLike | None = None,
@@ -113,7 +122,7 @@ class Controls:
         Raises:
             InputError: Neither or both ways given, wrong shapes, times that do not increase, or non-finite values.
         """
-        named = chosen_nodes(nodes, self.world_node_count, self.worlds, worlds)
+        named = self._chosen_nodes(nodes, worlds)
         chosen = named.indices
         if (velocity is None) == (times is None and displacements is None):
             raise InputError("prescribe takes either velocity, or times and displacements")
@@ -135,7 +144,7 @@ class Controls:
             self.trajectories.append(trajectory)
             self.revision += 1
 
-    def load(self, nodes: npt.ArrayLike, force: npt.ArrayLike, *, worlds: npt.ArrayLike | None = None) -> None:
+    def load(self, nodes: Nodes, force: npt.ArrayLike, *, worlds: npt.ArrayLike | None = None) -> None:
         """Set the external force on nodes, from the next step on.
 
         Args:
@@ -146,7 +155,7 @@ class Controls:
         Raises:
             InputError: Wrong shape or non-finite values.
         """
-        chosen = chosen_nodes(nodes, self.world_node_count, self.worlds, worlds)
+        chosen = self._chosen_nodes(nodes, worlds)
         values = chosen.vectors(force, "force")
         self._ensure_loads()
         loads = self.node_loads.numpy().copy()
@@ -209,15 +218,18 @@ class Controls:
         self._ensure_loads()
         return self._views.hand_out(vec3_view(self.node_loads[: self.node_count]))
 
-    def node_indices(self, nodes: npt.ArrayLike, worlds: npt.ArrayLike | None = None) -> npt.NDArray[np.intp]:
+    def node_indices(self, nodes: Nodes, worlds: npt.ArrayLike | None = None) -> npt.NDArray[np.intp]:
         """Indices, among the nodes of all worlds, of those named as in ``fix``.
 
         Raises:
             InputError: Mask of the wrong length, index out of range, or neither.
         """
-        return chosen_nodes(nodes, self.world_node_count, self.worlds, worlds).indices
+        return self._chosen_nodes(nodes, worlds).indices
 
     # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _chosen_nodes(self, nodes: Nodes, worlds: npt.ArrayLike | None) -> ChosenNodes:
+        return chosen_nodes(nodes_at(nodes, self.mesh), self.world_node_count, self.worlds, worlds)
 
     def _ensure_loads(self) -> None:
         if not self.has_loads:

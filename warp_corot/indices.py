@@ -19,7 +19,11 @@ def checked_indices(given: npt.ArrayLike, count: int, thing: str) -> npt.NDArray
     Raises:
         InputError: Mask of the wrong shape, an index out of range, or neither a mask nor whole numbers.
     """
-    chosen = np.asarray(given)
+    try:
+        chosen = np.asarray(given)
+    except ValueError:
+        wanted = f"a mask [{count}] or a list of whole numbers"
+        raise InputError(f"{thing} indices have rows of several lengths; they must be {wanted}") from None
     if chosen.dtype == bool:
         if chosen.shape != (count,):
             raise InputError(f"the {thing} mask has shape {chosen.shape}; it must be [{count}]")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from .checks import checked_numbers
 from .errors import InputError
 
 
@@ -14,7 +15,7 @@ def checked_times(times: npt.ArrayLike) -> npt.NDArray[np.float64]:
     Raises:
         InputError: They are not at least two finite numbers that increase.
     """
-    t = np.asarray(times, dtype=np.float64)
+    t = checked_numbers(times, "times", "at least two that increase")
     if t.ndim != 1 or len(t) < 2 or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
         raise InputError(f"times of shape {t.shape} must be at least two finite, increasing numbers")
     return t

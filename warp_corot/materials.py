@@ -74,10 +74,15 @@ class Material(ABC):
         for field in fields(self):  # type: ignore[arg-type]
             shape, tail = np.shape(getattr(self, field.name)), self.components.get(field.name, ())
             head = shape[: len(shape) - len(tail)]
+            of_worlds = f"[{', '.join(map(str, (worlds, 1, *tail)))}]"
             if len(head) == 1 and head[0] != count:
-                raise InputError(f"{field.name} has {head[0]} entries; the mesh has {count} elements")
+                cure = f"; one for each of {worlds} worlds is {of_worlds}" if head[0] == worlds > 1 else ""
+                raise InputError(f"{field.name} has {head[0]} entries; the mesh has {count} elements{cure}")
             if len(head) == 2 and (head[0] not in (1, worlds) or head[1] not in (1, count)):
-                raise InputError(f"{field.name} has shape {shape}; there are {worlds} worlds of {count} elements")
+                raise InputError(
+                    f"{field.name} has shape {shape}; there are {worlds} worlds of {count} elements: "
+                    f"it must be {[count, *tail]}, {of_worlds} or {[worlds, count, *tail]}"
+                )
 
 
 @dataclass(frozen=True, eq=False)

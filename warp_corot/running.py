@@ -1,49 +1,44 @@
-"""Runs of a simulation: how many steps come before something else is due, and what becomes of a state gone wrong."""
+"""Runs of a simulation: how many steps come before something else is due, and what becomes of a state gone wrong.
+
+``Simulation.advance`` asks for steps until a time. They are made in runs, which end where a check, a hook or a pass of
+remeshing is due. The host plans a run from what the device last reported, launches it (``solvers.recorded``), and waits
+once, for the report at its end (``solvers.guard``): the ordinary call of ``advance`` is one run.
+"""
 
 from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from .elasticity import StVenantKirchhoff
 from .errors import StabilityWarning, UnstableError, depth_of_user
-from .kernels.pace import GROWTH, LEAST
+from .kernels.pace import GROWTH
+from .solvers.energy_control import EnergyControl
 from .solvers.guard import Fault
+from .solvers.recorded import Segment
 
 if TYPE_CHECKING:
     from .simulation import Simulation
 
-#: Measurements from one check with elastic energies to the next: for a body that stays as stiff as at rest, for one
-#: that is strained so that its step is less than a share of that at rest, and while less than what is stable is taken
-#: or a strained body errs by more than QUIET of what is let pass.
-CHECK_INTERVALS = 16
-STRAINED_INTERVALS = 4
-CLOSE_INTERVALS = 2
-STRAINED = 0.7
-QUIET = 0.25
-#: Measurements are fewer once the step has been this share of the one at rest, or more, at two checks in a row.
-CALM = 0.95
-CALM_CHECKS = 2
-#: Energy from nowhere that is let pass between two checks, and in all, as shares of what gravity, loads and supports
-#: have moved: the step is made shorter for more than the first, and not longer again before both are kept. Less is let
-#: pass the nearer it is in all to the most there should be.
-GAIN = 0.001
-SURPLUS = 0.004
-MOST_SURPLUS = 0.008
-LEAST_LEAVE = 0.02
-#: What vibrations err by at any one time does not add up: it alone makes the share no smaller than this.
-RINGING = 0.3
-#: Growth of the step's share from one measurement to the next: from a half to the whole in 35 of them.
-RECOVERY = 1.02
 #: How often the step is halved to come over one place.
 MOST_RETURNS = 6
 #: How often it is halved for a little energy from nowhere, as comes with crushed elements also of the shortest steps.
 STRICT_RETURNS = 4
 #: Steps made one at a time from one look at where nodes are to the next.
 LOOK_STEPS = 256
+#: Steps after which a state is judged by elastic energies, which take as long as some steps, where a run ends; bodies
+#: that were not found calm sooner.
+JUDGED_STEPS = 64
+JUDGED_STRAINED = 16
 #: Longer runs are looked after in between.
 MOST_INTERVALS = 1000
+#: A step that was less than this share of the longest may have grown after some measurements.
+GROWN = 0.98
+#: What a measurement is expected to leave of the step of a strained body, which the state tells by this share of the
+#: longest step.
+SHRINKING = 0.95
 
 
 class Running:
@@ -55,41 +50,46 @@ class Running:
 
     def __init__(self, sim: Simulation):
         self._sim = sim
+        self._energies = EnergyControl(sim.guard, sim.recorded, sim.safe_step)
         self._returns = 0
         #: The time at which the state was found to be wrong, while it has not been passed.
         self._wrong_until = -math.inf
         self._has_warned = False
         self._steps_called = 0
-        #: Whether the last run ended with steps shorter than what the state allows.
-        self._shortened = False
+        #: Whether the last run may have ended with steps shorter than what the state allows.
+        self._shortened = True
         self._steps_made = 0
-        #: Steps done when the share of the step was last looked at.
-        self._followed = 0
-        self._check_intervals = CHECK_INTERVALS if sim.safe_step is None else CLOSE_INTERVALS
+        #: Steps done when elastic energies were last looked at.
+        self._judged = 0
 
     def step(self) -> None:
         """Make one step, with a measurement before it where one is due."""
         sim = self._sim
-        self._resume()
         position = sim.steps if sim.device.is_cpu else self._steps_made
         self._steps_made = position + 1
-        measured = sim.safe_step is not None and position % sim.recorded.interval == 0
-        sim.recorded.replay(1, whole=True, measured=measured)
+        recorded = sim.recorded
+        self._energies.go_on(position)
+        segment = Segment(1, adopts=True, publishes=True)
+        if sim.safe_step is not None:
+            measured = 0 if position % recorded.interval else recorded.interval
+            segment = replace(segment, resumes=self._shortened, measured=measured)
+            self._shortened = False
+        recorded.replay(segment)
 
     def make(self, count: int) -> None:
         """Make so many steps, with hooks and passes."""
         sim = self._sim
         end = sim.total_steps + count
-        self._begin()
+        self._energies.begin()
         while (left := end - sim.total_steps) > 0:
-            self._go(left, None)
+            self._run(left, None)
 
     def make_until(self, total_time: float) -> None:
         """Make steps until a time [s], exactly; only if the step is the simulation's to choose."""
         sim = self._sim
-        self._begin()
+        self._energies.begin()
         while sim.total_time < total_time:
-            if self._go(MOST_INTERVALS * sim.recorded.interval, total_time - sim.time_before_reset):
+            if self._run(MOST_INTERVALS * sim.recorded.interval, total_time - sim.time_before_reset):
                 break
 
     def look(self) -> None:
@@ -105,49 +105,46 @@ class Running:
         if fault is not None:
             raise UnstableError(self._message(fault))
 
-    # --- pieces ----------------------------------------------------------------------------------------------------
+    # --- one run ---------------------------------------------------------------------------------------------------
 
-    def _begin(self) -> None:
-        sim = self._sim
-        sim.recorded.adopt_positions()
-        self._take()
-        if sim.safe_step is not None:
-            calm, intervals, self._followed = sim.safe_step.schedule
-            self._check_intervals = intervals or CLOSE_INTERVALS
-            sim.recorded.is_calm = calm == CALM_CHECKS
-
-    def _take(self) -> None:
-        """Take the present state for good, which a user may have written."""
-        sim = self._sim
-        if sim.guard.begin() and sim.safe_step is not None:
-            sim.safe_step.take_given()
-
-    def _go(self, most: int, end: float | None) -> bool:
+    def _run(self, most: int, end: float | None) -> bool:
         """Make steps until something is due, and do it; whether the end is reached."""
         sim = self._sim
-        sim.recorded.adopt_positions()
+        if sim.guard.begin() and sim.safe_step is not None:
+            sim.pace.take_given()
         done = sim.steps
-        most = min(most, self._until_due(done))
-        reached = self._advance(done, most, end)
-        sim.recorded.publish_positions()
-        now = self._steps_made = sim.steps
+        segments, stop = self._plan(done, min(most, self._until_due(done)), end)
+        now = self._steps_made = done + sum(segment.count for segment in segments)
         whole = now % self._check_steps == 0 or bool(self._returns)
-        passed = self._check(now, whole)
+        judged = whole or self._is_to_be_judged(now)
+        sim.guard.order(end, stop)
+        for number, segment in enumerate(segments):
+            last = number == len(segments) - 1
+            sim.recorded.replay(segment.placed(begins=number == 0, ends=last, whole=last and judged))
+        passed = self._check(now, whole, judged)
+        self._judged = sim.steps if judged or now < self._judged else self._judged
+        if sim.guard.was_given:
+            self._energies.begin_anew()
         # Where short runs end does not count: the same run in one would take other steps.
         if whole or not passed:
-            self._choose_intervals(checked=passed)
+            self._energies.choose_intervals(checked=passed)
         if not passed:
             return False
+        reached = end is not None and sim.time >= end
         if sim.remeshing.is_due(now):
             sim.follow_motion()
             sim.guard.forget()
-            self._take()
         if any(now % every == 0 for every in sim.hook_intervals) and sim.total_steps > self._steps_called:
             self._steps_called = sim.total_steps
             sim.call_hooks()
-            sim.recorded.adopt_positions()
-            self._take()
         return reached
+
+    def _is_to_be_judged(self, steps: int) -> bool:
+        """Whether to look at elastic energies, only to see whether the state is good, after so many steps."""
+        sim = self._sim
+        if sim.safe_step is None:
+            return False
+        return steps - self._judged >= (JUDGED_STEPS if sim.recorded.calm > 0 else JUDGED_STRAINED)
 
     def _until_due(self, done: int) -> int:
         """Steps until a check, a pass or a hook is due."""
@@ -159,67 +156,64 @@ class Running:
 
     @property
     def _check_steps(self) -> int:
-        if self._returns:
-            return self._sim.recorded.interval
-        return self._check_intervals * self._sim.recorded.interval
+        return self._sim.recorded.interval if self._returns else self._energies.check_steps
 
-    def _advance(self, done: int, most: int, end: float | None) -> bool:
-        """Make at most so many steps; whether the end is reached."""
+    # --- what a run is to be ---------------------------------------------------------------------------------------
+
+    def _plan(self, done: int, most: int, end: float | None) -> tuple[list[Segment], int]:
+        """At most so many steps, and how many are done when they end in time.
+
+        The last steps before ``end`` are as many as they would be of the length that the device reported last. Where a
+        measurement within the run allows longer ones they are shorter than that; where it allows only shorter ones the
+        run ends before ``end``, and another one follows.
+        """
         sim = self._sim
         if sim.safe_step is None:
-            sim.recorded.replay_many(most)
-            return False
-        self._resume()
-        every, stop = sim.recorded.interval, done + most
-        sure = 0
-        while done < stop:
+            return [Segment(most)], 0
+        every, last = sim.recorded.interval, done + most
+        left = math.inf if end is None else end - sim.time
+        shortened, self._shortened = sim.safe_step.is_shortened, True
+        segments: list[Segment] = []
+        sure = stop = 0
+        while done < last:
             phase = done % every
-            count = min(stop - done, every - phase)
-            if end is not None and phase == 0 and not sure:
-                sure = self._sure_intervals(end - sim.time)
-            if end is None or (phase == 0 and sure and count == every):
-                self._measured(count, phase)
-                sure = max(sure - 1, 0)
-                done += count
-                continue
-            if phase == 0:
-                self._resume()
-                sim.recorded.replay(0, measured=True)
-            count, reached = self._ending(count, end)
+            if phase == 0 and not sure and not stop:
+                if any(segment.measured for segment in segments) and self._may_have_grown():
+                    break
+                sure = self._sure_intervals(left)
+            if not stop and not (sure and phase == 0):
+                needed = self._steps_for(left, -done % every)
+                stop = done + int(needed) if needed <= 2 * every else 0
+            count = min(last - done, every - phase, stop - done if stop else every)
+            measured = 0 if phase else every
+            resumes = shortened and (measured > 0 or not stop)
+            segments.append(Segment(count, resumes=resumes, measured=measured, fits=stop > 0))
+            shortened = stop > 0
             done += count
-            if reached:
-                return True
-        return False
+            left -= count * sim.safe_step.allowed
+            sure = max(sure - (phase == 0), 0)
+            if done == stop:
+                break
+        return segments, stop
 
-    def _measured(self, count: int, phase: int) -> None:
-        recorded = self._sim.recorded
-        if phase == 0 and count == recorded.interval:
-            recorded.replay(count, measured=True)
-            return
-        if phase == 0:
-            recorded.replay(1, measured=True)
-            count -= 1
-        recorded.replay_many(count)
-
-    def _ending(self, count: int, end: float) -> tuple[int, bool]:
-        """Make steps that end in time: the last ones are as long as one another. Returns how many, and whether it is
-        reached."""
-        sim = self._sim
-        assert sim.safe_step is not None
-        left, dt = end - sim.time, sim.safe_step.allowed
-        steps = max(math.ceil(left / dt * (1.0 - 1e-9)), 1)
-        self._shortened = True
-        sim.pace.set_step(left / steps if steps <= 2 * sim.recorded.interval else dt)
-        count = min(count, steps)
-        sim.recorded.replay_many(count)
-        if count == steps:
-            sim.pace.set_time(end)
-        return count, count == steps
+    def _steps_for(self, left: float, before: int) -> float:
+        """Steps for some time that is left [s], as far as can be known ``before`` so many steps, when they are measured
+        again."""
+        safe = self._sim.safe_step
+        assert safe is not None
+        if math.isinf(left):
+            return math.inf
+        allowed = safe.allowed
+        expected = allowed * (SHRINKING if allowed < SHRINKING * safe.at_rest else 1.0)
+        steps = _steps(left, allowed)
+        return steps if steps <= before else before + _steps(left - before * allowed, expected)
 
     def _sure_intervals(self, left: float) -> int:
         """Whole intervals after which there is still some time left, even if the step grows as fast as it may."""
         safe = self._sim.safe_step
         assert safe is not None
+        if math.isinf(left):
+            return MOST_INTERVALS
         interval, longest = self._sim.recorded.interval, safe.at_rest
         growth = float(GROWTH)
         dt = min(growth * safe.allowed, longest)
@@ -231,77 +225,29 @@ class Running:
             count += 1
         return count
 
-    def _resume(self) -> None:
-        """Take the step that the state allows again.
+    def _may_have_grown(self) -> bool:
+        """Whether steps may have become much longer since the device reported, so that fewer do."""
+        safe = self._sim.safe_step
+        assert safe is not None
+        share, allowed, at_rest = safe.shares
+        return share * allowed < GROWN * at_rest
 
-        Velocities shift neither here nor where the end of a run made the step shorter, so that the two cancel.
-        """
-        if self._shortened and self._sim.safe_step is not None:
-            self._sim.safe_step.resume()
-        self._shortened = False
+    # --- what became of it -----------------------------------------------------------------------------------------
 
-    def _check(self, now: int, whole: bool) -> bool:
-        """Check the state, elastic energies too if asked to; False if it was put back."""
+    def _check(self, now: int, whole: bool, judged: bool) -> bool:
+        """Check the state, by elastic energies too if these were found, which count if asked to; False if it was put
+        back."""
         sim = self._sim
         strict = sim.safe_step is not None and self._returns < STRICT_RETURNS
-        fault = sim.guard.check(whole=whole, strict=strict, lenient=sim.safe_step is not None)
+        fault = sim.guard.check(whole=judged, counts=whole, strict=strict, lenient=sim.safe_step is not None)
         if fault is not None:
             self._go_back(fault)
             return False
         if self._returns and sim.time > self._wrong_until:
             self._returns = 0
-        if whole and sim.safe_step is not None:
-            self._follow_energy(now)
+        if whole:
+            self._energies.follow(now)
         return True
-
-    def _follow_energy(self, now: int) -> None:
-        """Make the step shorter where energy came from nowhere, and longer again where none did."""
-        sim = self._sim
-        assert sim.safe_step is not None
-        share = self._share
-        intervals = (now - self._followed) / sim.recorded.interval
-        self._followed = now
-        gain = GAIN * max(1.0 - sim.guard.surplus / MOST_SURPLUS, LEAST_LEAVE)
-        late, more = sim.guard.untimely / SURPLUS, sim.guard.gain / gain
-        if late > 1.0 or more > 1.0:
-            least = min(share, RINGING)
-            share *= max(1.0 / math.sqrt(max(more, 1.0)), 0.5)
-            share = min(share, max(share / math.sqrt(max(late, 1.0)), least))
-        elif sim.guard.surplus + sim.guard.untimely <= SURPLUS:
-            share = min(share * RECOVERY**intervals, 1.0)
-        if share != self._share:
-            self._set_share(share)
-
-    def _choose_intervals(self, *, checked: bool) -> None:
-        """Look more often where a body is strained, less often where checks on elastic energies have found it calm."""
-        sim = self._sim
-        if sim.safe_step is None:
-            return
-        share, allowed, at_rest = sim.safe_step.shares
-        before = sim.safe_step.schedule
-        calm = min(before[0] + checked, CALM_CHECKS) if share == 1.0 and allowed >= CALM * at_rest else 0
-        sim.recorded.is_calm = calm == CALM_CHECKS
-        if share < 1.0:
-            self._check_intervals = CLOSE_INTERVALS
-        elif allowed < STRAINED * at_rest:
-            quiet = max(sim.guard.gain / GAIN, sim.guard.untimely / SURPLUS) < QUIET
-            self._check_intervals = STRAINED_INTERVALS if quiet else CLOSE_INTERVALS
-        else:
-            self._check_intervals = CHECK_INTERVALS
-        if before != (chosen := (calm, self._check_intervals, self._followed)):
-            sim.safe_step.schedule = chosen
-
-    @property
-    def _share(self) -> float:
-        return 1.0 if self._sim.safe_step is None else self._sim.safe_step.share
-
-    def _set_share(self, share: float) -> None:
-        """Take another share of the step that the state allows from here on."""
-        sim = self._sim
-        assert sim.safe_step is not None
-        sim.safe_step.share = max(share, float(LEAST))
-        sim.recorded.retime()
-        sim.guard.settle()
 
     def _go_back(self, fault: Fault) -> None:
         """Go on from the last good state with half the step.
@@ -317,10 +263,8 @@ class Running:
         if not self._returns:
             self._wrong_until = sim.time
         self._returns += 1
-        share = sim.safe_step.share
         sim.guard.go_back()
-        self._followed = sim.steps
-        self._set_share(0.5 * share)
+        self._energies.halve(sim.steps)
         if not self._has_warned and not fault.is_slight:
             self._has_warned = True
             message = (
@@ -349,3 +293,8 @@ class Running:
         if sim.safe_step is None:
             return ": take a shorter step, or dt=None, which follows the state"
         return f"; {MOST_RETURNS} times half the step did not help: look for loads or motions that crush the body"
+
+
+def _steps(seconds: float, dt: float) -> int:
+    """Whole steps that take some time, if they are as long as dt or a little shorter [s]."""
+    return max(math.ceil(seconds / dt * (1.0 - 1e-9)), 1)

@@ -1,4 +1,4 @@
-"""Nodes chosen by an expression in their rest coordinates, such as ``"z < 0.01"``.
+"""Nodes chosen by an expression in their rest coordinates, such as ``"z < 0.01"`` or ``"top or sphere(0, 0, 1, 0.2)"``.
 
 The expression is parsed with Python's grammar and walked by hand: names, numbers and operators listed here, nothing
 else. It is never evaluated as code.
@@ -32,6 +32,10 @@ FUNCTIONS: dict[str, tuple[Callable[..., np.ndarray], int, int | None]] = {
     "max": (lambda *a: np.maximum.reduce(np.broadcast_arrays(*a)), 2, None),
 }
 
+#: Regions by name, with the number of arguments (a second one where the last may be left out). They mean all nodes,
+#: wherever they stand in the expression.
+REGIONS = {"sphere": (4, 4), "box": (6, 6), "nearest": (3, 4)}
+
 _ARITHMETIC: dict[type[ast.operator], Callable[..., np.ndarray]] = {
     ast.Add: np.add,
     ast.Sub: np.subtract,
@@ -51,25 +55,31 @@ _COMPARISONS: dict[type[ast.cmpop], Callable[..., np.ndarray]] = {
     ast.NotEq: np.not_equal,
 }
 _LONGEST = 1000
+#: Not a name that an expression can have: which nodes are looked at, indices.
+_PLACES = "#"
 _PARENTHESES = " (with & and |, put each condition in parentheses)"
 
 Names = Mapping[str, np.ndarray]
+Named = Mapping[str, Callable[[], npt.NDArray[np.bool_]]]
 
 
 def select_nodes(
-    expression: str, points: npt.ArrayLike, *, bounds: npt.ArrayLike | None = None
+    expression: str, points: npt.ArrayLike, *, bounds: npt.ArrayLike | None = None, named: Named | None = None
 ) -> npt.NDArray[np.bool_]:
     """The nodes for which an expression holds.
 
     Names: ``x``, ``y``, ``z`` (rest coordinates [m]), ``xmin``, ``xmax``, …, ``zmax`` (bounds [m]), ``pi``, ``all``,
     ``none``. Operators: arithmetic, comparisons (also chained), ``and``, ``or``, ``not`` and, between comparisons in
-    parentheses, ``&``, ``|``, ``~``. Functions: see ``FUNCTIONS``. The right side of ``and`` and ``or`` is looked at
+    parentheses, ``&``, ``|``, ``~``. Functions: see ``FUNCTIONS``. Regions: ``sphere(x, y, z, radius)``,
+    ``box(x, y, z, x, y, z)`` between two corners, ``nearest(x, y, z)`` for the node that is nearest to a point and
+    ``nearest(x, y, z, n)`` for the n nearest [m]. The right side of ``and`` and ``or`` is looked at
     only where the left side leaves it open, so that ``y > 0 and x / y < 1`` divides by no zero.
 
     Args:
         expression: For example ``"x > 0.1 and not (y < 0.2)"``, ``"hypot(x, y) < 0.02"``, ``"z < zmin + 0.01"``.
         points: Rest positions [m], [N, 3].
         bounds: Lowest and highest coordinates [m], [2, 3]; None: those of the points.
+        named: More names and what gives their nodes, bool [N]; called where the expression has the name.
 
     Returns:
         Mask, bool [N].
@@ -83,19 +93,24 @@ def select_nodes(
     names: dict[str, np.ndarray] = {name: np.asarray(value) for name, value in CONSTANTS.items()}
     for axis, name in enumerate("xyz"):
         names |= {name: x[:, axis], f"{name}min": np.asarray(lowest[axis]), f"{name}max": np.asarray(highest[axis])}
-    return _Evaluation(expression, len(x)).mask(names)
+    return _Evaluation(expression, x, named or {}).mask(names)
 
 
 class _Evaluation:
     """One expression over N nodes; numbers are float64, truths bool, each [N] or a scalar."""
 
-    def __init__(self, expression: str, count: int):
+    def __init__(self, expression: str, points: npt.NDArray[np.float64], named: Named):
         self.expression = expression
-        self.count = count
+        self.points = points
+        self.named = named
+        self.count = len(points)
 
     def mask(self, names: Names) -> npt.NDArray[np.bool_]:
         try:
             tree = ast.parse(self._checked_text(), mode="eval").body
+            used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+            names = {**names, **{name: self.named[name]() for name in sorted(used & self.named.keys())}}
+            names[_PLACES] = np.arange(self.count)
             with np.errstate(all="ignore"):
                 value = self._value(tree, names, self.count)
         except SyntaxError as error:
@@ -126,7 +141,8 @@ class _Evaluation:
                 return self._constant(node, value)
             case ast.Name(id=name):
                 if name not in names:
-                    raise self._error(f"{name!r} is not known; names are {', '.join(names)}")
+                    known = [*(known for known in names if known != _PLACES), *(self.named.keys() - names.keys())]
+                    raise self._error(f"{name!r} is not known; names are {', '.join(known)}")
                 return names[name]
             case ast.UnaryOp(op=ast.Not() | ast.Invert(), operand=operand):
                 return ~self._truth(operand, names, count)
@@ -149,9 +165,37 @@ class _Evaluation:
                 if len(args) < least or (most is not None and len(args) > most):
                     raise self._error(f"{name} takes {least}{'' if most else ' or more'} arguments, not {len(args)}")
                 return self._finite(node, function(*(self._number(arg, names, count) for arg in args)), count)
+            case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in REGIONS:
+                return self._region(name, [self._constant_number(arg, names) for arg in args])[names[_PLACES]]
             case ast.Call(func=ast.Name(id=name)) if name not in FUNCTIONS:
-                raise self._error(f"{name!r} is no function here; functions are {', '.join(FUNCTIONS)}")
+                known_functions = ", ".join([*FUNCTIONS, *REGIONS])
+                raise self._error(f"{name!r} is no function here; functions are {known_functions}")
         raise self._error(f"{ast.unparse(node)!r} is not understood{self._hint()}")
+
+    def _constant_number(self, node: ast.expr, names: Names) -> float:
+        value = self._number(node, names, self.count)
+        if value.ndim:
+            raise self._error(f"{ast.unparse(node)!r} is not the same at all nodes, as numbers of a region must be")
+        return float(value)
+
+    def _region(self, name: str, given: list[float]) -> npt.NDArray[np.bool_]:
+        """All nodes of a region."""
+        least, most = REGIONS[name]
+        if not least <= len(given) <= most:
+            wanted = f"{least}" if least == most else f"{least} or {most}"
+            raise self._error(f"{name} takes {wanted} arguments, not {len(given)}")
+        if name == "box":
+            low, high = np.sort([given[:3], given[3:]], axis=0)
+            return ((self.points >= low) & (self.points <= high)).all(axis=1)
+        away = np.linalg.norm(self.points - given[:3], axis=1)
+        if name == "sphere":
+            return away <= given[3]
+        count = given[3] if len(given) == 4 else 1.0
+        if count != round(count) or not 1 <= count <= self.count:
+            raise self._error(f"nearest takes a number of nodes from 1 to {self.count}, not {count:g}")
+        chosen = np.zeros(self.count, bool)
+        chosen[np.argsort(away, kind="stable")[: int(count)]] = True
+        return chosen
 
     def _constant(self, node: ast.expr, value: float) -> np.ndarray:
         if isinstance(value, bool):

@@ -7,15 +7,15 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from os import PathLike
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from .body import SoftBody
-from .checks import checked_count
+from .checks import checked_count, checked_number, refuse_tape
 from .elasticity import Corotated, Model
+from .energy import Energy, WorldEnergies, find_energies
 from .errors import InputError, StabilityWarning, depth_of_user
 from .indices import checked_indices
 from .nodal import vec3_view
@@ -27,20 +27,8 @@ from .solvers import Integrator, SymplecticEuler, largest_frequency
 from .solvers.guard import Guard
 from .solvers.integrator import NEVER, StepContext
 from .solvers.pace import Pace
-from .solvers.recorded import RecordedSteps
+from .solvers.recorded import RecordedSteps, Segment
 from .solvers.safe_step import ANY_STEP, SafeStep
-
-
-class Energy(NamedTuple):
-    """Energies of all bodies together [J]; gravitational about the origin."""
-
-    kinetic: float
-    elastic: float
-    gravitational: float
-
-    @property
-    def total(self) -> float:
-        return self.kinetic + self.elastic + self.gravitational
 
 
 @dataclass(frozen=True)
@@ -112,13 +100,13 @@ class Simulation:
         #: What chooses the step, if none was given.
         self.safe_step: SafeStep | None = None
         if given is None:
-            self.safe_step = SafeStep(self.bodies, self.fields, self.models, self.pace, stable, self._context.gravity)
+            self.safe_step = SafeStep(self.bodies, self.fields, self.models, self.pace, stable)
         moved = zip(self.bodies, self.fields, strict=True)
         steppers = [self.integrator.bind(body, field, self._context) for body, field in moved]
-        self.recorded = RecordedSteps(self.bodies, steppers, self.pace, self.safe_step)
+        self.guard = Guard(self.bodies, self.fields, self._context)
+        self.recorded = RecordedSteps(self.bodies, steppers, self.pace, self.guard, self.safe_step)
         #: What is to be kept besides the states of bodies and fields for a run to go on as it would have.
         self.kept = self.pace.state | ({} if self.safe_step is None else self.safe_step.state)
-        self.guard = Guard(self.bodies, self.fields, self._context, tuple(self.kept.values()))
         self._running = Running(self)
 
     # --- stepping --------------------------------------------------------------------------------------------------
@@ -171,15 +159,18 @@ class Simulation:
         for the device unless hooks are set or bodies are remeshed.
 
         Raises:
-            InputError: Somebody is capturing, and there are bodies to be remeshed.
+            InputError: Somebody is capturing, and there are bodies to be remeshed; or a ``wp.Tape`` is recording, since
+                steps have no adjoint.
             UnstableError: On the CPU: the state is not finite any more, or nodes are far beyond reach, which is looked
                 at every few hundred steps. No step is made again here, as ``advance`` does, and energies are not looked
                 at, since users may write to the state between steps.
         """
+        refuse_tape()
         if self.device.is_capturing:
             if self.remeshing.every:
                 raise InputError("a simulation with remesh cannot be recorded by others: launches change with the mesh")
-            self.recorded.launch(1, whole=True)
+            self.pace.is_shared = True
+            self.recorded.launch(Segment(1, adopts=True, publishes=True))
             return
         self._running.step()
         if self.device.is_cpu or self._hooks or self.remeshing.every:
@@ -195,31 +186,33 @@ class Simulation:
         comes nearest.
 
         Raises:
-            InputError: Negative or non-finite time.
+            InputError: Negative or non-finite time, or a ``wp.Tape`` is recording.
             UnstableError: The state went wrong: it is not finite, or it has energy that nothing put in. If no step was
                 given: and shorter ones did not help.
 
         Warns:
             StabilityWarning: The state went wrong, and was made again with half the step; once.
         """
-        if not (math.isfinite(seconds) and seconds >= 0):
+        if not 0 <= checked_number(seconds, "seconds", "s") < math.inf:
             raise InputError(f"cannot advance by {seconds} s; it must be zero or a positive time")
         if self.device.is_capturing:
             raise InputError("advance cannot be called while its device is capturing; call step, which records")
         self.advance_until(self.total_time + seconds)
 
     def advance_until(self, total_time: float) -> None:
-        """Advance until ``total_time`` [s]; as ``advance``."""
+        """Advance until ``total_time`` [s], nowhere if that is past; as ``advance``."""
+        refuse_tape()
+        if not checked_number(total_time, "total_time", "s") < math.inf:
+            raise InputError(f"cannot advance until {total_time} s; it must be a finite time")
         if self.safe_step is not None:
             self._running.make_until(total_time)
         else:
             self._running.make(max(round((total_time - self.total_time) / self.dt), 0))
-        wp.synchronize_device(self.device)
 
     def advance_steps(self, count: int) -> None:
         """Advance by ``count`` time steps; as ``advance``. Steps that a hook makes count."""
+        refuse_tape()
         self._running.make(checked_count(count, "count", least=0))
-        wp.synchronize_device(self.device)
 
     def on_step(self, callback: Callable[[Simulation], None], every: int = 1) -> None:
         """Call ``callback(sim)`` after every ``every``-th step, counted from the beginning of the simulation.
@@ -272,15 +265,11 @@ class Simulation:
 
     def energy(self) -> Energy:
         """Kinetic, elastic and gravitational energy of all bodies in the present state [J]."""
-        kinetic = elastic = gravitational = 0.0
-        for body, field in zip(self.bodies, self.fields, strict=True):
-            body.adopt_positions()
-            v = body.velocities.numpy().astype(np.float64)
-            u = body.node_displacements[: body.node_count].numpy()[:, :3].astype(np.float64)
-            kinetic += 0.5 * float(body.masses @ np.einsum("ni,ni->n", v, v))
-            elastic += field.elastic_energy(body.node_displacements)
-            gravitational -= float(body.masses @ ((body.rest_positions + u) @ np.asarray(self.gravity)))
-        return Energy(kinetic, elastic, gravitational)
+        return self.world_energies().together
+
+    def world_energies(self) -> WorldEnergies:
+        """The same of each world [J], float64 [worlds]."""
+        return find_energies(self.bodies, self.fields, self.gravity)
 
     def forces(self, body: SoftBody | None = None) -> wp.array:
         """Elastic nodal forces in the present state [N], vec3 [worlds * N]; of the first body or the one named."""
@@ -335,7 +324,7 @@ class Simulation:
     def _find_stable_steps(self) -> list[float]:
         """The largest stable step of each body at rest [s], of which ``stable_dt`` is the smallest."""
         frequencies = [largest_frequency(body, f) for body, f in zip(self.bodies, self.fields, strict=True)]
-        steps = [2.0 / w if w > 0 else math.inf for w in frequencies]
+        steps = [self.integrator.stable_step(frequency) for frequency in frequencies]
         self.stable_dt = min(steps)
         given = self.integrator.dt
         if given is not None and float(given) > self.stable_dt:

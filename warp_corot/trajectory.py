@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from .checks import checked_numbers
 from .errors import InputError
 from .keys import checked_times, staying
 
@@ -38,7 +39,7 @@ class Trajectory:
         if times is None or displacements is None:
             raise InputError("prescribe needs both times and displacements")
         t = checked_times(times)
-        d = np.asarray(displacements, dtype=np.float64)
+        d = checked_numbers(displacements, "displacements", f"[{len(t)}, 3] or [{len(t)}, {len(nodes)}, 3]")
         if d.shape not in ((len(t), 3), (len(t), len(nodes), 3)) or not np.isfinite(d).all():
             raise InputError(
                 f"displacements has shape {d.shape}; it must be finite, [{len(t)}, 3] or [{len(t)}, {len(nodes)}, 3]"

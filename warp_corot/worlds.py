@@ -125,11 +125,14 @@ def chosen_nodes(nodes: npt.ArrayLike, count: int, worlds: int, chosen_worlds: A
     Raises:
         InputError: Mask of the wrong length, index out of range, or a mask of all worlds' nodes with chosen worlds.
     """
-    given = np.asarray(nodes)
+    try:
+        given = np.asarray(nodes)
+    except ValueError:
+        given = np.empty(0, object)
     if given.dtype == bool and given.shape in ((worlds, count), (worlds * count,)) and given.shape != (count,):
         if chosen_worlds is not None:
             raise InputError("a mask of all worlds' nodes says which worlds are meant; worlds cannot be given as well")
         return ChosenNodes(np.flatnonzero(given), worlds, None)
-    own = checked_indices(given, count, "node")
+    own = checked_indices(nodes, count, "node")
     which = np.arange(worlds) if chosen_worlds is None else checked_indices(chosen_worlds, worlds, "world")
     return ChosenNodes((which[:, None] * count + own).ravel(), len(which), len(own))

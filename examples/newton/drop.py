@@ -3,7 +3,7 @@
 The ball's surface is drawn, bound to its tetrahedra: these reach a little beyond, since those that it cuts are whole.
 
 python examples/newton/drop.py --viewer null --test, or --viewer usd --output-path drop.usd, gl, rerun, viser.
-Without a display: PYGLET_HEADLESS=1 and --viewer gl --headless.
+Without a display and --viewer frames go to a USD file.
 """
 
 import newton
@@ -103,7 +103,7 @@ class Example:
 
 
 if __name__ == "__main__":
-    viewer, args = newton.examples.init()
+    viewer, args = wn.open_viewer("drop")
     try:
         newton.examples.run(Example(viewer, args), args)
     except KeyboardInterrupt:  # rerun and viser run until then; what is written is kept

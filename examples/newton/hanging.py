@@ -1,7 +1,7 @@
 """Four cantilevers of the same rubber in Newton, of tetrahedra that are damped less and less, the last one a forest.
 
 python examples/newton/hanging.py --viewer null --test, or --viewer usd --output-path hanging.usd, gl, rerun, viser.
-Without a display: PYGLET_HEADLESS=1 and --viewer gl --headless.
+Without a display and --viewer frames go to a USD file.
 """
 
 import newton
@@ -88,7 +88,7 @@ class Example:
 
 
 if __name__ == "__main__":
-    viewer, args = newton.examples.init()
+    viewer, args = wn.open_viewer("hanging")
     try:
         newton.examples.run(Example(viewer, args), args)
     except KeyboardInterrupt:  # rerun and viser run until then; what is written is kept

@@ -6,6 +6,7 @@ import argparse
 import logging
 import os
 import re
+import shlex
 import sys
 import tempfile
 import warnings
@@ -15,13 +16,12 @@ from typing import NoReturn
 
 from ..errors import InputError, UnstableError
 from .say import EXIT_CODES, complain, interrupt_status, open_streams, silence
-from .signals import signals_waiting, terminable
+from .signals import terminable
 
 
 def commands() -> dict[str, ModuleType]:
     """The subcommands by name; they need all of the package, so that importing them takes a while."""
-    with signals_waiting():
-        from . import paper, scene, simulate
+    from . import paper, scene, simulate
 
     return {"simulate": simulate, "scene": scene, "paper": paper}
 
@@ -93,6 +93,7 @@ def _run(argv: Sequence[str] | None) -> int:
     wp.config.log_level = wp.LOG_ERROR  # before Warp starts, so that it says nothing about itself
     logging.basicConfig(format="warp-corot: warning: %(message)s", level=logging.WARNING)
     args = make_parser().parse_args(argv)
+    args.command_line = shlex.join(["warp-corot", *(sys.argv[1:] if argv is None else argv)])
     try:
         _start_warp()
     except OSError as error:

@@ -6,8 +6,12 @@ import argparse
 from pathlib import Path
 
 from ..elasticity import MODELS
+from . import patches, run_file
 from .label_materials import FORM
+from .loading import add_load_options
 from .organs import MAX_LEVEL_FOR_ERROR, TETS
+from .previews import add_preview_options
+from .quantities import acceleration, density, metres, per_second, pressure, seconds, unit_of_length, value_range
 from .remesh import add_remesh_options
 from .say import EXIT_CODES
 from .subject import STIFFNESS_PER_WEIGHT
@@ -23,47 +27,99 @@ def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParse
         description="Lets a soft body sag and sway under gravity and writes a USD animation, coloured by stress.",
         epilog=f"""examples:
   warp-corot simulate warp:bear -o bear.usd
-  warp-corot simulate liver.msh --scale 0.001 --young 5000 --fix "z < zmin + 0.01" -o liver.usd --preview liver.png
+  warp-corot simulate liver.msh --unit mm --young 5kPa --fix "z < zmin + 0.01" -o liver.usd --preview liver.png
   warp-corot simulate liver.stl --unit mm --tets 50000 -o liver.usd
   warp-corot simulate scan.nii.gz --labels liver=3kPa:0.45,vessel=30kPa:0.45 -o scan.usd
+  warp-corot simulate knee.vtu --materials bone=1GPa:0.3,cartilage=5MPa --also knee.pvd -o knee.usd
+  warp-corot simulate ct_folder --threshold 200 --tets 50000 -o bones.usd
   warp-corot simulate box --model linear -o beam.usd
   warp-corot simulate box --remesh --refine-above 1.03 --simplify-below 1.01 -o beam.usd
+  warp-corot simulate liver.stl --unit mm --fix bottom --pull "nearest(0.1, 0, 0.05, 20)" 0 0 0.03 -o liver.usd
+  warp-corot simulate box --fix "z == zmin" --twist "z == zmax" 90 --probe "z == zmax" --csv beam.csv -o beam.usd
+  warp-corot simulate run.toml -o out.usd
 
-expressions for --fix:
-  names      x y z (rest coordinates [m], after --scale), xmin xmax ymin ymax zmin zmax, pi, all, none
-  operators  + - * / // % **   < <= > >= == !=   and or not   ( )
-  functions  abs sqrt exp log sin cos tan atan2 hypot min max
+{patches.HELP}
 
-a label in --labels is {FORM}: a name and the numbers of its voxels,
-or a number for both; names alone are the volume's labels in ascending order.
+{run_file.HELP}
+
+a label in --labels and --materials is {FORM}: a name and the
+numbers of its voxels or region, or a number for both; names alone are the file's
+regions, or a volume's labels in ascending order.
+
+quantities are in SI units, or name their own: 5kPa, 1.06g/cm3, 500ms, 0.2inch.
 
 warp:bear, warp:bunny and box have defaults of their own for body and motion.
 
 {EXIT_CODES}""",
     )
+    add_options(parser)
+    return parser
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options to a parser."""
     parser.add_argument(
         "input",
         metavar="INPUT",
-        help="tetrahedra: a USD file with a TetMesh, or a Mesh with tetraIndices; a file that meshio reads (.msh, "
-        ".vtk, .vtu, ...); warp:bear, a toy bear; or box, the beam of Tagawa et al. 2013. A closed surface: .obj, "
-        ".stl, .ply, .off, .glb, a USD file with Mesh prims alone; or warp:bunny. A segmented scan: .nii, .nii.gz, "
-        ".mha, .mhd, .nrrd or .vti",
+        help="cells with volume, of which others than tetrahedra are split: a USD file with a TetMesh, or a Mesh with "
+        "tetraIndices; .vtk, .vtu, .vtm, .msh of Gmsh, .inp of Abaqus, .mesh, .node, .ele, .vol and others; "
+        "warp:bear, a toy bear; or box, the beam of Tagawa et al. 2013. A closed surface: .obj, .stl, .ply, .off, "
+        ".glb, .vtp, one of the files above with triangles alone, a USD file with Mesh prims alone; or warp:bunny. "
+        "A segmented scan: .nii, .nii.gz, .mgz, .mha, .mhd, .nrrd, .vti, or a folder with a DICOM series. Or a run "
+        "that is written down, .toml",
     )
     parser.add_argument(
-        "-o", "--output", required=True, type=Path, metavar="OUT.usd", help="animation to write (.usd, .usdc or .usda)"
+        "-o", "--output", type=Path, metavar="OUT.usd", help="animation to write (.usd, .usdc or .usda)"
+    )
+    parser.add_argument(
+        "--also",
+        type=Path,
+        action="append",
+        metavar="OUT.pvd",
+        help="for ParaView, with displacement, velocity, strain and stress: .pvd or .xdmf of all frames, .vtu of the "
+        "last one; may be given several times",
     )
 
     body = parser.add_argument_group("the body")
-    body.add_argument("--scale", type=float, metavar="S", help="factor on the coordinates, e.g. 0.001 for a mesh in mm")
+    body.add_argument(
+        "--unit",
+        type=unit_of_length,
+        metavar="LENGTH",
+        help="of the coordinates: mm, inch, 3.2cm, ... (default: what the file says; without that mm for what is 50 to "
+        "2500 long, and m)",
+    )
+    body.add_argument(
+        "--join",
+        action="store_true",
+        help="take all objects of a surface's file as one body, and nodes of tetrahedra in the same place as one node "
+        "(default: objects that are closed are bodies of their own)",
+    )
+    body.add_argument("--scale", type=float, metavar="S", help="factor on the coordinates, after their unit")
+    body.add_argument(
+        "--up",
+        type=str.upper,
+        choices=("Y", "Z"),
+        metavar="AXIS",
+        help="axis that points up, y or z (default: what the file says, or the habit of its format)",
+    )
     body.add_argument(
         "--young",
-        type=float,
+        type=pressure,
         metavar="E",
         help=f"Young's modulus [Pa] (default: {STIFFNESS_PER_WEIGHT:g} times density, gravity and height, with which "
         "a body visibly sags and stands)",
     )
     body.add_argument("--poisson", type=float, metavar="NU", help="Poisson's ratio (default: 0.45)")
-    body.add_argument("--density", type=float, metavar="RHO", help="mass density [kg/m^3] (default: 1000)")
+    body.add_argument("--density", type=density, metavar="RHO", help="mass density [kg/m^3] (default: 1000)")
+    body.add_argument(
+        "--materials",
+        metavar="LIST",
+        help="materials of regions, by physical groups, sets or cell data of the file, or by labels of a scan, as in "
+        "liver=3kPa:0.45,vessel@4=30kPa; what it does not name has --young, --poisson and --density",
+    )
+    body.add_argument(
+        "--regions-by", metavar="ARRAY", help="the file's array that numbers regions (default: the likeliest one)"
+    )
     body.add_argument("--model", choices=MODELS, default="corotated", help="elastic model (default: corotated)")
     body.add_argument(
         "--rotation-level",
@@ -72,10 +128,25 @@ warp:bear, warp:bunny and box have defaults of their own for body and motion.
         help="corotated box: take rotations from the tree's level L only (default: every element has its own)",
     )
     body.add_argument(
+        "--region",
+        nargs=2,
+        action="append",
+        metavar=("PATCH", "VALUES"),
+        help="another material where a tetrahedron's middle is in a patch: YOUNG[:POISSON[:DENSITY]], such as "
+        "30kPa:0.45; may be given several times, the last one counts",
+    )
+    body.add_argument(
+        "--patch",
+        action="append",
+        metavar="NAME=EXPR",
+        help="a name for a patch; later ones may be made of it",
+    )
+    body.add_argument(
         "--fix",
-        metavar="EXPR",
-        help='nodes that are held, such as "z < 0.01", or none (default: the lowest 2 %% of the height; 10 %% of a '
-        "surface or scan)",
+        action="append",
+        metavar="PATCH",
+        help='nodes that are held, such as bottom or "z < 0.01", or none; may be given several times (default: what '
+        "the body stands on, if that carries it, else its largest flat region or a broad side)",
     )
 
     _add_organ_options(parser.add_argument_group("a body from a surface or a scan"))
@@ -83,32 +154,50 @@ warp:bear, warp:bunny and box have defaults of their own for body and motion.
     motion = parser.add_argument_group("the motion")
     motion.add_argument(
         "--gravity",
-        type=float,
+        type=acceleration,
         nargs=3,
         metavar=("X", "Y", "Z"),
         help="[m/s^2] (default: 9.81 down the up axis, z where a file names none)",
     )
-    motion.add_argument("--damping", type=float, metavar="C", help="mass-proportional damping [1/s] (default: 2)")
-    motion.add_argument("--duration", type=float, metavar="T", help="simulated time [s] (default: 4)")
+    add_load_options(motion)
+    motion.add_argument("--damping", type=per_second, metavar="C", help="mass-proportional damping [1/s] (default: 2)")
+    motion.add_argument(
+        "--viscosity",
+        type=seconds,
+        metavar="S",
+        help="stiffness-proportional damping: viscous over elastic stress at one strain [s]; a vibration of angular "
+        "frequency w decays by S w^2 / 2 (default: 0)",
+    )
+    motion.add_argument("--duration", type=seconds, metavar="T", help="simulated time [s] (default: 4)")
     motion.add_argument("--fps", type=float, default=FPS, metavar="F", help=f"frames per second (default: {FPS:g})")
     motion.add_argument(
         "--dt",
-        type=float,
+        type=seconds,
         help="time step [s], shortened so that a whole number makes a frame (default: a safe one, found; with --remesh "
         "it follows the mesh)",
     )
 
     add_remesh_options(parser.add_argument_group("a mesh that follows the motion, of box, surfaces and scans"))
 
+    more = parser.add_argument_group("more results")
+    add_preview_options(more)
+    more.add_argument(
+        "--probe",
+        action="append",
+        metavar="POINT|PATCH",
+        help='what --csv tells of: "X Y Z" [m], or a patch; may be given several times',
+    )
+    more.add_argument(
+        "--csv",
+        type=Path,
+        metavar="FILE.csv",
+        help="displacement, velocity and reaction of each probe, and energies, in every frame",
+    )
+    more.add_argument("--write-run", type=Path, metavar="RUN.toml", help="write down what is asked here")
     parser.add_argument("--device", help='"cpu", "cuda:0", ... (default: a GPU if there is one)')
-    parser.add_argument("--preview", type=Path, metavar="FILE.png", help="also draw the last frame")
-    return parser
 
 
 def _add_organ_options(organ: argparse._ArgumentGroup) -> None:
-    organ.add_argument(
-        "--unit", choices=("mm", "cm", "m"), help="of the coordinates (default: what the file says, or m)"
-    )
     organ.add_argument(
         "--tets",
         type=int,
@@ -117,7 +206,13 @@ def _add_organ_options(organ: argparse._ArgumentGroup) -> None:
         "is given)",
     )
     organ.add_argument(
-        "--cell-size", type=float, metavar="M", help="edge of the coarsest cubes [m] (default: by --tets)"
+        "--min-layers",
+        type=float,
+        metavar="K",
+        help="so many tetrahedra through the thickness of thin parts, where --tets allows (default: 2)",
+    )
+    organ.add_argument(
+        "--cell-size", type=metres, metavar="M", help="edge of the coarsest cubes [m] (default: by --tets)"
     )
     organ.add_argument(
         "--max-level",
@@ -128,7 +223,7 @@ def _add_organ_options(organ: argparse._ArgumentGroup) -> None:
     )
     organ.add_argument(
         "--surface-error",
-        type=float,
+        type=metres,
         metavar="M",
         help="how far the surface may be from the given one [m] (default: as near as the rest allows)",
     )
@@ -139,7 +234,19 @@ def _add_organ_options(organ: argparse._ArgumentGroup) -> None:
         "(default: all, of one material)",
     )
     organ.add_argument(
-        "--smoothing", type=float, metavar="M", help="take the steps of voxels off, over this length [m]"
+        "--smoothing", type=metres, metavar="M", help="take the steps of voxels off, over this length [m]"
+    )
+    organ.add_argument(
+        "--threshold",
+        type=value_range,
+        metavar="LOW[:HIGH]",
+        help="of a scan that is not segmented: voxels of these values make the body, as in 200 or -200:300",
+    )
+    organ.add_argument(
+        "--skin",
+        choices=("input", "marched"),
+        help="what is drawn of a surface: the given one with its texture coordinates, names and materials, or the one "
+        "that the tetrahedra hold (default: input)",
     )
     organ.add_argument("--draw-tets", action="store_true", help="write the tetrahedra too, not the surface alone")
     organ.add_argument("--draw-labels", action="store_true", help="write a closed surface for each label")

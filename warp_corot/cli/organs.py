@@ -8,48 +8,33 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..errors import InputError
-from ..io.assets import find_asset
-from ..io.formats import USD_SUFFIXES
-from ..io.surfaces import UP_AXES
-from ..io.volumes import READERS
 from ..mesh import TetForest
-from .label_materials import numbers_by_name, parse_labels
+from .label_materials import LabelMaterial, numbers_by_name, parse_labels
+from .opened import Opened, placed_surface, placed_volume
 from .subject import Subject
 
 if TYPE_CHECKING:
     from ..domain import Domain
+    from ..domain.fidelity import Fidelity
+    from ..io.skins import OwnSurface
+    from ..io.volumes import LoadedVolume
+    from ..mesh import SurfaceMesh
 
 #: Tetrahedra, about, where nothing is said of their size.
 TETS = 20_000
-#: So many tetrahedra make a root cube of a length's cube worthwhile: most of them go to the surface.
+#: Where a surface error or a level is asked for in place of a number: so many of these tetrahedra make a root cube of a
+#: length's cube worthwhile.
 TETS_PER_CUBE = 30
-#: How often cubes are bisected at most. Where the surface is most curved elements are a fifth of a cube long; finer
-#: ones would bring the rest of the surface little, and make the time step smaller.
-MAX_LEVEL = 7
-#: From so many on there are too few elements at the surface for that.
-MANY_TETS = 300_000
-#: The same where a surface error is to be kept.
-MAX_LEVEL_FOR_ERROR = 12
+#: How often cubes are bisected at most then, and to how many levels below it is looked for what lies between nodes.
+MAX_LEVEL_FOR_ERROR, DETAIL = 12, 6
 #: Root cubes reach beyond the body by this share of its length.
 MARGIN = 1.0e-3
-#: Options that only such bodies take.
-OPTIONS = (
-    "unit",
-    "cell_size",
-    "max_level",
-    "surface_error",
-    "tets",
-    "labels",
-    "smoothing",
-    "draw_tets",
-    "draw_labels",
-)
 #: What Python's arguments are called on the command line.
 ARGUMENTS = {
     "unit": "--unit",
@@ -57,122 +42,126 @@ ARGUMENTS = {
     "max_level": "--max-level",
     "surface_error": "--surface-error",
     "target_elements": "--tets",
+    "min_layers": "--min-layers",
     "smoothing": "--smoothing",
 }
-FOR_SCANS = ("labels", "smoothing", "draw_labels")
+#: A scan of more different values than these, or of negative ones, holds intensities, not labels.
+MOST_LABELS = 256
+#: So many voxels are looked at to see it.
+LOOKED_AT = 10**6
 
 
-def kind_of(name: str) -> str:
-    """What INPUT is: "surface", "scan" or "tets".
-
-    Raises:
-        InputError: A USD file that cannot be opened, or no such asset.
-    """
-    asset = find_asset(name)
-    if asset:
-        return "surface" if asset.is_surface else "tets"
-    path = Path(name)
-    if any(path.name.lower().endswith(suffix) for suffix in READERS):
-        return "scan"
-    if path.suffix.lower() in UP_AXES:
-        return "surface"
-    if path.suffix.lower() in USD_SUFFIXES and path.is_file() and path.stat().st_size:
-        from ..io.usd_look import has_mesh
-
-        return "surface" if has_mesh(path) else "tets"
-    return "tets"
-
-
-def refuse_options(args: argparse.Namespace, kind: str) -> None:
-    """See that no option is given that would be of no effect.
-
-    Raises:
-        InputError: One is; the message names it.
-    """
-    organ = kind != "tets"
-    foreign = [] if kind == "scan" else list(FOR_SCANS if organ else OPTIONS)
-    for name in foreign:
-        if getattr(args, name) not in (None, False):
-            wanted = "scans" if name in FOR_SCANS else "surfaces and scans"
-            other = "; say --scale" if name == "unit" else ""
-            raise InputError(f"--{name.replace('_', '-')} is for {wanted}, and {args.input} is not one{other}")
-    if organ and args.scale is not None:
-        raise InputError(f"--scale is for meshes of tetrahedra; of {args.input} say --unit mm, cm or m")
-    if args.labels is not None and args.young is not None:
-        raise InputError("--young is given, but --labels gives each label its own")
-    if args.draw_labels and args.labels is None:
-        raise InputError("--draw-labels draws the labels that --labels names")
-
-
-def find_organ(args: argparse.Namespace, kind: str) -> Subject:
+def find_organ(opened: Opened, args: argparse.Namespace) -> Subject:
     """The body that a surface or a scan encloses, meshed.
 
     Args:
+        opened: INPUT, a surface or a scan.
         args: Of the command.
-        kind: "surface" or "scan".
 
     Raises:
         InputError: It encloses none, or an option is out of its range.
     """
     with _as_options():
         started = time.perf_counter()
-        entries = parse_labels(args.labels) if args.labels is not None else []
-        notes: list[str] = []
-        domain = _scan(args, entries, notes) if kind == "scan" else _surface(args)
+        if args.scale is not None and not (np.isfinite(args.scale) and args.scale > 0):
+            raise InputError(f"scale is {args.scale:g}; it must be a positive number")
+        entries: list[LabelMaterial] = []
+        domain = _scan(opened, args, entries) if opened.kind == "scan" else _surface(opened, args)
         meshing = time.perf_counter()
         mesh = _mesh(args, domain)
         surface = mesh.surface()
         done = time.perf_counter()
-    asset = find_asset(args.input)
-    source = asset.path if asset else Path(args.input)
+        measured = _measured(args, mesh, domain, surface)
+        skin = _own_surface(opened, args, domain)
+    asset, loaded = opened.asset, opened.volume or opened.surface
+    assert loaded is not None
     subject = Subject(
         mesh,
-        asset.name if asset else _title(source),
-        source,
+        loaded.name.encode(errors="replace").decode(),
+        opened.source,
         domain=domain,
         surface=surface,
+        fidelity=measured,
+        skin=skin,
         labels=entries,
-        times={"domain": meshing - started, "mesh": done - meshing},
-        notes=notes,
+        times={"domain": meshing - started, "mesh": done - meshing, "measuring": time.perf_counter() - done},
+        notes=opened.notes,
     )
     if asset:
-        subject.young, subject.poisson, subject.density = asset.young, asset.poisson, asset.density
-        subject.fix, subject.damping, subject.duration = asset.fix, asset.damping, asset.duration
+        subject.take(asset, args)
     return subject
 
 
-def _surface(args: argparse.Namespace) -> Domain:
+def _surface(opened: Opened, args: argparse.Namespace) -> Domain:
     from ..domain import Domain
 
-    return Domain.from_surface(args.input, unit=args.unit, device=args.device)
+    loaded, unit = placed_surface(opened, args)
+    return Domain.from_surface(loaded, unit=unit, device=args.device)
 
 
-def _scan(args: argparse.Namespace, entries: list, notes: list[str]) -> Domain:
+def _scan(opened: Opened, args: argparse.Namespace, entries: list[LabelMaterial]) -> Domain:
+    """The domain of a scan; ``entries`` are filled with the materials of its labels."""
     from ..domain import Domain
 
+    volume, unit = placed_volume(opened, args)
+    option, text = ("--labels", args.labels) if args.labels is not None else ("--materials", args.materials)
     numbers: dict[str, Any] | None = None
-    if entries:
-        numbers, said = numbers_by_name(entries, Path(args.input))
-        notes += [said] if said else []
+    if text is not None:
+        entries += parse_labels(text, option)
+        numbers, said = numbers_by_name(entries, volume)
+        opened.notes += [said] if said else []
+        if option == "--materials":
+            # The other labels are part of the body, too.
+            named = {number for of_name in numbers.values() for number in of_name}
+            numbers |= {f"{n:g}": (n,) for n in np.unique(volume.values).tolist() if n != 0 and n not in named}
+    elif args.threshold is not None:
+        inside = (volume.values >= args.threshold.low) & (volume.values <= args.threshold.high)
+        volume = replace(volume, values=inside.astype(np.uint8))
+    else:
+        _see_labels(volume)
     smoothing = args.smoothing or 0.0
-    return Domain.from_labels(args.input, labels=numbers, unit=args.unit, smoothing=smoothing, device=args.device)
+    up = args.up or "Z"
+    return Domain.from_labels(volume, labels=numbers, unit=unit, smoothing=smoothing, up_axis=up, device=args.device)
+
+
+def _see_labels(volume: LoadedVolume) -> None:
+    """See that a scan holds labels.
+
+    Raises:
+        InputError: It holds intensities.
+    """
+    values = np.ravel(volume.values)
+    found = np.unique(values[:: max(1, len(values) // LOOKED_AT)])
+    if np.isfinite(found).all() and (len(found) > MOST_LABELS or found[0] < 0):
+        raise InputError(
+            f"{volume.source}: has {len(found)} different values or more, {found[0]:g} to {found[-1]:g}, as "
+            "intensities do, not labels; say --threshold LOW[:HIGH] for the voxels that make the body, or --labels"
+        )
 
 
 def _mesh(args: argparse.Namespace, domain: Domain) -> TetForest:
     count = args.tets
     if count is None and args.max_level is None and args.surface_error is None:
         count = TETS
-    size = args.cell_size
-    if size is None:
-        cubes = max(1, round((max(count or TETS, 1) / TETS_PER_CUBE) ** (1.0 / 3.0)))
-        size = float(np.ptp(domain.bounds, axis=0).max()) * (1.0 + MARGIN) / cubes
-    level = args.max_level
-    if level is None:
-        level = MAX_LEVEL_FOR_ERROR if args.surface_error is not None else MAX_LEVEL + (count > MANY_TETS)
-
+    size, level, detail = args.cell_size, args.max_level, 0
+    if count is None:
+        detail = DETAIL
+        if size is None:
+            cubes = max(1, round((TETS / TETS_PER_CUBE) ** (1.0 / 3.0)))
+            size = float(np.ptp(domain.bounds, axis=0).max()) * (1.0 + MARGIN) / cubes
+        if level is None:
+            level = MAX_LEVEL_FOR_ERROR
+    layers = {} if args.min_layers is None else {"min_layers": args.min_layers}
     try:
         return TetForest.from_domain(
-            domain, size, max_level=level, surface_error=args.surface_error, target_elements=count, device=args.device
+            domain,
+            size,
+            max_level=level,
+            surface_error=args.surface_error,
+            target_elements=count,
+            detail=detail,
+            device=args.device,
+            **layers,
         )
     except InputError as error:
         unsaid = count is not None and count >= 1 and args.surface_error is None and "target_elements" not in str(error)
@@ -180,10 +169,35 @@ def _mesh(args: argparse.Namespace, domain: Domain) -> TetForest:
         raise InputError(f"{with_tets}{error}") from None
 
 
-def _title(source: Path) -> str:
-    name = source.name
-    suffix = next((s for s in READERS if name.lower().endswith(s)), source.suffix)
-    return name[: len(name) - len(suffix)].encode(errors="replace").decode()
+def _own_surface(opened: Opened, args: argparse.Namespace, domain: Domain) -> OwnSurface | None:
+    """The surface that was given, if it is to be drawn."""
+    if opened.surface is None or args.skin == "marched":
+        return None
+    from ..io.skins import OwnSurface
+
+    found = OwnSurface.of_domain(opened.source, opened.surface, domain.bounds)
+    if found is None:
+        opened.notes.append("the surface is not what it was before it was closed: the marched one is drawn")
+    return found
+
+
+def _measured(args: argparse.Namespace, mesh: TetForest, domain: Domain, surface: SurfaceMesh) -> Fidelity:
+    """How true the mesh is to the body; what is not is warned of."""
+    from ..domain.fidelity import fidelity
+    from ..domain.units import length
+
+    found = fidelity(mesh, domain, surface=surface)
+    for doubt in found.doubts():
+        warnings.warn(doubt.replace("more tetrahedra", f"more tetrahedra (--tets {2 * len(mesh.tets)})"), stacklevel=2)
+    off = max(found.distance_95)
+    if args.surface_error is not None and off > args.surface_error:
+        helps = "a larger --tets" if args.tets is not None else f"--max-level {int(mesh.levels.max()) + 3}"
+        warnings.warn(
+            f"--surface-error is {length(args.surface_error)}, and 95 % of the surface are within {length(off)}; "
+            f"{helps} would bring it nearer",
+            stacklevel=2,
+        )
+    return found
 
 
 @contextmanager

@@ -6,7 +6,6 @@ import argparse
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import InputError
@@ -69,7 +68,7 @@ def remesh_of(args: argparse.Namespace, kind: str) -> OnlineRemesh | None:
 
     Args:
         args: Of the command.
-        kind: What INPUT is: "surface", "scan" or "tets".
+        kind: What INPUT is: "box", "tets", "surface" or "scan".
 
     Raises:
         InputError: An option that is out of its range or of no effect, or a mesh that cannot be remeshed.
@@ -79,9 +78,7 @@ def remesh_of(args: argparse.Namespace, kind: str) -> OnlineRemesh | None:
             if getattr(args, name) is not None:
                 raise InputError(f"--{name.replace('_', '-')} is for --remesh, which is not given")
         return None
-    # What is not there is said by who reads it.
-    there = args.input.startswith("warp:") or Path(args.input).exists()
-    if kind == "tets" and args.input != "box" and there:
+    if kind == "tets":
         raise InputError(
             f"--remesh is for box, surfaces and scans, whose meshes are bisected cubes; {args.input} has tetrahedra of "
             "its own"

@@ -3,7 +3,8 @@
 import os
 import signal
 import sys
-from typing import TextIO
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, TextIO
 
 EXIT_CODES = """exit status:
   0    done
@@ -26,9 +27,16 @@ def complain(message: str, kind: str = "error") -> None:
     """Print ``warp-corot: KIND: MESSAGE``, in one line whatever is in it."""
     text = " ".join(message.split())
     try:
-        print(f"warp-corot: {kind}: {text}" if kind else f"warp-corot: {text}", file=sys.stderr, flush=True)
+        with _bars_aside():
+            print(f"warp-corot: {kind}: {text}" if kind else f"warp-corot: {text}", file=sys.stderr, flush=True)
     except OSError:  # nobody can be told; what is simulated must not be lost to that
         silence(sys.stderr)
+
+
+def _bars_aside() -> AbstractContextManager[Any]:
+    """Bars that are shown, if any are, come back below what is printed inside."""
+    bars = getattr(sys.modules.get("tqdm"), "tqdm", None)  # None also while it is being imported
+    return nullcontext() if bars is None else bars.external_write_mode(file=sys.stderr)
 
 
 def open_streams() -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..device import checked_device
 from ..errors import InputError, UnstableError
+from . import quantities
 from .compiling import compiling_said
 from .say import EXIT_CODES, complain, interrupt_status
 from .simulate import kept_so_far, progress_bar
@@ -64,10 +65,14 @@ what is written, on top of OUT's sublayer INPUT, which must stay beside it unles
         "-o", "--output", required=True, type=Path, metavar="OUT.usd", help="stage to write (.usd, .usdc or .usda)"
     )
     said = parser.add_argument_group("what the stage does not say")
-    said.add_argument("--young", type=float, metavar="E", help="Young's modulus [Pa] (default: 20 times the weight of "
-                      "a column as high as the body, over its area)")  # fmt: skip
+    said.add_argument(
+        "--young",
+        type=quantities.pressure,
+        metavar="E",
+        help="Young's modulus [Pa] (default: 20 times the weight of a column as high as the body, over its area)",
+    )
     said.add_argument("--poisson", type=float, metavar="NU", help="Poisson's ratio (default: 0.45)")
-    said.add_argument("--density", type=float, metavar="RHO", help="[kg/m^3] (default: 1000)")
+    said.add_argument("--density", type=quantities.density, metavar="RHO", help="[kg/m^3] (default: 1000)")
     said.add_argument(
         "--ground",
         default="auto",
@@ -77,7 +82,7 @@ what is written, on top of OUT's sublayer INPUT, which must stay beside it unles
     )
     said.add_argument(
         "--radius",
-        type=float,
+        type=quantities.metres,
         default=0.0,
         metavar="R",
         help="how far around each point of soft bodies contact is felt [m]: half of an edge closes the gaps between "
@@ -88,25 +93,37 @@ what is written, on top of OUT's sublayer INPUT, which must stay beside it unles
     )
     motion = parser.add_argument_group("the motion")
     motion.add_argument(
-        "--gravity", type=float, nargs=3, metavar=("X", "Y", "Z"), help="[m/s^2] (default: the stage's, else 9.81 down)"
+        "--gravity",
+        type=quantities.acceleration,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="[m/s^2] (default: the stage's, else 9.81 down)",
     )
     motion.add_argument(
         "--viscosity",
-        type=float,
+        type=quantities.seconds,
         metavar="S",
         help="viscous over elastic shear stress of one strain [s] (default: 5 %% of critical damping for each body's "
         "slowest vibration)",
     )
     motion.add_argument(
-        "--damping", type=float, default=0.0, metavar="C", help="mass-proportional damping, of falls too [1/s] (0)"
+        "--damping",
+        type=quantities.per_second,
+        default=0.0,
+        metavar="C",
+        help="mass-proportional damping, of falls too [1/s] (0)",
     )
     motion.add_argument(
-        "--duration", type=float, default=DURATION, metavar="T", help=f"simulated time [s] (default: {DURATION:g})"
+        "--duration",
+        type=quantities.seconds,
+        default=DURATION,
+        metavar="T",
+        help=f"simulated time [s] (default: {DURATION:g})",
     )
     motion.add_argument(
         "--fps", type=float, metavar="F", help="frames per second (default: the stage's time codes per second, else 24)"
     )
-    motion.add_argument("--dt", type=float, help="longest time step [s] (default: a safe one, found)")
+    motion.add_argument("--dt", type=quantities.seconds, help="longest time step [s] (default: a safe one, found)")
     motion.add_argument(
         "--rigid",
         choices=("semi-implicit", "xpbd", "none"),

@@ -2,51 +2,68 @@
 
 from __future__ import annotations
 
+import _thread
 import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 from typing import NoReturn
 
 from .say import Terminated
 
+#: How long a signal that came during an import waits before it is looked at again [s].
+WAIT = 0.02
+
 
 @contextmanager
 def terminable() -> Iterator[None]:
-    """SIGTERM ends what runs as Ctrl-C does."""
+    """SIGINT and SIGTERM end what runs here by an exception, after the import that is under way, if one is.
 
-    def terminate(*_: object) -> NoReturn:
+    In the middle of one an exception is swallowed by USD's modules, and the run would go on; NumPy's turn it into
+    another.
+    """
+
+    def interrupt() -> NoReturn:
+        raise KeyboardInterrupt
+
+    def terminate() -> NoReturn:
         raise Terminated
 
-    with _handled(terminate, signal.SIGTERM):
+    with _handled(_after_imports(interrupt), signal.SIGINT), _handled(_after_imports(terminate), signal.SIGTERM):
         yield
 
 
+def _after_imports(end: Callable[[], NoReturn]) -> Callable[[int, FrameType | None], None]:
+    def handle(number: int, frame: FrameType | None) -> None:
+        if not _is_importing(frame):
+            end()
+        again = threading.Timer(WAIT, _thread.interrupt_main, [number])
+        again.daemon = True
+        again.start()
+
+    return handle
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    """Whether a module is being imported, by what runs since ``main`` was called."""
+    while frame is not None and not (frame.f_code.co_name == "main" and frame.f_globals.get("__name__") == __package__):
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return True
+        frame = frame.f_back
+    return False
+
+
 @contextmanager
-def signals_waiting() -> Iterator[None]:
-    """Both take effect only after what runs here: USD's modules swallow an exception that comes while they are
-    imported, and the run would go on."""
-    came: list[int] = []
-
-    def wait(number: int, _: object) -> None:
-        came.append(number)
-
-    with _handled(wait, signal.SIGINT, signal.SIGTERM):
-        yield
-    for number in came:
-        signal.raise_signal(number)
-
-
-@contextmanager
-def _handled(handler: Callable[..., None], *numbers: int) -> Iterator[None]:
-    """Another handler for signals that are not ignored, as those of what is started in the background are."""
-    before = {number: signal.getsignal(number) for number in numbers}
+def _handled(handler: Callable[[int, FrameType | None], None], number: signal.Signals) -> Iterator[None]:
+    """Another handler for a signal that is not ignored, as those of what is started in the background are."""
+    before = signal.getsignal(number)
     mine = threading.current_thread() is threading.main_thread()
-    changed = {number: kept for number, kept in before.items() if mine and kept not in (signal.SIG_IGN, None)}
-    for number in changed:
+    changed = mine and before not in (signal.SIG_IGN, None)
+    if changed:
         signal.signal(number, handler)
     try:
         yield
     finally:
-        for number, kept in changed.items():
-            signal.signal(number, kept)
+        if changed:
+            signal.signal(number, before)

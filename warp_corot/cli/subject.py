@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,19 +11,20 @@ import numpy as np
 
 from ..errors import InputError
 from ..experiments import paper
-from ..io.assets import find_asset
-from ..io.formats import load_tets
 from ..mesh import TetForest, TetMesh
+from .label_materials import of_regions, parse_labels
+from .opened import Opened, placed_tets
 
 if TYPE_CHECKING:
     from ..domain import Domain
+    from ..domain.fidelity import Fidelity
+    from ..io.assets import Asset
+    from ..io.skins import OwnSurface
     from ..mesh.bound import SurfaceMesh
     from .label_materials import LabelMaterial
 
 #: Young's modulus over the weight of a column as high as the body: such bodies sag by roughly a tenth of their height.
 STIFFNESS_PER_WEIGHT = 20.0
-#: Meshes larger than this [m] are asked whether they are in millimetres.
-LARGEST_PLAUSIBLE = 10.0
 BOX_LEVEL = 6
 
 
@@ -43,6 +45,8 @@ class Subject:
         duration: [s].
         domain: What the mesh was made from, if from a surface or a scan.
         surface: The smooth surface of such a mesh.
+        fidelity: How true the mesh is to that.
+        skin: The user's own surface, drawn in place of that one.
         labels: Materials of its labels, if they were given.
         times: Seconds that its stages took.
         notes: What the user should know, a line each.
@@ -60,6 +64,8 @@ class Subject:
     duration: float = 4.0
     domain: Domain | None = None
     surface: SurfaceMesh | None = None
+    fidelity: Fidelity | None = None
+    skin: OwnSurface | None = None
     labels: list[LabelMaterial] = field(default_factory=list)
     times: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -81,52 +87,61 @@ class Subject:
         lowest, highest = self.bounds[:, "XYZ".index(self.mesh.up_axis)]
         return float(highest - lowest)
 
-    @property
-    def held_share(self) -> float:
-        """Share of the height that is held by default: round bodies, as organs are, would stand on a point."""
-        return 0.02 if self.domain is None else 0.1
-
-    def lowest_part(self) -> str:
-        """An expression for the lowest part of the height."""
-        up = self.mesh.up_axis.lower()
-        return f"{up} <= {up}min + {self.held_share:g} * ({up}max - {up}min)"
-
     def young_from_weight(self, density: float, gravity: tuple[float, float, float] | None) -> float:
         """Young's modulus [Pa] with which the body sags visibly and stands, to two digits."""
         g = 9.81 if gravity is None else float(np.linalg.norm(gravity)) or 9.81
         return float(f"{STIFFNESS_PER_WEIGHT * density * g * self.height:.1e}")
 
+    def take(self, asset: Asset, args: argparse.Namespace) -> None:
+        """Take an asset's defaults, as far as they suit what was asked for: its held nodes carry a body of its size
+        that is no softer than it is meant to be."""
+        self.poisson, self.density = asset.poisson, asset.density
+        self.damping, self.duration = asset.damping, asset.duration
+        if args.unit is None and args.scale in (None, asset.scale):
+            self.young = asset.young
+            if args.young is None or args.young >= asset.young:
+                self.fix = asset.fix
 
-def find_subject(name: str, scale: float | None) -> Subject:
+
+def find_subject(opened: Opened, args: argparse.Namespace) -> Subject:
     """The mesh that INPUT names.
 
     Args:
-        name: "box", "warp:NAME" or a file.
-        scale: Factor on its coordinates; None: 1, or the asset's own.
+        opened: INPUT: "box" or tetrahedra.
+        args: Of the command.
 
     Raises:
-        InputError: No such mesh, or one that cannot be simulated.
+        InputError: A mesh that cannot be simulated, or options that do not suit it.
     """
-    if scale is not None and not (np.isfinite(scale) and scale > 0):
-        raise InputError(f"scale is {scale:g}; it must be a positive number")
-    if name == "box":
-        return _box(1.0 if scale is None else scale)
-    asset = find_asset(name)
-    factor = scale if scale is not None else asset.scale if asset else 1.0
-    loaded = load_tets(name, scale=factor)
+    if args.scale is not None and not (np.isfinite(args.scale) and args.scale > 0):
+        raise InputError(f"scale is {args.scale:g}; it must be a positive number")
+    if opened.kind == "box":
+        return _box(1.0 if args.scale is None else args.scale)
+    loaded = placed_tets(opened, args)
+    points, tets = loaded.points, loaded.tets
+    if args.join:
+        from .several import merged_nodes
+
+        points, tets, merged = merged_nodes(points, tets)
+        if not merged:
+            raise InputError(f"{loaded.source}: no two nodes are in the same place, so that --join does nothing")
+        opened.notes.append(f"{merged} nodes are in the places of others, and joined with them")
+    entries, found = parse_labels(args.materials, "--materials") if args.materials else [], loaded.regions
     try:
-        mesh = TetMesh(loaded.points, loaded.tets, up_axis=loaded.up_axis)
+        if entries and found is None:
+            raise InputError("its arrays number no regions, so that --materials does nothing")
+        names, entries = of_regions(entries, found) if found is not None else ((), entries)
+        labels = None if found is None else found.of_tet
+        mesh = TetMesh(points, tets, up_axis=loaded.up_axis, labels=labels, label_names=names)
     except InputError as error:
         raise InputError(f"{loaded.source}: {error}") from None
-    subject = Subject(mesh, loaded.name, loaded.source)
+    subject = Subject(mesh, loaded.name, loaded.source, labels=entries, notes=opened.notes)
+    if found is not None and not entries:
+        shown = ", ".join(found.names[:12]) + (", ..." if len(found.names) > 12 else "")
+        subject.notes.append(f"its regions by {found.array!r}: {shown} (--materials gives each its own)")
+    asset = opened.asset
     if asset:
-        subject.poisson, subject.density = asset.poisson, asset.density
-        subject.damping, subject.duration = asset.damping, asset.duration
-        if factor == asset.scale:
-            subject.young, subject.fix = asset.young, asset.fix
-    size = float(np.ptp(subject.bounds, axis=0).max())
-    if size > LARGEST_PLAUSIBLE:
-        subject.notes.append(f"the mesh is {size:.3g} m long; if its coordinates are in mm, add --scale 0.001")
+        subject.take(asset, args)
     return subject
 
 

@@ -12,41 +12,42 @@ from ..mesh import TetForest
 from .remesh import remesh_rows
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Sequence
 
     from ..elements import Mesh
     from ..io.animate import Recording
     from ..materials import Isotropic
     from ..simulation import Simulation
+    from .simulate import Body
     from .subject import Subject
 
+#: Materials of regions that are named.
+MOST_KINDS = 8
 
-def summary(subject: Subject, sim: Simulation, done: Recording, fixed: str, preview: Path | None = None) -> str:
+
+def summary(bodies: Sequence[Body], sim: Simulation, done: Recording) -> str:
     """The run in a dozen lines.
 
     Args:
-        subject: What was simulated.
+        bodies: What was simulated.
         sim: The simulation at its end.
         done: What was recorded.
-        fixed: The fixed nodes, in words.
-        preview: The picture that was drawn.
     """
-    model = next(name for name, kind in MODELS.items() if type(sim.models[0]) is kind)
-    level = getattr(sim.models[0], "rotation_level", None)
-    material = sim.body.material
-    damping = asdict(sim.integrator)["damping"]  # type: ignore[call-overload]
+    shared = bodies[0].args
+    integrator = asdict(sim.integrator)  # type: ignore[call-overload]
+    damping = f"damping {integrator['damping']:g} /s"
+    if integrator["viscosity"]:
+        damping += f", viscosity {integrator['viscosity']:g} s"
     stepping = max(done.stepping, 1e-9)
-    at_end = (
-        f"{length(done.final_displacement)} at the end ({done.final_displacement / subject.height:.1%} of the height)"
-    )
+    height = max(body.subject.height for body in bodies)
+    at_end = f"{length(done.final_displacement)} at the end ({done.final_displacement / height:.1%} of the height)"
     at_last = " (at the end)" if sim.remeshing.every else ""
+    lines = []
+    for body in bodies:
+        lines += [f"{body.subject.name}, {body.held.words}", *_aligned(_of_body(body))]
     rows = [
-        *_body(subject),
         *remesh_rows(sim, done),
-        *_materials(subject, sim.body.mesh, material),
-        ("model", model if level is None else f"{model}, rotations of level {level}"),
-        ("fixed", fixed),
-        ("gravity", f"{' '.join(f'{g:g}' for g in sim.gravity)} m/s^2, damping {damping:g} /s"),
+        ("gravity", f"{' '.join(f'{g:g}' for g in sim.gravity)} m/s^2, {damping}"),
         ("time step", f"{_steps(sim)}; largest stable one at rest about {milliseconds(sim.stable_dt)}{at_last}"),
         ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"),
         ("wall time", f"{done.stepping:.2f} s stepping, {done.writing:.2f} s writing"),
@@ -54,9 +55,27 @@ def summary(subject: Subject, sim: Simulation, done: Recording, fixed: str, prev
         ("device", f"{sim.device} ({sim.device.name})"),
         ("written", f"{done.path}, {done.frames} frames, {done.simulated:.4g} s"),
     ]
-    if preview:
-        rows.append(("preview", str(preview)))
-    return "\n".join([subject.name, *(f"  {name:<14}{text}" for name, text in rows)])
+    rows += [("also written", str(path)) for path in shared.also or ()]
+    for name, path in (("preview", shared.preview), ("table", shared.csv)):
+        if path:
+            rows.append((name, str(path)))
+    return "\n".join([*lines, *([] if len(bodies) == 1 else ["all together"]), *_aligned(rows)])
+
+
+def _of_body(body: Body) -> list[tuple[str, str]]:
+    model = next(name for name, kind in MODELS.items() if type(body.model) is kind)
+    level = getattr(body.model, "rotation_level", None)
+    rows = [
+        *_body(body.subject),
+        *_materials(body.subject, body.soft.mesh, body.soft.material),
+        ("model", model if level is None else f"{model}, rotations of level {level}"),
+        ("fixed", f"{body.held.count} nodes, {body.held.words}" if body.held.count else "nothing"),
+    ]
+    return rows + [("" if number else "moved", str(load)) for number, load in enumerate(body.loads)]
+
+
+def _aligned(rows: Sequence[tuple[str, str]]) -> list[str]:
+    return [f"  {name:<14}{text}" for name, text in rows]
 
 
 def _body(subject: Subject) -> list[tuple[str, str]]:
@@ -66,6 +85,8 @@ def _body(subject: Subject) -> list[tuple[str, str]]:
     assert isinstance(subject.mesh, TetForest)
     took = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in subject.times.items())
     rows = [*_block("domain", subject.domain.report()), *_block("mesh", subject.mesh.summary())]
+    if subject.fidelity is not None:
+        rows += _block("true to it", subject.fidelity.report())
     if subject.surface is not None:
         rows.append(("surface", f"{len(subject.surface.points)} points, {len(subject.surface.triangles)} triangles"))
     return [*rows, ("ready in", f"{sum(subject.times.values()):.2f} s: {took}")]
@@ -76,9 +97,13 @@ def _block(name: str, lines: list[str]) -> list[tuple[str, str]]:
 
 
 def _materials(subject: Subject, mesh: Mesh, material: Isotropic) -> list[tuple[str, str]]:
+    values = [np.ravel(getattr(material, name)) for name in ("young", "poisson", "density")]
+    if not subject.labels and all(len(value) == 1 for value in values):
+        return [("material", _values(*(value[0] for value in values)))]
     if not subject.labels:
-        return [("material", _values(material.young, material.poisson, material.density))]
-    assert isinstance(mesh, TetForest)
+        kinds, counts = np.unique(np.stack(np.broadcast_arrays(*values)), axis=1, return_counts=True)
+        ordered = sorted(zip(counts.tolist(), kinds.T.tolist(), strict=True), reverse=True)
+        return _block("material", [f"{_values(*kind)} in {count} tetrahedra" for count, kind in ordered[:MOST_KINDS]])
     lines = []
     for label in subject.labels:
         of_label = np.flatnonzero(mesh.elements_of(label.name))
@@ -87,6 +112,12 @@ def _materials(subject: Subject, mesh: Mesh, material: Isotropic) -> list[tuple[
             lines.append(f"{label.name}: {_values(*one)}")
         else:
             lines.append(f"{label.name}: in no tetrahedron")
+    assert mesh.labels is not None
+    others = ~np.isin(mesh.labels, [1 + mesh.label_names.index(label.name) for label in subject.labels])
+    if others.any():
+        first = np.flatnonzero(others)[0]
+        one = (getattr(material, name)[first] for name in ("young", "poisson", "density"))
+        lines.append(f"all others: {_values(*one)}")
     return _block("material", lines)
 
 

@@ -16,10 +16,17 @@ from ..kernels import domain as kernels
 from .units import check_float32, length
 
 if TYPE_CHECKING:
-    Surface = str | PathLike[str] | tuple[npt.ArrayLike, npt.ArrayLike]
-    Volume = str | PathLike[str] | npt.ArrayLike
+    from ..io.surfaces import LoadedSurface
+    from ..io.volumes import LoadedVolume
+
+    Surface = str | PathLike[str] | LoadedSurface | tuple[npt.ArrayLike, npt.ArrayLike]
+    Volume = str | PathLike[str] | LoadedVolume | npt.ArrayLike
     # Or a Warp function, which type checkers do not know.
     Function = Callable[[np.ndarray], npt.ArrayLike]
+
+#: The shortest step inwards when a body's thickness is sought, over how far it is sought, and how many there are.
+SPHERE_STEP = 0.04
+SPHERES = 25
 
 
 class Domain:
@@ -90,6 +97,27 @@ class Domain:
             labels = wp.zeros(given.size, wp.int32, device=given.device)
         return labels if isinstance(points, wp.array) else labels.numpy()
 
+    #: Whether the body has, or may have, several pieces, which are not to grow together.
+    has_pieces = False
+
+    def thickness(
+        self, points: npt.ArrayLike, inward: npt.ArrayLike, reach: float, *, outside: bool = False
+    ) -> np.ndarray:
+        """How thick the body is at points of its surface: how far it is to where one leaves it again.
+
+        Args:
+            points: On the surface, or nearly [n, 3] [m].
+            inward: Unit vectors [n, 3].
+            reach: What is thicker counts as this thick [m].
+            outside: The same of what is around the body, outwards: how wide gaps are.
+
+        Returns:
+            float64 [n] [m].
+        """
+        side = -1.0 if outside else 1.0
+        given, directions = self._on_device(points), self._on_device(side * np.asarray(inward))
+        return self._thickness(given, directions, float(reach), side).astype(np.float64)
+
     def part(self, name: str) -> Domain:
         """The domain of one label alone.
 
@@ -132,6 +160,10 @@ class Domain:
 
         return Difference(self, other) if isinstance(other, Domain) else NotImplemented
 
+    def point_in(self, name: str) -> np.ndarray | None:
+        """A point where a label is [m], float64 [3]; None where none is known without looking for it."""
+        return None
+
     # What a kind of domain defines.
 
     def _phi(self, points: wp.array) -> wp.array:
@@ -141,6 +173,24 @@ class Domain:
     def _labels(self, points: wp.array) -> wp.array:
         """Labels int32 [n] on the points' device; outside the body those of the nearest part."""
         raise NotImplementedError
+
+    def _thickness(self, points: wp.array, along: wp.array, reach: float, side: float) -> np.ndarray:
+        """float32 [n]; of the body for a ``side`` of 1, of what is around it for -1.
+
+        Here by spheres: as far on as no surface can be, again and again.
+        """
+        start, along = points.numpy(), along.numpy()
+        gone = np.full(len(start), SPHERE_STEP * reach, np.float32)
+        going = np.arange(len(start))
+        for _ in range(SPHERES):
+            phi = side * self.phi(start[going] + gone[going, None] * along[going])
+            inside = phi < 0.0
+            going, step = going[inside], np.abs(phi[inside]) / self.lipschitz
+            gone[going] += np.maximum(step, SPHERE_STEP * reach)
+            going = going[gone[going] < reach]
+            if not len(going):
+                break
+        return np.minimum(gone, reach)
 
     def _details(self) -> list[str]:
         return []
@@ -161,7 +211,7 @@ class Domain:
         cls,
         surface: Surface,
         *,
-        unit: str | None = None,
+        unit: str | float | None = None,
         up_axis: str | None = None,
         device: str | wp.Device | None = None,
     ) -> Domain:
@@ -173,9 +223,11 @@ class Domain:
         was is reported. Parts that overlap count as one body, a part inside another and wound inwards as a cavity.
 
         Args:
-            surface: A file (.obj .stl .ply .off .glb .gltf through trimesh, or USD), ``warp:bunny``, or points [N, 3]
+            surface: A file (.obj .stl .ply .off .glb .gltf through trimesh, USD, or one of the formats of
+                `warp_corot.io.read` with triangles alone), ``warp:bunny``, what `load_surface` gives, or points [N, 3]
                 and triangles [T, 3].
-            unit: Of the coordinates, "m", "cm" or "mm". None: what the file says, metres if it says nothing.
+            unit: Of the coordinates, any length such as "mm", "inch" or "3.2cm". None: what the file says, metres if
+                it says nothing.
             up_axis: "X", "Y" or "Z". None: what the file says; if it says nothing Y, for .stl, .ply and .off Z.
             device: Where it is evaluated; None: Warp's default.
 
@@ -200,7 +252,7 @@ class Domain:
         origin: Sequence[float] | None = None,
         affine: npt.ArrayLike | None = None,
         labels: Mapping[str, int | Sequence[int]] | None = None,
-        unit: str | None = None,
+        unit: str | float | None = None,
         smoothing: float = 0.0,
         up_axis: str = "Z",
         device: str | wp.Device | None = None,
@@ -212,15 +264,16 @@ class Domain:
         outside; more than two voxels outside the body's box, phi is a lower bound of the distance.
 
         Args:
-            volume: Whole numbers [nx, ny, nz], or a file: .nii, .nii.gz (nibabel), .mha, .mhd, .nrrd (SimpleITK),
-                .vti (VTK). Positions are the file's own, in the directions right-anterior-superior where the format
-                names directions.
+            volume: Whole numbers [nx, ny, nz], what `load_volume` gives, or a file: .nii, .nii.gz, .mgz (nibabel),
+                .mha, .mhd, .nrrd (SimpleITK), .vti (VTK), or a folder with a DICOM series. Positions are the file's
+                own, in the directions right-anterior-superior where the format names directions.
             spacing: Distance of voxel centres along the three axes, in ``unit``; needed for an array.
             origin: Position of the centre of voxel (0, 0, 0), in ``unit``; None: the origin.
             affine: Instead of spacing and origin: the matrix [4, 4] from voxel indices to positions in ``unit``. It
                 may turn, mirror and shear.
             labels: The numbers of each named label. None: all numbers but 0, each named by itself.
-            unit: "m", "cm" or "mm". None: what a file says (an error where it says nothing); metres for an array.
+            unit: Any length such as "mm" or "3.2cm". None: what a file says (an error where it says nothing); metres
+                for an array.
             smoothing: Standard deviation [m] of a Gaussian by which phi is smoothed: takes the steps of the voxels
                 off, and details of this size with them. What it does to the volume is reported.
             up_axis: "X", "Y" or "Z".
@@ -246,7 +299,7 @@ class Domain:
         certain: float = 1.0,
         origin: Sequence[float] | None = None,
         affine: npt.ArrayLike | None = None,
-        unit: str | None = None,
+        unit: str | float | None = None,
         smoothing: float = 0.0,
         up_axis: str = "Z",
         device: str | wp.Device | None = None,

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
-from ..io.volumes import affine_of, load_volume
+from ..io.volumes import LoadedVolume, affine_of, load_volume
 from .units import metres_per_unit
 
 if TYPE_CHECKING:
@@ -30,11 +30,11 @@ class Grid:
     values: np.ndarray
     affine: np.ndarray
     metres: float
-    unit: str
+    unit: str | float
     notes: list[str] = field(default_factory=list)
 
 
-def placed_grid(scan: Volume, spacing: Any, origin: Any, affine: Any, unit: str | None) -> Grid:
+def placed_grid(scan: Volume, spacing: Any, origin: Any, affine: Any, unit: str | float | None) -> Grid:
     """A volume with its place in metres.
 
     Raises:
@@ -43,8 +43,8 @@ def placed_grid(scan: Volume, spacing: Any, origin: Any, affine: Any, unit: str 
     notes: list[str] = []
     if affine is not None and (spacing is not None or origin is not None):
         raise InputError("both affine and spacing or origin are given; the affine says all of it")
-    if isinstance(scan, str | PathLike):
-        loaded = load_volume(scan)
+    if isinstance(scan, str | PathLike | LoadedVolume):
+        loaded = scan if isinstance(scan, LoadedVolume) else load_volume(scan)
         values, given, notes, source = loaded.values, loaded.affine, list(loaded.notes), f"{loaded.source}: "
         if loaded.unit is None and unit is None:
             raise InputError(f"{source}the file names no unit of length; say unit='mm', 'cm' or 'm'")
@@ -52,10 +52,10 @@ def placed_grid(scan: Volume, spacing: Any, origin: Any, affine: Any, unit: str 
             notes.append(f"unit {loaded.unit}, as the file says")
         elif loaded.unit is not None:
             notes.append(f"unit {unit} as asked for, though the file says {loaded.unit}")
-        unit = unit or loaded.unit or "m"
+        unit = (loaded.unit or "m") if unit is None else unit
         given = _replaced(given, spacing, origin)
     else:
-        values, source, unit = np.asarray(scan), "", unit or "m"
+        values, source, unit = np.asarray(scan), "", "m" if unit is None else unit
         if spacing is None and affine is None:
             raise InputError("the volume has no spacing; give spacing=(dx, dy, dz), the distance of its voxel centres")
         given = np.eye(4) if spacing is None else affine_of(spacing, origin)

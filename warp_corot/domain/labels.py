@@ -108,6 +108,16 @@ class LabelDomain(Domain):
         wp.launch(kernels.read_voxels, points.size, given, [labels], device=points.device)
         return labels
 
+    def point_in(self, name: str) -> np.ndarray | None:
+        """See `Domain.point_in`: the voxel of it that is nearest to their middle."""
+        if name not in self.label_names:
+            return None
+        voxels = np.argwhere(self.numbers == self.label_names.index(name) + 1)
+        if not len(voxels):
+            return None
+        chosen = voxels[np.argmin(((voxels - voxels.mean(axis=0)) ** 2).sum(axis=1))]
+        return self.affine[:3, :3] @ chosen + self.affine[:3, 3]
+
     def part(self, name: str) -> Domain:
         """See `Domain.part`."""
         if name not in self.label_names:
@@ -136,7 +146,7 @@ def label_domain(
     origin: Sequence[float] | None,
     affine: npt.ArrayLike | None,
     labels: Mapping[str, int | Sequence[int]] | None,
-    unit: str | None,
+    unit: str | float | None,
     smoothing: float,
     up_axis: str,
     device: Any,
@@ -153,7 +163,7 @@ def probability_domain(
     spacing: Sequence[float] | None,
     origin: Sequence[float] | None,
     affine: npt.ArrayLike | None,
-    unit: str | None,
+    unit: str | float | None,
     smoothing: float,
     up_axis: str,
     device: Any,

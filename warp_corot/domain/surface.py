@@ -12,9 +12,10 @@ import numpy.typing as npt
 import warp as wp
 
 from ..errors import InputError
-from ..io.surfaces import UP_AXES, load_surface
+from ..io.surfaces import UP_AXES, LoadedSurface, load_surface
 from ..kernels import domain as kernels
 from .domain import Domain
+from .sides import sides_of
 from .units import length, metres_per_unit, unlikely_size, volume
 
 if TYPE_CHECKING:
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 SAMPLES = 16
 #: Space enclosed inside out, as a share of all that is enclosed, at which the surface is refused.
 LARGEST_REVERSED = 0.05
+#: Rays into the body start so far inside, over how far they go.
+START = 0.01
 #: Holes of this share of the area draw a warning.
 LARGE_HOLES = 0.01
 
@@ -46,18 +49,36 @@ class SurfaceDomain(Domain):
         self.closed = closed
         self.notes = list(notes)
         self._on: dict[str, wp.Mesh] = {}
+        self._sides: dict[str, list[wp.array]] = {}
         self.reversed, self.overlapping, self.undecided = self._windings()
         if self.reversed > LARGEST_REVERSED:
             raise InputError(
                 f"the surface crosses itself so that {self.reversed:.0%} of what it encloses is inside out; it must be "
                 f"wound outwards throughout (at most {LARGEST_REVERSED:.0%})"
             )
+        self.sides = sides_of(closed.points, closed.triangles, self._mesh(self.device))
 
     def _phi(self, points: wp.array) -> wp.array:
         phi = wp.empty(points.size, wp.float32, device=points.device)
-        mesh = self._mesh(points.device)
-        wp.launch(kernels.evaluate_surface, points.size, [points, mesh.id], [phi], device=points.device)
+        mesh, key = self._mesh(points.device), str(points.device)
+        if key not in self._sides:
+            self._sides[key] = self.sides.arrays(points.device)
+        inputs = [points, mesh.id, mesh.indices, *self._sides[key]]
+        wp.launch(kernels.evaluate_surface, points.size, inputs, [phi], device=points.device)
         return phi
+
+    @property
+    def has_pieces(self) -> bool:  # type: ignore[override]
+        return self.closed.pieces > 1
+
+    def _thickness(self, points: wp.array, along: wp.array, reach: float, side: float) -> np.ndarray:
+        found = wp.empty(points.size, wp.float32, device=points.device)
+        # A little inside, so that the surface that a ray starts at is not the one that it meets.
+        start = wp.array(points.numpy() + START * reach * along.numpy(), dtype=wp.vec3, device=points.device)
+        mesh = self._mesh(points.device)
+        inputs = [start, along, reach, side, mesh.id]
+        wp.launch(kernels.evaluate_thickness, points.size, inputs, [found], device=points.device)
+        return np.minimum(found.numpy() + START * reach, reach)
 
     def _mesh(self, device: wp.Device) -> wp.Mesh:
         key = str(device)
@@ -103,7 +124,7 @@ class SurfaceDomain(Domain):
         return [*lines, *(line for happened, line in said if happened)]
 
 
-def surface_domain(surface: Surface, unit: str | None, up_axis: str | None, device: Any) -> Domain:
+def surface_domain(surface: Surface, unit: str | float | None, up_axis: str | None, device: Any) -> Domain:
     """See `Domain.from_surface`."""
     from .closing import close_surface
 
@@ -162,14 +183,16 @@ def count_windings(mesh: wp.Mesh, points: wp.array, thresholds: Sequence[float])
     return above.numpy()
 
 
-def _given(surface: Surface, unit: str | None, up_axis: str | None) -> tuple[Any, Any, float, str, str, list[str]]:
+def _given(
+    surface: Surface, unit: str | float | None, up_axis: str | None
+) -> tuple[Any, Any, float, str, str, list[str]]:
     """Points, triangles, metres per unit, up axis, the file's name for messages, and notes."""
-    if not isinstance(surface, str | PathLike):
+    if not isinstance(surface, str | PathLike | LoadedSurface):
         if not isinstance(surface, tuple | list) or len(surface) != 2:
             raise InputError(f"the surface is a {type(surface).__name__}; it must be a file or (points, triangles)")
-        unit = unit or "m"
+        unit = "m" if unit is None else unit
         return *surface, metres_per_unit(unit), up_axis or "Y", "", [f"unit {unit}"]
-    loaded = load_surface(surface)
+    loaded = surface if isinstance(surface, LoadedSurface) else load_surface(surface)
     notes = list(loaded.notes)
     if unit is not None:
         metres = metres_per_unit(unit)
@@ -181,7 +204,7 @@ def _given(surface: Surface, unit: str | None, up_axis: str | None) -> tuple[Any
     else:
         metres = 1.0
         notes.append("unit m: the file names none, none was given")
-    axis = up_axis or loaded.up_axis or UP_AXES[loaded.source.suffix.lower()]
+    axis = up_axis or loaded.up_axis or UP_AXES.get(loaded.source.suffix.lower(), "Z")
     if not (up_axis or loaded.up_axis):
         notes.append(f"{axis} taken as up: the file names no up axis")
     return loaded.points, loaded.triangles, metres, axis, f"{loaded.source}: ", notes

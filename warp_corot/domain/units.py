@@ -1,8 +1,11 @@
-"""Units of length, never guessed, and a word on bodies of unlikely size."""
+"""Quantities with units, a guess at a unit that nobody names, and a word on bodies of unlikely size."""
 
 from __future__ import annotations
 
+import functools
 import math
+import re
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +13,10 @@ from ..errors import InputError
 
 #: Metres in a unit.
 UNITS = {"m": 1.0, "cm": 1.0e-2, "mm": 1.0e-3}
+#: What a number looks like at the beginning of a quantity.
+_NUMBER = re.compile(r"\s*[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|inf(?![a-z])|nan(?![a-z]))")
+#: Bodies and scans this long in their unit are taken to be in mm where nobody names one: organs, limbs, people.
+SMALLEST_IN_MM, SMALLEST_SCAN, LARGEST_IN_MM = 50.0, 10.0, 2500.0
 #: Bodies outside this range [m] are probably given in another unit than is said.
 SMALLEST, LARGEST = 1.0e-3, 100.0
 #: Lengths [m], and distances from the origin in lengths, that float32 computes with.
@@ -19,15 +26,81 @@ FLOAT32_DISTANCE = 1.0e4
 TYPICAL = 0.2
 
 
-def metres_per_unit(unit: str) -> float:
-    """Metres in a unit.
+def metres_per_unit(unit: str | float) -> float:
+    """Metres in a unit of length.
+
+    Args:
+        unit: "m", "cm", "mm" or any length that Pint knows, with or without a number: "inch", "3.2cm"; or metres as a
+            number.
 
     Raises:
-        InputError: It is not one of "m", "cm", "mm".
+        InputError: It is no positive length.
     """
-    if not isinstance(unit, str) or unit not in UNITS:
-        raise InputError(f"unit is {unit!r}; it must be one of {', '.join(map(repr, UNITS))}")
-    return UNITS[unit]
+    if isinstance(unit, str) and unit in UNITS:
+        return UNITS[unit]
+    try:
+        metres = in_units(f"1 {unit}" if isinstance(unit, str) and unit and not _NUMBER.match(unit) else unit, "m")
+    except InputError:
+        metres = math.nan
+    if not (math.isfinite(metres) and metres > 0.0):
+        raise InputError(f"unit is {unit!r}; it must be a length such as 'mm', 'cm', 'm', 'inch' or '3.2cm'")
+    return metres
+
+
+def in_units(given: str | float, unit: str) -> float:
+    """A quantity as a number in a unit.
+
+    Args:
+        given: A number, in that unit already; or a text such as "5kPa", "1.06 g/cm3" or "500".
+        unit: As Pint writes it, such as "Pa" or "kg/m^3".
+
+    Raises:
+        InputError: No number, or a unit that is not known or of another kind.
+    """
+    if isinstance(given, int | float | np.number) and not isinstance(given, bool):
+        return float(given)
+    if not isinstance(given, str):
+        raise InputError(f"{given!r} is no number with or without a unit")
+    match = _NUMBER.match(given)
+    if not match:
+        raise InputError(f"{given.strip()!r} is no number with or without a unit")
+    number, words = float(match[0]), given[match.end() :].strip()
+    return number * _factor(words, unit, given) if words else number
+
+
+@functools.cache
+def _factor(words: str, unit: str, given: str) -> float:
+    import pint
+
+    text = words.replace("³", "^3").replace("²", "^2").replace("·", "*")
+    text = f"1{text}" if text.startswith("/") else text
+    text = re.sub(r"(?<=[A-Za-zµ])([23])(?![\w.])", r"^\1", text)
+    # Pint evaluates what looks like a formula; names, powers, products and quotients are enough.
+    if not re.fullmatch(r"(?:1|[A-Za-zµΩ_]+)(?:\^-?[1-4])?(?:\s*[*/ ]\s*[A-Za-zµΩ_]+(?:\^-?[1-4])?)*", text):
+        raise InputError(f"{given.strip()!r}: {words!r} is no unit")
+    try:
+        return float(_registry().Quantity(1.0, text).to(unit).magnitude)
+    except pint.DimensionalityError:
+        raise InputError(f"{given.strip()!r}: {words!r} is no unit like {unit}") from None
+    except Exception:
+        raise InputError(f"{given.strip()!r}: the unit {words!r} is not known") from None
+
+
+@functools.cache
+def _registry() -> Any:
+    import pint
+
+    return pint.UnitRegistry(cache_folder=None)
+
+
+def likely_unit(size: float, scan: bool = False) -> str | None:
+    """The unit in which a body's coordinates are given most likely, None where its size does not tell.
+
+    Args:
+        size: Its longest side in that unit.
+        scan: Whether it comes from a scan, whose unit is mm by habit.
+    """
+    return "mm" if (SMALLEST_SCAN if scan else SMALLEST_IN_MM) <= size <= LARGEST_IN_MM else None
 
 
 def length(metres: float) -> str:

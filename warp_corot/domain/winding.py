@@ -138,12 +138,13 @@ class Parts:
     def is_within_others(self, part: int) -> bool:
         """Whether some corners of a part, spread over it, all lie within other parts."""
         own = self.corners[self.slices[part], 0]
-        return all(self._holds(corner, part) for corner in own[:: max(1, len(own) // CORNERS)])
+        return all(len(self.holders(corner, part)) for corner in own[:: max(1, len(own) // CORNERS)])
 
-    def _holds(self, at: np.ndarray, but: int) -> bool:
-        """Whether some part but one holds a point."""
+    def holders(self, at: np.ndarray, but: int) -> np.ndarray:
+        """Which parts but one hold a point."""
         near = np.flatnonzero(((self.lows <= at) & (at <= self.highs)).all(axis=1))
-        return any(abs(winding_number(self.corners[self.slices[part]], at)) > 0.5 for part in near if part != but)
+        inside = [abs(winding_number(self.corners[self.slices[part]], at)) > 0.5 for part in near]
+        return near[np.array(inside, bool) & (near != but)]
 
 
 def part_volumes(points: np.ndarray, triangles: np.ndarray, parts: np.ndarray) -> np.ndarray:

@@ -1,18 +1,19 @@
-"""Anisotropic general tetrahedra on CUDA; see ``kernels.general_cuda``."""
+"""Anisotropic general tetrahedra on CUDA, in clusters; see ``kernels.pair_clusters``."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
 from ..anisotropy import TransverselyIsotropic
+from ..kernels.cluster_laws import ActiveMaterial, anisotropic_law
+from ..kernels.cluster_layout import ANISOTROPIC
 from ..kernels.definite import quaternions_of
-from ..kernels.general_anisotropic import scatter_general_anisotropic
-from ..kernels.general_cuda import BLOCK
 from ..kernels.rotation import quick_rotation
 from .anisotropic import AnisotropicField
-from .law_general import posed_elements
+from .cluster_scatter import ClusterScatter
+from .law_general import clustered
 
 if TYPE_CHECKING:
     from ..body import SoftBody
@@ -28,11 +29,23 @@ class GeneralAnisotropicField(AnisotropicField):
     def __init__(self, body: SoftBody):
         super().__init__(body, quick_rotation, deterministic=False)
         axes = self.material.axes
-        self._kernel = scatter_general_anisotropic(isinstance(body.material, TransverselyIsotropic))
-        self._posed = posed_elements(self.elements)
+        law = anisotropic_law(isinstance(body.material, TransverselyIsotropic))
+        self.scatter = ClusterScatter(self.elements, law, ActiveMaterial, chosen=clustered(body), layout=ANISOTROPIC)
         self._quaternions = wp.empty(len(axes), dtype=wp.quat, device=self.device)
         self.launch(quaternions_of, len(axes), [axes], [self._quaternions])
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        inputs = [self._posed, self.material, self._quaternions, *self._activation, u]
-        wp.launch(self._kernel, self.element_count, inputs=inputs, outputs=[f], device=self.device, block_dim=BLOCK)
+        self.scatter(self.active_material, u, f)
+
+    @property
+    def active_material(self) -> Any:
+        """The material with the present active stress, as the kernel takes it."""
+        return active_material(self.material, self._quaternions, *self._activation)
+
+
+def active_material(passive: Any, axes: wp.array, is_active: int, activation: wp.array) -> Any:
+    """``kernels.cluster_laws.ActiveMaterial`` of its parts."""
+    material = ActiveMaterial()
+    material.passive, material.axes = passive, axes
+    material.is_active, material.activation = is_active, activation
+    return material

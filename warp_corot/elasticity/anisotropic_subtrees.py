@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from ..anisotropy import TransverselyIsotropic
+from ..kernels.cluster_laws import ActiveMaterial, anisotropic_law
+from ..kernels.cluster_layout import ANISOTROPIC
 from ..kernels.definite import quaternions_of
 from ..kernels.rotation import quick_rotation
 from ..kernels.subtree_anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
@@ -14,6 +16,8 @@ from ..kernels.subtree_cuda import BLOCK
 from ..mesh import TetForest
 from ..plan import ForcePlan, Plan
 from .anisotropic import AnisotropicField
+from .anisotropic_general import active_material
+from .cluster_scatter import ClusterScatter, grouped_and_others
 
 if TYPE_CHECKING:
     from ..body import SoftBody
@@ -22,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class AnisotropicSubtreeField(AnisotropicField):
-    """Complete subtrees in batches, leaf by leaf only what is left over.
+    """Complete subtrees in batches; what is left over leaf by leaf, or where the mesh stays as it is in clusters.
 
     Args:
         body: A forest's, of an ``Anisotropic`` material, on CUDA.
@@ -58,21 +62,29 @@ class AnisotropicSubtreeField(AnisotropicField):
         self._turn_axes(self._quaternions)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        material, plan = [self.material, *self._activation], self.plan
-        for batch, kernel, flags in zip(plan.batches, self._kernels, self._flags, strict=True):
+        material, flat = [self.material, *self._activation], self._flat
+        for batch, kernel, flags in zip(self._batches, self._kernels, self._flags, strict=True):
             inputs = [batch.subtrees, self.material, self._quaternions, *self._activation, u]
             outputs = [f, as_bytes(flags)]
             wp.launch(kernel, batch.count, inputs=inputs, outputs=outputs, device=self.device, block_dim=BLOCK)
             inputs = [flags, batch.subtrees.first, self.elements, *material, u]
             self.launch(repair_leaves, 8 * len(flags), inputs, [f])
-        if len(plan.flat):
-            inputs = [plan.flat.elements, plan.flat.leaves, *material, u]
-            self.launch(scatter_flat, len(plan.flat), inputs, [f])
+        if flat is not None:
+            self.launch(scatter_flat, len(flat), [flat.elements, flat.leaves, *material, u], [f])
+        if self._clusters is not None:
+            self._clusters(active_material(self.material, self._quaternions, *self._activation), u, f)
 
     def _go_through(self, plan: Plan) -> None:
         self.plan = plan
-        self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in plan.batches]
-        self._flags = [wp.zeros(-(-b.count // 8), dtype=wp.uint64, device=self.device) for b in plan.batches]
+        self._batches, self._flat = list(plan.batches), plan.flat if len(plan.flat) else None
+        self._clusters: ClusterScatter | None = None
+        if isinstance(plan, ForcePlan) and len(plan.flat) and self.device.is_cuda:
+            self._batches, leaves = grouped_and_others(plan)
+            law = anisotropic_law(self._transverse)
+            self._clusters = ClusterScatter(self.elements, law, ActiveMaterial, chosen=leaves, layout=ANISOTROPIC)
+            self._flat = None
+        self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in self._batches]
+        self._flags = [wp.zeros(-(-b.count // 8), dtype=wp.uint64, device=self.device) for b in self._batches]
 
     def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
         one_axes, one_stiffness = self.material.axes_stride == 0, self.material.stride == 0

@@ -1,21 +1,32 @@
-"""General tetrahedra on CUDA, one thread an element; see ``kernels.general_cuda``."""
+"""Single elements on CUDA whose forces need no settled order, in clusters; see ``kernels.clusters``."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
-from ..kernels.general_cpu import rest_matrices
-from ..kernels.general_cuda import BLOCK, PosedElements, corotated_law, scatter_general
+from ..clusters import isotropic_material, order_in_clusters
+from ..elements import in_worlds
+from ..kernels.cluster_laws import isotropic_law
+from ..kernels.general_cuda import corotated_law
+from ..mesh import TetForest
+from .cluster_scatter import ClusterScatter
 from .corotated_field import LeafField
-from .lanes import as_general
 from .model import LawField
 
 if TYPE_CHECKING:
     from ..body import SoftBody
     from .corotated import Corotated
+
+
+def clustered(body: SoftBody) -> np.ndarray:
+    """A body's elements, of all worlds, in the order of clusters: int32 [worlds * T]."""
+    mesh = body.mesh
+    if isinstance(mesh, TetForest):
+        return np.arange(body.worlds * len(mesh.tets), dtype=np.int32)
+    return in_worlds(order_in_clusters(mesh.points, mesh.tets), body.worlds, len(mesh.tets))
 
 
 class LawGeneralField(LawField):
@@ -37,10 +48,10 @@ class LawGeneralField(LawField):
         deterministic: bool = False,
     ):
         super().__init__(body, stress=stress, energy=energy, cauchy=cauchy, deterministic=deterministic)
-        self._scatter = GeneralScatter(self.elements, stress)
+        self._scatter = ClusterScatter(self.elements, isotropic_law(stress), chosen=clustered(body))
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        self._scatter(self.material_inputs, u, f)
+        self._scatter(isotropic_material(self.material_inputs), u, f)
 
 
 class CorotatedGeneralField(LeafField):
@@ -48,36 +59,8 @@ class CorotatedGeneralField(LeafField):
 
     def __init__(self, body: SoftBody, model: Corotated):
         super().__init__(body, model, deterministic=False)
-        self._scatter = GeneralScatter(self.elements, corotated_law(model.own_rotation))
+        law = isotropic_law(corotated_law(model.own_rotation))
+        self._scatter = ClusterScatter(self.elements, law, chosen=clustered(body))
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        self._scatter(self.material_inputs, u, f)
-
-
-class GeneralScatter:
-    """The launch that adds the forces of general elements under a law.
-
-    Args:
-        elements: ``kernels.elements.GeneralElements``.
-        stress: The law, a function of ``kernels.constitutive``.
-    """
-
-    def __init__(self, elements: Any, stress: wp.Function):
-        self._elements = posed_elements(elements)
-        self._kernel = scatter_general(stress)
-
-    def __call__(self, material: list, u: wp.array, f: wp.array) -> None:
-        """Add the forces [N] of displacements u to f, both vec4 [N]; ``material``: mu, lam and their stride."""
-        nodes = self._elements.nodes
-        inputs = [self._elements, *material, u]
-        wp.launch(self._kernel, len(nodes), inputs=inputs, outputs=[f], device=nodes.device, block_dim=BLOCK)
-
-
-def posed_elements(elements: Any) -> Any:
-    """Elements of either kind as ``kernels.general_cuda`` takes them."""
-    general = elements if hasattr(elements, "rest_inverse") else as_general(elements, rest_matrices, [elements])
-    posed = PosedElements()
-    posed.nodes, posed.volume = general.nodes, general.volume
-    rows = np.ascontiguousarray(general.rest_inverse.numpy().reshape(-1, 9).T)
-    posed.rest_inverse = wp.array(rows, dtype=wp.float32, device=elements.nodes.device)
-    return posed
+        self._scatter(isotropic_material(self.material_inputs), u, f)

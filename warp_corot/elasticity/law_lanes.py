@@ -25,7 +25,7 @@ class LawLanesField(LawField):
 
     Args:
         body: On the CPU.
-        law: A key of ``kernels.law_lanes.STRESSES``.
+        law: A key of ``kernels.law_lanes.LAWS``.
         functions: As for ``LawField``.
     """
 

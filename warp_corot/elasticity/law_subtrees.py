@@ -6,11 +6,14 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
+from ..clusters import isotropic_material
 from ..kernels import subtree_cuda
+from ..kernels.cluster_laws import isotropic_law
 from ..kernels.subtree_laws import scatter_subtrees
 from ..mesh import TetForest
 from ..plan import FlatLeaves, ForcePlan, Plan
 from ..subtrees import chosen
+from .cluster_scatter import ClusterScatter, grouped_and_others
 from .model import LawField
 
 if TYPE_CHECKING:
@@ -20,7 +23,8 @@ if TYPE_CHECKING:
 
 
 class LawSubtreeField(LawField):
-    """Complete subtrees in batches; the leaves that are in none one by one, under the same law.
+    """Complete subtrees in batches; the leaves that are in none one by one, under the same law. Where the mesh stays as
+    it is these go in clusters, and with them the subtrees that are in no group.
 
     Args:
         body: A forest's, on CUDA.
@@ -65,7 +69,12 @@ class LawSubtreeField(LawField):
     def _go_through(self, plan: Plan) -> None:
         self.plan = plan
         self.slots = plan.slots
-        self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in plan.batches]
+        self._batches, self._flat = list(plan.batches), plan.flat if len(plan.flat) else None
+        self._clusters: ClusterScatter | None = None
+        if isinstance(plan, ForcePlan) and len(plan.flat) and self.device.is_cuda and not self.deterministic:
+            self._batches, leaves = grouped_and_others(plan)
+            self._clusters, self._flat = ClusterScatter(self.elements, isotropic_law(self._stress), chosen=leaves), None
+        self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in self._batches]
         self._flat_material = self._material_of(plan.flat)
 
     def _material_of(self, flat: FlatLeaves) -> list:
@@ -79,9 +88,11 @@ class LawSubtreeField(LawField):
         return scatter_subtrees(shape, grouped, self._uniform, self._stress)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        body, flat = self.body, self.plan.flat
-        for batch, kernel in zip(self.plan.batches, self._kernels, strict=True):
+        body, flat = self.body, self._flat
+        for batch, kernel in zip(self._batches, self._kernels, strict=True):
             inputs = [batch.subtrees, body.mu, body.lam, u]
             wp.launch(kernel, batch.count, inputs=inputs, outputs=[f], device=self.device, block_dim=subtree_cuda.BLOCK)
-        if len(flat):
+        if flat is not None:
             self.launch(self._forces, len(flat), [flat.elements, *self._flat_material, u], [f])
+        if self._clusters is not None:
+            self._clusters(isotropic_material(self.material_inputs), u, f)

@@ -29,7 +29,7 @@ def law_field(
     """The fastest force field of a law on a body.
 
     Args:
-        law: Its name among those that run in lanes on the CPU, a key of ``kernels.law_lanes.STRESSES``.
+        law: Its name among those that run in lanes on the CPU, a key of ``kernels.law_lanes.LAWS``.
         body: The body.
         stress, energy, cauchy: The law, functions of ``kernels.constitutive``.
         deterministic: As for every field.

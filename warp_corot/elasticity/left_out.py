@@ -6,37 +6,37 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from ..kernels.repair import LIST_BLOCK, LeftOut, repair_listed_own, repair_listed_shared
+from ..kernels.repair import COUNT_STRIDE, LIST_BLOCK, LISTS, LeftOut, repair_listed_own, repair_listed_shared
+from ..kernels.subtree_cuda import BLOCK
 from ..plan import Plan
 from ..subtrees import Batch, Sharing
 
-#: Thread blocks a multiprocessor: enough to hide latency, few enough that a launch over an empty list ends at once.
-BLOCKS = 4
+#: Thread blocks a multiprocessor: as many as it has room for at once, so that a launch over an empty list soon ends.
+BLOCKS = 6
 
 
 class LeftOutLeaves:
-    """One list for all leaves with own rotations, and one for each batch that shares its roots' rotations.
+    """Lists of all leaves with own rotations, and of each batch that shares its roots' rotations.
 
     Args:
-        own_places: How many subtrees and single leaves with own rotations there can be on the list.
+        own: How many subtrees, and single leaves, each launch has that finds own rotations.
         shared: The batches that share their roots' rotations.
     """
 
     #: What a kernel gets that makes no list.
     NONE: ClassVar[Any] = LeftOut()
 
-    def __init__(self, own_places: int, shared: list[Batch], device: wp.Device):
-        self.own = _empty_list(own_places, device)
-        self._has_own = own_places > 0
-        self._shared = [(batch, _empty_list(batch.count, device)) for batch in shared]
+    def __init__(self, own: list[int], shared: list[Batch], device: wp.Device):
+        self.own = _empty_lists(own, device)
+        self._has_own = sum(own) > 0
+        self._shared = [(batch, _empty_lists([batch.count], device)) for batch in shared]
         self._threads = LIST_BLOCK * BLOCKS * max(device.sm_count, 1) if device.is_cuda else LIST_BLOCK
         self._device = device
 
     @classmethod
     def of(cls, plan: Plan, device: wp.Device) -> LeftOutLeaves:
-        own = [batch for batch in plan.batches if batch.sharing is Sharing.OWN]
-        places = sum(batch.count for batch in own) + len(plan.flat)
-        return cls(places, [batch for batch in plan.batches if batch.sharing is Sharing.ROOT], device)
+        own = [batch.count for batch in plan.batches if batch.sharing is Sharing.OWN]
+        return cls([*own, len(plan.flat)], [batch for batch in plan.batches if batch.sharing is Sharing.ROOT], device)
 
     @staticmethod
     def load(device: wp.Device) -> None:
@@ -68,8 +68,10 @@ class LeftOutLeaves:
         )
 
 
-def _empty_list(places: int, device: wp.Device) -> Any:
+def _empty_lists(launches: list[int], device: wp.Device) -> Any:
+    """With room for all subtrees of these launches, whose thread blocks take the lists in turn."""
     listed = LeftOut()
-    listed.counts = wp.zeros(2, dtype=wp.int32, device=device)
-    listed.entries = wp.zeros(places, dtype=wp.vec2i, device=device)
+    listed.counts = wp.zeros((LISTS + 1) * COUNT_STRIDE, dtype=wp.int32, device=device)
+    listed.room = BLOCK * sum(-(-count // (BLOCK * LISTS)) for count in launches)
+    listed.entries = wp.zeros(LISTS * listed.room, dtype=wp.vec2i, device=device)
     return listed

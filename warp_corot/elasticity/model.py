@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 class ForceField(ABC):
     """An elastic model on one body: launches that read displacements and add forces.
 
-    Launches only; nothing here waits for the device or comes back to the host but ``elastic_energy``.
+    Launches only; nothing here waits for the device or comes back to the host but ``elastic_energies``.
 
     Args:
         body: The body.
@@ -90,7 +90,7 @@ class ForceField(ABC):
 
     @abstractmethod
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
-        """Write the strain energies [J] that make up the whole; float64."""
+        """Write the strain energies [J] that make up the whole, world after world; float64."""
 
     @abstractmethod
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
@@ -132,11 +132,15 @@ class ForceField(ABC):
         return f
 
     def elastic_energy(self, u: wp.array) -> float:
-        """Strain energy of the body [J]."""
+        """Strain energy of the body in all worlds together [J]."""
+        return float(self.elastic_energies(u).sum())
+
+    def elastic_energies(self, u: wp.array) -> npt.NDArray[np.float64]:
+        """Strain energy of the body in each world [J], float64 [worlds]."""
         energies = wp.zeros(self.energy_count, dtype=wp.float64, device=self.device)
         with self.state_kept():
             self.write_energies(u, energies)
-        return float(energies.numpy().sum())
+        return energies.numpy().reshape(self.body.worlds, -1).sum(axis=1)
 
     def von_mises(self, u: wp.array) -> npt.NDArray[np.float32]:
         """Von Mises stress of each element [Pa], float32 [T]."""

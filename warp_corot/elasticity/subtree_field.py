@@ -12,12 +12,15 @@ import warp as wp
 
 from ..elements import with_targets
 from ..kernels import subtree_cpu, subtree_cuda
+from ..kernels.algebraic import corotated_stress
+from ..kernels.cluster_laws import isotropic_law
 from ..kernels.general_cpu import repair_elements, rest_matrices, scatter_elements
 from ..kernels.lanes import LANES
 from ..kernels.repair import repair_own, repair_shared
 from ..mesh import TetForest
 from ..plan import FlatLeaves, ForcePlan, Plan
 from ..subtrees import Batch, Sharing
+from .cluster_scatter import ChangingClusterScatter
 from .corotated_field import CorotatedField, Rotations
 from .lanes import Lanes, as_general
 from .left_out import LeftOutLeaves
@@ -37,6 +40,7 @@ class SubtreeField(CorotatedField):
     def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
         super().__init__(body, model, deterministic)
         self._uniform = body.material_stride == 0
+        self._changing: ChangingClusterScatter | None = None
         if body.changing is None:
             assert isinstance(body.mesh, TetForest)
             self._go_through(
@@ -48,7 +52,14 @@ class SubtreeField(CorotatedField):
     def follow(self, plan: DevicePlan) -> None:
         super().follow(plan)
         self._load_kernels(plan)
+        if self._listed and self.rotation_level is None and self._changing is None:
+            self._changing = ChangingClusterScatter(self.body, plan, isotropic_law(corotated_stress))
         self._go_through(plan)
+
+    def derive(self, plan: DevicePlan) -> None:
+        super().derive(plan)
+        if self._changing is not None:
+            self._changing.derive()
 
     def _load_kernels(self, plan: DevicePlan) -> None:
         """Everything that any mesh may come to need, so that nothing is compiled once steps are made."""
@@ -87,8 +98,10 @@ class SubtreeField(CorotatedField):
         self._own_launches: OwnLaunches | None = None
         if self._listed:
             if self.rotation_level is None and OwnLaunches.suit(plan):
-                self._own_launches = OwnLaunches(plan, self.elements, self.material_inputs, self.model.tolerance)
-                self._left_out = LeftOutLeaves(self._own_launches.places, [], self.device)
+                self._own_launches = OwnLaunches(
+                    plan, self.elements, self.material_inputs, self.model.tolerance, self._changing
+                )
+                self._left_out = LeftOutLeaves([self._own_launches.places], [], self.device)
                 return
             self._left_out = LeftOutLeaves.of(plan, self.device)
         self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]
@@ -144,11 +157,13 @@ class SubtreeField(CorotatedField):
                 )
             return subtree_cuda.scatter_subtrees_shared(shape, grouped, self._uniform, given, self._listed)
         if sharing is Sharing.OWN:
-            return subtree_cpu.scatter_subtrees_own(shape)
+            near = self.model.tolerance is not None
+            return subtree_cpu.scatter_subtrees_near(shape) if near else subtree_cpu.scatter_subtrees_own(shape)
         return subtree_cpu.scatter_subtrees_shared(shape, given)
 
     def _launch_batch(self, batch: Batch, kernel: wp.Kernel, u: wp.array, f: wp.array) -> None:
         body = self.body
+        own = batch.sharing is Sharing.OWN
         outputs = [f, batch.flagged]
         if self.device.is_cuda:
             threads = batch.count
@@ -157,14 +172,16 @@ class SubtreeField(CorotatedField):
         else:
             threads = -(-batch.count // LANES)
             inputs = [batch.subtrees, batch.count, *self.material_inputs, u]
-        if batch.sharing is not Sharing.OWN:
+            if own and self.model.tolerance is not None:
+                inputs.append(self.model.tolerance)
+        if not own:
             inputs += [self._rotations, self._no_unit if batch.unit is None else batch.unit]
         wp.launch(kernel, dim=threads, inputs=inputs, outputs=outputs, device=self.device, block_dim=self._block)
         if self._left_out is not None:
             return
         flags = batch.flags_by_eights
         inputs = [self.elements, *self.material_inputs, u]
-        if batch.sharing is Sharing.OWN:
+        if own:
             self.launch(repair_own, len(flags), [flags, batch.subtrees.first, *inputs], [f])
         elif batch.sharing is Sharing.ROOT:
             self.launch(repair_shared, len(flags), [flags, batch.subtrees.first, batch.roots, *inputs], [f])

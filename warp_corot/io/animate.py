@@ -6,8 +6,8 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -16,13 +16,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from ..checks import checked_number, checked_path, shown
 from ..errors import InputError
 from ..simulation import Simulation
+from .provenance import provenance, steps_made
 from .skins import BoundSkins, has_domain
 
 if TYPE_CHECKING:
     from .skins import Surface
     from .usd_writer import UsdWriter
+    from .write.paraview import Writer
 
 Progress = Callable[[int, int], None]
 
@@ -125,7 +128,7 @@ def frame_count(duration: float, fps: float) -> int:
         InputError: Not positive and finite, or shorter than half a frame.
     """
     for name, value, unit in (("fps", fps, ""), ("duration", duration, " s")):
-        if not (math.isfinite(value) and value > 0):
+        if not 0 < checked_number(value, name) < math.inf:
             raise InputError(f"{name} is {value:g}{unit}; it must be a positive number")
     count = round(duration * fps)
     if count < 1:
@@ -143,8 +146,10 @@ def record(
     surface: Surface | Sequence[Surface | None] | None = None,
     tets: bool | None = None,
     labels: bool = False,
+    also: Sequence[str | PathLike[str]] = (),
     progress: Progress | None = None,
     recording: Recording | None = None,
+    about: Mapping[str, Any] | None = None,
 ) -> Recording:
     """Advance a simulation and write a frame of it as often as ``fps`` asks, the present state first.
 
@@ -161,12 +166,18 @@ def record(
         fps: Frames per second of simulated time.
         world: Which of the bodies' copies is drawn; must be given where there are several.
         surface: Drawn in place of the mesh's own surface, for several bodies one each (None for the mesh's own): a
-            surface from ``mesh.bind(points, triangles)``; or a USD file with Mesh prims in the mesh's coordinates,
-            which are bound to it and keep their faces, texture coordinates and materials.
+            surface from ``mesh.bind(points, triangles)``; or a USD file with Mesh prims, or another surface file, in
+            the mesh's coordinates, whose parts are bound to it and keep their names, faces, texture coordinates,
+            subsets and materials. Parts without materials and colours show the stress.
         tets: Whether the TetMesh prim is written; None: unless a smooth surface is.
         labels: Draw each label of the mesh as a closed surface of its own, in place of one around all.
-        progress: Called with the frames done and their number, after each.
+        also: Files for ParaView with displacement, velocity, strain and stress: .pvd or .xdmf of all frames, .vtu of
+            the last.
+        progress: Called with the frames done and their number, after each; None: terminals show a bar from two
+            seconds on.
         recording: Filled while running, for who wants to look at it when the run has been ended early.
+        about: What the stage shall say of itself, besides what is known of every simulation: texts, numbers and
+            dictionaries of them, under "warp_corot" in the layer's custom data.
 
     Returns:
         What was recorded.
@@ -178,8 +189,13 @@ def record(
         OSError: The file cannot be written, as when the disk is full; the frames up to seconds before are kept.
     """
     from .usd_writer import UsdWriter
+    from .write import also_writer, fields_of
 
+    if not isinstance(sim, Simulation):
+        raise InputError(f"sim is {shown(sim)}; it must be a Simulation, as Simulation(body) makes one")
+    checked_path(path, "path")
     count = frame_count(duration, fps)
+    others = [also_writer(Path(other)) for other in also]
     if world is None and sim.worlds > 1:
         raise InputError(f"the simulation has {sim.worlds} worlds; say which one to draw, as in world=0")
     joined = _Joined(sim, world or 0)
@@ -193,10 +209,12 @@ def record(
         skins=skins.on(joined.meshes) if skins else (),
         tets=tets,
         changing=any(joined.changing),
+        gravity=sim.gravity,
     )
+    told = {**provenance(sim, joined.fixed), **(about or {})}
     done = Recording(writer.path) if recording is None else recording
     first_step, first_time = sim.total_steps, sim.total_time
-    with _closed_whole(writer, done):
+    with _closed_whole(writer, done, others), _bar(count, wanted=progress is None) as bar:
         for frame in range(count + 1):
             started = time.perf_counter()
             sim.advance_until(first_time + frame / fps)
@@ -205,14 +223,29 @@ def record(
                 if joined.has_changed():
                     bound = skins.on(joined.meshes) if skins else ()
                     writer.change_mesh(joined, fixed=joined.fixed, material=joined, skins=bound)
+                writer.about = {**told, **steps_made(sim)}
                 _write_frame(writer, sim, joined, done)
+                if others:
+                    fields = fields_of(sim, joined.worlds, sim.total_time - first_time)
+                    for other in others:
+                        other.write(fields)
             done.stepping += stepped - started
             done.writing += time.perf_counter() - stepped
             done.steps = sim.total_steps - first_step
             done.simulated = sim.total_time - first_time
-            if progress:
-                progress(frame, count)
+            (progress or bar)(frame, count)
     return done
+
+
+@contextmanager
+def _bar(count: int, *, wanted: bool) -> Iterator[Progress]:
+    """A bar on a terminal for runs that take a while."""
+    from tqdm import tqdm
+
+    form = "{desc}  {percentage:3.0f} % |{bar}| frame {n_fmt} of {total_fmt}, {remaining} left"
+    off = None if wanted else True
+    with tqdm(desc="simulating", total=count, delay=2.0, leave=False, disable=off, bar_format=form) as bar:
+        yield lambda frame, _: bar.update(frame - bar.n)
 
 
 def _write_frame(writer: UsdWriter, sim: Simulation, joined: _Joined, done: Recording) -> None:
@@ -229,17 +262,22 @@ def _write_frame(writer: UsdWriter, sim: Simulation, joined: _Joined, done: Reco
 
 
 @contextmanager
-def _closed_whole(writer: UsdWriter, done: Recording) -> Iterator[None]:
-    """The writer is closed at the end, whatever the end is, with signals held back and the time taken."""
+def _closed_whole(writer: UsdWriter, done: Recording, others: Sequence[Writer] = ()) -> Iterator[None]:
+    """The writers are closed at the end, whatever the end is, with signals held back and the time taken."""
     try:
         yield
     except BaseException as error:
         with signals_held_back():
             writer.__exit__(type(error), error, error.__traceback__)
+            with suppress(OSError):  # the first error is the one to be told
+                for other in others:
+                    other.close()
         raise
     started = time.perf_counter()
     with signals_held_back():
         writer.close()
+        for other in others:
+            other.close()
     done.writing += time.perf_counter() - started
 
 

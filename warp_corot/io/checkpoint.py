@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import warnings
-import zipfile
-import zlib
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
@@ -18,6 +16,7 @@ import warp as wp
 from ..activation import Activation, ElementActivation
 from ..anisotropy import Orthotropic, TransverselyIsotropic
 from ..body import SoftBody
+from ..checks import checked_path
 from ..elasticity import MODELS, ForceField, Model
 from ..errors import InputError, StabilityWarning
 from ..materials import Isotropic
@@ -26,19 +25,18 @@ from ..simulation import Simulation
 from ..solvers import INTEGRATORS
 from .checkpoint_mesh import pack_mesh, unpack_mesh
 from .checkpoint_remesh import pack_changing, remesh_options, unpack_changing
+from .quiet import bounded
 from .whole import written_whole
 
 Remesh = OnlineRemesh | Sequence[OnlineRemesh | None] | None
 
 FORMAT = "warp-corot checkpoint"
 #: 2: worlds, deterministic runs. 3: anisotropic materials, activation, forests made from domains. 4: meshes that
-#: change, steps of changing length. 5: a step that follows the state, starts of worlds in seconds. All are read.
-VERSION = 5
+#: change, steps of changing length. 5: a step that follows the state, starts of worlds in seconds. 6: the step at the
+#: last check. All are read.
+VERSION = 6
 
 MATERIALS = {kind.__name__: kind for kind in (Isotropic, TransverselyIsotropic, Orthotropic)}
-
-#: What reading a damaged archive raises.
-DAMAGE = (EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
 
 
 def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
@@ -47,7 +45,7 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
     Raises:
         InputError: The folder is not there, the path is a folder, or it cannot be written to.
     """
-    target = Path(path)
+    target = checked_path(path, "path")
     if not target.parent.is_dir():
         raise InputError(f"cannot save {target}: the folder {target.parent} is not there")
     if target.is_dir():
@@ -134,18 +132,23 @@ def load_checkpoint(
     path: str | PathLike[str], device: str | wp.Device | None = None, remesh: Remesh = None
 ) -> Simulation:
     """The simulation that ``save_checkpoint`` wrote; see ``Simulation.load``."""
-    source = Path(path)
+    source = checked_path(path, "path")
     if not source.is_file():
         raise InputError(f"there is no checkpoint {source}")
     what = f"{source} is not a whole checkpoint of warp_corot"
     try:
-        with np.load(source, allow_pickle=False) as archive:
+        with bounded(source), np.load(source, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
+        for name, array in arrays.items():
+            if not isinstance(array, np.ndarray):
+                raise InputError(f"{what}: {name} is no array")
         header = json.loads(arrays["header"].tobytes())
         newer = header["version"] > VERSION
         if header["format"] != FORMAT:
             raise InputError(what)
-    except DAMAGE as error:
+    except InputError:
+        raise
+    except Exception as error:  # whatever NumPy, zip files or JSON make of it
         raise InputError(what) from error
     if newer:
         raise InputError(f"{source} is of version {header['version']}; this warp_corot reads up to version {VERSION}")
@@ -155,6 +158,10 @@ def load_checkpoint(
         return _rebuilt_simulation(header, arrays, device, remesh)
     except (LookupError, TypeError) as error:
         raise InputError(f"{what}: {error} is missing or wrong") from error
+    except (ArithmeticError, AssertionError, AttributeError, MemoryError, RuntimeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{what}: {' '.join(str(error).split())[:160]}") from error
 
 
 def _upgrade(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
@@ -171,7 +178,15 @@ def _upgrade(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
             described["remesh"] = None
     if header["version"] < 4:
         header |= {"stable_dt": None, "epoch": 0.0, "steps_before_reset": 0, "time_before_reset": 0.0}
-    _upgrade_steps(header, arrays)
+    if header["version"] < 5:
+        _upgrade_steps(header, arrays)
+    if header["version"] < 6:
+        if "kept.control" in arrays:
+            # Without by how much the step was shortened last, and whether velocities were a user's; a place is new.
+            arrays["kept.control"] = np.append(np.delete(arrays["kept.control"], (5, 7)), 0.0)
+        arrays["kept.seconds"] = np.append(arrays["kept.seconds"], 0.0)
+        arrays["guard.lately"] = np.zeros((4, header["worlds"]))
+        arrays["guard.counted"] = np.full((7, header["worlds"]), np.nan)
 
 
 def _upgrade_steps(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
@@ -221,7 +236,7 @@ def _rebuilt_simulation(
             field.state[name].assign(arrays[f"body{number}.field.{name}"])
     for name in header["kept"]:
         sim.kept[name].assign(arrays[f"kept.{name}"])
-    sim.guard.resume(**{name: arrays[f"guard.{name}"] for name in ("scale", "drift", "counted")})
+    sim.guard.resume(**{name: arrays[f"guard.{name}"] for name in ("scale", "drift", "lately", "counted")})
     return sim
 
 

@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 INK = "#3b3640"
 _PIECES = 60_000  # about how many polygons a body is cut into
 _CREASE = math.cos(math.radians(40.0))  # edges sharper than this stay sharp
+_DEPTH_CELLS = 60  # across the picture that says which dots are hidden
 _GHOST, _GHOST_LINE = (0.90, 0.91, 0.93), (0.74, 0.76, 0.80)
 
 
@@ -82,6 +83,8 @@ def draw_body(
     color: tuple[float, float, float] = TISSUE,
     edges: bool = False,
     ground: float | bool = True,
+    held: ArrayLike | None = None,
+    pieces: int = _PIECES,
 ) -> Camera:
     """Draws a shaded surface into a Matplotlib Axes.
 
@@ -97,6 +100,8 @@ def draw_body(
         color: Of the body where there are no scalars, sRGB.
         edges: Draw the edges of the faces.
         ground: Height [m] of a ground that takes the shadow; True: below the lowest node; False: none.
+        held: Nodes to be marked with dots, mask [N].
+        pieces: About how many polygons the surface is cut into.
 
     Returns:
         The camera used, for the next body.
@@ -116,22 +121,24 @@ def draw_body(
     if x_rest is not None:
         _draw_silhouette(ax, x_rest[tri], camera)
 
-    pieces, normals, values = _cut(x, tri, _values(scalars, len(x), tri))
+    cut, normals, values = _cut(x, tri, _values(scalars, len(x), tri), pieces)
     _fill(ax, camera.project(x[tri][_facing(x[tri], camera)])[0], INK, INK, width=1.6, order=3)
-    front = _facing(pieces, camera)
-    pieces, normals = pieces[front], normals[front]
-    flat, depth = camera.project(pieces)
+    front = _facing(cut, camera)
+    cut, normals = cut[front], normals[front]
+    flat, depth = camera.project(cut)
     order = np.argsort(depth.mean(axis=1))
     if values is None:
-        base = np.broadcast_to(srgb_to_linear(color), (len(pieces), 3))
+        base = np.broadcast_to(srgb_to_linear(color), (len(cut), 3))
     else:
         lowest, highest = value_range or value_limits(scalars)
         base = srgb_to_linear(stress_colors())[color_index(values[front], lowest, highest)]
-    shaded = _shade(base, normals, camera.rays(pieces.mean(axis=1)), camera)[order]
+    shaded = _shade(base, normals, camera.rays(cut.mean(axis=1)), camera)[order]
     # The edge of each polygon, in its own colour, closes the seams that antialiasing leaves between neighbours.
     _fill(ax, flat[order], shaded, shaded, width=0.2, order=4)
     if edges:
         _draw_edges(ax, x[tri], camera)
+    if held is not None and np.any(held):
+        _draw_dots(ax, x, tri, np.asarray(held, dtype=bool), cut, camera)
     ax.set_aspect("equal")
     ax.set_axis_off()
     ax.update_datalim(np.concatenate([camera.project(s)[0] for s in seen]))
@@ -212,9 +219,9 @@ def _corner_normals(x: Array, tri: NDArray[np.int64]) -> Array:
     return (total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)).reshape(-1, 3, 3)
 
 
-def _cut(x: Array, tri: NDArray[np.int64], values: Array | None) -> tuple[Array, Array, Array | None]:
+def _cut(x: Array, tri: NDArray[np.int64], values: Array | None, count: int) -> tuple[Array, Array, Array | None]:
     """Cuts each face into n² triangles: their corners [m, 3, 3], and normals [m, 3] and values [m] at their centres."""
-    n = int(np.clip(math.sqrt(_PIECES / len(tri)), 1, 24))
+    n = int(np.clip(math.sqrt(count / len(tri)), 1, 24))
     weights = []
     for i in range(n):
         for j in range(n - i):
@@ -307,6 +314,30 @@ def _blur(image: Array, wide_u: float, wide_v: float) -> Array:
     fu, fv = np.fft.fftfreq(image.shape[0])[:, None], np.fft.rfftfreq(image.shape[1])[None, :]
     kernel = np.exp(-2.0 * np.pi**2 * ((wide_u * fu) ** 2 + (wide_v * fv) ** 2))
     return np.clip(np.fft.irfft2(np.fft.rfft2(image) * kernel, s=image.shape), 0.0, 1.0)
+
+
+def _draw_dots(
+    ax: "Axes", x: Array, tri: NDArray[np.int64], held: NDArray[np.bool_], pieces: Array, camera: Camera
+) -> None:
+    """Dots on the held nodes that can be seen: on a face that shows its outside, with none of the pieces before it."""
+    faces = tri[_facing(x[tri], camera)]
+    marked = np.unique(faces[held[faces]])
+    if not len(marked):
+        return
+    flat, depth = camera.project(x)
+    centers, nearness = camera.project(pieces.mean(axis=1))
+    low = np.minimum(centers.min(axis=0), flat[marked].min(axis=0))
+    cell = float(np.ptp(centers, axis=0).max()) / _DEPTH_CELLS or 1.0
+    nearest: dict[tuple[int, int], float] = {}
+    for place, near in zip(map(tuple, ((centers - low) / cell).astype(int).tolist()), nearness.tolist(), strict=True):
+        nearest[place] = max(near, nearest.get(place, -np.inf))
+    places = list(map(tuple, ((flat[marked] - low) / cell).astype(int).tolist()))
+    before = np.array([nearest.get(place, -np.inf) for place in places])
+    # Within a cell a surface seen at a slant is as much nearer as this.
+    seen = marked[depth[marked] > before - 4.0 * cell]
+    # So many that they do not run together.
+    _, first = np.unique(((flat[seen] - low) / (1.5 * cell)).astype(int), axis=0, return_index=True)
+    ax.plot(*flat[seen[first]].T, ".", color=INK, markersize=4.5, markeredgewidth=0.0, zorder=6)
 
 
 def _unit(vector: Array) -> Array:

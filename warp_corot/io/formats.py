@@ -1,10 +1,8 @@
-"""Tetrahedral meshes from files: USD, and whatever with tetrahedra meshio reads."""
+"""Tetrahedral meshes from files: USD, and whatever the readers in ``warp_corot.io.read`` know."""
 
-import contextlib
-import io
 import logging
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -12,10 +10,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..checks import checked_path
 from ..errors import InputError
 from .assets import find_asset
+from .read.filemesh import FileMesh
+from .read.files import read_mesh_file, suffix_of
+from .read.regions import Regions, find_regions
+from .read.split import split_solids
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
+#: Formats of surfaces alone, see `warp_corot.io.surfaces`.
+SURFACE_SUFFIXES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf")
+#: The formats of meshes that messages name.
+USUAL = (".msh", ".vtk", ".vtu", ".inp", ".mesh", ".node")
+#: How the note of cells that have been split ends.
+SPLIT = "are split into tetrahedra"
 
 log = logging.getLogger(__name__)
 
@@ -31,6 +40,9 @@ class LoadedMesh:
         metres_per_unit: Length of the file's unit [m], before ``scale``.
         name: Short name, fit for a title.
         source: The file it was read from.
+        regions: Its regions, if the file numbers any.
+        says_unit: Whether the file says its unit.
+        notes: What the user should know, a line each.
     """
 
     points: NDArray[np.float64]
@@ -39,32 +51,90 @@ class LoadedMesh:
     metres_per_unit: float
     name: str
     source: Path
+    regions: Regions | None = None
+    says_unit: bool = False
+    notes: list[str] = field(default_factory=list)
 
 
-def load_tets(path: str | PathLike[str], scale: float = 1.0) -> LoadedMesh:
+def load_tets(
+    path: str | PathLike[str],
+    scale: float = 1.0,
+    *,
+    unit: str | float | None = None,
+    regions: str | None = None,
+    found: FileMesh | None = None,
+) -> LoadedMesh:
     """Loads the tetrahedra of a file, in metres.
 
     USD stages are read with OpenUSD (unit, up axis and world transforms applied, several prims joined); other files
-    with meshio (``pip install "warp-corot[mesh]"``), taken as metres: all blocks of tetrahedra, of second-order ones
-    their four corners. ``warp:NAME`` names an asset in Warp's wheel, see `warp_corot.io.assets`.
+    with VTK, Gmsh, meshio or readers of this package, see `warp_corot.io.read`. Hexahedra, wedges and pyramids are
+    split into tetrahedra that fit those of their neighbours; cells of higher order are taken by their corners.
+    ``warp:NAME`` names an asset in Warp's wheel, see `warp_corot.io.assets`.
 
     Args:
         path: File, or asset name.
-        scale: Factor on all coordinates, after the file's own unit.
+        scale: Factor on all coordinates, after the unit.
+        unit: Of the coordinates, any length such as "mm" or "3.2cm", or metres as a number. None: what the file says,
+            metres if it says nothing.
+        regions: Name of the file's array that numbers regions; None: the likeliest.
+        found: What `read_mesh_file` has found in the file, if it has been read before.
 
     Returns:
         The mesh. Elements are not judged here (orientation, volume): `TetMesh` does that.
 
     Raises:
         InputError: No such file, not a mesh, no tetrahedra, coordinates that are not finite, indices out of range,
-            a scale that is not positive; one line that says which.
+            a scale that is not positive, no such array or unit; one line that says which.
     """
     if not (np.isfinite(scale) and scale > 0.0):
         raise InputError(f"scale is {scale}, should be a positive number")
     asset = find_asset(path)
-    source = asset.path if asset else Path(path)
+    source = asset.path if asset else checked_path(path, "path")
+    check_file(source, "mesh")
+    says_unit = source.suffix.lower() in USD_SUFFIXES
+    numbered: Regions | None = None
+    notes: list[str] = []
+    tets: NDArray[Any]
+    if says_unit:
+        from .usd_reader import read_usd_tets
+
+        points, tets, up_axis, metres = read_usd_tets(source)
+        if regions is not None:
+            raise InputError(f"{source}: there is no array {regions!r} that numbers regions; USD stages have none")
+    else:
+        points, tets, numbered, notes = _read(source, regions, found)
+        up_axis, metres = "Z", 1.0
+    if len(tets) == 0:
+        raise InputError(f"{source}: has no tetrahedra")
+    if tets.min() < 0 or tets.max() >= len(points):
+        row, column = np.argwhere((tets < 0) | (tets >= len(points)))[0]
+        raise InputError(
+            f"{source}: tetrahedron {row} names point {tets[row, column]} but the points are 0 to {len(points) - 1}"
+        )
+    from ..domain.units import metres_per_unit  # late: domains read files
+
+    points = points * (scale if unit is None else scale * metres_per_unit(unit) / metres)
+    check_finite(points, source)
+    for note in notes:
+        usual = found is not None or note.endswith(SPLIT)
+        log.log(logging.INFO if usual else logging.WARNING, "%s: %s", source, note)
+    # As UTF-8 whatever the locale is; what cannot be shown becomes a question mark.
+    name = asset.name if asset else os.fsencode(source.stem).decode("utf-8", "replace")
+    return LoadedMesh(points, tets.astype(np.int32), up_axis, metres, name, source, numbered, says_unit, notes)
+
+
+def check_file(source: Path, kind: str) -> None:
+    """See that there is a file with something in it.
+
+    Args:
+        source: The file.
+        kind: What it should be, for the message.
+
+    Raises:
+        InputError: A folder, no such file, an empty one, or one that cannot be read.
+    """
     if source.is_dir():
-        raise InputError(f"{source}: is a folder, should be a mesh file")
+        raise InputError(f"{source}: is a folder, should be a {kind} file")
     if not source.exists():
         raise InputError(f"{source}: no such file")
     try:
@@ -74,62 +144,52 @@ def load_tets(path: str | PathLike[str], scale: float = 1.0) -> LoadedMesh:
     except OSError as error:
         raise InputError(f"{source}: cannot be read ({error.strerror})") from None
 
-    if source.suffix.lower() in USD_SUFFIXES:
-        from .usd_reader import read_usd_tets
 
-        points, tets, up_axis, metres = read_usd_tets(source)
-    else:
-        points, tets, up_axis, metres = _read_meshio(source)
-    if len(tets) == 0:
-        raise InputError(f"{source}: has no tetrahedra")
-    if tets.min() < 0 or tets.max() >= len(points):
-        row, column = np.argwhere((tets < 0) | (tets >= len(points)))[0]
-        raise InputError(
-            f"{source}: tetrahedron {row} names point {tets[row, column]} but the points are 0 to {len(points) - 1}"
-        )
-    points = points * scale
+def check_finite(points: NDArray[np.float64], source: Path) -> None:
+    """See that all coordinates are finite.
+
+    Raises:
+        InputError: A point's are not; the message names the first.
+    """
     finite = np.isfinite(points).all(axis=1)
     if not finite.all():
         bad = int(np.argmin(finite))
         raise InputError(f"{source}: point {bad} has coordinates {points[bad].tolist()}, should be finite")
-    # As UTF-8 whatever the locale is; what cannot be shown becomes a question mark.
-    name = asset.name if asset else os.fsencode(source.stem).decode("utf-8", "replace")
-    return LoadedMesh(points, tets.astype(np.int32), up_axis, metres, name, source)
 
 
-def _read_meshio(path: Path) -> tuple[NDArray[np.float64], NDArray[Any], str, float]:
+def unknown_format(source: Path) -> InputError:
+    """What to say of an extension that no reader takes."""
+    return InputError(
+        f"{source}: unknown format {source.suffix or '(no extension)'}, should be {', '.join(USD_SUFFIXES)}, "
+        f"{', '.join(USUAL)}, another mesh file, a surface such as .stl or a scan such as .nii.gz"
+    )
+
+
+def _read(
+    path: Path, regions: str | None, found: FileMesh | None
+) -> tuple[NDArray[np.float64], NDArray[np.int64], Regions | None, list[str]]:
+    if path.suffix.lower() in SURFACE_SUFFIXES:
+        raise InputError(f"{path}: is not a mesh of tetrahedra but a surface, which Domain.from_surface reads")
+    if suffix_of(path) is None:
+        raise unknown_format(path)
+    mesh = read_mesh_file(path) if found is None else found
+    if not isinstance(mesh, FileMesh):
+        raise InputError(f"{path}: has no tetrahedra (it holds an image)")
+    if not mesh.solids:
+        raise InputError(f"{path}: has no tetrahedra (cell types: {mesh.kinds()})")
+    check_finite(mesh.points, path)
+    tets, cells, warped = split_solids(mesh.solids, mesh.points)
+    notes = list(mesh.notes)
+    others = {block.kind: 0 for block in mesh.solids if block.kind != "tetra"}
+    for block in mesh.solids:
+        if block.kind in others:
+            others[block.kind] += len(block.nodes)
+    if others:
+        said = ", ".join(f"{count} {kind}{'s' if kind != 'hexahedron' else ''}" for kind, count in others.items())
+        notes.append(f"{said.replace('hexahedron', 'hexahedra')} {SPLIT}")
+    if warped:
+        notes.append(f"{warped} cells are so warped that their tetrahedra overlap or leave gaps")
     try:
-        import meshio
-    except ImportError:
-        raise InputError(
-            f'{path}: reading {path.suffix or "this"} files needs: pip install "warp-corot[mesh]"'
-        ) from None
-
-    known = sorted(meshio.extension_to_filetypes)
-    if path.suffix.lower() not in known:
-        raise InputError(
-            f"{path}: unknown format {path.suffix or '(no extension)'}, should be {', '.join(USD_SUFFIXES)} "
-            f"or one that meshio reads, such as .msh, .vtk, .vtu, .mesh"
-        )
-    # meshio prints its complaints, and on a file that none of its readers takes it leaves the interpreter.
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            mesh = meshio.read(path)
-    except (Exception, SystemExit) as error:
-        what = " ".join(str(error).split()) if not isinstance(error, SystemExit) else ""
-        raise InputError(
-            f"{path}: is not a {path.suffix} file that meshio can read{f' ({what[:120]})' if what else ''}"
-        ) from None
-
-    blocks = [np.asarray(block.data)[:, :4] for block in mesh.cells if block.type in ("tetra", "tetra10")]
-    if any(block.type == "tetra10" and len(block.data) for block in mesh.cells):
-        log.warning("%s: second-order tetrahedra are read as first-order ones, by their four corners", path)
-    if not sum(len(block) for block in blocks):
-        kinds = ", ".join(sorted({block.type for block in mesh.cells})) or "none"
-        raise InputError(f"{path}: has no tetrahedra (cell types: {kinds})")
-    points = np.asarray(mesh.points, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"{path}: points have shape {points.shape}, should be [N, 3]")
-    tets = np.concatenate(blocks).astype(np.int64)
-    return points, tets, "Z", 1.0
+        return mesh.points, tets, find_regions(mesh, cells, regions), notes
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None

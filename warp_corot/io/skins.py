@@ -15,12 +15,55 @@ from ..mesh.bound import SurfaceMesh
 from ..mesh.surface import boundary_faces
 
 if TYPE_CHECKING:
+    from typing import TypeAlias
+
+    from .surfaces import LoadedSurface
     from .usd_look import Look
 
-    Surface = SurfaceMesh | str | PathLike[str]
+    Surface: TypeAlias = "SurfaceMesh | OwnSurface | str | PathLike[str]"
 
 #: A surface this many times longer or shorter than its body is in another unit, most likely.
 UNLIKELY = 3.0
+#: Bounds that differ by less than this share of the length are the same.
+SAME = 1.0e-3
+
+
+@dataclass(frozen=True, eq=False)
+class OwnSurface:
+    """A user's own surface, in the coordinates of the body's mesh.
+
+    Attributes:
+        looks: Its parts, each with its faces, texture coordinates, subsets and materials.
+    """
+
+    looks: Sequence[Look]
+
+    @classmethod
+    def of_domain(cls, path: str | PathLike[str], loaded: LoadedSurface, bounds: npt.ArrayLike) -> OwnSurface | None:
+        """The surface that a domain of these bounds [2, 3] [m] was made from; its unit is whatever makes the two
+        equally large. None if they are not the same but for that.
+
+        Args:
+            path: Of the file.
+            loaded: Its triangles, for files of which more than these is not known.
+            bounds: Of the domain.
+
+        Raises:
+            InputError: See `usd_look.read_looks`.
+        """
+        from .usd_look import has_looks, look_of_triangles, read_looks
+
+        looks = read_looks(path) if has_looks(path) else [look_of_triangles(path, loaded.points, loaded.triangles)]
+        given = np.asarray(bounds, dtype=np.float64)
+        length = float(np.ptp(given, axis=0).max())
+        # All of the file, or where it has several bodies one part of it.
+        for some in (looks, *([look] for look in looks)):
+            used = np.concatenate([look.points[look.triangles].reshape(-1, 3) for look in some])
+            own = np.stack([used.min(axis=0), used.max(axis=0)])
+            scale = length / max(float(np.ptp(own, axis=0).max()), 1e-300)
+            if np.abs(scale * own - given).max() <= SAME * length:
+                return cls([look.placed(scale) for look in some])
+        return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +104,7 @@ def skins_of(
 
     Args:
         meshes: Forests or tetrahedral meshes.
-        surface: Drawn instead of the mesh's own: a bound surface, or a USD file whose Mesh prims are bound; for several
+        surface: Drawn instead of the mesh's own: a bound surface, or a surface file whose parts are bound; for several
             meshes one each, None for the mesh's own.
         labels: Draw each label of a mesh by itself, closed all round.
 
@@ -119,7 +162,7 @@ def _bound_anew(skin: Skin, mesh: Any) -> Skin:
 def _one_each(surface: Any, count: int) -> list[Any]:
     if surface is None:
         return [None] * count
-    several = isinstance(surface, Sequence) and not isinstance(surface, str | SurfaceMesh)
+    several = isinstance(surface, Sequence) and not isinstance(surface, str | SurfaceMesh | OwnSurface)
     given = list(surface) if several else [surface]
     if len(given) != count:
         raise InputError(f"surface names {len(given)} surfaces; there must be one for each of the {count} bodies")
@@ -130,10 +173,18 @@ def _skins_of_one(mesh: Any, surface: Any, labels: bool) -> list[Skin]:
     if isinstance(surface, SurfaceMesh):
         _check_nodes(surface, len(mesh.points))
         return [Skin("surface", surface)]
+    if isinstance(surface, OwnSurface):
+        return _bound_looks(mesh, surface.looks)
     if isinstance(surface, str | PathLike):
         return _bound_prims(mesh, surface)
     if surface is not None:
-        raise InputError(f"surface is a {type(surface).__name__}; it must be a SurfaceMesh or a USD file")
+        raise InputError(f"surface is a {type(surface).__name__}; it must be a SurfaceMesh or a surface file")
+    if labels and has_labels(mesh) and not has_domain(mesh):
+        return [
+            Skin(name, boundary_surface(mesh, mesh.elements_of(name)))
+            for name in mesh.label_names
+            if mesh.elements_of(name).any()
+        ]
     if labels and has_labels(mesh):
         between = mesh.separating_surface()
         there = np.unique(between.sides)
@@ -144,9 +195,9 @@ def _skins_of_one(mesh: Any, surface: Any, labels: bool) -> list[Skin]:
     return [Skin("surface", boundary_surface(mesh), is_boundary=True)]
 
 
-def boundary_surface(mesh: Any) -> SurfaceMesh:
-    """The boundary of any tetrahedral mesh, its points bound to the nodes that they are."""
-    faces, _ = boundary_faces(mesh.tets, mesh.points)
+def boundary_surface(mesh: Any, of: npt.NDArray[np.bool_] | None = None) -> SurfaceMesh:
+    """The boundary of any tetrahedral mesh, or of some of its elements, its points bound to the nodes that they are."""
+    faces, _ = boundary_faces(mesh.tets if of is None else mesh.tets[of], mesh.points)
     used, triangles = np.unique(faces, return_inverse=True)
     weights = np.tile([1.0, 0.0, 0.0, 0.0], (len(used), 1))
     nodes = np.repeat(used[:, None], 4, axis=1).astype(np.int32)
@@ -171,10 +222,12 @@ def _check_nodes(surface: SurfaceMesh, count: int) -> None:
 def _bound_prims(mesh: Any, path: str | PathLike[str]) -> list[Skin]:
     from .usd_look import read_looks
 
-    if not hasattr(mesh, "bind"):
-        raise InputError(f"{path}: only a TetForest can have a surface bound to it, not a {type(mesh).__name__}")
+    return _bound_looks(mesh, read_looks(path))
+
+
+def _bound_looks(mesh: Any, looks: Sequence[Look]) -> list[Skin]:
     skins = []
-    for look in read_looks(path):
+    for look in looks:
         _check_size(look, mesh.points)
         skins.append(Skin(look.name, mesh.bind(look.points, look.triangles), look))
     return skins

@@ -1,15 +1,18 @@
 """Files as OpenUSD takes them: their names, whether one may be written, who is writing it, and what went wrong."""
 
+import functools
 import math
 import os
 import re
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from pxr import Tf, Usd, UsdGeom
 
 from ..errors import InputError
+from .quiet import bounded, quietly
 
 try:
     import fcntl
@@ -40,9 +43,47 @@ def open_stage(path: Path) -> Any:
     try:
         return Usd.Stage.Open(usd_name(path))
     except Tf.ErrorException as error:
-        where = re.search(rf"{re.escape(path.name)}:(\d+):\d+: ([^\n]+)", str(error))
-        why = f": line {where[1]}: {where[2].rstrip(chr(39))}" if where else ""
+        text = _text(error)
+        where = re.search(rf"{re.escape(path.name)}:(\d+):\d+: ([^\n]+)", text)
+        why = f": line {where[1]}: {_short(where[2].rstrip(chr(39)))}" if where else f" ({_first_message(text)})"
         raise InputError(f"{path}: is not a USD file that OpenUSD can open{why}") from None
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def reads_stage(read: Callable[Concatenate[Path, P], R]) -> Callable[Concatenate[Path, P], R]:
+    """Have a function that reads a file, its first argument, end in one line if OpenUSD finds it damaged on the way."""
+
+    @functools.wraps(read)
+    def reading(path: Path, *args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            with quietly(), bounded(path):
+                return read(path, *args, **kwargs)
+        except Tf.ErrorException as error:
+            raise InputError(f"{path}: is damaged: {_first_message(_text(error))}") from None
+        except UnicodeDecodeError:
+            raise InputError(f"{path}: is damaged: it has text that is not UTF-8") from None
+
+    return reading
+
+
+def _text(error: Tf.ErrorException) -> str:
+    try:
+        return str(error)
+    except UnicodeDecodeError:  # OpenUSD quotes the file as it is
+        return " : 'it has text that is not UTF-8'"
+
+
+def _first_message(text: str) -> str:
+    """What went wrong first, without where in OpenUSD's code."""
+    found = re.search(r" : '([^\n]*)'", text)
+    return _short(found[1] if found else " ".join(text.split()) or "unknown reason")
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= 200 else f"{text[:197]}..."
 
 
 def metres_per_unit(stage: Any, path: Path) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,8 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from ..errors import InputError
 from .formats import USD_SUFFIXES
-from .usd_files import metres_per_unit, open_stage
+from .surfaces import UP_AXES
+from .usd_files import metres_per_unit, open_stage, reads_stage
 from .usd_surfaces import DrawnMesh, drawn_meshes
 
 #: What frames give anew, or what no longer holds of a prim once its points are in the world's coordinates.
@@ -35,6 +36,7 @@ class Look:
         left_handed: Whether the faces as they are listed are wound the other way, in the world.
         had_normals: Whether the prim gives normals.
         smooth: Whether it is a subdivision surface, which needs none.
+        is_plain: Whether it has neither a material nor colours of its own, so that stress may colour it.
     """
 
     name: str
@@ -45,7 +47,12 @@ class Look:
     left_handed: bool
     had_normals: bool
     smooth: bool
+    is_plain: bool
     _stage: Any
+
+    def placed(self, scale: float) -> Look:
+        """The same, its points times a factor."""
+        return replace(self, points=scale * self.points)
 
     def copy_to(self, layer: Sdf.Layer, target: str, materials: str) -> None:
         """Copy the prim, without points, normals and transform, to a path of a layer, and the materials that it and
@@ -86,6 +93,7 @@ class Look:
         UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath(there)).Bind(UsdShade.Material.Get(stage, copied))
 
 
+@reads_stage
 def has_mesh(path: Path) -> bool:
     """Whether a stage has a Mesh prim and no tetrahedra.
 
@@ -100,19 +108,40 @@ def has_mesh(path: Path) -> bool:
     return meshes
 
 
+def has_looks(path: str | PathLike[str]) -> bool:
+    """Whether more than triangles is known of the surfaces in files of this name."""
+    return Path(path).suffix.lower() in (*USD_SUFFIXES, *UP_AXES)
+
+
+def look_of_triangles(path: str | PathLike[str], points: NDArray[Any], triangles: NDArray[Any]) -> Look:
+    """Triangles of a file as a prim of its name."""
+    from .scene_stages import stage_of_triangles
+
+    source = Path(path)
+    stage = stage_of_triangles(source.stem, points, triangles)
+    (drawn,) = drawn_meshes(stage, source)
+    return _look(drawn, stage, source, 1.0)
+
+
 def read_looks(path: str | PathLike[str]) -> list[Look]:
-    """All Mesh prims of a stage that are drawn, at its first time.
+    """All Mesh prims of a stage that are drawn, at its first time, or the parts of another surface file as such.
 
     Raises:
-        InputError: No such file, not a USD stage, one that is wrong, or no Mesh prim with faces in it.
+        InputError: No such file, not a USD stage or another surface file, one that is wrong, or no faces in it.
     """
     source = Path(path)
-    if source.suffix.lower() not in USD_SUFFIXES:
-        raise InputError(f"{source}: extension {source.suffix or '(none)'}, should be {', '.join(USD_SUFFIXES)}")
+    if source.suffix.lower() not in (*USD_SUFFIXES, *UP_AXES):
+        known = ", ".join((*USD_SUFFIXES, *UP_AXES))
+        raise InputError(f"{source}: extension {source.suffix or '(none)'}, should be {known}")
     if not source.is_file():
         raise InputError(f"{source}: no such file")
-    stage = _flattened(open_stage(source))
-    metres = metres_per_unit(stage, source)
+    if source.suffix.lower() in UP_AXES:
+        from .scene_stages import stage_of_file
+
+        stage, metres = stage_of_file(source), 1.0
+    else:
+        stage = _flattened(open_stage(source))
+        metres = metres_per_unit(stage, source)
     looks = [_look(drawn, stage, source, metres) for drawn in drawn_meshes(stage, source)]
     if not looks:
         raise InputError(f"{source}: has no Mesh prim with faces")
@@ -131,8 +160,17 @@ def _look(drawn: DrawnMesh, stage: Any, source: Path, metres: float) -> Look:
         drawn.left_handed,
         bool(normals),
         drawn.smooth,
+        _is_plain(prim),
         stage,
     )
+
+
+def _is_plain(prim: Any) -> bool:
+    parts = [prim, *(child for child in prim.GetChildren() if child.IsA(UsdGeom.Subset))]
+    bound = any(
+        UsdShade.MaterialBindingAPI(part).ComputeBoundMaterial(purpose)[0] for part in parts for purpose in PURPOSES
+    )
+    return not bound and not UsdGeom.Mesh(prim).GetDisplayColorAttr().HasAuthoredValue()
 
 
 def _flattened(stage: Any) -> Any:

@@ -57,10 +57,13 @@ class PieceStore:
         self.pieces_folder = self.path.with_name(self.path.name + ".pieces")
         self._run = self.pieces_folder / f"run-{uuid.uuid4().hex[:8]}"
         self._lock: IO[str] | None = None
+        self._is_open = False
         self._refuse_second_writer(InputError)
 
         self.custom_data: dict[str, Any] = {}
         """Custom data of the default prim as of the last frame added."""
+        self.layer_data: dict[str, Any] = {}
+        """The same of the layer."""
         self._static: Sdf.Layer | None = None
         self._varying: dict[str, Sdf.ValueTypeName] = {}
         self._root: Sdf.Layer | None = None
@@ -96,7 +99,8 @@ class PieceStore:
         """Takes the values of one frame, ``nbytes`` of them, and writes a piece when it is time to.
 
         Raises:
-            OSError: Could not be written, as when the disk is full; what was written before stays and plays.
+            OSError: Could not be written, as when the disk is full; the frames for which there is room, from the first
+                on, stay and play.
         """
         if self._broken:
             raise OSError(f"{self.path}: could not be written further, see the error before")
@@ -127,24 +131,11 @@ class PieceStore:
             return
         started = time.monotonic()
         try:
-            if not self._pieces:
-                self._open_run()
-            name = f"piece-{len(self._pieces):06d}.usdc"
-            self._write(self._piece_layer(), self._run / name)
-            first, last = self._pending[0][0], self._pending[-1][0]
-            root = self._root_layer([*self._pieces, (first, last)])
-            self._write(root, self.path)
+            self._write_piece(len(self._pending))
         except OSError as error:
             self._broken = True
-            if not self._pieces:
-                self._remove_run(self._run)
+            self._keep_what_fits(len(self._pending) // 2)
             raise OSError(f"{error}; {self._kept()}") from None
-        self._pieces.append((first, last))
-        self._repeated.append(frozenset(self._carried.keys() - self._pending[0][1].keys()))
-        self._carried = dict(self._last)
-        self._pending, self._pending_bytes = [], 0
-        if len(self._pieces) == 1:
-            self._remove_stale_runs()
         self._last_flush = time.monotonic()
         self._flush_cost = self._last_flush - started
 
@@ -167,7 +158,7 @@ class PieceStore:
         joined.TransferContent(self._static)
         opened: list[Sdf.Layer] = []  # kept open: the joined layer's arrays lie in their mapped files
         try:
-            for time_code, samples in self._frames(opened):
+            for time_code, samples in self._with_bar(opened):
                 if transform:
                     samples = {**samples, **transform(samples)}
                 for path, value in samples.items():
@@ -177,11 +168,8 @@ class PieceStore:
             self._run.mkdir(parents=True, exist_ok=True)
             self._write(joined, self.path, aside=f"part-joined{self.path.suffix}")
         except OSError as error:
-            if self._pieces:
-                with contextlib.suppress(OSError):
-                    self.flush()
-            else:
-                self._remove_run(self._run)
+            del joined
+            self._keep_what_fits(len(self._pending))
             self._release()
             raise OSError(f"{error}; {self._kept()}") from None
         del joined
@@ -189,6 +177,49 @@ class PieceStore:
         self._release()
         self._remove_run(self._run)
         self._remove_stale_runs()
+
+    def _write_piece(self, count: int) -> None:
+        """Write the first ``count`` frames that wait as a piece, and let the stage play it.
+
+        Raises:
+            OSError: It cannot be written; all frames wait as before.
+        """
+        if not self._is_open:
+            self._open_run()
+        frames = self._pending[:count]
+        piece = self._run / f"piece-{len(self._pieces):06d}.usdc"
+        first, last = frames[0][0], frames[-1][0]
+        try:
+            self._write(self._piece_layer(frames), piece)
+            self._write(self._root_layer([*self._pieces, (first, last)]), self.path)
+        except OSError:
+            with contextlib.suppress(OSError):
+                piece.unlink(missing_ok=True)
+            raise
+        self._pieces.append((first, last))
+        self._repeated.append(frozenset(self._carried.keys() - frames[0][1].keys()))
+        for _, samples in frames:
+            self._carried |= samples
+        self._pending = self._pending[count:]
+        self._pending_bytes = 0 if not self._pending else self._pending_bytes
+        if len(self._pieces) == 1:
+            self._remove_stale_runs()
+
+    def _keep_what_fits(self, count: int) -> None:
+        """Write as many of the frames that wait as there is room for, from the first on, in ever smaller pieces."""
+        while self._pending and count:
+            times = [time_code for time_code, _ in self._pending]
+            if count < len(times) and times[count] - times[count - 1] == JUST_BEFORE:
+                count -= 1  # what holds until just before a frame goes with it
+                continue
+            try:
+                self._write_piece(count)
+            except OSError:
+                count //= 2
+            else:
+                count = min(count, len(self._pending))
+        if not self._pieces:
+            self._remove_run(self._run)
 
     def _kept(self) -> str:
         """After a failure: what is left, in words."""
@@ -216,20 +247,33 @@ class PieceStore:
                 yield time_code, {path: value for path, value in values if value is not None}
         yield from self._pending
 
+    def _with_bar(self, opened: list[Sdf.Layer]) -> Iterator[tuple[float, Samples]]:
+        """The same; joining them takes as long as the disk does, and terminals show how far it is."""
+        from tqdm import tqdm
+
+        count = len(self._pending) + round(sum(last - first + 1.0 for first, last in self._pieces))
+        form = "{desc}  {percentage:3.0f} % |{bar}| frame {n_fmt} of {total_fmt}, {remaining} left"
+        with tqdm(
+            total=count, desc=f"joining {self.path.name}", delay=2.0, leave=False, disable=None, bar_format=form
+        ) as bar:
+            for frame in self._frames(opened):
+                yield frame
+                bar.update()
+
     def _held_over(self, samples: Samples) -> Samples:
         """What must be said to hold until just before a frame, lest it is interpolated with what the frame gives."""
         changed = (path for path, what in self._follows.items() if what in samples and path in self._last)
         return {path: self._last[path] for path in changed if len(self._last[path]) == len(samples[path])}
 
-    def _piece_layer(self) -> Sdf.Layer:
+    def _piece_layer(self, frames: list[tuple[float, Samples]]) -> Sdf.Layer:
         layer = Sdf.Layer.CreateAnonymous(".usdc")
         self._declare_varying(layer)
-        (first, earliest), *later = self._pending
+        (first, earliest), *later = frames
         for time_code, samples in [(first, self._carried | earliest), *later]:
             for path, value in samples.items():
                 layer.SetTimeSample(path, time_code, value)
-        layer.startTimeCode = self._pending[0][0]
-        layer.endTimeCode = self._pending[-1][0]
+        layer.startTimeCode = frames[0][0]
+        layer.endTimeCode = frames[-1][0]
         return layer
 
     def _declare_varying(self, layer: Sdf.Layer) -> None:
@@ -248,13 +292,15 @@ class PieceStore:
     def _annotate(self, layer: Sdf.Layer) -> None:
         if self.custom_data:
             layer.GetPrimAtPath(f"/{layer.defaultPrim}").SetInfo("customData", self.custom_data)
+        if self.layer_data:
+            layer.customLayerData = {**layer.customLayerData, **self.layer_data}
 
     def _open_run(self) -> None:
         """Makes the folder of this run with what all its pieces share."""
         assert self._static is not None
         self._refuse_second_writer(OSError)
         try:
-            self._run.mkdir(parents=True)
+            self._run.mkdir(parents=True, exist_ok=True)
             self._lock = (self._run / "lock").open("w")
         except OSError as error:
             raise OSError(f"{self.path}: cannot make {self._run} ({error.strerror})") from None
@@ -264,6 +310,7 @@ class PieceStore:
         manifest = Sdf.Layer.CreateAnonymous(".usda")
         self._declare_varying(manifest)
         self._write(manifest, self._run / "manifest.usda")
+        self._is_open = True
 
     def _write(self, layer: Sdf.Layer, target: Path, aside: str | None = None) -> None:
         """Writes a layer wholly or not at all: aside in the run's folder, synced, then renamed over the target."""

@@ -18,6 +18,7 @@ from .usd_pieces import Samples
 
 ROOT, TETS, SURFACE = "/SoftBody", "/SoftBody/tetrahedra", "/SoftBody/surface"
 MATERIALS = "/SoftBody/materials"
+PHYSICS = "/SoftBody/physics"
 
 Limits = tuple[float, float]
 
@@ -66,7 +67,7 @@ class SkinPrim:
         self._said: Skin | None = None
         look = skin.look
         self._with_normals = look is None or (look.had_normals and not look.smooth)
-        self._with_colors = look is None
+        self._with_colors = look is None or look.is_plain
         self.follow(skin, rest)
 
     def follow(self, skin: Skin, rest: NDArray[np.float64]) -> None:
@@ -97,7 +98,7 @@ class SkinPrim:
         if self._with_normals:
             mesh.CreateNormalsAttr()
             mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-        if self._changing and statics.velocities:
+        if statics.velocities:
             mesh.CreateVelocitiesAttr()
         if statics.stress:
             primvars = UsdGeom.PrimvarsAPI(mesh)
@@ -118,10 +119,10 @@ class SkinPrim:
             samples[f"{self._path}.normals"] = Vt.Vec3fArray.FromNumpy(normals)
         if frame.nodal is not None:
             samples[f"{self._path}.primvars:vonMises"] = Vt.FloatArray.FromNumpy(self._skin.values(frame.nodal))
+        if frame.velocities is not None:
+            of_points = np.einsum("vn,vnc->vc", surface.weights, frame.velocities[surface.nodes])
+            samples[f"{self._path}.velocities"] = Vt.Vec3fArray.FromNumpy(of_points.astype(np.float32))
         if self._changing:
-            if frame.velocities is not None:
-                of_points = np.einsum("vn,vnc->vc", surface.weights, frame.velocities[surface.nodes])
-                samples[f"{self._path}.velocities"] = Vt.Vec3fArray.FromNumpy(of_points.astype(np.float32))
             if self._said is None or not _are_same(self._said.surface, surface):
                 samples |= triangle_samples(self._path, surface.triangles)
             self._said = self._skin
@@ -142,7 +143,7 @@ def _are_same(one: SurfaceMesh, other: SurfaceMesh) -> bool:
 
 def skin_paths(skins: Sequence[Skin]) -> list[str]:
     """A path for each, all different, after their names."""
-    taken = {TETS, MATERIALS}
+    taken = {TETS, MATERIALS, PHYSICS}
     paths = []
     for skin in skins:
         name = path = f"{ROOT}/{Tf.MakeValidIdentifier(skin.name)}"

@@ -7,9 +7,10 @@ from numpy.typing import NDArray
 from pxr import Usd, UsdGeom
 
 from ..errors import InputError
-from .usd_files import metres_per_unit, open_stage
+from .usd_files import metres_per_unit, open_stage, reads_stage
 
 
+@reads_stage
 def read_usd_tets(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], str, float]:
     """Reads every tetrahedral prim of a stage, joined into one mesh, in world space.
 

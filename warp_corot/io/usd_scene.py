@@ -127,6 +127,12 @@ class Scene:
         found = [self.bounds(path) for path in paths]
         return min((float(box[0, axis]) for box in found if box is not None), default=math.inf)
 
+    def held(self, path: str) -> NDArray[np.intp]:
+        """Points of a TetMesh prim that the file says are held, by the primvar ``fixed`` of `UsdWriter`, indices."""
+        primvar = UsdGeom.PrimvarsAPI(self.stage.GetPrimAtPath(path)).GetPrimvar("fixed")
+        given = primvar.Get(Usd.TimeCode.EarliestTime()) if primvar and primvar.HasAuthoredValue() else None
+        return np.flatnonzero(np.asarray(() if given is None else given) == 1)
+
     def parent(self, path: str) -> str:
         """The path of a prim's parent."""
         return str(self.stage.GetPrimAtPath(path).GetPath().GetParentPath())
@@ -172,7 +178,10 @@ def open_scene(path: str | PathLike[str]) -> Scene:
     if not scene.tets and scene.skipped:
         raise InputError(f"{source}: its only TetMesh prims are patterns of a point instancer: {scene.skipped[0]}")
     if not scene.tets:
-        raise InputError(f"{source}: has no TetMesh prim; meshes of other kinds go into `warp-corot simulate`")
+        raise InputError(
+            f"{source}: has no TetMesh prim; meshes of other kinds go into `warp-corot simulate`, "
+            "which writes one of what it makes of them with --draw-tets"
+        )
     return scene
 
 
@@ -216,6 +225,8 @@ def _stop_animation(stage: Any) -> tuple[list[str], list[str]]:
             moves = any(attribute.ValueMightBeTimeVarying() for attribute in attributes)
         if moves and is_physical(prim):
             stopped.append(str(prim.GetPath()))
+        if prim.IsA(UsdGeom.Mesh):
+            attributes += [prim.GetAttribute(name) for name in ("points", "faceVertexCounts", "faceVertexIndices")]
         for attribute in attributes:
             if attribute.GetNumTimeSamples() and attribute.Get() is None:
                 attribute.Set(attribute.Get(Usd.TimeCode.EarliestTime()))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pxr import Usd, UsdGeom
 
 from ..errors import InputError
-from .usd_files import metres_per_unit, open_stage
+from .usd_files import metres_per_unit, open_stage, reads_stage
 
 
 class DrawnMesh(NamedTuple):
@@ -59,11 +59,15 @@ def drawn_meshes(stage: Any, path: Path) -> Iterator[DrawnMesh]:
         )
 
 
-def read_usd_surface(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64], float, str, list[str]]:
+@reads_stage
+def read_usd_surface(
+    path: Path,
+) -> tuple[NDArray[np.float64], NDArray[np.int64], float, str, list[str], list[tuple[str, int]]]:
     """All drawn Mesh prims of a stage as one surface.
 
     Returns:
-        Points [N, 3] in the stage's unit, triangles [T, 3], metres in that unit, the up axis, and notes for the user.
+        Points [N, 3] in the stage's unit, triangles [T, 3], metres in that unit, the up axis, notes for the user,
+        and the names of the prims with how many triangles each has.
 
     Raises:
         InputError: Not a stage, or one that is wrong.
@@ -71,13 +75,16 @@ def read_usd_surface(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]
     stage = open_stage(path)
     metres = metres_per_unit(stage, path)
     points, triangles, notes, offset = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], [], 0
+    objects = []
     for drawn in drawn_meshes(stage, path):
         if drawn.smooth:
             notes.append(f"{drawn.mesh.GetPath()} is a subdivision surface, taken as its control mesh")
         points.append(drawn.points)
         triangles.append(drawn.triangles + offset)
+        objects.append((drawn.mesh.GetPrim().GetName(), len(drawn.triangles)))
         offset += len(drawn.points)
-    return np.concatenate(points), np.concatenate(triangles), metres, str(UsdGeom.GetStageUpAxis(stage)), notes
+    up_axis = str(UsdGeom.GetStageUpAxis(stage))
+    return np.concatenate(points), np.concatenate(triangles), metres, up_axis, notes, objects
 
 
 def _triangles(mesh: UsdGeom.Mesh, path: Path, time: Usd.TimeCode) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -92,7 +99,7 @@ def _triangles(mesh: UsdGeom.Mesh, path: Path, time: Usd.TimeCode) -> tuple[NDAr
         raise InputError(f"{path}: prim {mesh.GetPath()} names point {bad[0]} but has points 0 to {len(points) - 1}")
     holes = np.asarray(_earliest(mesh.GetHoleIndicesAttr(), time), dtype=np.int64)
     kept = np.ones(len(counts), bool)
-    kept[holes[holes < len(counts)]] = False
+    kept[holes[(holes >= 0) & (holes < len(counts))]] = False
     starts = (np.cumsum(counts) - counts)[kept]
     fans = counts[kept] - 2
     first = np.repeat(starts, fans)

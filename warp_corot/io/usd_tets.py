@@ -76,7 +76,7 @@ class TetPrims:
             surface = UsdGeom.Mesh.Define(stage, SURFACE)
             declare_triangles(surface)
             declare_moving(surface, statics.stress)
-            if self._changing and statics.velocities:
+            if statics.velocities:
                 surface.CreateVelocitiesAttr()
         if not self._changing:
             for path, value in {**self._topology(), **self._surface_topology()}.items():
@@ -93,7 +93,7 @@ class TetPrims:
         if self._boundary:
             nodes = self._surface.nodes
             samples |= {f"{SURFACE}.points": Vt.Vec3fArray.FromNumpy(x[nodes]), f"{SURFACE}.extent": extent(x[nodes])}
-            if self._changing and v is not None:
+            if v is not None:
                 samples[f"{SURFACE}.velocities"] = Vt.Vec3fArray.FromNumpy(v[nodes])
         return samples | self._changes() if self._changing else samples
 

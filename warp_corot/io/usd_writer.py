@@ -13,7 +13,9 @@ from pxr import Kind, Sdf, Usd, UsdGeom
 from ..errors import InputError
 from ..mesh.surface import signed_volumes
 from .colors import COLORMAP_NAME, VertexAverage, round_limit
+from .provenance import KEY
 from .skins import Skin
+from .usd_materials import declare_physics
 from .usd_pieces import PieceStore, Samples
 from .usd_prims import ROOT, SURFACE, TETS, Frame, Present, SkinPrim, Statics, floats, skin_paths
 from .usd_tets import TetPrims
@@ -36,11 +38,12 @@ class UsdWriter:
 
     The stage, in metres: ``/SoftBody`` (the default prim) with ``tetrahedra``, a `UsdGeom.TetMesh` of purpose *guide*,
     and ``surface``, a `UsdGeom.Mesh` of the surface nodes only, which viewers draw. Frame i is time code i. Of the
-    TetMesh: ``points``, ``velocities`` [m/s] and ``extent`` a frame; primvars ``rest`` (vertex), ``fixed`` (vertex, 1
-    where held), ``young`` [Pa], ``poisson``, ``density`` [kg/m³] (constant, or uniform: one a tetrahedron) and
-    ``vonMises`` [Pa] (uniform, a frame). Both prims show the stress as ``displayColor``: averages over the tetrahedra
-    around each node, as indices into the 256 colours of `colors.stress_colors`; custom data of ``/SoftBody`` name the
-    map and its range.
+    TetMesh: ``points``, ``velocities`` [m/s] and ``extent`` a frame, as of surfaces; primvars ``rest`` (vertex),
+    ``fixed`` (vertex, 1 where held), ``young`` [Pa], ``poisson``, ``density`` [kg/m³] (constant, or uniform: one a
+    tetrahedron) and ``vonMises`` [Pa] (uniform, a frame). Both prims show the stress as ``displayColor``: averages over
+    the tetrahedra around each node, as indices into the 256 colours of `colors.stress_colors`; custom data of
+    ``/SoftBody`` name the map and its range. ``/SoftBody/physics`` has the physics materials, and with ``gravity`` a
+    physics scene, as `usd_materials.declare_physics` says.
 
     The colour range, unless given, starts at 0 and ends at the 99th percentile of the highest frame so far, rounded
     up to few digits (`colors.round_limit`); on closing, earlier frames are coloured again with the last range, so that
@@ -57,7 +60,7 @@ class UsdWriter:
     too, those that are not given a frame only where the mesh is another one. They hold until then: OpenUSD interpolates
     no integers, and no arrays of two lengths; where lengths agree by chance, a sample just before the frame (by
     `usd_pieces.JUST_BEFORE`) keeps points of different nodes from being interpolated. Between frames points go along
-    their ``velocities``, as the schema has it for meshes that change, which ``surface`` has then, too.
+    their ``velocities``, as the schema has it for meshes that change.
 
     Args:
         path: Where to: .usd or .usdc (binary) or .usda (text). A file there stays until the first frames are safe.
@@ -71,6 +74,10 @@ class UsdWriter:
         skins: Surfaces bound to the mesh's nodes.
         tets: Whether the TetMesh is written; None: if there are no skins.
         changing: Whether the mesh may become another one between frames (`change_mesh`).
+        gravity: [m/s^2], for a physics scene.
+
+    Attributes:
+        about: What the layer's custom data say of the run under "warp_corot"; may become more until it is closed.
 
     Raises:
         InputError: A path that cannot be written to (said now, not after the simulation), or arguments that do not fit.
@@ -90,6 +97,7 @@ class UsdWriter:
         skins: Sequence[Skin] = (),
         tets: bool | None = None,
         changing: bool = False,
+        gravity: Sequence[float] | None = None,
     ):
         up_axis = up_axis or getattr(mesh, "up_axis", "Y")
         if up_axis not in ("X", "Y", "Z"):
@@ -104,6 +112,8 @@ class UsdWriter:
         self._fps = float(fps)
         self._up_axis = up_axis
         self._changing = changing
+        self._gravity = gravity
+        self.about: dict[str, Any] = {}
         self._present = _present(mesh, fixed, material)
         self._tets = TetPrims(self._present, boundary=not skins, changing=changing) if tets or not skins else None
         named = zip(skins, skin_paths(skins), strict=True)
@@ -175,6 +185,7 @@ class UsdWriter:
             self._widen_range(stress)
             self._ranges_used.add(self._stress_range)
             self._store.custom_data["stressColors"] = self._color_legend()
+        self._store.layer_data = {KEY: self.about} if self.about else {}
         frame = Frame(x, v, stress, nodal)
         samples: Samples = {}
         for prim in self._prims:
@@ -261,6 +272,13 @@ class UsdWriter:
         statics = Statics(*self._given)
         for prim in self._prims:
             prim.declare(stage, statics)
+        declare_physics(
+            stage,
+            self._present,
+            with_tets=self._tets is not None,
+            changing=self._changing,
+            gravity=self._gravity,
+        )
         return layer
 
 

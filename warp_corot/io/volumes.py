@@ -1,8 +1,10 @@
-"""Scans: volumes of voxels from NIfTI (nibabel), MetaImage and NRRD (SimpleITK) and VTK image files."""
+"""Scans: volumes of voxels from NIfTI and MGH (nibabel), MetaImage, NRRD and DICOM (SimpleITK) and VTK image files."""
 
 from __future__ import annotations
 
+import importlib.util
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from os import PathLike
@@ -13,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from .quiet import bounded, quietly
 
 #: ITK's directions are left-posterior-superior; turned half round z they are NIfTI's right-anterior-superior.
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -40,41 +43,64 @@ class LoadedVolume:
     notes: list[str] = field(default_factory=list)
 
 
+def is_volume(path: Path) -> bool:
+    """Whether a file is a scan by its extension."""
+    return any(path.name.lower().endswith(suffix) for suffix in READERS)
+
+
 def load_volume(path: str | PathLike[str]) -> LoadedVolume:
-    """Reads a scan: .nii, .nii.gz, .mha, .mhd, .nrrd or .vti.
+    """Reads a scan: .nii, .nii.gz, .mgz, .mgh, .mha, .mhd, .nrrd, .nhdr, .vti, an image in a .vtk, or DICOM: a .dcm
+    with several slices or a folder with a series, of which the largest is taken.
 
     Raises:
         InputError: No such file, another format, not readable, not three-dimensional, more than one number a voxel, or
             the library that reads the format is not installed; one line that says which.
     """
     source = Path(path)
-    if source.is_dir():
-        raise InputError(f"{source}: is a folder, should be a volume file")
     if not source.exists():
         raise InputError(f"{source}: no such file")
     suffix = next((known for known in READERS if source.name.lower().endswith(known)), None)
-    if suffix is None:
+    if suffix is None and not source.is_dir():
         raise InputError(
             f"{source}: unknown format {source.suffix or '(no extension)'}, should be {', '.join(READERS)}"
         )
     try:
-        values, affine, unit, notes = READERS[suffix](source)
+        values, affine, unit, notes = _read_dicom(source) if source.is_dir() else READERS[suffix or ""](source)
     except ImportError:
-        extra = "vti" if suffix == ".vti" else "scans"
-        raise InputError(f'{source}: reading {suffix} files needs: pip install "warp-corot[{extra}]"') from None
+        extra = "mesh" if suffix in (".vti", ".vtk") else "scans"
+        what = f"{suffix} files" if suffix and not source.is_dir() else "DICOM series"
+        raise InputError(f'{source}: reading {what} needs: pip install "warp-corot[{extra}]"') from None
+    name = source.name[: len(source.name) - len(suffix or "")] if not source.is_dir() else source.resolve().name
+    return _checked(values, affine, unit, notes, name, source)
+
+
+def volume_of_image(path: Path, arrays: dict[str, NDArray[Any]]) -> LoadedVolume:
+    """The volume of an image that was found in a VTK file.
+
+    Raises:
+        InputError: See `load_volume`.
+    """
+    values, affine, unit, notes = _of_image(arrays)
+    return _checked(values, affine, unit, notes, path.stem, path)
+
+
+def _checked(
+    values: NDArray[Any], affine: NDArray[np.float64], unit: str | None, notes: list[str], name: str, source: Path
+) -> LoadedVolume:
     while values.ndim > 3 and values.shape[-1] == 1:
         values = values[..., 0]
     if values.ndim != 3:
         raise InputError(f"{source}: has shape {values.shape}, should be a volume [nx, ny, nz] of single numbers")
-    return LoadedVolume(values, affine, unit, source.name[: -len(suffix)], source, notes)
+    return LoadedVolume(values, affine, unit, name, source, notes)
 
 
 def _read_nifti(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
     import nibabel
 
     try:
-        image: Any = nibabel.load(path)
-        values = np.asanyarray(image.dataobj)
+        with quietly(), bounded(path):
+            image: Any = nibabel.load(path)
+            values = np.asanyarray(image.dataobj)
     except Exception as error:
         raise _unreadable(path, "NIfTI", error) from None
     unit = {"meter": "m", "mm": "mm"}.get(image.header.get_xyzt_units()[0])
@@ -91,66 +117,78 @@ def _read_nifti(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | No
     return values, affine, unit, notes
 
 
+def _read_mgh(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
+    import nibabel
+
+    try:
+        image: Any = nibabel.load(path)
+        values = np.asanyarray(image.dataobj)
+    except Exception as error:
+        raise _unreadable(path, path.suffix, error) from None
+    # FreeSurfer's format is in mm by definition.
+    return values, np.array(image.affine, dtype=np.float64), "mm", []
+
+
 def _read_itk(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
     import SimpleITK
 
     loud = SimpleITK.ProcessObject.GetGlobalWarningDisplay()
     SimpleITK.ProcessObject.SetGlobalWarningDisplay(False)
     try:
-        image = SimpleITK.ReadImage(str(path))
+        with quietly(), bounded(path):
+            image = SimpleITK.ReadImage(str(path))
     except Exception as error:
-        raise _unreadable(path, path.suffix, error) from None
+        # ITK names itself and its source files first; what went wrong comes last.
+        raise _unreadable(path, path.suffix, re.split(r"(?:sitk::|ITK )ERROR:", str(error))[-1]) from None
     finally:
         SimpleITK.ProcessObject.SetGlobalWarningDisplay(loud)
+    return _of_itk(path, image, None, [])
+
+
+def _read_dicom(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
+    from .read.dicom import read_series
+
+    if path.is_dir():
+        image, notes = read_series(path)
+        return _of_itk(path, image, "mm", notes)
+    values, affine, _, notes = _read_itk(path)
+    if values.shape[2] < 2:
+        raise InputError(f"{path}: has a single slice; name the folder with the whole series")
+    return values, affine, "mm", notes
+
+
+def _of_itk(
+    path: Path, image: Any, unit: str | None, notes: list[str]
+) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
+    from .read.dicom import array_of
+
     dimensions, numbers = image.GetDimension(), image.GetNumberOfComponentsPerPixel()
     if (dimensions, numbers) != (3, 1):
         raise InputError(f"{path}: has {dimensions} dimensions and {numbers} numbers a voxel, should have 3 and 1")
     affine = np.eye(4)
     affine[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
     affine[:3, 3] = image.GetOrigin()
-    notes = ["positions are turned from left-posterior-superior to right-anterior-superior"]
-    return SimpleITK.GetArrayFromImage(image).transpose(2, 1, 0), RAS_FROM_LPS @ affine, None, notes
+    notes = [*notes, "positions are turned from left-posterior-superior to right-anterior-superior"]
+    return array_of(image), RAS_FROM_LPS @ affine, unit, notes
 
 
 def _read_vti(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkCommonCore import vtkObject
-    from vtkmodules.vtkCommonMisc import vtkErrorCode
-    from vtkmodules.vtkIOXML import vtkXMLImageDataReader
+    from .read.isolated import read_isolated
 
-    loud = vtkObject.GetGlobalWarningDisplay()
-    vtkObject.GlobalWarningDisplayOff()
-    try:
-        reader = vtkXMLImageDataReader()
-        reader.SetFileName(str(path))
-        readable = bool(reader.CanReadFile(str(path)))
-        if readable:
-            reader.Update()
-    finally:
-        vtkObject.SetGlobalWarningDisplay(loud)
-    if not readable or reader.GetErrorCode():
-        raise _unreadable(path, ".vti", vtkErrorCode.GetStringFromErrorCode(reader.GetErrorCode()))
-    grid = reader.GetOutput()
-    extent = np.array(grid.GetExtent()).reshape(3, 2)
-    at_points = grid.GetPointData().GetNumberOfArrays() > 0
-    data = grid.GetPointData() if at_points else grid.GetCellData()
-    array = data.GetScalars()
-    if array is None and data.GetNumberOfArrays() == 1:
-        array = data.GetArray(0)
-    shape = extent[:, 1] - extent[:, 0] + (1 if at_points else 0)
-    if array is None or array.GetNumberOfTuples() != np.prod(shape):
-        names = ", ".join(str(data.GetArrayName(k)) for k in range(data.GetNumberOfArrays())) or "none"
-        raise _unreadable(path, ".vti", f"no whole array of scalars chosen; its arrays: {names}")
-    if array.GetNumberOfComponents() != 1:
-        raise InputError(f"{path}: has {array.GetNumberOfComponents()} numbers a voxel, should be one")
-    # Copies: VTK's memory goes with its reader.
-    values = np.array(vtk_to_numpy(array).reshape(tuple(shape), order="F"), order="F")
-    matrix = grid.GetIndexToPhysicalMatrix()
-    affine = np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
-    first = extent[:, 0] + (0.0 if at_points else 0.5)
-    affine[:3, 3] += affine[:3, :3] @ first
-    notes = [] if at_points else ["the numbers are those of cells: voxel centres lie between the grid's points"]
-    return values, affine, None, notes
+    if importlib.util.find_spec("vtkmodules") is None:
+        raise ImportError("vtkmodules")
+    arrays, reason = read_isolated("warp_corot.io.read.vtk_files", path)
+    if arrays is None or "image" not in arrays:
+        raise _unreadable(path, path.suffix, reason or "it holds a mesh, not an image")
+    return _of_image(arrays)
+
+
+def _of_image(
+    arrays: dict[str, NDArray[Any]],
+) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
+    from .read.filemesh import from_bytes
+
+    return arrays["values"], arrays["affine"], None, from_bytes(arrays["image"])
 
 
 def _unreadable(path: Path, kind: str, why: object) -> InputError:
@@ -162,9 +200,13 @@ def _unreadable(path: Path, kind: str, why: object) -> InputError:
 READERS: dict[str, Callable[[Path], tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]]] = {
     ".nii.gz": _read_nifti,
     ".nii": _read_nifti,
+    ".mgz": _read_mgh,
+    ".mgh": _read_mgh,
     ".mha": _read_itk,
     ".mhd": _read_itk,
     ".nrrd": _read_itk,
+    ".nhdr": _read_itk,
+    ".dcm": _read_dicom,
     ".vti": _read_vti,
 }
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from ..errors import InputError
 from ..indices import checked_indices
 from .bound import BoundPoints, SurfaceMesh
+from .cut import connected
 from .marching import marched
 from .numbering import in_order_of_leaves, live_or_void, renumbered, with_virtual
 from .separating import separated
@@ -18,12 +19,15 @@ from .surface import boundary_faces
 
 if TYPE_CHECKING:
     from .forest import TetForest
+    from .tetmesh import TetMesh
 
 
 def surface(forest: TetForest) -> SurfaceMesh:
     """See `TetForest.surface`."""
     if forest.phi is None:
         return _boundary(forest)
+    if forest.detail is not None:
+        return forest.detail.surface(forest)
     return _on_nodes(forest, marched(forest.lattice_points, _all_cut(forest), forest.phi))
 
 
@@ -31,13 +35,15 @@ def separating_surface(forest: TetForest) -> SurfaceMesh:
     """See `TetForest.separating_surface`."""
     if forest.phi is None or forest.node_labels is None:
         raise InputError("this mesh has no labels; they come from a domain that has")
+    if forest.detail is not None:
+        return forest.detail.separating_surface(forest)
     return _on_nodes(forest, separated(forest.lattice_points, _all_cut(forest), forest.phi, forest.node_labels))
 
 
-def bind(forest: TetForest, points: np.ndarray, triangles: npt.ArrayLike | None) -> BoundPoints:
+def bind(mesh: TetForest | TetMesh, points: np.ndarray, triangles: npt.ArrayLike | None) -> BoundPoints:
     """See `TetForest.bind`."""
-    elements, weights = forest.embed(points)
-    nodes = forest.tets[elements]
+    elements, weights = mesh.embed(points)
+    nodes = mesh.tets[elements]
     rest = np.array(points, dtype=np.float64)
     if triangles is None:
         return BoundPoints(rest, nodes, weights)
@@ -50,14 +56,7 @@ def bind(forest: TetForest, points: np.ndarray, triangles: npt.ArrayLike | None)
 
 def pieces(forest: TetForest) -> np.ndarray:
     """See `TetForest.pieces`."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    tets, count = forest.tets, forest.node_count
-    rows, columns = np.repeat(tets[:, 0], 3), tets[:, 1:].ravel()
-    linked = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(count, count))
-    _, of_node = connected_components(linked, directed=False)
-    piece = of_node[tets[:, 0]]
+    piece = np.unique(connected(forest.tets), return_inverse=True)[1]
     rank = np.argsort(np.argsort(-np.bincount(piece), kind="stable"), kind="stable")
     return rank[piece].astype(np.int32)
 
@@ -86,6 +85,7 @@ def largest_piece(forest: TetForest) -> TetForest:
         node_labels=None if forest.node_labels is None else forest.node_labels[order],
         fill=None if forest.fill is None else forest.fill[kept],
         labels=None if forest.labels is None else forest.labels[kept],
+        detail=None if forest.detail is None else forest.detail.within(forest, kept),
     )
 
 

@@ -13,6 +13,9 @@ import numpy as np
 
 Array = np.ndarray
 
+#: A part that would come apart is given up where it is of so few elements and of less than this share of its piece.
+FEW_ELEMENTS, LITTLE = 4, 1.0e-3
+
 #: Node orders that put the inside nodes first, by which nodes are inside (bit n for node n), and how many those are.
 _INSIDE_FIRST = np.array([sorted(range(4), key=lambda n: 1 - (code >> n & 1)) for code in range(16)])
 _COUNT = np.array([code.bit_count() for code in range(16)])
@@ -125,6 +128,157 @@ def merged(tets: Array, held: Array, small: Array) -> tuple[Array, Array]:
     np.add.at(held, target[given_up], held[given_up])
     held[given_up] = 0.0
     return held, given_up
+
+
+def without_slivers(tets: Array, held: Array, volume: Array, sliver: float) -> tuple[Array, Array]:
+    """Give up elements that hold too little of a body, but none without which a piece of it would come apart.
+
+    Pieces hang together by faces.
+
+    Args:
+        tets: int32 [n, 4].
+        held: Volume that each holds [n].
+        volume: Of each [n].
+        sliver: Those are small that hold less than this share of themselves.
+
+    Returns:
+        Volumes held after that, and which elements are given up.
+    """
+    small = held < sliver * volume
+    if not small.any():
+        return held, small
+    pairs, count = face_pairs(tets), len(tets)
+    piece = _linked(pairs, count)
+    crumbs, held = _crumbs(tets, piece, small, held)
+    if crumbs.any():
+        kept = np.flatnonzero(~crumbs)
+        given_up = crumbs.copy()
+        volumes = np.zeros(count)
+        volumes[kept], given_up[kept] = without_slivers(tets[kept], held[kept], volume[kept], sliver)
+        return volumes, given_up
+    volumes, given_up = merged(tets, held, small)
+    broken, small_parts = _broken(pairs, piece, ~given_up, volumes)
+    if broken.any() or small_parts.any():
+        small |= small_parts
+        small &= ~_ways(pairs, piece, ~given_up & ~small_parts, broken)
+        volumes, given_up = merged(tets, held, small)
+    return volumes, given_up
+
+
+def _broken(pairs: Array, piece: Array, kept: Array, volumes: Array) -> tuple[Array, Array]:
+    """What comes apart without the elements that are not kept.
+
+    Returns:
+        Which elements are of pieces that do, bool [n], and which are of parts of these that are too small to matter.
+    """
+    count = len(piece)
+    part = _linked(pairs[kept[pairs].all(axis=1)], count)
+    sizes, held = np.bincount(part, kept), np.bincount(part, volumes)
+    whole = np.bincount(piece, volumes)
+    of_part = np.zeros(len(sizes), np.int64)
+    of_part[part] = piece
+    minor = (sizes > 0) & (sizes <= FEW_ELEMENTS) & (held < LITTLE * whole[of_part])
+    parts = np.bincount(of_part, (sizes > 0) & ~minor, len(whole))
+    # Where all parts are minor nothing is given up for it.
+    minor &= parts[of_part] > 0
+    return (parts > 1)[piece], minor[part] & kept
+
+
+def _ways(pairs: Array, piece: Array, kept: Array, broken: Array) -> Array:
+    """Elements through which the parts of broken pieces are connected by the shortest ways, bool [n]."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import breadth_first_order
+
+    count = len(piece)
+    found = np.zeros(count, bool)
+    if not broken.any():
+        return found
+    part = _linked(pairs[kept[pairs].all(axis=1)], count)
+    sizes = np.bincount(part, kept)
+    largest = np.zeros(int(piece.max()) + 1, np.int64)
+    by_size = np.argsort(sizes[part], kind="stable")
+    largest[piece[by_size]] = part[by_size]
+    # One node more, tied to the largest part of each piece, makes a single search of all pieces.
+    start = np.flatnonzero(kept & (part == largest[piece]))
+    rows, columns = np.append(pairs[:, 0], np.full(len(start), count)), np.append(pairs[:, 1], start)
+    links = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(count + 1, count + 1)).tocsr()
+    order, before = breadth_first_order(links, count, directed=False)
+    order = order[1:]
+    others = order[kept[order] & broken[order] & (part[order] != largest[piece[order]])]
+    _, first = np.unique(part[others], return_index=True)
+    at = others[first]
+    while len(at):
+        at = before[at]
+        at = np.unique(at[(at != count) & ~found[np.minimum(at, count - 1)]])
+        found[at] = True
+        at = at[part[at] != largest[piece[at]]]
+    return found
+
+
+def _crumbs(tets: Array, piece: Array, small: Array, held: Array) -> tuple[Array, Array]:
+    """Pieces of few elements or small ones alone that hang on to others by nodes, about which they would turn.
+
+    Returns:
+        Which elements are of such, bool [n], and volumes held once these are handed to what they hang on to.
+    """
+    sizes, volumes = np.bincount(piece), np.bincount(piece, held)
+    tiny = (sizes <= FEW_ELEMENTS) & (volumes < LITTLE * volumes.sum()) | (np.bincount(piece, ~small) == 0)
+    suspects = tiny[piece]
+    if not suspects.any() or suspects.all():
+        return np.zeros(len(tets), bool), held
+    anchor = np.full(int(tets.max()) + 1, -1)
+    rest = np.flatnonzero(~suspects)
+    anchor[tets[rest]] = rest[:, None]
+    at = anchor[tets[suspects]].max(axis=1)
+    to = np.full(len(sizes), -1)
+    np.maximum.at(to, piece[suspects], at)
+    crumbs = suspects & (to[piece] >= 0)
+    held = held.copy()
+    np.add.at(held, to[piece[crumbs]], held[crumbs])
+    held[crumbs] = 0.0
+    return crumbs, held
+
+
+def face_pairs(tets: Array) -> Array:
+    """Pairs of elements that share a face [m, 2]."""
+    corners = np.sort(tets, axis=1).astype(np.uint64)
+    count = np.uint64(int(tets.max()) + 1)
+    faces = [corners[:, [i for i in range(4) if i != n]] for n in range(4)]
+    if int(count) ** 3 < 2**64:
+        keys = np.concatenate([(f[:, 0] * count + f[:, 1]) * count + f[:, 2] for f in faces])
+        order = np.argsort(keys, kind="stable")
+        same = keys[order[1:]] == keys[order[:-1]]
+    else:
+        first = np.concatenate([f[:, 0] * count + f[:, 1] for f in faces])
+        last = np.concatenate([f[:, 2] for f in faces])
+        order = np.lexsort((last, first))
+        same = (first[order[1:]] == first[order[:-1]]) & (last[order[1:]] == last[order[:-1]])
+    return np.stack([order[:-1][same], order[1:][same]], axis=1) % len(tets)
+
+
+def _linked(pairs: Array, count: int) -> Array:
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    links = coo_array((np.ones(len(pairs), np.int8), pairs.T), shape=(count, count))
+    return connected_components(links, directed=False)[1]
+
+
+def connected(tets: Array) -> Array:
+    """Which piece each element is in [n]; those that share a node are connected. Nodes below zero connect nothing."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    count = int(tets.max()) + 1
+    first = tets.max(axis=1)
+    tets = np.where(tets < 0, first[:, None], tets)
+    # An element without any node is a piece by itself.
+    alone = first < 0
+    tets[alone] = count + np.arange(np.count_nonzero(alone), dtype=tets.dtype)[:, None]
+    count += int(np.count_nonzero(alone))
+    rows, columns = np.repeat(tets[:, 0], 3), tets[:, 1:].ravel()
+    links = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(count, count))
+    return connected_components(links, directed=False)[1][tets[:, 0]]
 
 
 def _neighbours(tets: Array, small: Array) -> Array:

@@ -7,17 +7,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from ..errors import InputError
 from ..kernels import embedding as kernels
 from .lattice import LATTICE_BITS
+from .locating import FARTHEST, checked_points, nearest_faces
 from .surface import boundary_faces
 from .tree import VOID
 
 if TYPE_CHECKING:
     from .forest import TetForest
-
-#: Points farther away than so many lengths of the mesh count as that far: beyond, float32 tells no distances apart.
-FARTHEST = 1.0e3
 
 #: The walk from one corner of a cube to the opposite one, by the axes in descending order of a point's coordinates.
 _WALKS = np.array([[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]])
@@ -25,12 +22,7 @@ _WALKS = np.array([[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1,
 
 def embed(forest: TetForest, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """See `TetForest.embed`."""
-    points = np.asarray(points, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"points has shape {points.shape}; it must be [n, 3]")
-    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
-    if len(bad):
-        raise InputError(f"point {bad[0]} is {points[bad[0]].tolist()}; its coordinates must be finite")
+    points = checked_points(points)
     elements = _descended(forest, points)
     outside = np.flatnonzero(elements < 0)
     if len(outside):
@@ -80,20 +72,12 @@ def _descended(forest: TetForest, points: np.ndarray) -> np.ndarray:
 def _nearest(forest: TetForest, points: np.ndarray) -> np.ndarray:
     """The element behind the boundary face that is closest to each point, int32 [n]."""
     faces, parents = _boundary_faces(forest)
-    device = wp.get_device("cpu")
     # About the middle of the mesh, as float32 keeps few digits far from zero.
     middle = forest.points.mean(axis=0)
-    mesh = wp.Mesh(
-        wp.array(forest.points - middle, dtype=wp.vec3, device=device),
-        wp.array(faces.ravel(), dtype=wp.int32, device=device),
-    )
     moved = points - middle
     limit = FARTHEST * np.ptp(forest.points, axis=0).max()
     moved *= limit / np.maximum(np.abs(moved).max(axis=1, keepdims=True), limit)
-    given = wp.array(moved, dtype=wp.vec3, device=device)
-    closest = wp.empty(len(points), dtype=wp.int32, device=device)
-    wp.launch(kernels.nearest_faces, len(points), [given, mesh.id, 10.0 * limit], [closest], device=device)
-    return parents[closest.numpy()]
+    return parents[nearest_faces(forest.points - middle, faces, moved, 10.0 * limit)]
 
 
 def _boundary_faces(forest: TetForest) -> tuple[np.ndarray, np.ndarray]:

@@ -10,12 +10,14 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from os import PathLike
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from ..checks import checked_numbers, shown
 from ..errors import InputError
 from ..indices import checked_indices
 from .lattice import LATTICE_BITS, checked_cell_size, checked_cells, checked_level, volume_shares
@@ -27,6 +29,7 @@ from .uniform import halvings, uniform_leaves
 if TYPE_CHECKING:
     from ..domain import Domain
     from .bound import BoundPoints, SurfaceMesh
+    from .detail import Detail
 
 #: A user's function of points [n, 3] -> [n].
 Field = Callable[[np.ndarray], np.ndarray]
@@ -55,6 +58,7 @@ class TetForest:
         labels: Each leaf's label, its place in ``label_names`` plus one, 0 for none, int32 [T]; None: no labels.
         node_labels: As ``labels``, at all lattice points, at points outside that of the nearest part of the body.
         label_names: Names of the labels.
+        detail: The body's surface where it was looked at more closely than the mesh follows it; None: nowhere.
     """
 
     cells: tuple[int, int, int]
@@ -69,6 +73,7 @@ class TetForest:
     labels: np.ndarray | None = None
     node_labels: np.ndarray | None = None
     label_names: tuple[str, ...] = ()
+    detail: Detail | None = None
 
     @classmethod
     def box(
@@ -95,7 +100,7 @@ class TetForest:
         cells, cell_size, level = checked_cells(cells), checked_cell_size(cell_size), checked_level(level, "level")
         if up_axis not in ("X", "Y", "Z"):
             raise InputError(f"up_axis is {up_axis!r}; it must be 'X', 'Y' or 'Z'")
-        corners = np.asarray(origin, dtype=float)
+        corners = checked_numbers(origin, "origin", "[3]")
         if corners.shape != (3,) or not np.isfinite(corners).all():
             raise InputError(f"origin is {origin}; it must be three finite coordinates in metres")
         count = 6 * math.prod(cells) << level
@@ -110,15 +115,17 @@ class TetForest:
     def from_domain(
         cls,
         domain: Domain,
-        cell_size: float,
+        cell_size: float | None = None,
         *,
-        max_level: int = 12,
+        max_level: int | None = None,
         surface_error: float | None = None,
         min_level: int = 0,
         refine_where: Field | None = None,
         field: Field | None = None,
         field_tolerance: float = 0.0,
         target_elements: int | None = None,
+        min_layers: float = 2,
+        detail: int = 0,
         sliver: float = 0.02,
         device: str | wp.Device | None = None,
     ) -> TetForest:
@@ -131,16 +138,21 @@ class TetForest:
 
         Args:
             domain: What to mesh.
-            cell_size: Edge length of a root cube [m].
-            max_level: How often a root is bisected at most, up to 48; three levels halve the edge length.
+            cell_size: Edge length of a root cube [m]; None, with ``target_elements``: as suits these.
+            max_level: How often a root is bisected at most, up to 48; three levels halve the edge length. None: 12, or
+                as suits ``target_elements``.
             surface_error: How far the surface may be from the domain's [m]; None: all of it at ``max_level``.
             min_level: How often everything is bisected at least.
             refine_where: Points [n, 3] [m] -> bool [n]: tetrahedra at such points are bisected to ``max_level``.
             field: Points [n, 3] [m] -> numbers [n]: tetrahedra in which it varies by more than ``field_tolerance`` are
                 bisected.
             field_tolerance: In the field's unit.
-            target_elements: At most so many tetrahedra: the finest mesh within the other limits that has no more. It
-                is found by trying, which takes a few times longer.
+            target_elements: At most so many tetrahedra, and nearly as many: the body is looked at in a finer forest,
+                and the mesh is what follows it best with that number. Tetrahedra hold what they hold of the body there,
+                so parts thinner than one are not lost.
+            min_layers: With ``target_elements``: so many elements through the body's thickness, where there are enough.
+            detail: Without: to how many levels below ``max_level`` the body is looked at, where its surface is not
+                what the tetrahedra there say. 0: what lies between the mesh's nodes is not seen.
             sliver: Tetrahedra of which the body takes less than this share are left out, and what they hold is counted
                 to a neighbour, so that no node is left with next to no stiffness.
             device: Where to work; None: where the domain is.
@@ -148,8 +160,12 @@ class TetForest:
         Raises:
             InputError: An argument is out of its range, the body comes out empty, or there is no mesh so coarse.
         """
+        from ..domain import Domain
         from .from_domain import mesh_domain
 
+        if not isinstance(domain, Domain):
+            cure = f"Domain.from_surface({str(domain)!r}) makes one" if isinstance(domain, str | PathLike) else ""
+            raise InputError(f"domain is {shown(domain)}; it must be a Domain{cure and ': ' + cure}")
         return mesh_domain(
             domain,
             cell_size,
@@ -160,6 +176,8 @@ class TetForest:
             field,
             field_tolerance,
             target_elements,
+            min_layers,
+            detail,
             sliver,
             device,
         )

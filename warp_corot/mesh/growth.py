@@ -91,6 +91,11 @@ class Growth:
         """What kernels need to read the midpoints of slots."""
         return [slots, self._values]
 
+    @property
+    def table(self) -> list[wp.array]:
+        """From edges to their midpoints: keys and values of the hash table."""
+        return [self._keys, self._values]
+
     def hanging(self, first_new: int = 0) -> wp.array:
         """Leaves that must be bisected: wished, or with an active midpoint on an edge; ascending.
 

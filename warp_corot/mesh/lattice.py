@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from ..checks import checked_number
 from ..errors import InputError
 
 #: A root cube has 2**LATTICE_BITS lattice intervals a side, so levels may go to 3 * LATTICE_BITS.
@@ -55,6 +56,6 @@ def checked_cell_size(cell_size: float) -> float:
     Raises:
         InputError: It is not positive and finite.
     """
-    if not (np.isfinite(cell_size) and cell_size > 0):
+    if not 0 < checked_number(cell_size, "cell_size", "m") < np.inf:
         raise InputError(f"cell_size is {cell_size}; it must be a positive length in metres")
     return float(cell_size)

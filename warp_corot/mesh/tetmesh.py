@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from os import PathLike
+from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
+from ..checks import checked_number, checked_numbers
 from ..errors import InputError
 from .surface import signed_volumes
+
+if TYPE_CHECKING:
+    from .bound import BoundPoints
 
 #: A tetrahedron of less volume than this times its longest edge cubed cannot be told from a flat one in float32.
 FLAT = 1e-7
@@ -25,21 +32,37 @@ class TetMesh:
         tets: Node indices, [T, 4].
         up_axis: "X", "Y" or "Z": which axis points up where results are drawn.
         scale: Factor by which the points are multiplied.
+        labels: Each tetrahedron's region, its place in ``label_names`` plus one, 0 for none, [T]; None: no regions.
+        label_names: Names of the regions.
 
     Attributes:
         points: float64 [N, 3] [m].
         tets: int32 [T, 4], positively oriented.
         repaired: Number of tetrahedra that were turned round.
         up_axis: As given.
+        labels: int32 [T] or None, as given.
+        label_names: As given.
 
     Raises:
         InputError: Wrong shapes, non-finite coordinates, indices out of range, or a degenerate tetrahedron; the message
             names the first one.
     """
 
-    def __init__(self, points: np.ndarray, tets: np.ndarray, *, up_axis: str = "Y", scale: float = 1.0):
-        points = np.array(points, dtype=np.float64)
-        given = np.asarray(tets)
+    def __init__(
+        self,
+        points: np.ndarray,
+        tets: np.ndarray,
+        *,
+        up_axis: str = "Y",
+        scale: float = 1.0,
+        labels: np.ndarray | None = None,
+        label_names: Sequence[str] = (),
+    ):
+        points = checked_numbers(points, "points", "[N, 3]; TetMesh.load reads a file").copy()
+        try:
+            given = np.asarray(tets)
+        except ValueError:
+            raise InputError("tets has rows of several lengths; it must be [T, 4]") from None
         if points.ndim != 2 or points.shape[1] != 3 or not len(points):
             raise InputError(f"points has shape {points.shape}; it must be [N, 3] with at least one node")
         if given.ndim != 2 or given.shape[1] != 4 or not len(given):
@@ -48,7 +71,7 @@ class TetMesh:
             raise InputError(f"tets has dtype {given.dtype}; node indices are whole numbers")
         if up_axis not in ("X", "Y", "Z"):
             raise InputError(f"up_axis is {up_axis!r}; it must be 'X', 'Y' or 'Z'")
-        if not (np.isfinite(scale) and scale > 0):
+        if not 0 < checked_number(scale, "scale") < np.inf:
             raise InputError(f"scale is {scale}; it must be a positive number")
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
         if len(bad):
@@ -69,28 +92,108 @@ class TetMesh:
         turned = volumes < 0
         self.tets[turned] = self.tets[turned][:, [0, 1, 3, 2]]
         self.repaired = int(turned.sum())
+        self.label_names = tuple(label_names)
+        self.labels = None if labels is None else _checked_labels(labels, len(self.tets), len(self.label_names))
 
     @classmethod
-    def load(cls, path: str | PathLike[str], scale: float = 1.0) -> TetMesh:
-        """Read tetrahedra from a USD file (TetMesh, or Mesh with ``tetraIndices``), from any format that meshio reads,
-        or from ``warp:bear``.
+    def load(
+        cls,
+        path: str | PathLike[str],
+        scale: float = 1.0,
+        *,
+        unit: str | float | None = None,
+        up_axis: str | None = None,
+        regions: str | None = None,
+    ) -> TetMesh:
+        """Read the cells with volume of a file: USD (TetMesh, or Mesh with ``tetraIndices``), VTK, Gmsh, Abaqus, Medit,
+        TetGen, NetGen and whatever else meshio reads; or of ``warp:bear``.
+
+        Hexahedra, wedges and pyramids become tetrahedra that fit one another; cells of higher order are taken by their
+        corners. Physical groups, sets and cell data become ``labels``.
 
         Args:
             path: File, or the name of an asset.
-            scale: Factor by which the points are multiplied, after the file's own unit has been turned into metres.
+            scale: Factor by which the points are multiplied, after the unit has been turned into metres.
+            unit: Of the coordinates, any length such as "mm" or "3.2cm", or metres as a number. None: what the file
+                says, metres if it says nothing.
+            up_axis: "X", "Y" or "Z". None: what the file says, Z if it says nothing.
+            regions: Name of the file's array that numbers regions; None: the likeliest.
 
         Raises:
-            InputError: No such file, unknown format, no tetrahedra in it, or a mesh that cannot be simulated.
+            InputError: No such file, unknown format, no such cells in it, or a mesh that cannot be simulated.
         """
         from ..io.formats import load_tets
 
-        loaded = load_tets(path, scale=scale)
-        return cls(loaded.points, loaded.tets, up_axis=loaded.up_axis)
+        loaded = load_tets(path, scale=scale, unit=unit, regions=regions)
+        found = loaded.regions
+        return cls(
+            loaded.points,
+            loaded.tets,
+            up_axis=up_axis or loaded.up_axis,
+            labels=None if found is None else found.of_tet,
+            label_names=() if found is None else found.names,
+        )
 
     @cached_property
     def volumes(self) -> np.ndarray:
         """Rest volume of each tetrahedron [m^3], float64 [T]."""
         return signed_volumes(self.points, self.tets)
+
+    def elements_of(self, label: str) -> np.ndarray:
+        """Tetrahedra of a region, bool [T].
+
+        Raises:
+            InputError: No such region.
+        """
+        if label not in self.label_names or self.labels is None:
+            raise InputError(f"there is no label {label!r}; there are: {', '.join(self.label_names) or 'none'}")
+        return np.equal(self.labels, self.label_names.index(label) + 1)
+
+    def nodes_of(self, label: str) -> np.ndarray:
+        """Nodes of the tetrahedra of a region, bool [N]; nodes on a border belong to both sides.
+
+        Raises:
+            InputError: No such region.
+        """
+        found = np.zeros(len(self.points), bool)
+        found[self.tets[self.elements_of(label)]] = True
+        return found
+
+    def embed(self, points: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """The tetrahedron that holds each point, or the one behind the nearest face, and the point's place in it.
+
+        Args:
+            points: [n, 3] [m].
+
+        Returns:
+            Tetrahedra int32 [n], and barycentric weights of their nodes float64 [n, 4], some negative where the point
+            lies outside.
+
+        Raises:
+            InputError: Not [n, 3], or not finite.
+        """
+        from .locating import embed_in_tets
+
+        return embed_in_tets(self.points, self.tets, np.asarray(points))
+
+    def bind(self, points: npt.ArrayLike, triangles: npt.ArrayLike | None = None) -> BoundPoints:
+        """Points, or with triangles [F, 3] a surface, of the user's own that go along with the mesh.
+
+        Raises:
+            InputError: As `embed`, or triangles of points that are not there.
+        """
+        from .bodies import bind
+
+        return bind(self, np.asarray(points), triangles)
+
+
+def _checked_labels(given: np.ndarray, count: int, names: int) -> np.ndarray:
+    labels = np.asarray(given)
+    if labels.shape != (count,) or labels.dtype.kind not in "iu":
+        raise InputError(f"labels have shape {labels.shape} and dtype {labels.dtype}; they must be integers [{count}]")
+    if len(labels) and not 0 <= labels.min() <= labels.max() <= names:
+        raise InputError(f"labels run from {labels.min()} to {labels.max()}; there are {names} label_names")
+    return labels.astype(np.int32)
 
 
 def _longest_edges(points: np.ndarray, tets: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from .stage_material import StageOptions
     from .stage_steps import StageSimulation
     from .state import register_custom_attributes
+    from .viewing import open_viewer
 
 __all__ = [
     "Added",
@@ -23,6 +24,7 @@ __all__ = [
     "StageSimulation",
     "add_forest",
     "add_mesh",
+    "open_viewer",
     "register_custom_attributes",
 ]
 
@@ -33,6 +35,7 @@ _MODULES = {
     "StageSimulation": ".stage_steps",
     "add_forest": ".scene",
     "add_mesh": ".scene",
+    "open_viewer": ".viewing",
     "register_custom_attributes": ".state",
 }
 

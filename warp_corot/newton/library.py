@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+
 from ..errors import InputError
 
 
@@ -18,4 +20,11 @@ except ImportError as error:
         f'warp_corot.newton needs Newton 1.8 or newer: pip install "warp-corot[newton]" ({error})'
     ) from None
 
-__all__ = ["CouplingInterface", "MissingNewton", "ModelView", "SolverBase", "SolverSemiImplicit", "newton"]
+__all__ = ["CouplingInterface", "MissingNewton", "ModelView", "SolverBase", "SolverSemiImplicit", "examples", "newton"]
+
+
+def examples() -> ModuleType:
+    """What Newton's examples share, which needs more packages than Newton; an ImportError where they are not there."""
+    import newton.examples
+
+    return newton.examples

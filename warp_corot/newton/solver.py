@@ -9,6 +9,7 @@ from typing import Any
 
 import warp as wp
 
+from ..checks import refuse_tape
 from ..errors import InputError
 from .contact import Contacts
 from .following import Following
@@ -184,6 +185,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
                 more contacts than the buffer holds, contacts of edges and faces; as ``check``.
             UnstableError: On the CPU, unless capturing: the step's result is not finite.
         """
+        refuse_tape()
         self.validate_observables(observables, contacts)
         self._check_arguments(state_in, state_out, control, contacts)
         following = self._following

@@ -192,6 +192,10 @@ def _hold(made: StageModel, builder: newton.ModelBuilder, found: dict[str, Any],
         if not chosen:
             made.notes.append(f"no point is held by {options.fix!r}; coordinates are world ones in metres (--fix)")
         held |= chosen
+    else:
+        for body in made.soft:
+            said = made.scene.held(body.prim.path)
+            held |= set((said[said < len(body.prim.points)] + body.particles.start).tolist())
     for particle in held:
         builder.particle_mass[particle] = 0.0
     if held:

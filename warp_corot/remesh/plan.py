@@ -118,6 +118,12 @@ class DevicePlan:
         return True
 
     @property
+    def leaf_count(self) -> wp.array:
+        """How many leaves there are, int32 [1] on the device."""
+        row = self._plan.classes + 2
+        return self._plan.counts[row : row + 1]
+
+    @property
     def arrays(self) -> Any:
         """``kernels.remesh_plan.Plan``, for launches that derive more from it."""
         return self._plan

@@ -11,15 +11,19 @@ import numpy.typing as npt
 import warp as wp
 
 from ..kernels import balance as kernels
-from .integrator import StepContext
+from ..kernels.pace import Pace
+from .integrator import NEVER, StepContext
+from .mapped import Mapped
 
 if TYPE_CHECKING:
     from ..body import SoftBody
     from ..elasticity import ForceField
+    from .copies import Copies
 
-#: Threads that add up, at most, and those of one world.
-THREADS = 4096
-WORLD_THREADS = 1024
+#: Nodes that a thread adds up, and warps of threads of all worlds at most; a CPU has one thread a world.
+NODES = 4
+WARPS = 2048
+WARP = 32
 
 Floats = npt.NDArray[np.float64]
 
@@ -34,7 +38,7 @@ class Energies:
         exact: With symplectic Euler's own kinetic energy, velocities behind times those ahead, and the elastic energy:
             what a linear body keeps to rounding [J]; means nothing if elastic energies were not asked for.
         untimely: What the kinetic energy at the time of the displacements has more than that of ``exact`` [J].
-        loads: Work of loads since the displacements that were kept [J].
+        loads: Work of loads since the last good state [J].
         supports: Work of all moving supports since the beginning [J].
         supports_absolute: The sum of its absolute values [J].
         reach: The largest displacement [m].
@@ -51,55 +55,117 @@ class Energies:
     reach: Floats
 
 
+@dataclass(frozen=True)
+class Report:
+    """What the device has found at the end of a run.
+
+    Attributes:
+        energies: Of the state then.
+        has_changed: Whether the state was another at the beginning than at the end of the run before.
+        bad_step: The first step after which something was not finite, NEVER if there was none.
+    """
+
+    energies: Energies
+    has_changed: bool
+    bad_step: int
+
+
 class Balance:
-    """Adds up energies, world by world.
+    """Adds up energies, world by world, and reports them with the clock.
 
     Args:
         bodies, fields: The simulation's.
         context: Its pace, gravity and what supports put in.
+        copies: Of its state.
     """
 
-    def __init__(self, bodies: Sequence[SoftBody], fields: Sequence[ForceField], context: StepContext):
-        self.bodies, self.fields, self.context = tuple(bodies), tuple(fields), context
+    def __init__(self, bodies: Sequence[SoftBody], fields: Sequence[ForceField], context: StepContext, copies: Copies):
+        self.bodies, self.fields, self.context, self._copies = tuple(bodies), tuple(fields), context, copies
         self.worlds, self.device = bodies[0].worlds, bodies[0].device
-        parts = 1 if self.device.is_cpu else max(min(THREADS // self.worlds, WORLD_THREADS), 1)
-        self._sums = wp.zeros((self.worlds, parts, kernels.COLUMNS), dtype=wp.float64, device=self.device)
+        self._lanes = 1 if self.device.is_cpu else WARP
+        wanted = -(-max(body.launch_nodes for body in bodies) // (self.worlds * NODES * WARP))
+        warps = 1 if self.device.is_cpu else max(min(wanted, WARPS // self.worlds), 1)
+        self._threads = warps * self._lanes
+        self._sums = wp.zeros((self.worlds, warps, kernels.COLUMNS), dtype=wp.float64, device=self.device)
         self._energies: list[wp.array] = [wp.empty(0, dtype=wp.float64, device=self.device) for _ in bodies]
+        self._field_states: list[dict[str, wp.array]] = [{} for _ in bodies]
+        self._mapped = Mapped(self.worlds * kernels.COLUMNS + kernels.NUMBERS, self.device)
+        numbers = self.worlds * kernels.COLUMNS
+        self._totals = self._mapped.array[:numbers].reshape((self.worlds, kernels.COLUMNS))
+        self._numbers = self._mapped.array[numbers:]
 
     @property
     def is_closed(self) -> bool:
         """Whether nothing but gravity, loads and supports puts work in: active stress does."""
         return not any(body.has_activation for body in self.bodies)
 
-    def find(self, before: Sequence[wp.array], *, whole: bool) -> Energies:
-        """The energies of the present state; waits for the device.
+    def prepare(self) -> None:
+        """Make room for the energies of the present elements; not while launches are recorded."""
+        for k, field in enumerate(self.fields):
+            if len(self._energies[k]) != field.energy_count:
+                self._energies[k] = wp.empty(field.energy_count, dtype=wp.float64, device=self.device)
+            kept = self._field_states[k]
+            if {name: len(array) for name, array in field.state.items()} != {name: len(a) for name, a in kept.items()}:
+                self._field_states[k] = {name: wp.empty_like(array) for name, array in field.state.items()}
+
+    def launch(
+        self,
+        *,
+        whole: bool,
+        keeps: bool = False,
+        at: Sequence[tuple[wp.array, wp.array]] | None = None,
+        seconds: Sequence[float] | None = None,
+    ) -> None:
+        """Launch sums and their report; may be recorded.
 
         Args:
-            before: Displacements since which the work of loads counts, of each body.
             whole: Whether elastic energies are wanted, which take as long as some steps.
+            keeps: Whether the state is kept in passing.
+            at: Displacements and velocities of each body in place of the present ones.
+            seconds: Of the clock, in place of the present ones [3].
         """
-        self._sums.zero_()
+        context, copies = self.context, self._copies
+        pace = context.pace.arrays
+        if seconds is not None:
+            pace = Pace()
+            pace.counts = context.pace.arrays.counts
+            pace.seconds = wp.array(np.array(seconds), dtype=wp.float64, device=self.device)
         for k, (body, field) in enumerate(zip(self.bodies, self.fields, strict=True)):
+            u, v = (body.node_displacements, body.node_velocities) if at is None else at[k]
             if whole:
-                self._add_elastic(k, body, field)
-            self._add_nodal(body, before[k])
+                self._add_elastic(k, body, field, u)
+            self._add_nodal(body, u, v, pace, (copies.u[k], copies.v[k]), keeps)
             if whole:
                 body.node_forces.zero_()
-        sums = self._sums.numpy()
-        total, reach = sums.sum(axis=1), sums[:, :, kernels.REACH].max(axis=1)
-        supports = self.context.support_work.numpy()
+        inputs = [self._lanes, context.pace.orders, context.support_work, context.bad_step, copies.changed]
+        inputs += [context.pace.control, context.pace.arrays, self._sums]
+        dim = (self.worlds, kernels.COLUMNS, self._lanes)
+        wp.launch(kernels.report, dim, inputs, [self._totals, self._numbers], device=self.device)
+
+    def wait(self) -> Report:
+        """What was reported; waits for the device, once."""
+        wp.synchronize_stream(self.device)
+        numbers = self._mapped.values[self.worlds * kernels.COLUMNS :]
+        total = self._mapped.values[: self.worlds * kernels.COLUMNS].reshape(self.worlds, kernels.COLUMNS).copy()
+        self.context.pace.saw(numbers)
         kinetic, ahead, elastic = (total[:, int(c)] for c in (kernels.KINETIC, kernels.AHEAD, kernels.ELASTIC))
-        done = np.full(self.worlds, supports[0] + total[:, kernels.SUPPORTS].sum())
-        return Energies(
+        done = np.full(self.worlds, numbers[int(kernels.WORK)] + total[:, int(kernels.SUPPORTS)].sum())
+        energies = Energies(
             kinetic=kinetic,
-            gravitational=total[:, kernels.GRAVITATIONAL],
+            gravitational=total[:, int(kernels.GRAVITATIONAL)],
             elastic=elastic,
             exact=kinetic + ahead + elastic,
-            untimely=total[:, kernels.UNTIMELY],
-            loads=total[:, kernels.LOADS],
+            untimely=total[:, int(kernels.UNTIMELY)],
+            loads=total[:, int(kernels.LOADS)],
             supports=done,
-            supports_absolute=float(supports[1]),
-            reach=reach,
+            supports_absolute=float(numbers[int(kernels.WORK_ABSOLUTE)]),
+            reach=total[:, int(kernels.REACH)],
+        )
+        bad_step = numbers[int(kernels.BAD_STEP)]
+        return Report(
+            energies=energies,
+            has_changed=bool(numbers[int(kernels.CHANGED)]),
+            bad_step=NEVER if bad_step >= float(NEVER) else int(bad_step),
         )
 
     def rounding(self) -> Floats:
@@ -110,32 +176,45 @@ class Balance:
             found += 1e-7 * stiffness * float(np.sum(body.mesh.volumes))
         return found
 
-    def _add_elastic(self, k: int, body: SoftBody, field: ForceField) -> None:
+    def _add_elastic(self, k: int, body: SoftBody, field: ForceField, u: wp.array) -> None:
         """Strain energies to the sums, and elastic forces to ``node_forces``."""
-        count = field.energy_count
-        if len(self._energies[k]) != count:
-            self._energies[k] = wp.empty(count, dtype=wp.float64, device=self.device)
-        self._energies[k].zero_()
-        with field.state_kept():
-            field.write_energies(body.node_displacements, self._energies[k])
-            field.add_forces(body.node_displacements, body.node_forces)
-        inputs = [self._energies[k], count // self.worlds]
-        wp.launch(kernels.sum_elements, self._sums.shape[:2], inputs, [self._sums], device=self.device)
+        energies, kept = self._energies[k], self._field_states[k]
+        energies.zero_()
+        for name, array in field.state.items():
+            wp.copy(kept[name], array)
+        field.write_energies(u, energies)
+        field.add_forces(u, body.node_forces)
+        for name, array in field.state.items():
+            wp.copy(array, kept[name])
+        inputs = [energies, len(energies) // self.worlds, self._threads, self._lanes]
+        wp.launch(kernels.sum_elements, (self.worlds, self._threads), inputs, [self._sums], device=self.device)
 
-    def _add_nodal(self, body: SoftBody, before: wp.array) -> None:
+    def _add_nodal(
+        self,
+        body: SoftBody,
+        u: wp.array,
+        v: wp.array,
+        pace: Pace,
+        copies: tuple[wp.array, wp.array],
+        keeps: bool,
+    ) -> None:
         context = self.context
         inputs = [
-            context.pace.arrays,
+            pace,
             context.gravity,
             body.launch_nodes // self.worlds,
+            self._threads,
+            self._lanes,
             body.node_mass,
             body.node_inverse_mass,
             int(body.has_loads),
             body.node_loads,
             body.node_forces,
-            body.node_displacements,
-            before,
-            body.node_velocities,
+            u,
+            v,
+            context.pace.orders,
+            int(keeps),
         ]
         kernel = kernels.SUM_NODES[body.node_loads.dtype]
-        wp.launch(kernel, self._sums.shape[:2], inputs, [self._sums], device=self.device)
+        outputs = [*copies, self._sums]
+        wp.launch(kernel, (self.worlds, self._threads), inputs, outputs, device=self.device)

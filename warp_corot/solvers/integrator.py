@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -39,9 +40,8 @@ class StepContext:
     @classmethod
     def of(cls, pace: Pace, gravity: wp.vec3) -> StepContext:
         """A new one, in which nothing has happened."""
-        work = wp.zeros(2, dtype=wp.float64, device=pace.device)
         bad_step = wp.array([NEVER], dtype=wp.int64, device=pace.device)
-        return cls(pace, gravity, work, bad_step)
+        return cls(pace, gravity, pace.support_work, bad_step)
 
 
 class Stepper(ABC):
@@ -73,6 +73,11 @@ class Integrator(ABC):
     """The description of a time integrator: a frozen dataclass of plain values with a step ``dt`` [s] or None."""
 
     dt: float | None
+
+    def stable_step(self, frequency: float) -> float:
+        """The largest stable step [s] of a body whose largest angular frequency at rest is this [rad/s]; infinite for
+        zero."""
+        return 2.0 / frequency if frequency > 0.0 else math.inf
 
     @abstractmethod
     def bind(self, body: SoftBody, field: ForceField, context: StepContext) -> Stepper:

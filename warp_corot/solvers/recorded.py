@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import warp as wp
 
 from ..subnormals import FlushedSubnormals
+from .guard import Guard
 from .integrator import Stepper
 from .pace import Pace
-from .safe_step import BLOCK_INTERVAL, INTERVAL, SafeStep
+from .safe_step import (
+    BLOCK_INTERVAL,
+    CALM_CHECKS,
+    FIRST_INTERVAL,
+    INTERVAL,
+    LIVELY,
+    LIVELY_BLOCK_INTERVAL,
+    LIVELY_INTERVAL,
+    UNKNOWN,
+    SafeStep,
+)
 
 if TYPE_CHECKING:
     from ..body import SoftBody
@@ -18,6 +30,53 @@ if TYPE_CHECKING:
 #: Steps recorded in one graph; more where a launch is many steps.
 GRAPH_STEPS = 64
 BLOCK_STEPS = 1024
+#: Steps up to which what is asked for twice is recorded as it is: recording takes longer than many replays.
+SHORT = 8
+#: Graphs that are kept at most.
+MOST_GRAPHS = 256
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Steps without a measurement in between, and what is launched before and after them, in this order.
+
+    Attributes:
+        begins: Whether a run begins, for the guard.
+        adopts: Whether positions are taken over without one.
+        resumes: Whether the step that the state allows is taken again, after shorter ones at the end of a run.
+        measured: If it is measured how long a step may be: for how many steps. Else zero.
+        fits: Whether the steps that are left of the run end in time.
+        count: How many steps.
+        publishes: Whether positions are published.
+        ends: Whether a run ends, for the guard.
+        whole: Whether elastic energies are found then.
+    """
+
+    count: int
+    begins: bool = False
+    adopts: bool = False
+    resumes: bool = False
+    measured: int = 0
+    fits: bool = False
+    publishes: bool = False
+    ends: bool = False
+    whole: bool = False
+
+    def placed(self, *, begins: bool, ends: bool, whole: bool) -> Segment:
+        """The same as the first one of a run, or the last."""
+        return replace(self, begins=begins, publishes=ends, ends=ends, whole=whole)
+
+    def pieces(self, longest: int) -> Iterator[Segment]:
+        """The same in pieces of a power of two steps, at most ``longest``, of which there are few different ones."""
+        left, piece = self.count, replace(self, publishes=False, ends=False, whole=False)
+        while True:
+            size = min(1 << max(left.bit_length() - 1, 0), longest) if left else 0
+            left -= size
+            if not left:
+                break
+            yield replace(piece, count=size)
+            piece = Segment(0)
+        yield replace(piece, count=size, publishes=self.publishes, ends=self.ends, whole=self.whole)
 
 
 class RecordedSteps:
@@ -27,20 +86,28 @@ class RecordedSteps:
         bodies: On one device.
         steppers: One for each body.
         pace: The clock.
+        guard: Looks at where runs begin and end.
         safe_step: What measures how long a step may be, if none was given.
     """
 
     def __init__(
-        self, bodies: Sequence[SoftBody], steppers: Sequence[Stepper], pace: Pace, safe_step: SafeStep | None = None
+        self,
+        bodies: Sequence[SoftBody],
+        steppers: Sequence[Stepper],
+        pace: Pace,
+        guard: Guard,
+        safe_step: SafeStep | None = None,
     ):
         self._bodies = bodies
         self._steppers = steppers
         self._pace = pace
+        self._guard = guard
         self._safe_step = safe_step
         self._flushed = FlushedSubnormals(pace.device)
-        self._graphs: dict[tuple[int, bool, int], wp.Graph] = {}
-        #: Whether the bodies have hardly been strained for a while, so that their stiffness needs a look half as often.
-        self.is_calm = False
+        self._graphs: dict[Segment, wp.Graph] = {}
+        self._asked: set[Segment] = set()
+        #: How calm the bodies are, as a ``Schedule`` has it.
+        self.calm = UNKNOWN
         self._revisions: tuple[int, ...] = ()
 
     @property
@@ -51,68 +118,77 @@ class RecordedSteps:
     @property
     def interval(self) -> int:
         """Steps from one measurement to the next."""
-        return (BLOCK_INTERVAL if self.in_blocks else INTERVAL) * (2 if self.is_calm else 1)
+        if self.calm == UNKNOWN:
+            return FIRST_INTERVAL
+        if self.calm == LIVELY:
+            return LIVELY_BLOCK_INTERVAL if self.in_blocks else LIVELY_INTERVAL
+        return (BLOCK_INTERVAL if self.in_blocks else INTERVAL) * (2 if self.calm == CALM_CHECKS else 1)
 
-    def launch(self, count: int, *, whole: bool = False, measured: bool = False) -> None:
-        """Launch steps.
-
-        Args:
-            count: How many; none with ``measured`` measures only.
-            whole: Whether positions are taken over before and published after.
-            measured: Whether it is measured first how long these steps may be.
-        """
-        with self._flushed():
-            self._launch(count, whole, measured)
-
-    def _launch(self, count: int, whole: bool, measured: bool) -> None:
-        if whole:
+    def launch(self, segment: Segment) -> None:
+        """Launch a segment; somebody else may be recording."""
+        if segment.begins:
+            self._guard.launch_begin()
+        if segment.adopts:
             self.adopt_positions()
-        if measured:
-            assert self._safe_step is not None
-            for stepper in self._steppers:
-                stepper.forces()
-            self._safe_step.launch(self.interval)
-        if count:
-            for stepper in self._steppers:
-                stepper.steps(count, forces_known=measured)
-            self._pace.advance(count)
-        else:
-            for body in self._bodies:
-                body.node_forces.zero_()
-        if whole:
-            self.publish_positions()
-
-    def replay(self, count: int, *, whole: bool = False, measured: bool = False) -> None:
-        """Replay recorded steps, recording them first where they are new or the bodies' launches have changed."""
-        revisions = tuple(body.revision for body in self._bodies)
-        if revisions != self._revisions:
-            self._graphs.clear()
-            self._revisions = revisions
-            for stepper in self._steppers:
-                stepper.prepare()
-        key = (count, whole, self.interval if measured else 0)
-        if key not in self._graphs:
-            with wp.ScopedCapture(device=self._pace.device) as capture:
-                self.launch(count, whole=whole, measured=measured)
-            self._graphs[key] = capture.graph
-        wp.capture_launch(self._graphs[key])
-
-    def retime(self) -> None:
-        """Take the step that the state allows now, also where it is another at once."""
-        assert self._safe_step is not None
         with self._flushed():
+            self._launch_steps(segment)
+        if segment.publishes:
+            self.publish_positions()
+        if segment.ends:
+            self._guard.launch_end(whole=segment.whole)
+
+    def _launch_steps(self, segment: Segment) -> None:
+        safe_step = self._safe_step
+        if segment.resumes:
+            assert safe_step is not None
+            safe_step.launch_resumption()
+        if segment.measured:
+            assert safe_step is not None
             for stepper in self._steppers:
                 stepper.forces()
-            self._safe_step.retime()
-        for body in self._bodies:
-            body.node_forces.zero_()
+            safe_step.launch(segment.measured)
+        if segment.fits:
+            assert safe_step is not None
+            safe_step.launch_fit()
+        for stepper in self._steppers:
+            stepper.steps(segment.count, forces_known=segment.measured > 0)
+        self._pace.advance(segment.count)
+
+    def replay(self, segment: Segment) -> None:
+        """Replay a segment: one recording if it is short and was asked for before, else recordings of its pieces."""
+        self._follow_bodies()
+        if segment in self._graphs or segment in self._asked:
+            self._replay_recording(segment)
+            return
+        if segment.count <= SHORT:
+            self._asked.add(segment)
+        for piece in segment.pieces(BLOCK_STEPS if self.in_blocks else GRAPH_STEPS):
+            self._replay_recording(piece)
 
     def replay_many(self, count: int) -> None:
-        """Replay any number of steps as few recordings."""
-        for size in (BLOCK_STEPS, GRAPH_STEPS, 1) if self.in_blocks else (GRAPH_STEPS, 1):
-            for _ in range(count // size):
-                self.replay(size)
-            count %= size
+        """Replay any number of steps, and nothing else."""
+        self.replay(Segment(count))
+
+    def _follow_bodies(self) -> None:
+        """Forget recordings where the bodies' launches have changed."""
+        revisions = (self._guard.revision, *(body.revision for body in self._bodies))
+        if revisions != self._revisions:
+            self._graphs.clear()
+            self._asked.clear()
+            for stepper in self._steppers:
+                stepper.prepare()
+            self._guard.prepare()
+            self._revisions = (self._guard.revision, *revisions[1:])
+
+    def _replay_recording(self, segment: Segment) -> None:
+        if segment not in self._graphs:
+            if len(self._graphs) >= MOST_GRAPHS:
+                self._graphs.clear()
+            with wp.ScopedCapture(device=self._pace.device) as capture:
+                self.launch(segment)
+            self._graphs[segment] = capture.graph
+        wp.capture_launch(self._graphs[segment])
+        self._pace.forget()
 
     def adopt_positions(self) -> None:
         """Take over what somebody wrote to positions since they were published."""

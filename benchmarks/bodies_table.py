@@ -1,0 +1,131 @@
+"""The table of ``bodies.py``: a line a body, and what all of them come to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+LEGEND = """\
+Elements are made and, in brackets, a share of those asked for; volume is the mesh's over the input's. Distances are
+mean and 95 % of the mesh's surface from the input's and back, in thousandths of the body's longest side (‰). Pieces
+are the mesh's of the input's; labels those that no element has. "angle" is the smallest dihedral angle; s the time from
+the file to mesh and surface, warm. "said" is whether the command warns: **no** where it should (volume off by more than
+3 %, a piece or label lost or broken off) and does not. "fall" is the largest displacement in 2 s by defaults over the
+height."""
+
+GOOD_VOLUME = 0.01
+
+
+@dataclass(frozen=True)
+class Row:
+    """What was found of a body: numbers by name, or why there are none."""
+
+    name: str
+    found: dict[str, Any]
+
+    @classmethod
+    def of(cls, name: str, found: dict[str, Any]) -> Row:
+        return cls(name, found)
+
+    @property
+    def is_meshed(self) -> bool:
+        return "elements" in self.found
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether a warning is missing."""
+        words = ("would help", "piece", "label", "volume")
+        return bool(self.found["doubts"]) and not any(w in note for note in self.found["notes"] for w in words)
+
+    @property
+    def topples(self) -> bool:
+        return self.found.get("fall", 0.0) > 1.0 and not self.found.get("free")
+
+    def cells(self) -> list[str]:
+        """The columns up to the fall."""
+        f = self.found
+        if not self.is_meshed:
+            if "tets" in f:
+                return [self.name, f"tetrahedra already: {f['tets']}", *[""] * 8]
+            why = f.get("refused") or f.get("failed") or "?"
+            return [self.name, ("refused: " if "refused" in f else "failed: ") + _short(why), *[""] * 8]
+        lost = f" ({f['lost_pieces']} lost)" if f["lost_pieces"] else ""
+        labels = f", {f['lost_labels']} labels" if f["lost_labels"] else ""
+        return [
+            self.name,
+            f"{f['elements']} ({f['share']:.2f})",
+            f"{f['volume']:.3f}",
+            " / ".join(f"{1e3 * d:.2g}" for d in f["mean"]),
+            " / ".join(f"{1e3 * d:.2g}" for d in f["far"]),
+            f"{f['pieces']} of {f['input_pieces']}{lost}{labels}",
+            "yes" if f["watertight"] else "**no**",
+            f"{f['dihedral']:.0f}°",
+            f"{f['seconds']:.1f}",
+            ("**no**" if self.is_silent else "yes") if f["doubts"] else "",
+        ]
+
+    def fall(self) -> str:
+        """The column of the fall."""
+        f = self.found
+        if "fall_failed" in f or "fall" not in f:
+            return _short(f.get("fall_failed", "")) or ("failed" if self.is_meshed else "")
+        text = f"{f['fall']:.2g}" + (", free" if f["free"] else "")
+        return f"**{text}**" if self.topples else text
+
+
+HEAD = ["body", "elements", "volume", "mean ‰", "95 % ‰", "pieces", "watertight", "angle", "s", "said"]
+
+
+def table(rows: list[Row], before: dict[str, Any] | None = None, *, fall: bool = False) -> str:
+    """Markdown.
+
+    Args:
+        rows: In their order.
+        before: Numbers of an earlier run by body; elements, volume, pieces and fall of it stand beside.
+        fall: Whether the fall has a column.
+    """
+    head = HEAD + (["fall"] if fall else [])
+    if before is not None:
+        head = [head[0], "elements before", "volume before", "pieces before", *head[1:]]
+        head += ["fall before"] if fall else []
+    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    for row in rows:
+        cells = row.cells() + ([row.fall()] if fall else [])
+        if before is not None:
+            was = Row.of(row.name, before.get(row.name, {"failed": "not there"}))
+            earlier = was.cells()
+            cells = [cells[0], earlier[1], earlier[2], earlier[5], *cells[1:], *([was.fall()] if fall else [])]
+        lines.append("| " + " | ".join(cell.replace("|", "/") for cell in cells) + " |")
+    return f"{LEGEND}\n\n" + "\n".join(lines)
+
+
+def totals(rows: list[Row], tets: int) -> str:
+    """All of them in some lines."""
+    made = [row for row in rows if row.is_meshed]
+    if not made:
+        return f"{len(rows)} bodies, none of them meshed."
+    near = sum(abs(row.found["volume"] - 1.0) <= GOOD_VOLUME for row in made)
+    budget = sum(0.9 <= row.found["share"] <= 1.0 for row in made)
+    whole = sum(row.found["pieces"] == row.found["input_pieces"] for row in made)
+    seconds = sorted(row.found["seconds"] for row in made)
+    lines = [
+        f"{len(rows)} bodies at {tets} elements; {len(made)} meshed, "
+        f"{sum('tets' in row.found for row in rows)} of tetrahedra already, "
+        f"{sum('refused' in row.found for row in rows)} refused, {sum('failed' in row.found for row in rows)} failed.",
+        f"Volume within 1 %: {near} of {len(made)} ({near / len(made):.0%}). Elements within 10 % below what was asked "
+        f"for: {budget}. As many pieces as the input: {whole}. "
+        f"Watertight: {sum(row.found['watertight'] for row in made)}. "
+        f"Warnings missing: {sum(row.is_silent for row in made)}.",
+        f"Time: median {seconds[len(seconds) // 2]:.1f} s, longest {seconds[-1]:.1f} s.",
+    ]
+    falls = [row for row in made if "fall" in row.found]
+    if falls:
+        names = ", ".join(row.name for row in falls if row.topples)
+        lines.append(f"Let fall: {len(falls)}; toppled without a word: {names or 'none'}.")
+    return "\n".join(lines)
+
+
+def _short(text: str) -> str:
+    text = " ".join(text.split())
+    text = text.rpartition("/")[2] if text.startswith("/") else text
+    return text if len(text) <= 90 else text[:87] + "..."

@@ -1,0 +1,102 @@
+"""Measuring surfaces: how far points are from one, and which of its parts cross each other."""
+
+import warp as wp
+
+#: Along an edge so many triangles of its own part are passed by at most.
+MOST_OWN_HITS = wp.constant(8)
+#: The same of triangles around its points, and how far beyond its ends it is looked, over its length.
+MOST_OWN_TRIANGLES = wp.constant(64)
+BEYOND = wp.constant(1.0e-3)
+#: What of an edge's length is left out at its ends, where its own triangles begin.
+ENDS = wp.constant(1.0e-4)
+
+
+@wp.kernel(enable_backward=False)
+def measure_distances(
+    # In
+    points: wp.array[wp.vec3],
+    mesh: wp.uint64,
+    far: float,
+    # Out
+    distances: wp.array[wp.float32],
+):
+    """How far each point is from the closest triangle, ``far`` where none is nearer."""
+    i = wp.tid()
+    found = wp.mesh_query_point_no_sign(mesh, points[i], far)
+    distance = far
+    if found.result:
+        distance = wp.length(wp.mesh_eval_position(mesh, found.face, found.u, found.v) - points[i])
+    distances[i] = distance
+
+
+@wp.kernel(enable_backward=False)
+def find_crossed_parts(
+    # In
+    points: wp.array[wp.vec3],
+    edges: wp.array[wp.vec2i],
+    edge_parts: wp.array[wp.int32],
+    mesh: wp.uint64,
+    triangle_parts: wp.array[wp.int32],
+    # Out
+    crossed: wp.array[wp.int32],
+):
+    """Another part whose triangle an edge goes through, -1 for none."""
+    i = wp.tid()
+    start = points[edges[i][0]]
+    along = points[edges[i][1]] - start
+    length = wp.length(along)
+    crossed[i] = -1
+    if length == 0.0:
+        return
+    direction = along / length
+    at = ENDS * length
+    end = (1.0 - ENDS) * length
+    for _ in range(MOST_OWN_HITS):
+        if at >= end or crossed[i] >= 0:
+            return
+        found = wp.mesh_query_ray(mesh, start + at * direction, direction, end - at)
+        if not found.result:
+            return
+        if triangle_parts[found.face] != edge_parts[i]:
+            crossed[i] = triangle_parts[found.face]
+        at += found.t + ENDS * length
+
+
+@wp.kernel(enable_backward=False)
+def find_touched_triangles(
+    # In
+    points: wp.array[wp.vec3],
+    edges: wp.array[wp.vec2i],
+    mesh: wp.uint64,
+    indices: wp.array[wp.int32],
+    # Out
+    touched: wp.array[wp.int32],
+):
+    """A triangle that an edge goes through or ends at, but for those around its two points; -1 for none."""
+    i = wp.tid()
+    a = edges[i][0]
+    b = edges[i][1]
+    start = points[a]
+    along = points[b] - start
+    length = wp.length(along)
+    touched[i] = -1
+    if length == 0.0:
+        return
+    direction = along / length
+    at = -BEYOND * length
+    end = (1.0 + BEYOND) * length
+    for _ in range(MOST_OWN_TRIANGLES):
+        if at < end:
+            found = wp.mesh_query_ray(mesh, start + at * direction, direction, end - at)
+            if not found.result:
+                return
+            own = bool(False)
+            for n in range(3):
+                corner = indices[3 * found.face + n]
+                own = own or corner == a or corner == b
+            if not own:
+                touched[i] = found.face
+                return
+            at += found.t + ENDS * length
+    # More triangles than can be passed: none of them is sure.
+    touched[i] = -2

@@ -1,0 +1,97 @@
+"""How true a mesh is to its body, measured where the answer is known."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from warp_corot.domain import Domain
+from warp_corot.domain.fidelity import fidelity, smallest_dihedral
+from warp_corot.domain.reference import reference_of
+from warp_corot.mesh import TetForest, TetMesh
+
+
+def surface_of(*parts: trimesh.Trimesh) -> Domain:
+    whole = trimesh.util.concatenate(parts)
+    return Domain.from_surface((whole.vertices, whole.faces))
+
+
+def ball(radius: float, x: float = 0.0) -> trimesh.Trimesh:
+    return trimesh.creation.icosphere(3, radius=radius).apply_translation((x, 0, 0))
+
+
+def test_a_mesh_of_boxes_is_what_it_is() -> None:
+    mesh = TetForest.from_domain(Domain.box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), 0.26, max_level=6)
+    found = fidelity(mesh, Domain.box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)))
+    assert found.input_volume == pytest.approx(1.0, rel=2e-3)
+    assert found.volume == pytest.approx(1.0, rel=1e-2)
+    assert max(found.distance_mean) < 5e-3
+    assert found.watertight
+    assert found.pieces == found.input_pieces == 1
+    assert not found.doubts()
+    assert found.smallest_dihedral == pytest.approx(45.0)
+
+
+def test_distances_are_those_of_spheres_of_two_radii() -> None:
+    inner = TetForest.from_domain(surface_of(ball(0.9)), 0.3, max_level=6)
+    found = fidelity(inner, surface_of(ball(1.0)))
+    assert np.allclose(found.distance_mean, 0.1, atol=0.01)
+    assert np.allclose(found.distance_95, 0.1, atol=0.015)
+    assert found.volume_error == pytest.approx(0.9**3 - 1, abs=0.01)
+    assert "volume" in found.doubts()[0]
+
+
+@pytest.mark.parametrize(
+    ("parts", "pieces"),
+    [
+        ([ball(1.0), ball(0.5, 3.0)], 2),
+        ([ball(1.0), ball(1.0, 1.5)], 1),  # they cross
+        ([ball(1.0), ball(0.3, 0.2)], 1),  # one within the other
+        ([ball(1.0), ball(0.9).copy(), ball(0.3)], 1),
+    ],
+)
+def test_pieces_of_surfaces(parts: list[trimesh.Trimesh], pieces: int) -> None:
+    assert reference_of(surface_of(*parts), 1000).pieces == pieces
+
+
+def test_a_cavity_is_no_piece_and_what_lies_in_it_is() -> None:
+    cavity = ball(0.8)
+    cavity.invert()
+    domain = surface_of(ball(1.0), cavity, ball(0.4))
+    given = reference_of(domain, 1000)
+    assert given.pieces == 2
+    assert given.volume == pytest.approx(4 / 3 * np.pi * (1 - 0.8**3 + 0.4**3), rel=0.02)
+
+
+def test_overlapping_parts_count_once() -> None:
+    given = reference_of(surface_of(trimesh.creation.box((2, 1, 1)), trimesh.creation.box((1, 2, 1.0001))), 4000)
+    assert given.volume == pytest.approx(3.0, rel=5e-3)
+    # None of the points is where the two boxes overlap.
+    assert not ((np.abs(given.points[:, :2]) < 0.49).all(axis=1) & (np.abs(given.points[:, 2]) < 0.49)).any()
+
+
+def test_lost_and_joined_pieces_are_told() -> None:
+    far = TetForest.from_domain(surface_of(ball(1.0)), 0.5, max_level=3)
+    lost = fidelity(far, surface_of(ball(1.0), ball(0.2, 3.0)))
+    assert lost.lost_pieces == 1
+    assert any("in no tetrahedron" in line for line in lost.doubts())
+    joined = fidelity(far, surface_of(ball(0.5), ball(0.4, -0.93)))
+    assert joined.pieces == 1
+    assert joined.input_pieces == 2
+    assert any("grown together" in line for line in joined.doubts())
+
+
+def test_voxels_and_their_labels() -> None:
+    numbers = np.zeros((20, 20, 20), np.int16)
+    numbers[3:17, 3:17, 3:17] = 1
+    numbers[8, 8, 8] = 2
+    domain = Domain.from_labels(numbers, spacing=(0.01, 0.01, 0.01), labels={"organ": 1, "speck": 2})
+    given = reference_of(domain, 3000)
+    assert given.volume == pytest.approx(14**3 * 1e-6)
+    assert given.pieces == 1
+    assert np.abs(domain.phi(given.points)).max() < 1e-6
+
+
+def test_the_sharpest_angle_of_any_tetrahedra() -> None:
+    flat = TetMesh(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, 0.01]]), np.array([[0, 1, 2, 3]]))
+    # Over a base of this size, at the edge that is nearest to the top.
+    assert smallest_dihedral(flat) == pytest.approx(np.degrees(np.arctan2(0.01, 0.3)), rel=1e-6)

@@ -1,0 +1,79 @@
+"""What is shown on a terminal while one waits."""
+
+import os
+import struct
+import subprocess
+import sys
+import time
+
+import pytest
+
+pty = pytest.importorskip("pty", reason="terminals are for POSIX")
+fcntl = pytest.importorskip("fcntl")
+termios = pytest.importorskip("termios")
+
+SLOW_SCAN = """
+import sys, time
+from warp_corot.cli import waiting, simulate, main
+waiting.SILENT = waiting.EVERY = 0.05
+found = simulate._found
+def slow(body):
+    from warp_corot.cli.say import complain
+    time.sleep(1.0)
+    complain("of something", kind="note")
+    time.sleep(1.0)
+    return found(body)
+simulate._found = slow
+sys.exit(main(["simulate", "box", "-o", "a.usd", "--duration", "0.05", "--fps", "40", "--device", "cpu"]))
+"""
+
+MANY_WORLDS = """
+import time
+import warp_corot as wc
+body = wc.SoftBody(wc.TetForest.box((1, 1, 1), 0.1, 3), wc.Isotropic(1e4, 0.4, 1e3), worlds=256, device="cpu")
+body.fix("z < 0.01")
+sim = wc.Simulation(body)
+sim.on_step(lambda sim: time.sleep(0.15))
+wc.record(sim, "a.usd", duration=0.2, fps=50.0, world=3)
+"""
+
+
+def on_terminal(code: str, folder) -> str:
+    """What a terminal gets of a program's stderr."""
+    main, end = pty.openpty()
+    fcntl.ioctl(end, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
+    process = subprocess.Popen([sys.executable, "-c", code], cwd=folder, stdout=subprocess.DEVNULL, stderr=end)
+    os.close(end)
+    said = b""
+    started = time.monotonic()
+    while time.monotonic() - started < 120:
+        try:
+            part = os.read(main, 4096)
+        except OSError:  # the other end is closed
+            break
+        if not part:
+            break
+        said += part
+    assert process.wait(timeout=60) == 0, said
+    os.close(main)
+    return said.decode()
+
+
+def test_reading_and_meshing_show_since_when_and_lines_stay_whole(tmp_path):
+    said = on_terminal(SLOW_SCAN, tmp_path)
+    assert "meshing box, 00:00" in said
+    # The note stands in a line of its own, and the bar is gone at the end.
+    assert "\rwarp-corot: note: of something\r\n" in said
+    assert said.rpartition("meshing box")[2].count("\r") >= 1
+
+
+def test_a_run_of_many_worlds_shows_how_far_it_is(tmp_path):
+    said = on_terminal(MANY_WORLDS, tmp_path)
+    assert "simulating" in said
+    assert "of 10, " in said
+
+
+def test_nothing_is_shown_without_a_terminal(tmp_path):
+    done = subprocess.run([sys.executable, "-c", MANY_WORLDS], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0
+    assert "simulating" not in done.stderr

@@ -1,0 +1,95 @@
+"""One rule for options: one that would do nothing for this input is refused, with the reason."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import NamedTuple
+
+from ..errors import InputError
+from .opened import Opened
+
+
+class Rule(NamedTuple):
+    """When options do something.
+
+    Attributes:
+        options: Their names in Python.
+        applies: Whether they do, given the command's arguments and the input.
+        purpose: What they are for, to follow "--NAME is for".
+    """
+
+    options: tuple[str, ...]
+    applies: Callable[[argparse.Namespace, Opened], bool]
+    purpose: str
+
+
+def _is_scan(_: argparse.Namespace, opened: Opened) -> bool:
+    return opened.kind == "scan"
+
+
+def _is_meshed(_: argparse.Namespace, opened: Opened) -> bool:
+    return opened.kind in ("surface", "scan")
+
+
+def _is_file(_: argparse.Namespace, opened: Opened) -> bool:
+    return opened.kind != "box"
+
+
+RULES = (
+    Rule(("skin",), lambda args, opened: opened.kind == "surface" or args.skin != "input", "surfaces"),
+    Rule(("unit", "up"), _is_file, "files"),
+    Rule(
+        ("join",),
+        lambda args, opened: opened.kind == "tets" or len(opened.surface.objects if opened.surface else ()) > 1,
+        "surfaces of several objects and meshes of tetrahedra",
+    ),
+    Rule(("labels", "smoothing"), _is_scan, "scans"),
+    Rule(
+        ("threshold",),
+        lambda args, opened: opened.kind == "scan" and args.labels is None and args.materials is None,
+        "scans without --labels and --materials",
+    ),
+    Rule(
+        ("cell_size", "max_level", "surface_error", "tets", "min_layers", "draw_tets"),
+        _is_meshed,
+        "surfaces and scans",
+    ),
+    Rule(
+        ("materials",),
+        lambda args, opened: (opened.kind == "scan" and args.labels is None) or opened.has_regions,
+        "scans without --labels and meshes of tetrahedra whose file numbers regions",
+    ),
+    Rule(
+        ("regions_by",),
+        lambda args, opened: args.materials is not None and opened.has_regions,
+        "--materials on meshes of tetrahedra whose file numbers regions",
+    ),
+    Rule(
+        ("draw_labels",),
+        lambda args, opened: opened.has_regions or opened.kind == "scan",
+        "scans and meshes of tetrahedra whose file numbers regions",
+    ),
+)
+
+
+def refuse_options(args: argparse.Namespace, opened: Opened) -> None:
+    """See that no option is given that would be of no effect.
+
+    Raises:
+        InputError: One is; the message names it and says what it is for.
+    """
+    for rule in RULES:
+        for name in rule.options:
+            given = getattr(args, name, None)
+            if given is not None and given is not False and not rule.applies(args, opened):
+                option = f"--{name.replace('_', '-')}"
+                raise InputError(f"{option} is for {rule.purpose}, and {args.input} is not one{_instead(name, args)}")
+    if args.labels is not None and args.young is not None:
+        raise InputError("--young is given, but --labels gives each label its own")
+    if args.draw_labels and args.labels is None and args.materials is None:
+        raise InputError("--draw-labels draws the labels that --labels or --materials names")
+
+
+def _instead(name: str, args: argparse.Namespace) -> str:
+    return "; say --scale" if name == "unit" else ""

@@ -1,0 +1,102 @@
+"""What holds the body: ``--fix``, or what is chosen where it is not given."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import InputError
+from ..holding import holds_of
+from ..materials import Isotropic
+
+if TYPE_CHECKING:
+    from .patches import Patches
+    from .subject import Subject
+
+
+#: Times what is needed at least.
+MORE = 1.05
+
+
+def up_of(subject: Subject, gravity: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Against gravity, unit vector; the mesh's up axis without any."""
+    if not gravity.any():
+        return np.eye(3)["XYZ".index(subject.mesh.up_axis)]
+    return -gravity / np.linalg.norm(gravity)
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """The nodes that are held.
+
+    Attributes:
+        nodes: Mask bool [N].
+        words: For the summary: "standing on its lowest 10 %", "free".
+        title: For the picture, of many pieces in fewer words; empty: these.
+    """
+
+    nodes: npt.NDArray[np.bool_]
+    words: str
+    title: str = ""
+
+    @property
+    def count(self) -> int:
+        return int(self.nodes.sum())
+
+
+def held_as_told(subject: Subject, patches: Patches, expressions: Sequence[str], pulled: bool) -> Held:
+    """The nodes of ``--fix``, all its patches together.
+
+    Args:
+        subject: Gets a note if nothing is held.
+        patches: Of the body.
+        expressions: One or several.
+        pulled: Whether something else moves nodes.
+
+    Raises:
+        InputError: A bad expression, or no node is left free.
+    """
+    nodes = np.logical_or.reduce([patches.nodes(expression) for expression in expressions])
+    said = " or ".join(expressions)
+    if nodes.sum() == len(patches.used):
+        raise InputError(f"expression {said!r}: holds all {nodes.sum()} nodes, at least one must be free to move")
+    if not nodes.any():
+        if not pulled:
+            subject.notes.append(f"no node is held ({said!r}): the body falls freely")
+        return Held(nodes, "free, nothing is held")
+    return Held(nodes, f"held where {said}")
+
+
+def held_by_default(
+    subject: Subject, material: Isotropic, gravity: npt.NDArray[np.float64], *, may_stiffen: bool
+) -> tuple[Held, float]:
+    """What carries the body, and how many times as stiff it shall be: more than once if no patch would carry it as it
+    is.
+
+    Args:
+        subject: Gets notes of what was chosen and why.
+        material: Of the body.
+        gravity: [m/s^2].
+        may_stiffen: Whether nobody gave Young's modulus.
+    """
+    holds = holds_of(
+        subject.mesh, young=material.young, density=material.density, gravity=gravity, surface=subject.surface
+    )
+    lines = holds.reasons()
+    subject.notes += [*lines[:-1], f"{lines[-1]} (--fix says otherwise)"]
+    held = Held(holds.nodes, holds.words, holds.title)
+    if not (1.0 < holds.stiffer < np.inf):
+        return held, 1.0
+    if may_stiffen:
+        subject.notes.append(f"it is made {holds.stiffer:.2g} times as stiff as for its weight alone, to be carried")
+        return held, MORE * holds.stiffer
+    sag = max(hold.sag for hold in holds.pieces)
+    subject.notes.append(
+        f"so soft, the body sags by about {sag:.0%} of its height; {holds.stiffer:.2g} times as stiff it would be "
+        "carried (--young), or hold more of it (--fix)"
+    )
+    return held, 1.0

@@ -1,0 +1,222 @@
+"""``--pull``, ``--twist`` and ``--press``: what is done to a body over time."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from ..domain.units import in_units
+from ..errors import InputError
+from ..io.skins import boundary_surface
+from ..keys import checked_times
+from .quantities import seconds
+
+if TYPE_CHECKING:
+    from ..body import SoftBody
+    from ..simulation import Simulation
+    from .patches import Patches
+
+#: Numbers after PATCH, and what they are.
+FORMS = {"pull": (3, "DX DY DZ"), "twist": (1, "DEGREES"), "press": (1, "PASCALS")}
+#: Their units where they name none.
+UNITS = {"pull": "m", "twist": "degree", "press": "Pa"}
+#: A pressure that changes is set anew at least so often while it does.
+UPDATES = 200
+#: Largest angle from one keyframe of a twist to the next [degrees]: in between nodes go straight.
+KEY_ANGLE = 5.0
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Load:
+    """Something done to a patch.
+
+    Attributes:
+        kind: "pull", "twist" or "press".
+        patch: The expression.
+        values: Displacement [m], angle [degrees] or pressure [Pa].
+        times: Increasing [s]; () for a ramp as long as is said elsewhere.
+        shares: Of the values at these times; linear in between, constant before and after.
+        axis: Of a twist; None: the mean normal of the patch's surface.
+    """
+
+    kind: str
+    patch: str
+    values: tuple[float, ...]
+    times: tuple[float, ...] = ()
+    shares: tuple[float, ...] = ()
+    axis: tuple[float, float, float] | None = None
+
+    def curve(self, ramp: float) -> tuple[Array, Array]:
+        """Times [s] and shares at them.
+
+        Raises:
+            InputError: They are not as many, or times that do not increase.
+        """
+        if not self.times:
+            return np.array([0.0, ramp]), np.array([0.0, 1.0])
+        times, shares = checked_times(self.times), np.asarray(self.shares, dtype=np.float64)
+        if shares.shape != times.shape or not np.isfinite(shares).all():
+            raise InputError(f"{self.kind}: shares are {list(self.shares)}; they must be one number for each time")
+        return times, shares
+
+    def __str__(self) -> str:
+        return f"--{self.kind} {self.patch!r} {' '.join(f'{value:g}' for value in self.values)}"
+
+
+def add_load_options(group: argparse._ArgumentGroup) -> None:
+    """Add the options to a group of the command's."""
+    for kind, (count, names) in FORMS.items():
+        group.add_argument(
+            f"--{kind}",
+            action="append",
+            nargs=1 + count,
+            metavar=("PATCH", *names.split()),
+            help={
+                "pull": "move a patch by so much [m], such as 0 0 3cm",
+                "twist": "turn a patch about its mean normal, counter-clockwise seen from outside",
+                "press": "a pressure on the surface of a patch, along the normals at rest; pulls if negative",
+            }[kind],
+        )
+    group.add_argument(
+        "--ramp", type=seconds, metavar="T", help="time over which these grow [s] (default: half of the duration)"
+    )
+
+
+def loads_of(args: argparse.Namespace) -> list[Load]:
+    """What the options ask for.
+
+    Raises:
+        InputError: Something that is no number.
+    """
+    found = list(getattr(args, "curves", ()))
+    for kind in FORMS:
+        for patch, *texts in getattr(args, kind) or ():
+            try:
+                found.append(Load(kind, patch, tuple(value_of(kind, text) for text in texts)))
+            except InputError as error:
+                raise InputError(f"--{kind} {patch!r} {' '.join(texts)}: {error}") from None
+    if args.ramp is not None:
+        if not (math.isfinite(args.ramp) and args.ramp > 0.0):
+            raise InputError(f"--ramp is {args.ramp:g} s; it must be a positive time")
+        if not found:
+            raise InputError("--ramp is for --pull, --twist and --press, none of which is given")
+    if args.remesh and any(load.kind == "press" for load in found):
+        raise InputError("--press is for meshes that stay, and --remesh changes the mesh")
+    return found
+
+
+def value_of(kind: str, text: str) -> float:
+    """A displacement [m], an angle [degrees] or a pressure [Pa], as a number or with a unit of its own.
+
+    Raises:
+        InputError: It is none.
+    """
+    value = in_units(text, UNITS[kind])
+    if not math.isfinite(value):
+        raise InputError(f"{text} must be a finite number")
+    return value
+
+
+def move_patches(body: SoftBody, loads: Sequence[Load], patches: Patches, ramp: float) -> None:
+    """Have the patches of ``--pull`` and ``--twist`` move as told.
+
+    Raises:
+        InputError: A patch without nodes or, where one is needed, without a direction; a node in two of them.
+    """
+    taken = np.zeros(len(patches.subject.mesh.points), bool)
+    for load in loads:
+        if load.kind == "press":
+            continue
+        mask = patches.some(load.patch, f"--{load.kind}")
+        if (mask & taken).any():
+            raise InputError(f"{load}: {int((mask & taken).sum())} of its nodes are moved by another option, too")
+        taken |= mask
+        times, shares = load.curve(ramp)
+        if load.kind == "pull":
+            moves = shares[:, None] * load.values
+        else:
+            times, moves = _turned(load, patches, mask, times, shares)
+        body.prescribe(mask, times=times, displacements=moves)
+    if taken.sum() == len(patches.used):
+        raise InputError("all nodes are moved by options; at least one must be free to move")
+
+
+def press_patches(sim: Simulation, body: SoftBody, loads: Sequence[Load], patches: Patches, ramp: float) -> None:
+    """Have the pressures of ``--press`` act and grow.
+
+    Raises:
+        InputError: A patch without surface.
+    """
+    pressing = [load for load in loads if load.kind == "press"]
+    if not pressing:
+        return
+    pressures = [(load.values[0] * _inward(load, patches), *load.curve(ramp)) for load in pressing]
+    loaded = np.flatnonzero(np.any([forces.any(axis=1) for forces, *_ in pressures], axis=0))
+
+    pressing_on = np.stack([forces[loaded] for forces, *_ in pressures])
+
+    def at(time: float) -> Array:
+        shares = [np.interp(time, times, shares) for _, times, shares in pressures]
+        return np.einsum("p,pnx->nx", shares, pressing_on)
+
+    body.load(loaded, at(0.0))
+    first = min(times[0] for _, times, _ in pressures)
+    last = max(times[-1] for _, times, _ in pressures)
+    every = max(1, int((last - first) / UPDATES / sim.dt))
+    done = False
+
+    def update(sim: Simulation) -> None:
+        nonlocal done
+        if not done and sim.time >= first:
+            body.load(loaded, at(sim.time))
+            done = sim.time >= last
+
+    sim.on_step(update, every=every)
+
+
+def _inward(load: Load, patches: Patches) -> Array:
+    """Nodal forces of one pascal on the patch's surface [N], [N, 3].
+
+    Raises:
+        InputError: It has none.
+    """
+    mesh = patches.subject.mesh
+    surface = patches.subject.surface or boundary_surface(mesh)
+    inside = patches.on_surface(load.patch, surface)
+    triangles = surface.triangles[inside[surface.triangles].all(axis=1)]
+    if not len(triangles):
+        raise InputError(f"--{load.kind} {load.patch!r}: no part of the surface is in it")
+    a, b, c = np.moveaxis(surface.points[triangles], 1, 0)
+    at_corners = np.repeat(-np.cross(b - a, c - a) / 6.0, 3, axis=0)
+    at_points = np.zeros_like(surface.points)
+    np.add.at(at_points, triangles.ravel(), at_corners)
+    forces = np.zeros((len(mesh.points), 3))
+    np.add.at(forces, surface.nodes.ravel(), (surface.weights[:, :, None] * at_points[:, None]).reshape(-1, 3))
+    return forces
+
+
+def _turned(
+    load: Load, patches: Patches, mask: npt.NDArray[np.bool_], times: Array, shares: Array
+) -> tuple[Array, Array]:
+    """Keyframes of a twist: times [K], and displacements [K, n, 3]."""
+    axis = -_inward(load, patches).sum(axis=0) if load.axis is None else np.asarray(load.axis, dtype=np.float64)
+    length = np.linalg.norm(axis)
+    if not (np.isfinite(axis).all() and length > 0.0):
+        raise InputError(f"{load}: has no axis; it must be three numbers, not all zero")
+    fine = [times[:1]]
+    for start, end, turn in zip(times, times[1:], np.abs(np.diff(shares)) * abs(load.values[0]), strict=False):
+        fine.append(np.linspace(start, end, 1 + max(1, math.ceil(turn / KEY_ANGLE)))[1:])
+    keys = np.concatenate(fine)
+    angles = np.radians(load.values[0]) * np.interp(keys, times, shares)
+    points = patches.subject.mesh.points[mask]
+    arms = points - points.mean(axis=0)
+    return keys, np.stack([Rotation.from_rotvec(angle * axis / length).apply(arms) - arms for angle in angles])

@@ -1,0 +1,143 @@
+"""Parts of a body that options name: expressions, regions that every body has, and those of ``--patch``."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import InputError
+from ..mesh.surface import boundary_faces
+from ..regions import LOWEST, Shape, flat_region
+from ..selection import CONSTANTS, FUNCTIONS, REGIONS, select_nodes
+
+if TYPE_CHECKING:
+    from ..mesh.bound import SurfaceMesh
+    from .subject import Subject
+
+HELP = """patches, for --fix, --pull, --press, --twist and --probe, are expressions:
+  names      bottom top (tenths of the height), flat (the largest flat region), surface, all, none; labels of a scan;
+             those of --patch
+  regions    sphere(x, y, z, radius), box(x, y, z, x, y, z), nearest(x, y, z), nearest(x, y, z, n): the n nearest nodes
+  numbers    x y z (rest coordinates [m], after --scale), xmin xmax ymin ymax zmin zmax, pi
+  operators  + - * / // % **   < <= > >= == !=   and or not   ( )
+  functions  abs sqrt exp log sin cos tan atan2 hypot min max"""
+
+_TAKEN = {"x", "y", "z", *(f"{axis}{end}" for axis in "xyz" for end in ("min", "max")), "and", "or", "not"}
+_TAKEN |= {*CONSTANTS, *FUNCTIONS, *REGIONS}
+
+Mask = npt.NDArray[np.bool_]
+
+
+class Patches:
+    """The patches of a body.
+
+    Args:
+        subject: The body.
+        up: Against gravity, unit vector.
+        given: What ``--patch`` says, ``NAME=EXPR`` each.
+
+    Raises:
+        InputError: Not of that form, or a name that cannot be one.
+    """
+
+    def __init__(self, subject: Subject, up: npt.NDArray[np.float64], given: Sequence[str] = ()):
+        self.subject = subject
+        self.used = subject.used
+        self._up = up
+        self._named: dict[str, Callable[[], Mask]] = {
+            "bottom": lambda: self._end(-up),
+            "top": lambda: self._end(up),
+            "flat": self._flat,
+            "surface": self._surface,
+        }
+        for number, name in enumerate(getattr(subject.mesh, "label_names", ()), start=1):
+            if name.isidentifier() and name not in _TAKEN:
+                self._named[name] = partial(self._label, number)
+        for text in given:
+            name, equals, expression = (part.strip() for part in text.partition("="))
+            if not equals or not re.fullmatch(r"[A-Za-z_]\w*", name) or not expression:
+                raise InputError(f"--patch {text!r}: it must be NAME=EXPR, such as tip=nearest(0, 0, 0.1)")
+            if name in _TAKEN or name in self._named:
+                raise InputError(f"--patch {text!r}: {name} is a name already; take another one")
+            self._named[name] = partial(np.array, self.nodes(expression)[self.used])
+
+    def nodes(self, expression: str) -> Mask:
+        """Nodes of a patch, bool [N]; those in no tetrahedron are in none.
+
+        Raises:
+            InputError: As `select_nodes`.
+        """
+        mesh, mask = self.subject.mesh, np.zeros(len(self.subject.mesh.points), bool)
+        points = mesh.points[self.used]
+        mask[self.used] = select_nodes(expression, points, bounds=self.subject.bounds, named=self._named)
+        return mask
+
+    def some(self, expression: str, option: str) -> Mask:
+        """Nodes of a patch that must have some.
+
+        Raises:
+            InputError: It has none, or as `nodes`.
+        """
+        mask = self.nodes(expression)
+        if not mask.any():
+            raise InputError(f"{option} {expression!r}: there are no nodes in it")
+        return mask
+
+    def tetrahedra(self, expression: str) -> Mask:
+        """Tetrahedra whose middle is in a patch, bool [T]; of patches that are given by names, all of whose nodes are.
+
+        Raises:
+            InputError: As `select_nodes`.
+        """
+        tets, mesh = self.subject.mesh.tets, self.subject.mesh
+        places = np.searchsorted(self.used, tets)
+        middles = {name: partial(_all_four, nodes, places) for name, nodes in self._named.items()}
+        return select_nodes(expression, mesh.points[tets].mean(axis=1), bounds=self.subject.bounds, named=middles)
+
+    def on_surface(self, expression: str, surface: SurfaceMesh) -> Mask:
+        """Points of a bound surface that are in a patch, bool [V]; of named patches, those bound to it by half or more.
+
+        Raises:
+            InputError: As `select_nodes`.
+        """
+        named = {name: partial(self._bound, nodes, surface) for name, nodes in self._named.items()}
+        return select_nodes(expression, surface.points, bounds=self.subject.bounds, named=named)
+
+    @cached_property
+    def shape(self) -> Shape:
+        """The whole body."""
+        mesh, surface = self.subject.mesh, self.subject.surface
+        if surface is not None:
+            return Shape(mesh.points, self.used, surface.points, surface.triangles, self._up)
+        return Shape(mesh.points, self.used, mesh.points, boundary_faces(mesh.tets, mesh.points)[0], self._up)
+
+    def _end(self, way: npt.NDArray[np.float64]) -> Mask:
+        return np.isin(self.used, self.shape.beyond(way, LOWEST))
+
+    def _flat(self) -> Mask:
+        patch = flat_region(self.shape)
+        if patch is None:
+            raise InputError(f"{self.subject.name}: no region of its surface is flat")
+        return np.isin(self.used, patch.nodes)
+
+    def _surface(self) -> Mask:
+        return np.isin(self.used, boundary_faces(self.subject.mesh.tets, self.subject.mesh.points)[0])
+
+    def _bound(self, nodes: Callable[[], Mask], surface: SurfaceMesh) -> Mask:
+        inside = np.zeros(len(self.subject.mesh.points), bool)
+        inside[self.used] = nodes()
+        return np.einsum("vn,vn->v", surface.weights, inside[surface.nodes]) >= 0.5
+
+    def _label(self, number: int) -> Mask:
+        mesh = self.subject.mesh
+        return np.isin(self.used, mesh.tets[np.asarray(mesh.labels) == number])
+
+
+def _all_four(nodes: Callable[[], Mask], places: npt.NDArray[np.integer]) -> Mask:
+    """Tetrahedra all of whose nodes are in a patch."""
+    return nodes()[places].all(axis=1)

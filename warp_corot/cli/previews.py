@@ -1,0 +1,291 @@
+"""``--preview``: pictures of frames from several sides, or a film of all of them."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+import tempfile
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..io.film import FILMS, check_film, frames_shown, write_film
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+    from ..simulation import Simulation
+    from .simulate import Body
+
+#: Views by name: azimuth and elevation [°].
+VIEWS = {
+    "corner": (35.0, 14.0),
+    "front": (0.0, 0.0),
+    "right": (90.0, 0.0),
+    "back": (180.0, 0.0),
+    "left": (-90.0, 0.0),
+    "top": (0.0, 89.9),
+    "bottom": (0.0, -89.9),
+}
+MOST_PANELS, MOST_COLUMNS = 12, 4
+#: Pixels of each view of a film, and about how many polygons it is drawn of.
+FILM_SIZE, FILM_PIECES = (640, 540), 15_000
+
+
+def add_preview_options(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--preview", type=Path, metavar="FILE", help="also draw the last frame (.png), or a film of all (.gif, .mp4)"
+    )
+    group.add_argument(
+        "--preview-frames",
+        metavar="LIST",
+        help="draw these frames of a .png side by side: numbers from 0, or from -1 at the end back, as in 0,12,-1",
+    )
+    group.add_argument(
+        "--preview-views",
+        metavar="LIST",
+        help=f"draw from these sides: {', '.join(VIEWS)}, or AZIMUTH:ELEVATION in degrees, as in front,left,35:14 "
+        "(default: corner)",
+    )
+
+
+@dataclass
+class Shown:
+    """One frame of all bodies as it is drawn, and as it waits on the disk."""
+
+    positions: np.ndarray
+    triangles: np.ndarray
+    values: np.ndarray
+    rest: np.ndarray
+    held: np.ndarray
+    time: float
+
+    def write(self, file: IO[bytes]) -> None:
+        for array in (self.positions, self.triangles, self.values, self.rest, self.held, np.float64(self.time)):
+            np.save(file, array, allow_pickle=False)
+
+    @classmethod
+    def read(cls, file: IO[bytes]) -> Shown:
+        positions, triangles, values, rest, held, time = (np.load(file, allow_pickle=False) for _ in range(6))
+        return cls(positions, triangles, values, rest, held, float(time))
+
+
+@dataclass
+class Previews:
+    """What ``--preview`` draws: frames are kept aside while the run goes on, and drawn at its end.
+
+    Args:
+        args: Of the command.
+        count: How many frames follow the first.
+
+    Raises:
+        InputError: Not a list of frames that there are, not a view, or a package is missing.
+    """
+
+    args: argparse.Namespace
+    count: int
+    frames: list[int] = field(init=False)
+    views: list[tuple[float, float]] = field(init=False)
+    fps: float = field(init=False)
+    _file: Any = None
+    _places: list[int] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        path = self.args.preview
+        self.views = _views(self.args.preview_views)
+        self.frames = _frames(self.args.preview_frames, self.count)
+        self.fps = self.args.fps
+        if is_film(path):
+            self.frames, self.fps = frames_shown(path, list(range(self.count + 1)), self.args.fps)
+        elif len(self.frames) * len(self.views) > MOST_PANELS:
+            panels = f"{len(self.frames)} frames from {len(self.views)} sides"
+            raise InputError(f"--preview would have {panels}; a picture has at most {MOST_PANELS} panels")
+
+    def add(self, frame: int, bodies: Sequence[Body], sim: Simulation) -> None:
+        """Keep the present state if it is one of the frames that are drawn."""
+        if frame not in self.frames:
+            return
+        if self._file is None:
+            self._file = tempfile.TemporaryFile()  # noqa: SIM115 (closed in draw)
+        self._places.append(self._file.tell())
+        shown_now(bodies, sim).write(self._file)
+
+    def draw(self, bodies: Sequence[Body], name: str) -> None:
+        """Draw what was kept.
+
+        Args:
+            bodies: Of the run.
+            name: For the title, which the time follows.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        if not self._places:
+            return
+        from tqdm import tqdm
+
+        from ..io.drawing import value_limits
+        from ..io.preview import Picture, bounds_of, cameras_of, draw_strip, save_picture
+
+        up_axis = bodies[0].soft.mesh.up_axis
+        boxes, highest, ground = [], 0.0, np.inf
+        up = "XYZ".index(up_axis)
+        for shown in self._kept():
+            boxes.append(bounds_of([Picture(shown.positions, shown.triangles, rest=shown.rest)]))
+            highest = max(highest, value_limits(shown.values)[1])
+            ground = min(ground, boxes[-1][0, up])
+        box = np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
+
+        def pictures(shown: Shown, frame_title: str) -> list[Picture]:
+            named = (self.args.preview_views or "").split(",") if len(self.views) > 1 else [""]
+            titles = [", ".join(filter(None, (name, frame_title))) for name in named]
+            options: dict[str, Any] = {"held": shown.held} if shown.held.any() else {}
+            if is_film(self.args.preview):
+                options["pieces"] = FILM_PIECES
+            return [
+                Picture(shown.positions, shown.triangles, shown.values, shown.rest, words, dict(options), view)
+                for view, words in zip(self.views, titles, strict=True)
+            ]
+
+        limits = (0.0, highest)
+        path = self.args.preview
+        with tqdm(
+            total=len(self._places),
+            desc="drawing",
+            leave=False,
+            disable=None,
+            delay=2.0,
+            file=sys.stderr,
+            bar_format="{desc}  {percentage:3.0f} % |{bar}| {remaining} left",
+        ) as bar:
+            if not is_film(path):
+                panels: list[Picture] = []
+                for shown in self._kept():
+                    panels += pictures(shown, f"{shown.time:.3g} s" if len(self.frames) > 1 else "")
+                    bar.update()
+                cameras = cameras_of(panels, up_axis, *VIEWS["corner"], box)
+                size = (1200, 900) if len(panels) == 1 else None
+                several = len(self.views) > 1 and len(self.frames) > 1
+                columns = len(self.views) if several else min(len(panels), MOST_COLUMNS)
+                words = name if len(self.frames) > 1 else f"{name}; {shown.time:.3g} s"
+                drawn = draw_strip(panels, cameras, value_range=limits, title=words, size=size, columns=columns)
+                save_picture(drawn, path)
+                return
+
+            def images() -> Generator[Image, None, None]:
+                width, height = FILM_SIZE
+                for shown in self._kept():
+                    views = pictures(shown, "")
+                    yield draw_strip(
+                        views,
+                        cameras_of(views, up_axis, *VIEWS["corner"], box),
+                        value_range=limits,
+                        title=f"{name}; {shown.time:.2f} s",
+                        size=(width * len(views), height),
+                        box=box,
+                        ground=float(ground),
+                        fineness=1,
+                    )
+                    bar.update()
+
+            with contextlib.closing(images()) as drawing:
+                write_film(path, drawing, self.fps)
+
+    def _kept(self) -> Iterator[Shown]:
+        for place in self._places:
+            self._file.seek(place)
+            yield Shown.read(self._file)
+
+
+def shown_now(bodies: Sequence[Body], sim: Simulation) -> Shown:
+    """The present state of all bodies as it is drawn."""
+    from ..io.colors import VertexAverage
+    from ..io.skins import BoundSkins
+    from ..mesh.surface import signed_volumes
+
+    moved: list[np.ndarray] = []
+    rest: list[np.ndarray] = []
+    triangles, values, held = [], [], []
+    for body in bodies:
+        subject, mesh = body.subject, body.soft.mesh
+        drawn = subject.skin or subject.surface
+        average = VertexAverage(mesh.tets, np.abs(signed_volumes(mesh.points, mesh.tets)), len(mesh.points))
+        stress = average(sim.von_mises(body.soft))
+        for skin in BoundSkins([mesh], drawn, changing=[mesh is not subject.mesh]).on([mesh]):
+            triangles.append(skin.surface.triangles + sum(len(points) for points in rest))
+            moved.append(skin.surface.moved(body.soft.displacements.numpy()))
+            rest.append(skin.surface.points)
+            values.append(skin.values(stress))
+            held.append(skin.values(body.soft.constrained.astype(float)) > 0.5)
+    arrays = [np.concatenate(each) for each in (moved, triangles, values, rest, held)]
+    return Shown(
+        arrays[0].astype(np.float32), arrays[1], arrays[2].astype(np.float32), arrays[3], arrays[4], time=sim.time
+    )
+
+
+def is_film(path: Path) -> bool:
+    return path.suffix.lower() in FILMS
+
+
+def check_preview(args: argparse.Namespace) -> None:
+    """Say before a long run what would stop its picture from being drawn.
+
+    Raises:
+        InputError: Something would.
+    """
+    from ..io.preview import check_picture_path
+
+    if args.preview is None:
+        for name in ("preview_frames", "preview_views"):
+            if getattr(args, name) is not None:
+                raise InputError(f"--{name.replace('_', '-')} is for --preview, which is not given")
+        return
+    if find_spec("matplotlib") is None:
+        raise InputError('--preview needs Matplotlib: pip install "warp-corot[plot]"')
+    check_picture_path(args.preview, (".png", *FILMS))
+    check_film(args.preview)
+    if is_film(args.preview) and args.preview_frames is not None:
+        raise InputError(f"--preview-frames is for a .png; {args.preview} is a film and has all frames")
+    _views(args.preview_views)
+
+
+def _frames(text: str | None, count: int) -> list[int]:
+    """Numbers of frames from 0 to ``count``, in rising order."""
+    if text is None:
+        return [count]
+    found = []
+    for word in text.split(","):
+        try:
+            number = int(word)
+        except ValueError:
+            raise InputError(f"--preview-frames {text!r}: {word!r} must be a whole number") from None
+        if not -count - 1 <= number <= count:
+            raise InputError(f"--preview-frames {text!r}: there is no frame {number}; the last one is {count}")
+        found.append(number % (count + 1))
+    return sorted(set(found))
+
+
+def _views(text: str | None) -> list[tuple[float, float]]:
+    """Azimuth and elevation [°] of each view."""
+    if text is None:
+        return [VIEWS["corner"]]
+    found = []
+    for word in text.split(","):
+        if word in VIEWS:
+            found.append(VIEWS[word])
+            continue
+        try:
+            azimuth, elevation = (float(number) for number in word.split(":"))
+        except ValueError:
+            azimuth = elevation = np.nan
+        if not (np.isfinite(azimuth) and abs(elevation) <= 90.0):
+            known = ", ".join(VIEWS)
+            raise InputError(f"--preview-views {text!r}: {word!r} must be {known} or AZIMUTH:ELEVATION in degrees")
+        found.append((azimuth, elevation))
+    return found

@@ -1,0 +1,62 @@
+"""Quantities as options take them: a number in SI units, or with a unit of its own, as in 5kPa."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ..domain.units import in_units, metres_per_unit
+from ..errors import InputError
+
+
+def quantity(unit: str) -> Callable[[str], float]:
+    """What turns an option's text into a number in a unit, for ``add_argument(type=...)``."""
+
+    def parse(text: str) -> float:
+        try:
+            return in_units(text, unit)
+        except InputError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return parse
+
+
+pressure = quantity("Pa")
+density = quantity("kg/m^3")
+seconds = quantity("s")
+metres = quantity("m")
+per_second = quantity("1/s")
+acceleration = quantity("m/s^2")
+
+
+@dataclass(frozen=True)
+class ValueRange:
+    """Numbers from one to another, both included."""
+
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.low!r}:{self.high!r}"
+
+
+def value_range(text: str) -> ValueRange:
+    """Two numbers as LOW:HIGH, or one, to which everything larger belongs."""
+    words = text.split(":")
+    try:
+        low, high = [float(word) for word in words] if len(words) == 2 else (float(text), float("inf"))
+    except ValueError:
+        low, high = float("nan"), float("nan")
+    if not low <= high:
+        raise argparse.ArgumentTypeError(f"{text!r} must be a number or LOW:HIGH, such as 200 or -200:300")
+    return ValueRange(low, high)
+
+
+def unit_of_length(text: str) -> str:
+    """A unit, or a length that is one, such as mm or 3.2cm."""
+    try:
+        metres_per_unit(text)
+    except InputError as error:
+        raise argparse.ArgumentTypeError(str(error).removeprefix("unit is ")) from None
+    return text

@@ -1,0 +1,276 @@
+"""Runs written down: TOML files whose keys are the names of ``simulate``'s options."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import tomllib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from ..errors import InputError
+from ..io.whole import written_whole
+from .loading import FORMS, Load, value_of
+
+HELP = """a run may be written down: run.toml has the options' names for keys, lists for several values, and true for
+options without any; what the command line says in addition counts for all its bodies, paths are beside the file:
+  input = "liver.stl"
+  unit = "mm"
+  fix = ["bottom"]
+  pull = [{ patch = "top", by = [0, 0, 0.02], times = [0, 1, 2], shares = [0, 1, 0] }]
+several bodies are tables [[body]], each with an input and options of its own"""
+
+#: What paths of files are, which a run file has beside it.
+PATHS = ("input", "output", "also", "preview", "csv")
+#: Of these there is one for all bodies.
+SHARED = (
+    *("output", "also", "preview", "preview_frames", "preview_views", "csv"),
+    *("gravity", "damping", "viscosity", "duration", "fps", "dt", "device", "ramp"),
+)
+#: What tables of loads have, besides times and shares.
+VALUES = {"pull": "by", "twist": "degrees", "press": "pressure"}
+
+
+class _Parser(argparse.ArgumentParser):
+    """Complains about a file."""
+
+    path = Path()
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{self.path}: {message}")
+
+
+def bodies_of(args: argparse.Namespace) -> list[argparse.Namespace]:
+    """The options of each body: those of the command, or of the run file that INPUT is, with the command's.
+
+    Raises:
+        InputError: No such file, not TOML, or something in it that is no option.
+    """
+    if not args.input.lower().endswith(".toml"):
+        return [args]
+    path = Path(args.input)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as text ({error})") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: is not TOML: {error}") from None
+    tables = data.pop("body", [{}])
+    if not isinstance(tables, list) or not tables or not all(isinstance(table, dict) for table in tables):
+        raise InputError(f"{path}: 'body' must be tables, each below a line [[body]]")
+    for key in (key for table in tables for key in table if key in SHARED):
+        raise InputError(f"{path}: {key!r} is for the whole run, should stand above the first [[body]]")
+    parser, actions = _parser(path)
+    asked = list(_tokens_given(args, actions))
+    return [_body_of(parser, actions, {**data, **table}, asked, path) for table in tables]
+
+
+def write_run(path: Path, bodies: Sequence[argparse.Namespace]) -> None:
+    """Write down a run, whole or not at all.
+
+    Raises:
+        OSError: It cannot be written.
+        InputError: A value that TOML cannot hold.
+    """
+    _, actions = _parser(path)
+    folder = path.parent
+    if len(bodies) == 1:
+        lines = _lines(bodies[0], actions, folder)
+    else:
+        lines = _lines(bodies[0], {name: actions[name] for name in SHARED}, folder)
+        own = {name: action for name, action in actions.items() if name not in SHARED}
+        for body in bodies:
+            lines += ["", "[[body]]", *_lines(body, own, folder)]
+    try:
+        text = "\n".join(lines) + "\n"
+        data = text.encode()
+    except UnicodeEncodeError:
+        raise InputError(f"{path}: a name in the run is not UTF-8, which TOML must be") from None
+    try:
+        with written_whole(path) as part:
+            part.write_bytes(data)
+    except OSError as error:
+        raise OSError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+def check_run_path(path: Path, source: str) -> None:
+    """Say before a long run what would stop it from being written down.
+
+    Raises:
+        InputError: Something would.
+    """
+    if path.suffix.lower() != ".toml":
+        raise InputError(f"{path}: extension {path.suffix or '(none)'}, should be .toml")
+    if path.is_dir() or not path.parent.is_dir():
+        raise InputError(f"{path}: {'is a folder' if path.is_dir() else f'output folder {path.parent} is not there'}")
+    if path.exists() and Path(source).exists() and path.samefile(source):
+        raise InputError(f"{path}: is the input, should be another file")
+    if not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise InputError(f"{path}: cannot be written to")
+
+
+def _parser(path: Path) -> tuple[_Parser, dict[str, argparse.Action]]:
+    from .options import add_options
+
+    parser = _Parser(allow_abbrev=False, add_help=False, prog="simulate")
+    parser.path = path
+    parser._negative_number_matcher = _Numbers()  # type: ignore[assignment]
+    add_options(parser)
+    return parser, {action.dest: action for action in parser._actions if action.dest != "write_run"}
+
+
+class _Numbers:
+    """Takes all that begins with a minus and is no option for a value."""
+
+    @staticmethod
+    def match(text: str) -> bool:
+        return text.startswith("-") and not text.startswith("--")
+
+
+def _body_of(
+    parser: _Parser, actions: dict[str, argparse.Action], table: dict[str, Any], asked: list[str], path: Path
+) -> argparse.Namespace:
+    if "input" not in table:
+        raise InputError(f"{path}: a body has no 'input'")
+    tokens: list[str] = []
+    curves: list[Load] = []
+    for key, value in table.items():
+        name = key.replace("-", "_")
+        if name not in actions:
+            raise InputError(f"{path}: {key!r} is no option; see warp-corot simulate --help")
+        if name in FORMS and isinstance(value, list):
+            curves += [_load(name, entry, path) for entry in value if isinstance(entry, dict)]
+            value = [entry for entry in value if not isinstance(entry, dict)]
+        if name in PATHS:
+            several = name == "also" and isinstance(value, list)
+            value = [_beside(one, path, name) for one in value] if several else _beside(value, path, name)
+        try:
+            tokens += _tokens(actions[name], value)
+        except TypeError:
+            raise InputError(f"{path}: {key} = {value!r} is not what the option takes") from None
+    body = parser.parse_args([*tokens, *asked])
+    body.curves, body.write_run = curves, None
+    return body
+
+
+def _beside(value: Any, path: Path, name: str) -> Any:
+    if not isinstance(value, str):
+        raise InputError(f"{path}: {name} = {value!r} must be a name in quotation marks")
+    is_name = name == "input" and (value == "box" or value.startswith("warp:"))
+    return value if is_name else str(path.parent / value)
+
+
+def _load(kind: str, table: dict[str, Any], path: Path) -> Load:
+    wanted = {"patch", VALUES[kind], "times", "shares", *(["axis"] if kind == "twist" else [])}
+    known = ", ".join(sorted(wanted))
+    if not {"patch", VALUES[kind]} <= table.keys() <= wanted or ("times" in table) != ("shares" in table):
+        raise InputError(f"{path}: {kind} has {', '.join(map(str, table))}; it may have {known}, times with shares")
+    try:
+        given = table[VALUES[kind]]
+        values = tuple(value_of(kind, str(value)) for value in (given if isinstance(given, list) else [given]))
+        times, shares = (tuple(float(value) for value in table.get(name, ())) for name in ("times", "shares"))
+        axis = tuple(float(value) for value in table["axis"]) if "axis" in table else None
+    except InputError as error:
+        raise InputError(f"{path}: {kind} of {table['patch']!r}: {error}") from None
+    except (TypeError, ValueError):
+        raise InputError(f"{path}: {kind} = {table!r}: something in it must be a number and is none") from None
+    if len(values) != FORMS[kind][0] or (axis is not None and len(axis) != 3):
+        needed = f"{VALUES[kind]} must be {FORMS[kind][0]} numbers, an axis 3"
+        raise InputError(f"{path}: {kind} of {table['patch']!r}: {needed}")
+    return Load(kind, str(table["patch"]), values, times, shares, axis)
+
+
+def _tokens(action: argparse.Action, value: Any) -> list[str]:
+    """A value as the command line has it.
+
+    Raises:
+        TypeError: It is not of the kind that the option takes.
+    """
+    if not action.option_strings:
+        return [str(value)]
+    option = action.option_strings[-1]
+    if action.nargs == 0:
+        if not isinstance(value, bool):
+            raise TypeError
+        return [option] if value else []
+    if isinstance(value, bool | dict):
+        raise TypeError
+    if isinstance(action, argparse._AppendAction):
+        entries = value if isinstance(value, list) else [value]
+        return [token for entry in entries for token in _valued(action, option, entry)]
+    return _valued(action, option, value)
+
+
+def _valued(action: argparse.Action, option: str, value: Any) -> list[str]:
+    if action.nargs is None:
+        if isinstance(value, list | dict):
+            raise TypeError
+        return [f"{option}={value}"]
+    if not isinstance(value, list | tuple) or any(isinstance(one, list | dict) for one in value):
+        raise TypeError
+    return [option, *map(str, value)]
+
+
+def _tokens_given(args: argparse.Namespace, actions: dict[str, argparse.Action]) -> Iterator[str]:
+    """What the command line says in addition."""
+    for name, action in actions.items():
+        value = getattr(args, name)
+        if name != "input" and value != action.default:
+            yield from _tokens(action, value)
+
+
+def _lines(body: argparse.Namespace, actions: dict[str, argparse.Action], folder: Path) -> list[str]:
+    lines = []
+    for name, action in actions.items():
+        value = getattr(body, name)
+        curves = [_table(load) for load in getattr(body, "curves", ()) if load.kind == name]
+        if value == action.default and not curves:
+            continue
+        if name in PATHS:
+            several = isinstance(value, list)
+            value = [_relative(str(one), folder, name) for one in (value if several else [value])]
+            value = value if several else value[0]
+        key = action.option_strings[-1].lstrip("-") if action.option_strings else name
+        if name in FORMS:
+            value = [*([patch, *map(_number, texts)] for patch, *texts in value or ()), *curves]
+        lines.append(f"{key} = {_toml(value)}")
+    return lines
+
+
+def _relative(value: str, folder: Path, name: str) -> str:
+    if os.path.isabs(value) or (name == "input" and (value == "box" or value.startswith("warp:"))):
+        return value
+    return os.path.relpath(value, folder)
+
+
+def _number(text: str) -> float | str:
+    """A number, or a quantity as it is written."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _table(load: Load) -> dict[str, Any]:
+    values: Any = list(load.values) if len(load.values) > 1 else load.values[0]
+    table = {"patch": load.patch, VALUES[load.kind]: values}
+    if load.times:
+        table |= {"times": list(load.times), "shares": list(load.shares)}
+    return table | ({"axis": list(load.axis)} if load.axis else {})
+
+
+def _toml(value: Any) -> str:
+    match value:
+        case bool():
+            return str(value).lower()
+        case int() | float():
+            return repr(value)
+        case list() | tuple():
+            return f"[{', '.join(_toml(one) for one in value)}]"
+        case dict():
+            return "{ " + ", ".join(f"{key} = {_toml(one)}" for key, one in value.items()) + " }"
+    return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -1,0 +1,86 @@
+"""Several bodies of one file: each for itself, or all as one with ``--join``."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from ..io.surfaces import LoadedSurface
+from .opened import Opened, longest_side
+from .organs import TETS
+
+#: More objects than these are taken as one: each would be a body, with a mesh of its own.
+MOST_BODIES = 32
+#: Tetrahedra that each of several bodies has at least, where they share a number.
+FEWEST_TETS = 100
+#: Points of an object nearer to one another than this share of its length are one.
+SAME = 1.0e-6
+
+
+def bodies_in(opened: Opened, args: argparse.Namespace) -> list[tuple[Opened, argparse.Namespace]]:
+    """The bodies of an input with their options.
+
+    The objects of a surface's file are bodies of their own if each is closed, none is a cavity of another, and
+    ``--join`` is not given. They share the number of tetrahedra by their volumes.
+    """
+    surface = opened.surface
+    if surface is None or args.join or not 2 <= len(surface.objects) <= MOST_BODIES:
+        return [(opened, args)]
+    parts = _parts(surface)
+    volumes = np.array([_volume(part) for part in parts])
+    if not all(map(_is_closed, parts)) or (volumes <= 0.0).any():
+        return [(opened, args)]
+    names = ", ".join(part.name for part in parts[:8]) + (", ..." if len(parts) > 8 else "")
+    opened.notes.append(f"{len(parts)} bodies, each for itself: {names} (--join takes them as one)")
+    size = longest_side(surface.points[np.unique(surface.triangles)])
+    found = []
+    for place, (part, share) in enumerate(zip(parts, volumes / volumes.sum(), strict=True)):
+        own = argparse.Namespace(**vars(args))
+        if args.tets is not None or (args.max_level is None and args.surface_error is None and args.cell_size is None):
+            own.tets = max(FEWEST_TETS, int((args.tets or TETS) * share))
+        found.append((replace(opened, surface=part, size=size, notes=opened.notes if place == 0 else []), own))
+    return found
+
+
+def merged_nodes(
+    points: npt.NDArray[np.float64], tets: npt.NDArray[np.int32]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32], int]:
+    """Tetrahedra whose nodes in the same place are one node, and how many nodes went into others."""
+    kept, place = _welded(points)
+    return points[kept], place[tets].astype(np.int32), len(points) - len(kept)
+
+
+def _welded(points: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """The first point of each place, and each point's place among them."""
+    step = SAME * longest_side(points) or 1.0
+    _, kept, place = np.unique(np.round(points / step), axis=0, return_index=True, return_inverse=True)
+    return kept, place.reshape(-1)
+
+
+def _parts(surface: LoadedSurface) -> list[LoadedSurface]:
+    ends = np.cumsum([count for _, count in surface.objects])
+    parts = []
+    for (name, _), triangles in zip(surface.objects, np.split(surface.triangles, ends[:-1]), strict=True):
+        used, renumbered = np.unique(triangles, return_inverse=True)
+        points, own = surface.points[used], renumbered.reshape(-1, 3).astype(np.int32)
+        parts.append(replace(surface, points=points, triangles=own, name=name, objects=[]))
+    return [part for part in parts if len(part.triangles)]
+
+
+def _is_closed(part: LoadedSurface) -> bool:
+    """Whether each edge is walked as often in one direction as in the other."""
+    _, place = _welded(part.points)
+    corners = place[part.triangles]
+    edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    keys = edges.min(axis=1) * (place.max() + 1) + edges.max(axis=1)
+    _, where = np.unique(keys, return_inverse=True)
+    return not np.bincount(where, np.where(edges[:, 0] < edges[:, 1], 1.0, -1.0)).any()
+
+
+def _volume(part: LoadedSurface) -> float:
+    corners = part.points[part.triangles] - part.points.mean(axis=0)
+    return float(np.linalg.det(corners).sum() / 6.0)

@@ -1,0 +1,231 @@
+"""How true a mesh is to the body that it was made from: volume, distances, pieces, labels, shapes of elements."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from ..kernels import measuring as kernels
+from .domain import Domain
+from .reference import reference_of
+from .units import length, volume
+from .winding import net_edges
+
+if TYPE_CHECKING:
+    from ..mesh import SurfaceMesh, TetForest, TetMesh
+
+#: Points spread over each of the two surfaces.
+SAMPLES = 20_000
+#: Volume may be off by this share before it draws a warning.
+LARGEST_VOLUME_ERROR = 0.03
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """A mesh compared with the body that it was made from. Lengths [m], volumes [m^3], angles [°].
+
+    Attributes:
+        volume: What the elements hold of the body.
+        input_volume: Of the body as given.
+        distance_mean: Mean distance of the mesh's surface from the given one, and of the given one from the mesh's.
+        distance_95: The distances below which 95 % are, likewise.
+        pieces: Connected pieces of the mesh; elements that share a face are connected.
+        input_pieces: Of the body as given; parts of a surface that touch, cross or hold one another are one.
+        lost_pieces: Pieces of the body that are in no element.
+        lost_labels: Names of labels that no element has.
+        watertight: Whether every edge of the mesh's surface is walked once each way.
+        smallest_dihedral: The sharpest angle between two faces of an element.
+        elements: How many there are.
+    """
+
+    volume: float
+    input_volume: float
+    distance_mean: tuple[float, float]
+    distance_95: tuple[float, float]
+    pieces: int
+    input_pieces: int
+    lost_pieces: int
+    lost_labels: tuple[str, ...]
+    watertight: bool
+    smallest_dihedral: float
+    elements: int
+
+    @property
+    def volume_error(self) -> float:
+        """What the mesh holds too much, as a share of the body."""
+        return self.volume / self.input_volume - 1.0
+
+    def report(self) -> list[str]:
+        """What was measured, line by line."""
+        (there, back), (far, far_back) = self.distance_mean, self.distance_95
+        return [
+            f"volume {volume(self.volume)} of {volume(self.input_volume)} ({self.volume_error:+.2%})",
+            f"surface {length(there)} from the input's on average, 95 % within {length(far)}; "
+            f"the input's from it {length(back)}, {length(far_back)}",
+            f"pieces {self.pieces}, of the input {self.input_pieces}"
+            + (f"; labels lost: {', '.join(self.lost_labels)}" if self.lost_labels else ""),
+        ]
+
+    def doubts(self) -> list[str]:
+        """What has gone wrong and what would help, a line each; nothing where the mesh is as it should be."""
+        found = []
+        if abs(self.volume_error) > LARGEST_VOLUME_ERROR:
+            found.append(f"the tetrahedra hold {self.volume_error:+.1%} of the body's volume; more of them would help")
+        if self.lost_pieces:
+            found.append(
+                f"{self.lost_pieces} of the body's {self.input_pieces} pieces are in no tetrahedron; more tetrahedra "
+                "would help"
+            )
+        if self.pieces > self.input_pieces - self.lost_pieces:
+            found.append(
+                f"the body has {self.input_pieces} piece{'s'[: self.input_pieces != 1]} and the mesh {self.pieces}: "
+                "something thin is broken; more tetrahedra would help"
+            )
+        if self.pieces < self.input_pieces - self.lost_pieces:
+            found.append(
+                f"the body has {self.input_pieces} pieces and the mesh {self.pieces}: pieces closer to one another "
+                "than a tetrahedron have grown together; more tetrahedra would help"
+            )
+        if self.lost_labels:
+            found.append(
+                f"no tetrahedron has the label{'s'[: len(self.lost_labels) != 1]} {', '.join(self.lost_labels)}: "
+                "smaller than one; more of them would help"
+            )
+        return found
+
+
+def fidelity(
+    mesh: TetForest | TetMesh,
+    surface_or_domain: Any,
+    *,
+    surface: SurfaceMesh | None = None,
+    samples: int = SAMPLES,
+) -> Fidelity:
+    """Measure how true a mesh is to what it was made from.
+
+    Args:
+        mesh: A forest or a mesh of any tetrahedra.
+        surface_or_domain: A domain, or what `Domain.from_surface` takes: a file or (points [N, 3] [m], triangles).
+        surface: The mesh's surface; None: its marched one, or its boundary if it has none.
+        samples: Points spread over each of the two surfaces.
+
+    Raises:
+        InputError: A surface that encloses nothing.
+    """
+    domain = surface_or_domain if isinstance(surface_or_domain, Domain) else Domain.from_surface(surface_or_domain)
+    given = reference_of(domain, samples)
+    surface = _own_surface(mesh) if surface is None else surface
+    forth = np.abs(np.asarray(domain.phi(_spread(surface, samples)), np.float64))
+    back = _distances(surface, given.points, domain.device)
+    pieces, _ = pieces_of(mesh)
+    lost = tuple(n for n in domain.label_names if not (n in _labels(mesh) and mesh.elements_of(n).any()))
+    return Fidelity(
+        volume=held_volume(mesh),
+        input_volume=given.volume,
+        distance_mean=(float(forth.mean()), float(back.mean())),
+        distance_95=(float(np.quantile(forth, 0.95)), float(np.quantile(back, 0.95))),
+        pieces=pieces,
+        input_pieces=given.pieces,
+        lost_pieces=_lost_pieces(mesh, given.points, given.piece, back),
+        lost_labels=lost,
+        watertight=not len(net_edges(surface.triangles.astype(np.int64))[0]),
+        smallest_dihedral=smallest_dihedral(mesh),
+        elements=len(mesh.tets),
+    )
+
+
+def held_volume(mesh: TetForest | TetMesh) -> float:
+    """Volume of a mesh's elements [m^3], of those that a surface cuts what is inside."""
+    from ..mesh.surface import signed_volumes
+
+    volumes = getattr(mesh, "volumes", None)
+    if volumes is None:
+        volumes = np.abs(signed_volumes(mesh.points, mesh.tets))
+    fill = getattr(mesh, "fill", None)
+    return float(np.sum(volumes if fill is None else volumes * fill))
+
+
+def pieces_of(mesh: TetForest | TetMesh) -> tuple[int, np.ndarray]:
+    """How many pieces elements make that are connected by faces, and which each is in, int32 [T]."""
+    from ..mesh.cut import face_pairs
+
+    count = len(mesh.tets)
+    pairs = face_pairs(mesh.tets)
+    links = coo_array((np.ones(len(pairs), np.int8), pairs.T), shape=(count, count))
+    pieces, piece = connected_components(links, directed=False)
+    return pieces, piece.astype(np.int32)
+
+
+def smallest_dihedral(mesh: TetForest | TetMesh) -> float:
+    """The sharpest angle between two faces of an element [°]."""
+    tets = mesh.tets
+    if hasattr(mesh, "levels"):
+        # A forest has three shapes.
+        tets = tets[np.unique(mesh.levels % 3, return_index=True)[1]]
+    smallest = np.pi
+    for part in np.array_split(tets, len(tets) // 200_000 + 1):
+        x = mesh.points[part]
+        normals = []
+        for opposite in range(4):
+            a, b, c = (x[:, n] for n in range(4) if n != opposite)
+            normal = np.cross(b - a, c - a)
+            normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+            towards = np.einsum("ij,ij->i", normal, x[:, opposite] - a)
+            normals.append(np.where(towards > 0, -1.0, 1.0)[:, None] * normal)
+        for one, other in itertools.combinations(normals, 2):
+            cosine = np.einsum("ij,ij->i", one, other)
+            smallest = min(smallest, float(np.pi - np.arccos(np.clip(cosine, -1.0, 1.0)).max()))
+    return float(np.degrees(smallest))
+
+
+def _labels(mesh: Any) -> tuple[str, ...]:
+    return tuple(getattr(mesh, "label_names", ()))
+
+
+def _own_surface(mesh: Any) -> SurfaceMesh:
+    if hasattr(mesh, "surface"):
+        return mesh.surface()
+    from ..io.skins import boundary_surface
+
+    return boundary_surface(mesh)
+
+
+def _spread(surface: SurfaceMesh, count: int) -> np.ndarray:
+    """Points evenly spread over a surface, float64 [n, 3]."""
+    corners = surface.points[surface.triangles]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    rng = np.random.default_rng(0)
+    chosen = rng.choice(len(corners), count, p=areas / areas.sum())
+    u, v = np.sqrt(rng.random(count)), rng.random(count)
+    weights = np.stack([1.0 - u, u * (1.0 - v), u * v], axis=1)
+    return np.einsum("nc,ncx->nx", weights, corners[chosen])
+
+
+def _distances(surface: SurfaceMesh, points: np.ndarray, device: wp.Device) -> np.ndarray:
+    """How far points are from a surface [m], float64 [n]."""
+    # About the middle of the surface, as float32 keeps few digits far from zero.
+    middle = surface.points.mean(axis=0)
+    mesh = wp.Mesh(
+        wp.array(surface.points - middle, dtype=wp.vec3, device=device),
+        wp.array(surface.triangles.astype(np.int32).ravel(), dtype=wp.int32, device=device),
+    )
+    placed = wp.array(points - middle, dtype=wp.vec3, device=device)
+    found = wp.empty(len(points), dtype=wp.float32, device=device)
+    wp.launch(kernels.measure_distances, len(points), [placed, mesh.id, 1.0e15], [found], device=device)
+    return found.numpy().astype(np.float64)
+
+
+def _lost_pieces(mesh: Any, points: np.ndarray, piece: np.ndarray, distances: np.ndarray) -> int:
+    """Pieces of the body of which no point is in an element."""
+    if not hasattr(mesh, "embed"):
+        return 0
+    near = np.unique(piece, return_index=True)[1]
+    _, weights = mesh.embed(points)
+    held = weights.min(axis=1) > -1.0e-6
+    return len(near) - len(np.unique(piece[held]))

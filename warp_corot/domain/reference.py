@@ -1,0 +1,218 @@
+"""What a body is before it is meshed: its volume, its pieces, and points spread over its surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.ndimage
+import warp as wp
+
+from ..kernels import measuring as kernels
+from .domain import Domain
+from .labels import LabelDomain
+from .surface import SurfaceDomain
+from .winding import Parts, edge_parts, linked, part_volumes
+
+#: Points along the longest side at which a function is looked at first, and how often cells at the surface are halved.
+CELLS, HALVINGS = 24, 2
+#: How far off a triangle it is looked whether a body begins there, over the body's length.
+ASIDE = 1.0e-5
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A body as it was given.
+
+    Attributes:
+        volume: [m^3].
+        points: Points of its surface, evenly spread, float64 [n, 3] [m].
+        piece: Which connected piece each is of, int32 [n].
+        pieces: How many pieces there are.
+    """
+
+    volume: float
+    points: np.ndarray
+    piece: np.ndarray
+    pieces: int
+
+
+def reference_of(domain: Domain, count: int) -> Reference:
+    """What is known of a domain, without meshing it.
+
+    Args:
+        domain: Any. Of a surface and of voxels all is exact; of others volume and pieces come from samples.
+        count: About how many points.
+    """
+    if isinstance(domain, SurfaceDomain):
+        return _of_surface(domain, count)
+    if isinstance(domain, LabelDomain):
+        return _of_voxels(domain, count)
+    return _of_samples(domain, count)
+
+
+def _of_surface(domain: SurfaceDomain, count: int) -> Reference:
+    points, triangles = domain.closed.points, domain.closed.triangles.astype(np.int64)
+    pieces, piece, crossing = joined_parts(points, triangles, domain.device)
+    corners = points[triangles]
+    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    rng = np.random.default_rng(0)
+    # One of each piece at least, however small it is.
+    first = np.unique(piece, return_index=True)[1]
+    chosen = np.concatenate([first, rng.choice(len(triangles), count, p=areas / areas.sum())])
+    u, v = np.sqrt(rng.random(len(chosen))), rng.random(len(chosen))
+    weights = np.stack([1.0 - u, u * (1.0 - v), u * v], axis=1)
+    spread = np.einsum("nc,ncx->nx", weights, corners[chosen])
+    own = piece[chosen]
+    volume = domain.closed.volume
+    if crossing:
+        normal = np.cross(corners[chosen, 1] - corners[chosen, 0], corners[chosen, 2] - corners[chosen, 0])
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+        aside = ASIDE * float(np.ptp(domain.bounds, axis=0).max()) * normal
+        bounds = (domain.phi(spread + aside) > 0.0) & (domain.phi(spread - aside) < 0.0)
+        spread, own = spread[bounds], own[bounds]
+        volume = _sampled(domain)[0]
+    return Reference(volume, spread, own, pieces)
+
+
+def joined_parts(points: np.ndarray, triangles: np.ndarray, device: wp.Device) -> tuple[int, np.ndarray, bool]:
+    """Pieces of the body that a closed surface encloses: its parts, those that touch, cross or hold one another joined.
+
+    Returns:
+        How many there are, the piece of each triangle [T] (that of a cavity's is its surroundings'), and whether parts
+        overlap.
+    """
+    part = edge_parts(triangles)
+    count = int(part.max()) + 1
+    if count == 1:
+        return 1, np.zeros(len(triangles), np.int32), False
+    # Parts that share a point.
+    at = np.unique(np.stack([triangles.ravel(), np.repeat(part, 3)], axis=1), axis=0)
+    same = at[1:, 0] == at[:-1, 0]
+    links = [np.stack([at[:-1][same, 1], at[1:][same, 1]], axis=1)]
+    crossings = _crossings(points, triangles, part, device)
+    links.append(crossings)
+    # Parts that lie within another: a cavity in its surroundings, or what is buried in it.
+    groups, outward = Parts(points, triangles, part), part_volumes(points, triangles, part) > 0.0
+    overlap = len(crossings) > 0
+    for own in range(count):
+        holders = groups.holders(groups.corners[groups.slices[own]][0, 0], own)
+        depth = int(np.sum(np.where(outward[holders], 1, -1)))
+        if len(holders) and depth > 0:
+            links.append(np.stack([np.full(len(holders), own), holders], axis=1))
+            overlap |= bool(outward[own])
+    pairs = np.concatenate(links)
+    pieces, of_part = linked(pairs[:, 0], pairs[:, 1], count)
+    return pieces, of_part[part].astype(np.int32), overlap
+
+
+def _crossings(points: np.ndarray, triangles: np.ndarray, part: np.ndarray, device: wp.Device) -> np.ndarray:
+    """Pairs of parts of which an edge of one goes through a triangle of the other [n, 2]."""
+    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges, first = np.unique(edges, axis=0, return_index=True)
+    own = part[first // 3]
+    middle = points.mean(axis=0)
+    placed = wp.array(points - middle, dtype=wp.vec3, device=device)
+    mesh = wp.Mesh(placed, wp.array(triangles.astype(np.int32).ravel(), dtype=wp.int32, device=device))
+    crossed = wp.empty(len(edges), dtype=wp.int32, device=device)
+    inputs = [
+        placed,
+        wp.array(edges.astype(np.int32), dtype=wp.vec2i, device=device),
+        wp.array(own.astype(np.int32), dtype=wp.int32, device=device),
+        mesh.id,
+        wp.array(part.astype(np.int32), dtype=wp.int32, device=device),
+    ]
+    wp.launch(kernels.find_crossed_parts, len(edges), inputs, [crossed], device=device)
+    other = crossed.numpy()
+    return np.unique(np.stack([own, other], axis=1)[other >= 0], axis=0)
+
+
+def _of_voxels(domain: LabelDomain, count: int) -> Reference:
+    inside = domain.numbers > 0
+    numbers, pieces = scipy.ndimage.label(inside, np.ones((3, 3, 3)))
+    voxel = abs(float(np.linalg.det(domain.affine[:3, :3])))
+    rng = np.random.default_rng(0)
+    found, owners, areas = [], [], []
+    for axis in range(3):
+        # Faces between a voxel inside and one outside: the surface is in the middle between their centres.
+        low = tuple(slice(None, -1) if k == axis else slice(None) for k in range(3))
+        high = tuple(slice(1, None) if k == axis else slice(None) for k in range(3))
+        faces = np.argwhere(inside[low] != inside[high])
+        step = np.eye(3)[axis]
+        owners.append(np.maximum(numbers[low][tuple(faces.T)], numbers[high][tuple(faces.T)]) - 1)
+        found.append(faces + 0.5 * step)
+        areas.append(np.full(len(faces), voxel / np.linalg.norm(domain.affine[:3, axis])))
+    places, owner, weight = np.concatenate(found), np.concatenate(owners), np.concatenate(areas)
+    first = np.unique(owner, return_index=True)[1]
+    chosen = np.concatenate([first, rng.choice(len(places), count, p=weight / weight.sum())])
+    spread = places[chosen] @ domain.affine[:3, :3].T + domain.affine[:3, 3]
+    return Reference(float(inside.sum()) * voxel, spread, owner[chosen].astype(np.int32), int(pieces))
+
+
+def _of_samples(domain: Domain, count: int) -> Reference:
+    volume, points, pieces = _sampled(domain)
+    points = _projected(domain, points)
+    if len(points) > count:
+        points = points[np.random.default_rng(0).choice(len(points), count, replace=False)]
+    return Reference(volume, points, np.zeros(len(points), np.int32), pieces)
+
+
+def _sampled(domain: Domain) -> tuple[float, np.ndarray, int]:
+    """Volume, points near the surface, and pieces, of cells that are halved where the surface may be."""
+    low, size = domain.bounds[0], np.ptp(domain.bounds, axis=0)
+    h = float(size.max()) / CELLS
+    cells = np.maximum(np.ceil(size / h).astype(int), 1)
+    centres = low + (np.indices(cells).reshape(3, -1).T + 0.5) * (size / cells)
+    box = size / cells
+    volume = 0.0
+    for halving in range(HALVINGS + 1):
+        phi = np.asarray(domain.phi(centres), np.float64)
+        if halving == 0:
+            pieces = scipy.ndimage.label((phi < 0.0).reshape(cells), np.ones((3, 3, 3)))[1]
+        reach = 0.5 * domain.lipschitz * float(np.linalg.norm(box))
+        near = np.abs(phi) <= reach
+        volume += float((phi[~near] < 0.0).sum()) * float(box.prod())
+        if halving == HALVINGS:
+            # Of the last cells as much as points in them say, one in each eighth.
+            rng = np.random.default_rng(0)
+            eighths = (np.indices((2, 2, 2)).reshape(3, -1).T - 1.0)[None] + rng.random((int(near.sum()), 8, 3))
+            within = centres[near][:, None] + 0.5 * eighths * box
+            share = float((np.asarray(domain.phi(within.reshape(-1, 3))) < 0.0).mean())
+            return volume + share * float(near.sum()) * float(box.prod()), centres[near], max(int(pieces), 1)
+        parts = (np.indices((2, 2, 2)).reshape(3, -1).T - 0.5) * 0.5
+        centres = (centres[near][:, None] + parts * box).reshape(-1, 3)
+        box = 0.5 * box
+    raise AssertionError
+
+
+def _projected(domain: Domain, points: np.ndarray) -> np.ndarray:
+    """Points near the surface, moved onto it."""
+    size = float(np.ptp(domain.bounds, axis=0).max())
+    step = 1.0e-4 * size
+    for _ in range(4):
+        phi = np.asarray(domain.phi(points), np.float64)
+        slopes = [domain.phi(points + step * axis) - domain.phi(points - step * axis) for axis in np.eye(3)]
+        gradient = np.stack(slopes, axis=1).astype(np.float64) / (2.0 * step)
+        points = points - (phi / np.maximum((gradient**2).sum(axis=1), 0.05))[:, None] * gradient
+    return points[np.abs(domain.phi(points)) < 1.0e-3 * size / CELLS]
+
+
+def extent_of(domain: Domain) -> tuple[float, float]:
+    """About the volume [m^3] and the area of the surface [m^2] of a domain."""
+    if isinstance(domain, SurfaceDomain):
+        corners = domain.closed.points[domain.closed.triangles]
+        crossed = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        return domain.closed.volume, 0.5 * float(np.linalg.norm(crossed, axis=1).sum())
+    if isinstance(domain, LabelDomain):
+        inside = domain.numbers > 0
+        voxel = abs(float(np.linalg.det(domain.affine[:3, :3])))
+        area = 0.0
+        for axis in range(3):
+            faces = np.count_nonzero(np.diff(inside, axis=axis))
+            area += faces * voxel / float(np.linalg.norm(domain.affine[:3, axis]))
+        # A staircase has half as much again as the slope that it stands for, about.
+        return float(inside.sum()) * voxel, area / 1.5
+    volume, points, _ = _sampled(domain)
+    # The cells that are near the surface are as wide as their diagonal, on both sides.
+    cell = float(np.ptp(domain.bounds, axis=0).max()) / CELLS * 0.5**HALVINGS
+    return volume, len(points) * cell**3 / (domain.lipschitz * np.sqrt(3.0) * cell)

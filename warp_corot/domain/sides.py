@@ -1,0 +1,182 @@
+"""Which triangles of a closed surface have the body behind them and the outside in front, all over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from ..kernels import domain as kernels
+from ..kernels import measuring
+from .winding import linked, winding_number
+
+#: How far off a triangle winding numbers are looked at, over its own size and, at least, over the surface's.
+ASIDE, LEAST_ASIDE = 1.0e-3, 2.0e-6
+#: Where more than this share of the edges goes through triangles of their own part, nothing is sure.
+MESSY = 2.0e-3
+#: Two triangles whose unit normals add up to less lie on one another, nearly.
+FOLDED = 0.05
+#: Patches of which winding numbers are looked at; more are not worth it.
+MOST_PATCHES = 20_000
+#: Signs that may differ from those by the device's winding numbers, if those are wrong.
+MOST_DIFFERENT = 32
+#: Points near the surface at which what was found is tried.
+TRIED = 4096
+
+
+@dataclass(frozen=True)
+class Sides:
+    """What tells inside from outside at the triangle that is closest to a point.
+
+    Attributes:
+        known: BOUNDARY, BURIED or UNSURE, uint8 [T].
+        edge_normals: Sums of the unit normals of the two triangles at each edge, the one across from each corner,
+            float32 [T, 3, 3].
+        corner_normals: Of all triangles around each point, weighted by their angles, float32 [N, 3].
+    """
+
+    known: np.ndarray
+    edge_normals: np.ndarray
+    corner_normals: np.ndarray
+
+    def arrays(self, device: wp.Device) -> list[wp.array]:
+        """The three on a device."""
+        return [
+            wp.array(self.known, dtype=wp.uint8, device=device),
+            wp.array(self.edge_normals, dtype=wp.vec3, device=device),
+            wp.array(self.corner_normals, dtype=wp.vec3, device=device),
+        ]
+
+
+def sides_of(points: np.ndarray, triangles: np.ndarray, mesh: wp.Mesh) -> Sides:
+    """What is on the two sides of each triangle.
+
+    Where no triangle crosses or touches another but along common edges, all of a patch is alike, and two winding
+    numbers tell of it. Triangles that cross others are unsure, and so are those around edges that are not shared by
+    two. In the end signs are compared at random points near the surface; if any is wrong, or if the surface crosses
+    itself in many places, no triangle is sure.
+
+    Args:
+        points: float64 [N, 3].
+        triangles: Closed, int32 [T, 3].
+        mesh: The same, with winding numbers.
+    """
+    triangles = triangles.astype(np.int64)
+    count = len(triangles)
+    # Edge k of a triangle is across from its corner k.
+    ends = np.sort(triangles[:, [1, 2, 2, 0, 0, 1]].reshape(-1, 2), axis=1)
+    keys = ends[:, 0] * (int(triangles.max()) + 1) + ends[:, 1]
+    order = np.argsort(keys, kind="stable")
+    starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    sharers = np.diff(starts, append=len(order))
+    two = starts[sharers == 2]
+    one, other = order[two], order[two + 1]
+    a, b = one // 3, other // 3
+
+    corners = points[triangles]
+    crossed = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    double_area = np.linalg.norm(crossed, axis=1)
+    normal = crossed / np.maximum(double_area, 1e-300)[:, None]
+    edge_normals = np.zeros((3 * count, 3), np.float32)
+    edge_normals[one] = edge_normals[other] = normal[a] + normal[b]
+    corner_normals = _corner_normals(corners, triangles, normal, len(points))
+    unknown = np.full(count, kernels.UNSURE, np.uint8)
+
+    def with_sides(known: np.ndarray) -> Sides:
+        return Sides(known, edge_normals.reshape(count, 3, 3), corner_normals)
+
+    touched = _touched(ends[order[starts]], mesh)
+    parts, owner_of = linked(a, b, count)[1], order[starts] // 3
+    hit = touched >= 0
+    crosses_itself = parts[owner_of[hit]] == parts[touched[hit]]
+    if np.count_nonzero(crosses_itself) + np.count_nonzero(touched < -1) > MESSY * len(touched):
+        return with_sides(unknown)
+    doubtful = np.zeros(count, bool)
+    doubtful[order[np.repeat((touched != -1) | (sharers != 2), sharers)] // 3] = True
+    doubtful[touched[touched >= 0]] = True
+    folded = np.linalg.norm(normal[a] + normal[b], axis=1) < FOLDED
+    doubtful[a[folded]] = doubtful[b[folded]] = True
+    doubtful |= np.isin(triangles, _pinched(triangles, one, other)).any(axis=1)
+    # And their neighbours, as what crosses does not end at a triangle's edge for float32.
+    doubtful |= np.isin(triangles, triangles[doubtful]).any(axis=1)
+    linking = ~(doubtful[a] | doubtful[b])
+    patches, patch = linked(a[linking], b[linking], count)
+    sure = np.unique(patch[~doubtful])
+    if not len(sure) or len(sure) > MOST_PATCHES:
+        return with_sides(unknown)
+    largest = np.zeros(patches, np.int64)
+    by_size = np.argsort(double_area)
+    largest[patch[by_size]] = by_size
+    chosen = largest[sure]
+    aside = np.maximum(ASIDE * np.sqrt(double_area[chosen]), LEAST_ASIDE * np.ptp(points, axis=0).max())
+    middle = corners[chosen].mean(axis=1)
+    outside, inside = (
+        _signed(mesh, middle + way * aside[:, None] * normal[chosen], with_sides(unknown)) < 0.0 for way in (1.0, -1.0)
+    )
+    of_patch = np.full(patches, kernels.UNSURE, np.uint8)
+    of_patch[sure[~outside & inside]] = kernels.BOUNDARY
+    of_patch[sure[outside & inside]] = kernels.BURIED
+    known = np.where(doubtful, np.uint8(kernels.UNSURE), of_patch[patch])
+    points_near = _near(corners, double_area)
+    quick, slow = (_signed(mesh, points_near, with_sides(one)) for one in (known, unknown))
+    noise = 1e-6 * float(np.ptp(points, axis=0).max())
+    differ = np.flatnonzero(((quick < 0.0) != (slow < 0.0)) & (np.abs(slow) >= noise))
+    if len(differ) > MOST_DIFFERENT:
+        return with_sides(unknown)
+    # Winding numbers on the device take groups of triangles together; which of the two is right?
+    exact = np.array([winding_number(corners, points_near[i]) for i in differ]) > 0.5
+    return with_sides(known if (exact == (quick[differ] < 0.0)).all() else unknown)
+
+
+def _corner_normals(corners: np.ndarray, triangles: np.ndarray, normal: np.ndarray, count: int) -> np.ndarray:
+    found = np.zeros((count, 3))
+    for n in range(3):
+        u, v = corners[:, (n + 1) % 3] - corners[:, n], corners[:, (n + 2) % 3] - corners[:, n]
+        angle = np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), np.einsum("ij,ij->i", u, v))
+        for axis in range(3):
+            found[:, axis] += np.bincount(triangles[:, n], angle * normal[:, axis], count)
+    return found.astype(np.float32)
+
+
+def _pinched(triangles: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Points around which triangles are not all linked by common edges."""
+    count = len(triangles)
+    links = []
+    for a_corner in (1, 2):
+        mine = 3 * (one // 3) + (one + a_corner) % 3
+        point = triangles.ravel()[mine]
+        for b_corner in (1, 2):
+            theirs = 3 * (other // 3) + (other + b_corner) % 3
+            same = triangles.ravel()[theirs] == point
+            links.append(np.stack([mine[same], theirs[same]]))
+    a, b = np.concatenate(links, axis=1)
+    _, fan = linked(a, b, 3 * count)
+    fans = np.unique(np.stack([triangles.ravel(), fan], axis=1), axis=0)[:, 0]
+    names, times = np.unique(fans, return_counts=True)
+    return names[times > 1]
+
+
+def _touched(edges: np.ndarray, mesh: wp.Mesh) -> np.ndarray:
+    touched = wp.empty(len(edges), dtype=wp.int32, device=mesh.device)
+    given = wp.array(edges.astype(np.int32), dtype=wp.vec2i, device=mesh.device)
+    inputs = [mesh.points, given, mesh.id, mesh.indices]
+    wp.launch(measuring.find_touched_triangles, len(edges), inputs, [touched], device=mesh.device)
+    return touched.numpy()
+
+
+def _signed(mesh: wp.Mesh, points: np.ndarray, sides: Sides) -> np.ndarray:
+    given = wp.array(points, dtype=wp.vec3, device=mesh.device)
+    phi = wp.empty(len(points), dtype=wp.float32, device=mesh.device)
+    inputs = [given, mesh.id, mesh.indices, *sides.arrays(mesh.device)]
+    wp.launch(kernels.evaluate_surface, len(points), inputs, [phi], device=mesh.device)
+    return phi.numpy()
+
+
+def _near(corners: np.ndarray, area: np.ndarray) -> np.ndarray:
+    """Points near the surface, at all distances from it."""
+    rng = np.random.default_rng(0)
+    chosen = rng.choice(len(corners), TRIED, p=area / area.sum())
+    size = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
+    apart = size * 10.0 ** rng.uniform(-4.0, -1.0, (TRIED, 1)) * rng.standard_normal((TRIED, 3))
+    return np.einsum("nc,ncx->nx", rng.dirichlet([1.0, 1.0, 1.0], TRIED), corners[chosen]) + apart

@@ -1,0 +1,47 @@
+"""Viscous forces of a body, which take energy out of what changes its shape and leave its motion as a whole alone."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from ..kernels.viscosity import scatter_viscous
+from .model import leaf_slots
+
+if TYPE_CHECKING:
+    from ..body import SoftBody
+    from .model import ForceField
+
+
+class Viscosity:
+    """Stresses proportional to the rate of strain, in every element.
+
+    Args:
+        body: The body.
+        field: Its elastic forces, whose elements are followed where the mesh changes.
+        seconds: Viscosities over Lamé's parameters [s].
+    """
+
+    def __init__(self, body: SoftBody, field: ForceField, seconds: float):
+        self.body, self.field, self.seconds = body, field, seconds
+        self._kernel = scatter_viscous(body.element_kind)
+        #: Where sums must come out the same every time, the elements' own places for them.
+        self._slots = leaf_slots(body) if field.deterministic else None
+
+    def add_forces(self, f: wp.array) -> None:
+        """Launch the forces of the present displacements and velocities [N], added to f, vec4 [worlds * N]."""
+        if self._slots is None:
+            # Forces go to the nodes also where the field's own kernels take them elsewhere.
+            self._launch(self.field.elements if self.body.changing is not None else self.body.elements, f)
+            return
+        slots, elements = self._slots
+        slots.values.zero_()
+        self._launch(elements, slots.values)
+        slots.gather(f)
+
+    def _launch(self, elements: object, f: wp.array) -> None:
+        body = self.body
+        inputs = [elements, self.seconds, body.mu, body.lam, body.material_stride]
+        inputs += [body.node_displacements, body.node_velocities]
+        wp.launch(self._kernel, self.field.element_count, inputs, [f], device=body.device)

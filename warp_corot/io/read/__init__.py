@@ -1,0 +1,7 @@
+"""Readers of people's mesh files: one file a family of formats, and the process in which they run."""
+
+from .filemesh import Block, FileMesh
+from .files import SUFFIXES, read_mesh_file
+from .split import split_solids, triangles_of
+
+__all__ = ["SUFFIXES", "Block", "FileMesh", "read_mesh_file", "split_solids", "triangles_of"]

@@ -1,0 +1,243 @@
+"""Abaqus input files (.inp), as Abaqus, CalculiX, FreeCAD and Gmsh write them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .filemesh import CORNERS, Block, FileMesh, Unreadable, corners_note, real, whole
+
+#: Kinds by the number of nodes that an element type's name gives.
+SOLIDS = {4: "tetra", 10: "tetra", 5: "pyramid", 13: "pyramid", 6: "wedge", 15: "wedge"}
+SOLIDS |= {8: "hexahedron", 20: "hexahedron", 27: "hexahedron"}
+SHELLS = {3: "triangle", 6: "triangle", 4: "quad", 8: "quad", 9: "quad"}
+SOLID = re.compile(r"(?:[DA]?C3D|SC)(\d+)")
+SHELL = re.compile(r"(?:STRI|SFM3D|R3D|M3D|F3D|DS|CPS|CPE|S)(\d+)")
+#: Files may include files so deep.
+DEEPEST = 8
+#: The array of numbers of sets and of instances.
+SETS, INSTANCES = "element set", "instance"
+
+
+@dataclass
+class Card:
+    """A keyword with its parameters and the lines of data after it."""
+
+    keyword: str
+    given: dict[str, str]
+    lines: list[str]
+
+    def numbers(self) -> list[list[str]]:
+        """The data, words by line; a comma at a line's end says nothing."""
+        return [[word.strip() for word in line.rstrip(", \t").split(",")] for line in self.lines]
+
+
+@dataclass
+class Part:
+    """Nodes, elements and sets of a part; those of a file without parts are one."""
+
+    nodes: dict[int, list[float]] = field(default_factory=dict)
+    elements: dict[str, list[list[int]]] = field(default_factory=dict)  # kind -> rows of number and corners
+    of_lines: dict[str, list[int]] = field(default_factory=dict)
+    sets: dict[str, list[int]] = field(default_factory=dict)
+    sections: list[str] = field(default_factory=list)
+
+
+def read(path: Path) -> FileMesh:
+    """The elements of all instances, with sets as arrays of numbers.
+
+    Regions are the sets that sections give a material; without sections those that elements are listed in; without
+    those the others, where several hold an element the smallest.
+
+    Raises:
+        Unreadable: Nodes or elements that do not fit, or an included file that is not there.
+    """
+    parts: dict[str, Part] = {"": Part()}
+    instances: list[tuple[str, str, NDArray[np.float64]]] = []
+    here, names = parts[""], {"": ""}
+    notes: list[str] = []
+    ignored: dict[str, int] = {}
+    for card in _cards(path, 0):
+        word, given = card.keyword, card.given
+        if word == "PART":
+            here = parts.setdefault(given.get("NAME", "").upper(), Part())
+        elif word == "ENDPART":
+            here = parts[""]
+        elif word == "INSTANCE":
+            name, part = given.get("NAME", ""), given.get("PART", "").upper()
+            if part not in parts:
+                raise Unreadable(f"the instance {name!r} is of part {part!r}, which is not there")
+            instances.append((name, part, _placed(card)))
+            here = parts[part]
+        elif word == "ENDINSTANCE":
+            here = parts[""]
+        elif word == "NODE":
+            for row in card.numbers():
+                here.nodes[whole(row[0])] = [*((real(word) if word else 0.0) for word in row[1:4]), 0.0, 0.0, 0.0][:3]
+        elif word == "ELEMENT":
+            _elements(card, here, ignored, notes)
+        elif word == "ELSET":
+            placed = _part_of(instances, given.get("INSTANCE", ""))
+            owner = here if placed is None else parts[placed]
+            name = given.get("ELSET", "")
+            owner.sets.setdefault(_known(names, name), []).extend(_members(card, owner, names))
+        elif word in ("SOLIDSECTION", "SHELLSECTION"):
+            here.sections.append(_known(names, given.get("ELSET", "")))
+    if not instances or parts[""].nodes:
+        instances.insert(0, ("", "", np.eye(4)))
+    return _joined(parts, instances, ignored, list(dict.fromkeys(notes)))
+
+
+def _cards(path: Path, depth: int) -> Iterator[Card]:
+    """The keywords of a file and of those that it includes."""
+    card: Card | None = None
+    unfinished = False
+    for line in path.read_text("utf-8", "replace").splitlines():
+        if line.startswith("**") or not line.strip():
+            continue
+        if line.lstrip().startswith("*") or (unfinished and card):
+            if unfinished and card:
+                card.given |= _parameters(line)
+            else:
+                if card:
+                    yield card
+                keyword, _, rest = line.strip()[1:].partition(",")
+                card = Card(re.sub(r"\s", "", keyword).upper(), _parameters(rest), [])
+            unfinished = line.rstrip().endswith(",")
+            if card.keyword == "INCLUDE" and not unfinished:
+                other = path.parent / card.given.get("INPUT", "")
+                if depth >= DEEPEST or not other.is_file():
+                    raise Unreadable(f"it includes {card.given.get('INPUT', '')!r}, which is not there")
+                yield from _cards(other, depth + 1)
+                card = None
+        elif card:
+            card.lines.append(line)
+    if card:
+        yield card
+
+
+def _parameters(text: str) -> dict[str, str]:
+    found = {}
+    for part in text.split(","):
+        name, _, value = part.partition("=")
+        if name.strip():
+            found[re.sub(r"\s", "", name).upper()] = value.strip().strip('"')
+    return found
+
+
+def _known(names: dict[str, str], name: str) -> str:
+    """A set's name as it was written first: case does not count."""
+    return names.setdefault(name.upper(), name)
+
+
+def _part_of(instances: list[tuple[str, str, NDArray[np.float64]]], instance: str) -> str | None:
+    return next((part for name, part, _ in instances if name.upper() == instance.upper() and instance), None)
+
+
+def _placed(card: Card) -> NDArray[np.float64]:
+    """An instance's affine [4, 4]: moved, then turned about the axis between two points by an angle."""
+    rows = [[(real(word) if word else 0.0) for word in row] for row in card.numbers()]
+    affine = np.eye(4)
+    if rows:
+        affine[:3, 3] = [*rows[0], 0.0, 0.0, 0.0][:3]
+    if len(rows) > 1 and len(rows[1]) == 7:
+        start, axis, angle = np.array(rows[1][:3]), np.subtract(rows[1][3:6], rows[1][:3]), np.deg2rad(rows[1][6])
+        x, y, z = axis / (np.linalg.norm(axis) or 1.0)
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        turn = np.eye(4)
+        turn[:3, :3] += np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+        turn[:3, 3] = start - turn[:3, :3] @ start
+        affine = turn @ affine
+    return affine
+
+
+def _elements(card: Card, part: Part, ignored: dict[str, int], notes: list[str]) -> None:
+    name = card.given.get("TYPE", "").upper()
+    solid, shell = SOLID.match(name), SHELL.match(name)
+    count = int(solid[1]) if solid else 6 if name == "STRI65" else int(shell[1][0]) if shell else 0
+    kind = SOLIDS.get(count) if solid else SHELLS.get(count) if shell else None
+    if kind is None:
+        ignored[name] = ignored.get(name, 0) + len(card.lines)
+        return
+    if name == "C3D15V":
+        count = 18
+    words = [whole(word) for row in card.numbers() for word in row if word]
+    if len(words) % (count + 1):
+        raise Unreadable(f"elements of type {name} have {len(words)} numbers, not a multiple of {count + 1}")
+    corners = CORNERS[kind]
+    if count > corners:
+        notes.append(corners_note(kind))
+    rows = [words[k : k + 1 + corners] for k in range(0, len(words), count + 1)]
+    part.elements.setdefault(kind, []).extend(rows)
+    if card.given.get("ELSET"):
+        part.of_lines.setdefault(card.given["ELSET"], []).extend(row[0] for row in rows)
+
+
+def _members(card: Card, part: Part, names: dict[str, str]) -> list[int]:
+    """Numbers of the elements of a set: listed, in ranges, or by other sets."""
+    rows = card.numbers()
+    if "GENERATE" in card.given:
+        found: list[int] = []
+        for row in rows:
+            first, last, step = [*(whole(word) for word in row), 1][:3]
+            if step < 1 or (last - first) // step > 10**8:
+                raise Unreadable(f"a set's range is {', '.join(row)}")
+            found += range(first, last + 1, step)
+        return found
+    found = []
+    for word in (word for row in rows for word in row if word):
+        if re.fullmatch(r"\d+", word):
+            found.append(int(word))
+        else:
+            name = names.get(word.upper(), word)
+            found += part.sets.get(name, part.of_lines.get(name, []))
+    return found
+
+
+def _joined(
+    parts: dict[str, Part], instances: list[tuple[str, str, NDArray]], ignored: dict[str, int], notes: list[str]
+) -> FileMesh:
+    points: list[NDArray[np.float64]] = [np.empty((0, 3))]
+    blocks: list[Block] = []
+    numbers: dict[str, int] = {}
+    offset = 0
+    for place, (_, name, affine) in enumerate(instances, start=1):
+        part = parts[name]
+        tags = np.array(sorted(part.nodes), np.int64)
+        own = np.array([part.nodes[tag] for tag in tags.tolist()], np.float64).reshape(-1, 3)
+        set_of = _regions(part, numbers)
+        for kind, rows in part.elements.items():
+            table = np.array(rows, np.int64)
+            index = np.searchsorted(tags, table[:, 1:]).clip(0, max(len(tags) - 1, 0))
+            if not len(tags) or (tags[index] != table[:, 1:]).any():
+                row, column = np.argwhere(tags[index] != table[:, 1:])[0] if len(tags) else (0, 0)
+                raise Unreadable(f"element {table[row, 0]} names node {table[row, 1 + column]}, which is not there")
+            data = {SETS: np.array([set_of.get(tag, 0) for tag in table[:, 0].tolist()], np.int64)}
+            if len(instances) > 1:
+                data[INSTANCES] = np.full(len(table), place)
+            blocks.append(Block(kind, index + offset, data))
+        points.append(own @ affine[:3, :3].T + affine[:3, 3])
+        offset += len(own)
+    if not blocks and not offset:
+        raise Unreadable("it has no *NODE and no *ELEMENT")
+    names = {SETS: {number: name for name, number in numbers.items()}}
+    if len(instances) > 1:
+        names[INSTANCES] = {k: name or f"instance {k}" for k, (name, _, _) in enumerate(instances, start=1)}
+    return FileMesh(np.concatenate(points), blocks, names, ignored, notes)
+
+
+def _regions(part: Part, numbers: dict[str, int]) -> dict[int, int]:
+    """The number of each element's set."""
+    sets = {**part.of_lines, **part.sets}
+    with_section = {name: sets[name] for name in part.sections if name in sets}
+    chosen = with_section or part.of_lines or dict(sorted(part.sets.items(), key=lambda item: -len(item[1])))
+    found: dict[int, int] = {}
+    for name, members in chosen.items():
+        number = numbers.setdefault(name, len(numbers) + 1)
+        found |= dict.fromkeys(members, number)
+    return found

@@ -1,0 +1,156 @@
+"""What a reader finds in a file: points, blocks of cells, and numbers that tell regions apart."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Corners of the kinds of cells that make bodies.
+SOLIDS = {"tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8}
+#: Corners of the kinds of cells that make surfaces.
+FACES = {"triangle": 3, "quad": 4}
+CORNERS = {**SOLIDS, **FACES}
+
+
+class Unreadable(Exception):
+    """A reader's own reason for not reading a file."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """Cells of one kind.
+
+    Attributes:
+        kind: A key of `SOLIDS` or `FACES`.
+        nodes: Their corners in VTK's order, int64 [n, corners].
+        data: Numbers of cells by the name of their array, int64 [n].
+    """
+
+    kind: str
+    nodes: NDArray[np.int64]
+    data: dict[str, NDArray[np.int64]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        corners = {**SOLIDS, **FACES}.get(self.kind)
+        if corners is not None and self.nodes.shape[1:] != (corners,):
+            raise Unreadable(f"its cells of the kind {self.kind} have the shape {list(self.nodes.shape)}")
+
+
+@dataclass(frozen=True)
+class FileMesh:
+    """Everything in a file that bodies and surfaces are made of.
+
+    Attributes:
+        points: In the file's unit, float64 [N, 3].
+        blocks: Cells with volume and cells of surfaces; higher-order ones by their corners.
+        names: What the numbers of an array stand for, by array and number.
+        ignored: How many cells of other kinds (lines, vertices) the file has, by kind.
+        notes: What the user should know, a line each.
+    """
+
+    points: NDArray[np.float64]
+    blocks: list[Block]
+    names: dict[str, dict[int, str]] = field(default_factory=dict)
+    ignored: dict[str, int] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def solids(self) -> list[Block]:
+        """The blocks of cells with volume."""
+        return [block for block in self.blocks if block.kind in SOLIDS and len(block.nodes)]
+
+    @property
+    def faces(self) -> list[Block]:
+        """The blocks of triangles and quadrilaterals."""
+        return [block for block in self.blocks if block.kind in FACES and len(block.nodes)]
+
+    def kinds(self) -> str:
+        """The kinds of cells, for messages."""
+        found = {block.kind for block in self.blocks if len(block.nodes)} | {k for k, n in self.ignored.items() if n}
+        return ", ".join(sorted(found)) or "none"
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """All of it as arrays of plain numbers, to be handed from one process to another."""
+        described = {
+            "kinds": [block.kind for block in self.blocks],
+            "names": {array: {str(n): name for n, name in names.items()} for array, names in self.names.items()},
+            "data": [list(block.data) for block in self.blocks],
+            "ignored": self.ignored,
+            "notes": self.notes,
+        }
+        arrays: dict[str, NDArray[Any]] = {"mesh": as_bytes(described), "points": self.points}
+        for place, block in enumerate(self.blocks):
+            arrays[f"nodes{place}"] = block.nodes
+            for index, values in enumerate(block.data.values()):
+                arrays[f"data{place}_{index}"] = values
+        return arrays
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> FileMesh:
+        """The mesh of such arrays."""
+        described = from_bytes(arrays["mesh"])
+        blocks = [
+            Block(kind, arrays[f"nodes{place}"], {name: arrays[f"data{place}_{k}"] for k, name in enumerate(data)})
+            for place, (kind, data) in enumerate(zip(described["kinds"], described["data"], strict=True))
+        ]
+        names = {array: {int(n): name for n, name in of.items()} for array, of in described["names"].items()}
+        return cls(arrays["points"], blocks, names, described["ignored"], described["notes"])
+
+
+def whole(word: str) -> int:
+    """A whole number in a text.
+
+    Raises:
+        Unreadable: It is none.
+    """
+    try:
+        return int(word)
+    except ValueError:
+        raise Unreadable(f"{word[:40]!r} is no whole number") from None
+
+
+def real(word: str) -> float:
+    """A number in a text, with Fortran's letter D for the exponent too.
+
+    Raises:
+        Unreadable: It is none.
+    """
+    try:
+        return float(word.replace("D", "e").replace("d", "e"))
+    except ValueError:
+        raise Unreadable(f"{word[:40]!r} is no number") from None
+
+
+def corners_note(kind: str, order: int | None = 2) -> str:
+    """What to say of cells of higher order, of which only the corners are taken."""
+    word = {2: "second-order", 3: "third-order"}.get(order or 0, "higher-order")
+    return f"{word} cells ({kind}) are taken by their corners, with straight edges"
+
+
+def as_bytes(thing: Any) -> NDArray[np.uint8]:
+    """Lists, dictionaries, texts and numbers as an array of bytes."""
+    return np.frombuffer(json.dumps(thing).encode(), np.uint8)
+
+
+def from_bytes(array: NDArray[np.uint8]) -> Any:
+    """What `as_bytes` was given."""
+    return json.loads(array.tobytes())
+
+
+def whole_numbers(values: Any) -> NDArray[np.int64] | None:
+    """Values as int64 [n], None if they are not whole numbers, one a cell."""
+    array = np.asarray(values)
+    if array.ndim == 2 and array.shape[1] == 1:
+        array = array[:, 0]
+    if array.ndim != 1:
+        return None
+    if array.dtype.kind in "iub":
+        return array.astype(np.int64)
+    if array.dtype.kind == "f" and (np.abs(array) < 2**53).all() and (array == np.round(array)).all():
+        return array.astype(np.int64)
+    return None

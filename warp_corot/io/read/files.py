@@ -1,0 +1,156 @@
+"""Which reader takes which file, and what is said when none can."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+from .filemesh import FileMesh
+from .isolated import read_isolated
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A module of this folder with a function ``read(path)``.
+
+    Attributes:
+        name: What messages call it.
+        module: Its name in this folder.
+        package: The Python package that it needs, if any.
+        extra: What installs that package, as in ``pip install "warp-corot[EXTRA]"``.
+    """
+
+    name: str
+    module: str
+    package: str | None = None
+    extra: str | None = None
+
+
+VTK = Reader("VTK", "vtk_files", "vtkmodules", "mesh")
+GMSH = Reader("Gmsh", "gmsh_files", "gmsh", "gmsh")
+GMSH_1 = Reader("the reader of Gmsh's format 1", "gmsh_1")
+MESHIO = Reader("meshio", "meshio_files", "meshio", "mesh")
+ABAQUS = Reader("the reader of Abaqus input files", "abaqus")
+NETGEN = Reader("the reader of NetGen's files", "netgen")
+TETGEN = Reader("the reader of TetGen's files", "tetgen")
+
+#: Readers by extension, the one that knows most of a format first.
+READERS: dict[str, tuple[Reader, ...]] = {
+    ".msh": (GMSH_1, GMSH, MESHIO),
+    ".mesh": (NETGEN, GMSH, MESHIO),
+    ".meshb": (GMSH, MESHIO),
+    ".unv": (GMSH,),
+    ".bdf": (GMSH, MESHIO),
+    ".nas": (GMSH, MESHIO),
+    ".fem": (MESHIO,),
+    ".vtk": (VTK, MESHIO),
+    ".vtu": (VTK, MESHIO),
+    ".vtp": (VTK,),
+    ".vtm": (VTK,),
+    ".vtmb": (VTK,),
+    ".vts": (VTK,),
+    ".vtr": (VTK,),
+    ".pvtu": (VTK,),
+    ".pvtp": (VTK,),
+    ".vtkhdf": (VTK,),
+    ".inp": (ABAQUS,),
+    ".node": (TETGEN,),
+    ".ele": (TETGEN,),
+    ".vol": (NETGEN,),
+    ".vol.gz": (NETGEN,),
+    ".xdmf": (MESHIO,),
+    ".xmf": (MESHIO,),
+    ".e": (MESHIO,),
+    ".ex2": (MESHIO,),
+    ".exo": (MESHIO,),
+    ".med": (MESHIO,),
+    ".cgns": (MESHIO,),
+    ".h5m": (MESHIO,),
+    ".avs": (MESHIO,),
+    ".su2": (MESHIO,),
+    ".f3grid": (MESHIO,),
+    ".mdpa": (MESHIO,),
+    ".post": (MESHIO,),
+    ".dato": (MESHIO,),
+    ".ugrid": (MESHIO,),
+    ".tec": (MESHIO,),
+    ".xml": (MESHIO,),
+}
+#: The extensions of mesh files.
+SUFFIXES = tuple(READERS)
+#: A reason longer than this is cut.
+LONGEST_REASON = 200
+
+
+def suffix_of(path: Path) -> str | None:
+    """The extension by which a file is a mesh file, None if it is none."""
+    name = path.name.lower()
+    return next((suffix for suffix in sorted(SUFFIXES, key=len, reverse=True) if name.endswith(suffix)), None)
+
+
+def read_mesh_file(path: Path) -> FileMesh | dict[str, NDArray[Any]]:
+    """What is in a mesh file.
+
+    Readers run one after the other, each in a process of its own, until one can read the file.
+
+    Args:
+        path: A file with one of the extensions `SUFFIXES`.
+
+    Returns:
+        Points and cells; or of a VTK file that holds an image the arrays ``values`` [nx, ny, nz] and ``affine`` [4, 4].
+
+    Raises:
+        InputError: No reader that is installed can read it; in one line with the readers' own reasons.
+    """
+    suffix = suffix_of(path)
+    if suffix is None:
+        raise InputError(f"{path}: unknown format {path.suffix or '(no extension)'}, should be {', '.join(SUFFIXES)}")
+    reasons, missing = [], []
+    for reader in READERS[suffix]:
+        if reader.package and importlib.util.find_spec(reader.package) is None:
+            missing.append(reader)
+            continue
+        arrays, reason = read_isolated(f"{__package__}.{reader.module}", path)
+        if arrays is not None and "points" in arrays and not len(arrays["points"]):
+            reason = "it finds no nodes in it"
+        elif arrays is not None:
+            return _checked(FileMesh.from_arrays(arrays), path) if "mesh" in arrays else arrays
+        if reason:
+            reasons.append(f"{reader.name}: {shortened(reason)}")
+    cures = " or ".join(f'pip install "warp-corot[{reader.extra}]"' for reader in missing)
+    if not reasons and missing:
+        raise InputError(f"{path}: reading {suffix} files needs: {cures}")
+    also = f"; {missing[0].name} might read it: {cures}" if missing else ""
+    raise InputError(f"{path}: is not a {suffix} file that can be read ({'; '.join(reasons)}){also}")
+
+
+def shortened(reason: object) -> str:
+    """A reader's reason in one line."""
+    words = " ".join(str(reason).split()).rstrip(".")
+    return words if len(words) <= LONGEST_REASON else words[: LONGEST_REASON - 4] + " ..."
+
+
+def _checked(mesh: FileMesh, path: Path) -> FileMesh:
+    """The mesh, if its cells name points that there are.
+
+    Raises:
+        InputError: They do not, or points have no three coordinates.
+    """
+    points = mesh.points
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"{path}: points have shape {points.shape}, should be [N, 3]")
+    for block in mesh.blocks:
+        bad = np.argwhere((block.nodes < 0) | (block.nodes >= len(points)))
+        if len(bad):
+            row, column = bad[0]
+            cell = "tetrahedron" if block.kind == "tetra" else block.kind
+            raise InputError(
+                f"{path}: {cell} {row} names point {block.nodes[row, column]} but the points are 0 to {len(points) - 1}"
+            )
+    return mesh

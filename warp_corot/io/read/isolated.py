@@ -1,0 +1,74 @@
+"""Readers in a process of their own: what a broken file does to a library, it does there.
+
+Libraries that read meshes crash, leave the interpreter, never end, ask for all memory or write to the terminal on files
+that are cut or garbled. The process gets bounds of memory and time by the file's size, and hands over arrays.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def read_isolated(module: str, path: Path) -> tuple[dict[str, NDArray[Any]] | None, str | None]:
+    """Has a reader read a file in another process.
+
+    Args:
+        module: Full name of a module with a function ``read(path)`` that returns something with ``to_arrays()``, or
+            arrays by name; None if the file is none of its own.
+        path: The file.
+
+    Returns:
+        The arrays, or None; and the reason for None, which is missing too if the file is none of the reader's.
+    """
+    with tempfile.TemporaryDirectory(prefix="warp-corot-") as folder:
+        out = Path(folder) / "arrays.npz"
+        report = Path(folder) / "report.json"
+        command = [
+            sys.executable,
+            "-P",
+            "-m",
+            f"{__package__}.worker",
+            module,
+            os.fspath(path.absolute()),
+            str(out),
+            str(report),
+        ]
+        paths = os.pathsep.join(filter(None, sys.path))
+        done = subprocess.run(
+            command,
+            env={**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            check=False,
+        )
+        said = json.loads(report.read_text()) if report.is_file() and report.stat().st_size else {}
+        if done.returncode == 0 and out.is_file():
+            with np.load(out, allow_pickle=False) as arrays:
+                return {name: arrays[name] for name in arrays.files}, None
+        if done.returncode == 0 and said.get("foreign"):
+            return None, None
+        return None, said.get("reason") or _death(done.returncode, done.stderr)
+
+
+def _death(status: int, stderr: bytes) -> str:
+    """Why a reader has ended without a word."""
+    if status == -getattr(signal, "SIGXCPU", 0):
+        return "it did not come to an end"
+    said = stderr.decode(errors="replace")
+    if "bad_alloc" in said or "Unable to allocate" in said:
+        return "it asks for more memory than such a file can need"
+    if status < 0:
+        return f"it crashed ({signal.Signals(-status).name})"
+    lines = [line for line in said.splitlines() if line.strip()]
+    return lines[-1] if lines else f"it ended with status {status}"

@@ -1,0 +1,68 @@
+"""meshio's readers: NetGen .vol, XDMF, Exodus, MED, and what VTK and Gmsh read where they are not installed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .filemesh import CORNERS, Block, FileMesh, Unreadable, corners_note, whole_numbers
+
+#: Names of arrays elsewhere.
+RENAMED = {"gmsh:physical": "physical group", "gmsh:geometrical": "entity", "netgen:index": "material"}
+RENAMED |= {"medit:ref": "entity"}
+
+#: Orders of cells by meshio's names, where they are not two.
+ORDERS = {"tetra20": 3, "tetra35": 4, "hexahedron64": 3, "triangle10": 3, "quad16": 3}
+
+
+def read(path: Path) -> FileMesh:
+    """All cells of a file, with the arrays of whole numbers and the sets of its cells.
+
+    Raises:
+        Unreadable: meshio's own words.
+    """
+    import meshio
+    from meshio._helpers import _filetypes_from_path, reader_map
+
+    reasons = []
+    for kind in _filetypes_from_path(path):
+        try:
+            return _mesh(reader_map[kind](str(path)))
+        except meshio.ReadError as error:
+            reasons.append(str(error) or f"it is no {kind} file")
+    raise Unreadable("; ".join(dict.fromkeys(reasons)))
+
+
+def _mesh(mesh: Any) -> FileMesh:
+    blocks: list[Block] = []
+    ignored: dict[str, int] = {}
+    notes: list[str] = []
+    for place, block in enumerate(mesh.cells):
+        kind = block.type.rstrip("0123456789")
+        if kind not in CORNERS:
+            ignored[block.type] = ignored.get(block.type, 0) + len(block.data)
+            continue
+        if block.type != kind:
+            notes.append(corners_note(kind, ORDERS.get(block.type, 2)))
+        nodes = np.asarray(block.data, np.int64)
+        data = {}
+        for name, values in mesh.cell_data.items():
+            numbers = whole_numbers(values[place])
+            if numbers is not None and len(numbers) == len(nodes):
+                data[RENAMED.get(name, name)] = numbers
+        blocks.append(Block(kind, nodes[:, : CORNERS[kind]], data))
+    points = np.asarray(mesh.points, np.float64)
+    return FileMesh(points, blocks, _names(mesh), ignored, list(dict.fromkeys(notes)))
+
+
+def _names(mesh: Any) -> dict[str, dict[int, str]]:
+    """Names of physical groups, or of NetGen's materials, of dimension 3."""
+    found = {}
+    for name, value in mesh.field_data.items():
+        numbers = np.asarray(value).ravel()
+        if len(numbers) == 2 and numbers[1] == 3:
+            found[int(numbers[0])] = str(name)
+    array = "material" if "netgen:index" in mesh.cell_data else "physical group"
+    return {array: found} if found else {}

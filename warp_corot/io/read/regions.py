@@ -1,0 +1,82 @@
+"""Which of a file's arrays tells the regions of a body apart, and what the regions are called."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import InputError
+from .filemesh import FileMesh
+
+#: Names of arrays that number regions, the likelier first; of others, those of few different numbers.
+USUAL = ("physical group", "material", "element set", "region", "label", "tissue", "attribute", "part", "block")
+#: More different numbers than these are no regions.
+MOST = 1000
+
+
+@dataclass(frozen=True)
+class Regions:
+    """Regions of tetrahedra.
+
+    Attributes:
+        array: The array of the file that they come from.
+        names: Their names.
+        numbers: Their numbers in the file.
+        of_tet: Each tetrahedron's region, its place in ``names`` plus one, 0 for none, int32 [T].
+    """
+
+    array: str
+    names: tuple[str, ...]
+    numbers: tuple[int, ...]
+    of_tet: NDArray[np.int32]
+
+
+def find_regions(mesh: FileMesh, cells: NDArray[np.int64], wanted: str | None = None) -> Regions | None:
+    """The regions of the tetrahedra of a file.
+
+    Args:
+        mesh: What is in the file.
+        cells: The cell of each tetrahedron, int64 [T], see `split_solids`.
+        wanted: The array to take; None: the likeliest that tells cells apart or gives them a name.
+
+    Returns:
+        The regions; None where no array numbers any.
+
+    Raises:
+        InputError: The array that is wanted is not there; the message lists those there are.
+    """
+    blocks = mesh.solids
+    known = dict.fromkeys(name for block in blocks for name in block.data)
+    if wanted is not None:
+        if wanted not in known:
+            raise InputError(f"there is no array {wanted!r} of whole numbers; there are: {', '.join(known) or 'none'}")
+        return _regions(mesh, wanted, cells)
+    for name in sorted(known, key=_likelihood):
+        found = _regions(mesh, name, cells)
+        if 1 <= len(found.names) <= MOST and (len(np.unique(found.of_tet)) > 1 or mesh.names.get(name)):
+            return found
+    return None
+
+
+def _likelihood(name: str) -> tuple[int, str]:
+    lower = name.lower()
+    places = [place for place, usual in enumerate(USUAL) if usual in lower]
+    return (min(places, default=len(USUAL)), lower)
+
+
+def _regions(mesh: FileMesh, name: str, cells: NDArray[np.int64]) -> Regions:
+    values = np.concatenate([block.data.get(name, np.zeros(len(block.nodes), np.int64)) for block in mesh.solids])
+    there = np.unique(values)
+    said = mesh.names.get(name, {})
+    # Zero without a name is none: a cell of no physical group or set.
+    numbers = [int(number) for number in there if number != 0 or number in said]
+    names: list[str] = []
+    for number in numbers:
+        own = said.get(number, str(number))
+        names.append(own if own not in names else f"{own} ({number})")
+    place = np.zeros(len(there), np.int32)
+    for index, number in enumerate(numbers, start=1):
+        place[np.searchsorted(there, number)] = index
+    return Regions(name, tuple(names), tuple(numbers), place[np.searchsorted(there, values)][cells])

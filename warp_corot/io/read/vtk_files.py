@@ -1,0 +1,273 @@
+"""VTK's own readers: legacy .vtk of every version, and XML: .vtu .vtp .vtm .vts .vtr .vti and parallel ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
+from vtkmodules.vtkCommonDataModel import (
+    vtkCompositeDataSet,
+    vtkImageData,
+    vtkPolyData,
+    vtkRectilinearGrid,
+    vtkStructuredGrid,
+    vtkUnstructuredGrid,
+)
+from vtkmodules.vtkFiltersCore import vtkAppendFilter, vtkTriangleFilter
+
+from .filemesh import CORNERS, Block, FileMesh, Unreadable, as_bytes, corners_note, whole_numbers
+from .split import fan, split_polyhedron
+
+#: VTK's numbers of cells by the kind that their corners make; corners come first in cells of any order.
+KINDS = {
+    "tetra": (10, 24, 71, 78, 82),
+    "hexahedron": (12, 25, 29, 33, 72, 79),
+    "wedge": (13, 26, 31, 32, 73, 80),
+    "pyramid": (14, 27, 37, 74, 81),
+    "triangle": (5, 22, 34, 69, 76),
+    "quad": (9, 23, 28, 30, 70, 77),
+}
+LINEAR = {10, 12, 13, 14, 5, 9}
+VOXEL, PIXEL, STRIP, POLYGON, PENTAPRISM, HEXAPRISM, POLYHEDRON = 11, 8, 6, 7, 15, 16, 42
+#: Arrays that tell nothing of regions.
+INTERNAL = ("vtkGhostType", "vtkOriginalCellIds", "vtkOriginalPointIds", "GlobalCellIds", "GlobalElementId")
+
+
+def read(path: Path) -> FileMesh | dict[str, NDArray[Any]]:
+    """The cells of a file, or the arrays of an image.
+
+    Raises:
+        Unreadable: VTK's own words.
+    """
+    window = vtkStringOutputWindow()
+    vtkOutputWindow.SetInstance(window)
+    reader = _reader(path)
+    reader.SetFileName(str(path))
+    readable = not hasattr(reader, "CanReadFile") or reader.CanReadFile(str(path))
+    if readable:
+        reader.Update()
+        data = reader.GetOutputDataObject(0)
+    said = _errors(window.GetOutput())
+    if not readable or said or data is None:
+        raise Unreadable(said or _first_look(path))
+    if isinstance(data, vtkImageData):
+        return _image(data)
+    leaves = list(_leaves(data, ""))
+    if not leaves:
+        raise Unreadable(f"it holds {data.GetClassName()}, which is empty or no mesh")
+    return _joined(leaves)
+
+
+def _reader(path: Path) -> Any:
+    from vtkmodules import vtkIOLegacy, vtkIOXML
+
+    suffix = path.suffix.lower()
+    if suffix == ".vtk":
+        return vtkIOLegacy.vtkGenericDataObjectReader()
+    if suffix == ".vtkhdf":
+        from vtkmodules import vtkIOHDF
+
+        return vtkIOHDF.vtkHDFReader()
+    kinds = {
+        ".vtu": vtkIOXML.vtkXMLUnstructuredGridReader,
+        ".vtp": vtkIOXML.vtkXMLPolyDataReader,
+        ".vts": vtkIOXML.vtkXMLStructuredGridReader,
+        ".vtr": vtkIOXML.vtkXMLRectilinearGridReader,
+        ".vti": vtkIOXML.vtkXMLImageDataReader,
+        ".vtm": vtkIOXML.vtkXMLMultiBlockDataReader,
+        ".vtmb": vtkIOXML.vtkXMLMultiBlockDataReader,
+        ".pvtu": vtkIOXML.vtkXMLPUnstructuredGridReader,
+        ".pvtp": vtkIOXML.vtkXMLPPolyDataReader,
+    }
+    return kinds[suffix]()
+
+
+def _errors(said: str) -> str:
+    """The messages among what VTK has written, less where in its code they come from."""
+    found = []
+    for part in said.split("ERROR: ")[1:]:
+        text = part.split("\n\n")[0]
+        lines = [line.strip() for line in text.splitlines()[1:] if line.strip()]
+        words = " ".join(lines)
+        _, address, message = words.partition("): ")
+        said_of_itself = message if address else words
+        if not said_of_itself.startswith("Algorithm "):  # which only repeats that something has failed
+            found.append(said_of_itself)
+    return "; ".join(dict.fromkeys(filter(None, found)))
+
+
+def _first_look(path: Path) -> str:
+    start = path.read_bytes()[:64]
+    if not start.lstrip().startswith(b"<"):
+        return "it does not begin as XML does"
+    return f"its root element is no VTKFile of this kind (it begins {start[:40].decode(errors='replace')!r})"
+
+
+def _leaves(data: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """The data sets of a file with their names, those of a composite one by one."""
+    if isinstance(data, vtkCompositeDataSet):
+        iterator = data.NewIterator()
+        iterator.SkipEmptyNodesOn()
+        iterator.InitTraversal()
+        while not iterator.IsDoneWithTraversal():
+            leaf = iterator.GetCurrentDataObject()
+            info = iterator.GetCurrentMetaData() if iterator.HasCurrentMetaData() else None
+            own = info.Get(vtkCompositeDataSet.NAME()) if info is not None else None
+            yield from _leaves(leaf, own or f"block {iterator.GetCurrentFlatIndex()}")
+            iterator.GoToNextItem()
+    elif isinstance(data, vtkStructuredGrid | vtkRectilinearGrid | vtkImageData):
+        append = vtkAppendFilter()
+        append.AddInputData(data)
+        append.Update()
+        yield name, append.GetOutput()
+    elif isinstance(data, vtkUnstructuredGrid | vtkPolyData) and data.GetNumberOfCells():
+        yield name, data
+
+
+def _joined(leaves: list[tuple[str, Any]]) -> FileMesh:
+    points: list[NDArray[np.float64]] = []
+    blocks: list[Block] = []
+    ignored: dict[str, int] = {}
+    notes: list[str] = []
+    offset = 0
+    for number, (_, data) in enumerate(leaves, start=1):
+        own = _points(data)
+        extra = {"block": number} if len(leaves) > 1 else {}
+        for block in _cells(data, ignored, notes):
+            values = {**block.data, **{name: np.full(len(block.nodes), k) for name, k in extra.items()}}
+            blocks.append(Block(block.kind, block.nodes + offset, values))
+        points.append(own)
+        offset += len(own)
+    names = {"block": {k: name for k, (name, _) in enumerate(leaves, start=1)}} if len(leaves) > 1 else {}
+    return FileMesh(np.concatenate(points), blocks, names, ignored, list(dict.fromkeys(notes)))
+
+
+def _points(data: Any) -> NDArray[np.float64]:
+    if data.GetPoints() is None:
+        return np.empty((0, 3))
+    return np.array(vtk_to_numpy(data.GetPoints().GetData()), dtype=np.float64)
+
+
+def _cells(data: Any, ignored: dict[str, int], notes: list[str]) -> Iterator[Block]:
+    if isinstance(data, vtkPolyData):
+        # Strips and polygons of any shape, by VTK's own triangulation.
+        filtered = vtkTriangleFilter()
+        filtered.SetInputData(data)
+        filtered.PassLinesOff()
+        filtered.PassVertsOff()
+        filtered.Update()
+        data = filtered.GetOutput()
+        triangles = _ints(data.GetPolys().GetConnectivityArray()).reshape(-1, 3)
+        yield Block("triangle", triangles, _data(data, np.arange(len(triangles))))
+        return
+    types = _types(data)
+    array = data.GetCells()
+    offsets, nodes = _ints(array.GetOffsetsArray()), _ints(array.GetConnectivityArray())
+    if len(offsets) != len(types) + 1 or (np.diff(offsets) < 0).any() or offsets[-1] > len(nodes):
+        raise Unreadable("the offsets of its cells do not fit their number")
+    kinds = {number: kind for kind, numbers in KINDS.items() for number in numbers}
+    for number in np.unique(types).tolist():
+        cells = np.flatnonzero(types == number)
+        kind = {VOXEL: "hexahedron", PIXEL: "quad"}.get(number, kinds.get(number))
+        if kind is not None:
+            yield _corners(kind, number, cells, offsets, nodes, data)
+            if number not in LINEAR | {VOXEL, PIXEL}:
+                notes.append(corners_note(kind, 2 if number < 69 else None))
+        elif number in (STRIP, POLYGON, PENTAPRISM, HEXAPRISM, POLYHEDRON):
+            yield _by_faces(number, cells, data)
+        else:
+            ignored[f"VTK's type {number}" if number > 4 else "line"] = len(cells)
+
+
+def _corners(kind: str, number: int, cells: NDArray, offsets: NDArray, nodes: NDArray, data: Any) -> Block:
+    count = CORNERS[kind]
+    short = np.flatnonzero(offsets[cells + 1] - offsets[cells] < count)
+    if len(short):
+        raise Unreadable(f"cell {cells[short[0]]}, a {kind}, has fewer than {count} corners")
+    corners = nodes[offsets[cells][:, None] + np.arange(count)]
+    if number == VOXEL:
+        corners = corners[:, [0, 1, 3, 2, 4, 5, 7, 6]]
+    elif number == PIXEL:
+        corners = corners[:, [0, 1, 3, 2]]
+    return Block(kind, corners, _data(data, cells))
+
+
+def _by_faces(number: int, cells: NDArray, data: Any) -> Block:
+    """Cells of many corners one by one, as tetrahedra; strips and polygons as triangles."""
+    made: list[tuple[int, ...]] = []
+    whose: list[int] = []
+    for index in cells.tolist():
+        cell = data.GetCell(index)
+        if number in (STRIP, POLYGON):
+            ids = _corners_of(cell)
+            strip = [(ids[k + k % 2], ids[k + 1 - k % 2], ids[k + 2]) for k in range(len(ids) - 2)]
+            parts: list[tuple[int, ...]] = list(strip if number == STRIP else fan(ids))
+        else:
+            # A cell hands out one face object again and again: its corners are taken at once.
+            faces = [_corners_of(cell.GetFace(k)) for k in range(cell.GetNumberOfFaces())]
+            parts = list(split_polyhedron(faces))
+        made += parts
+        whose += [index] * len(parts)
+    flat = number in (STRIP, POLYGON)
+    nodes = np.array(made, np.int64).reshape(-1, 3 if flat else 4)
+    return Block("triangle" if flat else "tetra", nodes, _data(data, np.array(whose, np.int64)))
+
+
+def _corners_of(cell: Any) -> list[int]:
+    return [cell.GetPointId(k) for k in range(cell.GetNumberOfPoints())]
+
+
+def _data(data: Any, cells: NDArray) -> dict[str, NDArray[np.int64]]:
+    """The arrays of whole numbers, one a cell."""
+    found = {}
+    arrays = data.GetCellData()
+    for k in range(arrays.GetNumberOfArrays()):
+        array, name = arrays.GetArray(k), arrays.GetArrayName(k)
+        if array is None or not name or name in INTERNAL:
+            continue
+        values = whole_numbers(vtk_to_numpy(array))
+        if values is not None and len(values) == data.GetNumberOfCells():
+            found[name] = values[cells]
+    return found
+
+
+def _types(data: Any) -> NDArray[np.int64]:
+    array = data.GetCellTypes() if hasattr(data, "GetCellTypes") else None
+    if array is None or not hasattr(array, "GetNumberOfTuples"):
+        array = data.GetCellTypesArray()
+    return _ints(array)
+
+
+def _ints(array: Any) -> NDArray[np.int64]:
+    """Whole numbers, those of VTK's implicit arrays too."""
+    try:
+        return np.array(vtk_to_numpy(array), dtype=np.int64)
+    except (AttributeError, TypeError, ValueError, AssertionError):
+        return np.array([array.GetComponent(k, 0) for k in range(array.GetNumberOfTuples())], dtype=np.int64)
+
+
+def _image(grid: Any) -> dict[str, NDArray[Any]]:
+    """Values [nx, ny, nz] and the affine of their places; see `warp_corot.io.volumes`."""
+    extent = np.array(grid.GetExtent()).reshape(3, 2)
+    at_points = grid.GetPointData().GetNumberOfArrays() > 0
+    data = grid.GetPointData() if at_points else grid.GetCellData()
+    array = data.GetScalars()
+    if array is None and data.GetNumberOfArrays() == 1:
+        array = data.GetArray(0)
+    shape = extent[:, 1] - extent[:, 0] + (1 if at_points else 0)
+    if array is None or array.GetNumberOfTuples() != np.prod(shape):
+        names = ", ".join(str(data.GetArrayName(k)) for k in range(data.GetNumberOfArrays())) or "none"
+        raise Unreadable(f"no whole array of scalars chosen; its arrays: {names}")
+    if array.GetNumberOfComponents() != 1:
+        raise Unreadable(f"it has {array.GetNumberOfComponents()} numbers a voxel, should be one")
+    matrix = grid.GetIndexToPhysicalMatrix()
+    affine = np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
+    affine[:3, 3] += affine[:3, :3] @ (extent[:, 0] + (0.0 if at_points else 0.5))
+    notes = [] if at_points else ["the numbers are those of cells: voxel centres lie between the grid's points"]
+    values = np.array(vtk_to_numpy(array).reshape(tuple(shape), order="F"), order="F")
+    return {"image": as_bytes(notes), "values": values, "affine": affine}

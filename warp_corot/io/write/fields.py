@@ -1,0 +1,80 @@
+"""What a frame holds for who looks into it: displacements and velocities of nodes, strain and stress of elements."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...elasticity.tensors import cauchy_stress, gradients, green_strain, has_tensor
+
+if TYPE_CHECKING:
+    from ...simulation import Simulation
+
+
+@dataclass(frozen=True)
+class Fields:
+    """A frame.
+
+    Attributes:
+        time: [s].
+        points: At rest [m], float64 [N, 3].
+        tets: int32 [T, 4].
+        nodal: Fields of nodes by name, [N] or [N, 3].
+        elemental: Fields of elements by name, [T] or [T, 9], tensors row by row.
+    """
+
+    time: float
+    points: npt.NDArray[np.float64]
+    tets: npt.NDArray[np.int32]
+    nodal: dict[str, npt.NDArray[Any]]
+    elemental: dict[str, npt.NDArray[Any]]
+
+
+def fields_of(sim: Simulation, worlds: Sequence[Any], time: float) -> Fields:
+    """The present state of bodies, one world of them, one body after the other.
+
+    Nodes have ``displacement`` [m], ``velocity`` [m/s] and ``fixed``; elements ``strain`` (Green-Lagrange), ``stress``
+    [Pa] where the elastic law is local and isotropic, ``von_mises`` [Pa], and ``region`` where meshes have labels.
+
+    Args:
+        sim: The simulation.
+        worlds: A view of a world of each of its bodies.
+        time: What the frame's time is called [s].
+    """
+    meshes = [world.body.mesh for world in worlds]
+    offsets = np.cumsum([0, *(len(mesh.points) for mesh in meshes)])
+    nodal: dict[str, list[npt.NDArray[Any]]] = {}
+    elemental: dict[str, list[npt.NDArray[Any]]] = {}
+    tensors = all(has_tensor(model, w.body.material) for model, w in zip(sim.models, worlds, strict=True))
+    labelled = any(getattr(mesh, "labels", None) is not None for mesh in meshes)
+    for model, world, mesh in zip(sim.models, worlds, meshes, strict=True):
+        displacements, body = world.displacements.numpy().astype(np.float64), world.body
+        nodal.setdefault("displacement", []).append(displacements.astype(np.float32))
+        nodal.setdefault("velocity", []).append(world.velocities.numpy())
+        nodal.setdefault("fixed", []).append(body.constrained[world.nodes].astype(np.int8))
+        f = gradients(mesh.points, mesh.tets, displacements)
+        elemental.setdefault("strain", []).append(green_strain(f).reshape(-1, 9).astype(np.float32))
+        if tensors:
+            count = len(mesh.tets)
+            young, poisson = (
+                np.broadcast_to(getattr(body.material, name), (body.worlds, count))[world.index]
+                for name in ("young", "poisson")
+            )
+            stress = cauchy_stress(model, f, young, poisson)
+            elemental.setdefault("stress", []).append(stress.reshape(-1, 9).astype(np.float32))
+        elemental.setdefault("von_mises", []).append(sim.von_mises(body)[world.elements])
+        if labelled:
+            labels = getattr(mesh, "labels", None)
+            own = np.zeros(len(mesh.tets), np.int32) if labels is None else labels
+            elemental.setdefault("region", []).append(own.astype(np.int32))
+    return Fields(
+        time,
+        np.concatenate([mesh.points for mesh in meshes]),
+        np.concatenate([mesh.tets + n for mesh, n in zip(meshes, offsets[:-1], strict=True)]).astype(np.int32),
+        {name: np.concatenate(parts) for name, parts in nodal.items()},
+        {name: np.concatenate(parts) for name, parts in elemental.items()},
+    )

@@ -1,0 +1,145 @@
+"""Frames for ParaView: one .vtu, a .pvd with a .vtu for each frame, or an .xdmf with its numbers in HDF5.
+
+Points are those at rest; *Warp By Vector* with ``displacement`` shows the body as it moves.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import tempfile
+from pathlib import Path
+from typing import Protocol
+
+from ...errors import InputError
+from ..whole import written_whole
+from .fields import Fields
+
+#: What each format needs.
+PACKAGES = {".vtu": "meshio", ".pvd": "meshio", ".xdmf": "h5py"}
+
+
+class Writer(Protocol):
+    """Takes frames one after the other."""
+
+    def write(self, fields: Fields) -> None:
+        """Write a frame, or keep it.
+
+        Raises:
+            OSError: It could not be written.
+        """
+
+    def close(self) -> None:
+        """Finish the file.
+
+        Raises:
+            OSError: It could not be written.
+        """
+
+
+def check_also(path: Path) -> None:
+    """Says before a simulation begins what would stop its result from being written.
+
+    Raises:
+        InputError: Another extension, a library that is not installed, a folder in the way, or an output folder that is
+            not there or cannot be written to.
+    """
+    package = PACKAGES.get(path.suffix.lower())
+    if package is None:
+        raise InputError(f"{path}: extension {path.suffix or '(none)'}, should be {', '.join(PACKAGES)}")
+    if importlib.util.find_spec(package) is None:
+        raise InputError(f'{path}: writing {path.suffix} files needs: pip install "warp-corot[paraview]"')
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, should be a file name")
+    folder = path.parent
+    if not folder.is_dir():
+        raise InputError(f"{path}: output folder {folder} {'is a file' if folder.exists() else 'is not there'}")
+    if path.exists() and not os.access(path, os.W_OK):
+        raise InputError(f"{path}: is write-protected")
+    frames = _frames_folder(path)
+    if path.suffix.lower() == ".pvd" and frames.exists() and not frames.is_dir():
+        raise InputError(f"{frames}: is a file, should be a folder for the frames of {path.name}")
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"{path}: output folder {folder} cannot be written to ({error.strerror})") from None
+
+
+def also_writer(path: Path) -> Writer:
+    """The writer of a file by its extension.
+
+    Raises:
+        InputError: See `check_also`.
+    """
+    check_also(path)
+    suffix = path.suffix.lower()
+    if suffix == ".xdmf":
+        from .xdmf import XdmfWriter
+
+        return XdmfWriter(path)
+    return VtuWriter(path) if suffix == ".vtu" else PvdWriter(path)
+
+
+class VtuWriter:
+    """The last frame, as one file."""
+
+    def __init__(self, path: Path):
+        self._path = path
+        self._last: Fields | None = None
+
+    def write(self, fields: Fields) -> None:
+        self._last = fields
+
+    def close(self) -> None:
+        if self._last is not None:
+            write_vtu(self._path, self._last)
+        self._last = None
+
+
+class PvdWriter:
+    """All frames: files in a folder beside, and one that lists them with their times, whole after every frame."""
+
+    def __init__(self, path: Path):
+        self._path = path
+        self._listed: list[str] = []
+
+    def write(self, fields: Fields) -> None:
+        folder = _frames_folder(self._path)
+        folder.mkdir(exist_ok=True)
+        name = f"{self._path.stem}_{len(self._listed):05}.vtu"
+        write_vtu(folder / name, fields)
+        self._listed.append(
+            f'    <DataSet timestep="{fields.time:.9g}" part="0" file="{_xml(folder.name)}/{_xml(name)}"/>'
+        )
+        lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">']
+        lines += ["  <Collection>", *self._listed, "  </Collection>", "</VTKFile>", ""]
+        with written_whole(self._path) as part:
+            part.write_text("\n".join(lines), "utf-8")
+
+    def close(self) -> None:
+        pass
+
+
+def write_vtu(path: Path, fields: Fields) -> None:
+    """Write a frame as a .vtu, whole or not at all.
+
+    Raises:
+        OSError: It could not be written.
+    """
+    import meshio
+
+    cells = {name: [values] for name, values in fields.elemental.items()}
+    mesh = meshio.Mesh(fields.points, [("tetra", fields.tets)], point_data=fields.nodal, cell_data=cells)
+    with written_whole(path) as part:
+        meshio.write(part, mesh, file_format="vtu")
+
+
+def _frames_folder(path: Path) -> Path:
+    return path.with_name(f"{path.stem}_frames")
+
+
+def _xml(text: str) -> str:
+    from xml.sax.saxutils import quoteattr
+
+    return quoteattr(text)[1:-1]
