@@ -80,3 +80,11 @@ class Bar:
         strains = 0.5 * (gradients + np.swapaxes(gradients, 1, 2))
         mean = np.einsum("t,tij->ij", reference.volumes, strains) / reference.volumes.sum()
         return mean, np.abs(strains - mean).max()
+
+
+def made(kind, mesh, rng):
+    """A material and its tensor C, [3, 3, 3, 3] or one for each element."""
+    axes = random_axes(rng, len(mesh.tets)) if "field" in kind else random_axes(rng)
+    if "muscle" in kind:
+        return muscle(2.5 * axes[..., 0, :]), muscle_tensor(axes[..., 0, :])
+    return wood(0.1 * axes), wood_tensor(axes)

@@ -133,3 +133,25 @@ __all__ = [
     "wc",
     "wn",
 ]
+KE = 2e4
+
+
+def contact_parameters(model, ke=KE, kd=20.0, kf=100.0, mu=0.5):
+    """The same for particles and shapes."""
+    model.soft_contact_ke, model.soft_contact_kd = ke, kd
+    model.soft_contact_kf, model.soft_contact_mu = kf, mu
+    for array, value in (
+        (model.shape_material_ke, ke),
+        (model.shape_material_kd, kd),
+        (model.shape_material_kf, kf),
+        (model.shape_material_mu, mu),
+    ):
+        array.fill_(value)
+
+
+def model_without_particles(model):
+    from newton.solvers.experimental.coupled import ModelView
+
+    view = ModelView(model, "bodies")
+    view.particle_count = view.tet_count = view.tri_count = view.edge_count = 0
+    return view

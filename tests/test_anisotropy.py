@@ -9,8 +9,8 @@ from fibres import (
     MUSCLE,
     WOOD,
     Bar,
+    made,
     muscle,
-    muscle_tensor,
     random_axes,
     simulated,
     turned,
@@ -23,14 +23,6 @@ import warp_corot as wc
 TOLERANCE = 1e-5  # of the largest nodal force: rounding, see test_forces
 FORCE_MESHES = ("level 3", "level 4", "level 5", "mixed levels", "general")
 KINDS = ("muscle", "wood", "muscle field", "wood field")
-
-
-def made(kind, mesh, rng):
-    """A material and its tensor C, [3, 3, 3, 3] or one for each element."""
-    axes = random_axes(rng, len(mesh.tets)) if "field" in kind else random_axes(rng)
-    if "muscle" in kind:
-        return muscle(2.5 * axes[..., 0, :]), muscle_tensor(axes[..., 0, :])
-    return wood(0.1 * axes), wood_tensor(axes)
 
 
 def turned_displacement(mesh, rng, amount):

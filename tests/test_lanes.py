@@ -7,7 +7,7 @@ import numpy as np
 import oracle
 import pytest
 from cases import oracle_mesh, place, random_displacement, simulation
-from test_miscompile import MATERIAL, MESHES, meshed, shared_rotations
+from thousands import MATERIAL, MESHES, meshed, shared_rotations
 
 import warp_corot as wc
 

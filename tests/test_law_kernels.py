@@ -9,10 +9,9 @@ import oracle
 import pytest
 import warp as wp
 from cases import oracle_mesh, random_displacement
-from fibres import WOOD, random_axes, wood
+from fibres import WOOD, made, random_axes, wood
 from pairs import add_forces
-from test_anisotropy import made
-from test_miscompile import FORESTS, TOLERANCE, materials, meshed, turned
+from thousands import FORESTS, TOLERANCE, materials, meshed, turned
 from warp_corot.kernels import constitutive
 from warp_corot.kernels.anisotropic import scatter_anisotropic
 from warp_corot.kernels.cluster_laws import isotropic_law

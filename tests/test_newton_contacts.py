@@ -3,23 +3,22 @@
 import numpy as np
 import pytest
 import warp as wp
-from newton_scenes import add_grid, builder, grid_model, momentum, newton, run, semi_implicit, wc, wn
+from newton_scenes import (
+    KE,
+    add_grid,
+    builder,
+    contact_parameters,
+    grid_model,
+    model_without_particles,
+    momentum,
+    newton,
+    run,
+    semi_implicit,
+    wc,
+    wn,
+)
 
-KE = 2e4
 KF, DT = 1e5, 4e-4
-
-
-def contact_parameters(model, ke=KE, kd=20.0, kf=100.0, mu=0.5):
-    """The same for particles and shapes."""
-    model.soft_contact_ke, model.soft_contact_kd = ke, kd
-    model.soft_contact_kf, model.soft_contact_mu = kf, mu
-    for array, value in (
-        (model.shape_material_ke, ke),
-        (model.shape_material_kd, kd),
-        (model.shape_material_kf, kf),
-        (model.shape_material_mu, mu),
-    ):
-        array.fill_(value)
 
 
 def on_ground(device, gravity=(0.0, 0.0, -9.81), mu=0.5, **options):
@@ -170,14 +169,6 @@ class TestBodies:
         state = run(wn.SolverCorotated(model), model, 50, 5e-4, pipeline=pipeline)
         np.testing.assert_array_equal(state.body_q.numpy(), model.body_q.numpy())
         assert model.particle_mass.numpy() @ state.particle_qd.numpy()[:, 2] > 0.1
-
-
-def model_without_particles(model):
-    from newton.solvers.experimental.coupled import ModelView
-
-    view = ModelView(model, "bodies")
-    view.particle_count = view.tet_count = view.tri_count = view.edge_count = 0
-    return view
 
 
 def test_attachments_hang(device):

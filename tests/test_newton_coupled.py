@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from newton_scenes import add_grid, builder, newton, run, wn
-from test_newton_contacts import contact_parameters, model_without_particles
+from newton_scenes import add_grid, builder, contact_parameters, model_without_particles, newton, run, wn
 
 coupled = pytest.importorskip("newton.solvers.experimental.coupled")
 

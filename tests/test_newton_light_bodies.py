@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from newton_scenes import add_grid, builder, momentum, newton, run, semi_implicit, wn
-from test_newton_contacts import contact_parameters
+from newton_scenes import add_grid, builder, contact_parameters, momentum, newton, run, semi_implicit, wn
 
 
 def light_box(device, density):

@@ -5,8 +5,8 @@ import pytest
 from command_line import SHORT, simulate
 
 pytest.importorskip("matplotlib")
+from pictures import CUBE, FACES, picture_of
 from PIL import Image, ImageChops
-from test_preview import CUBE, FACES, picture_of
 
 from warp_corot.io.preview import Picture, _fit, render_preview, render_strip
 

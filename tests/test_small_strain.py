@@ -9,7 +9,7 @@ import oracle
 import pytest
 import warp as wp
 from cases import edge_scale, mixed_forest, oracle_mesh, place, random_displacement, simulation
-from test_left_out import Launches
+from left_out_launches import Launches
 from warp_corot.kernels.repair import LeftOut
 from warp_corot.kernels.subtree_cuda import scatter_subtrees_shared
 

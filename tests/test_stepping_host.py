@@ -6,7 +6,7 @@ from collections import Counter
 import numpy as np
 import pytest
 import warp as wp
-from test_stepping import beam, stretched
+from beams import beam, stretched
 
 import warp_corot as wc
 from warp_corot.solvers.safe_step import INTERVAL

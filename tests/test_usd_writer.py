@@ -11,7 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import written
 from pxr import Gf, Usd, UsdGeom, UsdValidation
+from written import Cube, frames_of
 
 from warp_corot.errors import InputError
 from warp_corot.io import usd_pieces
@@ -21,29 +23,8 @@ from warp_corot.io.usd_writer import SURFACE, TETS, UsdWriter
 from warp_corot.mesh.surface import signed_volumes
 
 
-class Cube:
-    """Two of the six path tetrahedra of a cube, one of them mirrored, and a node that none uses."""
-
-    points = np.array(
-        [[0, 0, 0], [1, 0, 0], [1, 1, 0], [1, 1, 1], [0, 1, 0], [0.5, 0.5, 0.5]], dtype=np.float64
-    )  # fmt: skip
-    tets = np.array([[0, 1, 2, 3], [0, 4, 2, 3]], dtype=np.int32)
-    up_axis = "Z"
-
-
 class Material:
     young, poisson, density = 5e3, np.array([0.3, 0.4]), 1000.0
-
-
-def frames_of(mesh, count: int):
-    """Positions, velocities and stresses that differ in every frame."""
-    for index in range(count):
-        noise = np.random.default_rng(index)
-        yield (
-            (mesh.points + 0.1 * noise.standard_normal(mesh.points.shape)).astype(np.float32),
-            noise.standard_normal(mesh.points.shape).astype(np.float32),
-            (100.0 * (index + 1) * noise.random(len(mesh.tets))).astype(np.float32),
-        )
 
 
 def write_frames(writer: UsdWriter, frames, flush_every: int = 0) -> None:
@@ -278,7 +259,8 @@ RUN = """
 import sys
 import numpy as np
 sys.path[:0] = {path!r}
-from test_usd_writer import Cube, UsdWriter, frames_of
+from written import Cube, frames_of
+from warp_corot.io.usd_writer import UsdWriter
 with UsdWriter({out!r}, Cube, fps=25, flush_seconds=60.0) as writer:
     print("ready", flush=True)
     for x, v, stress in frames_of(Cube, {count}):
@@ -290,7 +272,9 @@ with UsdWriter({out!r}, Cube, fps=25, flush_seconds=60.0) as writer:
 
 
 def run_code(out: Path, count: int, flush_every: int) -> str:
-    return RUN.format(path=[str(Path(__file__).parent), *sys.path], out=str(out), count=count, flush_every=flush_every)
+    return RUN.format(
+        path=[str(Path(written.__file__).parent), *sys.path], out=str(out), count=count, flush_every=flush_every
+    )
 
 
 def start_run(out: Path, flush_every: int) -> subprocess.Popen:
