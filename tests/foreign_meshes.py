@@ -136,3 +136,58 @@ def vtk_grid(points, cells: list[tuple[int, list[int]]], arrays: dict[str, list]
         array.SetName(name)
         data.GetCellData().AddArray(array)
     return data
+
+
+VTK_KINDS = {"tetra": 10, "hexahedron": 12, "wedge": 13, "pyramid": 14}
+
+
+GMSH_KINDS = {"tetra": 4, "hexahedron": 5, "wedge": 6, "pyramid": 7}
+
+
+ABAQUS = """\
+*Heading
+** two parts, the second twice
+*Part, name=Block
+*Node
+ 1, 0., 0., 0.
+ 2, 1., 0., 0.
+ 3, 1., 1., 0.
+ 4, 0., 1., 0.
+*Node, nset=top
+ 5, 0., 0., 1.
+ 6, 1., 0., 1.
+ 7, 1., 1., 1.
+ 8, 0., 1., 1.
+*Element, type=c3d8r, elset=Whole
+ 3, 1, 2, 3, 4, 5, 6,
+ 7, 8
+*Solid Section, elset=WHOLE, material=Liver
+,
+*End Part
+*Part, name=Tip
+*Node
+ 10, 0, 0, 0
+ 20, 1, 0, 0
+ 30, 0, 1, 0
+ 40, 0, 0, 1
+*Element, type=C3D4
+ 1, 10, 20, 30, 40
+*Elset, elset=All, generate
+ 1, 1, 1
+*Solid Section,
+elset=All, material=Bone
+*End Part
+*Assembly, name=A
+*Instance, name=one, part=Block
+*End Instance
+*Instance, name=two, part=Tip
+ 5., 0., 0.
+*End Instance
+*Instance, name=three, part=Tip
+ 0., 0., 1.
+ 0., 0., 1., 0., 1., 1., 90.
+*End Instance
+*Elset, elset=Loaded, instance=one
+ 3,
+*End Assembly
+"""

@@ -6,8 +6,17 @@ import time
 
 import numpy as np
 import pytest
-from foreign_meshes import grid, vtk_grid, write_gmsh_1, write_netgen, write_tetgen, write_with_vtk
-from test_foreign_formats import ABAQUS, GMSH_KINDS, VTK_KINDS
+from foreign_meshes import (
+    ABAQUS,
+    GMSH_KINDS,
+    VTK_KINDS,
+    grid,
+    vtk_grid,
+    write_gmsh_1,
+    write_netgen,
+    write_tetgen,
+    write_with_vtk,
+)
 
 from warp_corot.errors import InputError
 from warp_corot.io.formats import load_tets
