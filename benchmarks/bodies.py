@@ -137,7 +137,7 @@ def measured(name: str, tets: int, device: str, folder: Path) -> dict:
     from warp_corot.cli.organs import find_organ
     from warp_corot.domain.fidelity import fidelity
     from warp_corot.errors import InputError
-    from warp_corot.io.formats import load_tets
+    from warp_corot.io.read.tetrahedra import load_tets
 
     wp.config.log_level = wp.LOG_ERROR
     wc.TetForest.from_domain(wc.Domain.sphere(0.1), 0.1, max_level=3, device=device).surface()  # kernels are there

@@ -44,12 +44,12 @@ from problem import SUBTREE_LEVELS, Problem, oracle, relative_error
 from solver_cases import DAMPING, force_case, put_back, step_error
 from stable import Steppable
 from stage_cases import SVD_WRONG
-from warp_corot.kernels.polar import rotate_all
-from warp_corot.kernels.rotation import byers_xu
 
 import warp_corot as wc
 from warp_corot.elasticity import Model
-from warp_corot.rotations import rotation_function
+from warp_corot.elasticity.polar import rotation_function
+from warp_corot.kernels.math.polar import rotate_all
+from warp_corot.kernels.math.rotation import byers_xu
 
 HEADER = ("stage", "variant", "ns/tet", "spread", "Gtet/s", "x ours", "error", "largest dt", "simulated s/s")
 

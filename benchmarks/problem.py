@@ -15,14 +15,14 @@ import numpy as np
 import warp as wp
 
 import warp_corot as wc
-from warp_corot.elements import forest_elements
+from warp_corot.discretization.elements import forest_elements
 
-sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))
+sys.path.append(str(Path(__file__).resolve().parent.parent / "tests" / "support"))
 try:
     import oracle
 except ImportError as error:
     sys.exit(
-        f"benchmarks check every result against tests/oracle.py, which needs {error.name}: pip install {error.name}"
+        f"benchmarks check every result against tests/support/oracle.py, which needs {error.name}: pip install {error.name}"
     )
 
 #: Nodal displacements are uniform in this share of the edge length, to either side along each axis.

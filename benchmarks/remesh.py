@@ -17,12 +17,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import warp as wp
 from measure import Case, Result, checked, finish, machine, measure, number, parser, percent, table, tell
-from warp_corot.kernels.remesh_mark import ElementState
 
 import warp_corot as wc
+from warp_corot.discretization.changing.pools import DeviceForest
+from warp_corot.kernels.remesh.mark import ElementState
 from warp_corot.mesh.lattice import volume_shares
-from warp_corot.remesh.pools import DeviceForest
-from warp_corot.simulation import Simulation
+from warp_corot.simulation.simulation import Simulation
 
 LEVELS = (7, 10, 14, 17)
 HEADER = ("what", "of it", "leaves", "ms", "spread", "ns/leaf", "bisected", "ns/bisected")

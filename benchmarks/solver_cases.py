@@ -11,11 +11,11 @@ from measure import Case, kind
 from problem import SUBTREE_LEVELS, Problem, Sample, oracle, padded, relative_error
 
 import warp_corot as wc
+from warp_corot.body.worlds import World
 from warp_corot.elasticity import ForceField, Model
 from warp_corot.experiments import paper
 from warp_corot.solvers.integrator import StepContext
-from warp_corot.solvers.pace import Pace
-from warp_corot.worlds import World
+from warp_corot.solvers.steps.pace import Pace
 
 #: Steps of one sample of a whole-step row.
 STEPS = 64

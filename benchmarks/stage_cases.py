@@ -10,12 +10,12 @@ import warp as wp
 import work
 from measure import WRONG, Case
 from problem import GROUP_LEVELS, SUBTREE_LEVELS, Problem, oracle, padded, relative_error
-from warp_corot.kernels.corotated import extract_rotations, extract_warm_rotations
-from warp_corot.kernels.elements import ForestElements
-from warp_corot.kernels.rotation import byers_xu
 
-from warp_corot.elements import forest_elements
-from warp_corot.rotations import rotation_function
+from warp_corot.discretization.elements import forest_elements
+from warp_corot.elasticity.polar import rotation_function
+from warp_corot.kernels.corotated.corotated import extract_rotations, extract_warm_rotations
+from warp_corot.kernels.elements.elements import ForestElements
+from warp_corot.kernels.math.rotation import byers_xu
 
 #: Warp's SVD stops early.
 SVD_WRONG = 1e-2

@@ -8,9 +8,10 @@ The scatters add a constant, so that the exact result is a count.
 import functools
 
 import warp as wp
-from warp_corot.kernels.constitutive import corotated_strain, hooke
-from warp_corot.kernels.corotated import rest_shape
-from warp_corot.kernels.elements import (
+
+from warp_corot.kernels.corotated.corotated import rest_shape
+from warp_corot.kernels.elements.constitutive import corotated_strain, hooke
+from warp_corot.kernels.elements.elements import (
     ROOT2,
     ForestElements,
     add_force,
@@ -22,8 +23,8 @@ from warp_corot.kernels.elements import (
     rest_volume,
     shape_of,
 )
-from warp_corot.kernels.rotation import identity3
-from warp_corot.kernels.stiffness import stiffness_product, vec12
+from warp_corot.kernels.elements.stiffness import stiffness_product, vec12
+from warp_corot.kernels.math.rotation import identity3
 
 wp.set_module_options({"enable_backward": False})
 

@@ -15,8 +15,8 @@ from solver_cases import put_back
 from state_bodies import GRAVITY, MATERIAL, State, Subject
 
 import warp_corot as wc
+from warp_corot.discretization.elements import forest_elements
 from warp_corot.elasticity import ForceField, Model
-from warp_corot.elements import forest_elements
 from warp_corot.errors import InputError
 
 #: Fibres along y, three times as stiff as across.

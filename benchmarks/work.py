@@ -12,8 +12,8 @@ multiply-add is two), without addressing, selection by type, or tests that fail.
 
 from __future__ import annotations
 
-from warp_corot.kernels.shapes import edge_stiffness
-from warp_corot.kernels.stiffness import is_zero
+from warp_corot.kernels.elements.stiffness import is_zero
+from warp_corot.kernels.tables.shapes import edge_stiffness
 
 NODE = 16.0  # vec4
 INDICES = 16.0

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from scipy.ndimage import binary_closing
 
 import warp_corot as wc
-from warp_corot.io.preview import draw_body
-from warp_corot.io.sections import Section
+from warp_corot.io.pictures.preview import draw_body
+from warp_corot.io.pictures.sections import Section
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--device", help="cpu or cuda:0")

@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from scipy.ndimage import binary_dilation, binary_erosion
 
 import warp_corot as wc
-from warp_corot.io.preview import draw_body
-from warp_corot.io.sections import Section
-from warp_corot.io.volumes import load_volume
+from warp_corot.io.pictures.preview import draw_body
+from warp_corot.io.pictures.sections import Section
+from warp_corot.io.read.volumes import load_volume
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--device", help="cpu or cuda:0")

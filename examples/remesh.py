@@ -9,9 +9,9 @@ import argparse
 import numpy as np
 import warp as wp
 from scipy.spatial import ConvexHull
-from warp_corot.kernels.remesh_criteria import nearness
 
 import warp_corot as wc
+from warp_corot.kernels.remesh.criteria import nearness
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--device", help="cpu or cuda:0")

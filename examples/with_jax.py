@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 import warp_corot as wc
-from warp_corot.io.usd_writer import UsdWriter
+from warp_corot.io.write.usd.writer import UsdWriter
 
 try:
     import jax

@@ -1,18 +1,19 @@
 """The names that ``import warp_corot`` gives."""
 
-from .activation import Activation
-from .anisotropy import Orthotropic, TransverselyIsotropic
-from .body import SoftBody
+from warp_corot.body.activation import Activation
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.elasticity.polar import polar_rotation
+from warp_corot.io.write.animate import record
+from warp_corot.materials.anisotropic import Orthotropic, TransverselyIsotropic
+from warp_corot.materials.isotropic import Isotropic
+from warp_corot.remesh.online import OnlineRemesh
+from warp_corot.simulation.energy import Energy, WorldEnergies
+from warp_corot.simulation.simulation import Simulation
+
 from .domain import Domain
 from .elasticity import Corotated, EdgeStVK, Linear, MassSpring, NeoHookean, StVenantKirchhoff
-from .energy import Energy, WorldEnergies
 from .errors import CapacityWarning, InputError, StabilityWarning, StaleViewError, UnstableError
-from .io.animate import record
-from .materials import Isotropic
 from .mesh import SurfaceMesh, TetForest, TetMesh
-from .remesh.online import OnlineRemesh
-from .rotations import polar_rotation
-from .simulation import Simulation
 from .solvers import SymplecticEuler
 
 __all__ = [

@@ -14,7 +14,7 @@ import warp as wp
 from matplotlib.figure import Figure
 
 import warp_corot.newton as wn
-from warp_corot.io.colors import VertexAverage, round_limit, stress_colors
+from warp_corot.io.pictures.colors import VertexAverage, round_limit, stress_colors
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "newton"
 WIDTH, HEIGHT, FINER = 400, 300, 3

@@ -14,7 +14,8 @@ from collections.abc import Sequence
 from types import ModuleType
 from typing import NoReturn
 
-from ..errors import InputError, UnstableError
+from warp_corot.errors import InputError, UnstableError
+
 from .say import EXIT_CODES, complain, interrupt_status, open_streams, silence
 from .signals import terminable
 
@@ -43,7 +44,7 @@ class Parser(argparse.ArgumentParser):
 def make_parser() -> argparse.ArgumentParser:
     import warp as wp
 
-    from .. import __version__
+    from warp_corot import __version__
 
     parser = Parser(
         prog="warp-corot",

@@ -6,7 +6,8 @@ import argparse
 from collections.abc import Callable
 from typing import NamedTuple
 
-from ..errors import InputError
+from warp_corot.errors import InputError
+
 from .opened import Opened
 
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import InputError
-from ..holding import holds_of
-from ..materials import Isotropic
+from warp_corot.errors import InputError
+from warp_corot.holding.choice import holds_of
+from warp_corot.materials.isotropic import Isotropic
 
 if TYPE_CHECKING:
     from .patches import Patches

@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..domain.units import in_units
-from ..errors import InputError
-from ..materials import Isotropic
+from warp_corot.domain.units import in_units
+from warp_corot.errors import InputError
+from warp_corot.materials.isotropic import Isotropic
 
 if TYPE_CHECKING:
-    from ..elements import Mesh
-    from ..io.read.regions import Regions
-    from ..io.volumes import LoadedVolume
-    from ..mesh import TetForest, TetMesh
+    from warp_corot.discretization.elements import Mesh
+    from warp_corot.io.read.regions import Regions
+    from warp_corot.io.read.volumes import LoadedVolume
+    from warp_corot.mesh import TetForest, TetMesh
+
     from .patches import Patches
 
 FORM = "NAME[@NUMBER[+NUMBER...]]=YOUNG[:POISSON[:DENSITY]]"

@@ -12,15 +12,17 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from ..domain.units import in_units
-from ..errors import InputError
-from ..io.skins import boundary_surface
-from ..keys import checked_times
+from warp_corot.domain.units import in_units
+from warp_corot.errors import InputError
+from warp_corot.inputs.keys import checked_times
+from warp_corot.io.write.skins import boundary_surface
+
 from .quantities import seconds
 
 if TYPE_CHECKING:
-    from ..body import SoftBody
-    from ..simulation import Simulation
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.simulation.simulation import Simulation
+
     from .patches import Patches
 
 #: Numbers after PATCH, and what they are.

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ..domain.units import LARGEST, likely_unit, metres_per_unit
-from ..errors import InputError
-from ..io.assets import Asset, find_asset
-from ..io.formats import USD_SUFFIXES, LoadedMesh, check_file, load_tets, unknown_format
-from ..io.read import FileMesh, read_mesh_file
-from ..io.read.files import suffix_of
-from ..io.surfaces import UP_AXES, LoadedSurface, load_surface
-from ..io.volumes import LoadedVolume, is_volume, load_volume, volume_of_image
+from warp_corot.domain.units import LARGEST, likely_unit, metres_per_unit
+from warp_corot.errors import InputError
+from warp_corot.io.read import FileMesh, read_mesh_file
+from warp_corot.io.read.assets import Asset, find_asset
+from warp_corot.io.read.files import suffix_of
+from warp_corot.io.read.surfaces import UP_AXES, LoadedSurface, load_surface
+from warp_corot.io.read.tetrahedra import USD_SUFFIXES, LoadedMesh, check_file, load_tets, unknown_format
+from warp_corot.io.read.volumes import LoadedVolume, is_volume, load_volume, volume_of_image
 
 #: Meshes larger than this [m] are asked whether they are in millimetres.
 LARGEST_PLAUSIBLE = 10.0
@@ -73,7 +73,7 @@ def open_input(name: str) -> Opened:
         check_file(path, "mesh")
     suffix = path.suffix.lower()
     if suffix in USD_SUFFIXES:
-        from ..io.usd_look import has_mesh
+        from warp_corot.io.read.usd.look import has_mesh
 
         drawn = asset.is_surface if asset else has_mesh(path)
         return Opened(name, "surface", asset, surface=load_surface(name)) if drawn else Opened(name, "tets", asset)

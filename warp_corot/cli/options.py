@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ..elasticity import MODELS
+from warp_corot.elasticity import MODELS
+
 from . import patches, run_file
 from .label_materials import FORM
 from .loading import add_load_options

@@ -13,18 +13,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import InputError
-from ..mesh import TetForest
+from warp_corot.errors import InputError
+from warp_corot.mesh import TetForest
+
 from .label_materials import LabelMaterial, numbers_by_name, parse_labels
 from .opened import Opened, placed_surface, placed_volume
 from .subject import Subject
 
 if TYPE_CHECKING:
-    from ..domain import Domain
-    from ..domain.fidelity import Fidelity
-    from ..io.skins import OwnSurface
-    from ..io.volumes import LoadedVolume
-    from ..mesh import SurfaceMesh
+    from warp_corot.domain import Domain
+    from warp_corot.domain.fidelity import Fidelity
+    from warp_corot.io.read.volumes import LoadedVolume
+    from warp_corot.io.write.skins import OwnSurface
+    from warp_corot.mesh import SurfaceMesh
 
 #: Tetrahedra, about, where nothing is said of their size.
 TETS = 20_000
@@ -93,7 +94,7 @@ def find_organ(opened: Opened, args: argparse.Namespace) -> Subject:
 
 
 def _surface(opened: Opened, args: argparse.Namespace) -> Domain:
-    from ..domain import Domain
+    from warp_corot.domain import Domain
 
     loaded, unit = placed_surface(opened, args)
     return Domain.from_surface(loaded, unit=unit, device=args.device)
@@ -101,7 +102,7 @@ def _surface(opened: Opened, args: argparse.Namespace) -> Domain:
 
 def _scan(opened: Opened, args: argparse.Namespace, entries: list[LabelMaterial]) -> Domain:
     """The domain of a scan; ``entries`` are filled with the materials of its labels."""
-    from ..domain import Domain
+    from warp_corot.domain import Domain
 
     volume, unit = placed_volume(opened, args)
     option, text = ("--labels", args.labels) if args.labels is not None else ("--materials", args.materials)
@@ -173,7 +174,7 @@ def _own_surface(opened: Opened, args: argparse.Namespace, domain: Domain) -> Ow
     """The surface that was given, if it is to be drawn."""
     if opened.surface is None or args.skin == "marched":
         return None
-    from ..io.skins import OwnSurface
+    from warp_corot.io.write.skins import OwnSurface
 
     found = OwnSurface.of_domain(opened.source, opened.surface, domain.bounds)
     if found is None:
@@ -183,8 +184,8 @@ def _own_surface(opened: Opened, args: argparse.Namespace, domain: Domain) -> Ow
 
 def _measured(args: argparse.Namespace, mesh: TetForest, domain: Domain, surface: SurfaceMesh) -> Fidelity:
     """How true the mesh is to the body; what is not is warned of."""
-    from ..domain.fidelity import fidelity
-    from ..domain.units import length
+    from warp_corot.domain.fidelity import fidelity
+    from warp_corot.domain.units import length
 
     found = fidelity(mesh, domain, surface=surface)
     for doubt in found.doubts():

@@ -8,18 +8,19 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import InputError
+from warp_corot.errors import InputError
+
 from .say import complain, interrupt_status
 
 if TYPE_CHECKING:
-    from ..experiments.paper import Results, Settings
+    from warp_corot.experiments.paper import Results, Settings
 
 RESULTS = "results.json"
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
     """Add the command to ``warp-corot``."""
-    from ..experiments.paper import FULL_DURATION, SHORT_DURATION
+    from warp_corot.experiments.paper import FULL_DURATION, SHORT_DURATION
 
     parser = subparsers.add_parser(
         "paper",
@@ -59,8 +60,8 @@ def run(args: argparse.Namespace) -> int:
         InputError: Bad options; nothing has been simulated or written.
         UnstableError: A state is not finite any more; nothing has been written.
     """
-    from ..experiments import figures, report
-    from ..experiments.paper import FULL_DURATION, SHORT_DURATION, Settings
+    from warp_corot.experiments import figures, report
+    from warp_corot.experiments.paper import FULL_DURATION, SHORT_DURATION, Settings
 
     settings = Settings(duration=FULL_DURATION if args.full else args.duration, level=args.level, dt=args.dt)
     figures.check_matplotlib()
@@ -112,8 +113,9 @@ def checked_folder(folder: Path, names: Iterable[str] = ()) -> Path:
 def _with_progress(settings: Settings, device: str | None) -> Results:
     from tqdm import tqdm
 
-    from ..device import checked_device
-    from ..experiments.paper import run_experiment, work
+    from warp_corot.experiments.paper import run_experiment, work
+    from warp_corot.inputs.device import checked_device
+
     from .compiling import compiling_said
 
     where = checked_device(device)

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import InputError
-from ..mesh.surface import boundary_faces
-from ..regions import LOWEST, Shape, flat_region
-from ..selection import CONSTANTS, FUNCTIONS, REGIONS, select_nodes
+from warp_corot.errors import InputError
+from warp_corot.holding.regions import LOWEST, Shape, flat_region
+from warp_corot.inputs.selection import CONSTANTS, FUNCTIONS, REGIONS, select_nodes
+from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 if TYPE_CHECKING:
-    from ..mesh.bound import SurfaceMesh
+    from warp_corot.mesh.surfaces.bound import SurfaceMesh
+
     from .subject import Subject
 
 HELP = """patches, for --fix, --pull, --press, --twist and --probe, are expressions:

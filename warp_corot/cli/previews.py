@@ -14,13 +14,14 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import InputError
-from ..io.film import FILMS, check_film, frames_shown, write_film
+from warp_corot.errors import InputError
+from warp_corot.io.pictures.film import FILMS, check_film, frames_shown, write_film
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-    from ..simulation import Simulation
+    from warp_corot.simulation.simulation import Simulation
+
     from .simulate import Body
 
 #: Views by name: azimuth and elevation [°].
@@ -130,8 +131,8 @@ class Previews:
             return
         from tqdm import tqdm
 
-        from ..io.drawing import value_limits
-        from ..io.preview import Picture, bounds_of, cameras_of, draw_strip, save_picture
+        from warp_corot.io.pictures.drawing import value_limits
+        from warp_corot.io.pictures.preview import Picture, bounds_of, cameras_of, draw_strip, save_picture
 
         up_axis = bodies[0].soft.mesh.up_axis
         boxes, highest, ground = [], 0.0, np.inf
@@ -205,9 +206,9 @@ class Previews:
 
 def shown_now(bodies: Sequence[Body], sim: Simulation) -> Shown:
     """The present state of all bodies as it is drawn."""
-    from ..io.colors import VertexAverage
-    from ..io.skins import BoundSkins
-    from ..mesh.surface import signed_volumes
+    from warp_corot.io.pictures.colors import VertexAverage
+    from warp_corot.io.write.skins import BoundSkins
+    from warp_corot.mesh.surfaces.boundary import signed_volumes
 
     moved: list[np.ndarray] = []
     rest: list[np.ndarray] = []
@@ -239,7 +240,7 @@ def check_preview(args: argparse.Namespace) -> None:
     Raises:
         InputError: Something would.
     """
-    from ..io.preview import check_picture_path
+    from warp_corot.io.pictures.preview import check_picture_path
 
     if args.preview is None:
         for name in ("preview_frames", "preview_views"):

@@ -12,11 +12,12 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import InputError
+from warp_corot.errors import InputError
 
 if TYPE_CHECKING:
-    from ..body import SoftBody
-    from ..simulation import Simulation
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.simulation.simulation import Simulation
+
     from .patches import Patches
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"

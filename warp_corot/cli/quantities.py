@@ -6,8 +6,8 @@ import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ..domain.units import in_units, metres_per_unit
-from ..errors import InputError
+from warp_corot.domain.units import in_units, metres_per_unit
+from warp_corot.errors import InputError
 
 
 def quantity(unit: str) -> Callable[[str], float]:

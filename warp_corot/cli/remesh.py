@@ -8,12 +8,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from ..errors import InputError
-from ..remesh.online import OnlineRemesh
+from warp_corot.errors import InputError
+from warp_corot.remesh.online import OnlineRemesh
 
 if TYPE_CHECKING:
-    from ..io.animate import Recording
-    from ..simulation import Simulation
+    from warp_corot.io.write.animate import Recording
+    from warp_corot.simulation.simulation import Simulation
 
 #: What Python's arguments are called on the command line.
 ARGUMENTS = {

@@ -10,8 +10,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ..errors import InputError
-from ..io.whole import written_whole
+from warp_corot.errors import InputError
+from warp_corot.io.files.whole import written_whole
+
 from .loading import FORMS, Load, value_of
 
 HELP = """a run may be written down: run.toml has the options' names for keys, lists for several values, and true for

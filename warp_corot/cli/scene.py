@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..device import checked_device
-from ..errors import InputError, UnstableError
+from warp_corot.errors import InputError, UnstableError
+from warp_corot.inputs.device import checked_device
+
 from . import quantities
 from .compiling import compiling_said
 from .say import EXIT_CODES, complain, interrupt_status
@@ -19,9 +20,9 @@ from .simulate import kept_so_far, progress_bar
 from .summary import length, milliseconds, pressure
 
 if TYPE_CHECKING:
-    from ..io.animate import Recording
-    from ..io.usd_over import SceneWriter
-    from ..newton.stage_steps import StageSimulation
+    from warp_corot.io.write.animate import Recording
+    from warp_corot.io.write.usd.over import SceneWriter
+    from warp_corot.newton.stages.steps import StageSimulation
 
 __all__ = ["add_parser", "run"]
 
@@ -145,10 +146,10 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: Newton is not there, bad options, or a bad stage; nothing has been simulated or written.
     """
-    from ..io.animate import Recording, frame_count, signals_held_back
-    from ..io.usd_pieces import PieceStore
-    from ..newton.stage import StageOptions
-    from ..newton.stage_steps import StageSimulation
+    from warp_corot.io.write.animate import Recording, frame_count, signals_held_back
+    from warp_corot.io.write.usd.pieces import PieceStore
+    from warp_corot.newton.stages.stage import StageOptions
+    from warp_corot.newton.stages.steps import StageSimulation
 
     gravity = None if args.gravity is None else tuple(args.gravity)
     options = StageOptions(
@@ -212,7 +213,7 @@ def _write(writer: SceneWriter, sim: StageSimulation, done: Recording) -> None:
 
 
 def _close(writer: SceneWriter, done: Recording) -> None:
-    from ..io.animate import signals_held_back
+    from warp_corot.io.write.animate import signals_held_back
 
     started = time.perf_counter()
     with signals_held_back():

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from ..io.surfaces import LoadedSurface
+from warp_corot.io.read.surfaces import LoadedSurface
+
 from .opened import Opened, longest_side
 from .organs import TETS
 

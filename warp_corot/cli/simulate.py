@@ -12,16 +12,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..body import SoftBody
-from ..device import checked_device
-from ..elasticity import MODELS, Corotated, Model
-from ..errors import InputError, UnstableError
-from ..holding import NAMED
-from ..materials import Isotropic
-from ..parts import checked_gravity
-from ..remesh.online import OnlineRemesh
-from ..simulation import Simulation
-from ..solvers import SymplecticEuler
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.elasticity import MODELS, Corotated, Model
+from warp_corot.errors import InputError, UnstableError
+from warp_corot.holding.choice import NAMED
+from warp_corot.inputs.device import checked_device
+from warp_corot.materials.isotropic import Isotropic
+from warp_corot.remesh.online import OnlineRemesh
+from warp_corot.simulation.parts import checked_gravity
+from warp_corot.simulation.simulation import Simulation
+from warp_corot.solvers import SymplecticEuler
+
 from .about import about
 from .applies import refuse_options
 from .compiling import compiling_said
@@ -43,9 +44,9 @@ from .summary import pressure, summary
 from .waiting import waiting
 
 if TYPE_CHECKING:
-    from ..io.animate import Progress, Recording
-    from ..io.skins import OwnSurface
-    from ..mesh.bound import SurfaceMesh
+    from warp_corot.io.write.animate import Progress, Recording
+    from warp_corot.io.write.skins import OwnSurface
+    from warp_corot.mesh.surfaces.bound import SurfaceMesh
 
 __all__ = ["add_parser", "run"]
 
@@ -88,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: Bad options; nothing has been simulated or written.
     """
-    from ..io.animate import Recording, frame_count, record
+    from warp_corot.io.write.animate import Recording, frame_count, record
 
     options = bodies_of(args)
     shared = options[0]
@@ -183,7 +184,7 @@ def _found(body: Body) -> Subject:
 
 def _frames(args: argparse.Namespace, bodies: Sequence[Body]) -> tuple[float, int]:
     """The duration [s], and how many frames follow the first."""
-    from ..io.animate import frame_count
+    from warp_corot.io.write.animate import frame_count
 
     duration = max(body.subject.duration for body in bodies) if args.duration is None else args.duration
     return duration, frame_count(duration, args.fps)
@@ -223,8 +224,8 @@ def _each_frame(
 
 def _check_output(args: argparse.Namespace) -> None:
     """Say before a long run what would stop its results from being written."""
-    from ..io.usd_pieces import PieceStore
-    from ..io.write import check_also
+    from warp_corot.io.write import check_also
+    from warp_corot.io.write.usd.pieces import PieceStore
 
     PieceStore(args.output)  # checks, and writes nothing before the first frame
     for other in args.also or ():
@@ -315,7 +316,7 @@ def _material(
 
 def _make_simulation(args: argparse.Namespace, bodies: Sequence[Body]) -> Simulation:
     """The simulation, its kernels compiled; a given step is shortened until a whole number of them makes a frame."""
-    from ..io.animate import steps_per_frame
+    from warp_corot.io.write.animate import steps_per_frame
 
     first = bodies[0].subject
     damping = first.damping if args.damping is None else args.damping

@@ -9,18 +9,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..errors import InputError
-from ..experiments import paper
-from ..mesh import TetForest, TetMesh
+from warp_corot.errors import InputError
+from warp_corot.experiments import paper
+from warp_corot.mesh import TetForest, TetMesh
+
 from .label_materials import of_regions, parse_labels
 from .opened import Opened, placed_tets
 
 if TYPE_CHECKING:
-    from ..domain import Domain
-    from ..domain.fidelity import Fidelity
-    from ..io.assets import Asset
-    from ..io.skins import OwnSurface
-    from ..mesh.bound import SurfaceMesh
+    from warp_corot.domain import Domain
+    from warp_corot.domain.fidelity import Fidelity
+    from warp_corot.io.read.assets import Asset
+    from warp_corot.io.write.skins import OwnSurface
+    from warp_corot.mesh.surfaces.bound import SurfaceMesh
+
     from .label_materials import LabelMaterial
 
 #: Young's modulus over the weight of a column as high as the body: such bodies sag by roughly a tenth of their height.

@@ -7,17 +7,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..elasticity import MODELS
-from ..mesh import TetForest
+from warp_corot.elasticity import MODELS
+from warp_corot.mesh import TetForest
+
 from .remesh import remesh_rows
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ..elements import Mesh
-    from ..io.animate import Recording
-    from ..materials import Isotropic
-    from ..simulation import Simulation
+    from warp_corot.discretization.elements import Mesh
+    from warp_corot.io.write.animate import Recording
+    from warp_corot.materials.isotropic import Isotropic
+    from warp_corot.simulation.simulation import Simulation
+
     from .simulate import Body
     from .subject import Subject
 

@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from ..errors import InputError
+from warp_corot.errors import InputError
+
 from .winding import edge_parts, linked, net_edges, part_volumes, wind_alike, wind_outwards
 
 #: Points closer than this share of the surface's size are welded where it is open.

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from ..errors import InputError
-from ..kernels import domain as kernels
+from warp_corot.errors import InputError
+from warp_corot.kernels.meshing import domain as kernels
+
 from .domain import Domain
 
 

@@ -10,14 +10,15 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..device import checked_device
-from ..errors import InputError
-from ..kernels import domain as kernels
+from warp_corot.errors import InputError
+from warp_corot.inputs.device import checked_device
+from warp_corot.kernels.meshing import domain as kernels
+
 from .units import check_float32, length
 
 if TYPE_CHECKING:
-    from ..io.surfaces import LoadedSurface
-    from ..io.volumes import LoadedVolume
+    from warp_corot.io.read.surfaces import LoadedSurface
+    from warp_corot.io.read.volumes import LoadedVolume
 
     Surface = str | PathLike[str] | LoadedSurface | tuple[npt.ArrayLike, npt.ArrayLike]
     Volume = str | PathLike[str] | LoadedVolume | npt.ArrayLike

@@ -11,14 +11,15 @@ import warp as wp
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from ..kernels import measuring as kernels
+from warp_corot.kernels.meshing import measuring as kernels
+
 from .domain import Domain
 from .reference import reference_of
 from .units import length, volume
 from .winding import net_edges
 
 if TYPE_CHECKING:
-    from ..mesh import SurfaceMesh, TetForest, TetMesh
+    from warp_corot.mesh import SurfaceMesh, TetForest, TetMesh
 
 #: Points spread over each of the two surfaces.
 SAMPLES = 20_000
@@ -142,7 +143,7 @@ def fidelity(
 
 def held_volume(mesh: TetForest | TetMesh) -> float:
     """Volume of a mesh's elements [m^3], of those that a surface cuts what is inside."""
-    from ..mesh.surface import signed_volumes
+    from warp_corot.mesh.surfaces.boundary import signed_volumes
 
     volumes = getattr(mesh, "volumes", None)
     if volumes is None:
@@ -153,7 +154,7 @@ def held_volume(mesh: TetForest | TetMesh) -> float:
 
 def pieces_of(mesh: TetForest | TetMesh) -> tuple[int, np.ndarray]:
     """How many pieces elements make that are connected by faces, and which each is in, int32 [T]."""
-    from ..mesh.cut import face_pairs
+    from warp_corot.mesh.growing.cut import face_pairs
 
     count = len(mesh.tets)
     pairs = face_pairs(mesh.tets)
@@ -191,7 +192,7 @@ def _labels(mesh: Any) -> tuple[str, ...]:
 def _own_surface(mesh: Any) -> SurfaceMesh:
     if hasattr(mesh, "surface"):
         return mesh.surface()
-    from ..io.skins import boundary_surface
+    from warp_corot.io.write.skins import boundary_surface
 
     return boundary_surface(mesh)
 

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import InputError
-from ..io.volumes import LoadedVolume, affine_of, load_volume
+from warp_corot.errors import InputError
+from warp_corot.io.read.volumes import LoadedVolume, affine_of, load_volume
+
 from .units import metres_per_unit
 
 if TYPE_CHECKING:

@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..errors import InputError
-from ..kernels import domain as kernels
+from warp_corot.errors import InputError
+from warp_corot.kernels.meshing import domain as kernels
+
 from .domain import Domain
 from .grid import Grid, labels_from_probabilities, numbered_labels, placed_grid
 from .units import length, unlikely_size, volume

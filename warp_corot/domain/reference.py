@@ -8,7 +8,8 @@ import numpy as np
 import scipy.ndimage
 import warp as wp
 
-from ..kernels import measuring as kernels
+from warp_corot.kernels.meshing import measuring as kernels
+
 from .domain import Domain
 from .labels import LabelDomain
 from .surface import SurfaceDomain

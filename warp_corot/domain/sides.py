@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..kernels import domain as kernels
-from ..kernels import measuring
+from warp_corot.kernels.meshing import domain as kernels
+from warp_corot.kernels.meshing import measuring
+
 from .winding import linked, winding_number
 
 #: How far off a triangle winding numbers are looked at, over its own size and, at least, over the surface's.

@@ -11,9 +11,10 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..errors import InputError
-from ..io.surfaces import UP_AXES, LoadedSurface, load_surface
-from ..kernels import domain as kernels
+from warp_corot.errors import InputError
+from warp_corot.io.read.surfaces import UP_AXES, LoadedSurface, load_surface
+from warp_corot.kernels.meshing import domain as kernels
+
 from .domain import Domain
 from .sides import sides_of
 from .units import length, metres_per_unit, unlikely_size, volume

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
+from warp_corot.errors import InputError
 
 #: Metres in a unit.
 UNITS = {"m": 1.0, "cm": 1.0e-2, "mm": 1.0e-3}

@@ -1,6 +1,7 @@
 """Elastic models, one file each, all from the same Young's modulus and Poisson's ratio. A new one is listed here."""
 
-from .corotated import Corotated
+from warp_corot.elasticity.corotated.model import Corotated
+
 from .edge_stvk import EdgeStVK
 from .linear import Linear
 from .mass_spring import MassSpring

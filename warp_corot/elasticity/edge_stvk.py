@@ -5,14 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ..errors import InputError
-from ..kernels.constitutive import stvk_cauchy
-from ..kernels.forces import element_von_mises
-from ..kernels.springs import edge_stvk_energies, scatter_edge_stvk
+from warp_corot.errors import InputError
+from warp_corot.kernels.elements.constitutive import stvk_cauchy
+from warp_corot.kernels.elements.forces import element_von_mises
+from warp_corot.kernels.elements.springs import edge_stvk_energies, scatter_edge_stvk
+
 from .model import ElementField, ForceField, Model
 
 if TYPE_CHECKING:
-    from ..body import SoftBody
+    from warp_corot.body.soft_body import SoftBody
 
 
 @dataclass(frozen=True)

@@ -9,16 +9,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from ..elements import in_worlds, repeated
-from ..errors import InputError
-from ..kernels.constitutive import stvk_cauchy
-from ..kernels.forces import element_von_mises
-from ..kernels.springs import mass_spring_energies, scatter_mass_spring
-from ..slots import Slots
+from warp_corot.discretization.elements import in_worlds, repeated
+from warp_corot.discretization.slots import Slots
+from warp_corot.errors import InputError
+from warp_corot.kernels.elements.constitutive import stvk_cauchy
+from warp_corot.kernels.elements.forces import element_von_mises
+from warp_corot.kernels.elements.springs import mass_spring_energies, scatter_mass_spring
+
 from .model import ForceField, Model
 
 if TYPE_CHECKING:
-    from ..body import SoftBody
+    from warp_corot.body.soft_body import SoftBody
 
 
 @dataclass(frozen=True)

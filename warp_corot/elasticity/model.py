@@ -11,17 +11,17 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..anisotropy import Anisotropic
-from ..elements import in_worlds, with_targets
-from ..errors import InputError
-from ..kernels.forces import element_energies, element_von_mises, scatter_forces
-from ..slots import Slots
+from warp_corot.discretization.elements import in_worlds, with_targets
+from warp_corot.discretization.slots import Slots
+from warp_corot.errors import InputError
+from warp_corot.kernels.elements.forces import element_energies, element_von_mises, scatter_forces
+from warp_corot.materials.anisotropic import Anisotropic
 
 if TYPE_CHECKING:
-    from ..body import SoftBody
-    from ..remesh.plan import DevicePlan
-    from ..remesh.pools import DeviceForest
-    from ..solvers.pace import Pace
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.changing.plan import DevicePlan
+    from warp_corot.discretization.changing.pools import DeviceForest
+    from warp_corot.solvers.steps.pace import Pace
 
 
 class ForceField(ABC):
@@ -65,7 +65,7 @@ class ForceField(ABC):
 
     def plan_of(self, forest: DeviceForest) -> DevicePlan:
         """What the field wants to know of a mesh that changes, derived there."""
-        from ..remesh.plan import DevicePlan
+        from warp_corot.discretization.changing.plan import DevicePlan
 
         return DevicePlan(forest, subtrees=False)
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ..kernels.constitutive import neo_hookean_cauchy, neo_hookean_energy, neo_hookean_stress
-from .laws import law_field
+from warp_corot.elasticity.paths.laws import law_field
+from warp_corot.kernels.elements.constitutive import neo_hookean_cauchy, neo_hookean_energy, neo_hookean_stress
+
 from .model import ForceField, Model
 
 if TYPE_CHECKING:
-    from ..body import SoftBody
+    from warp_corot.body.soft_body import SoftBody
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ..kernels.constitutive import stvk_cauchy, stvk_energy, stvk_stress
-from .laws import law_field
+from warp_corot.elasticity.paths.laws import law_field
+from warp_corot.kernels.elements.constitutive import stvk_cauchy, stvk_energy, stvk_stress
+
 from .model import ForceField, Model
 
 if TYPE_CHECKING:
-    from ..body import SoftBody
+    from warp_corot.body.soft_body import SoftBody
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from ..kernels.constitutive import CONTINUED_BELOW
-from ..materials import Isotropic
-from .corotated import Corotated
+from warp_corot.elasticity.corotated.model import Corotated
+from warp_corot.kernels.elements.constitutive import CONTINUED_BELOW
+from warp_corot.materials.isotropic import Isotropic
+
 from .edge_stvk import EdgeStVK
 from .linear import Linear
 from .mass_spring import MassSpring
@@ -17,7 +18,7 @@ from .stvk import StVenantKirchhoff
 
 Tensors = npt.NDArray[np.float64]
 
-#: As in ``kernels/constitutive.py``: |J| is kept away from zero.
+#: As in ``kernels/elements/constitutive.py``: |J| is kept away from zero.
 LEAST_J = 1.0e-3
 
 

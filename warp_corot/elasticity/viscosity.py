@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from ..kernels.viscosity import scatter_viscous
+from warp_corot.kernels.elements.viscosity import scatter_viscous
+
 from .model import leaf_slots
 
 if TYPE_CHECKING:
-    from ..body import SoftBody
+    from warp_corot.body.soft_body import SoftBody
+
     from .model import ForceField
 
 

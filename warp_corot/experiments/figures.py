@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import InputError
+from warp_corot.errors import InputError
+
 from .claims import PUBLISHED_COROTATED, PUBLISHED_LINEAR
 from .paper import OWN, PEER, REFERENCE, Results, Run
 from .shapes import draw_shapes

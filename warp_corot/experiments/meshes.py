@@ -14,10 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..domain import Domain
-from ..errors import InputError
-from ..io.preview import check_picture_path
-from ..mesh import TetForest
+from warp_corot.domain import Domain
+from warp_corot.errors import InputError
+from warp_corot.io.pictures.preview import check_picture_path
+from warp_corot.mesh import TetForest
+
 from .style import FAINT, INK, LINEAR, OWN_COLOR, new_figure, save, tidy
 
 #: Edge of a root cube [m]; the bodies fit into one cube or a few.

@@ -16,16 +16,17 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..body import SoftBody
-from ..device import checked_device
-from ..elasticity import Corotated, Linear, Model, NeoHookean, StVenantKirchhoff
-from ..errors import InputError
-from ..materials import Isotropic
-from ..mesh import TetForest
-from ..mesh.surface import signed_volumes
-from ..simulation import Simulation
-from ..solvers import SymplecticEuler
-from ..solvers.recorded import GRAPH_STEPS
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.elasticity import Corotated, Linear, Model, NeoHookean, StVenantKirchhoff
+from warp_corot.errors import InputError
+from warp_corot.inputs.device import checked_device
+from warp_corot.materials.isotropic import Isotropic
+from warp_corot.mesh import TetForest
+from warp_corot.mesh.surfaces.boundary import signed_volumes
+from warp_corot.simulation.simulation import Simulation
+from warp_corot.solvers import SymplecticEuler
+from warp_corot.solvers.recorded import GRAPH_STEPS
+
 from .timing import Stages, Times, measure_times
 
 Array = npt.NDArray[np.float64]

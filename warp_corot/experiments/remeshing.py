@@ -17,17 +17,17 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..body import SoftBody
-from ..device import checked_device
-from ..domain import Domain
-from ..errors import InputError
-from ..kernels.remesh_criteria import nearness, strain
-from ..kernels.remesh_mark import elongation
-from ..materials import Isotropic
-from ..mesh import TetForest
-from ..remesh.online import OnlineRemesh
-from ..simulation import Simulation
-from ..solvers import SymplecticEuler
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.domain import Domain
+from warp_corot.errors import InputError
+from warp_corot.inputs.device import checked_device
+from warp_corot.kernels.remesh.criteria import nearness, strain
+from warp_corot.kernels.remesh.mark import elongation
+from warp_corot.materials.isotropic import Isotropic
+from warp_corot.mesh import TetForest
+from warp_corot.remesh.online import OnlineRemesh
+from warp_corot.simulation.simulation import Simulation
+from warp_corot.solvers import SymplecticEuler
 
 #: Edge of a root cube [m].
 CELL = 0.02

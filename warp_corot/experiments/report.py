@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from .. import __version__
-from ..io.whole import written_whole
+from warp_corot import __version__
+from warp_corot.io.files.whole import written_whole
+
 from .claims import judged_claims, speed_up
 from .paper import CELL_SIZE, CELLS, GRAVITY, MATERIAL, OBSERVED, OWN, REFERENCE, SAMPLE_STEPS, Results, Run
 from .timing import LAUNCHES, RUN_STEPS, StageTimes

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..io.preview import Camera, draw_body
-from ..mesh.surface import boundary_faces
+from warp_corot.io.pictures.preview import Camera, draw_body
+from warp_corot.mesh.surfaces.boundary import boundary_faces
+
 from .claims import VOLUME_KEPT
 from .paper import CELL_SIZE, CELLS, OWN, PEER, REFERENCE, Results
 from .style import FAINT, INK, LINEAR, OWN_COLOR, head, new_figure, save

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..io.whole import written_whole
+from warp_corot.io.files.whole import written_whole
+
 from .paper import Results
 from .report import device_name
 

@@ -17,13 +17,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import warp as wp
 
-from ..body import SoftBody
-from ..elasticity import Corotated, ForceField
-from ..elasticity.corotated import CorotatedField
-from ..simulation import Simulation
-from ..solvers import SymplecticEuler
-from ..solvers.integrator import StepContext
-from ..solvers.pace import Pace
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.elasticity import Corotated, ForceField
+from warp_corot.elasticity.corotated.model import CorotatedField
+from warp_corot.simulation.simulation import Simulation
+from warp_corot.solvers import SymplecticEuler
+from warp_corot.solvers.integrator import StepContext
+from warp_corot.solvers.steps.pace import Pace
 
 #: Launches of one stage recorded in a graph.
 LAUNCHES = 64

@@ -1,6 +1,7 @@
 """Meshes: the forest of bisected tetrahedra, tetrahedra of any shape, and surfaces that go along with them."""
 
-from .bound import BoundPoints, SurfaceMesh
+from warp_corot.mesh.surfaces.bound import BoundPoints, SurfaceMesh
+
 from .forest import TetForest, Tree
 from .tetmesh import TetMesh
 

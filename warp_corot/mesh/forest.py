@@ -17,19 +17,20 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..checks import checked_numbers, shown
-from ..errors import InputError
-from ..indices import checked_indices
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_numbers, shown
+from warp_corot.inputs.indices import checked_indices
+from warp_corot.mesh.growing.refined import refined
+
 from .lattice import LATTICE_BITS, checked_cell_size, checked_cells, checked_level, volume_shares
 from .lattice import MAX_LEVEL as MAX_LEVEL
-from .refined import refined
 from .tree import Tree, UniformTree
 from .uniform import halvings, uniform_leaves
 
 if TYPE_CHECKING:
-    from ..domain import Domain
-    from .bound import BoundPoints, SurfaceMesh
-    from .detail import Detail
+    from warp_corot.domain import Domain
+    from warp_corot.mesh.growing.detail import Detail
+    from warp_corot.mesh.surfaces.bound import BoundPoints, SurfaceMesh
 
 #: A user's function of points [n, 3] -> [n].
 Field = Callable[[np.ndarray], np.ndarray]
@@ -160,8 +161,8 @@ class TetForest:
         Raises:
             InputError: An argument is out of its range, the body comes out empty, or there is no mesh so coarse.
         """
-        from ..domain import Domain
-        from .from_domain import mesh_domain
+        from warp_corot.domain import Domain
+        from warp_corot.mesh.growing.from_domain import mesh_domain
 
         if not isinstance(domain, Domain):
             cure = f"Domain.from_surface({str(domain)!r}) makes one" if isinstance(domain, str | PathLike) else ""
@@ -260,7 +261,7 @@ class TetForest:
         Raises:
             InputError: Not [n, 3], or not finite.
         """
-        from .embedding import embed
+        from warp_corot.mesh.surfaces.embedding import embed
 
         return embed(self, np.asarray(points))
 
@@ -270,7 +271,7 @@ class TetForest:
         Raises:
             InputError: As `embed`, or triangles of points that are not there.
         """
-        from .bodies import bind
+        from warp_corot.mesh.surfaces.bodies import bind
 
         return bind(self, np.asarray(points), triangles)
 
@@ -280,7 +281,7 @@ class TetForest:
         Points sit on edges between nodes inside and outside. Where the outer end went with an element that holds too
         little, the point is bound to the nodes of the nearest element.
         """
-        from .bodies import surface
+        from warp_corot.mesh.surfaces.bodies import surface
 
         return surface(self)
 
@@ -290,7 +291,7 @@ class TetForest:
         Raises:
             InputError: The mesh has no labels.
         """
-        from .bodies import separating_surface
+        from warp_corot.mesh.surfaces.bodies import separating_surface
 
         return separating_surface(self)
 
@@ -316,18 +317,18 @@ class TetForest:
 
     def pieces(self) -> np.ndarray:
         """Which piece each leaf is in, int32 [T]: leaves that hang together by nodes; the largest piece is 0."""
-        from .bodies import pieces
+        from warp_corot.mesh.surfaces.bodies import pieces
 
         return pieces(self)
 
     def largest_piece(self) -> TetForest:
         """The mesh without what hangs together with its largest piece by no node, surface and all."""
-        from .bodies import largest_piece
+        from warp_corot.mesh.surfaces.bodies import largest_piece
 
         return largest_piece(self)
 
     def summary(self) -> list[str]:
         """What a user should know of the mesh, line by line: counts by level and type, volume, labels, pieces."""
-        from .bodies import summary
+        from warp_corot.mesh.surfaces.bodies import summary
 
         return summary(self)

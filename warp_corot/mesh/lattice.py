@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import checked_number
-from ..errors import InputError
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_number
 
 #: A root cube has 2**LATTICE_BITS lattice intervals a side, so levels may go to 3 * LATTICE_BITS.
 LATTICE_BITS = 16

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from ..checks import checked_number, checked_numbers
-from ..errors import InputError
-from .surface import signed_volumes
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_number, checked_numbers
+from warp_corot.mesh.surfaces.boundary import signed_volumes
 
 if TYPE_CHECKING:
-    from .bound import BoundPoints
+    from warp_corot.mesh.surfaces.bound import BoundPoints
 
 #: A tetrahedron of less volume than this times its longest edge cubed cannot be told from a flat one in float32.
 FLAT = 1e-7
@@ -122,7 +122,7 @@ class TetMesh:
         Raises:
             InputError: No such file, unknown format, no such cells in it, or a mesh that cannot be simulated.
         """
-        from ..io.formats import load_tets
+        from warp_corot.io.read.tetrahedra import load_tets
 
         loaded = load_tets(path, scale=scale, unit=unit, regions=regions)
         found = loaded.regions
@@ -172,7 +172,7 @@ class TetMesh:
         Raises:
             InputError: Not [n, 3], or not finite.
         """
-        from .locating import embed_in_tets
+        from warp_corot.mesh.surfaces.locating import embed_in_tets
 
         return embed_in_tets(self.points, self.tets, np.asarray(points))
 
@@ -182,7 +182,7 @@ class TetMesh:
         Raises:
             InputError: As `embed`, or triangles of points that are not there.
         """
-        from .bodies import bind
+        from warp_corot.mesh.surfaces.bodies import bind
 
         return bind(self, np.asarray(points), triangles)
 

@@ -10,10 +10,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from warp_corot.newton.stages.material import StageOptions
+    from warp_corot.newton.stages.steps import StageSimulation
+
     from .scene import Added, add_forest, add_mesh
     from .solver import SolverCorotated
-    from .stage_material import StageOptions
-    from .stage_steps import StageSimulation
     from .state import register_custom_attributes
     from .viewing import open_viewer
 
@@ -31,8 +32,8 @@ __all__ = [
 _MODULES = {
     "Added": ".scene",
     "SolverCorotated": ".solver",
-    "StageOptions": ".stage_material",
-    "StageSimulation": ".stage_steps",
+    "StageOptions": ".stages.material",
+    "StageSimulation": ".stages.steps",
     "add_forest": ".scene",
     "add_mesh": ".scene",
     "open_viewer": ".viewing",

@@ -11,10 +11,11 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from ..errors import InputError
-from ..kernels.newton_contacts import ContactLaw, scatter_attachments, scatter_soft_contacts
-from ..kernels.newton_worlds import check_contact_count
-from ..kernels.newton_yielding import gather_attachments, gather_soft_contacts, solve_yielding
+from warp_corot.errors import InputError
+from warp_corot.kernels.newton.contacts import ContactLaw, scatter_attachments, scatter_soft_contacts
+from warp_corot.kernels.newton.worlds import check_contact_count
+from warp_corot.kernels.newton.yielding import gather_attachments, gather_soft_contacts, solve_yielding
+
 from .library import newton
 
 #: ``newton.BodyFlags.KINEMATIC``, of bodies that move as they are told.

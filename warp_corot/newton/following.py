@@ -1,4 +1,4 @@
-"""How many substeps a step needs in the present state; see ``kernels.gauge``."""
+"""How many substeps a step needs in the present state; see ``kernels.stepping.gauge``."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ import warp as wp
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from ..elasticity import Corotated
-from ..kernels import gauge, newton_gauge
-from ..solvers.gauge import REST_TURNS
-from ..solvers.stable_step import PROBE
+from warp_corot.elasticity import Corotated
+from warp_corot.kernels.newton import gauge as newton_gauge
+from warp_corot.kernels.stepping import gauge
+from warp_corot.solvers.steps.gauge import REST_TURNS
+from warp_corot.solvers.steps.stable_step import PROBE
+
 from .library import newton
 from .tetrahedra import Tetrahedra
 

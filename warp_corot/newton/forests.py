@@ -8,11 +8,12 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..body import SoftBody
-from ..elasticity import Corotated
-from ..kernels.newton_particles import add_nodes, gather_nodes
-from ..materials import Isotropic
-from ..mesh import TetForest
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.elasticity import Corotated
+from warp_corot.kernels.newton.particles import add_nodes, gather_nodes
+from warp_corot.materials.isotropic import Isotropic
+from warp_corot.mesh import TetForest
+
 from .library import newton
 from .scene import mesh_fill, right_handed
 from .state import attribute_of

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from types import ModuleType
 
-from ..errors import InputError
+from warp_corot.errors import InputError
 
 
 class MissingNewton(InputError, ImportError):

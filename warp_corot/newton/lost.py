@@ -7,7 +7,8 @@ import warnings
 import numpy as np
 import numpy.typing as npt
 
-from ..mesh.surface import boundary_faces
+from warp_corot.mesh.surfaces.boundary import boundary_faces
+
 from .library import newton
 
 _REPAIR = (

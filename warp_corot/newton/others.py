@@ -14,8 +14,9 @@ from contextlib import contextmanager
 import numpy as np
 import warp as wp
 
-from ..errors import InputError
-from ..kernels.newton_linear import scatter_bending, scatter_springs, scatter_triangles
+from warp_corot.errors import InputError
+from warp_corot.kernels.newton.linear import scatter_bending, scatter_springs, scatter_triangles
+
 from .library import ModelView, SolverBase, SolverSemiImplicit, newton
 
 #: Contacts with other particles that one is in, in a heap of them, for how stiff these are together. Those of two that

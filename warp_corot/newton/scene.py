@@ -10,12 +10,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from ..body import centroids, lumped_masses
-from ..errors import InputError
-from ..indices import checked_indices
-from ..materials import Isotropic
-from ..mesh import TetForest, TetMesh
-from ..mesh.surface import boundary_faces, signed_volumes
+from warp_corot.body.soft_body import centroids, lumped_masses
+from warp_corot.errors import InputError
+from warp_corot.inputs.indices import checked_indices
+from warp_corot.materials.isotropic import Isotropic
+from warp_corot.mesh import TetForest, TetMesh
+from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes
+
 from .library import newton
 from .state import NAMESPACE, ForestName, register_forests
 

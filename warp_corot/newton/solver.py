@@ -9,8 +9,9 @@ from typing import Any
 
 import warp as wp
 
-from ..checks import refuse_tape
-from ..errors import InputError
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import refuse_tape
+
 from .contact import Contacts
 from .following import Following
 from .library import CouplingInterface, ModelView, SolverBase, newton

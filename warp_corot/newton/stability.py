@@ -11,11 +11,12 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..kernels.constitutive import linear_stress
-from ..kernels.elements import GeneralElements
-from ..kernels.forces import scatter_forces
-from ..kernels.lanczos import add_scaled, scale_by
-from ..solvers import largest_frequency
+from warp_corot.kernels.elements.constitutive import linear_stress
+from warp_corot.kernels.elements.elements import GeneralElements
+from warp_corot.kernels.elements.forces import scatter_forces
+from warp_corot.kernels.stepping.lanczos import add_scaled, scale_by
+from warp_corot.solvers import largest_frequency
+
 from .library import newton
 from .others import Others
 from .tetrahedra import Tetrahedra
@@ -93,7 +94,7 @@ def stable_step(
         stiffness: Of a spring at every particle [N/m], for contact.
         damping: Of a damper at every particle [N s/m].
         of_bodies: Stiffness over mass at the other end of such a spring [1/s^2]; 0: nothing moves there. Bodies that
-            are touched in several places need no shorter steps; see ``kernels.newton_yielding``.
+            are touched in several places need no shorter steps; see ``kernels.newton.yielding``.
     """
     model = tets.model
     body = cast(Any, _Particles(model, tets.elements.volume.numpy().astype(np.float64)))

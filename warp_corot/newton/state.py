@@ -6,7 +6,8 @@ from typing import Any
 
 import warp as wp
 
-from ..mesh import TetForest
+from warp_corot.mesh import TetForest
+
 from .library import newton
 
 NAMESPACE = "warp_corot"

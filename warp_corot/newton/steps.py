@@ -7,11 +7,12 @@ import warnings
 import numpy as np
 import warp as wp
 
-from ..errors import InputError, UnstableError
-from ..kernels import newton_particles as kernels
-from ..kernels import newton_worlds as worlds
-from ..kernels.newton_contacts import add_wrenches
-from ..subnormals import FlushedSubnormals
+from warp_corot.errors import InputError, UnstableError
+from warp_corot.kernels.newton import particles as kernels
+from warp_corot.kernels.newton import worlds as worlds
+from warp_corot.kernels.newton.contacts import add_wrenches
+from warp_corot.solvers.subnormals import FlushedSubnormals
+
 from .contact import Contacts
 from .following import RETRIES, Following
 from .library import newton

@@ -8,14 +8,15 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..errors import InputError
-from ..kernels.constitutive import linear_stress
-from ..kernels.elements import GeneralElements
-from ..kernels.forces import scatter_forces
-from ..kernels.general_cuda import BLOCK, PosedElements
-from ..kernels.lanes import LANES
-from ..kernels.newton_attributes import split_materials, write_attributes
-from ..kernels.newton_elements import (
+from warp_corot.errors import InputError
+from warp_corot.kernels.elements.constitutive import linear_stress
+from warp_corot.kernels.elements.elements import GeneralElements
+from warp_corot.kernels.elements.forces import scatter_forces
+from warp_corot.kernels.elements.general_cuda import BLOCK, PosedElements
+from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.math.rotation import quick_rotation
+from warp_corot.kernels.newton.attributes import split_materials, write_attributes
+from warp_corot.kernels.newton.elements import (
     EACH,
     repair_posed,
     scatter_damping_and_activation,
@@ -23,7 +24,7 @@ from ..kernels.newton_elements import (
     scatter_posed_lanes,
     scatter_posed_warm,
 )
-from ..kernels.rotation import quick_rotation
+
 from .forests import ForestGroup, forest_groups
 from .library import newton
 from .lost import warn_of_lost, why_none
@@ -45,7 +46,7 @@ class Part:
 class Tetrahedra:
     """Forces, rotations and stresses of all tetrahedra of a model.
 
-    Forces are of positions that have been gathered (see ``kernels.newton_particles``) into arrays that are empty where
+    Forces are of positions that have been gathered (see ``kernels.newton.particles``) into arrays that are empty where
     no element needs them.
 
     Args:

@@ -10,14 +10,15 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..activation import Activation, ElementActivation
-from ..kernels.anisotropic_remesh import READ_LEAVES, WRITE_LEAVES
-from ..kernels.remesh_state import NO_ROW
+from warp_corot.body.activation import Activation, ElementActivation
+from warp_corot.discretization.changing.pools import DeviceForest
+from warp_corot.kernels.remesh.anisotropic import READ_LEAVES, WRITE_LEAVES
+from warp_corot.kernels.remesh.state import NO_ROW
+
 from .carried_material import ACTIVATION, ACTIVATION_ROW
-from .pools import DeviceForest
 
 if TYPE_CHECKING:
-    from ..body import SoftBody
+    from warp_corot.body.soft_body import SoftBody
 
 
 @dataclass(frozen=True, eq=False)

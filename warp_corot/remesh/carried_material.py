@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ..anisotropy import FRAME_ENTRIES, STIFFNESS_ENTRIES, Anisotropic, constants_of
-from ..kernels.remesh_state import FIRST, MEAN_IF_ALIKE, MEAN_OF_CONTENTS, NO_ROW
-from ..materials import Isotropic, Material
-from .plan import DevicePlan
-from .pools import DeviceForest
-from .transfer import Column, Numbers
+from warp_corot.discretization.changing.plan import DevicePlan
+from warp_corot.discretization.changing.pools import DeviceForest
+from warp_corot.discretization.changing.transfer import Column, Numbers
+from warp_corot.kernels.remesh.state import FIRST, MEAN_IF_ALIKE, MEAN_OF_CONTENTS, NO_ROW
+from warp_corot.materials.anisotropic import FRAME_ENTRIES, STIFFNESS_ENTRIES, Anisotropic, constants_of
+from warp_corot.materials.isotropic import Isotropic, Material
 
 if TYPE_CHECKING:
-    from ..body import SoftBody
+    from warp_corot.body.soft_body import SoftBody
 
 #: The active stress, and, of whole numbers, the row of keyframes that it follows.
 ACTIVATION = "activation"

@@ -8,25 +8,26 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..errors import InputError
-from ..kernels.integrate import set_start
-from ..kernels.remesh_mark import elongation, marking_kernel
-from ..materials import Material
-from ..mesh import TetForest
-from ..mesh.lattice import volume_shares
+from warp_corot.discretization.changing.passes import RemeshPass
+from warp_corot.discretization.changing.plan import DevicePlan
+from warp_corot.discretization.changing.pools import DeviceForest, PassCounts
+from warp_corot.discretization.changing.sizes import launch_size
+from warp_corot.discretization.changing.survey import Survey
+from warp_corot.errors import InputError
+from warp_corot.kernels.remesh.mark import elongation, marking_kernel
+from warp_corot.kernels.stepping.integrate import set_start
+from warp_corot.materials.isotropic import Material
+from warp_corot.mesh import TetForest
+from warp_corot.mesh.lattice import volume_shares
+
 from .carried_material import carried_material
 from .conditions import Conditions
 from .online import OnlineRemesh
-from .passes import RemeshPass
-from .plan import DevicePlan
-from .pools import DeviceForest, PassCounts
-from .sizes import launch_size
-from .survey import Survey
 
 if TYPE_CHECKING:
-    from ..body import SoftBody
-    from ..elasticity import ForceField
-    from ..solvers.pace import Pace
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.elasticity import ForceField
+    from warp_corot.solvers.steps.pace import Pace
 
 #: Nodes are launched in multiples of this.
 NODE_GRANULE = 256

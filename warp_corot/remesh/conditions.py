@@ -8,15 +8,16 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..kernels import remesh_followers as kernels
-from ..kernels.remesh_plan import begin_counts
+from warp_corot.discretization.changing.pools import DeviceForest
+from warp_corot.kernels.plan.plan import begin_counts
+from warp_corot.kernels.remesh import followers as kernels
+
 from .carried_activation import CarriedActivation
 from .carried_material import ACTIVATION, ACTIVATION_ROW
 from .keyframes import Keyframes
-from .pools import DeviceForest
 
 if TYPE_CHECKING:
-    from ..body import SoftBody
+    from warp_corot.body.soft_body import SoftBody
 
 
 #: What is kept for ``put_back``.

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ..kernels.remesh_state import MIXED_ROWS, NO_ROW
-from ..trajectory import Trajectory
+from warp_corot.body.trajectory import Trajectory
+from warp_corot.kernels.remesh.state import MIXED_ROWS, NO_ROW
 
 
 @dataclass(frozen=True, eq=False)

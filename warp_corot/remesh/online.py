@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..checks import checked_count
-from ..errors import InputError
-from ..kernels.remesh_criteria import PARAMETER_COUNTS
-from ..mesh import TetForest
-from ..mesh.lattice import MAX_LEVEL
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_count
+from warp_corot.kernels.remesh.criteria import PARAMETER_COUNTS
+from warp_corot.mesh import TetForest
+from warp_corot.mesh.lattice import MAX_LEVEL
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +41,8 @@ class OnlineRemesh:
         every: Steps between passes.
         capacity: How many elements there may be; None: four times those of the mesh, at least 100,000. When it is
             reached refinement stops, with one warning, and the simulation goes on.
-        criterion: In place of the elongation: one of ``kernels.remesh_criteria``, ``strain``, ``von_mises_stress`` or
-            ``nearness``, or a Warp function (``@wp.func``) of your own of a ``kernels.remesh_mark.ElementState`` and an
+        criterion: In place of the elongation: one of ``kernels.remesh.criteria``, ``strain``, ``von_mises_stress`` or
+            ``nearness``, or a Warp function (``@wp.func``) of your own of a ``kernels.remesh.mark.ElementState`` and an
             array of numbers.
         parameters: Those numbers, float32 [n] on the simulation's device, which may be written to between steps. They
             must be all that the criterion reads: there is no check within kernels.

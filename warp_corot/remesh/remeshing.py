@@ -7,12 +7,14 @@ import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from ..errors import CapacityWarning, InputError, depth_of_user
+from warp_corot.errors import CapacityWarning, InputError, depth_of_user
+
 from .online import OnlineRemesh
 
 if TYPE_CHECKING:
-    from ..body import SoftBody
-    from ..elasticity import ForceField, Model
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.elasticity import ForceField, Model
+
     from .changing import Changing
 
 

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from ..elasticity import ForceField
-from .pace import Pace
+from warp_corot.elasticity import ForceField
+from warp_corot.solvers.steps.pace import Pace
 
 if TYPE_CHECKING:
-    from ..body import SoftBody
+    from warp_corot.body.soft_body import SoftBody
 
 
 #: No step: later than all.

@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from ..subnormals import FlushedSubnormals
-from .guard import Guard
-from .integrator import Stepper
-from .pace import Pace
-from .safe_step import (
+from warp_corot.solvers.guarding.guard import Guard
+from warp_corot.solvers.steps.pace import Pace
+from warp_corot.solvers.steps.safe_step import (
     BLOCK_INTERVAL,
     CALM_CHECKS,
     FIRST_INTERVAL,
@@ -24,8 +22,11 @@ from .safe_step import (
     SafeStep,
 )
 
+from .integrator import Stepper
+from .subnormals import FlushedSubnormals
+
 if TYPE_CHECKING:
-    from ..body import SoftBody
+    from warp_corot.body.soft_body import SoftBody
 
 #: Steps recorded in one graph; more where a launch is many steps.
 GRAPH_STEPS = 64

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import InputError
+from warp_corot.errors import InputError
 
 #: Folders below the one that is named that are looked into at most.
 MOST_FOLDERS = 1000

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import InputError
+from warp_corot.errors import InputError
+
 from .filemesh import FileMesh
 from .isolated import read_isolated
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import InputError
+from warp_corot.errors import InputError
+
 from .filemesh import FileMesh
 
 #: Names of arrays that number regions, the likelier first; of others, those of few different numbers.

@@ -252,7 +252,7 @@ def _ints(array: Any) -> NDArray[np.int64]:
 
 
 def _image(grid: Any) -> dict[str, NDArray[Any]]:
-    """Values [nx, ny, nz] and the affine of their places; see `warp_corot.io.volumes`."""
+    """Values [nx, ny, nz] and the affine of their places; see `warp_corot.io.read.volumes`."""
     extent = np.array(grid.GetExtent()).reshape(3, 2)
     at_points = grid.GetPointData().GetNumberOfArrays() > 0
     data = grid.GetPointData() if at_points else grid.GetCellData()

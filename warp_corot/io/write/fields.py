@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ...elasticity.tensors import cauchy_stress, gradients, green_strain, has_tensor
+from warp_corot.elasticity.tensors import cauchy_stress, gradients, green_strain, has_tensor
 
 if TYPE_CHECKING:
-    from ...simulation import Simulation
+    from warp_corot.simulation.simulation import Simulation
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,9 @@ import tempfile
 from pathlib import Path
 from typing import Protocol
 
-from ...errors import InputError
-from ..whole import written_whole
+from warp_corot.errors import InputError
+from warp_corot.io.files.whole import written_whole
+
 from .fields import Fields
 
 #: What each format needs.

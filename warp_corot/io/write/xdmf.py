@@ -8,7 +8,8 @@ from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
-from ..whole import written_whole
+from warp_corot.io.files.whole import written_whole
+
 from .fields import Fields
 
 HEAD = (

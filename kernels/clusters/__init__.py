@@ -1,0 +1,1 @@
+"""Elements in clusters whose forces meet in shared memory (CUDA)."""

@@ -1,0 +1,152 @@
+"""Elements of a forest that changes, as clusters take them: one by one, on their axes.
+
+On suitable axes, which are those of the lattice in some order and direction, an element of a forest has the
+displacement gradient W = (D0, D1, D2) / h with
+    D0 = u1 - u0,  D1 = (u2 - u1) + [type 2] (u2 - u0),  D2 = (1 + [type 2]) (u3 - u2) + [type 1] (u3 - u0),
+nodes in Maubach order: the columns of ``tables.shapes.GRADIENT``, but for type 2 half their sum and difference, which turns
+its two diagonals into an edge and the height on it. One integer says which axes these are; isotropic laws do not mind
+whether they are right- or left-handed.
+"""
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import LEVEL_MASK
+from warp_corot.kernels.math.matrices import column
+from warp_corot.kernels.tables.shapes import MIRROR_BIT
+
+wp.set_module_options({"enable_backward": False})
+
+# An element's integer: its type; which components of vectors trade places, one pair after another, in its axes' order;
+# which axes point backwards; and how many times its cube's edge was halved.
+IS_TYPE1, IS_TYPE2 = wp.constant(1), wp.constant(2)
+SWAPS = (4, 8, 16)
+SWAP_XY, SWAP_YZ, SWAP_XY_AGAIN = (wp.constant(bit) for bit in SWAPS)
+BACKWARDS = (32, 64, 128)
+BACKWARDS_X, BACKWARDS_Y, BACKWARDS_Z = (wp.constant(bit) for bit in BACKWARDS)
+HALVINGS_SHIFT = wp.constant(8)
+
+
+@wp.struct
+class AlignedElements:
+    """Elements of a forest, as their clusters order them."""
+
+    shape: wp.array[wp.int32]  # [T] see above
+    cell: float  # edge length of a root cube [m]
+    inverse_cell: float
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __int_as_float((n + 127) << 23);
+#else
+    return ldexpf(1.0f, n);
+#endif
+""")
+def power_of_two(n: int) -> float: ...
+
+
+@wp.func_native("return numbers.data[i];")
+def number_of(numbers: wp.array[wp.int32], i: int) -> int:
+    """Of a contiguous array, which Warp does not know: that saves some instructions."""
+    ...
+
+
+@wp.func
+def to_axes(v: wp.vec3, shape: int):
+    """A vector's components in the order of the element's axes."""
+    swaps = (shape & SWAP_XY) != 0
+    x, y, z = wp.where(swaps, v[1], v[0]), wp.where(swaps, v[0], v[1]), v[2]
+    swaps = (shape & SWAP_YZ) != 0
+    y, z = wp.where(swaps, z, y), wp.where(swaps, y, z)
+    swaps = (shape & SWAP_XY_AGAIN) != 0
+    return wp.vec3(wp.where(swaps, y, x), wp.where(swaps, x, y), z)
+
+
+@wp.func
+def from_axes(v: wp.vec3, shape: int):
+    """The opposite of ``to_axes``."""
+    swaps = (shape & SWAP_XY_AGAIN) != 0
+    x, y, z = wp.where(swaps, v[1], v[0]), wp.where(swaps, v[0], v[1]), v[2]
+    swaps = (shape & SWAP_YZ) != 0
+    y, z = wp.where(swaps, z, y), wp.where(swaps, y, z)
+    swaps = (shape & SWAP_XY) != 0
+    return wp.vec3(wp.where(swaps, y, x), wp.where(swaps, x, y), z)
+
+
+@wp.func
+def one_if(shape: int, bit: int):
+    return wp.where((shape & bit) != 0, 1.0, 0.0)
+
+
+@wp.func
+def directions(shape: int, length: float):
+    """The same length along each axis, negative where that points backwards."""
+    return wp.vec3(
+        wp.where((shape & BACKWARDS_X) != 0, -length, length),
+        wp.where((shape & BACKWARDS_Y) != 0, -length, length),
+        wp.where((shape & BACKWARDS_Z) != 0, -length, length),
+    )
+
+
+@wp.func
+def rows_times(d: wp.vec3, c0: wp.vec3, c1: wp.vec3, c2: wp.vec3):
+    """diag(d) (c0, c1, c2)."""
+    return wp.matrix_from_cols(wp.cw_mul(d, c0), wp.cw_mul(d, c1), wp.cw_mul(d, c2))
+
+
+@wp.func
+def shape_word(elements: AlignedElements, t: int):
+    return number_of(elements.shape, t)
+
+
+@wp.func
+def element_gradient(elements: AlignedElements, t: int, shape: int, u0: wp.vec3, u1: wp.vec3, u2: wp.vec3, u3: wp.vec3):
+    """The displacement gradient of element t in its axes, of its nodes' displacements."""
+    type1, type2 = one_if(shape, IS_TYPE1), one_if(shape, IS_TYPE2)
+    d0 = u1 - u0
+    d1 = (u2 - u1) + type2 * (u2 - u0)
+    d2 = (1.0 + type2) * (u3 - u2) + type1 * (u3 - u0)
+    inverse_h = elements.inverse_cell * power_of_two(shape >> HALVINGS_SHIFT)
+    return rows_times(directions(shape, inverse_h), to_axes(d0, shape), to_axes(d1, shape), to_axes(d2, shape))
+
+
+@wp.func
+def material_scale(elements: AlignedElements, t: int, shape: int):
+    """What stresses are multiplied by before ``element_forces``: V / h."""
+    h = elements.cell * power_of_two(-(shape >> HALVINGS_SHIFT))
+    volume = wp.where((shape & IS_TYPE1) != 0, wp.static(1.0 / 12.0), wp.static(1.0 / 6.0))
+    return wp.where((shape & IS_TYPE2) != 0, wp.static(1.0 / 24.0), volume) * (h * h)
+
+
+@wp.func
+def element_forces(elements: AlignedElements, t: int, shape: int, p: wp.mat33):
+    """The four nodes' forces from the scaled first Piola-Kirchhoff stress in the element's axes."""
+    type1, type2 = one_if(shape, IS_TYPE1), one_if(shape, IS_TYPE2)
+    d = directions(shape, 1.0)
+    p0 = from_axes(wp.cw_mul(d, column(p, 0)), shape)
+    p1 = from_axes(wp.cw_mul(d, column(p, 1)), shape)
+    p2 = from_axes(wp.cw_mul(d, column(p, 2)), shape)
+    f0 = p0 + type2 * p1 + type1 * p2
+    f1 = p1 - p0
+    f3 = -(1.0 + type2 + type1) * p2
+    return f0, f1, -(f0 + f1 + f3), f3
+
+
+@wp.kernel(enable_backward=False)
+def align_elements(
+    # In
+    goes: wp.array[wp.int32],
+    count: wp.array[wp.int32],
+    code: wp.array[wp.int32],
+    words: wp.array[wp.int32],
+    # Out
+    shape: wp.array[wp.int32],
+):
+    """The integers of elements from their shape codes, if ``goes`` says so.
+
+    ``words`` has those of all frames, mirrored or not, and types; see ``single.axis_words``.
+    """
+    i = wp.tid()
+    if goes[0] != 0 and i < count[0]:
+        level = code[i] & LEVEL_MASK
+        shape[i] = words[3 * (code[i] >> MIRROR_BIT) + level % 3] | ((level / 3) << HALVINGS_SHIFT)

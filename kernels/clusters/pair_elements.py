@@ -1,0 +1,218 @@
+"""Elements in pairs, as clusters take them: two that share a face have five nodes in place of eight.
+
+The nodes of a pair are a, b and c of the face, then d of the first element and e of the second. An element's
+displacement gradient is W = (ub - ua, uc - ua, ud - ua) B with the hat functions' gradients at b, c and d as rows of B.
+What a pair is stands in one record, which is read 16 bytes at once: the five nodes, and B twice. In a forest the
+entries of B are whole numbers over the edge of a root cube, each of a power of two or zero, for which 16 bits are
+enough. Where a second element is missing its B is zero, and so are its forces.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.math.matrices import column
+
+wp.set_module_options({"enable_backward": False})
+
+vec4u = wp.types.vector(length=4, dtype=wp.uint32)
+lattice_record = wp.types.vector(length=12, dtype=wp.uint32)
+general_record = wp.types.vector(length=24, dtype=wp.uint32)
+
+#: Words of a record. Two 16-bit numbers a word: nodes a to e in bytes, and, of elements of a forest, the exponents of
+#: their volumes, 8 bits each. Then B of both, row by row; of general elements, their volumes.
+LATTICE_WORDS, GENERAL_WORDS = 12, 24
+FIRST_MATRIX, GENERAL_VOLUMES = 3, 21
+
+
+@wp.struct
+class LatticePairs:
+    """Pairs of a forest's elements."""
+
+    records: wp.array[vec4u]  # [3 * count], the first four words of all, then the next
+    count: int
+    inverse_cell: float  # of a root cube's edge length [1/m]
+    scale: float  # a sixth of its square [m^2]
+
+
+@wp.struct
+class GeneralPairs:
+    """Pairs of any elements."""
+
+    records: wp.array[vec4u]  # [6 * count]
+    count: int
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const uint4 a = ((const uint4*)records.data)[i];
+    return wp::vec_t<4, wp::uint32>(a.x, a.y, a.z, a.w);
+#else
+    return records.data[i];
+#endif
+""")
+def quad_of(records: wp.array[vec4u], i: int) -> vec4u: ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __uint_as_float(word);
+#else
+    float number;
+    memcpy(&number, &word, 4);
+    return number;
+#endif
+""")
+def as_float(word: wp.uint32) -> float: ...
+
+
+@wp.func
+def record_of(pairs: LatticePairs, i: int):
+    record = lattice_record()
+    for k in range(3):
+        quad = quad_of(pairs.records, k * pairs.count + i)
+        for j in range(4):
+            record[4 * k + j] = quad[j]
+    return record
+
+
+@wp.func
+def record_of(pairs: GeneralPairs, i: int):
+    record = general_record()
+    for k in range(6):
+        quad = quad_of(pairs.records, k * pairs.count + i)
+        for j in range(4):
+            record[4 * k + j] = quad[j]
+    return record
+
+
+@wp.func
+def half_word(record: Any, k: int):
+    """The k-th 16-bit number."""
+    word = record[k // 2]
+    if k % 2 == 1:
+        word = word >> wp.uint32(16)
+    return int(word & wp.uint32(0xFFFF))
+
+
+@wp.func_native("""
+    const wp::uint32 bits = word & 0xffff0000u;
+#if defined(__CUDA_ARCH__)
+    return __uint_as_float(bits);
+#else
+    float number;
+    memcpy(&number, &bits, 4);
+    return number;
+#endif
+""")
+def upper_half(word: wp.uint32) -> float: ...
+
+
+@wp.func
+def lower_half(word: wp.uint32):
+    return as_float(word << wp.uint32(16))
+
+
+@wp.func
+def scaled_displacement(pairs: LatticePairs, u: wp.vec3):
+    """A displacement in what B is the inverse of."""
+    return pairs.inverse_cell * u
+
+
+@wp.func
+def scaled_displacement(pairs: GeneralPairs, u: wp.vec3):
+    return u
+
+
+@wp.func
+def first_matrix(record: lattice_record):
+    """B of the first element."""
+    return wp.mat33(
+        lower_half(record[3]), upper_half(record[3]), lower_half(record[4]),
+        upper_half(record[4]), lower_half(record[5]), upper_half(record[5]),
+        lower_half(record[6]), upper_half(record[6]), lower_half(record[7]),
+    )  # fmt: skip
+
+
+@wp.func
+def second_matrix(record: lattice_record):
+    """B of the second element."""
+    return wp.mat33(
+        upper_half(record[7]), lower_half(record[8]), upper_half(record[8]),
+        lower_half(record[9]), upper_half(record[9]), lower_half(record[10]),
+        upper_half(record[10]), lower_half(record[11]), upper_half(record[11]),
+    )  # fmt: skip
+
+
+@wp.func
+def first_matrix(record: general_record):
+    return wp.mat33(
+        as_float(record[3]), as_float(record[4]), as_float(record[5]),
+        as_float(record[6]), as_float(record[7]), as_float(record[8]),
+        as_float(record[9]), as_float(record[10]), as_float(record[11]),
+    )  # fmt: skip
+
+
+@wp.func
+def second_matrix(record: general_record):
+    return wp.mat33(
+        as_float(record[12]), as_float(record[13]), as_float(record[14]),
+        as_float(record[15]), as_float(record[16]), as_float(record[17]),
+        as_float(record[18]), as_float(record[19]), as_float(record[20]),
+    )  # fmt: skip
+
+
+@wp.func
+def first_scale(pairs: LatticePairs, record: lattice_record):
+    """What the first element's stress times the transpose of B is to be multiplied by for forces: its volume."""
+    return pairs.scale * as_float(((record[2] >> wp.uint32(16)) & wp.uint32(0xFF)) << wp.uint32(23))
+
+
+@wp.func
+def second_scale(pairs: LatticePairs, record: lattice_record):
+    return pairs.scale * as_float((record[2] >> wp.uint32(24)) << wp.uint32(23))
+
+
+@wp.func
+def first_scale(pairs: GeneralPairs, record: general_record):
+    return as_float(record[wp.static(GENERAL_VOLUMES)])
+
+
+@wp.func
+def second_scale(pairs: GeneralPairs, record: general_record):
+    return as_float(record[wp.static(GENERAL_VOLUMES + 1)])
+
+
+@functools.cache
+def pair_forces(law: wp.Function) -> wp.Function:
+    """Forces on the five nodes of the i-th pair, of their scaled displacements, by a law of ``laws``."""
+
+    @wp.func
+    def pair_forces(
+        pairs: Any,
+        record: Any,
+        material: Any,
+        listed: wp.array[wp.int32],
+        i: int,
+        ua: wp.vec3,
+        ub: wp.vec3,
+        uc: wp.vec3,
+        ud: wp.vec3,
+        ue: wp.vec3,
+    ):
+        e1 = ub - ua
+        e2 = uc - ua
+        b = first_matrix(record)
+        w = wp.matrix_from_cols(e1, e2, ud - ua) * b
+        h = law(material, listed, 2 * i, first_scale(pairs, record), w) * wp.transpose(b)
+        f1, f2, f3 = -column(h, 0), -column(h, 1), -column(h, 2)
+        b = second_matrix(record)
+        w = wp.matrix_from_cols(e1, e2, ue - ua) * b
+        h = law(material, listed, 2 * i + 1, second_scale(pairs, record), w) * wp.transpose(b)
+        f1 -= column(h, 0)
+        f2 -= column(h, 1)
+        f4 = -column(h, 2)
+        return -(f1 + f2 + f3 + f4), f1, f2, f3, f4
+
+    return pair_forces

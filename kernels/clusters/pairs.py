@@ -1,0 +1,154 @@
+"""Forces of pairs of elements in clusters, on CUDA: a cluster's nodes meet in shared memory; see ``single``.
+
+What bounds such a kernel is not arithmetic but how long a block waits, so nothing is looked up on the way: each thread
+has a pair, and a task, which is a node to read and to add up to twelve slots of; both are read at once, and at the
+begin. A cluster has no more pairs or tasks than threads. Nodes of more slots have several tasks.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.stepping.block import LOAD, STORE, synchronize_block
+from warp_corot.kernels.tables.cluster_layout import BANK_GROUPS, QUAD_BYTES, PairLayout
+
+from .elements import number_of
+from .pair_elements import (
+    GENERAL_WORDS,
+    LATTICE_WORDS,
+    GeneralPairs,
+    LatticePairs,
+    half_word,
+    pair_forces,
+    quad_of,
+    record_of,
+    scaled_displacement,
+    vec4u,
+)
+from .single import add_sum, shared_quads, vector_of
+
+wp.set_module_options({"enable_backward": False})
+
+#: Slots in a word, of so many bits each, words of a task, and its slots.
+WORD_SLOTS, SLOT_BITS, TASK_WORDS = 3, 10, 4
+PAIR_TASK_SLOTS = WORD_SLOTS * TASK_WORDS
+SLOT_MASK = (1 << SLOT_BITS) - 1
+
+
+@wp.struct
+class PairClusters:
+    """Pairs by clusters, one thread's after another's."""
+
+    elements: wp.array[wp.int32]  # [2 * threads] which of a mesh's elements a pair is of
+    nodes: wp.array[wp.int32]  # [threads] the task's node, -1: there is none; a node's first task is its place
+    slots: wp.array[vec4u]  # [threads] its slots, those that it has not are zero slots
+
+
+@wp.func
+def slot_of(word: wp.uint32, k: int):
+    """The k-th slot in a word."""
+    return int((word >> wp.uint32(SLOT_BITS * k)) & wp.uint32(SLOT_MASK))
+
+
+def slot_sum(slot: wp.Function, zero: int) -> wp.Function:
+    """The sum of a task's slots; words that are all ``zero`` are left out but for the first."""
+    nothing = sum(zero << SLOT_BITS * k for k in range(WORD_SLOTS))
+
+    @wp.func
+    def slot_sum(words: vec4u):
+        force = wp.vec3()
+        for j in range(wp.static(TASK_WORDS)):
+            if wp.static(j == 0) or words[j] != wp.static(wp.uint32(nothing)):
+                for k in range(wp.static(WORD_SLOTS)):
+                    force += slot(wp.static(LOAD), wp.static(QUAD_BYTES) * slot_of(words[j], k), force)
+        return force
+
+    return slot_sum
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    asm volatile("prefetch.global.L2 [%0];" :: "l"(quads.data + i));
+#endif
+""")
+def fetch_quad(quads: wp.array[vec4u], i: int):
+    """Bring an entry nearer that another block will soon read."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    asm volatile("prefetch.global.L2 [%0];" :: "l"(numbers.data + i));
+#endif
+""")
+def fetch_number(numbers: wp.array[wp.int32], i: int): ...
+
+
+@functools.cache
+def scatter_pairs(Pairs: Any, Material: Any, law: wp.Function, layout: PairLayout) -> wp.Kernel:
+    """Add the nodal forces of a law to f; launch with block_dim ``layout.threads`` and whole blocks.
+
+    Args:
+        Pairs: ``LatticePairs`` or ``GeneralPairs``, in the order of the clusters, one for each thread.
+        Material: The material of a law; law: a function of ``laws`` that takes it.
+    """
+    threads, zero = layout.threads, layout.zero
+    quads_of = {LatticePairs: LATTICE_WORDS // 4, GeneralPairs: GENERAL_WORDS // 4}
+    displacement = shared_quads(threads, "displacements")
+    slot = shared_quads(zero + BANK_GROUPS, "forces")
+    forces, sum_of = pair_forces(law), slot_sum(slot, zero)
+
+    # What is out of line is rarely run, and shall not take registers from all.
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(threads, layout.resident))
+    def scatter_pairs(
+        # In
+        clusters: PairClusters,
+        pairs: Pairs,
+        material: Material,
+        u: wp.array[wp.vec4],
+        # Out
+        f: wp.array[wp.vec4],
+    ):
+        i = wp.tid()
+        thread = i % wp.static(threads)
+        node = number_of(clusters.nodes, i)
+        record = record_of(pairs, i)
+        words = quad_of(clusters.slots, i)
+        if wp.static(layout.ahead > 0):
+            later = i + wp.static(layout.ahead * threads)
+            if later < clusters.nodes.shape[0]:
+                fetch_number(clusters.nodes, later)
+                fetch_quad(clusters.slots, later)
+                for k in range(wp.static(quads_of[Pairs])):
+                    fetch_quad(pairs.records, k * pairs.count + later)
+        at = wp.static(QUAD_BYTES) * thread
+        if node >= 0:
+            displacement(wp.static(STORE), at, scaled_displacement(pairs, vector_of(u, node)))
+        if thread < wp.static(BANK_GROUPS):
+            slot(wp.static(STORE), at + wp.static(QUAD_BYTES * zero), wp.vec3())
+        synchronize_block()
+        fa, fb, fc, fd, fe = forces(
+            pairs,
+            record,
+            material,
+            clusters.elements,
+            i,
+            displacement(wp.static(LOAD), half_word(record, 0), wp.vec3()),
+            displacement(wp.static(LOAD), half_word(record, 1), wp.vec3()),
+            displacement(wp.static(LOAD), half_word(record, 2), wp.vec3()),
+            displacement(wp.static(LOAD), half_word(record, 3), wp.vec3()),
+            displacement(wp.static(LOAD), half_word(record, 4), wp.vec3()),
+        )
+        slot(wp.static(STORE), at, fa)
+        slot(wp.static(STORE), at + wp.static(QUAD_BYTES * threads), fb)
+        slot(wp.static(STORE), at + wp.static(2 * QUAD_BYTES * threads), fc)
+        slot(wp.static(STORE), at + wp.static(3 * QUAD_BYTES * threads), fd)
+        slot(wp.static(STORE), at + wp.static(4 * QUAD_BYTES * threads), fe)
+        synchronize_block()
+        if wp.static(not layout.early):
+            words = quad_of(clusters.slots, i)
+        if node >= 0:
+            add_sum(f, node, sum_of(words))
+
+    return scatter_pairs

@@ -1,0 +1,89 @@
+"""What forces of general tetrahedra are made of on CUDA, one thread an element, as the solver for Newton has them.
+
+Two things make that fast: rest matrices are read component by component, so that the threads of a warp read what is
+side by side, and neighbouring elements' forces are added up before they go to memory. Blocks of 64 threads were the
+fastest.
+"""
+
+import functools
+
+import warp as wp
+
+from warp_corot.kernels.corotated.algebraic import corotated_stress
+from warp_corot.kernels.math.rotation import column, identity3, quick_rotation
+
+from .constitutive import corotated_strain, hooke, stretch_strain
+from .elements import load_node
+from .merging import add_four_forces
+
+wp.set_module_options({"enable_backward": False})
+
+#: Threads of a block: more wait longer for one another (H200: 64 takes 0.86 of 256).
+BLOCK = 64
+
+
+@wp.struct
+class PosedElements:
+    """As ``GeneralElements``, so that the threads of a warp read what is side by side."""
+
+    nodes: wp.array[wp.vec4i]  # [T]
+    rest_inverse: wp.array2d[wp.float32]  # [9, T], row by row
+    volume: wp.array[wp.float32]  # [T]
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const int4 n = *reinterpret_cast<const int4*>(&wp::index(nodes, t));
+    return wp::vec_t<4, wp::int32>(n.x, n.y, n.z, n.w);
+#else
+    return wp::index(nodes, t);
+#endif
+""")
+def load_four(nodes: wp.array[wp.vec4i], t: int) -> wp.vec4i:
+    """An element's nodes by one 16-byte load; see ``load_node``."""
+    ...
+
+
+@wp.func
+def rest_inverse_of(elements: PosedElements, t: int):
+    b = elements.rest_inverse
+    return wp.mat33(b[0, t], b[1, t], b[2, t], b[3, t], b[4, t], b[5, t], b[6, t], b[7, t], b[8, t])
+
+
+@wp.func
+def edge_differences(nodes: wp.vec4i, x: wp.array[wp.vec4]):
+    """The last three nodes' vectors from the first's, columns."""
+    x0 = load_node(x, nodes[0])
+    return wp.matrix_from_cols(load_node(x, nodes[1]) - x0, load_node(x, nodes[2]) - x0, load_node(x, nodes[3]) - x0)
+
+
+@functools.cache
+def add_stress(rounds: int) -> wp.Function:
+    """Add the nodal forces of element t from its first Piola-Kirchhoff stress."""
+    add_forces = add_four_forces(rounds)
+
+    @wp.func
+    def add_stress(elements: PosedElements, t: int, nodes: wp.vec4i, p: wp.mat33, f: wp.array[wp.vec4]):
+        # The rest matrix is read again, so as to keep no registers meanwhile.
+        h = (-elements.volume[t]) * p * wp.transpose(rest_inverse_of(elements, t))
+        f1, f2, f3 = column(h, 0), column(h, 1), column(h, 2)
+        add_forces(f, nodes, -(f1 + f2 + f3), f1, f2, f3)
+
+    return add_stress
+
+
+@functools.cache
+def corotated_law(rotation: wp.Function) -> wp.Function:
+    """The corotated stress of each element's own rotation, as a law of its displacement gradient.
+
+    That of ``quick_rotation`` needs none.
+    """
+    if rotation is quick_rotation:
+        return corotated_stress
+
+    @wp.func
+    def stress_of_rotation(a: wp.mat33, mu: float, lam: float):
+        r = rotation(identity3() + a)
+        return r * hooke(stretch_strain(corotated_strain(a, identity3(), r), a), mu, lam)
+
+    return stress_of_rotation

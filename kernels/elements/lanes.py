@@ -1,0 +1,41 @@
+"""Eight of a thing side by side in the lanes of a CPU's vector registers: native code that the fast CPU kernels share.
+
+What a CPU core lacks is vectorisation. The lanes here are the compiler's own vector type: code on them compiles in
+about a second, depends on no optimiser to find the vectors, and so is right and fast whatever its flags. The same in
+Warp's 8-lane vectors took ten times as long to compile and was as fast only where the optimiser saw through it.
+
+Memory is read and written four floats of a lane at a time and transposed in registers: written float by float, lanes
+would be read before the stores have arrived.
+
+What a lane comes to never depends on its neighbours, and forces are added lane after lane, so that worlds that share
+registers do what each would do alone.
+"""
+
+import functools
+from pathlib import Path
+
+#: The vectors are as wide as the machine at hand has them.
+COMPILER_FLAGS = "-march=native -ffp-contract=fast"
+
+LANES = 8
+
+#: Native code in files of its own, each of which says what it takes and what it leaves. They are parts of one function
+#: and stand one after another in it.
+NATIVE = Path(__file__).parents[1] / "native"
+
+
+@functools.cache
+def native(*names: str) -> str:
+    """The native code of some files, in this order."""
+    return "".join((NATIVE / f"{name}.h").read_text(encoding="utf-8") for name in names)
+
+
+def constants(**values: float) -> str:
+    """Native code that gives names to numbers."""
+    kinds = {name: "int" if isinstance(value, int) else "float" for name, value in values.items()}
+    return "".join(f"const {kinds[name]} {name} = {value!r};\n" for name, value in values.items())
+
+
+def on_cpu(*code: str) -> str:
+    """A native snippet on lanes, which is nothing where Warp compiles it for a GPU."""
+    return f"#if !defined(__CUDA_ARCH__)\n{native('lanes')}{''.join(code)}#endif\n"

@@ -1,0 +1,71 @@
+"""Viscous forces: a stress proportional to the rate at which an element's stretch changes, whatever it turns.
+
+With F = R U, Fdot = (du/dt) grad N and A = R^T Fdot, A = W U + Udot, where W = R^T Rdot is skew and Udot symmetric. The
+skew part of A says W: (tr(U) I - U) w is the axial vector of A - A^T. Udot vanishes where a body turns as a whole,
+however it is strained. The stress s = eta (2 mu Udot + lambda tr(Udot) I) works against Udot; the force that does the
+same work at the nodes is that of P = R (s + [a]x), with (tr(U) I - U) a the axial vector of U s - s U: it takes out
+s : Udot >= 0 of power and has no torque.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.math.rotation import byers_xu, identity3
+
+from .constitutive import corotated_strain, hooke, symmetric
+from .elements import frame, local_gradient, scatter_stress
+
+wp.set_module_options({"enable_backward": False})
+
+#: Below this determinant of tr(U) I - U, which is 8 at rest, the turning of a crushed element is hardly determined: the
+#: symmetric part of A is taken for Udot there, which still takes power out.
+LEAST = wp.constant(0.05)
+
+
+@wp.func
+def axial(a: wp.mat33):
+    """The axial vector of a - a^T."""
+    return wp.vec3(a[2, 1] - a[1, 2], a[0, 2] - a[2, 0], a[1, 0] - a[0, 1])
+
+
+@wp.func
+def viscous_stress(u: wp.mat33, a: wp.mat33, mu: float, lam: float):
+    """R^T P of a stretch U, a rate A and viscosities [Pa s]."""
+    m = wp.trace(u) * identity3() - u
+    if wp.determinant(m) < LEAST:
+        return hooke(symmetric(a), mu, lam)
+    inverse = wp.inverse(m)
+    rate = symmetric(a - wp.skew(inverse * axial(a)) * u)
+    s = hooke(rate, mu, lam)
+    return s + wp.skew(inverse * axial(u * s))
+
+
+@functools.cache
+def scatter_viscous(Elements: Any) -> wp.Kernel:
+    """Add viscous nodal forces to f: eta times the stiffness, for small motions."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def scatter_viscous(
+        # In
+        elements: Elements,
+        eta: float,
+        mu: wp.array[wp.float32],
+        lam: wp.array[wp.float32],
+        stride: int,
+        u: wp.array[wp.vec4],
+        v: wp.array[wp.vec4],
+        # Out
+        f: wp.array[wp.vec4],
+    ):
+        t = wp.tid()
+        g = local_gradient(elements, t, u)
+        q = frame(elements, t)
+        r = byers_xu(q + g)
+        stretch = identity3() + corotated_strain(g, q, r)
+        rate = wp.transpose(r) * local_gradient(elements, t, v)
+        p = r * viscous_stress(stretch, rate, eta * mu[t * stride], eta * lam[t * stride])
+        scatter_stress(elements, t, p, f)
+
+    return scatter_viscous

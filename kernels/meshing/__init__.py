@@ -1,0 +1,1 @@
+"""Forests grown from bodies, and points in them."""

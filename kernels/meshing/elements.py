@@ -1,0 +1,337 @@
+"""What an element holds of a body: nothing, part of its surface and how flat, or neither.
+
+The body's signed function is known at the nodes; between them it changes by no more than its Lipschitz constant says.
+"""
+
+import warp as wp
+
+from warp_corot.kernels.elements.springs import FIRST_NODE, SECOND_NODE
+
+from .growth import VOID
+
+# What is known of a new element.
+DONE = wp.constant(0)
+SPLIT = wp.constant(1)
+OPEN = wp.constant(2)
+
+#: The need of an element that must be bisected, whatever is wished [m].
+MUST = wp.constant(1.0e30)
+
+#: A gradient below this share of the steepest possible is taken for that much.
+FLATTEST = wp.constant(0.1)
+
+vec6 = wp.types.vector(length=6, dtype=wp.float32)
+
+
+@wp.kernel(enable_backward=False)
+def flag_equal(
+    # In
+    states: wp.array[wp.int32],
+    state: int,
+    # Out
+    flags: wp.array[wp.int32],
+):
+    i = wp.tid()
+    flags[i] = wp.where(states[i] == state, 1, 0)
+
+
+@wp.kernel(enable_backward=False)
+def node_points(
+    # In
+    lattice: wp.array[wp.vec3i],
+    first: int,
+    origin: wp.vec3d,
+    spacing: wp.float64,
+    # Out
+    points: wp.array[wp.vec3],
+):
+    """Positions in float64, rounded once."""
+    i = wp.tid()
+    p = lattice[first + i]
+    points[i] = wp.vec3(
+        float(origin[0] + wp.float64(p[0]) * spacing),
+        float(origin[1] + wp.float64(p[1]) * spacing),
+        float(origin[2] + wp.float64(p[2]) * spacing),
+    )
+
+
+@wp.kernel(enable_backward=False)
+def take_values(
+    # In
+    found: wp.array[wp.float32],
+    lattice: wp.array[wp.vec3i],
+    first: int,
+    top: wp.vec3i,
+    noise: float,
+    # Out
+    phi: wp.array[wp.float32],
+):
+    """Values of new nodes: nothing is inside on the outermost faces of the grid, and rounding noise counts as zero."""
+    i = wp.tid()
+    p = lattice[first + i]
+    value = found[i]
+    if wp.abs(value) <= noise:
+        value = 0.0
+    if wp.min(p) == 0 or p[0] == top[0] or p[1] == top[1] or p[2] == top[2]:
+        value = wp.max(value, 0.0)
+    phi[first + i] = value
+
+
+@wp.kernel(enable_backward=False)
+def judge_by_corners(
+    # In
+    first: int,
+    tets: wp.array[wp.vec4i],
+    level: wp.array[wp.int32],
+    phi: wp.array[wp.float32],
+    circumradius: wp.array[wp.float32],
+    edges: wp.array2d[wp.float32],
+    lipschitz: float,
+    min_level: int,
+    max_level: int,
+    # In and out
+    first_child: wp.array[wp.int32],
+    # Out
+    states: wp.array[wp.int32],
+    needs: wp.array[wp.float32],
+):
+    """No surface is where values are beyond what the function can change over the distance from them.
+
+    Every point of an element is within its circumradius of some corner, within the longest edge of each, and within
+    half the circumradius of some corner or midpoint of an edge: these ten are the nodes of the eight elements three
+    levels below, of half the size. Midpoints' values are bounded from those of the ends.
+    """
+    i = wp.tid()
+    tet = tets[first + i]
+    own_level = level[first + i]
+    p = wp.vec4(phi[tet[0]], phi[tet[1]], phi[tet[2]], phi[tet[3]])
+    near = lipschitz * circumradius[own_level]
+    lowest = wp.min(p)
+    highest = wp.max(p)
+    longest = float(0.0)
+    for e in range(6):
+        longest = wp.max(longest, edges[own_level, e])
+    outside = lowest > near or highest > lipschitz * longest
+    inside = highest < -near or lowest < -lipschitz * longest
+    for e in range(6):
+        change = 0.5 * lipschitz * edges[own_level, e]
+        a = p[FIRST_NODE[e]]
+        b = p[SECOND_NODE[e]]
+        lowest = wp.min(lowest, wp.max(a, b) - change)
+        highest = wp.max(highest, wp.min(a, b) + change)
+    state = DONE
+    need = float(0.0)
+    if outside or lowest > 0.5 * near:
+        first_child[first + i] = VOID
+    elif own_level < min_level:
+        state = SPLIT
+        need = MUST
+    elif own_level < max_level and not (inside or highest < -0.5 * near):
+        state = OPEN
+    states[i] = state
+    needs[first + i] = need
+
+
+@wp.func
+def gradient_size(
+    tet: wp.vec4i, phi: wp.array[wp.float32], lattice: wp.array[wp.vec3i], spacing: float, lipschitz: float
+):
+    """Length of the interpolant's gradient, from below bounded by a share of the steepest."""
+    p = lattice[tet[0]]
+    rows = wp.mat33()
+    rise = wp.vec3()
+    for n in range(3):
+        q = lattice[tet[n + 1]]
+        rows[n] = spacing * wp.vec3(float(q[0] - p[0]), float(q[1] - p[1]), float(q[2] - p[2]))
+        rise[n] = phi[tet[n + 1]] - phi[tet[0]]
+    # Scaled, so that no determinant is below float32's range.
+    size = wp.length(rows[0])
+    gradient = wp.inverse(rows / size) * rise / size
+    return wp.max(wp.length(gradient), FLATTEST * lipschitz)
+
+
+@wp.func
+def worst_deviation(deviation: vec6):
+    """The largest deviation of a quadratic function from the linear interpolant, from those at the midpoints.
+
+    At barycentric coordinates l it is the sum of 4 l_i l_j e_ij: the mean of the e times 4/3 at a face's centre, times
+    3/2 at the centroid.
+    """
+    faces = wp.static(4.0 / 9.0) * wp.vec4(
+        deviation[0] + deviation[1] + deviation[3],
+        deviation[0] + deviation[2] + deviation[4],
+        deviation[1] + deviation[2] + deviation[5],
+        deviation[3] + deviation[4] + deviation[5],
+    )
+    worst = wp.max(wp.max(faces), -wp.min(faces))
+    total = float(0.0)
+    for e in range(6):
+        total += deviation[e]
+        worst = wp.max(worst, wp.abs(deviation[e]))
+    return wp.max(worst, 0.25 * wp.abs(total))
+
+
+@wp.func
+def middle_of_piece(tet: wp.vec4i, phi: wp.array[wp.float32]):
+    """Barycentric coordinates of the mean of the points at which the surface cuts a crossed element's edges."""
+    place = wp.vec4(0.0)
+    count = float(0.0)
+    for e in range(6):
+        a = FIRST_NODE[e]
+        b = SECOND_NODE[e]
+        if (phi[tet[a]] < 0.0) != (phi[tet[b]] < 0.0):
+            t = phi[tet[a]] / (phi[tet[a]] - phi[tet[b]])
+            place[a] = place[a] + 1.0 - t
+            place[b] = place[b] + t
+            count += 1.0
+    return place / count
+
+
+@wp.kernel(enable_backward=False)
+def judge_by_edges(
+    # In
+    elements: wp.array[wp.int32],
+    first: int,
+    slots: wp.array[wp.int32],
+    values: wp.array[wp.int32],
+    tets: wp.array[wp.vec4i],
+    level: wp.array[wp.int32],
+    phi: wp.array[wp.float32],
+    lattice: wp.array[wp.vec3i],
+    origin: wp.vec3d,
+    spacing: wp.float64,
+    circumradius: wp.array[wp.float32],
+    lipschitz: float,
+    tolerances: wp.array[wp.float32],
+    # In and out
+    first_child: wp.array[wp.int32],
+    states: wp.array[wp.int32],
+    needs: wp.array[wp.float32],
+    # Out
+    unsure: wp.array[wp.int32],
+    probes: wp.array[wp.vec3],
+    expected: wp.array[wp.float32],
+    deviations: wp.array[wp.float32],
+):
+    """Compare the midpoints of the six edges with the linear interpolant: of a quadratic function they tell all.
+
+    What barely passes is unsure, and looked at once more, in the middle of its piece of the surface or at its centroid:
+    what the quadratic function has there is ``expected``. An element's need is how far off its piece of the surface
+    is [m].
+    """
+    i = wp.tid()
+    element = elements[i]
+    tet = tets[element]
+    tolerance = tolerances[level[element]]
+    deviation = vec6()
+    lowest = phi[tet[0]]
+    highest = phi[tet[0]]
+    for n in range(1, 4):
+        lowest = wp.min(lowest, phi[tet[n]])
+        highest = wp.max(highest, phi[tet[n]])
+    crossed = lowest < 0.0 and highest >= 0.0
+    for e in range(6):
+        middle = phi[values[slots[6 * i + e]]]
+        lowest = wp.min(lowest, middle)
+        highest = wp.max(highest, middle)
+        deviation[e] = middle - 0.5 * (phi[tet[FIRST_NODE[e]]] + phi[tet[SECOND_NODE[e]]])
+    worst = worst_deviation(deviation)
+
+    state = OPEN
+    need = float(0.0)
+    near = 0.5 * lipschitz * circumradius[level[element]]
+    if lowest > near:
+        first_child[element] = VOID
+        state = DONE
+    elif highest < -near:
+        state = DONE
+    elif crossed:
+        slope = gradient_size(tet, phi, lattice, float(spacing), lipschitz)
+        tolerance *= slope
+        need = worst / slope
+        if worst > tolerance:
+            state = SPLIT
+    elif wp.max(lowest, -highest) <= 2.0 * worst:
+        need = worst
+        if worst > tolerance:
+            state = SPLIT
+    if state == OPEN and (worst < 0.25 * tolerance or wp.max(lowest, -highest) > 4.0 * worst):
+        state = DONE
+    states[element - first] = state
+    needs[element] = wp.min(need, circumradius[level[element]])
+    unsure[i] = wp.where(state == OPEN, 1, 0)
+
+    place = wp.vec4(0.25)
+    if crossed:
+        place = middle_of_piece(tet, phi)
+    value = float(0.0)
+    for e in range(6):
+        value += 4.0 * place[FIRST_NODE[e]] * place[SECOND_NODE[e]] * deviation[e]
+    at = origin
+    for n in range(4):
+        p = lattice[tet[n]]
+        value += place[n] * phi[tet[n]]
+        weight = wp.float64(place[n]) * spacing
+        at += wp.vec3d(wp.float64(p[0]) * weight, wp.float64(p[1]) * weight, wp.float64(p[2]) * weight)
+    probes[i] = wp.vec3(float(at[0]), float(at[1]), float(at[2]))
+    expected[i] = value
+    deviations[i] = worst
+
+
+@wp.kernel(enable_backward=False)
+def judge_by_probes(
+    # In
+    chosen: wp.array[wp.int32],
+    elements: wp.array[wp.int32],
+    first: int,
+    found: wp.array[wp.float32],
+    expected: wp.array[wp.float32],
+    deviations: wp.array[wp.float32],
+    tets: wp.array[wp.vec4i],
+    level: wp.array[wp.int32],
+    phi: wp.array[wp.float32],
+    lattice: wp.array[wp.vec3i],
+    spacing: float,
+    lipschitz: float,
+    tolerances: wp.array[wp.float32],
+    # Out
+    states: wp.array[wp.int32],
+    needs: wp.array[wp.float32],
+):
+    """The last look. Where the function is not the quadratic one of its ten values, as at a crease, it deviates between
+    the points looked at by more than at them: by half as much again where three faces meet."""
+    i = wp.tid()
+    element = elements[chosen[i]]
+    tet = tets[element]
+    inside = int(0)
+    for n in range(4):
+        if phi[tet[n]] < 0.0:
+            inside += 1
+    surprise = wp.abs(found[i] - expected[chosen[i]])
+    deviation = deviations[chosen[i]]
+    if surprise > 0.1 * deviation:
+        deviation = 1.5 * deviation + surprise
+    state = DONE
+    need = needs[element]
+    if inside > 0 and inside < 4:
+        need = deviation / gradient_size(tet, phi, lattice, spacing, lipschitz)
+    elif (found[i] < 0.0) != (inside == 4):
+        need = wp.max(wp.abs(found[i]), deviation)
+    elif wp.abs(found[i]) <= 2.0 * deviation:
+        need = deviation
+    if need > tolerances[level[element]]:
+        state = SPLIT
+    states[element - first] = state
+    needs[element] = need
+
+
+@wp.kernel(enable_backward=False)
+def take_wishes(
+    # In
+    states: wp.array[wp.int32],
+    first: int,
+    # Out
+    wished: wp.array[wp.uint8],
+):
+    i = wp.tid()
+    wished[first + i] = wp.where(states[i] == SPLIT, wp.uint8(1), wp.uint8(0))

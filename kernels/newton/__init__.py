@@ -1,0 +1,1 @@
+"""Tetrahedra, contacts and particles of a Newton model."""

@@ -1,0 +1,78 @@
+"""Tetrahedra of a Newton model to and from its arrays: materials read, rotations and stresses written."""
+
+import functools
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import GeneralElements
+from warp_corot.kernels.elements.forces import von_mises
+from warp_corot.kernels.math.rotation import byers_xu, warm_rotation
+
+from .elements import difference_gradient, place_in_model, rotated_stress
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel(enable_backward=False)
+def split_materials(
+    # In
+    materials: wp.array2d[wp.float32],
+    ids: wp.array[wp.int32],
+    mu_from_mu: float,
+    lam_from_mu: float,
+    # Out
+    mu: wp.array[wp.float32],
+    lam: wp.array[wp.float32],
+    k_lambda: wp.array[wp.float32],
+    k_damp: wp.array[wp.float32],
+):
+    """Lamé's parameters of chosen elements, mu = a k_mu, lambda = k_lambda + b k_mu, and what else is in Newton's rows,
+    one after another."""
+    t = wp.tid()
+    row = place_in_model(ids, 0, t)
+    k_mu = materials[row, 0]
+    mu[t] = mu_from_mu * k_mu
+    lam[t] = materials[row, 1] + lam_from_mu * k_mu
+    k_lambda[t] = materials[row, 1]
+    k_damp[t] = materials[row, 2]
+
+
+@functools.cache
+def write_attributes(has_rotation: bool, has_stress: bool, has_von_mises: bool, is_warm: bool) -> wp.Kernel:
+    """Rotation and Cauchy stress of every element, those of them that the state has room for."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def write_attributes(
+        # In
+        elements: GeneralElements,
+        mu: wp.array[wp.float32],
+        lam: wp.array[wp.float32],
+        fill: wp.array[wp.float32],
+        fill_stride: int,
+        q: wp.array[wp.vec3],
+        guesses: wp.array[wp.quat],
+        # Out
+        rotations: wp.array[wp.quat],
+        stresses: wp.array[wp.mat33],
+        equivalent: wp.array[wp.float32],
+    ):
+        t = wp.tid()
+        gradient = difference_gradient(elements, t, q)
+        r = wp.mat33()
+        if wp.static(is_warm):
+            turned = warm_rotation(gradient, guesses[t])
+            r = wp.quat_to_matrix(turned)
+            if wp.static(has_rotation):
+                rotations[t] = turned
+        else:
+            r = byers_xu(gradient)
+            if wp.static(has_rotation):
+                rotations[t] = wp.normalize(wp.quat_from_matrix(r))
+        share = 1.0 / fill[t * fill_stride]
+        stress = share * rotated_stress(gradient, r, mu[t], lam[t])
+        if wp.static(has_stress):
+            stresses[t] = r * stress * wp.transpose(r)
+        if wp.static(has_von_mises):
+            equivalent[t] = von_mises(stress)
+
+    return write_attributes

@@ -1,0 +1,207 @@
+"""Worlds of a Newton model in which something is wrong: found, put back as they were, and reported; and worlds reset.
+
+Entities of no world (-1) have the last place in arrays over worlds.
+"""
+
+import warp as wp
+
+from warp_corot.kernels.stepping.integrate import is_finite
+
+wp.set_module_options({"enable_backward": False})
+
+# What is wrong with a world in this step; the report keeps the largest number of a world it was seen in, plus one.
+# The graver of two has the larger number.
+SOUND = wp.constant(0)
+UNSTABLE = wp.constant(1)
+TOO_MANY_CONTACTS = wp.constant(2)
+SURFACE_CONTACTS = wp.constant(3)
+BAD_INPUT = wp.constant(4)
+REPORTS = 5
+
+#: Newton's default for how fast a particle may be [m/s]. What gets there is no motion any more.
+RUNAWAY = wp.constant(1.0e5)
+
+
+@wp.func
+def place_of(world: int, count: int):
+    """A world's place in an array over worlds; the last one is that of no world."""
+    return wp.where(world < 0, count - 1, world)
+
+
+@wp.kernel(enable_backward=False)
+def check_contact_count(
+    # In
+    count: wp.array[wp.int32],
+    most: int,
+    # Out
+    trouble: wp.array[wp.int32],
+):
+    """More contacts than there is room for: nobody knows which worlds' are missing, so none is stepped."""
+    w = wp.tid()
+    if count[0] > most:
+        wp.atomic_max(trouble, w, TOO_MANY_CONTACTS)
+
+
+@wp.kernel(enable_backward=False)
+def check_particles(
+    # In
+    q: wp.array[wp.vec3],
+    qd: wp.array[wp.vec3],
+    fastest: float,
+    world: wp.array[wp.int32],
+    # Out
+    trouble: wp.array[wp.int32],
+):
+    i = wp.tid()
+    if not (is_finite(q[i]) and wp.max(wp.abs(qd[i])) < 0.5 * fastest):
+        wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), UNSTABLE)
+
+
+@wp.kernel(enable_backward=False)
+def put_back_particles(
+    # In
+    world: wp.array[wp.int32],
+    trouble: wp.array[wp.int32],
+    before_q: wp.array[wp.vec3],
+    before_qd: wp.array[wp.vec3],
+    kept_q: wp.array[wp.vec3],
+    kept_qd: wp.array[wp.vec3],
+    # Out
+    q: wp.array[wp.vec3],
+    qd: wp.array[wp.vec3],
+):
+    """Undo what was written to particles of marked worlds.
+
+    Args:
+        before_q, before_qd: The state that the step began with.
+        kept_q, kept_qd: What was in the state that it went to, for worlds that began with what is not finite; or empty,
+            where those were not written.
+    """
+    i = wp.tid()
+    wrong = trouble[place_of(world[i], trouble.shape[0])]
+    if wrong == BAD_INPUT:
+        if kept_q.shape[0] > 0:
+            q[i] = kept_q[i]
+            qd[i] = kept_qd[i]
+    elif wrong != SOUND:
+        q[i] = before_q[i]
+        qd[i] = before_qd[i]
+
+
+@wp.kernel(enable_backward=False)
+def check_bodies(
+    # In
+    q: wp.array[wp.transform],
+    qd: wp.array[wp.spatial_vector],
+    world: wp.array[wp.int32],
+    wrong: int,
+    # Out
+    trouble: wp.array[wp.int32],
+):
+    b = wp.tid()
+    size = wp.dot(wp.abs(q[b][0:3]), wp.vec3(1.0)) + wp.dot(wp.abs(wp.spatial_top(qd[b])), wp.vec3(1.0))
+    size += wp.dot(wp.abs(wp.spatial_bottom(qd[b])), wp.vec3(1.0))
+    if not (size <= 3.0e38):
+        wp.atomic_max(trouble, place_of(world[b], trouble.shape[0]), wrong)
+
+
+@wp.kernel(enable_backward=False)
+def put_back_bodies(
+    # In
+    world: wp.array[wp.int32],
+    trouble: wp.array[wp.int32],
+    before_q: wp.array[wp.transform],
+    before_qd: wp.array[wp.spatial_vector],
+    kept_q: wp.array[wp.transform],
+    kept_qd: wp.array[wp.spatial_vector],
+    # Out
+    q: wp.array[wp.transform],
+    qd: wp.array[wp.spatial_vector],
+):
+    """Undo what a rigid solver wrote to bodies of marked worlds; as ``put_back_particles``."""
+    b = wp.tid()
+    wrong = trouble[place_of(world[b], trouble.shape[0])]
+    if wrong == BAD_INPUT:
+        q[b] = kept_q[b]
+        qd[b] = kept_qd[b]
+    elif wrong != SOUND:
+        q[b] = before_q[b]
+        qd[b] = before_qd[b]
+
+
+@wp.kernel(enable_backward=False)
+def report_trouble(
+    # In and out
+    trouble: wp.array[wp.int32],
+    # Out
+    report: wp.array[wp.int32],
+    seen: wp.array[wp.int32],
+):
+    """Remember what was wrong and in which world, and begin the next step with nothing wrong.
+
+    Args:
+        seen: That something was, for the host, in its own memory.
+    """
+    w = wp.tid()
+    wrong = trouble[w]
+    if wrong != SOUND:
+        wp.atomic_max(report, wrong, w + 1)
+        seen[0] = 1
+        trouble[w] = SOUND
+
+
+@wp.kernel(enable_backward=False)
+def reset_particles(
+    # In
+    chosen: wp.array[wp.bool],
+    world: wp.array[wp.int32],
+    with_q: int,
+    with_qd: int,
+    initial_q: wp.array[wp.vec3],
+    initial_qd: wp.array[wp.vec3],
+    # Out
+    q: wp.array[wp.vec3],
+    qd: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    if chosen[place_of(world[i], chosen.shape[0])]:
+        if with_q != 0:
+            q[i] = initial_q[i]
+        if with_qd != 0:
+            qd[i] = initial_qd[i]
+
+
+@wp.kernel(enable_backward=False)
+def reset_rotations(
+    # In
+    chosen: wp.array[wp.bool],
+    world: wp.array[wp.int32],
+    tets: wp.array[wp.vec4i],
+    # Out
+    rotations: wp.array[wp.quat],
+):
+    """Start the rotations of elements in chosen worlds from the identity again; an element is where its nodes are."""
+    t = wp.tid()
+    if chosen[place_of(world[tets[t][0]], chosen.shape[0])]:
+        rotations[t] = wp.quat_identity()
+
+
+@wp.kernel(enable_backward=False)
+def reset_bodies(
+    # In
+    chosen: wp.array[wp.bool],
+    world: wp.array[wp.int32],
+    with_q: int,
+    with_qd: int,
+    initial_q: wp.array[wp.transform],
+    initial_qd: wp.array[wp.spatial_vector],
+    # Out
+    q: wp.array[wp.transform],
+    qd: wp.array[wp.spatial_vector],
+):
+    b = wp.tid()
+    if chosen[place_of(world[b], chosen.shape[0])]:
+        if with_q != 0:
+            q[b] = initial_q[b]
+        if with_qd != 0:
+            qd[b] = initial_qd[b]

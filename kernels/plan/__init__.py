@@ -1,0 +1,1 @@
+"""The force plan of a forest that has changed."""

@@ -1,0 +1,77 @@
+"""Whose rotations are found where leaves share them: the units of a derived plan (``plan``), in tree order.
+
+A unit is the highest tetrahedron above a leaf that is not above the rotation level and stands on nodes. The leaves of
+one follow one another.
+"""
+
+import warp as wp
+
+from warp_corot.kernels.remesh.pools import NODE_TOP, Pools, padding
+
+from .plan import Plan, extent, flat_row, level_of, padding_code
+
+
+@wp.func
+def on_nodes(e: int, pools: Pools):
+    """Whether all corners are nodes of leaves, as they may not be on the rim of a domain's mesh."""
+    if pools.node_limit == pools.sink:
+        return True
+    tet = pools.tets[e]
+    return wp.max(wp.max(tet[0], tet[1]), wp.max(tet[2], tet[3])) < pools.counts[NODE_TOP]
+
+
+@wp.func
+def unit_of(e: int, pools: Pools, plan: Plan):
+    """The highest tetrahedron above a leaf, or itself, that is not above the rotation level and stands on nodes."""
+    found = int(e)
+    climbed = int(e)
+    while pools.level[climbed] > plan.rotation_level:
+        climbed = pools.parent[climbed]
+        if on_nodes(climbed, pools):
+            found = climbed
+    return found
+
+
+@wp.func
+def begins_unit(i: int, pools: Pools, plan: Plan):
+    """Whether leaf i has another unit than the one before it.
+
+    They share one if an ancestor of both that is not above the level stands on nodes.
+    """
+    limit = plan.rotation_level
+    if plan.rotation_level < 0:
+        return False
+    if i == 0 or wp.min(level_of(i, plan), level_of(i - 1, plan)) <= limit:
+        return True
+    a = int(pools.leaves[i - 1])
+    b = int(pools.leaves[i])
+    level_a = level_of(i - 1, plan)
+    level_b = level_of(i, plan)
+    while a != b and (level_a > limit or level_b > limit):
+        if level_a >= level_b:
+            a = pools.parent[a]
+            level_a -= 1
+        else:
+            b = pools.parent[b]
+            level_b -= 1
+    if a != b:
+        return True
+    while not on_nodes(a, pools) and level_a > limit:
+        a = pools.parent[a]
+        level_a -= 1
+    return not on_nodes(a, pools)
+
+
+@wp.kernel(enable_backward=False)
+def pad_units(
+    # In
+    threads: int,
+    pools: Pools,
+    # In and out
+    plan: Plan,
+):
+    """Units are counted without the first place, which is padding."""
+    row = flat_row(plan) + 1
+    for k in range(plan.counts[row] + 1 + wp.tid(), extent(row, plan) + 1, threads):
+        plan.unit_nodes[k] = padding(k, pools)
+        plan.unit_code[k] = padding_code(pools)

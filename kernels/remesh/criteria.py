@@ -1,0 +1,77 @@
+"""Criteria for remeshing besides the elongation: Warp functions of an element's state and an array of numbers."""
+
+import warp as wp
+
+from warp_corot.kernels.elements.constitutive import corotated_strain, hooke
+from warp_corot.kernels.elements.forces import von_mises
+from warp_corot.kernels.math.rotation import byers_xu, identity3
+from warp_corot.kernels.meshing.bisection import refinement_end
+
+from .mark import ElementState
+
+
+@wp.func
+def longest_edge(element: ElementState):
+    """Rest length of the longest edge, which is the refinement edge [m]."""
+    return wp.length(element.rest[refinement_end(element.level)])
+
+
+@wp.func
+def displacement_gradient(element: ElementState):
+    """du/dX, which is F - I."""
+    rest = wp.matrix_from_cols(element.rest[1], element.rest[2], element.rest[3])
+    u = element.moved[0]
+    moved = wp.matrix_from_cols(element.moved[1] - u, element.moved[2] - u, element.moved[3] - u)
+    return moved * wp.inverse(rest)
+
+
+@wp.func
+def green_strain(element: ElementState):
+    """Green strain E = (F^T F - I) / 2, which is free of rotations."""
+    gradient = displacement_gradient(element)
+    return 0.5 * (gradient + wp.transpose(gradient) + wp.transpose(gradient) * gradient)
+
+
+@wp.func
+def von_mises_stress(element: ElementState, parameters: wp.array[wp.float32]):
+    """Von Mises stress of the corotated law [Pa], times the longest edge over ``parameters[0]`` [m] as in ``strain``.
+
+    A parent's material is known once it has been an element; one that never was counts as free of stress.
+    """
+    gradient = displacement_gradient(element)
+    r = byers_xu(identity3() + gradient)
+    stress = hooke(corotated_strain(gradient, identity3(), r), element.mu, element.lam)
+    return von_mises(stress) * longest_edge(element) / parameters[0]
+
+
+@wp.func
+def strain(element: ElementState, parameters: wp.array[wp.float32]):
+    """Norm of the Green strain, times the longest edge over ``parameters[0]`` [m].
+
+    It does not depend on how the edges lie to the direction of stretch, as the elongation does. What asks for small
+    elements is not strain but how it varies within them; next to a notch or a tool it falls off with the distance, so
+    that strain times size says about that, and the mesh grows coarser with the distance.
+    """
+    e = green_strain(element)
+    return wp.sqrt(wp.ddot(e, e)) * longest_edge(element) / parameters[0]
+
+
+@wp.func
+def nearness(element: ElementState, parameters: wp.array[wp.float32]):
+    """Longest edge over the distance of the moved centroid from a tool, a box that may be rounded off.
+
+    Parameters, all in metres: the box's centre, half its size along each axis, the radius that it is rounded off with
+    (of a ball alone, the half sizes being zero), and a length added to the distance, so that elements are not refined
+    without end where they touch.
+    """
+    x = element.corner
+    for n in range(4):
+        x += 0.25 * (element.rest[n] + element.moved[n])
+    centre = wp.vec3(parameters[0], parameters[1], parameters[2])
+    half = wp.vec3(parameters[3], parameters[4], parameters[5])
+    outside = wp.length(wp.max(wp.abs(x - centre) - half, wp.vec3(0.0))) - parameters[6]
+    return longest_edge(element) / (wp.max(outside, 0.0) + parameters[7])
+
+
+#: How many parameters each of these reads.
+PARAMETER_COUNTS = {von_mises_stress: 1, strain: 1, nearness: 8}

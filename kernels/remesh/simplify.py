@@ -1,0 +1,112 @@
+"""Removal of nodes, the reverse of bisection.
+
+A node can go when all leaves that name it, live or void, are children that were made with it, and all are to be
+simplified: then their parents become leaves. Two children of which only one is live, or whose labels differ, stay.
+"""
+
+import warp as wp
+
+from warp_corot.kernels.meshing.bisection import refinement_end
+from warp_corot.kernels.meshing.growth import LIVE
+
+from .pools import CANDIDATES, FREE_PAIRS, LEAVES, NODES_GIVEN, PAIRS_GIVEN, SIMPLIFY, UNUSED, Pools
+from .state import Carried, average_children, quarter_mass, unmake_node
+
+
+@wp.struct
+class Removal:
+    """Nodes that some leaves would give up."""
+
+    willing: wp.array[wp.int32]  # how many leaves would
+    head: wp.array[wp.int32]  # their first parent, or -1
+    candidates: wp.array[wp.int32]
+
+
+@wp.func
+def offer_node(i: int, min_level: int, pools: Pools, carried: Carried, removal: Removal):
+    """If this and the next leaf are a pair that is to be merged, count them at the node that would go."""
+    e = pools.leaves[i]
+    if e < pools.roots or (e - pools.roots) % 2 == 1 or pools.leaves[i + 1] != e + 1:
+        return
+    level = pools.level[e] - 1
+    if level < min_level or pools.first_child[e] != LIVE or pools.first_child[e + 1] != LIVE:
+        return
+    if carried.label[e] != carried.label[e + 1]:
+        return
+    parent = pools.parent[e]
+    z = pools.tets[e][refinement_end(level)]
+    before = wp.atomic_exch(removal.head, z, parent)
+    pools.next[parent] = before
+    wp.atomic_add(removal.willing, z, 2)
+    if before < 0:
+        removal.candidates[wp.atomic_add(pools.counts, CANDIDATES, 1)] = z
+
+
+@wp.kernel(enable_backward=False)
+def offer_nodes(
+    # In
+    threads: int,
+    min_level: int,
+    carried: Carried,
+    # In and out
+    pools: Pools,
+    removal: Removal,
+):
+    for i in range(wp.tid(), pools.counts[LEAVES] - 1, threads):
+        if pools.marks[i] == SIMPLIFY and pools.marks[i + 1] == SIMPLIFY:
+            offer_node(i, min_level, pools, carried, removal)
+
+
+@wp.func
+def remove_node(z: int, pools: Pools, carried: Carried, removal: Removal):
+    """Merge the pairs around a node, and hand on what they and the node carry."""
+    ends = pools.ends[z]
+    gain_a = wp.float64(0.0)
+    gain_b = wp.float64(0.0)
+    place = pools.counts[FREE_PAIRS] + wp.atomic_add(pools.counts, PAIRS_GIVEN, pools.valence[z] / 2)
+    e = int(removal.head[z])
+    while e >= 0:
+        child = pools.first_child[e]
+        level = pools.level[e]
+        tet = pools.tets[e]
+        end = refinement_end(level)
+        average_children(e, child, carried)
+        whole = quarter_mass(e, level, carried)
+        at_first = whole - quarter_mass(child, level + 1, carried)
+        at_second = whole - quarter_mass(child + 1, level + 1, carried)
+        if tet[0] == ends[0]:
+            gain_a += at_first
+            gain_b += at_second
+        else:
+            gain_a += at_second
+            gain_b += at_first
+        for n in range(1, 4):
+            if n != end:
+                wp.atomic_add(pools.valence, tet[n], -1)
+        pools.first_child[e] = LIVE
+        # The parent's number stays, for those who put the leaves in order.
+        pools.level[child] = UNUSED
+        pools.level[child + 1] = UNUSED
+        pools.free_pairs[place] = child
+        place += 1
+        e = pools.next[e]
+    pools.valence[z] = 0
+    wp.atomic_add(pools.counts, NODES_GIVEN, 1)
+    unmake_node(z, ends[0], ends[1], gain_a, gain_b, pools, carried)
+
+
+@wp.kernel(enable_backward=False)
+def remove_nodes(
+    # In
+    threads: int,
+    # In and out
+    pools: Pools,
+    carried: Carried,
+    removal: Removal,
+):
+    for i in range(wp.tid(), pools.counts[CANDIDATES], threads):
+        z = removal.candidates[i]
+        if removal.willing[z] == pools.valence[z]:
+            remove_node(z, pools, carried, removal)
+        removal.willing[z] = 0
+        removal.head[z] = -1

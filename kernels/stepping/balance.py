@@ -1,0 +1,277 @@
+"""What a check needs of a state, in one look: energies world by world in float64 and in a settled order, the clock, and
+whether somebody has written to the state; and the two copies of it, of which one is the last good one.
+
+A run begins with ``take_over``, which compares the state with the last good copy, and ends with ``sum_nodes``, which
+writes the present state to the other copy in passing, and ``report``, which writes all that the host wants to know to
+one place.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import load_node, store_node
+
+from .integrate import by_vectors, vector_at
+from .pace import BEFORE, CONTROLS, DONE, DONE_THEN, DT, END, SLOT, THEN, Pace, length_before, time_after
+
+wp.set_module_options({"enable_backward": False})
+
+#: Columns of ``sums``.
+KINETIC, AHEAD, GRAVITATIONAL, LOADS, SUPPORTS, REACH, ELASTIC, UNTIMELY = (wp.constant(k) for k in range(8))
+COLUMNS = 8
+
+#: Places in what is reported besides sums: the clock's numbers, what moving supports have put in and the sum of its
+#: absolute values [J], the first step that was not finite, whether somebody has written to the state, and from CONTROL
+#: on the control of the step.
+STEPS, STEPS_THEN, LENGTH, TIME_THEN, LENGTH_BEFORE, WORK, WORK_ABSOLUTE, BAD_STEP, CHANGED, CONTROL = (
+    wp.constant(k) for k in range(10)
+)
+NUMBERS = 9 + CONTROLS
+
+#: A run has ended in time if it came so near, in steps: what rounding leaves of the last one.
+NEAR = wp.constant(wp.float64(1e-4))
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    for (int k = 16; k > 0; k >>= 1) value += __shfl_down_sync(0xffffffffu, value, k);
+#endif
+    return value;
+""")
+def sum_of_lanes(value: wp.float64) -> wp.float64:
+    """The first lane's is the sum over the warp, added up in one order; a CPU has one lane."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    for (int k = 16; k > 0; k >>= 1) value = fmax(value, __shfl_down_sync(0xffffffffu, value, k));
+#endif
+    return value;
+""")
+def most_of_lanes(value: wp.float64) -> wp.float64:
+    """The first lane's is the largest of the warp."""
+    ...
+
+
+@wp.func
+def equal(a: wp.vec3, b: wp.vec3):
+    """False where anything is NaN."""
+    return a[0] == b[0] and a[1] == b[1] and a[2] == b[2]
+
+
+@wp.kernel(enable_backward=False)
+def take_over(
+    # In
+    rest: wp.array[wp.vec4],
+    positions: wp.array[Any],
+    inverse_mass: wp.array[wp.float32],
+    orders: wp.array[wp.float64],
+    v: wp.array[wp.vec4],
+    # In and out
+    u: wp.array[wp.vec4],
+    kept_u: wp.array2d[wp.vec4],
+    kept_v: wp.array2d[wp.vec4],
+    kept_inverse_mass: wp.array[wp.float32],
+    # Out
+    pace: Pace,
+    changed: wp.array[wp.int32],
+):
+    """Adopt positions that a user wrote; compare the state with the last good copy, and update that if they differ."""
+    i = wp.tid()
+    slot = int(orders[SLOT])
+    x = load_node(rest, i)
+    p = vector_at(positions, i)
+    displacement = load_node(u, i)
+    q = x + displacement
+    if p[0] != q[0] or p[1] != q[1] or p[2] != q[2]:
+        displacement = p - x
+        store_node(u, i, displacement)
+    velocity = load_node(v, i)
+    w = inverse_mass[i]
+    is_same = equal(displacement, load_node(kept_u[slot], i)) and equal(velocity, load_node(kept_v[slot], i))
+    if not is_same or w != kept_inverse_mass[i]:
+        store_node(kept_u[slot], i, displacement)
+        store_node(kept_v[slot], i, velocity)
+        kept_inverse_mass[i] = w
+        changed[0] = 1
+        pace.seconds[BEFORE] = wp.float64(0.0)
+
+
+@wp.func
+def dot64(a: wp.vec3, b: wp.vec3):
+    return (
+        wp.float64(a[0]) * wp.float64(b[0]) + wp.float64(a[1]) * wp.float64(b[1]) + wp.float64(a[2]) * wp.float64(b[2])
+    )
+
+
+@wp.kernel(enable_backward=False)
+def sum_nodes(
+    # In
+    pace: Pace,
+    gravity: wp.vec3,
+    count: int,
+    threads: int,
+    lanes: int,
+    mass: wp.array[wp.float32],
+    inverse_mass: wp.array[wp.float32],
+    has_load: int,
+    load: wp.array[Any],
+    f: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    v: wp.array[wp.vec4],
+    orders: wp.array[wp.float64],
+    keeps: int,
+    # In and out
+    kept_u: wp.array2d[wp.vec4],
+    kept_v: wp.array2d[wp.vec4],
+    sums: wp.array3d[wp.float64],
+):
+    """Add what free nodes have: kinetic and gravitational energy, the work of loads since the last good state, the
+    farthest; and if ``keeps``, keep the present state beside the last good one.
+
+    Velocities are half of the last step behind displacements. With the elastic forces f of these displacements they are
+    known at any time about it. Half of the next step behind times half of it ahead, v_behind . M v_ahead / 2, kinetic
+    energy and ``AHEAD``, is what symplectic Euler keeps exactly with the elastic energy where forces are linear: also
+    beyond the stable step, where it need not be positive.
+    The work of supports that ``add_support_work`` has added up counts half of f's share too early; that half is
+    ``SUPPORTS``. Velocities at the time of the displacements, halfway, have ``UNTIMELY`` more than that product.
+    """
+    world, thread = wp.tid()
+    slot = int(orders[SLOT])
+    dt = pace.seconds[DT]
+    before = length_before(pace)
+    both = wp.float64(0.25) * (before * before - dt * dt)
+    kinetic = wp.float64(0.0)
+    ahead = wp.float64(0.0)
+    gravitational = wp.float64(0.0)
+    work = wp.float64(0.0)
+    supports = wp.float64(0.0)
+    untimely = wp.float64(0.0)
+    reach = wp.float64(0.0)
+    k = thread
+    while k < count:
+        i = world * count + k
+        x = load_node(u, i)
+        reach = wp.max(reach, dot64(x, x))
+        velocity = load_node(v, i)
+        force = load_node(f, i)
+        if inverse_mass[i] == 0.0:
+            supports -= wp.float64(0.5) * before * dot64(force, velocity)
+        else:
+            m = wp.float64(mass[i])
+            pull = wp.vec3d(force) + m * wp.vec3d(gravity)
+            power = dot64(force, velocity) + m * dot64(gravity, velocity)
+            if has_load != 0:
+                external = vector_at(load, i)
+                pull += wp.vec3d(external)
+                power += dot64(external, velocity)
+                work += dot64(external, x) - dot64(external, load_node(kept_u[slot], i))
+            square = wp.dot(pull, pull) / m
+            ahead += wp.float64(0.5) * (before * power + both * square)
+            untimely += square
+            kinetic += wp.float64(0.5) * m * dot64(velocity, velocity)
+            gravitational -= m * dot64(gravity, x)
+        if keeps != 0:
+            store_node(kept_u[1 - slot], i, x)
+            store_node(kept_v[1 - slot], i, velocity)
+        k += threads
+    kinetic = sum_of_lanes(kinetic)
+    ahead = sum_of_lanes(ahead)
+    gravitational = sum_of_lanes(gravitational)
+    work = sum_of_lanes(work)
+    supports = sum_of_lanes(supports)
+    untimely = sum_of_lanes(wp.float64(0.125) * dt * dt * untimely)
+    reach = most_of_lanes(wp.sqrt(reach))
+    if thread % lanes == 0:
+        part = thread / lanes
+        sums[world, part, KINETIC] = sums[world, part, KINETIC] + kinetic
+        sums[world, part, AHEAD] = sums[world, part, AHEAD] + ahead
+        sums[world, part, GRAVITATIONAL] = sums[world, part, GRAVITATIONAL] + gravitational
+        sums[world, part, LOADS] = sums[world, part, LOADS] + work
+        sums[world, part, SUPPORTS] = sums[world, part, SUPPORTS] + supports
+        sums[world, part, UNTIMELY] = sums[world, part, UNTIMELY] + untimely
+        sums[world, part, REACH] = wp.max(sums[world, part, REACH], reach)
+
+
+@wp.kernel(enable_backward=False)
+def sum_elements(energies: wp.array[wp.float64], count: int, threads: int, lanes: int, sums: wp.array3d[wp.float64]):
+    """Add strain energies, ``count`` of each world."""
+    world, thread = wp.tid()
+    total = wp.float64(0.0)
+    k = thread
+    while k < count:
+        total += energies[world * count + k]
+        k += threads
+    total = sum_of_lanes(total)
+    if thread % lanes == 0:
+        part = thread / lanes
+        sums[world, part, ELASTIC] = sums[world, part, ELASTIC] + total
+
+
+@wp.kernel(enable_backward=False)
+def keep_words(words: wp.array[wp.uint32], orders: wp.array[wp.float64], beside: int, kept: wp.array2d[wp.uint32]):
+    """Keep further arrays with the last good state, or beside it."""
+    i = wp.tid()
+    slot = int(orders[SLOT])
+    if beside != 0:
+        slot = 1 - slot
+    kept[slot, i] = words[i]
+
+
+@wp.kernel(enable_backward=False)
+def report(
+    # In
+    lanes: int,
+    orders: wp.array[wp.float64],
+    support_work: wp.array[wp.float64],
+    bad_step: wp.array[wp.int64],
+    changed: wp.array[wp.int32],
+    control: wp.array[wp.float64],
+    # In and out
+    pace: Pace,
+    sums: wp.array3d[wp.float64],
+    # Out
+    totals: wp.array2d[wp.float64],
+    numbers: wp.array[wp.float64],
+):
+    """Add the parts up, which are zero then, and write all that the host wants to know where it looks.
+
+    The time is exactly ``END`` where the run has come there.
+    """
+    world, column, lane = wp.tid()
+    value = wp.float64(0.0)
+    k = lane
+    while k < sums.shape[1]:
+        part = sums[world, k, column]
+        sums[world, k, column] = wp.float64(0.0)
+        if column == REACH:
+            value = wp.max(value, part)
+        else:
+            value += part
+        k += lanes
+    together = sum_of_lanes(value)
+    if column == REACH:
+        together = most_of_lanes(value)
+    if lane == 0:
+        totals[world, column] = together
+        if world == 0 and column == 0:
+            if wp.abs(time_after(pace, 0) - orders[END]) <= NEAR * pace.seconds[DT]:
+                pace.seconds[THEN] = orders[END]
+                pace.counts[DONE_THEN] = pace.counts[DONE]
+            numbers[STEPS] = wp.float64(pace.counts[DONE])
+            numbers[STEPS_THEN] = wp.float64(pace.counts[DONE_THEN])
+            numbers[LENGTH] = pace.seconds[DT]
+            numbers[TIME_THEN] = pace.seconds[THEN]
+            numbers[LENGTH_BEFORE] = pace.seconds[BEFORE]
+            numbers[WORK] = support_work[0]
+            numbers[WORK_ABSOLUTE] = support_work[1]
+            numbers[BAD_STEP] = wp.float64(bad_step[0])
+            numbers[CHANGED] = wp.float64(changed[0])
+            for k in range(CONTROLS):
+                numbers[CONTROL + k] = control[k]
+
+
+TAKE_OVER = by_vectors(take_over, "positions")
+SUM_NODES = by_vectors(sum_nodes, "load")

@@ -1,0 +1,459 @@
+"""A small body's steps whole in one thread block: nodes and forces in shared memory, many steps a launch.
+
+A body of a thousand elements is done before the next launch has begun, so here a block stays with its world. Each
+thread takes a complete subtree, or a part of its leaves where there are too few worlds to fill the card, and writes its
+nodal forces to slots; then each thread sums up the slots of a node and moves it. Nothing is added atomically, so runs
+are reproducible bit by bit, and nothing leaves the multiprocessor but the state at the end.
+
+CUDA only. ``tables.block_layout`` says which thread does what.
+"""
+
+import functools
+
+import warp as wp
+
+from warp_corot.kernels.corotated.algebraic import turned_stress
+from warp_corot.kernels.elements.constitutive import hooke, symmetric
+from warp_corot.kernels.elements.elements import FRAME_SHIFT, LEVEL_MASK, Subtrees, load_node, mirror_sign, store_node
+from warp_corot.kernels.math.matrices import column, identity3
+from warp_corot.kernels.math.quaternion import robust_rotation
+from warp_corot.kernels.subtrees.forces import columns_of, leaf_forces_of, mat10, near_forces, shared_forces
+from warp_corot.kernels.tables.block_layout import (
+    FIRST_SHIFT,
+    FOLLOWING_SHIFT,
+    NEIGHBOURS,
+    NO_NODE,
+    NODE_WORDS,
+    NUMBERS,
+    WARP,
+    Layout,
+)
+from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
+from warp_corot.kernels.tables.subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS
+
+from .integrate import add_support_work, is_finite, symplectic_euler_velocity, vector_at
+from .pace import DONE, DT, Pace, length_before
+
+wp.set_module_options({"enable_backward": False})
+
+#: Threads of a multiprocessor that registers must have room for.
+BUSY_THREADS = 640
+
+LOAD, STORE, LOAD_BYTES = 0, 1, 2
+RESERVE, WRITE, READ, COUNT, CLEAR = 0, 1, 2, 3, 4
+#: What an entry of a block's list is: which thread left it out, and which leaf it is.
+LEAF_SHIFT = 16
+
+vec3u = wp.types.vector(length=NODE_WORDS, dtype=wp.uint64)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+""")
+def synchronize_block(): ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __syncthreads_or(flag);
+#else
+    return flag;
+#endif
+""")
+def synchronize_any(flag: int) -> int:
+    """Wait for the block's threads; whether any has a flag."""
+    ...
+
+
+@wp.func
+def number_in(word: wp.uint64, k: int):
+    """The k-th of the four 16-bit numbers in a word."""
+    return int((word >> wp.uint64(16 * k)) & wp.uint64(0xFFFF))
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __popc(bits);
+#else
+    return __builtin_popcount(bits);
+#endif
+""")
+def bit_count(bits: int) -> int: ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __ffs(bits) - 1;
+#else
+    return __builtin_ctz(bits);
+#endif
+""")
+def lowest_bit(bits: int) -> int: ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return wp::vec_t<3, wp::float32>(
+        __shfl_down_sync(0xffffffff, value[0], distance),
+        __shfl_down_sync(0xffffffff, value[1], distance),
+        __shfl_down_sync(0xffffffff, value[2], distance));
+#else
+    return value;
+#endif
+""")
+def shuffle_down(value: wp.vec3, distance: int) -> wp.vec3: ...
+
+
+def shared_list(room: int) -> wp.Function:
+    """A list of integers in shared memory, as one function.
+
+    It makes room for some and returns where, writes or reads one, returns how many there are, or forgets all.
+    """
+    snippet = f"""
+#if defined(__CUDA_ARCH__)
+    __shared__ int count;
+    __shared__ int entries[{room}];
+    if (access == {RESERVE}) return atomicAdd(&count, value);
+    if (access == {WRITE}) entries[i] = value;
+    if (access == {READ}) return entries[i];
+    if (access == {COUNT}) return count < {room} ? count : {room};
+    if (access == {CLEAR}) count = 0;
+#endif
+    return 0;
+"""
+
+    @wp.func_native(snippet)
+    def list_of(access: int, i: int, value: int) -> int: ...
+
+    return list_of
+
+
+def shared_vectors(count: int, tag: str) -> wp.Function:
+    """An array of vectors in shared memory, as one function that reads or writes it; ``LOAD_BYTES`` counts in bytes."""
+
+    snippet = f"""
+#if defined(__CUDA_ARCH__)
+    // {tag}
+    __shared__ float memory[{3 * count}];
+    if (access == {STORE}) {{
+        memory[3 * i] = value[0]; memory[3 * i + 1] = value[1]; memory[3 * i + 2] = value[2];
+        return value;
+    }}
+    const float* at = access == {LOAD_BYTES} ? (const float*)((const char*)memory + i) : memory + 3 * i;
+    return wp::vec_t<3, wp::float32>(at[0], at[1], at[2]);
+#else
+    return value;
+#endif
+"""
+
+    @wp.func_native(snippet)
+    def memory(access: int, i: int, value: wp.vec3) -> wp.vec3: ...
+
+    return memory
+
+
+@wp.struct
+class BlockBody:
+    """A body as its block goes through it: one world's subtrees, and who adds up which slots."""
+
+    subtrees: Subtrees  # of one world, one by one
+    subtree_count: int
+    node_count: int
+    element_count: int
+    tasks: wp.array[wp.int32]  # [tasks] see ``FOLLOWING_SHIFT``
+    nodes: wp.array2d[wp.uint64]  # [3, subtree_count] the ten nodes of each subtree, four to a word, in bytes
+    slots: wp.array2d[wp.uint64]  # [2, tasks] four slots each, the zero one past the last, in bytes
+
+
+def _table(rows: list[list[int]]) -> wp.Function:
+    """Whole numbers by row and column. A matrix that is indexed so would be copied for every use."""
+    numbers = ", ".join(str(number) for row in rows for number in row)
+    snippet = f"""
+    static const signed char numbers[{len(rows) * len(rows[0])}] = {{{numbers}}};
+    return numbers[{len(rows[0])} * row + column];
+"""
+
+    @wp.func_native(snippet)
+    def look_up(row: int, column: int) -> int: ...
+
+    return look_up
+
+
+def _vectors(rows: list) -> wp.Function:
+    """Constant vectors by number."""
+    numbers = ", ".join(f"{float(c)!r}f" for row in rows for c in row)
+    snippet = f"""
+    static const float numbers[{3 * len(rows)}] = {{{numbers}}};
+    return wp::vec_t<3, wp::float32>(numbers[3 * i], numbers[3 * i + 1], numbers[3 * i + 2]);
+"""
+
+    @wp.func_native(snippet)
+    def look_up(i: int) -> wp.vec3: ...
+
+    return look_up
+
+
+def _left_out_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -> tuple[wp.Function, ...]:
+    """What does the leaves that the subtrees' threads leave out.
+
+    These list them, any thread finds the forces of one, and who left it out adds them up, so that sums have one order.
+    """
+    shape, room = layout.shape, layout.room
+    node_of, place_of = _table([list(leaf) for leaf in LEAVES[shape]]), _table(layout.places)
+    handed = _table([[int(h)] for h in HANDEDNESS[shape]])
+    rest_of = _vectors([[2.0 * c for c in point] for point in POSITIONS[shape]])
+    frame_of = _vectors([column for leaf in FRAMES[shape] for column in leaf])
+    columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
+    waiting, force = shared_list(room), shared_vectors(4 * room, "forces of single leaves")
+
+    @wp.func
+    def enlist(thread: int, left_out: int):
+        """List a thread's leaves as far as there is room; where the first of them stands."""
+        first = int(0)
+        if left_out != 0:
+            first = waiting(wp.static(RESERVE), 0, bit_count(left_out))
+            i = int(first)
+            left = int(left_out)
+            while left != 0 and i < wp.static(room):
+                waiting(wp.static(WRITE), i, thread | (lowest_bit(left) << wp.static(LEAF_SHIFT)))
+                left = left & (left - 1)
+                i += 1
+        return first
+
+    @wp.func
+    def position(words: vec3u, k: int, q: wp.mat33, inv_h: float):
+        """Of node k, relative to the first's displacement, in edge lengths of a leaf."""
+        # An index that is not known would put the words into memory.
+        word = wp.where(k < NUMBERS, words[0], wp.where(k < wp.static(2 * NUMBERS), words[1], words[2]))
+        moved = displacement(wp.static(LOAD_BYTES), number_in(word, k % NUMBERS), wp.vec3())
+        origin = displacement(wp.static(LOAD_BYTES), number_in(words[0], 0), wp.vec3())
+        return (moved - origin) * inv_h + q * rest_of(k)
+
+    @wp.func
+    def do_one(
+        body: BlockBody, i: int, mu: wp.array[wp.float32], lam: wp.array[wp.float32], material: int, stride: int
+    ):
+        """Find the forces of the i-th listed leaf, for any F; ``material`` is the world's first."""
+        entry = waiting(wp.static(READ), i, 0)
+        leaf = entry >> wp.static(LEAF_SHIFT)
+        warp = (entry & wp.static((1 << LEAF_SHIFT) - 1)) // wp.static(WARP)
+        s = (warp // wp.static(layout.parts)) * wp.static(WARP) + entry % wp.static(WARP)
+        code = body.subtrees.code[s]
+        h = 0.5 * body.subtrees.size[(code & LEVEL_MASK) // 3]
+        mirror = mirror_sign(code)
+        q = body.subtrees.frames[code >> FRAME_SHIFT]
+        # Left-handed if ``mirror`` is -1.
+        maubach = wp.matrix_from_cols(column(q, 0), column(q, 1), column(q, 2) * mirror)
+        words = vec3u(body.nodes[0, s], body.nodes[1, s], body.nodes[2, s])
+        inv_h = 1.0 / h
+        area = wp.static(VOLUME[shape]) * h * h
+        at = material + (body.subtrees.first[s] + leaf) * stride
+        m = area * mu[at]
+        k = area * lam[at]
+        c0, c1, c2 = columns(
+            position(words, node_of(leaf, 0), maubach, inv_h),
+            position(words, node_of(leaf, 1), maubach, inv_h),
+            position(words, node_of(leaf, 2), maubach, inv_h),
+            position(words, node_of(leaf, 3), maubach, inv_h),
+        )
+        p = wp.mat33()
+        if wp.static(layout.shared):
+            d0, d1, d2 = columns(
+                position(words, 0, maubach, inv_h),
+                position(words, 1, maubach, inv_h),
+                position(words, 2, maubach, inv_h),
+                position(words, 3, maubach, inv_h),
+            )
+            r = robust_rotation(wp.matrix_from_cols(d0, d1, d2 * mirror))
+            turned = wp.matrix_from_cols(column(r, 0), column(r, 1), column(r, 2) * mirror)
+            # R times the leaf's Maubach frame.
+            z = turned * wp.matrix_from_cols(frame_of(3 * leaf), frame_of(3 * leaf + 1), frame_of(3 * leaf + 2))
+            p = z * hooke(symmetric(wp.transpose(z) * wp.matrix_from_cols(c0, c1, c2)) - identity3(), m, k)
+        else:
+            hand = mirror * float(handed(leaf, 0))
+            p = turned_stress(wp.matrix_from_cols(c0, c1, c2 * hand), m, k)
+            p = wp.matrix_from_cols(column(p, 0), column(p, 1), hand * column(p, 2))
+        f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
+        force(wp.static(STORE), 4 * i, f0)
+        force(wp.static(STORE), 4 * i + 1, f1)
+        force(wp.static(STORE), 4 * i + 2, f2)
+        force(wp.static(STORE), 4 * i + 3, f3)
+
+    @wp.func
+    def collect(s: int, part: int, first: int, left_out: int):
+        """Add the forces of a thread's listed leaves to its slots; the leaves for which there was no room."""
+        left = int(left_out)
+        i = int(first)
+        while left != 0 and i < wp.static(room):
+            leaf = lowest_bit(left)
+            left = left & (left - 1)
+            for n in range(4):
+                at = s + place_of(part, node_of(leaf, n)) * wp.static(layout.subtrees)
+                added = force(wp.static(LOAD), 4 * i + n, wp.vec3())
+                slot(wp.static(STORE), at, slot(wp.static(LOAD), at, added) + added)
+            i += 1
+        return left
+
+    return waiting, enlist, do_one, collect
+
+
+@functools.cache
+def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
+    """Symplectic Euler steps of the corotated model, a block a world; launch with ``layout.threads`` a block.
+
+    Args:
+        load_vectors: What loads are an array of, vec3 or vec4.
+    """
+    shape, shared, uniform, parts = layout.shape, layout.shared, layout.uniform, layout.parts
+    capacity, threads, zero_slot = layout.subtrees, layout.threads, layout.slot_count
+    own = [near_forces(shape, uniform, layout.tolerance, layout.leaves(part)) for part in range(parts)]
+    turned = [shared_forces(shape, uniform, False, layout.leaves(part)) for part in range(parts)]
+    needs, places = [layout.needs(part) for part in range(parts)], layout.places
+    displacement, velocity = shared_vectors(layout.nodes, "displacements"), shared_vectors(layout.nodes, "velocities")
+    slot = shared_vectors(zero_slot + 1, "forces")
+    waiting, enlist, do_one, collect = _left_out_of(layout, displacement, slot)
+
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        grid_stride=False,
+        launch_bounds=(threads, max(BUSY_THREADS // threads, 1)),
+    )
+    def step_block(
+        # In
+        body: BlockBody,
+        steps: int,
+        damping: float,
+        gravity: wp.vec3,
+        mu: wp.array[wp.float32],
+        lam: wp.array[wp.float32],
+        stride: int,
+        mass: wp.array[wp.float32],
+        inverse_mass: wp.array[wp.float32],
+        has_load: int,
+        load: wp.array[load_vectors],
+        pace: Pace,
+        # In and out
+        u: wp.array[wp.vec4],
+        v: wp.array[wp.vec4],
+        # Out
+        reactions: wp.array[wp.vec4],
+        support_work: wp.array[wp.float64],
+        bad_step: wp.array[wp.int64],
+    ):
+        _generated_from = wp.static(fingerprint(needs, places))
+        dt = float(pace.seconds[DT])
+        kick = 0.5 * (float(length_before(pace)) + dt)
+        world = wp.tid() // wp.static(threads)
+        thread = wp.tid() % wp.static(threads)
+        base = world * body.node_count
+        place = thread
+        while place < body.node_count:
+            displacement(wp.static(STORE), place, load_node(u, base + place))
+            velocity(wp.static(STORE), place, load_node(v, base + place))
+            place += wp.static(threads)
+        if thread == 0:
+            slot(wp.static(STORE), wp.static(zero_slot), wp.vec3())
+            waiting(wp.static(CLEAR), 0, 0)
+        synchronize_block()
+        warp = thread // wp.static(WARP)
+        part = warp % wp.static(parts)
+        s = (warp // wp.static(parts)) * wp.static(WARP) + thread % wp.static(WARP)
+        mine = wp.min(s, body.subtree_count - 1)
+        code = body.subtrees.code[mine]
+        h = 0.5 * body.subtrees.size[(code & LEVEL_MASK) // 3]
+        mirror = mirror_sign(code)
+        q = body.subtrees.frames[code >> FRAME_SHIFT]
+        material_of_world = world * body.element_count * stride
+        material = material_of_world + body.subtrees.first[mine] * stride
+        damped = 1.0 / (1.0 + dt * damping)
+        # In registers from here on, two nodes each.
+        words = vec3u()
+        for word in range(wp.static(NODE_WORDS)):
+            words[word] = body.nodes[word, mine]
+        task = wp.min(thread, wp.static(layout.tasks - 1))
+        about = body.tasks[task]
+        numbers0 = body.slots[0, task]
+        numbers1 = body.slots[1, task]
+        step = int(0)
+        while step < steps:
+            left_out = int(0)
+            if s < body.subtree_count:
+                for p in range(wp.static(parts)):
+                    if part == p:
+                        x = mat10()
+                        for k in range(10):
+                            if wp.static(needs[p][k]):
+                                x[k] = displacement(
+                                    wp.static(LOAD_BYTES),
+                                    number_in(words[k // wp.static(NUMBERS)], k % wp.static(NUMBERS)),
+                                    wp.vec3(),
+                                )
+                        g = mat10()
+                        if wp.static(shared):
+                            g, left_out = wp.static(turned[p])(x, q, h, mirror, wp.mat33(), mu, lam, material)
+                        else:
+                            g, left_out = wp.static(own[p])(x, q, h, mirror, mu, lam, material)
+                        for k in range(10):
+                            if wp.static(places[p][k] >= 0):
+                                slot(wp.static(STORE), s + wp.static(places[p][k] * capacity), g[k])
+            listed = enlist(thread, left_out)
+            while synchronize_any(left_out) != 0:
+                if thread < waiting(wp.static(COUNT), 0, 0):
+                    do_one(body, thread, mu, lam, material_of_world, stride)
+                synchronize_block()
+                left_out = collect(s, part, listed, left_out)
+                if thread == 0:
+                    waiting(wp.static(CLEAR), 0, 0)
+                synchronize_block()
+                listed = enlist(thread, left_out)
+            task = thread
+            while task < wp.static(layout.tasks):
+                if wp.static(layout.tasks > threads):
+                    about = body.tasks[task]
+                    numbers0 = body.slots[0, task]
+                    numbers1 = body.slots[1, task]
+                force = wp.vec3()
+                for k in range(wp.static(NUMBERS)):
+                    force += slot(wp.static(LOAD_BYTES), number_in(numbers0, k), force)
+                for k in range(wp.static(NUMBERS)):
+                    force += slot(wp.static(LOAD_BYTES), number_in(numbers1, k), force)
+                following = (about >> wp.static(FOLLOWING_SHIFT)) & 255
+                distance = int(1)
+                while distance < wp.static(NEIGHBOURS):
+                    theirs = shuffle_down(force, distance)
+                    if distance <= following:
+                        force += theirs
+                    distance *= 2
+                if (about >> wp.static(FIRST_SHIFT)) == 1:
+                    place = about & wp.static(NO_NODE)
+                    i = base + place
+                    elastic = force
+                    if has_load != 0:
+                        force += vector_at(load, i)
+                    w = inverse_mass[i]
+                    moving = velocity(wp.static(LOAD), place, force)
+                    if w > 0.0:
+                        moving = symplectic_euler_velocity(moving, force, w, gravity, kick, damped)
+                        velocity(wp.static(STORE), place, moving)
+                    else:
+                        add_support_work(elastic, dt * moving, support_work)
+                        if step == steps - 1:
+                            store_node(reactions, i, -(force + mass[i] * gravity))
+                    moved = displacement(wp.static(LOAD), place, force) + dt * moving
+                    displacement(wp.static(STORE), place, moved)
+                    if not is_finite(moved):
+                        wp.atomic_min(bad_step, 0, pace.counts[DONE] + wp.int64(step + 1))
+                task += wp.static(threads)
+            synchronize_block()
+            kick = dt
+            step += 1
+        place = thread
+        while place < body.node_count:
+            store_node(u, base + place, displacement(wp.static(LOAD), place, wp.vec3()))
+            store_node(v, base + place, velocity(wp.static(LOAD), place, wp.vec3()))
+            place += wp.static(threads)
+
+    return step_block

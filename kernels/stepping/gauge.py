@@ -1,0 +1,141 @@
+"""How stiff a body is now: one force evaluation looks at all places at once, and the elements' strains tell how soon
+that may change.
+
+Small motions about the present displacements u obey q'' = -A q with A = M^-1/2 K M^-1/2 and q = M^1/2 d. Every free
+node has a direction, |q_i| = 1, so that none is missed wherever the stiffest place will be. A q comes from a difference
+of forces. s_i = q_i . (A q)_i never exceeds the sum of the norms of the blocks of row i, which bounds the eigenvalues
+of A (Gershgorin's circles, for blocks). The directions then turn to A q, each made a unit again: a power iteration
+without the loss of what is small elsewhere. At places that fold (s_i < 0) nothing vibrates.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import frame, load_node, local_gradient, store_node
+
+from .pace import CURVATURE, DONE, DT, STRAIN, Pace
+
+wp.set_module_options({"enable_backward": False})
+
+#: Measurements in which every element's strain is looked at once.
+TURNS = wp.constant(4)
+
+
+@wp.kernel(enable_backward=False)
+def probe_directions(
+    # In
+    scale: wp.array[wp.float32],
+    inverse_mass: wp.array[wp.float32],
+    u: wp.array[wp.vec4],
+    # In and out
+    q: wp.array[wp.vec4],
+    # Out
+    probed: wp.array[wp.vec4],
+    f: wp.array[wp.vec4],
+):
+    """Displacements that are moved along the directions by scale M^-1/2 q; nodes without a direction get one."""
+    i = wp.tid()
+    w = inverse_mass[i]
+    a = load_node(q, i)
+    if w > 0.0:
+        if wp.dot(a, a) == 0.0:
+            state = wp.rand_init(20130705, i)
+            a = wp.normalize(wp.vec3(wp.randn(state), wp.randn(state), wp.randn(state)))
+            store_node(q, i, a)
+        a = (scale[0] * wp.sqrt(w)) * a
+    else:
+        a = wp.vec3()
+    store_node(probed, i, load_node(u, i) + a)
+    store_node(f, i, wp.vec3())
+
+
+#: Bits of floats that are not negative are ordered as the floats are. Threads of a warp find their largest first:
+#: thousands of atomic operations on one address would take longer than all else here.
+_KEEP_LARGEST = """
+    if (!(value > wp::index(largest, place))) return;
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+    const unsigned int together = __activemask();
+    const int most = __reduce_max_sync(together, __float_as_int(value));
+    if (__popc(together & ((1u << (threadIdx.x & 31)) - 1u)) == 0)
+        atomicMax(reinterpret_cast<int*>(&wp::index(largest, place)), most);
+#elif defined(__CUDA_ARCH__)
+    atomicMax(reinterpret_cast<int*>(&wp::index(largest, place)), __float_as_int(value));
+#else
+    wp::index(largest, place) = value;
+#endif
+"""
+
+
+@wp.func_native(_KEEP_LARGEST)
+def keep_largest(value: float, place: int, largest: wp.array[wp.float32]):
+    """Let a place hold the largest value, at least zero, that any thread has for it; NaN is left out."""
+    ...
+
+
+@wp.kernel(enable_backward=False)
+def find_curvatures(
+    # In
+    inverse_mass: wp.array[wp.float32],
+    u: wp.array[wp.vec4],
+    probed: wp.array[wp.vec4],
+    f: wp.array[wp.vec4],
+    f_probed: wp.array[wp.vec4],
+    # Out
+    q: wp.array[wp.vec4],
+    found: wp.array[wp.float32],
+):
+    """The largest s_i [1/s^2], and the directions that come next."""
+    i = wp.tid()
+    w = inverse_mass[i]
+    if w == 0.0:
+        return
+    # As it was after rounding: far from home it is still the motion that made the forces.
+    d = load_node(probed, i) - load_node(u, i)
+    force = load_node(f, i) - load_node(f_probed, i)
+    square = wp.dot(d, d)
+    length = wp.length(force)
+    if square > 0.0 and length > 0.0 and length <= 3.0e38:
+        keep_largest(w * (wp.dot(d, force) / square), CURVATURE, found)
+        store_node(q, i, force / length)
+
+
+@functools.cache
+def find_strains(Elements: Any) -> wp.Kernel:
+    """The largest entry of C - I = F^T F - I among elements, now and after ``steps`` more at the present rate.
+
+    One element of ``TURNS`` is looked at, others the next time: neighbours, which share nodes, are strained too.
+    """
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def find_strains(
+        # In
+        elements: Elements,
+        u: wp.array[wp.vec4],
+        v: wp.array[wp.vec4],
+        pace: Pace,
+        steps: int,
+        count: int,
+        # Out
+        found: wp.array[wp.float32],
+    ):
+        measurement = int(pace.counts[DONE] / wp.int64(steps))
+        i = wp.tid()
+        t = i * TURNS + measurement % TURNS
+        if t >= count:
+            return
+        g = local_gradient(elements, t, u)
+        rate = local_gradient(elements, t, v)
+        q = frame(elements, t)
+        strain = wp.transpose(q) * g
+        strain = strain + wp.transpose(strain) + wp.transpose(g) * g
+        strain_rate = wp.transpose(q + g) * rate
+        ahead = strain + (float(steps) * float(pace.seconds[DT])) * (strain_rate + wp.transpose(strain_rate))
+        most = float(0.0)
+        for i in range(3):
+            for j in range(3):
+                most = wp.max(most, wp.max(wp.abs(strain[i, j]), wp.abs(ahead[i, j])))
+        keep_largest(most, STRAIN, found)
+
+    return find_strains

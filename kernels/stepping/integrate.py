@@ -1,0 +1,239 @@
+"""Time stepping on the nodes: symplectic Euler, prescribed motion, and the two ways positions and displacements meet.
+
+The state is the displacement from rest: float32 positions would lose what small strains need. Positions are published
+for users after each run of steps, and adopted before the next where somebody changed them.
+
+Loads and positions may be arrays of other programs. Kernels that meet them are there twice: for vec4 arrays, which the
+solver's own are, and for vec3 arrays with any stride.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import load_node, store_node
+
+from .keyframes import key_before
+from .pace import DONE, DT, Pace, length_before, time_after
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def vector_at(vectors: wp.array[wp.vec4], i: int):
+    return load_node(vectors, i)
+
+
+@wp.func
+def vector_at(vectors: wp.array[wp.vec3], i: int):
+    return vectors[i]
+
+
+@wp.func
+def write_vector(vectors: wp.array[wp.vec4], i: int, value: wp.vec3):
+    store_node(vectors, i, value)
+
+
+@wp.func
+def write_vector(vectors: wp.array[wp.vec3], i: int, value: wp.vec3):
+    vectors[i] = value
+
+
+def by_vectors(kernel: wp.Kernel, argument: str) -> dict[type, wp.Kernel]:
+    """A generic kernel for either type of vectors in one of its arrays, chosen here and not anew at every launch."""
+    return {dtype: wp.overload(kernel, {argument: wp.array(dtype=dtype)}) for dtype in (wp.vec3, wp.vec4)}
+
+
+@wp.func
+def is_finite(a: wp.vec3):
+    """False where any component is NaN or infinite."""
+    return wp.abs(a[0]) + wp.abs(a[1]) + wp.abs(a[2]) <= 3.0e38
+
+
+@wp.func
+def symplectic_euler_velocity(
+    v: wp.vec3, force: wp.vec3, inverse_mass: float, gravity: wp.vec3, dt: float, damped: float
+):
+    """(v + dt (f/m + g)) damped, where damped = 1 / (1 + dt damping)."""
+    return (v + dt * (inverse_mass * force + gravity)) * damped
+
+
+@wp.func
+def add_support_work(elastic: wp.vec3, moved: wp.vec3, work: wp.array[wp.float64]):
+    """What a support puts in that moves a node against its elastic force; only where supports move at all."""
+    added = wp.float64(-wp.dot(elastic, moved))
+    if added != wp.float64(0.0):
+        wp.atomic_add(work, 0, added)
+        wp.atomic_add(work, 1, wp.abs(added))
+
+
+@wp.kernel(enable_backward=False)
+def step_symplectic_euler(
+    # In
+    damping: float,
+    gravity: wp.vec3,
+    mass: wp.array[wp.float32],
+    inverse_mass: wp.array[wp.float32],
+    has_load: int,
+    load: wp.array[Any],
+    pace: Pace,
+    offset: int,
+    # In and out
+    f: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    v: wp.array[wp.vec4],
+    # Out
+    reactions: wp.array[wp.vec4],
+    support_work: wp.array[wp.float64],
+    bad_step: wp.array[wp.int64],
+):
+    """v <- (v + dt (f/m + g)) / (1 + dt damping); u <- u + dt v; f <- 0 for the next step to add to.
+
+    After a change of the step forces act for half of the old one and half of the new one.
+
+    ``offset`` is this step's place in a run of recorded ones, whose steps ``pace`` does not count before its end.
+    ``support_work`` adds up what moving supports put in against the elastic forces, and its absolute value [J].
+    A node without inverse mass moves with the velocity it has (zero if fixed), and its support takes what is left of
+    Newton's second law: the weight, the elastic force and the load.
+    """
+    i = wp.tid()
+    dt = float(pace.seconds[DT])
+    kick = dt
+    if offset == 0:
+        kick = 0.5 * (float(length_before(pace)) + dt)
+    elastic = load_node(f, i)
+    force = elastic
+    if has_load != 0:
+        force += vector_at(load, i)
+    w = inverse_mass[i]
+    velocity = load_node(v, i)
+    if w > 0.0:
+        velocity = symplectic_euler_velocity(velocity, force, w, gravity, kick, 1.0 / (1.0 + dt * damping))
+        store_node(v, i, velocity)
+    else:
+        store_node(reactions, i, -(force + mass[i] * gravity))
+        add_support_work(elastic, dt * velocity, support_work)
+    displacement = load_node(u, i) + dt * velocity
+    store_node(u, i, displacement)
+    store_node(f, i, wp.vec3())
+    if not is_finite(displacement):
+        wp.atomic_min(bad_step, 0, pace.counts[DONE] + wp.int64(offset + 1))
+
+
+@wp.kernel(enable_backward=False)
+def set_start(pace: Pace, world_starts: wp.array[wp.float64]):
+    """Let the time of the one world there is begin now."""
+    world_starts[0] = time_after(pace, 0)
+
+
+@wp.kernel(enable_backward=False)
+def follow_trajectory(
+    # In
+    nodes: wp.array[wp.int32],
+    times: wp.array[wp.float64],
+    displacements: wp.array2d[wp.vec3],
+    pace: Pace,
+    world_starts: wp.array[wp.float64],
+    world_node_count: int,
+    offset: int,
+    f: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    # Out
+    v: wp.array[wp.vec4],
+    support_work: wp.array[wp.float64],
+):
+    """Give prescribed nodes the velocity that takes them to their keyframed displacement at the end of the step.
+
+    The work of a step is that of the mean of the forces f at its two ends, by the trapezoidal rule: each force counts
+    with half the motion before it and half the motion after. The step itself counts the latter as a whole.
+    """
+    k = wp.tid()
+    i = nodes[k]
+    start = world_starts[i // world_node_count]
+    t = time_after(pace, offset + 1) - start
+    key, s = key_before(times, t)
+    row = wp.min(k, displacements.shape[1] - 1)
+    a = displacements[key, row]
+    target = a + s * (displacements[key + 1, row] - a)
+    dt = float(pace.seconds[DT])
+    before = dt
+    if offset == 0:
+        before = float(length_before(pace))
+    velocity = (target - load_node(u, i)) / dt
+    add_support_work(load_node(f, i), 0.5 * (before * load_node(v, i) - dt * velocity), support_work)
+    store_node(v, i, velocity)
+
+
+@wp.kernel(enable_backward=False)
+def publish_positions(
+    # In
+    rest: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    # Out
+    positions: wp.array[Any],
+):
+    i = wp.tid()
+    write_vector(positions, i, load_node(rest, i) + load_node(u, i))
+
+
+@wp.kernel(enable_backward=False)
+def adopt_positions(
+    # In
+    rest: wp.array[wp.vec4],
+    positions: wp.array[Any],
+    # In and out
+    u: wp.array[wp.vec4],
+):
+    """Take over the positions that somebody wrote since they were published; untouched ones keep their digits."""
+    i = wp.tid()
+    x = load_node(rest, i)
+    p = vector_at(positions, i)
+    q = x + load_node(u, i)
+    if p[0] != q[0] or p[1] != q[1] or p[2] != q[2]:
+        store_node(u, i, p - x)
+
+
+@wp.kernel(enable_backward=False)
+def reset_nodes(
+    # In
+    chosen: wp.array[wp.int32],
+    world_node_count: int,
+    has_initial: int,
+    initial_u: wp.array[wp.vec4],
+    initial_v: wp.array[wp.vec4],
+    rest: wp.array[wp.vec4],
+    inverse_mass: wp.array[wp.float32],
+    pace: Pace,
+    # Out
+    u: wp.array[wp.vec4],
+    v: wp.array[wp.vec4],
+    positions: wp.array[Any],
+    reactions: wp.array[wp.vec4],
+    world_starts: wp.array[wp.float64],
+):
+    """Put the nodes of chosen worlds back to their initial state, or to rest where there is none.
+
+    Held nodes keep the velocity they were given.
+    """
+    i = wp.tid()
+    world = i // world_node_count
+    if chosen[world] == 0:
+        return
+    if i % world_node_count == 0:
+        world_starts[world] = time_after(pace, 0)
+    displacement = wp.vec3()
+    velocity = wp.vec3()
+    if has_initial != 0:
+        displacement = load_node(initial_u, i)
+        velocity = load_node(initial_v, i)
+    if inverse_mass[i] > 0.0:
+        store_node(v, i, velocity)
+    store_node(u, i, displacement)
+    write_vector(positions, i, load_node(rest, i) + displacement)
+    store_node(reactions, i, wp.vec3())
+
+
+STEP_SYMPLECTIC_EULER = by_vectors(step_symplectic_euler, "load")
+PUBLISH_POSITIONS = by_vectors(publish_positions, "positions")
+ADOPT_POSITIONS = by_vectors(adopt_positions, "positions")
+RESET_NODES = by_vectors(reset_nodes, "positions")

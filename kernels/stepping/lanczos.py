@@ -1,0 +1,150 @@
+"""Vectors of Lanczos' iteration on M^-1/2 K M^-1/2, one vec4 a node: what it does between two evaluations of forces.
+
+Nothing comes back to the host before the last step. Sums are float64, and always in the same order: of parts, then of
+sums of parts.
+"""
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import load_node, store_node
+
+wp.set_module_options({"enable_backward": False})
+
+#: Partial sums, each a thread's, at most; and what these are folded into.
+PARTS = 16384
+FOLDED = 128
+
+
+@wp.kernel(enable_backward=False)
+def random_motion(seed: int, inverse_mass: wp.array[wp.float32], q: wp.array[wp.vec4]):
+    """Normally distributed numbers at nodes that are free to move."""
+    i = wp.tid()
+    state = wp.rand_init(seed, i)
+    a = wp.vec3(wp.randn(state), wp.randn(state), wp.randn(state))
+    if inverse_mass[i] == 0.0:
+        a = wp.vec3()
+    store_node(q, i, a)
+
+
+@wp.kernel(enable_backward=False)
+def largest_motions(inverse_mass: wp.array[wp.float32], q: wp.array[wp.vec4], largest: wp.array[wp.float64]):
+    """Largest component of M^-1/2 q among every ``len(largest)``-th node."""
+    part = wp.tid()
+    most = float(0.0)
+    i = part
+    while i < q.shape[0]:
+        a = wp.sqrt(inverse_mass[i]) * load_node(q, i)
+        most = wp.max(most, wp.max(wp.abs(a[0]), wp.max(wp.abs(a[1]), wp.abs(a[2]))))
+        i += largest.shape[0]
+    largest[part] = wp.float64(most)
+
+
+@wp.kernel(enable_backward=False)
+def inner_products(a: wp.array[wp.vec4], b: wp.array[wp.vec4], sums: wp.array[wp.float64]):
+    """Partial sums of a . b."""
+    part = wp.tid()
+    total = wp.float64(0.0)
+    i = part
+    while i < a.shape[0]:
+        x = load_node(a, i)
+        y = load_node(b, i)
+        for axis in range(3):
+            # What fits into float32 need not do so once multiplied.
+            total += wp.float64(x[axis]) * wp.float64(y[axis])
+        i += sums.shape[0]
+    sums[part] = total
+
+
+@wp.kernel(enable_backward=False)
+def fold(parts: wp.array[wp.float64], sums: wp.array[wp.float64], largest: wp.array[wp.float64]):
+    """Sums and largest of every ``FOLDED``-th part."""
+    k = wp.tid()
+    total = wp.float64(0.0)
+    most = wp.float64(0.0)
+    for i in range(k, parts.shape[0], FOLDED):
+        total += parts[i]
+        most = wp.max(most, parts[i])
+    sums[k] = total
+    largest[k] = most
+
+
+@wp.kernel(enable_backward=False)
+def take_scale(probe: float, largest: wp.array[wp.float64], scale: wp.array[wp.float32]):
+    """By what motions are multiplied so that the largest of them is ``probe``."""
+    most = wp.float64(0.0)
+    for k in range(FOLDED):
+        most = wp.max(most, largest[k])
+    scale[0] = 1.0
+    if most > wp.float64(0.0):
+        scale[0] = float(wp.float64(probe) / most)
+
+
+@wp.kernel(enable_backward=False)
+def take_sum(sums: wp.array[wp.float64], root: int, place: int, numbers: wp.array[wp.float64]):
+    """A sum, or its root, into its place."""
+    total = wp.float64(0.0)
+    for k in range(FOLDED):
+        total += sums[k]
+    if root != 0:
+        total = wp.sqrt(total)
+    numbers[place] = total
+
+
+@wp.kernel(enable_backward=False)
+def probe_motion(
+    scale: wp.array[wp.float32], inverse_mass: wp.array[wp.float32], q: wp.array[wp.vec4], u: wp.array[wp.vec4]
+):
+    """u = scale M^-1/2 q."""
+    i = wp.tid()
+    store_node(u, i, (scale[0] * wp.sqrt(inverse_mass[i])) * load_node(q, i))
+
+
+@wp.kernel(enable_backward=False)
+def apply_stiffness(
+    # In
+    scale: wp.array[wp.float32],
+    off: wp.array[wp.float64],
+    step: int,
+    inverse_mass: wp.array[wp.float32],
+    f: wp.array[wp.vec4],
+    before: wp.array[wp.vec4],
+    # Out
+    w: wp.array[wp.vec4],
+):
+    """w = M^-1/2 K M^-1/2 q - off[step] before, from the forces f = -scale K M^-1/2 q.
+
+    Nothing is ``before`` step 0.
+    """
+    i = wp.tid()
+    a = (-wp.sqrt(inverse_mass[i]) / scale[0]) * load_node(f, i)
+    if step > 0:
+        a -= float(off[step]) * load_node(before, i)
+    store_node(w, i, a)
+
+
+@wp.kernel(enable_backward=False)
+def take_away(numbers: wp.array[wp.float64], place: int, a: wp.array[wp.vec4], b: wp.array[wp.vec4]):
+    """b -= number a."""
+    i = wp.tid()
+    store_node(b, i, load_node(b, i) - float(numbers[place]) * load_node(a, i))
+
+
+@wp.kernel(enable_backward=False)
+def divide_by(numbers: wp.array[wp.float64], place: int, a: wp.array[wp.vec4]):
+    """a /= number, if that is not zero."""
+    i = wp.tid()
+    if numbers[place] > wp.float64(0.0):
+        store_node(a, i, float(wp.float64(1.0) / numbers[place]) * load_node(a, i))
+
+
+@wp.kernel(enable_backward=False)
+def add_scaled(factor: float, a: wp.array[wp.vec4], b: wp.array[wp.vec4]):
+    """b += factor a."""
+    i = wp.tid()
+    store_node(b, i, load_node(b, i) + factor * load_node(a, i))
+
+
+@wp.kernel(enable_backward=False)
+def scale_by(factor: float, a: wp.array[wp.vec4]):
+    i = wp.tid()
+    store_node(a, i, factor * load_node(a, i))

@@ -1,0 +1,395 @@
+"""An organ's steps in thread blocks that stay: each block keeps its patch of nodes, and many steps are one launch.
+
+A block computes every element that touches a node of its own, those between patches too, so that no forces travel and
+no block waits for all others. What travels are displacements: a block publishes those of its nodes, and waits for the
+other corners of its elements, its halo. Each goes as one word of 16 bytes with the number of its step in the last four;
+who polls it has the value as soon as it sees the number, without fences or counters. Two buffers take turns: a block
+publishes step n + 1 only when it has seen step n of all its neighbours, who then have read its step n - 1.
+
+All blocks of a launch must be on the card at once, one to a multiprocessor. Sums have one order, so runs are
+reproducible bit by bit. CUDA only; ``solvers.patch_layout`` says which block does what.
+"""
+
+import functools
+from dataclasses import dataclass
+
+import warp as wp
+
+from warp_corot.kernels.corotated.algebraic import stretch_stress, turned_stress
+from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.math.matrices import column, identity3
+from warp_corot.kernels.tables.shapes import fingerprint
+
+from .block import LOAD, STORE, lowest_bit, number_in, shuffle_down, synchronize_any, synchronize_block
+from .integrate import add_support_work, is_finite, symplectic_euler_velocity, vector_at
+from .pace import DONE, DT, Pace, length_before, time_after
+
+wp.set_module_options({"enable_backward": False})
+
+WARP = 32
+#: How often a block looks for a displacement that does not come, some seconds, before it gives up.
+MOST_LOOKS = 1 << 22
+#: What a row of ``PatchBody.rest`` is: the inverse of the rest edges, row by row, then the volume.
+VOLUME_ROW = 9
+#: What a thread keeps of an element: the same, with the volume times mu and times lambda.
+CONSTANTS = 11
+
+row = wp.types.vector(length=CONSTANTS, dtype=wp.float32)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a kernel is generated for.
+
+    Attributes:
+        threads: Threads a block.
+        elements, halo: Elements, and nodes of the halo, a thread.
+        lanes: Threads that add up one node.
+        nodes, slots: Room for displacements and for forces in shared memory; one more slot takes what nobody adds up.
+        overlaps: Whether a block computes the elements that need no halo before it waits for that.
+    """
+
+    threads: int
+    elements: int
+    halo: int
+    lanes: int
+    nodes: int
+    slots: int
+    overlaps: bool = True
+
+    @property
+    def floats(self) -> int:
+        """What all of that takes of shared memory, in numbers of four bytes."""
+        return 3 * (self.nodes + self.slots + 1)
+
+
+@wp.struct
+class PatchBody:
+    """A body by patches; see ``solvers.patch_layout.Patches``."""
+
+    own: wp.array[wp.int32]  # [N]
+    own_start: wp.array[wp.int32]  # [patches + 1], as the other starts
+    halo: wp.array[wp.int32]
+    halo_start: wp.array[wp.int32]
+    elements: wp.array[wp.int32]  # [E]
+    element_start: wp.array[wp.int32]
+    interior: wp.array[wp.int32]  # [patches] how many of a patch's elements need no halo; they come first
+    corners: wp.array[wp.uint64]  # [E] the four corners' places among the patch's nodes, 16 bits each
+    slots: wp.array[wp.uint64]  # [E] the same of their forces
+    bases: wp.array[wp.int32]
+    base_start: wp.array[wp.int32]
+    rest: wp.array2d[wp.float32]  # [10, E] see ``VOLUME_ROW``
+    # Keyframes of all trajectories, one after another.
+    trajectory: wp.array[wp.int32]  # [N] which one a node follows, -1: none
+    place: wp.array[wp.int32]  # [N] its column there
+    key_start: wp.array[wp.int32]  # [trajectories + 1] into ``times``
+    value_start: wp.array[wp.int32]  # [trajectories] into ``values``, whose rows are of ``columns``
+    columns: wp.array[wp.int32]  # [trajectories]
+    times: wp.array[wp.float64]
+    values: wp.array[wp.vec3]
+
+
+@wp.struct
+class Exchange:
+    """What blocks tell one another."""
+
+    published: wp.array[wp.vec4]  # [2 N] displacements of even and of odd steps, the step's number in the last bits
+    begun: wp.array[wp.uint32]  # [patches] the number of the next launch's first state
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const unsigned long long low = ((unsigned long long)__float_as_uint(value[1]) << 32) | __float_as_uint(value[0]);
+    const unsigned long long high = ((unsigned long long)number << 32) | __float_as_uint(value[2]);
+    asm volatile("{ .reg .b128 all; mov.b128 all, {%1, %2}; st.relaxed.gpu.global.b128 [%0], all; }"
+        :: "l"(&wp::index(published, i)), "l"(low), "l"(high) : "memory");
+#endif
+""")
+def publish(published: wp.array[wp.vec4], i: int, value: wp.vec3, number: wp.uint32):
+    """Write a displacement and its number at once."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    unsigned long long low = 0, high = 0;
+    for (int look = 0; look < {MOST_LOOKS}; ++look) {{
+        asm volatile("{{ .reg .b128 all; ld.relaxed.gpu.global.b128 all, [%2]; mov.b128 {{%0, %1}}, all; }}"
+            : "=l"(low), "=l"(high) : "l"(&wp::index(published, i)) : "memory");
+        if ((unsigned)(high >> 32) == number)
+            return wp::vec_t<4, wp::float32>(__uint_as_float((unsigned)low), __uint_as_float((unsigned)(low >> 32)),
+                                             __uint_as_float((unsigned)high), 0.0f);
+    }}
+#endif
+    return wp::vec_t<4, wp::float32>(0.0f, 0.0f, 0.0f, 1.0f);
+""")
+def await_displacement(published: wp.array[wp.vec4], i: int, number: wp.uint32) -> wp.vec4:
+    """The displacement of this number, and 0; or 1 in the last place if it did not come."""
+    ...
+
+
+def vectors_at(first: int) -> wp.Function:
+    """An array of vectors in the block's dynamic shared memory from the ``first`` one on; see ``block.shared_vectors``.
+
+    The kernel reserves the memory as a tile, with which Warp asks for more than 48 KB where it takes that.
+    """
+    snippet = f"""
+#if defined(__CUDA_ARCH__)
+    extern __shared__ char dynamic_smem_base[];
+    float* at = (float*)dynamic_smem_base + 3 * (i + {first});
+    if (access == {STORE}) {{
+        at[0] = value[0]; at[1] = value[1]; at[2] = value[2];
+        return value;
+    }}
+    return wp::vec_t<3, wp::float32>(at[0], at[1], at[2]);
+#else
+    return value;
+#endif
+"""
+
+    @wp.func_native(snippet)
+    def memory(access: int, i: int, value: wp.vec3) -> wp.vec3: ...
+
+    return memory
+
+
+@wp.func
+def rest_inverse(c: row):
+    return wp.mat33(c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8])
+
+
+@wp.func
+def key_from(times: wp.array[wp.float64], key: int, last: int, t: wp.float64):
+    """As ``keyframes.key_before``, from an earlier key on, where the last but one is ``last``."""
+    found = key
+    while found < last and times[found + 1] <= t:
+        found += 1
+    share = (t - times[found]) / (times[found + 1] - times[found])
+    return found, float(wp.clamp(share, wp.float64(0.0), wp.float64(1.0)))
+
+
+@functools.cache
+def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
+    """Symplectic Euler steps of the corotated model with own rotations; launch with ``layout.threads`` a patch.
+
+    Args:
+        load_vectors: What loads are an array of, vec3 or vec4.
+    """
+    threads, each, halo_each, lanes = layout.threads, layout.elements, layout.halo, layout.lanes
+    slot, displacement = vectors_at(0), vectors_at(layout.slots + 1)
+    words = wp.types.vector(length=each, dtype=wp.uint64)
+    numbers = wp.types.matrix(shape=(each, CONSTANTS), dtype=wp.float32)
+    places = wp.types.vector(length=halo_each, dtype=wp.int32)
+
+    @wp.func
+    def displacement_gradient(corners: wp.uint64, c: row):
+        x0 = displacement(wp.static(LOAD), number_in(corners, 0), wp.vec3())
+        x1 = displacement(wp.static(LOAD), number_in(corners, 1), wp.vec3())
+        x2 = displacement(wp.static(LOAD), number_in(corners, 2), wp.vec3())
+        x3 = displacement(wp.static(LOAD), number_in(corners, 3), wp.vec3())
+        return wp.matrix_from_cols(x1 - x0, x2 - x0, x3 - x0) * rest_inverse(c)
+
+    @wp.func
+    def store_forces(targets: wp.uint64, c: row, p: wp.mat33):
+        h = p * wp.transpose(rest_inverse(c))
+        f1 = -column(h, 0)
+        f2 = -column(h, 1)
+        f3 = -column(h, 2)
+        slot(wp.static(STORE), number_in(targets, 0), -(f1 + f2 + f3))
+        slot(wp.static(STORE), number_in(targets, 1), f1)
+        slot(wp.static(STORE), number_in(targets, 2), f2)
+        slot(wp.static(STORE), number_in(targets, 3), f3)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(threads, 1))
+    def step_patches(
+        # In
+        body: PatchBody,
+        steps: int,
+        damping: float,
+        gravity: wp.vec3,
+        mu: wp.array[wp.float32],
+        lam: wp.array[wp.float32],
+        stride: int,
+        mass: wp.array[wp.float32],
+        inverse_mass: wp.array[wp.float32],
+        has_load: int,
+        load: wp.array[load_vectors],
+        pace: Pace,
+        world_starts: wp.array[wp.float64],
+        # In and out
+        exchange: Exchange,
+        u: wp.array[wp.vec4],
+        v: wp.array[wp.vec4],
+        # Out
+        reactions: wp.array[wp.vec4],
+        support_work: wp.array[wp.float64],
+        bad_step: wp.array[wp.int64],
+    ):
+        _generated_from = wp.static(fingerprint(layout))
+        block = wp.tid() // wp.static(threads)
+        thread = wp.tid() % wp.static(threads)
+        node_count = body.own.shape[0]
+        dt = float(pace.seconds[DT])
+        before = float(length_before(pace))
+        damped = 1.0 / (1.0 + dt * damping)
+        number = exchange.begun[block]
+
+        # The node that the thread adds up, with its neighbours; the first of them moves it.
+        first_own = body.own_start[block]
+        own_count = body.own_start[block + 1] - first_own
+        place = thread // wp.static(lanes)
+        moves = place < own_count and thread % wp.static(lanes) == 0
+        i = body.own[first_own + wp.min(place, own_count - 1)]
+        x = load_node(u, i)
+        velocity = load_node(v, i)
+        w = inverse_mass[i]
+        load_here = wp.vec3()
+        if has_load != 0:
+            load_here = vector_at(load, i)
+        trajectory = body.trajectory[i]
+        key = int(0)
+        last_key = int(0)
+        if trajectory >= 0:
+            key = body.key_start[trajectory]
+            last_key = body.key_start[trajectory + 1] - 2
+        warp = thread // wp.static(WARP)
+        bases = body.base_start[block]
+        warps = body.base_start[block + 1] - bases - 1
+        first_slot = body.bases[bases + wp.min(warp, warps)] + thread % wp.static(WARP)
+        rows = (body.bases[bases + wp.min(warp + 1, warps)] - first_slot + thread % wp.static(WARP)) // wp.static(WARP)
+
+        halo_count = body.halo_start[block + 1] - body.halo_start[block]
+        halo = places()
+        for k in range(wp.static(halo_each)):
+            at = thread + k * wp.static(threads)
+            if at < halo_count:
+                halo[k] = body.halo[body.halo_start[block] + at]
+
+        first_element = body.element_start[block]
+        element_count = body.element_start[block + 1] - first_element
+        interior_count = int(0)
+        if wp.static(layout.overlaps):
+            interior_count = body.interior[block]
+        corners = words()
+        targets = words()
+        constants = numbers()
+        for k in range(wp.static(each)):
+            at = thread + k * wp.static(threads)
+            if at < element_count:
+                e = first_element + at
+                corners[k] = body.corners[e]
+                targets[k] = body.slots[e]
+                for j in range(9):
+                    constants[k, j] = body.rest[j, e]
+                volume = body.rest[wp.static(VOLUME_ROW), e]
+                t = body.elements[e] * stride
+                constants[k, 9] = volume * mu[t]
+                constants[k, 10] = volume * lam[t]
+
+        # ``slot`` and ``displacement``; places that no corner has are read too, and stay zero.
+        _memory = wp.tile_zeros(shape=wp.static(layout.floats), dtype=wp.float32, storage="shared")
+        synchronize_block()
+        if moves:
+            displacement(wp.static(STORE), place, x)
+            publish(exchange.published, int(number & wp.uint32(1)) * node_count + i, x, number)
+
+        gave_up = int(0)
+        step = int(0)
+        while step < steps:
+            buffer = int(number & wp.uint32(1)) * node_count
+            # First the elements between own nodes, while the halo is on its way, then the others.
+            begin = int(0)
+            end = int(interior_count)
+            phase = int(wp.static(0 if layout.overlaps else 1))
+            left_out = int(0)
+            while phase < 2:
+                if phase == 0:
+                    synchronize_block()
+                else:
+                    begin = interior_count
+                    end = element_count
+                    for k in range(wp.static(halo_each)):
+                        at = thread + k * wp.static(threads)
+                        if at < halo_count:
+                            told = await_displacement(exchange.published, buffer + halo[k], number)
+                            displacement(wp.static(STORE), own_count + at, wp.vec3(told[0], told[1], told[2]))
+                            if told[3] != 0.0:
+                                gave_up = 1
+                    gave_up = synchronize_any(gave_up)
+                for k in range(wp.static(each)):
+                    at = thread + k * wp.static(threads)
+                    if at >= begin and at < end:
+                        c = constants[k]
+                        p, trusted = stretch_stress(displacement_gradient(corners[k], c), c[9], c[10])
+                        if trusted:
+                            store_forces(targets[k], c, p)
+                        else:
+                            left_out |= wp.static(1 << k)
+                phase += 1
+            if gave_up != 0:
+                break
+            # Elements that were left out, once a step and in one place: a warp's threads do theirs at the same time.
+            while left_out != 0:
+                chosen = lowest_bit(left_out)
+                left_out = left_out & (left_out - 1)
+                its_corners = corners[0]
+                its_targets = targets[0]
+                c = constants[0]
+                for k in range(1, wp.static(each)):
+                    if chosen == k:
+                        its_corners = corners[k]
+                        its_targets = targets[k]
+                        c = constants[k]
+                f = identity3() + displacement_gradient(its_corners, c)
+                store_forces(its_targets, c, turned_stress(f, c[9], c[10]))
+            synchronize_block()
+
+            elastic = wp.vec3()
+            row = int(0)
+            while row < rows:
+                elastic += slot(wp.static(LOAD), first_slot + row * wp.static(WARP), elastic)
+                row += 1
+            distance = int(wp.static(lanes // 2))
+            while distance > 0:
+                elastic += shuffle_down(elastic, distance)
+                distance = distance // 2
+            number = number + wp.uint32(1)
+            if moves:
+                if trajectory >= 0:
+                    t_end = time_after(pace, step + 1) - world_starts[0]
+                    key, share = key_from(body.times, key, last_key, t_end)
+                    columns = body.columns[trajectory]
+                    at = body.value_start[trajectory] + (key - body.key_start[trajectory]) * columns
+                    at += wp.min(body.place[i], columns - 1)
+                    value = body.values[at]
+                    target = value + share * (body.values[at + columns] - value)
+                    towards = (target - x) / dt
+                    # As ``follow_trajectory``: each force counts with half the motion before it and half after.
+                    add_support_work(elastic, 0.5 * (before * velocity - dt * towards), support_work)
+                    velocity = towards
+                force = elastic + load_here
+                if w > 0.0:
+                    velocity = symplectic_euler_velocity(velocity, force, w, gravity, 0.5 * (before + dt), damped)
+                else:
+                    add_support_work(elastic, dt * velocity, support_work)
+                    if step == steps - 1:
+                        store_node(reactions, i, -(force + mass[i] * gravity))
+                x = x + dt * velocity
+                displacement(wp.static(STORE), place, x)
+                publish(exchange.published, int(number & wp.uint32(1)) * node_count + i, x, number)
+                if not is_finite(x):
+                    wp.atomic_min(bad_step, 0, pace.counts[DONE] + wp.int64(step + 1))
+            before = dt
+            step += 1
+
+        if gave_up != 0:
+            # What could not be computed must not be taken for a state.
+            x = wp.vec3(wp.nan, wp.nan, wp.nan)
+            wp.atomic_min(bad_step, 0, pace.counts[DONE] + wp.int64(step + 1))
+        if moves:
+            store_node(u, i, x)
+            store_node(v, i, velocity)
+        if thread == 0:
+            exchange.begun[block] = exchange.begun[block] + wp.uint32(steps + 1)
+
+    return step_patches

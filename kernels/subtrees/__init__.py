@@ -1,0 +1,1 @@
+"""Complete subtrees of a forest as units of work."""

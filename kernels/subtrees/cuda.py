@@ -1,0 +1,380 @@
+"""Corotated forces of complete subtrees on CUDA: one thread a subtree, eight leaves in registers.
+
+Three things make it fast. Forces are summed over the eight leaves in registers, and over a group of eight subtrees in
+shared memory, by a table that tells each lane which slots to add up, so that nothing is added atomically twice. What
+leaves for global memory are 16-byte vector reductions where the card has them. And the stress comes of a root of one
+polynomial (``corotated.algebraic``), the same way for small strains and large ones.
+
+A leaf that is flat, turned over or far from order one adds nothing. Its bit is set in its subtree's byte, and the
+subtree is put on a list; ``repair`` does those leaves. A warp most of whose leaves were left out before puts all of
+them on the list untried, but for now and then. Bodies of one type of subtree alone have a kernel of their own; all
+others are one launch, in which each thread block looks up what it is to do.
+"""
+
+import functools
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import (
+    ADD_FORCE,
+    FRAME_SHIFT,
+    LEVEL_MASK,
+    ForestElements,
+    Subtrees,
+    add_force,
+    frame,
+    gradient_of,
+    load_node,
+    mirror_sign,
+    nodal_forces,
+    node_displacements,
+)
+from warp_corot.kernels.elements.merging import add_four_forces
+from warp_corot.kernels.tables.subtree import GROUP_NODES, SLOT_STRIDE, group_slots, group_sources
+
+from .forces import ALL_LEAVES, leaf_stress, mat10, near_forces, shared_forces
+from .repair import LeftOut, append, is_hopeless, list_of, reserve
+
+wp.set_module_options({"enable_backward": False})
+
+BLOCK = 128
+#: Blocks that a multiprocessor's registers must have room for, by type.
+RESIDENT = (6, 5, 5)
+#: What ``Stretch.shape`` is for leaves in no subtree.
+FLAT = 3
+
+
+@wp.struct
+class Stretch:
+    """Subtrees of one type, or leaves in none, that neighbouring thread blocks go through."""
+
+    begin: int  # the first of these blocks
+    count: int
+    shape: int
+    grouped: int
+    subtrees: Subtrees
+    flagged: wp.array[wp.uint8]
+
+
+def _numbers(values: list[int]) -> str:
+    return ", ".join(map(str, values))
+
+
+def _table(name: str, rows: list[list[int]]) -> str:
+    numbers = ", ".join(f"{{{_numbers(row)}}}" for row in rows)
+    return f"static const unsigned char {name}[{len(rows)}][{len(rows[0])}] = {{{numbers}}};"
+
+
+def _load_snippet(shapes: tuple[int, ...]) -> str:
+    """Stage a group's displacements in shared memory, each read once, and hand every lane its subtree's ten."""
+    slots = [[place for ten in group_slots(shape) for place in ten] for shape in shapes]
+    return f"""
+#if defined(__CUDA_ARCH__)
+    {_table("slot", slots)}
+    __shared__ float4 staged[{BLOCK // 8}][{GROUP_NODES + 1}];
+    const int lane = threadIdx.x & 7;
+    const int g = threadIdx.x >> 3;
+    #pragma unroll
+    for (int r = 0; r < {GROUP_NODES // 8}; ++r) {{
+        const int node = wp::index(nodes, group, 8 * r + lane);
+        if (node >= 0) staged[g][8 * r + lane] = *reinterpret_cast<const float4*>(&wp::index(u, node));
+    }}
+    __syncwarp();
+    wp::mat_t<10, 3, wp::float32> x;
+    #pragma unroll
+    for (int k = 0; k < 10; ++k) {{
+        const float4 a = staged[g][slot[row][10 * lane + k]];
+        x.data[k][0] = a.x; x.data[k][1] = a.y; x.data[k][2] = a.z;
+    }}
+    return x;
+#else
+    return wp::mat_t<10, 3, wp::float32>();
+#endif
+"""
+
+
+def _merge_snippet(shapes: tuple[int, ...]) -> str:
+    """Sum a group's forces in shared memory and reduce each node's once; a lane sums every eighth node's."""
+    sources = [group_sources(shape) for shape in shapes]
+    empty = 10  # the spare slot of the first subtree, kept zero
+    tables: list[list[int]] = [[] for _ in shapes]
+    rounds = ""
+    for r in range(GROUP_NODES // 8):
+        lists = [of_shape[8 * r : 8 * r + 8] for of_shape in sources]
+        longest = max(len(slots) for of_shape in lists for slots in of_shape)
+        rounds += f"""
+    {{
+        float4 sum = make_float4(0.f, 0.f, 0.f, 0.f);
+        #pragma unroll
+        for (int m = 0; m < {longest}; ++m) {{
+            const float4 a = part[g][source[row][{len(tables[0])} + 8 * m + lane]];
+            sum.x += a.x; sum.y += a.y; sum.z += a.z;
+        }}
+        const int node = wp::index(targets, group, {8 * r} + lane);
+        const wp::vec_t<3, wp::float32> force(sum.x, sum.y, sum.z);
+        if (node >= 0) {{ {ADD_FORCE} }}
+    }}"""
+        for table, of_shape in zip(tables, lists, strict=True):
+            table += [slots[m] if m < len(slots) else empty for m in range(longest) for slots in of_shape]
+    return f"""
+#if defined(__CUDA_ARCH__)
+    {_table("source", tables)}
+    __shared__ float4 part[{BLOCK // 8}][{8 * SLOT_STRIDE + 1}];
+    const int lane = threadIdx.x & 7;
+    const int g = threadIdx.x >> 3;
+    #pragma unroll
+    for (int k = 0; k < 10; ++k)
+        part[g][{SLOT_STRIDE} * lane + k] = make_float4(x.data[k][0], x.data[k][1], x.data[k][2], 0.f);
+    if (lane == 0) part[g][{empty}] = make_float4(0.f, 0.f, 0.f, 0.f);
+    __syncwarp();
+    {rounds}
+#endif
+"""
+
+
+@functools.cache
+def _group_memory(shapes: tuple[int, ...]) -> tuple[wp.Function, wp.Function]:
+    """How displacements of subtrees in groups come in and their forces go out; ``row`` says which of the shapes."""
+
+    @wp.func_native(_load_snippet(shapes))
+    def load_group(nodes: wp.array2d[wp.int32], group: int, row: int, u: wp.array[wp.vec4]) -> mat10: ...
+
+    @wp.func_native(_merge_snippet(shapes))
+    def merge_group(targets: wp.array2d[wp.int32], group: int, row: int, x: mat10, f: wp.array[wp.vec4]): ...
+
+    return load_group, merge_group
+
+
+@wp.func
+def load_single(subtrees: Subtrees, s: int, u: wp.array[wp.vec4]):
+    x = mat10()
+    for k in range(10):
+        x[k] = load_node(u, subtrees.nodes[k, s])
+    return x
+
+
+@wp.func
+def add_single(subtrees: Subtrees, s: int, g: mat10, f: wp.array[wp.vec4]):
+    for k in range(10):
+        add_force(f, subtrees.targets[k, s], g[k])
+
+
+@functools.cache
+def memory_of(shape: int, grouped: bool) -> tuple[wp.Function, wp.Function]:
+    """How a subtree's displacements come in and its forces go out."""
+    if not grouped:
+        return load_single, add_single
+    load_group, merge_group = _group_memory((shape,))
+
+    @wp.func
+    def load(subtrees: Subtrees, s: int, u: wp.array[wp.vec4]):
+        return load_group(subtrees.nodes, s // 8, 0, u)
+
+    @wp.func
+    def add(subtrees: Subtrees, s: int, g: mat10, f: wp.array[wp.vec4]):
+        merge_group(subtrees.targets, s // 8, 0, g, f)
+
+    return load, add
+
+
+@functools.cache
+def scatter_subtrees_own(
+    shape: int, grouped: bool, uniform: bool, listed: bool, tolerance: float | None = None
+) -> wp.Kernel:
+    """Corotated forces of subtrees of one type, every leaf with its own rotation. Launch with block_dim BLOCK.
+
+    ``listed`` says whether subtrees with leaves that are left out are put on a list, and whether what ``flagged`` has
+    from before may tell how to go about it. With a ``tolerance`` the root's rotation is taken where it is near enough
+    (``forces.shared_forces``).
+    """
+    load, add = memory_of(shape, grouped)
+    forces = near_forces(shape, uniform, tolerance)
+    resident = RESIDENT[shape] if uniform and tolerance is None else min(RESIDENT)
+
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        grid_stride=False,
+        launch_bounds=(BLOCK, resident),
+    )
+    def scatter_subtrees_own(
+        # In
+        subtrees: Subtrees,
+        mu: wp.array[wp.float32],
+        lam: wp.array[wp.float32],
+        u: wp.array[wp.vec4],
+        # In and out
+        f: wp.array[wp.vec4],
+        flagged: wp.array[wp.uint8],
+        left_out: LeftOut,
+    ):
+        s = wp.tid()
+        before = int(0)
+        if wp.static(listed):
+            before = int(flagged[s])
+        code = subtrees.code[s]
+        h = 0.5 * subtrees.size[(code & LEVEL_MASK) // 3]
+        mirror = mirror_sign(code)
+        q = subtrees.frames[code >> FRAME_SHIFT]
+        x = load(subtrees, s, u)
+        hopeless = bool(False)
+        if wp.static(listed):
+            hopeless = is_hopeless(left_out, s, before)
+        if hopeless:
+            to_come = subtrees.code.shape[0] - s
+            place = reserve(left_out, list_of(s // BLOCK), True, to_come)
+            append(left_out, list_of(s // BLOCK), place, subtrees.first[s], ALL_LEAVES, to_come)
+            return
+        g, mask = forces(x, q, h, mirror, mu, lam, wp.where(wp.static(uniform), 0, subtrees.first[s]))
+        flagged[s] = wp.uint8(mask)
+        reserved = int(0)
+        if wp.static(listed):
+            reserved = reserve(left_out, list_of(s // BLOCK), mask != 0, subtrees.code.shape[0] - s)
+        add(subtrees, s, g, f)
+        if wp.static(listed):
+            append(left_out, list_of(s // BLOCK), reserved, subtrees.first[s], mask, subtrees.code.shape[0] - s)
+
+    return scatter_subtrees_own
+
+
+@functools.cache
+def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: bool, listed: bool) -> wp.Kernel:
+    """Corotated forces of subtrees whose leaves share a rotation: the subtree root's, or a given one from further up.
+
+    Launch with block_dim BLOCK.
+    """
+    load, add = memory_of(shape, grouped)
+    forces = shared_forces(shape, uniform, given)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    def scatter_subtrees_shared(
+        # In
+        subtrees: Subtrees,
+        mu: wp.array[wp.float32],
+        lam: wp.array[wp.float32],
+        u: wp.array[wp.vec4],
+        rotations: wp.array[wp.mat33],
+        unit: wp.array[wp.int32],
+        # Out
+        f: wp.array[wp.vec4],
+        flagged: wp.array[wp.uint8],
+        left_out: LeftOut,
+    ):
+        s = wp.tid()
+        code = subtrees.code[s]
+        h = 0.5 * subtrees.size[(code & LEVEL_MASK) // 3]
+        mirror = mirror_sign(code)
+        q = subtrees.frames[code >> FRAME_SHIFT]
+        x = load(subtrees, s, u)
+        turn = wp.mat33()
+        if wp.static(given):
+            turn = rotations[unit[s]] * q
+        g, mask = forces(x, q, h, mirror, turn, mu, lam, wp.where(wp.static(uniform), 0, subtrees.first[s]))
+        if wp.static(not given):
+            flagged[s] = wp.uint8(mask)
+        reserved = int(0)
+        if wp.static(listed and not given):
+            reserved = reserve(left_out, list_of(s // BLOCK), mask != 0, subtrees.code.shape[0] - s)
+        add(subtrees, s, g, f)
+        if wp.static(listed and not given):
+            append(left_out, list_of(s // BLOCK), reserved, s, mask, subtrees.code.shape[0] - s)
+
+    return scatter_subtrees_shared
+
+
+# --- all of a body in one launch ------------------------------------------------------------------------------------
+
+
+@functools.cache
+def _scatter_subtree(shape: int, uniform: bool, tolerance: float | None) -> wp.Function:
+    """One subtree of a stretch; all shapes share the memory that groups meet in."""
+    load_group, merge_group = _group_memory((0, 1, 2))
+    forces = near_forces(shape, uniform, tolerance)
+
+    @wp.func
+    def scatter_subtree(
+        subtrees: Subtrees,
+        s: int,
+        grouped: bool,
+        mu: wp.array[wp.float32],
+        lam: wp.array[wp.float32],
+        u: wp.array[wp.vec4],
+        f: wp.array[wp.vec4],
+    ):
+        code = subtrees.code[s]
+        h = 0.5 * subtrees.size[(code & LEVEL_MASK) // 3]
+        q = subtrees.frames[code >> FRAME_SHIFT]
+        x = mat10()
+        if grouped:
+            x = load_group(subtrees.nodes, s // 8, wp.static(shape), u)
+        if not grouped:
+            x = load_single(subtrees, s, u)
+        material = wp.where(wp.static(uniform), 0, subtrees.first[s])
+        g, mask = forces(x, q, h, mirror_sign(code), mu, lam, material)
+        if grouped:
+            merge_group(subtrees.targets, s // 8, wp.static(shape), g, f)
+        else:
+            add_single(subtrees, s, g, f)
+        return mask
+
+    return scatter_subtree
+
+
+@functools.cache
+def scatter_stretches(uniform: bool, tolerance: float | None = None) -> wp.Kernel:
+    """Corotated forces of all subtrees and other leaves of a body, every leaf with its own rotation.
+
+    Launch with block_dim BLOCK and whole blocks.
+    """
+    subtree0, subtree1, subtree2 = (_scatter_subtree(shape, uniform, tolerance) for shape in range(3))
+    add_neighbours = add_four_forces(2)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, min(RESIDENT)))
+    def scatter_stretches(
+        # In
+        stretches: wp.array[Stretch],
+        flat: ForestElements,
+        flat_leaves: wp.array[wp.int32],
+        mu: wp.array[wp.float32],
+        lam: wp.array[wp.float32],
+        u: wp.array[wp.vec4],
+        # Out
+        f: wp.array[wp.vec4],
+        left_out: LeftOut,
+    ):
+        block = wp.tid() // BLOCK
+        k = int(stretches.shape[0] - 1)
+        while stretches[k].begin > block:
+            k -= 1
+        s = wp.tid() - stretches[k].begin * BLOCK
+        if s >= stretches[k].count:
+            return
+        shape = stretches[k].shape
+        if shape == FLAT:
+            m = int(0)
+            if wp.static(not uniform):
+                m = flat_leaves[s]
+            u0, u1, u2, u3 = node_displacements(flat.nodes[s], u)
+            p, trusted = leaf_stress(gradient_of(flat, s, u0, u1, u2, u3), frame(flat, s), mu[m], lam[m])
+            if not trusted:
+                p = wp.mat33()
+            reserved = reserve(left_out, list_of(block), not trusted, stretches[k].count - s)
+            f0, f1, f2, f3 = nodal_forces(flat, s, p)
+            add_neighbours(f, flat.targets[s], f0, f1, f2, f3)
+            append(left_out, list_of(block), reserved, flat_leaves[s], wp.where(trusted, 0, 1), stretches[k].count - s)
+            return
+        subtrees = stretches[k].subtrees
+        grouped = stretches[k].grouped != 0
+        mask = int(0)
+        if shape == 0:
+            mask = subtree0(subtrees, s, grouped, mu, lam, u, f)
+        elif shape == 1:
+            mask = subtree1(subtrees, s, grouped, mu, lam, u, f)
+        else:
+            mask = subtree2(subtrees, s, grouped, mu, lam, u, f)
+        stretches[k].flagged[s] = wp.uint8(mask)
+        to_come = stretches[k].count - s
+        reserved = reserve(left_out, list_of(block), mask != 0, to_come)
+        append(left_out, list_of(block), reserved, subtrees.first[s], mask, to_come)
+
+    return scatter_stretches

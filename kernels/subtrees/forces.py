@@ -1,0 +1,370 @@
+"""Corotated forces of one complete subtree in registers: ten displacements in, ten nodal forces out.
+
+What kernels share that read and write their nodes each in its own way (``cuda``, ``stepping.block``). Stresses are
+worked out from displacement gradients, so that small strains keep their digits (``corotated.algebraic.stretch_stress``); a leaf
+that is flat, turned over or far from order one is left out and reported: bit k stands for leaf k in tree order.
+"""
+
+import functools
+from collections.abc import Sequence
+
+import warp as wp
+
+from warp_corot.kernels.corotated.algebraic import stretch_stress
+from warp_corot.kernels.elements.elements import ROOT2
+from warp_corot.kernels.math.rotation import ITERATIONS, column, newton_rotation
+from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
+from warp_corot.kernels.tables.subtree import FRAMES, LEAVES, POSITIONS
+
+wp.set_module_options({"enable_backward": False})
+
+mat10 = wp.types.matrix(shape=(10, 3), dtype=wp.float32)
+
+#: What a mask of left-out leaves is where the whole subtree is.
+ALL_LEAVES = wp.constant(255)
+
+
+def first_of(weights: Sequence[float]) -> int:
+    """The first of a list that is not zero."""
+    return next(i for i, weight in enumerate(weights) if abs(weight) > 1e-9)
+
+
+@functools.cache
+def columns_of(shape: int) -> wp.Function:
+    """Differences of four nodes, the columns of F in the Maubach frame where lengths are in edge lengths."""
+
+    @wp.func
+    def columns(x0: wp.vec3, x1: wp.vec3, x2: wp.vec3, x3: wp.vec3):
+        c0 = x1 - x0
+        c1 = x2 - x1
+        c2 = x3 - x2
+        if wp.static(shape == 1):
+            c2 = c2 + (x3 - x0)
+        if wp.static(shape == 2):
+            c0 = ROOT2 * (x0 - x2)
+            c1 = ROOT2 * (x1 - x2)
+            c2 = 2.0 * c2
+        return c0, c1, c2
+
+    return columns
+
+
+@functools.cache
+def leaf_forces_of(shape: int) -> wp.Function:
+    """Forces on the four nodes from the columns of the stress times V / h."""
+
+    @wp.func
+    def leaf_forces(p0: wp.vec3, p1: wp.vec3, p2: wp.vec3):
+        f0 = p0
+        f1 = p1 - p0
+        f2 = p2 - p1
+        f3 = -p2
+        if wp.static(shape == 1):
+            f0 = p0 + p2
+            f3 = -2.0 * p2
+        if wp.static(shape == 2):
+            f0 = -ROOT2 * p0
+            f1 = -ROOT2 * p1
+            f2 = ROOT2 * (p0 + p1) + 2.0 * p2
+            f3 = -2.0 * p2
+        return f0, f1, f2, f3
+
+    return leaf_forces
+
+
+@wp.func
+def leaf_stress(g: wp.mat33, q: wp.mat33, mu: float, lam: float):
+    """First Piola-Kirchhoff stress times Q of one leaf with its own rotation, and whether it may be trusted."""
+    p, trusted = stretch_stress(wp.transpose(q) * g, mu, lam)
+    return q * p, trusted
+
+
+@functools.cache
+def turned_forces_of(shape: int, uniform: bool, chosen: range) -> wp.Function:
+    """Forces of the chosen leaves, each with its own rotation, and which are left out: in the subtree's Maubach frame,
+    or in one that is turned along with the subtree.
+
+    ``y`` are ten displacements there, in edge lengths h of a leaf; leaves' frames B are tables.
+    """
+    columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
+    leaves, frames = LEAVES[shape], FRAMES[shape]
+    rows = [[first_of(axis) for axis in frame] for frame in frames]
+    backs = [[first_of([frame[i][axis] for i in range(3)]) for axis in range(3)] for frame in frames]
+    begin, end = chosen.start, chosen.stop
+    volume = VOLUME[shape]
+
+    @wp.func
+    def turned_forces(y: mat10, h: float, mu: wp.array[wp.float32], lam: wp.array[wp.float32], first: int):
+        _generated_from = wp.static(fingerprint(leaves, frames, begin, end))
+        # P V / h.
+        area = wp.static(volume) * h * h
+        m = area * mu[first]
+        k = area * lam[first]
+        g = mat10()
+        left_out = int(0)
+        for leaf in range(wp.static(begin), wp.static(end)):
+            if wp.static(not uniform):
+                m = area * mu[first + leaf]
+                k = area * lam[first + leaf]
+            b0, b1, b2 = columns(
+                y[wp.static(leaves[leaf][0])],
+                y[wp.static(leaves[leaf][1])],
+                y[wp.static(leaves[leaf][2])],
+                y[wp.static(leaves[leaf][3])],
+            )
+            c = wp.matrix_from_cols(b0, b1, b2)
+            # The displacement gradient in the leaf's frame: B^T C, zeros of B left out.
+            w = wp.mat33()
+            for i in range(3):
+                for axis in range(3):
+                    if wp.static(axis == rows[leaf][i]):
+                        for j in range(3):
+                            w[i, j] = wp.static(frames[leaf][i][axis]) * c[axis, j]
+                    elif wp.static(abs(frames[leaf][i][axis]) > 1e-9):
+                        for j in range(3):
+                            w[i, j] += wp.static(frames[leaf][i][axis]) * c[axis, j]
+            sigma, trusted = stretch_stress(w, m, k)
+            if trusted:
+                p = wp.mat33()
+                for axis in range(3):
+                    for i in range(3):
+                        if wp.static(i == backs[leaf][axis]):
+                            for j in range(3):
+                                p[axis, j] = wp.static(frames[leaf][i][axis]) * sigma[i, j]
+                        elif wp.static(abs(frames[leaf][i][axis]) > 1e-9):
+                            for j in range(3):
+                                p[axis, j] += wp.static(frames[leaf][i][axis]) * sigma[i, j]
+                f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
+                g[wp.static(leaves[leaf][0])] += f0
+                g[wp.static(leaves[leaf][1])] += f1
+                g[wp.static(leaves[leaf][2])] += f2
+                g[wp.static(leaves[leaf][3])] += f3
+            else:
+                left_out |= wp.static(1 << leaf)
+        return g, left_out
+
+    return turned_forces
+
+
+@functools.cache
+def own_forces(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Function:
+    """Forces of the chosen leaves from ten displacements, each leaf with its own rotation, and which are left out.
+
+    ``q`` is the subtree's frame, ``h`` a leaf's edge length, ``first`` where its material stands, and that of the other
+    leaves unless uniform.
+    """
+    turned_forces = turned_forces_of(shape, uniform, chosen)
+
+    @wp.func
+    def own_forces(
+        x: mat10, q: wp.mat33, h: float, mirror: float, mu: wp.array[wp.float32], lam: wp.array[wp.float32], first: int
+    ):
+        q0 = column(q, 0)
+        q1 = column(q, 1)
+        q2 = column(q, 2) * mirror
+        inv_h = 1.0 / h
+        h0 = inv_h * q0
+        h1 = inv_h * q1
+        h2 = inv_h * q2
+        origin = x[0]
+        y = mat10()
+        for n in range(1, 10):
+            d = x[n] - origin
+            y[n] = wp.vec3(wp.dot(h0, d), wp.dot(h1, d), wp.dot(h2, d))
+        g, left_out = turned_forces(y, h, mu, lam, first)
+        for n in range(10):
+            force = g[n]
+            g[n] = force[0] * q0 + force[1] * q1 + force[2] * q2
+        return g, left_out
+
+    return own_forces
+
+
+@functools.cache
+def turned_back_of(shape: int) -> wp.Function:
+    """Displacements R^T x - x0 in the subtree's Maubach frame q, in edge lengths of a leaf; r = R q.
+
+    They are R^T u + (R^T - I) x0. With D = R - I, which is small where the rotation is, sym(R^T - I) = -D^T D / 2 for a
+    rotation: so R^T - I keeps the digits of D, and the strain those of the displacements.
+    """
+    at = [[2.0 * c for c in point] for point in POSITIONS[shape]]
+
+    @wp.func
+    def turned_back(
+        x: mat10, inv_h: float, q0: wp.vec3, q1: wp.vec3, q2: wp.vec3, r0: wp.vec3, r1: wp.vec3, r2: wp.vec3
+    ):
+        _generated_from = wp.static(fingerprint(at))
+        d0 = r0 - q0
+        d1 = r1 - q1
+        d2 = r2 - q2
+        # The skew part, and half of the symmetric one.
+        w01 = 0.5 * (wp.dot(d0, q1) - wp.dot(d1, q0))
+        w02 = 0.5 * (wp.dot(d0, q2) - wp.dot(d2, q0))
+        w12 = 0.5 * (wp.dot(d1, q2) - wp.dot(d2, q1))
+        s01 = -0.5 * wp.dot(d0, d1)
+        s02 = -0.5 * wp.dot(d0, d2)
+        s12 = -0.5 * wp.dot(d1, d2)
+        t0 = wp.vec3(-0.5 * wp.dot(d0, d0), s01 - w01, s02 - w02)
+        t1 = wp.vec3(s01 + w01, -0.5 * wp.dot(d1, d1), s12 - w12)
+        t2 = wp.vec3(s02 + w02, s12 + w12, -0.5 * wp.dot(d2, d2))
+        origin = x[0]
+        y = mat10()
+        for n in range(10):
+            d = (x[n] - origin) * inv_h
+            y[n] = wp.vec3(wp.dot(r0, d), wp.dot(r1, d), wp.dot(r2, d)) + (
+                wp.static(at[n][0]) * t0 + wp.static(at[n][1]) * t1 + wp.static(at[n][2]) * t2
+            )
+        return y
+
+    return turned_back
+
+
+@functools.cache
+def shared_forces(
+    shape: int, uniform: bool, given: bool, chosen: range = range(8), tolerance: float | None = None
+) -> wp.Function:
+    """Forces of the chosen leaves from ten displacements, all with one rotation, and which are left out: none or all.
+
+    The rotation is the subtree root's or a given one; ``turn`` is the given one times the subtree's frame ``q``. Ten
+    displacements are turned back once; in the subtree's own frame the leaves are linear elements.
+
+    With a ``tolerance`` [rad] the chosen leaves share the root's rotation only where that is near their own ones: where
+    the displacement gradients E that are left have |skew E| <= tolerance and |sym E| <= 1/2. Then F = I + E = exp(w) U
+    with |w| <= 2 tolerance, and the stress is wrong by at most (2 mu + 3 lambda) (3 |w| |U - I| + |w|^2 |U|). Elsewhere
+    each has its own rotation.
+    """
+    columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
+    leaves, frames, at = LEAVES[shape], FRAMES[shape], POSITIONS[shape]
+    turned_back = turned_back_of(shape)
+    turned_forces = turned_forces_of(shape, uniform, chosen)
+    adaptive = tolerance is not None
+    inverse_square = 0.0 if tolerance is None else 1.0 / tolerance**2
+    begin, end = chosen.start, chosen.stop
+    volume = VOLUME[shape]
+
+    @wp.func
+    def shared_forces(
+        x: mat10,
+        q: wp.mat33,
+        h: float,
+        mirror: float,
+        turn: wp.mat33,
+        mu: wp.array[wp.float32],
+        lam: wp.array[wp.float32],
+        first: int,
+    ):
+        _generated_from = wp.static(fingerprint(leaves, frames, at, begin, end))
+        left_out = int(0)
+        q0 = column(q, 0)
+        q1 = column(q, 1)
+        q2 = column(q, 2) * mirror
+        inv_h = 1.0 / h
+        r0 = wp.vec3()
+        r1 = wp.vec3()
+        r2 = wp.vec3()
+        if wp.static(given):
+            r0 = column(turn, 0)
+            r1 = column(turn, 1)
+            r2 = column(turn, 2) * mirror
+        else:
+            # The subtree's edge is two of a leaf's.
+            c0, c1, c2 = columns(x[0], x[1], x[2], x[3])
+            half = 0.5 * inv_h
+            z0, z1, z2, trusted = newton_rotation(q0 + half * c0, q1 + half * c1, q2 + half * c2, mirror)
+            r0 = wp.static(0.5**ITERATIONS) * z0
+            r1 = wp.static(0.5**ITERATIONS) * z1
+            r2 = wp.static(0.5**ITERATIONS) * z2
+            if not trusted:
+                left_out = wp.static(sum(1 << leaf for leaf in chosen))
+                if wp.static(adaptive):
+                    r0 = q0
+                    r1 = q1
+                    r2 = q2
+        y = turned_back(x, inv_h, q0, q1, q2, r0, r1, r2)
+        m = mu[first]
+        k = lam[first]
+        area = wp.static(volume) * h * h
+        g = mat10()
+        apart = float(0.0)
+        for leaf in range(wp.static(begin), wp.static(end)):
+            if wp.static(not uniform):
+                m = mu[first + leaf]
+                k = lam[first + leaf]
+            b0, b1, b2 = columns(
+                y[wp.static(leaves[leaf][0])],
+                y[wp.static(leaves[leaf][1])],
+                y[wp.static(leaves[leaf][2])],
+                y[wp.static(leaves[leaf][3])],
+            )
+            c = wp.matrix_from_cols(b0, b1, b2)
+            # B^T C in the leaf's frame B, zeros of B left out.
+            e = wp.mat33()
+            for i in range(3):
+                for j in range(3):
+                    for axis in range(3):
+                        if wp.static(abs(frames[leaf][i][axis]) > 1e-9):
+                            e[i, j] += wp.static(frames[leaf][i][axis]) * c[axis, j]
+            if wp.static(adaptive):
+                axial = wp.vec3(e[0, 1] - e[1, 0], e[0, 2] - e[2, 0], e[1, 2] - e[2, 1])
+                # Of the Frobenius norm, |E|^2 = |sym E|^2 + |skew E|^2.
+                skew = 0.5 * wp.dot(axial, axial)
+                apart = wp.max(apart, wp.max(wp.static(inverse_square) * skew, 4.0 * (wp.ddot(e, e) - skew)))
+            double_mu = 2.0 * m * area
+            pressure = k * area * (e[0, 0] + e[1, 1] + e[2, 2])
+            s01 = m * area * (e[0, 1] + e[1, 0])
+            s02 = m * area * (e[0, 2] + e[2, 0])
+            s12 = m * area * (e[1, 2] + e[2, 1])
+            sigma = wp.mat33(
+                double_mu * e[0, 0] + pressure,
+                s01,
+                s02,
+                s01,
+                double_mu * e[1, 1] + pressure,
+                s12,
+                s02,
+                s12,
+                double_mu * e[2, 2] + pressure,
+            )
+            p = wp.mat33()
+            for axis in range(3):
+                for j in range(3):
+                    for i in range(3):
+                        if wp.static(abs(frames[leaf][i][axis]) > 1e-9):
+                            p[axis, j] += wp.static(frames[leaf][i][axis]) * sigma[i, j]
+            f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
+            g[wp.static(leaves[leaf][0])] += f0
+            g[wp.static(leaves[leaf][1])] += f1
+            g[wp.static(leaves[leaf][2])] += f2
+            g[wp.static(leaves[leaf][3])] += f3
+        if wp.static(adaptive):
+            # A comparison with NaN is false.
+            if left_out == 0 and apart <= 1.0:
+                left_out = 0
+            else:
+                # In the frame that is turned along, y is in the place of displacements.
+                g, left_out = turned_forces(y, h, mu, lam, first)
+        for n in range(10):
+            force = g[n]
+            g[n] = force[0] * r0 + force[1] * r1 + force[2] * r2
+        if wp.static(not adaptive) and left_out != 0:
+            g = mat10()
+        return g, left_out
+
+    return shared_forces
+
+
+@functools.cache
+def near_forces(shape: int, uniform: bool, tolerance: float | None, chosen: range = range(8)) -> wp.Function:
+    """As ``own_forces``, which it is without a tolerance; with one, see ``shared_forces``."""
+    if tolerance is None:
+        return own_forces(shape, uniform, chosen)
+    forces = shared_forces(shape, uniform, False, chosen, tolerance)
+
+    @wp.func
+    def near_forces(
+        x: mat10, q: wp.mat33, h: float, mirror: float, mu: wp.array[wp.float32], lam: wp.array[wp.float32], first: int
+    ):
+        g, left_out = forces(x, q, h, mirror, wp.mat33(), mu, lam, first)
+        return g, left_out
+
+    return near_forces

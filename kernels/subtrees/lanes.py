@@ -1,0 +1,141 @@
+"""Native code on lanes of subtrees of a type, generated from the tables of ``tables.subtree``.
+
+Text, as the code in ``native`` that stands around it; nothing of Warp is in here.
+"""
+
+import functools
+
+from warp_corot.kernels.elements.elements import FRAME_SHIFT, LEVEL_MASK, MIRROR_BIT
+from warp_corot.kernels.elements.lanes import constants, native
+from warp_corot.kernels.elements.stiffness import Coefficients
+from warp_corot.kernels.tables.shapes import SQRT2, VOLUME
+from warp_corot.kernels.tables.subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS, stiffness
+
+#: Columns of the displacement gradient from displacements x0 to x3 over the edge length, by type.
+COLUMNS = (
+    ("minus(x1, x0)", "minus(x2, x1)", "minus(x3, x2)"),
+    ("minus(x1, x0)", "minus(x2, x1)", "plus(minus(x3, x2), minus(x3, x0))"),
+    (
+        f"scaled(spread({SQRT2!r}f), minus(x0, x2))",
+        f"scaled(spread({SQRT2!r}f), minus(x1, x2))",
+        "scaled(spread(2.0f), minus(x3, x2))",
+    ),
+)
+
+#: Forces on the four nodes from the columns p of P V / h, by type.
+FORCES = (
+    ("p[0]", "minus(p[1], p[0])", "minus(p[2], p[1])", "minus(nothing, p[2])"),
+    ("plus(p[0], p[2])", "minus(p[1], p[0])", "minus(p[2], p[1])", "scaled(spread(-2.0f), p[2])"),
+    (
+        f"scaled(spread({-SQRT2!r}f), p[0])",
+        f"scaled(spread({-SQRT2!r}f), p[1])",
+        f"plus(scaled(spread({SQRT2!r}f), plus(p[0], p[1])), scaled(spread(2.0f), p[2]))",
+        "scaled(spread(-2.0f), p[2])",
+    ),
+)
+
+
+@functools.cache
+def begin(shape: int) -> str:
+    """Eight subtrees of a type, and what is to be known of it.
+
+    Defines what ``native/subtrees.h`` does; tables of the leaves' nodes, ``nodes_of``, and in the subtree's Maubach
+    frame of the nodes' places ``at``, of the leaves' frames ``frame_of`` and handedness ``hand``; ``leaf_axes``, of
+    which three are the frame of each leaf, by ``axes_of``; and the functions ``columns`` and ``add_leaf`` of ten
+    displacements or forces and four of their numbers.
+    """
+    c, f = COLUMNS[shape], FORCES[shape]
+    functions = f"""
+const auto columns = [&](const lanes8* x, const int* n, triple* a) {{
+    const triple x0 = get(x, n[0]), x1 = get(x, n[1]), x2 = get(x, n[2]), x3 = get(x, n[3]);
+    a[0] = {c[0]}, a[1] = {c[1]}, a[2] = {c[2]};
+}};
+const auto add_leaf = [&](lanes8* g, const int* n, const triple* p) {{
+    add(g, n[0], {f[0]}); add(g, n[1], {f[1]}); add(g, n[2], {f[2]}); add(g, n[3], {f[3]});
+}};
+"""
+    names = {"FRAME_SHIFT": FRAME_SHIFT, "MIRROR_BIT": MIRROR_BIT, "LEVEL_MASK": LEVEL_MASK}
+    numbers = constants(VOLUME=VOLUME[shape], **{name: int(value) for name, value in names.items()})
+    return numbers + _tables(shape) + functions + native("subtrees") + _frames(shape)
+
+
+@functools.cache
+def product(shape: int) -> str:
+    """``multiply``: g = -h^2 K y with the stiffness of a whole subtree, straight-line code without its zeros."""
+    entries = Coefficients(*stiffness(shape))
+    values = "".join(
+        f"    const float c{k} = {a!r}f * lam.data[0] + {b!r}f * mu.data[0];\n"
+        for k, (a, b) in enumerate(entries.distinct)
+    )
+    rows = ""
+    for i, (places, signs) in enumerate(zip(entries.table, entries.signs, strict=True)):
+        terms = " ".join(f"{'+' if signs[j] > 0 else '-'} c{k} * y[{j}]" for j, k in enumerate(places) if k >= 0)
+        rows += f"    g[{i}] = w * ({terms});\n"
+    # K is over the subtree's edge, two of a leaf's.
+    return (
+        "const auto multiply = [&](const lanes8* y, lanes8* g) {\n"
+        f"{values}    const lanes8 w = -2.0f * h * h;\n{rows}}};\n"
+    )
+
+
+@functools.cache
+def near_test(shape: int) -> str:
+    """``are_near``: where |skew E| <= tolerance and |sym E| <= 1/2 in every leaf, of displacements y turned back.
+
+    E is C B^T with the columns C that ``columns`` finds and the leaf's frame B.
+    """
+    code = ""
+    for nodes, frame in zip(LEAVES[shape], FRAMES[shape], strict=True):
+
+        def difference(i: int, j: int, frame: list = frame) -> str:
+            """Of the entries i, j and j, i of C B^T."""
+            terms = [(frame[c][j], f"a[{c}].{'xyz'[i]}") for c in range(3)]
+            terms += [(-frame[c][i], f"a[{c}].{'xyz'[j]}") for c in range(3)]
+            return " + ".join(f"{weight!r}f * {entry}" for weight, entry in terms if abs(weight) > 1e-9)
+
+        code += f"""
+    {{
+        static const int n[4] = {{{", ".join(map(str, nodes))}}};
+        triple a[3];
+        columns(y, n, a);
+        const triple twice = {{{difference(2, 1)}, {difference(0, 2)}, {difference(1, 0)}}};
+        const lanes8 skew = 0.5f * dot(twice, twice);
+        const lanes8 whole = dot(a[0], a[0]) + dot(a[1], a[1]) + dot(a[2], a[2]);
+        near &= (skew <= bound) & (whole - skew <= 0.25f);
+    }}"""
+    return f"""const auto are_near = [&](const lanes8* y) {{
+    const lanes8 bound = spread(tolerance * tolerance);
+    masks8 near = every;{code}
+    return near;
+}};
+"""
+
+
+def _table(name: str, kind: str, rows: list) -> str:
+    inner = ", ".join("{" + ", ".join(f"{v!r}f" if kind == "float" else str(v) for v in row) + "}" for row in rows)
+    return f"static const {kind} {name}[{len(rows)}][{len(rows[0])}] = {{{inner}}};\n"
+
+
+def _tables(shape: int) -> str:
+    return (
+        _table("nodes_of", "int", [list(leaf) for leaf in LEAVES[shape]])
+        + _table("at", "float", [[2.0 * c for c in point] for point in POSITIONS[shape]])
+        + _table("hand", "float", [[h] for h in HANDEDNESS[shape]])
+        + _table("frame_of", "float", [[c for column in frame for c in column] for frame in FRAMES[shape]])
+    )
+
+
+def _columns_of_frames(shape: int) -> tuple[list[tuple[float, ...]], list[list[int]]]:
+    """The different columns that frames of leaves have in the subtree's, and which each leaf has."""
+    rounded = [[tuple(round(c, 12) + 0.0 for c in column) for column in frame] for frame in FRAMES[shape]]
+    different = sorted({column for frame in rounded for column in frame})
+    return different, [[different.index(column) for column in frame] for frame in rounded]
+
+
+def _frames(shape: int) -> str:
+    different, used = _columns_of_frames(shape)
+    code = f"triple leaf_axes[{len(different)}];\n"
+    for i, column in enumerate(different):
+        terms = [f"{weight!r}f * frame[{c}].%s" for c, weight in enumerate(column) if weight]
+        code += f"leaf_axes[{i}] = triple{{{', '.join(' + '.join(terms).replace('%s', axis) for axis in 'xyz')}}};\n"
+    return _table("axes_of", "int", used) + code

@@ -1,0 +1,399 @@
+"""Forces of the leaves that the subtree kernels left out: flat or inverted ones, with the rotation that is right for
+every F.
+
+Which those are is a byte a subtree, a bit a leaf. On CUDA the subtrees that have any stand in a list (``LeftOut``), and
+one launch of a fixed size goes through it. On the CPU, and where the order of the sums must be settled, a thread reads
+the bytes of eight subtrees at a time, nearly always all zero, and goes through their leaves in order.
+"""
+
+import warp as wp
+
+from warp_corot.kernels.corotated.algebraic import FLAT, stretch_stress, turned_stress
+from warp_corot.kernels.elements.constitutive import corotated_strain, hooke
+from warp_corot.kernels.elements.elements import ForestElements, frame, local_gradient, nodal_forces, scatter_stress
+from warp_corot.kernels.elements.merging import add_four_forces
+from warp_corot.kernels.math.matrices import identity3
+from warp_corot.kernels.math.quaternion import robust_rotation
+
+wp.set_module_options({"enable_backward": False})
+
+#: Subtrees that one thread looks after; ``flagged`` has a multiple of these.
+SUBTREES = 8
+LEAVES = 8
+#: Threads of a block that goes through a list, and of a warp.
+LIST_BLOCK = 128
+WARP = 32
+#: Lists that a body's thread blocks take in turn.
+LISTS = 32
+COUNT_STRIDE = 32
+EVALUATIONS = COUNT_STRIDE * LISTS + 1
+#: How seldom subtrees of which most leaves were left out are tried again.
+TRIED_EVERY = 16
+
+
+# More rounds would cost more arithmetic than they save sums.
+add_pairs = add_four_forces(1)
+
+
+@wp.struct
+class LeftOut:
+    """Subtrees with leaves that were left out, in lists which thread blocks take in turn.
+
+    One list would not do: additions to one number, each of which returns what was there, take 5 ns each.
+    """
+
+    # Entries of each list, a cache line apart, then blocks that are done, all zero between evaluations; then how many
+    # evaluations have left out any.
+    counts: wp.array[wp.int32]  # [(LISTS + 1) COUNT_STRIDE]
+    room: int  # of a list
+    entries: wp.array[wp.vec2i]  # [LISTS room] where its first leaf (own rotations) or it itself stands, and the mask
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    // Half of the leaves of half of the subtrees of a whole warp.
+    if (__activemask() != 0xffffffffu || __popc(__ballot_sync(0xffffffffu, __popc(mask) >= 4)) < 16) return false;
+    return (wp::index(lists.counts, {EVALUATIONS}) + s / {WARP}) % {TRIED_EVERY} != 0;
+#else
+    return false;
+#endif
+""")
+def is_hopeless(lists: LeftOut, s: int, mask: int) -> bool:
+    """Whether so many of a warp's leaves were left out before, by their masks, that all go on a list untried."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    // One addition for all threads of a warp; nobody waits for it here.
+    const int lane = threadIdx.x & 31;
+    const unsigned all = to_come + lane >= 32 ? 0xffffffffu : (1u << (to_come + lane)) - 1;
+    const unsigned those = __ballot_sync(all, is_left_out);
+    if (lane == 0 && those != 0) return atomicAdd(&wp::index(lists.counts, {COUNT_STRIDE} * list), __popc(those));
+    return 0;
+#else
+    return wp::index(lists.counts, {COUNT_STRIDE} * list);
+#endif
+""")
+def reserve(lists: LeftOut, list: int, is_left_out: bool, to_come: int) -> int:
+    """Make room on a list for those of a warp's threads who have leaves left out.
+
+    ``to_come`` is how many threads there are from this one on. All of a warp must come, and to ``append`` as well.
+    """
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    const int lane = threadIdx.x & 31;
+    const unsigned all = to_come + lane >= 32 ? 0xffffffffu : (1u << (to_come + lane)) - 1;
+    const unsigned those = __ballot_sync(all, mask != 0);
+    if (those == 0) return;
+    const int begin = lists.room * list + __shfl_sync(all, reserved, 0);
+    const int before = __popc(those & ((1u << lane) - 1));
+    if (mask != 0) wp::index(lists.entries, begin + before) = wp::vec_t<2, wp::int32>(place, mask);
+#else
+    if (mask == 0) return;
+    wp::index(lists.entries, lists.room * list + reserved) = wp::vec_t<2, wp::int32>(place, mask);
+    wp::index(lists.counts, {COUNT_STRIDE} * list) = reserved + 1;
+#endif
+""")
+def append(lists: LeftOut, list: int, reserved: int, place: int, mask: int, to_come: int):
+    """Put a subtree on a list, in the room that was made for it, unless its mask is zero."""
+    ...
+
+
+@wp.func
+def list_of(block: int):
+    """The list that a thread block appends to."""
+    return block % LISTS
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    return __syncthreads_or(wp::index(lists.counts, {COUNT_STRIDE} * (threadIdx.x % {LISTS}))) != 0;
+#else
+    int any = 0;
+    for (int list = 0; list < {LISTS}; ++list) any |= wp::index(lists.counts, {COUNT_STRIDE} * list);
+    return any != 0;
+#endif
+""")
+def any_left_out(lists: LeftOut) -> bool:
+    """Whether there is any entry; asked by all threads of a block at once."""
+    ...
+
+
+@wp.func
+def entry_count(lists: LeftOut, list: int):
+    return lists.counts[COUNT_STRIDE * list]
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+    if (threadIdx.x == 0) {{
+        __threadfence();
+        int* const counts = &wp::index(lists.counts, 0);
+        if (atomicAdd(counts + {COUNT_STRIDE * LISTS}, 1) == blocks - 1)
+        {{
+            for (int list = 0; list <= {LISTS}; ++list) counts[{COUNT_STRIDE} * list] = 0;
+            counts[{EVALUATIONS}] += 1;
+        }}
+    }}
+#else
+    for (int list = 0; list < {LISTS}; ++list) wp::index(lists.counts, {COUNT_STRIDE} * list) = 0;
+#endif
+""")
+def leave(lists: LeftOut, blocks: int):
+    """Empty the lists once every block is done with them."""
+    ...
+
+
+@wp.func
+def is_left_out(flags: wp.uint64, leaf: int):
+    """Whether the ``leaf``-th of the 64 leaves of eight subtrees was."""
+    return ((flags >> wp.uint64(leaf)) & wp.uint64(1)) != wp.uint64(0)
+
+
+@wp.func
+def scatter_turned(
+    elements: ForestElements, t: int, r: wp.mat33, mu: float, lam: float, u: wp.array[wp.vec4], f: wp.array[wp.vec4]
+):
+    """Add the forces of element t with r, the rotation of its F Q."""
+    strain = corotated_strain(local_gradient(elements, t, u), frame(elements, t), r)
+    scatter_stress(elements, t, r * hooke(strain, mu, lam), f)
+
+
+@wp.func
+def own_stress(
+    elements: ForestElements,
+    t: int,
+    mu: wp.array[wp.float32],
+    lam: wp.array[wp.float32],
+    stride: int,
+    u: wp.array[wp.vec4],
+):
+    """First Piola-Kirchhoff stress times Q of element t with its own rotation, whatever its F."""
+    q = frame(elements, t)
+    w = wp.transpose(q) * local_gradient(elements, t, u)
+    m = mu[t * stride]
+    k = lam[t * stride]
+    p = wp.mat33()
+    trusted = wp.determinant(identity3() + w) > FLAT
+    if trusted:
+        p, trusted = stretch_stress(w, m, k)
+    if not trusted:
+        p = turned_stress(identity3() + w, m, k)
+    return q * p
+
+
+@wp.func
+def scatter_own(
+    elements: ForestElements,
+    t: int,
+    mu: wp.array[wp.float32],
+    lam: wp.array[wp.float32],
+    stride: int,
+    u: wp.array[wp.vec4],
+    f: wp.array[wp.vec4],
+):
+    """Add the forces of element t with its own rotation."""
+    scatter_stress(elements, t, own_stress(elements, t, mu, lam, stride, u), f)
+
+
+@wp.func
+def root_rotation(roots: ForestElements, s: int, u: wp.array[wp.vec4]):
+    q = frame(roots, s)
+    return robust_rotation(q + local_gradient(roots, s, u)) * wp.transpose(q)
+
+
+# --- by a list ------------------------------------------------------------------------------------------------------
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    __shared__ int places[{LIST_BLOCK // WARP}][{WARP * LEAVES}];
+    int* const own = places[threadIdx.x / {WARP}];
+    if (k >= 0) return own[k];
+    const int lane = threadIdx.x % {WARP};
+    int place = 0, mask = 0;
+    if (lane < entries) {{
+        place = wp::index(lists.entries, begin + lane)[0];
+        mask = wp::index(lists.entries, begin + lane)[1];
+    }}
+    int end = __popc(mask);
+    int at = -end;
+    for (int step = 1; step < {WARP}; step *= 2) {{
+        const int before = __shfl_up_sync(0xffffffff, end, step);
+        if (lane >= step) end += before;
+    }}
+    at += end;
+    __syncwarp();
+    for (; mask != 0; mask &= mask - 1) own[at++] = place + __ffs(mask) - 1;
+    __syncwarp();
+    return __shfl_sync(0xffffffff, end, {WARP - 1});
+#else
+    static int own[{WARP * LEAVES}];
+    if (k >= 0) return own[k];
+    int at = 0;
+    for (int entry = begin; entry < begin + entries; ++entry) {{
+        const int mask = wp::index(lists.entries, entry)[1];
+        for (int leaf = 0; leaf < {LEAVES}; ++leaf)
+            if ((mask >> leaf) & 1) own[at++] = wp::index(lists.entries, entry)[0] + leaf;
+    }}
+    return at;
+#endif
+""")
+def leaves_of_entries(lists: LeftOut, begin: int, entries: int, k: int) -> int:
+    """Write down the leaves of up to 32 entries for the threads of a warp, and how many there are; or the k-th of them.
+
+    Where few leaves of each entry were left out, every thread has one to do all the same.
+    """
+    ...
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def repair_listed_own(
+    # In
+    threads: int,
+    elements: ForestElements,
+    mu: wp.array[wp.float32],
+    lam: wp.array[wp.float32],
+    stride: int,
+    u: wp.array[wp.vec4],
+    # In and out
+    listed: LeftOut,
+    # Out
+    f: wp.array[wp.vec4],
+):
+    """Every leaf with its own rotation, a thread a leaf.
+
+    Neighbours' forces are added up before they go to memory. Launch with block_dim LIST_BLOCK and as many ``threads``,
+    a multiple of it; or with one.
+    """
+    if not any_left_out(listed):
+        return
+    lanes = wp.min(threads, WARP)
+    warps = threads // lanes
+    warp = wp.tid() // lanes
+    # A warp goes through one of so many lists at a time, with others.
+    at_a_time = wp.min(warps, LISTS)
+    list = warp % at_a_time
+    each_list = (warps - list + at_a_time - 1) // at_a_time
+    while list < LISTS:
+        count = entry_count(listed, list)
+        each = wp.clamp((count + each_list - 1) // each_list, 1, WARP)
+        begin = (warp // at_a_time) * each
+        while begin < count:
+            total = leaves_of_entries(listed, listed.room * list + begin, wp.min(each, count - begin), -1)
+            k = wp.tid() % lanes
+            # All threads of a warp stay together, for their neighbours'.
+            while k - k % lanes < total:
+                t = int(0)
+                targets = wp.vec4i(-1, -1, -1, -1)
+                p = wp.mat33()
+                if k < total:
+                    t = leaves_of_entries(listed, 0, 0, k)
+                    targets = elements.targets[t]
+                    p = own_stress(elements, t, mu, lam, stride, u)
+                f0, f1, f2, f3 = nodal_forces(elements, t, p)
+                add_pairs(f, targets, f0, f1, f2, f3)
+                k += lanes
+            begin += each_list * each
+        list += at_a_time
+    leave(listed, threads // LIST_BLOCK)
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def repair_listed_shared(
+    # In
+    threads: int,
+    first: wp.array[wp.int32],
+    roots: ForestElements,
+    elements: ForestElements,
+    mu: wp.array[wp.float32],
+    lam: wp.array[wp.float32],
+    stride: int,
+    u: wp.array[wp.vec4],
+    # In and out
+    listed: LeftOut,
+    # Out
+    f: wp.array[wp.vec4],
+):
+    """Every leaf of a listed subtree with the rotation of the subtree's root, a thread a leaf; launch as the other."""
+    if not any_left_out(listed):
+        return
+    at_a_time = wp.min(threads, LISTS)
+    list = wp.tid() % at_a_time
+    each_list = (threads - list + at_a_time - 1) // at_a_time
+    while list < LISTS:
+        i = wp.tid() // at_a_time
+        while i < entry_count(listed, list) * LEAVES:
+            s = listed.entries[listed.room * list + i // LEAVES][0]
+            t = first[s] + i % LEAVES
+            r = root_rotation(roots, s, u) * frame(elements, t)
+            scatter_turned(elements, t, r, mu[t * stride], lam[t * stride], u, f)
+            i += each_list
+        list += at_a_time
+    leave(listed, threads // LIST_BLOCK)
+
+
+# --- by bytes, in order ---------------------------------------------------------------------------------------------
+
+
+@wp.kernel(enable_backward=False)
+def repair_own(
+    # In
+    flagged: wp.array[wp.uint64],
+    first: wp.array[wp.int32],
+    elements: ForestElements,
+    mu: wp.array[wp.float32],
+    lam: wp.array[wp.float32],
+    stride: int,
+    u: wp.array[wp.vec4],
+    # Out
+    f: wp.array[wp.vec4],
+):
+    """Every leaf with its own rotation."""
+    i = wp.tid()
+    flags = flagged[i]
+    if flags == wp.uint64(0):
+        return
+    leaf = int(0)
+    while leaf < SUBTREES * LEAVES:
+        if is_left_out(flags, leaf):
+            t = first[SUBTREES * i + leaf // LEAVES] + leaf % LEAVES
+            scatter_own(elements, t, mu, lam, stride, u, f)
+        leaf += 1
+
+
+@wp.kernel(enable_backward=False)
+def repair_shared(
+    # In
+    flagged: wp.array[wp.uint64],
+    first: wp.array[wp.int32],
+    roots: ForestElements,
+    elements: ForestElements,
+    mu: wp.array[wp.float32],
+    lam: wp.array[wp.float32],
+    stride: int,
+    u: wp.array[wp.vec4],
+    # Out
+    f: wp.array[wp.vec4],
+):
+    """Every leaf with the rotation of its subtree's root."""
+    i = wp.tid()
+    flags = flagged[i]
+    if flags == wp.uint64(0):
+        return
+    member = int(0)
+    while member < SUBTREES:
+        if is_left_out(flags, LEAVES * member):
+            s = SUBTREES * i + member
+            rotation = root_rotation(roots, s, u)
+            leaf = int(0)
+            while leaf < LEAVES:
+                t = first[s] + leaf
+                scatter_turned(elements, t, rotation * frame(elements, t), mu[t * stride], lam[t * stride], u, f)
+                leaf += 1
+        member += 1

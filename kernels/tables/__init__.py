@@ -1,0 +1,1 @@
+"""Tables that kernels are generated from."""

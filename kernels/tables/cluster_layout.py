@@ -1,0 +1,67 @@
+"""How elements are dealt out to the thread blocks of ``clusters.single``: numbers from which its kernels are generated."""
+
+from dataclasses import dataclass
+
+#: Bytes of a vector in shared memory.
+QUAD_BYTES = 16
+#: How many of these shared memory reads or writes at once, from groups of banks.
+BANK_GROUPS = 8
+
+
+@dataclass(frozen=True)
+class ClusterLayout:
+    """What a kernel is generated for.
+
+    Attributes:
+        threads: Threads a block.
+        each: Elements a thread.
+        resident: Blocks that a multiprocessor's registers must have room for.
+        early: Whether a thread reads what it will add up before it needs that.
+    """
+
+    threads: int = 128
+    each: int = 1
+    resident: int = 8
+    early: bool = True
+
+    @property
+    def elements(self) -> int:
+        """Elements of a cluster."""
+        return self.threads * self.each
+
+    @property
+    def corners(self) -> int:
+        return 4 * self.elements
+
+
+DEFAULT_LAYOUT = ClusterLayout(early=False)
+
+
+@dataclass(frozen=True)
+class PairLayout:
+    """The same of pairs of elements, one a thread.
+
+    Attributes:
+        threads: Threads a block, up to 192: slots have ten bits.
+        resident, early: As above.
+        ahead: How many blocks ahead tables are fetched into the second-level cache, 0: they are not.
+    """
+
+    threads: int = 128
+    resident: int = 6
+    early: bool = False
+    ahead: int = 0
+
+    @property
+    def zero(self) -> int:
+        """The first of the slots that are zero; before it there are five a thread."""
+        return 5 * self.threads
+
+
+#: Of a forest's elements, of general ones, and of the anisotropic law: the more blocks are resident the less they wait,
+#: so long as few registers go to memory.
+LATTICE, GENERAL, ANISOTROPIC = PairLayout(resident=8), PairLayout(resident=7), PairLayout(resident=4)
+
+#: Tables of so many bytes and more do not stay in the second-level cache beside the nodes, and are fetched so many
+#: blocks ahead: about as many as an H200 has at once.
+LARGE, AHEAD = 24 << 20, 1024

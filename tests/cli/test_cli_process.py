@@ -1,0 +1,152 @@
+"""The command line as a process: signals, streams that are closed, full or left, locales."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from pxr import Usd
+
+import warp_corot as wc
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX signals, pipes and locales")
+
+COMMAND = [sys.executable, "-m", "warp_corot"]
+BOX = ["simulate", "box", "-o", "a.usd", "--duration", "0.05", "--fps", "40", "--device", "cpu"]
+
+
+def started(folder: Path, *args: str, **options) -> subprocess.Popen:
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen([*COMMAND, *args], cwd=folder, **(streams | options))
+
+
+def frame_count(path: Path) -> int:
+    stage = Usd.Stage.Open(str(path))
+    return int(stage.GetEndTimeCode() - stage.GetStartTimeCode()) + 1
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_signals_keep_frames(tmp_path, number, status):
+    command = ["simulate", "box", "-o", "a.usd", "--duration", "1000", "--device", "cpu"]
+    # What was started in the background ignores SIGINT, and so would its children.
+    process = started(tmp_path, *command, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+    try:
+        for _ in range(600):  # until the first frames are there
+            if (tmp_path / "a.usd").exists() or process.poll() is not None:
+                break
+            time.sleep(0.1)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == status, err
+    assert out == ""
+    # On a machine that has run nothing yet, kernels are compiled first, and that is said.
+    said = r"(?:warp-corot: compiling kernels .*\n)?warp-corot: interrupted; (\d+) frames, .* s, are kept in a\.usd\n"
+    match = re.fullmatch(said, err)
+    assert match, err
+    assert frame_count(tmp_path / "a.usd") == int(match[1]) > 1
+    assert [file.name for file in tmp_path.iterdir()] == ["a.usd"]
+
+
+@pytest.mark.parametrize("module", ["warp", "warp_corot.body.soft_body", "pxr"])
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_while_modules_are_imported_is_one_line(tmp_path, module, number, status):
+    """Python tells of each module that it begins to import; the signal comes at the first import of this one."""
+    (tmp_path / "interrupted.py").write_text(f"""
+import runpy, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+came = []
+def heard(event, args):
+    if event == "import" and args[0] == {module!r} and not came:
+        came.append(event)
+        signal.raise_signal({int(number)})
+sys.addaudithook(heard)
+sys.argv = ["warp-corot", *{BOX!r}]
+runpy.run_module("warp_corot", run_name="__main__")
+""")
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    command = [sys.executable, str(tmp_path / "interrupted.py")]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout, done.stderr) == (status, "", "warp-corot: interrupted\n")
+    assert list(folder.iterdir()) == []
+
+
+def test_reader_that_leaves_is_no_error(tmp_path):
+    read, write = os.pipe()
+    os.close(read)
+    process = started(tmp_path, *BOX, stdout=write)
+    os.close(write)
+    _, err = process.communicate(timeout=120)
+    assert err == ""
+    assert process.returncode == 141
+    assert frame_count(tmp_path / "a.usd") == 3
+
+
+@pytest.mark.parametrize(
+    ("streams", "status", "said"),
+    [
+        (">&-", 0, ""),
+        ("2>&-", 0, ""),
+        ("<&- >&- 2>&-", 0, ""),
+        (">/dev/full", 1, "warp-corot: error: standard output: No space left on device\n"),
+        ("2>/dev/full", 0, ""),
+    ],
+)
+def test_streams_that_take_nothing_cost_no_frames(tmp_path, streams, status, said):
+    """The notes that --young left out gives go to stderr, the summary to stdout."""
+    if "/dev/full" in streams and not os.path.exists("/dev/full"):
+        pytest.skip("no /dev/full")
+    mesh = wc.TetForest.box((1, 1, 1), 0.1, 3)
+    wc.record(wc.Simulation(wc.SoftBody(mesh, wc.Isotropic(1e4, 0.4, 1e3))), tmp_path / "b.usd", duration=0.05)
+    command = ["b.usd" if word == "box" else word for word in BOX]
+    shell = ["sh", "-c", f'exec "$@" {streams}', "sh", *COMMAND, *command]
+    done = subprocess.run(shell, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == status, done.stderr
+    # Whether kernels are compiled, and that is said, depends on what ran before.
+    lines = [line for line in done.stderr.splitlines(True) if "note:" not in line and "compiling kernels" not in line]
+    assert lines == said.splitlines(True)
+    assert frame_count(tmp_path / "a.usd") == 3
+
+
+def test_names_are_utf8_in_every_locale(tmp_path):
+    plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    first = [word.replace("a.usd", "bär.usd") for word in BOX]
+    again = [word.replace("box", "bär.usd").replace("a.usd", "ö.usd") for word in BOX]
+    for command in (first, [*again, "--preview", "ü.png"]):
+        process = started(tmp_path, *command, env=os.environ | plain)
+        _, err = process.communicate(timeout=120)
+        assert process.returncode == 0, err
+    assert frame_count(tmp_path / "ö.usd") == 3
+    assert {file.name for file in tmp_path.iterdir()} == {"bär.usd", "ö.usd", "ü.png"}
+
+
+def test_a_kernel_cache_that_cannot_be_made_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    process = started(tmp_path, *BOX, env=os.environ | {"WARP_CACHE_PATH": str(tmp_path / "file" / "cache")})
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert re.fullmatch(r"warp-corot: error: Warp's kernel cache .*; name a folder .* WARP_CACHE_PATH\n", err), err
+
+
+def test_compiling_is_said_when_kernels_are_compiled_and_only_then(tmp_path):
+    """On stderr, once, in a line of its own; stdout does not tell whether the cache was cold."""
+    cache = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache")}
+    ran = [started(tmp_path, *BOX, "--model", "mass-spring", env=cache).communicate(timeout=120) for _ in range(2)]
+    (first, cold), (again, warm) = ran
+    assert re.fullmatch(r"warp-corot: compiling kernels for cpu, once: .*\n", cold), cold
+    assert warm == ""
+    assert [line.split()[0] for line in first.splitlines()] == [line.split()[0] for line in again.splitlines()]
+    assert "kernels" not in first
+
+
+def test_module_and_version(tmp_path):
+    process = started(tmp_path, "--version")
+    out, _ = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert out.startswith(f"warp-corot {wc.__version__}")

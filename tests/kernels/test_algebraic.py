@@ -1,0 +1,91 @@
+"""The corotated stress in closed form against the polar decomposition in float64, for strains of every size."""
+
+import numpy as np
+import oracle
+import pytest
+import warp as wp
+
+from warp_corot.kernels.corotated.algebraic import corotated_stress, stretch_stress
+
+MU, LAM = 1.0, 9.0
+
+
+@wp.kernel(enable_backward=False)
+def stresses(
+    a: wp.array[wp.mat33], mu: float, lam: float, p: wp.array[wp.mat33], q: wp.array[wp.mat33], ok: wp.array[wp.int32]
+):
+    i = wp.tid()
+    of_near, trusted = stretch_stress(a[i], mu, lam)
+    p[i] = of_near
+    q[i] = corotated_stress(a[i], mu, lam)
+    ok[i] = int(trusted)
+
+
+def stress_of(A, device):
+    """The closed form's, that of any A, and where the first may be trusted."""
+    p, q = (wp.empty(len(A), dtype=wp.mat33, device=device) for _ in range(2))
+    ok = wp.empty(len(A), dtype=wp.int32, device=device)
+    inputs = [wp.array(A, dtype=wp.mat33, device=device), MU, LAM]
+    wp.launch(stresses, len(A), inputs=inputs, outputs=[p, q, ok], device=device)
+    return p.numpy(), q.numpy(), ok.numpy().astype(bool)
+
+
+def expected(A):
+    F = np.eye(3) + A.astype(float)
+    R = oracle.polar(F)
+    strain = np.swapaxes(R, 1, 2) @ F - np.eye(3)
+    return R @ (2 * MU * strain + LAM * np.trace(strain, axis1=1, axis2=2)[:, None, None] * np.eye(3))
+
+
+def relative_error(P, exact):
+    return np.linalg.norm(P - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
+
+
+def of_stretches(rng, low, high, count=5000):
+    """Displacement gradients of random rotations and principal stretches."""
+    turn, axes = (oracle.polar(rng.standard_normal((count, 3, 3))) for _ in range(2))
+    sigma = np.exp(rng.uniform(np.log(low), np.log(high), (count, 3)))
+    return (turn @ np.einsum("tij,tj,tkj->tik", axes, sigma, axes) - np.eye(3)).astype(np.float32)
+
+
+@pytest.mark.parametrize("size", [1e-6, 1e-4, 1e-2, 0.1, 0.3])
+def test_small_strains_keep_their_digits(size, device, rng):
+    """Relative to the stress itself: C - I is a sum of terms that are no larger than it is."""
+    A = (size * rng.uniform(-1, 1, (5000, 3, 3))).astype(np.float32)
+    P, Q, ok = stress_of(A, device)
+    assert ok.all()
+    # In float64 the reference itself loses 1e-16 / size.
+    assert relative_error(P, expected(A)).max() < 1e-5
+    assert np.array_equal(P, Q)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.8, 1.25), (0.5, 2.0), (0.35, 4.0)])
+def test_large_strains_and_rotations(low, high, device, rng):
+    """Of the modulus times the stretch: C - I of a turned F has the rounding of numbers of order C."""
+    A = of_stretches(rng, low, high)
+    exact = expected(A)
+    P, Q, ok = stress_of(A, device)
+    assert ok.mean() > 0.99
+    scale = LAM * high**2
+    assert np.abs(P - exact)[ok].max() < 1e-5 * scale
+    assert np.abs(Q - exact).max() < 1e-5 * scale
+
+
+def test_turned_over_and_flat(device, rng):
+    """Where the rotation is defined."""
+    F = rng.standard_normal((5000, 3, 3))
+    _, sigma, _ = np.linalg.svd(F)
+    F = F[sigma[:, 1] + np.sign(np.linalg.det(F)) * sigma[:, 2] > 0.1 * sigma[:, 0]]
+    A = (F - np.eye(3)).astype(np.float32)
+    exact = expected(A)
+    _, Q, ok = stress_of(A, device)
+    assert 0.3 < ok.mean() < 0.8
+    assert np.abs(Q - exact).max() < 1e-4 * np.abs(exact).max()
+
+
+def test_anything_is_finite(device, rng):
+    """Zero, tiny and huge F; what is not trusted adds nothing."""
+    F = np.concatenate([s * rng.standard_normal((100, 3, 3)) for s in (0.0, 1e-30, 1e-15, 1.0, 1e15)])
+    P, Q, ok = stress_of((F - np.eye(3)).astype(np.float32), device)
+    assert (P[~ok] == 0).all()
+    assert np.isfinite(Q).all()

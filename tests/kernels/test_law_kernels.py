@@ -1,0 +1,185 @@
+"""Kernels of laws that CUDA takes, on random strained states, every node against float64.
+
+Their arithmetic is the same on either device; what only CUDA has, memory shared by groups of subtrees and warps that
+add up, runs through the public models there (see ``test_miscompile``).
+"""
+
+import numpy as np
+import oracle
+import pytest
+import warp as wp
+from cases import oracle_mesh, random_displacement
+from fibres import WOOD, made, random_axes, wood
+from pairs import add_forces
+from thousands import FORESTS, TOLERANCE, materials, meshed, turned
+
+import warp_corot as wc
+from warp_corot.discretization.clusters.single import isotropic_material
+from warp_corot.discretization.plan import ForcePlan
+from warp_corot.elasticity.corotated.anisotropic import AnisotropicField
+from warp_corot.elasticity.corotated.anisotropic_general import GeneralAnisotropicField
+from warp_corot.elasticity.corotated.anisotropic_subtrees import as_bytes
+from warp_corot.elasticity.paths.clusters import ClusterScatter
+from warp_corot.kernels.clusters.laws import isotropic_law
+from warp_corot.kernels.corotated.anisotropic import scatter_anisotropic
+from warp_corot.kernels.corotated.definite import quaternions_of
+from warp_corot.kernels.elements import constitutive
+from warp_corot.kernels.elements.general_cuda import corotated_law
+from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
+from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
+from warp_corot.kernels.subtrees.cuda import BLOCK
+from warp_corot.kernels.subtrees.laws import scatter_subtrees
+
+LAWS = {
+    "linear": constitutive.linear_stress,
+    "stvk": constitutive.stvk_stress,
+    "neo_hookean": constitutive.neo_hookean_stress,
+}
+
+
+def state(mesh, law, rng):
+    """Displacements as the device has them, and positions in float64."""
+    u = random_displacement(mesh, rng, 0.1) if law == "linear" else turned(mesh, rng, 0.1)
+    return np.pad(u, ((0, 0), (0, 1))), mesh.points + u.astype(float)
+
+
+def by_node(subtrees, device):
+    """Node numbers as kernels for CUDA read them, [10, subtrees]."""
+    if device.is_cpu:
+        transposed = np.ascontiguousarray(subtrees.nodes.numpy().T)
+        subtrees.nodes = subtrees.targets = wp.array(transposed, dtype=wp.int32, device=device)
+
+
+def assert_right(forces, expected):
+    wrong = np.abs(forces - expected).max(axis=1) > TOLERANCE * np.abs(expected).max()
+    assert not wrong.any(), f"{wrong.sum()} of {wrong.size} nodes"
+
+
+def _of_subtrees(chosen, others):
+    """Pairs of a forest and something of its kernels: each compiles for a second or two, so ``others`` are slow."""
+    pairs = [(name, other) for other in others for name in FORESTS]
+    return [pytest.param(*pair, marks=() if pair in chosen else pytest.mark.slow, id=", ".join(pair)) for pair in pairs]
+
+
+#: Every type of a law's kernel, and every law.
+OF_LAWS = [
+    *((name, "neo_hookean") for name in FORESTS),
+    ("type 0", "one material"),
+    ("type 1", "linear"),
+    ("type 2", "stvk"),
+]
+OF_KINDS = [
+    ("type 0", "muscle field"),
+    ("mixed levels", "muscle field"),
+    ("type 1", "wood"),
+    ("type 2", "stiffness field"),
+]
+
+
+@pytest.mark.parametrize(("name", "law"), _of_subtrees(OF_LAWS, [*LAWS, "one material"]))
+def test_subtrees_one_by_one(name, law, device, rng):
+    """All subtrees of a forest, without the leaves that are in none; of one material under the last of the laws."""
+    uniform = law == "one material"
+    law = "neo_hookean" if uniform else law
+    mesh = meshed(name)
+    given, (mu, lam) = materials(len(mesh.tets), uniform, rng)
+    body = wc.SoftBody(mesh, wc.Isotropic(**given), device=device)
+    u, x = state(mesh, law, rng)
+    on_device = wp.array(u, dtype=wp.vec4, device=device)
+    f = wp.zeros_like(on_device)
+    plan = ForcePlan.of_forest(mesh, None, wp.get_device(device), grouped=False)
+    for batch in plan.batches:
+        by_node(batch.subtrees, body.device)
+        kernel = scatter_subtrees(batch.shape, False, uniform, LAWS[law])
+        inputs = [batch.subtrees, body.mu, body.lam, on_device]
+        wp.launch(kernel, batch.count, inputs=inputs, outputs=[f], device=device, block_dim=BLOCK)
+    inside = np.ones(len(mesh.tets), bool)
+    inside[plan.flat.leaves.numpy()] = False
+    assert inside.sum() > 100
+    mu, lam = (np.broadcast_to(value, inside.shape)[inside] for value in (mu, lam))
+    _, expected = oracle.evaluate(law, oracle.Mesh(mesh.points, mesh.tets[inside]), x, mu, lam)
+    assert_right(f.numpy()[:, :3], expected)
+
+
+@pytest.mark.parametrize("uniform", [True, False], ids=["one material", "material per element"])
+@pytest.mark.parametrize("law", [*LAWS, "corotated"])
+def test_general_elements(law, uniform, device, rng):
+    mesh = meshed("general")
+    given, (mu, lam) = materials(len(mesh.tets), uniform, rng)
+    body = wc.SoftBody(mesh, wc.Isotropic(**given), device=device)
+    u, x = state(mesh, law, rng)
+    on_device = wp.array(u, dtype=wp.vec4, device=device)
+    f = wp.zeros_like(on_device)
+    stress = LAWS.get(law) or corotated_law(quick_rotation)
+    material = isotropic_material([body.mu, body.lam, body.material_stride])
+    add_forces(ClusterScatter(body.elements, isotropic_law(stress)), material, on_device, f)
+    assert_right(f.numpy()[:, :3], oracle.evaluate(law, oracle_mesh(mesh), x, mu, lam)[1])
+
+
+@pytest.mark.parametrize(("name", "kind"), _of_subtrees(OF_KINDS, ["muscle field", "wood", "stiffness field"]))
+def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
+    """Every hundredth node is displaced by an edge and more, so that some leaves of uniform forests are left to the
+    robust rotation; and active stress."""
+    mesh = meshed(name)
+    material = anisotropic(kind, mesh, rng)
+    body = wc.SoftBody(mesh, material, device=device)
+    on_device, active = strained(mesh, rng, device)
+    whole = AnisotropicField(body, byers_xu, False)
+    axes = wp.empty(len(whole.material.axes), dtype=wp.quat, device=device)
+    wp.launch(quaternions_of, len(axes), inputs=[whole.material.axes], outputs=[axes], device=device)
+    options = ("muscle" in kind, whole.material.axes_stride == 0, whole.material.stride == 0)
+    plan = ForcePlan.of_forest(mesh, None, wp.get_device(device), grouped=False)
+    f, flags = wp.zeros_like(on_device), 0
+    for batch in plan.batches:
+        by_node(batch.subtrees, body.device)
+        left = wp.zeros(-(-batch.count // 8), dtype=wp.uint64, device=device)
+        kernel = scatter_anisotropic_subtrees(batch.shape, False, *options)
+        inputs = [batch.subtrees, whole.material, axes, 1, active, on_device]
+        wp.launch(kernel, batch.count, inputs=inputs, outputs=[f, as_bytes(left)], device=device, block_dim=BLOCK)
+        inputs = [left, batch.subtrees.first, body.elements, whole.material, 1, active, on_device]
+        wp.launch(repair_leaves, 8 * len(left), inputs=inputs, outputs=[f], device=device)
+        flags += np.unpackbits(as_bytes(left).numpy()).sum()
+    flat = plan.flat
+    if len(flat):
+        inputs = [flat.elements, flat.leaves, whole.material, 1, active, on_device]
+        wp.launch(scatter_flat, len(flat), inputs=inputs, outputs=[f], device=device)
+    assert flags < 0.3 * len(mesh.tets)
+    assert flags > 0 or name == "mixed levels"
+    assert_right(f.numpy()[:, :3], leaf_by_leaf(whole, active, on_device))
+
+
+@pytest.mark.parametrize("kind", ["muscle", "wood field", "stiffness field"])
+def test_anisotropic_general_elements(kind, device, rng):
+    mesh = meshed("general")
+    material = anisotropic(kind, mesh, rng)
+    body = wc.SoftBody(mesh, material, device=device)
+    on_device, active = strained(mesh, rng, device)
+    f = wp.zeros_like(on_device)
+    field = GeneralAnisotropicField(body)
+    body.has_activation = True
+    body.element_activation = active
+    add_forces(field.scatter, field.active_material, on_device, f)
+    assert_right(f.numpy()[:, :3], leaf_by_leaf(field, active, on_device))
+
+
+def anisotropic(kind, mesh, rng):
+    if kind == "stiffness field":
+        return wood(random_axes(rng), young=rng.uniform(0.5, 2, (len(mesh.tets), 1)) * WOOD["young"])
+    return made(kind, mesh, rng)[0]
+
+
+def strained(mesh, rng, device):
+    """Displacements, every hundredth node's by an edge and more; and active stress."""
+    u, _ = state(mesh, "corotated", rng)
+    u[:, :3] += np.where(rng.random((len(mesh.points), 1)) < 0.01, random_displacement(mesh, rng, 1.2), 0)
+    active = rng.uniform(0, 1e4, len(mesh.tets))
+    return wp.array(u, dtype=wp.vec4, device=device), wp.array(active, dtype=wp.float32, device=device)
+
+
+def leaf_by_leaf(field, active, u):
+    """Forces [N, 3] of the kernel that test_anisotropy compares with the oracle."""
+    f = wp.zeros_like(u)
+    kernel = scatter_anisotropic(field.body.element_kind, byers_xu)
+    inputs = [field.body.elements, field.material, 1, active, u]
+    wp.launch(kernel, field.element_count, inputs=inputs, outputs=[f], device=u.device)
+    return f.numpy()[:, :3]

@@ -1,0 +1,144 @@
+"""Leaves that the subtree kernels leave out, and leaves in no subtree: what CUDA does with them.
+
+Those kernels are plain Warp but for groups of subtrees and clusters, so they run on every device; a CPU's threads come
+one after another.
+"""
+
+import numpy as np
+import oracle
+import pytest
+import warp as wp
+from cases import edge_scale, mixed_forest, oracle_mesh
+from left_out_launches import Launches
+
+import warp_corot as wc
+from warp_corot.discretization.plan import ForcePlan
+from warp_corot.elasticity.corotated.left_out import LeftOutLeaves
+from warp_corot.kernels.subtrees.repair import COUNT_STRIDE, EVALUATIONS, LISTS
+
+TOLERANCE = 1e-5  # of the largest force, as in test_miscompile
+
+
+def expected(forest, u, young):
+    """Forces by the oracle, and the nodes that no element without a definite rotation touches; see test_miscompile."""
+    reference, x = oracle_mesh(forest), forest.points + u.astype(np.float32).astype(float)
+    F = reference.deformation_gradients(x)
+    sigma = np.linalg.svd(F, compute_uv=False)
+    sound = np.ones(len(forest.points), bool)
+    sound[forest.tets[sigma[:, 1] + sigma[:, 2] * np.sign(np.linalg.det(F)) < 0.1 * sigma[:, 0]]] = False
+    _, forces = oracle.evaluate("corotated", reference, x, *oracle.lame(young, 0.4))
+    return forces, sound
+
+
+@pytest.mark.parametrize("uniform", [True, False], ids=["one material", "material per element"])
+@pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
+def test_listed_leaves_get_their_forces(share, uniform, device, rng):
+    """No node, a tenth, or all displaced by an edge: subtrees and single leaves, and the list is empty again after."""
+    forest = mixed_forest(cells=(2, 1, 1), level=7, passes=3, share=0.05)
+    young = np.full(len(forest.tets), 1e4) if uniform else rng.uniform(5e3, 2e4, len(forest.tets))
+    material = wc.Isotropic(1e4 if uniform else young, 0.4, 1000.0)
+    body = wc.SoftBody(forest, material, device=device)
+    far = rng.random((len(forest.points), 1)) < share
+    u = np.where(far, 1.0, 0.08) * edge_scale(forest) * rng.uniform(-1, 1, forest.points.shape)
+    body.displacements = u
+    launches = Launches(body)
+    assert {batch.shape for batch in launches.plan.batches} == {0, 1, 2}
+    forces, sound = expected(forest, u, young)
+    for _ in range(2):
+        error = np.abs(launches.forces() - forces)[sound].max()
+        assert error < TOLERANCE * np.abs(forces).max()
+        assert (launches.count > 0) == (share > 0)
+        assert (launches.listed.own.counts.numpy()[:EVALUATIONS] == 0).all()
+
+
+def test_whole_subtrees_get_their_forces(device, rng):
+    """A body turned over, and pressed so that it has definite rotations: every subtree is left out whole."""
+    forest = wc.TetForest.box((2, 1, 1), 0.1, 9)
+    body = wc.SoftBody(forest, wc.Isotropic(1e4, 0.4, 1000.0), device=device)
+    u = 0.02 * edge_scale(forest) * rng.uniform(-1, 1, forest.points.shape) - [0, 0, 1.6] * forest.points
+    body.displacements = u
+    launches = Launches(body)
+    forces, sound = expected(forest, u, 1e4)
+    assert sound.all()
+    assert np.abs(launches.forces() - forces).max() < TOLERANCE * np.abs(forces).max()
+    (batch,) = launches.plan.batches
+    assert (batch.flagged.numpy()[: batch.count] == 255).all()
+
+
+def test_one_bad_leaf_is_left_out_alone(device, rng):
+    """Of the subtree of a leaf that is turned over, the leaves that still have a volume are not left out."""
+    forest = wc.TetForest.box((1, 1, 1), 0.1, 9)
+    body = wc.SoftBody(forest, wc.Isotropic(1e4, 0.4, 1000.0), device=device)
+    u = 0.02 * edge_scale(forest) * rng.uniform(-1, 1, forest.points.shape)
+    tet = forest.tets[len(forest.tets) // 2]
+    u[tet[0]] += 1.5 * (forest.points[tet[1:]].mean(0) - forest.points[tet[0]])
+    body.displacements = u
+    launches = Launches(body)
+    launches.forces()
+    F = oracle_mesh(forest).deformation_gradients(forest.points + u)
+    (batch,) = launches.plan.batches
+    bits = np.unpackbits(batch.flagged.numpy()[: batch.count, None], axis=1, bitorder="little")
+    leaves = batch.subtrees.first.numpy()[:, None] + np.arange(8)
+    left_out = np.zeros(len(forest.tets), bool)
+    left_out[leaves[bits.astype(bool)]] = True
+    det = np.linalg.det(F)
+    # Between the two bounds rounding and the shape of F decide.
+    assert left_out[det < 0.029].all()
+    assert not left_out[det > 0.031].any()
+    assert 0 < left_out.sum() < 8
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
+def test_every_leaf_may_be_listed(share, device, rng):
+    """Also those that need not be: the forces of a body all of whose subtrees are put on the lists."""
+    forest = wc.TetForest.box((2, 1, 1), 0.1, 9)
+    young = rng.uniform(5e3, 2e4, len(forest.tets))
+    body = wc.SoftBody(forest, wc.Isotropic(young, 0.4, 1000.0), device=device)
+    far = rng.random((len(forest.points), 1)) < share
+    u = np.where(far, 1.0, 0.08) * edge_scale(forest) * rng.uniform(-1, 1, forest.points.shape)
+    body.displacements = u
+    plan = ForcePlan.of_forest(forest, None, body.device, grouped=False)
+    listed = LeftOutLeaves.of(plan, body.device)
+    # Dealt out to lists of different lengths, some of them empty.
+    (batch,) = plan.batches
+    counts, entries = listed.own.counts.numpy(), listed.own.entries.numpy().reshape(LISTS, listed.own.room, 2)
+    for k, first in enumerate(batch.subtrees.first.numpy()):
+        of = k * k % (LISTS - 1)
+        entries[of, counts[of * COUNT_STRIDE]] = first, 255
+        counts[of * COUNT_STRIDE] += 1
+    listed.own.counts.assign(counts)
+    listed.own.entries.assign(entries.reshape(-1, 2))
+    f = wp.zeros_like(body.node_displacements)
+    listed.repair(body.elements, [body.mu, body.lam, body.material_stride], body.node_displacements, f)
+    forces, sound = expected(forest, u, young)
+    assert np.abs(f.numpy()[:, :3] - forces)[sound].max() < TOLERANCE * np.abs(forces).max()
+    assert (listed.own.counts.numpy()[: LISTS * COUNT_STRIDE] == 0).all()
+
+
+@pytest.mark.skipif(not wp.get_cuda_devices(), reason="on the CPU what is left out is done in order")
+@pytest.mark.parametrize("turned", [1.0, 0.4])
+def test_what_was_left_out_before_changes_nothing(turned, rng):
+    """All of a body, or a part, turned over: the first evaluation knows nothing of that, the next ones do."""
+    device = wp.get_cuda_devices()[0]
+    forest = wc.TetForest.box((1, 1, 1), 0.1, 17)
+    body = wc.SoftBody(forest, wc.Isotropic(1e4, 0.4, 1000.0), device=device)
+    x = forest.points
+    body.displacements = (
+        0.02 * edge_scale(forest) * rng.uniform(-1, 1, x.shape)
+        - np.where(x[:, 2:] < turned * 0.1, 1.6, 0.0) * [0, 0, 1] * x
+    )
+    fast, leaf = (wc.Corotated(subtrees=subtrees).bind(body) for subtrees in (True, False))
+    found, flags = [], []
+    for field in (fast, fast, leaf, *([fast] * 20)):
+        f = wp.zeros_like(body.node_displacements)
+        field.scatter_forces(body.node_displacements, f)
+        found.append(f.numpy()[:, :3])
+        flags.append(fast.plan.batches[0].flagged.numpy())
+    assert (flags[0] == 255).mean() > 0.9 * turned
+    for other in found:
+        assert np.abs(other - found[2]).max() < TOLERANCE * np.abs(found[2]).max()
+    # Once it is the right way round again that is found out.
+    body.displacements = np.zeros_like(x)
+    for _ in range(40):
+        fast.scatter_forces(body.node_displacements, f)
+    assert (fast.plan.batches[0].flagged.numpy() == 0).all()

@@ -1,0 +1,105 @@
+"""Small motions are not noise: forces and energies keep their digits however small the strain is.
+
+Displacements are float32, right to 6e-8 of themselves, and a sum of differences of them to a few times that; a strain
+that is found as a difference of numbers near one is off by 1.5e-7 whatever its size.
+"""
+
+import numpy as np
+import oracle
+import pytest
+import warp as wp
+from cases import edge_scale, mixed_forest, oracle_mesh, place, random_displacement, simulation
+from left_out_launches import Launches
+
+import warp_corot as wc
+from warp_corot.discretization.plan import ForcePlan
+from warp_corot.kernels.subtrees.cuda import scatter_subtrees_shared
+from warp_corot.kernels.subtrees.repair import LeftOut
+
+LAME = oracle.lame(1e4, 0.4)
+MATERIAL = {"young": 1e4, "poisson": 0.4, "density": 1000.0}
+AMOUNTS = [1e-2, 1e-3, 1e-4, 1e-6]
+TOLERANCE = 3e-6  # some 10 roundings of each of some 10 elements of a node, relative to the largest force
+
+
+def gathered(forest, x, level):
+    if level is None:
+        return None
+    ancestors, unit = np.unique(forest.ancestors(level), return_inverse=True)
+    return oracle.polar(oracle.Mesh(forest.points, forest.tree.tets[ancestors]).deformation_gradients(x))[unit.ravel()]
+
+
+@pytest.mark.parametrize("amount", AMOUNTS)
+@pytest.mark.parametrize("level", [None, 2])
+def test_leaf_by_leaf(level, amount, device, rng):
+    """Own and shared rotations: forces and the energy."""
+    forest = mixed_forest(cells=(1, 1, 1), level=4, passes=2)
+    model = wc.Corotated(rotation_level=level, subtrees=False)
+    sim, body = simulation(forest, model, device, material=MATERIAL)
+    u = random_displacement(forest, rng, amount)
+    place(body, u)
+    x = forest.points + u.astype(float)
+    energies, expected = oracle.evaluate("corotated", oracle_mesh(forest), x, *LAME, R=gathered(forest, x, level))
+    assert np.abs(sim.forces().numpy() - expected).max() < TOLERANCE * np.abs(expected).max()
+    assert sim.energy().elastic == pytest.approx(energies.sum(), rel=TOLERANCE)
+
+
+@pytest.mark.parametrize("amount", AMOUNTS)
+def test_own_rotations_by_subtrees(amount, device, rng):
+    """The series of small displacements at and below its bound: right to 2e-5 in the worst case, beyond it to 1e-4.
+
+    ``amount`` = 0.01 lies about the bound, with leaves by both ways side by side.
+    """
+    forest = mixed_forest(cells=(2, 1, 1), level=7, passes=3, share=0.05)
+    body = wc.SoftBody(forest, wc.Isotropic(**MATERIAL), device=device)
+    u = amount * edge_scale(forest) * rng.uniform(-1, 1, forest.points.shape)
+    body.displacements = u
+    _, expected = oracle.evaluate(
+        "corotated", oracle_mesh(forest), forest.points + u.astype(np.float32).astype(float), *LAME
+    )
+    tolerance = 1e-4 if amount > 5e-3 else TOLERANCE
+    assert np.abs(Launches(body).forces() - expected).max() < tolerance * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("amount", AMOUNTS)
+@pytest.mark.parametrize("leaf_level", [6, 7, 8])
+def test_shared_rotations_by_subtrees(leaf_level, amount, device, rng):
+    """Displacements turned back by the root's rotation keep their digits at every size."""
+    forest = wc.TetForest.box((1, 1, 1), 0.1, leaf_level)
+    body = wc.SoftBody(forest, wc.Isotropic(**MATERIAL), device=device)
+    u = amount * edge_scale(forest) * rng.uniform(-1, 1, forest.points.shape)
+    body.displacements = u
+    level = leaf_level - 3
+    (batch,) = ForcePlan.of_forest(forest, level, body.device, grouped=False).batches
+    if body.device.is_cpu:
+        nodes = wp.array(np.ascontiguousarray(batch.subtrees.nodes.numpy().T), dtype=wp.int32, device=body.device)
+        batch.subtrees.nodes = batch.subtrees.targets = nodes
+    f = wp.zeros_like(body.node_displacements)
+    none = wp.empty(0, dtype=wp.mat33, device=body.device), wp.empty(0, dtype=wp.int32, device=body.device)
+    wp.launch(
+        scatter_subtrees_shared(batch.shape, False, True, False, False),
+        dim=batch.count,
+        inputs=[batch.subtrees, body.mu, body.lam, body.node_displacements, *none],
+        outputs=[f, batch.flagged, LeftOut()],
+        device=body.device,
+        block_dim=128,
+    )
+    x = forest.points + u.astype(np.float32).astype(float)
+    _, expected = oracle.evaluate("corotated", oracle_mesh(forest), x, *LAME, R=gathered(forest, x, level))
+    assert np.abs(f.numpy()[:, :3] - expected).max() < TOLERANCE * np.abs(expected).max()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("speed", [1.0, 1e-2, 1e-4, 1e-6])
+def test_energy_of_an_undamped_beam(speed, device):
+    """The paper's beam, soft, set off with v = a (z/L)^2: the energy is kept within 1 % over 20,000 steps."""
+    forest = wc.TetForest.box((1, 1, 3), 0.064, 3)
+    fixed = np.flatnonzero(forest.points[:, 2] < 1e-9)
+    material = {"young": 5e3, "poisson": 0.49, "density": 1000.0}
+    v = np.zeros_like(forest.points)
+    v[:, 0] = speed * (forest.points[:, 2] / 0.192) ** 2
+    sim, body = simulation(forest, wc.Corotated(subtrees=False), device, dt=1e-4, material=material, fixed=fixed)
+    place(body, np.zeros_like(v), v)
+    start = sim.energy().total
+    sim.advance_steps(20_000)
+    assert sim.energy().total == pytest.approx(start, rel=0.01)

@@ -1,0 +1,121 @@
+"""Meshes of a number of elements: of any shape, as many as asked for, all of the body in them, in one piece."""
+
+import numpy as np
+import pytest
+import trimesh
+
+import warp_corot as wc
+from warp_corot.domain.fidelity import fidelity
+from warp_corot.mesh.growing.cut import face_pairs, without_slivers
+
+TURN = trimesh.transformations.rotation_matrix(0.4, (1.0, 2.0, 3.0))
+
+
+def turned(mesh: trimesh.Trimesh) -> wc.Domain:
+    mesh = mesh.copy().apply_transform(TURN)
+    return wc.Domain.from_surface((mesh.vertices, mesh.faces))
+
+
+def coil() -> wc.Domain:
+    """A wire of 2 mm, 60 cm of it, wound in a space of 10 cm."""
+    t = np.linspace(0.0, 4.0 * np.pi, 80)
+    path = np.stack([0.05 * np.cos(t), 0.05 * np.sin(t), 0.1 * t / t[-1]], axis=1)
+    parts = [
+        trimesh.creation.cylinder(0.001, segment=segment, sections=8)
+        for segment in np.stack([path[:-1], path[1:]], axis=1)
+    ]
+    whole = trimesh.util.concatenate(parts)
+    return wc.Domain.from_surface((whole.vertices, whole.faces))
+
+
+SHAPES = {
+    "cube": lambda: turned(trimesh.creation.box((0.1, 0.1, 0.1))),
+    "sheet": lambda: turned(trimesh.creation.box((0.2, 0.2, 0.002))),
+    "tube": lambda: turned(trimesh.creation.annulus(0.018, 0.02, 0.1)),
+    "ball": lambda: wc.Domain.sphere(0.05),
+    "coil": coil,
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_all_of_a_body_is_in_as_many_elements_as_asked_for(shape):
+    domain = SHAPES[shape]()
+    mesh = wc.TetForest.from_domain(domain, target_elements=3000)
+    found = fidelity(mesh, domain)
+    assert 0.9 * 3000 <= found.elements <= 3000
+    assert found.volume_error == pytest.approx(0.0, abs=0.012)
+    assert found.pieces == found.input_pieces == 1
+    assert found.lost_pieces == 0
+    assert found.watertight
+
+
+def test_thin_parts_get_layers_where_the_number_allows():
+    """A slab on a block: with two layers asked for, its elements are half as thick as it is or less."""
+    block = trimesh.creation.box((0.06, 0.06, 0.06))
+    slab = trimesh.creation.box((0.12, 0.06, 0.006)).apply_translation((0.08, 0.0, 0.0))
+    whole = trimesh.util.concatenate([block, slab])
+    domain = wc.Domain.from_surface((whole.vertices, whole.faces))
+    sizes = []
+    for layers in (0, 2):
+        mesh = wc.TetForest.from_domain(domain, target_elements=20_000, min_layers=layers)
+        middle = mesh.points[mesh.tets].mean(axis=1)
+        edges = mesh.cell_size * 0.5 ** (mesh.levels / 3.0)
+        sizes.append(edges[(middle[:, 0] > 0.05) & (np.abs(middle[:, 2]) < 0.003)].max())
+    assert sizes[1] <= 1.3 * 0.006 / 2 < sizes[0]
+
+
+def test_more_levels_are_used_where_the_given_cubes_are_large():
+    mesh = wc.TetForest.from_domain(SHAPES["tube"](), 0.1, target_elements=3000)
+    assert mesh.cell_size == 0.1
+    assert 0.8 * 3000 <= len(mesh.tets) <= 3000
+    assert fidelity(mesh, SHAPES["tube"]()).volume_error == pytest.approx(0.0, abs=0.02)
+
+
+def test_parts_apart_stay_apart_where_elements_have_room():
+    pair = [trimesh.creation.box((0.03, 0.03, 0.03)).apply_translation((x, 0, 0)) for x in (0.0, 0.04)]
+    whole = trimesh.util.concatenate(pair)
+    domain = wc.Domain.from_surface((whole.vertices, whole.faces))
+    assert fidelity(wc.TetForest.from_domain(domain, target_elements=10_000), domain).pieces == 2
+
+
+def test_a_label_smaller_than_an_element_has_one():
+    numbers = np.zeros((24, 24, 24), np.int16)
+    numbers[2:22, 2:22, 2:22] = 1
+    numbers[9, 9, 9] = 2
+    domain = wc.Domain.from_labels(numbers, spacing=(0.005, 0.005, 0.005), labels={"organ": 1, "speck": 2})
+    mesh = wc.TetForest.from_domain(domain, target_elements=1000)
+    assert not fidelity(mesh, domain).lost_labels
+    at = mesh.points[mesh.tets[mesh.elements_of("speck")]].mean(axis=1)
+    assert np.linalg.norm(at - 0.045, axis=1).max() < 0.03
+
+
+def test_the_same_mesh_comes_out_twice():
+    one, two = (wc.TetForest.from_domain(SHAPES["tube"](), target_elements=2000) for _ in range(2))
+    assert np.array_equal(one.lattice, two.lattice)
+    assert np.array_equal(one.tets, two.tets)
+    assert np.array_equal(one.fill, two.fill)
+
+
+def test_slivers_that_connect_stay():
+    """A row of cubes' elements, all but the ends' next to empty: none is given up, or the ends would come apart."""
+    row = wc.TetForest.box((6, 1, 1))
+    volume = row.volumes
+    middle = row.points[row.tets].mean(axis=1)[:, 0]
+    held = np.where((middle < 1.0) | (middle > 5.0), 1.0, 0.01) * volume
+    volumes, given_up = without_slivers(row.tets, held, volume, 0.02)
+    assert volumes.sum() == pytest.approx(held.sum())
+    kept = np.flatnonzero(~given_up)
+    assert given_up.any()
+    pairs = face_pairs(row.tets[kept])
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(kept), len(kept)))
+    assert connected_components(links)[0] == 1
+
+
+def test_a_cube_takes_what_it_is_given(tmp_path):
+    """So many of its elements are equally needy that none of them has room, and nothing is left to look at."""
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "cube.stl")
+    mesh = wc.TetForest.from_domain(wc.Domain.from_surface(tmp_path / "cube.stl"), target_elements=20000)
+    assert 18000 <= len(mesh.tets) <= 20000

@@ -1,0 +1,72 @@
+"""Elements that a surface cuts: what they hold, and what becomes of those that hold next to nothing."""
+
+import numpy as np
+import pytest
+from meshes import PAIRS, SHAPES, as_trimesh, assert_bound, held
+from scipy.spatial import ConvexHull
+
+import warp_corot as wc
+from warp_corot.mesh.growing.cut import inside_shares, label_shares, merged
+
+
+def test_share_inside_is_the_volume_of_the_convex_hull():
+    rng = np.random.default_rng(1)
+    values = rng.standard_normal((200, 4))
+    corner = np.vstack([np.zeros(3), np.eye(3)])
+    for value, share in zip(values, inside_shares(values), strict=True):
+        if (value >= 0).all():
+            assert share == 0
+            continue
+        points = [corner[value < 0]]
+        for i, j in PAIRS:
+            if (value[i] < 0) != (value[j] < 0):
+                points.append((corner[i] * value[j] - corner[j] * value[i])[None] / (value[j] - value[i]))
+        assert share == pytest.approx(6 * ConvexHull(np.concatenate(points)).volume, rel=1e-9)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("sliver", [0.0, 0.02, 0.3])
+def test_what_elements_hold_is_what_the_surface_encloses(shape, sliver):
+    forest = wc.TetForest.from_domain(SHAPES[shape][0](), 0.3, max_level=9, surface_error=3e-3, sliver=sliver)
+    surface = forest.surface()
+    assert held(forest) == pytest.approx(surface.volume, rel=1e-11)
+    assert forest.fill.min() > sliver * (1 - 1e-12)
+    named = np.zeros(len(forest.points), bool)
+    named[forest.tets] = True
+    assert named.all()
+    assert as_trimesh(surface).is_watertight
+    assert_bound(surface, forest)
+
+
+def test_slivers_without_other_neighbours_go_to_the_fullest():
+    box = wc.TetForest.box((1, 1, 1), 1.0, 3)
+    rng = np.random.default_rng(2)
+    volumes = rng.random(len(box.tets))
+    after, gone = merged(box.tets, volumes, np.ones(len(volumes), bool))
+    assert gone.sum() == len(volumes) - 1
+    assert not gone[np.argmax(volumes)]
+    assert after.sum() == pytest.approx(volumes.sum())
+    small = rng.random(len(volumes)) < 0.4
+    after, gone = merged(box.tets, volumes, small)
+    assert np.array_equal(gone, small)
+    assert after.sum() == pytest.approx(volumes.sum())
+    assert (after[~gone] >= volumes[~gone]).all()
+    # What a single one holds goes to the neighbour across a face that holds most.
+    alone = np.arange(len(volumes)) == 17
+    after, gone = merged(box.tets, volumes, alone)
+    shared = (box.tets[:, :, None] == box.tets[17]).any(axis=2).sum(axis=1)
+    taker = max(np.flatnonzero(shared == 3), key=lambda t: volumes[t])
+    assert np.flatnonzero(after > volumes).tolist() == [taker]
+
+
+def test_label_shares_fill_what_is_inside():
+    rng = np.random.default_rng(6)
+    values, labels = rng.standard_normal((500, 4)), rng.integers(1, 4, (500, 4))
+    shares = label_shares(values, labels, 3)
+    assert np.allclose(shares.sum(axis=1), inside_shares(values), atol=1e-12)
+    assert (shares >= 0).all()
+    pure = np.ptp(labels, axis=1) == 0
+    assert np.allclose(shares[pure, labels[pure, 0]], inside_shares(values[pure]))
+    # Two labels, all inside: one node's corner is an eighth, two nodes' wedge a half.
+    shares = label_shares(-np.ones((2, 4)), np.array([[1, 2, 2, 2], [1, 2, 1, 2]]), 2)
+    assert np.allclose(shares, [[0, 1 / 8, 7 / 8], [0, 1 / 2, 1 / 2]])

@@ -1,0 +1,256 @@
+"""The benchmarks run, check what they time, and report all of it. How fast anything is, no test asks."""
+
+import argparse
+import importlib.util
+import json
+import math
+import os
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import oracle
+import pytest
+import warp as wp
+
+import warp_corot as wc
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+
+STAGES = {"rotation", "stiffness product", "scatter", "whole force", "integration", "whole step"}
+
+
+def run(script, *arguments, path=None):
+    """One of the scripts as users start it, small and fast; ``path`` comes before what is installed."""
+    environment = os.environ | ({} if path is None else {"PYTHONPATH": str(path)})
+    command = [sys.executable, str(BENCHMARKS / script), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=Path(__file__).parent)
+
+
+def report(done, path):
+    """The JSON of a run that went well, whose table has a line for every row."""
+    assert done.returncode == 0, done.stderr
+    found = json.loads(path.read_text(encoding="utf-8"))
+    for row in found["rows"]:
+        named = [line.startswith(row["stage"]) and row["variant"] in line for line in done.stdout.splitlines()]
+        assert any(named), row
+        assert math.isfinite(row["ns_per_tet"])
+        assert row["ns_per_tet"] > 0
+        assert row["gtet_per_s"] == pytest.approx(1 / row["ns_per_tet"])
+        assert row["spread"] >= 0
+    return found
+
+
+@pytest.fixture
+def benchmarks(monkeypatch):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+
+
+def test_kernels(device, tmp_path):
+    path = tmp_path / "kernels.json"
+    done = run("kernels.py", "--device", device, "--level", 3, "--rounds", 1, "--json", path)
+    found = report(done, path)
+    assert found["device"] == device
+    assert found["tets"] == 48
+    assert found["copy_gb_per_s"] > 0
+    rows = found["rows"]
+    assert {row["stage"] for row in rows} == STAGES
+    for name in ("ns/tet", "spread", "Gtet/s", "B/tet", "flop/tet", "of copy", "error"):
+        assert name in done.stdout
+    for row in rows:
+        assert row["error"] <= (1e-2 if "SVD" in row["variant"] else 1e-4), row
+        # A repeat moves what it must at the bandwidth that this means.
+        if row["bytes_per_tet"] is not None:
+            fraction = row["bytes_per_tet"] / row["ns_per_tet"] / found["copy_gb_per_s"]
+            assert row["copy_fraction"] == pytest.approx(fraction)
+    bytes_of = {(row["stage"], row["variant"]): row["bytes_per_tet"] for row in rows}
+    force = bytes_of["whole force", "corotated, own rotations"]
+    assert force < bytes_of["whole force", "corotated, general mesh"]
+    assert force < bytes_of["whole step", "corotated, own rotations"]
+    flops = {row["variant"]: row["flops_per_tet"] for row in rows if row["stage"] == "stiffness product"}
+    assert flops["factored"] < flops["sparse K_T by type"] < flops["dense 12x12"]
+
+
+def test_peers_that_are_not_there_are_left_out(device, tmp_path):
+    for name in ("newton", "mujoco"):
+        (tmp_path / f"{name}.py").write_text(f"raise ImportError('no {name} here')\n")
+    path = tmp_path / "peers.json"
+    arguments = ["--device", device, "--level", 3, "--step-level", 3, "--rounds", 1, "--json", path]
+    done = run("peers.py", *arguments, path=tmp_path)
+    found = report(done, path)
+    assert "newton: left out (no newton here)" in done.stdout
+    assert "mujoco: left out (no mujoco here)" in done.stdout
+    assert found["peers"] == {}
+    firsts = {}
+    for row in found["rows"]:
+        first = firsts.setdefault(row["stage"], row)
+        assert row["times_ours"] == pytest.approx(row["ns_per_tet"] / first["ns_per_tet"])
+        assert row["error"] <= 1e-3
+        if row["stage"] == "whole step":
+            assert 0 < row["dt"] < row["largest_dt"] <= 1 / 60
+            assert row["simulated_s_per_s"] == pytest.approx(row["largest_dt"] / (row["ns_per_tet"] * 48e-9))
+    assert {"rotation", "whole force", "whole step"} == set(firsts)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("package", "rows"),
+    [
+        ("newton", ("eval_tetrahedra", "SemiImplicit", "VBD", "XPBD")),
+        ("mujoco", ("flex",)),
+    ],
+)
+def test_peers(package, rows, device, tmp_path):
+    if importlib.util.find_spec(package) is None:
+        pytest.skip(f"{package} is not installed")
+    path = tmp_path / "peers.json"
+    arguments = ["--device", device, "--level", 3, "--step-level", 3, "--rounds", 1, "--json", path]
+    found = report(run("peers.py", *arguments), path)
+    for name in rows:
+        (row,) = (row for row in found["rows"] if name in row["variant"])
+        # The iterations of VBD and XPBD leave some of their residual; everything else is rounding.
+        assert row["error"] <= (1.0 if name in ("VBD", "XPBD") else 1e-4)
+
+
+@pytest.mark.parametrize("script", ["kernels.py", "peers.py", "states.py"])
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("--device", "cuda:99", "cuda:99"),
+        ("--level", "2", "--level is 2; it must be from 3 to"),
+        ("--level", "many", "many"),
+        ("--rounds", "0", "--rounds is 0"),
+        ("--json", "nowhere/at/all.json", "nowhere/at"),
+    ],
+)
+@pytest.mark.usefixtures("benchmarks")
+def test_bad_options_are_said_in_one_line(script, option, value, said, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [script, option, value])
+    monkeypatch.setattr(wp.config, "log_level", wp.config.log_level)  # which the script changes
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(BENCHMARKS / script), run_name="__main__")
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"{script}: error: ")
+    assert said in line
+
+
+# --- the pieces -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("benchmarks")
+def test_a_sample_gives_the_whole_meshs_forces(rng):
+    from problem import Sample
+
+    forest = wc.TetForest.box((1, 1, 1), 1.0, 12)
+    x = forest.points + 0.003 * rng.uniform(-1, 1, forest.points.shape)
+    sample = Sample(forest.points, forest.tets)
+    assert len(sample.nodes) < len(forest.points) / 4
+    whole = oracle.evaluate("corotated", oracle.Mesh(forest.points, forest.tets), x, 3.0, 5.0)[1]
+    found = sample.forces("corotated", x, 3.0, 5.0)
+    assert np.abs(found - whole[sample.nodes]).max() < 1e-12 * np.abs(whole).max()
+    masses = oracle.Mesh(forest.points, forest.tets).masses(7.0)
+    assert np.allclose(sample.masses(7.0), masses[sample.nodes], rtol=1e-12)
+
+
+@pytest.mark.usefixtures("benchmarks")
+@pytest.mark.parametrize("error", [0.02, math.nan, math.inf])
+def test_a_wrong_result_fails_the_run(error, tmp_path, capsys):
+    from measure import Case, finish, measure
+
+    a = wp.zeros(4, dtype=wp.float32, device="cpu")
+    cases = [
+        Case("stage", name, lambda: a.fill_(1.0), lambda found=found: found, tets=4)
+        for name, found in (("right", 1e-7), ("off", error))
+    ]
+    results = measure(cases, wp.get_device("cpu"), rounds=1, tell=lambda _: None)
+    options = argparse.Namespace(json=None)
+    assert finish(options, {}, results[:1]) == 0
+    assert finish(options, {}, results) == 1
+    assert "WRONG: stage, off" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("benchmarks")
+@pytest.mark.parametrize("limit", [3e-3, 0.7e-4, 1.0])
+def test_the_largest_stable_step_is_found(limit):
+    from stable import LONGEST, PRECISION, Steppable
+
+    class Threshold(Steppable):
+        """Blows up beyond a step."""
+
+        name = "threshold"
+
+        def reset(self):
+            self.far = 0.0
+
+        def step(self, count):
+            self.far += count * (self.dt > limit)
+
+        def largest_displacement(self):
+            return self.far
+
+        def error(self):
+            return 0.0
+
+    found = Threshold().largest_stable_step(guess=1e-3)
+    assert found <= min(limit, LONGEST)
+    assert found >= min(limit, LONGEST) / PRECISION
+
+
+def test_remesh(device, tmp_path):
+    path = tmp_path / "remesh.json"
+    done = run("remesh.py", "--device", device, "--level", 6, "--rounds", 1, "--json", path)
+    rows = report(done, path)["rows"]
+    assert {row["stage"] for row in rows} == {
+        "a time step",
+        "nothing",
+        "1 %, in one place",
+        "1 %, scattered",
+        "doubled",
+    }
+    for row in rows:
+        assert row["error"] <= 1e-9
+        assert row["bisected"] >= {"doubled": 384}.get(row["stage"], 0)
+
+
+def test_states(device, tmp_path):
+    path = tmp_path / "states.json"
+    done = run("states.py", "--device", device, "--quick", "--laws", "corotated", "neo-Hookean", "--json", path)
+    found = report(done, path)
+    assert {(row["state"], row["body"]) for row in found["states"]} >= {
+        ("at rest", "beam 3"),
+        ("under its weight", "beam 3"),
+        ("all leaves turned over", "cube 3"),
+    }
+    for row in found["states"]:
+        inverted = {"one leaf turned over": 1 / 48, "all leaves turned over": 1.0}
+        if row["state"] in inverted:
+            assert row["inverted"] == pytest.approx(inverted[row["state"]])
+        assert 1.0 <= row["condition"][0] <= row["condition"][2]
+    for row in found["rows"]:
+        assert row["error"] <= 1e-3
+        assert row["over_rest"] > 0
+        assert row["over_general"] > 0
+        if row["stage"].endswith("at rest") and row["variant"] == "corotated":
+            assert row["flagged"] == 0.0
+
+
+def test_bodies(tmp_path):
+    """A body that is meshed, one that is refused, and an earlier run beside them."""
+    pytest.importorskip("trimesh")
+    table, numbers = tmp_path / "bodies.md", tmp_path / "bodies.json"
+    command = ("bodies.py", "cube-askew", "open-bowl", "--tets", 500, "--json", numbers, "-o", table)
+    done = run(*command)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(numbers.read_text(encoding="utf-8"))
+    assert found["cube-askew"]["volume"] == pytest.approx(1.0, abs=0.1)
+    assert 0 < found["cube-askew"]["elements"] <= 500
+    assert "the surface is open" in found["open-bowl"]["refused"]
+    lines = table.read_text(encoding="utf-8").splitlines()
+    assert any(line.startswith("| cube-askew | ") for line in lines)
+    assert lines[0].startswith("2 bodies at 500 elements; 1 meshed")
+    listed = run("bodies.py", "--list").stdout.split()
+    assert len(listed) >= 44
+    assert {"cube", "windpipe", "rough-ball-1-7-million"} <= set(listed)

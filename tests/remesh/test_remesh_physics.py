@@ -1,0 +1,128 @@
+"""Meshes that follow the motion give what uniform fine ones give, with a fraction of the elements."""
+
+import functools
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warp_corot as wc
+from warp_corot.discretization.changing.passes import RemeshPass
+from warp_corot.discretization.changing.pools import DeviceForest
+from warp_corot.experiments.remeshing import CELL, SCENES, TISSUE, run, table
+from warp_corot.kernels.remesh.criteria import nearness, strain, von_mises_stress
+
+CASES = [("bar", "elongation"), ("bar", "strain"), ("slab", "nearness")]
+LEVELS = [9, pytest.param(10, marks=pytest.mark.slow), pytest.param(11, marks=pytest.mark.slow)]
+
+
+@functools.cache
+def uniform(name, level, device, coarse):
+    return run(SCENES[name], level, wp.get_device(device), coarse=coarse)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize(("name", "criterion"), CASES)
+def test_remeshed_bodies_resist_and_move_as_finely_meshed_ones(name, criterion, level, device):
+    """Within 2 % of the force and of all displacements, with a fifth of the elements, where coarse meshes are not."""
+    fine, coarse = (uniform(name, level, device, which) for which in (False, True))
+    found = run(SCENES[name], level, wp.get_device(device), criterion)
+    print(*table(SCENES[name], [fine, coarse, found]), sep="\n")
+    assert max(outcome.unrest for outcome in (fine, coarse, found)) < 1e-8
+    assert found.most <= fine.elements / 5
+    assert max(map(abs, found.errors(fine).values())) < 0.02
+    assert max(map(abs, coarse.errors(fine).values())) > 0.02
+
+
+def test_what_is_let_go_is_coarse_again(device):
+    """A bar pulled and brought back has the mesh and masses it began with, and is bent by nothing."""
+    scene = SCENES["bar"]
+    mesh = scene.mesh(5)
+    body = wc.SoftBody(mesh, TISSUE, device=device)
+    mass = body.masses.copy()
+    cubes = mesh.points / CELL
+    body.fix(scene.held(cubes))
+    body.prescribe(scene.moved(cubes), times=[0.0, 0.3, 0.6], displacements=[[0, 0, 0], scene.travel, [0, 0, 0]])
+    sim = wc.Simulation(
+        body,
+        integrator=wc.SymplecticEuler(damping=60.0),
+        gravity=(0, 0, 0),
+        remesh=scene.remesh("strain", 9, wp.get_device(device)),
+    )
+    sim.advance(0.3)
+    assert body.element_count > 1.3 * len(mesh.tets)
+    pulled = body.reactions.numpy()[scene.moved(body.mesh.points / CELL)].sum(axis=0)
+    sim.advance(1.0)
+    back = body.mesh
+    assert len(back.tets) == len(mesh.tets)
+    assert np.array_equal(np.sort(back.lattice[back.tets], axis=1), np.sort(mesh.lattice[mesh.tets], axis=1))
+    left = body.reactions.numpy()[scene.moved(back.points / CELL)].sum(axis=0)
+    assert pulled[0] > 0.5
+    assert np.abs(left).max() < 1e-3 * pulled[0]
+    assert np.abs(body.displacements.numpy()).max() < 1e-3 * scene.travel[0]
+    assert np.allclose(np.sort(body.masses), np.sort(mass), rtol=1e-12)
+
+
+# --- the criteria -----------------------------------------------------------------------------------------------------
+
+
+def marked(forest, gradient, criterion, parameters, threshold, device):
+    """Which leaves a criterion finds to be above a threshold where the deformation gradient is the same everywhere."""
+    adaptive = DeviceForest(forest, len(forest.tets), device=device)
+    adaptive.carriage.set_nodes(displacements=forest.points @ (gradient - np.eye(3)).T)
+    numbers = wp.array(parameters, dtype=wp.float32, device=device)
+    mark = RemeshPass(adaptive, criterion=criterion, refine_above=threshold, simplify_below=0.0, parameters=numbers)
+    mark.run()
+    return adaptive.pools.marks.numpy() == 1
+
+
+@pytest.mark.parametrize("level", [3, 4, 5])
+def test_the_strain_criterion_sees_strain_and_no_rotation(level, device, rng):
+    forest = wc.TetForest.box((1, 1, 1), 0.1, level)
+    gradient = np.eye(3) + 0.3 * rng.normal(size=(3, 3))
+    green = 0.5 * (gradient.T @ gradient - np.eye(3))
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    rotation *= np.linalg.det(rotation)
+    edge = 0.1 / 2 ** (level // 3) * np.sqrt(3 - level % 3)
+    value = np.linalg.norm(green) * edge / 0.02
+    for turned in (gradient, rotation @ gradient):
+        assert marked(forest, turned, strain, [0.02], 0.999 * value, device).all()
+        assert not marked(forest, turned, strain, [0.02], 1.001 * value, device).any()
+    assert not marked(forest, rotation, strain, [0.02], 1e-4, device).any()
+
+
+def test_the_nearness_criterion_goes_by_the_moved_place(device, rng):
+    """Longest edge over the distance of the moved centroid from a rounded box, in float64."""
+    forest = wc.TetForest.box((2, 1, 1), 0.1, 4)
+    gradient = np.eye(3) + 0.3 * rng.normal(size=(3, 3))
+    centre, half, radius, more = np.array([0.05, 0.1, 0.02]), np.array([0.02, 0.0, 0.03]), 0.02, 0.01
+    centroids = forest.points[forest.tets].mean(axis=1) @ gradient.T
+    outside = np.linalg.norm(np.maximum(np.abs(centroids - centre) - half, 0.0), axis=1)
+    value = 0.05 * np.sqrt(2.0) / (np.maximum(outside - radius, 0.0) + more)
+    threshold = np.quantile(value, 0.4)
+    clear = np.abs(value / threshold - 1.0) > 1e-5
+    found = marked(forest, gradient, nearness, [*centre, *half, radius, more], threshold, device)
+    assert np.array_equal(found[clear], (value > threshold)[clear])
+    assert clear.mean() > 0.9
+
+
+@pytest.mark.parametrize("varied", [False, True], ids=["uniform", "varied"])
+def test_the_stress_criterion_goes_by_the_bodys_stress(varied, device, rng):
+    forest = wc.TetForest.box((2, 1, 1), 0.1, 5)
+    young = rng.uniform(1e3, 1e5, len(forest.tets)) if varied else 1e4
+    body = wc.SoftBody(forest, wc.Isotropic(young, 0.4, 1000.0), device=device)
+    body.displacements = 2e-3 * rng.normal(size=(body.node_count, 3))
+    sim = wc.Simulation(body)
+    value = sim.von_mises() * 0.05 / 0.02  # longest edges of level 5 are 0.05 m
+    threshold = float(np.quantile(value, 0.4))
+    clear = np.abs(value / threshold - 1.0) > 1e-3
+    numbers = wp.array([0.02], dtype=wp.float32, device=device)
+    other = wc.SoftBody(forest, body.material, device=device)
+    other.displacements = body.displacements
+    options = {"refine_above": threshold, "simplify_below": 0.0, "min_level": 0, "max_level": 12, "parameters": numbers}
+    remesh = wc.OnlineRemesh(criterion=von_mises_stress, capacity=len(forest.tets), every=1, **options)
+    changing = wc.Simulation(other, remesh=remesh).remeshing.changing[0]
+    changing.run()
+    found = changing.forest.pools.marks.numpy()[: len(value)] == 1
+    assert np.array_equal(found[clear], (value > threshold)[clear])
+    assert clear.mean() > 0.9

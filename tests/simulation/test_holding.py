@@ -1,0 +1,203 @@
+"""Bodies that nobody holds: what is chosen carries them, and the estimate of their sag is that of beam theory."""
+
+import functools
+
+import numpy as np
+import pytest
+
+import warp_corot as wc
+from warp_corot.holding.choice import holds_of, pieces_of
+from warp_corot.holding.regions import Shape, flat_region
+from warp_corot.holding.sag import CoarseBody
+from warp_corot.mesh.surfaces.boundary import boundary_faces
+
+GRAVITY = np.array([0.0, 0.0, -9.81])
+DENSITY = 1000.0
+
+
+def shaped(move, level=6, cells=(2, 2, 2)) -> wc.TetMesh:
+    """A ball of radius one, of tetrahedra, with its points moved."""
+    box = wc.TetForest.box(cells, 1.0, level)
+    x = box.points - box.points.mean(axis=0)
+    x /= np.abs(x).max(axis=0)
+    # A cube to a ball: each shell of the cube to one of the ball.
+    radius, length = np.abs(x).max(axis=1), np.linalg.norm(x, axis=1)
+    ball = x * np.divide(radius, length, out=np.zeros_like(length), where=length > 0)[:, None]
+    return wc.TetMesh(move(ball), box.tets, up_axis="Z")
+
+
+def kidney(x):
+    """On one pole, bent."""
+    y = x * [0.025, 0.02, 0.055]
+    return y - np.outer(6.0 * y[:, 2] ** 2, [1.0, 0.0, 0.0])
+
+
+def gall_bladder(x):
+    """A pear whose thin end is down, tilted."""
+    y = x * [0.018, 0.018, 0.045] * (1.0 + 0.6 * np.clip(x[:, 2:], -1.0, 0.0)) ** [1.0, 1.0, 0.0]
+    return turned(y, 40.0)
+
+
+def liver(x):
+    """A wedge with a thin lobe."""
+    thick = (1.0 - x[:, 0]) / 2.0
+    y = x * [0.11, 0.06, 0.0]
+    y[:, 2] = x[:, 2] * (0.012 + 0.05 * thick)
+    return turned(y, 25.0)
+
+
+def turned(x, degrees):
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return x @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]).T
+
+
+def soft(mesh) -> float:
+    """Young's modulus that the command gives a body of unknown stuff."""
+    return 20.0 * DENSITY * 9.81 * float(np.ptp(mesh.points[:, 2]))
+
+
+def held(mesh, young=None):
+    return holds_of(mesh, young=young or soft(mesh), density=DENSITY, gravity=GRAVITY)
+
+
+def largest_displacement(mesh, nodes, young, seconds) -> float:
+    """Of any node at any of 40 times a second, over the height."""
+    body = wc.SoftBody(mesh, wc.Isotropic(young, 0.45, DENSITY), device="cpu")
+    body.fix(nodes)
+    sim = wc.Simulation(body, integrator=wc.SymplecticEuler(damping=2.0), gravity=GRAVITY)
+    largest = 0.0
+    for _ in range(round(40 * seconds)):
+        sim.advance(0.025)
+        largest = max(largest, float(np.linalg.norm(body.displacements.numpy(), axis=1).max()))
+    return largest / float(np.ptp(mesh.points[:, 2]))
+
+
+@pytest.mark.parametrize("shape", [kidney, gall_bladder, liver])
+def test_organs_do_not_topple(shape):
+    """Within the time in which they turn over when their lowest tip holds them."""
+    mesh = shaped(shape)
+    chosen = held(mesh)
+    young = soft(mesh) * chosen.stiffer
+    assert largest_displacement(mesh, chosen.nodes, young, 0.5) < 0.7
+    if not chosen.pieces[0].stands:
+        assert chosen.nodes.sum() >= 0.1 * len(mesh.points)
+        assert "lowest 10 %" in chosen.reasons()[0]
+
+
+def test_what_is_not_chosen_topples():
+    """The estimate has a reason: a pear held by its lower tip does fall over."""
+    mesh = shaped(gall_bladder)
+    tip = mesh.points[:, 2] < mesh.points[:, 2].min() + 0.1 * np.ptp(mesh.points[:, 2])
+    assert not held(mesh).pieces[0].stands
+    assert largest_displacement(mesh, tip, soft(mesh), 0.5) > 1.0
+
+
+def test_what_stands_stays_standing():
+    cube = wc.TetForest.box((2, 2, 2), 0.05, 3)
+    (hold,) = held(cube).pieces
+    assert hold.stands
+    np.testing.assert_array_equal(np.sort(hold.nodes), np.flatnonzero(cube.points[:, 2] == 0.0))
+
+
+def test_a_slender_column_stands_only_if_it_is_stiff():
+    """Greenhill: it buckles under its weight where E < q L^3 / (7.84 I)."""
+    cells, edge = (1, 1, 12), 0.02
+    column = wc.TetMesh(wc.TetForest.box(cells, edge, 6).points, wc.TetForest.box(cells, edge, 6).tets, up_axis="Z")
+    length = cells[2] * edge
+    critical = DENSITY * 9.81 * edge**2 * length**3 / (7.84 * edge**4 / 12.0)
+    assert not held(column, 0.8 * critical).pieces[0].stands
+    assert held(column, 4.0 * critical).pieces[0].stands
+
+
+def test_it_stands_only_with_its_centre_of_mass_over_the_patch():
+    """An inverted L whose arm is long; stiff, so that it is a matter of balance alone."""
+    box = wc.TetForest.box((4, 1, 3), 0.1, 3)
+    centroids = box.points[box.tets].mean(axis=1)
+    kept = (centroids[:, 2] > 0.2) | (centroids[:, 0] < 0.1)
+    used, tets = np.unique(box.tets[kept], return_inverse=True)
+    mesh = wc.TetMesh(box.points[used], tets.reshape(-1, 4), up_axis="Z")
+    (hold,) = held(mesh, 1e9).pieces
+    assert not hold.stands
+    assert "centre of mass is not over" in hold.why_not
+    assert hold.stiffer == 1.0
+
+
+def test_each_piece_is_held():
+    """Also one that meets another in one node only, about which it would swing."""
+    one = shaped(functools.partial(np.multiply, 0.05), level=3)
+    top = int(np.argmax(one.points[:, 2]))
+    shift = one.points[top] - one.points[np.argmin(one.points[:, 2])]
+    count = len(one.points)
+    other = one.tets + count
+    other[other == count + int(np.argmin(one.points[:, 2]))] = top
+    mesh = wc.TetMesh(np.concatenate([one.points, one.points + shift]), np.concatenate([one.tets, other]), up_axis="Z")
+    assert np.bincount(pieces_of(mesh)).tolist() == 2 * [len(one.tets)]
+    chosen = held(mesh, 1e6)
+    assert len(chosen.pieces) == 2
+    lower, upper = chosen.nodes[:count], chosen.nodes[count:]
+    assert lower.any()
+    assert upper.any()
+    assert len(chosen.reasons()) == 2
+
+
+def test_sag_is_that_of_a_beam():
+    """Timoshenko's cantilever: bending by q L^4 / 8 E I, and shear by q L^2 / 2 k G A."""
+    mesh = wc.TetForest.box((8, 1, 1), 0.1, 9)
+    young, length, edge = 1e6, 0.8, 0.1
+    load = DENSITY * 9.81 * edge**2
+    shear_modulus = young / 2.6
+    expected = load * length**4 / (8 * young * edge**4 / 12) + load * length**2 / (2 * 5 / 6 * shear_modulus * edge**2)
+    coarse = CoarseBody(mesh.points, mesh.tets, mesh.volumes, young, DENSITY)
+    ends = np.flatnonzero(mesh.points[:, 0] == 0.0)
+    down, along = coarse.sag(ends, [GRAVITY, [9.81, 0.0, 0.0]])
+    assert down.largest == pytest.approx(expected, rel=0.1)
+    assert along.largest == pytest.approx(DENSITY * 9.81 * length**2 / (2 * young), rel=0.1)
+    assert coarse.centre == pytest.approx([0.4, 0.05, 0.05], abs=1e-3)
+
+
+def test_the_largest_flat_region_is_found():
+    """A bowl that is full to the brim."""
+    mesh = shaped(lambda x: x * [0.05, 0.05, 0.04] * np.where(x[:, 2:] > 0.0, [1.0, 1.0, 0.1], 1.0))
+    faces = boundary_faces(mesh.tets, mesh.points)[0]
+    shape = Shape(mesh.points, np.arange(len(mesh.points)), mesh.points, faces, np.array([0.0, 0.0, 1.0]))
+    patch = flat_region(shape)
+    assert patch.where.endswith("facing up")
+    assert mesh.points[patch.nodes, 2].min() > -0.02
+    assert len(patch.nodes) >= 0.1 * len(mesh.points)
+
+
+def test_a_thin_sheet_and_a_single_tetrahedron_keep_free_nodes():
+    sheet = wc.TetForest.box((8, 8, 1), 0.01, 0)
+    leaf = wc.TetMesh(sheet.points * [1.0, 1.0, 0.2], sheet.tets, up_axis="Z")
+    on_edge = wc.TetMesh(leaf.points[:, [2, 0, 1]], leaf.tets, up_axis="Z")
+    tetrahedron = wc.TetMesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]], [[0, 1, 2, 3]], up_axis="Z")
+    for mesh in (leaf, on_edge, tetrahedron):
+        nodes = held(mesh).nodes
+        assert nodes.any()
+        assert not nodes.all()
+
+
+def test_loose_tetrahedra_are_held_each_and_all_move():
+    """Also where they meet in nodes."""
+    corner = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]])
+    points = np.concatenate([corner, np.add(corner[1:], [1.0, 0.0, 0.0]), -corner[1:]])
+    mesh = wc.TetMesh(points, [[0, 1, 2, 3], [0, 4, 5, 6], [0, 8, 7, 9]], up_axis="Z")
+    chosen = held(mesh)
+    for tet in mesh.tets:
+        assert chosen.nodes[tet].sum() >= 3
+    assert not chosen.nodes.all()
+    assert chosen.title == f"{chosen.words.split(', ')[0]}, and 2 more"
+
+
+def test_an_asset_softer_than_it_is_meant_to_be_is_held_by_what_carries_it():
+    from argparse import Namespace
+
+    from warp_corot.cli.subject import Subject
+    from warp_corot.io.read.assets import find_asset
+
+    mesh = wc.TetForest.box((1, 1, 1), 0.1, 0)
+    for young, fix in ((None, "y < 0.01"), (3e4, "y < 0.01"), (3e3, None)):
+        subject = Subject(mesh, "bunny")
+        subject.take(find_asset("warp:bunny"), Namespace(young=young, unit=None, scale=None))
+        assert subject.fix == fix
+        assert subject.young == 3e4

@@ -1,0 +1,50 @@
+"""The launches of leaves that subtree kernels left out, by hand."""
+
+import numpy as np
+import warp as wp
+
+from warp_corot.discretization.plan import ForcePlan
+from warp_corot.elasticity.corotated.left_out import LeftOutLeaves
+from warp_corot.kernels.subtrees.cuda import BLOCK, FLAT, Stretch, scatter_stretches
+
+
+class Launches:
+    """The launches of a body's plan without groups or clusters."""
+
+    def __init__(self, body):
+        self.body, self.device = body, body.device
+        self.plan = plan = ForcePlan.of_forest(body.mesh, None, body.device, grouped=False)
+        self.listed = LeftOutLeaves.of(plan, body.device)
+        self.rows, self.blocks = [], 0
+        for batch in plan.batches:
+            if self.device.is_cpu:
+                nodes = np.ascontiguousarray(batch.subtrees.nodes.numpy().T)
+                batch.subtrees.nodes = batch.subtrees.targets = wp.array(nodes, dtype=wp.int32, device=self.device)
+            self._add(batch.count, batch.shape, batch.subtrees, batch.flagged)
+        if len(plan.flat):
+            self._add(len(plan.flat), FLAT)
+        self.stretches = wp.array(self.rows, dtype=Stretch, device=self.device)
+
+    def _add(self, count, shape, subtrees=None, flagged=None):
+        stretch = Stretch()
+        stretch.begin, stretch.count, stretch.shape = self.blocks, count, shape
+        if subtrees is not None:
+            stretch.subtrees, stretch.flagged = subtrees, flagged
+        self.rows.append(stretch)
+        self.blocks += -(-count // BLOCK)
+
+    def forces(self):
+        body, flat = self.body, self.plan.flat
+        f = wp.zeros_like(body.node_displacements)
+        wp.launch(
+            scatter_stretches(body.material_stride == 0),
+            dim=self.blocks * BLOCK,
+            inputs=[self.stretches, flat.elements, flat.leaves, body.mu, body.lam, body.node_displacements],
+            outputs=[f, self.listed.own],
+            device=self.device,
+            block_dim=BLOCK,
+        )
+        self.count = int(self.listed.own.counts.numpy().sum())
+        material = [body.mu, body.lam, body.material_stride]
+        self.listed.repair(body.elements, material, body.node_displacements, f)
+        return f.numpy()[:, :3]

@@ -1,0 +1,66 @@
+"""What clusters of pairs add up, on devices that have no shared memory too."""
+
+import functools
+
+import numpy as np
+import warp as wp
+
+from warp_corot.kernels.clusters.pair_elements import half_word, pair_forces, record_of, scaled_displacement
+from warp_corot.kernels.clusters.pairs import PairClusters
+from warp_corot.kernels.elements.elements import load_node
+from warp_corot.kernels.tables.cluster_layout import QUAD_BYTES
+
+
+def add_forces(scatter, material, u, f):
+    """As a ``ClusterScatter`` does; on a CPU pair by pair, without the sums in shared memory."""
+    if u.device.is_cuda:
+        scatter(material, u, f)
+        return
+    size = scatter.count * scatter.layout.threads
+    forces = wp.zeros((size, 5), dtype=wp.vec3, device=u.device)
+    nodes = wp.zeros((size, 5), dtype=wp.int32, device=u.device)
+    kernel = forces_of_pairs(scatter.Pairs, scatter.Material, scatter.law)
+    inputs = [scatter.pairs, scatter.clusters, material, scatter.layout.threads, u]
+    wp.launch(kernel, size, inputs=inputs, outputs=[forces, nodes], device=u.device)
+    found = f.numpy()
+    np.add.at(found[:, :3], nodes.numpy(), forces.numpy())
+    f.assign(found)
+
+
+@functools.cache
+def forces_of_pairs(Pairs, Material, law):
+    of_pair = pair_forces(law)
+
+    @wp.kernel(module="unique")
+    def forces_of_pairs(
+        pairs: Pairs,
+        clusters: PairClusters,
+        material: Material,
+        size: int,
+        u: wp.array[wp.vec4],
+        forces: wp.array2d[wp.vec3],
+        nodes: wp.array2d[wp.int32],
+    ):
+        i = wp.tid()
+        record = record_of(pairs, i)
+        for k in range(5):
+            nodes[i, k] = clusters.nodes[i // size * size + half_word(record, k) // wp.static(QUAD_BYTES)]
+        fa, fb, fc, fd, fe = of_pair(
+            pairs,
+            record,
+            material,
+            clusters.elements,
+            i,
+            scaled_displacement(pairs, load_node(u, nodes[i, 0])),
+            scaled_displacement(pairs, load_node(u, nodes[i, 1])),
+            scaled_displacement(pairs, load_node(u, nodes[i, 2])),
+            scaled_displacement(pairs, load_node(u, nodes[i, 3])),
+            scaled_displacement(pairs, load_node(u, nodes[i, 4])),
+        )
+        forces[i, 0] = fa
+        forces[i, 1] = fb
+        forces[i, 2] = fc
+        forces[i, 3] = fd
+        forces[i, 4] = fe
+
+    return forces_of_pairs

@@ -1,0 +1,133 @@
+"""Active stress: what muscle fibres pull with, whatever their length."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.errors import InputError
+from warp_corot.inputs.indices import checked_indices
+from warp_corot.inputs.keys import checked_times, staying
+
+if TYPE_CHECKING:
+    from .controls import Controls
+
+
+@dataclass(frozen=True, eq=False)
+class Activation:
+    """Active stress over time: keyframes, linear in between, constant before and after.
+
+    Attributes:
+        times: Increasing times [s], [K], at least two, in the time of the simulation, from a world's last reset.
+        stress: Active stress at these times [Pa], [K] for all elements alike or [K, n] for n of them; positive
+            contracts.
+
+    Raises:
+        InputError: Wrong shapes, times that do not increase, or values that are not finite.
+    """
+
+    times: npt.ArrayLike
+    stress: npt.ArrayLike
+
+    def __post_init__(self) -> None:
+        try:
+            t, s = np.asarray(self.times, dtype=np.float64), np.asarray(self.stress, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise InputError("times and stress of an Activation must be numbers") from None
+        checked_times(t)
+        if s.ndim not in (1, 2) or len(s) != len(t) or not np.isfinite(s).all():
+            raise InputError(f"stress has shape {s.shape}; it must be finite, [{len(t)}] or [{len(t)}, n]")
+        object.__setattr__(self, "times", t)
+        object.__setattr__(self, "stress", s)
+
+
+@dataclass(frozen=True, eq=False)
+class ElementActivation:
+    """Keyframes that a set of elements follows, on the device.
+
+    Attributes:
+        elements: int32 [n], among those of all worlds.
+        times: float64 [K] [s].
+        stress: float32 [K, n], or [K, 1] for all elements alike [Pa].
+    """
+
+    elements: wp.array
+    times: wp.array
+    stress: wp.array
+
+    @classmethod
+    def of_keys(cls, elements: np.ndarray, activation: Activation, device: wp.Device) -> ElementActivation:
+        """From keyframes for these elements.
+
+        Raises:
+            InputError: A number of columns that is not the number of elements.
+        """
+        stress = np.asarray(activation.stress)
+        if stress.ndim == 2 and stress.shape[1] not in (1, len(elements)):
+            raise InputError(f"stress of an Activation has shape {stress.shape}; there are {len(elements)} elements")
+        return cls(
+            wp.array(elements, dtype=wp.int32, device=device),
+            wp.array(activation.times, dtype=wp.float64, device=device),
+            wp.array(stress.reshape(len(stress), -1), dtype=wp.float32, device=device),
+        )
+
+    def without(self, chosen: np.ndarray) -> ElementActivation | None:
+        """The same for the elements that are not among the chosen; None if all are."""
+        left = staying(self.elements.numpy(), chosen, self.stress.numpy())
+        if left is None:
+            return self
+        elements, stress = left
+        if not len(elements):
+            return None
+        return ElementActivation.of_keys(elements, Activation(self.times.numpy(), stress), self.elements.device)
+
+
+def activate(
+    body: Controls,
+    stress: float | npt.ArrayLike | Activation,
+    elements: npt.ArrayLike | None,
+    worlds: npt.ArrayLike | None,
+) -> None:
+    """``SoftBody.activate``."""
+    live, count = body.activation, body.world_element_count
+    own = np.arange(count) if elements is None else checked_indices(np.asarray(elements), count, "element")
+    which = np.arange(body.worlds) if worlds is None else checked_indices(np.asarray(worlds), body.worlds, "world")
+    chosen = (which[:, None] * count + own).ravel()
+    if isinstance(stress, Activation):
+        keys = np.asarray(stress.stress)
+        if keys.ndim == 2 and keys.shape[1] == len(own):
+            stress = Activation(stress.times, np.tile(keys, (1, len(which))))
+        added = [ElementActivation.of_keys(chosen, stress, body.device)] if len(chosen) else []
+    else:
+        values = live.numpy().copy()
+        values[chosen] = _constant(stress, len(which), len(own)).ravel()
+        live.assign(values)
+        added = []
+    kept = [left for a in body.activations if (left := a.without(chosen))]
+    # Other numbers in the same array are no other launches.
+    if added or kept != body.activations:
+        body.activations = kept + added
+        body.revision += 1
+
+
+def _constant(stress: float | npt.ArrayLike, worlds: int, count: int) -> npt.NDArray[np.float64]:
+    """[worlds, count] of a number or an array that broadcasts to that.
+
+    Raises:
+        InputError: It does not, or is not finite.
+    """
+    try:
+        values = np.asarray(stress, dtype=np.float64)
+        spread = np.broadcast_to(values, (worlds, count))
+    except (TypeError, ValueError):
+        shape = f"an array of shape {np.shape(stress)}" if np.ndim(stress) else repr(stress)
+        raise InputError(
+            f"stress is {shape}; it must be a number, [{count}], [{worlds}, {count}] or an Activation"
+        ) from None
+    if not np.isfinite(values).all():
+        raise InputError("stress of an activation must be finite")
+    return spread

@@ -1,0 +1,261 @@
+"""What users do to a body: hold and move its nodes, load them, and let its fibres pull."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.discretization.elements import Mesh
+from warp_corot.discretization.nodal import vec3_view
+from warp_corot.errors import InputError
+from warp_corot.materials.anisotropic import Anisotropic
+from warp_corot.materials.isotropic import Material
+
+from .activation import Activation, ElementActivation, activate
+from .places import Nodes, nodes_at
+from .trajectory import Trajectory
+from .views import Views
+from .worlds import ChosenNodes, chosen_nodes
+
+
+class Controls:
+    """The part of ``SoftBody`` that is not its state: constraints, loads and activation.
+
+    Nodes and elements are named within a world and meant in all of them, unless ``worlds`` says otherwise.
+    """
+
+    device: wp.Device
+    worlds: int
+    #: Nodes and elements of one world.
+    world_node_count: int
+    world_element_count: int
+    node_velocities: wp.array
+    node_inverse_mass: wp.array
+    node_reactions: wp.array
+    node_loads: wp.array
+    element_activation: wp.array
+    trajectories: list[Trajectory]
+    activations: list[ElementActivation]
+    revision: int
+    has_loads: bool
+    has_activation: bool
+    _views: Views
+
+    @property
+    @abstractmethod
+    def mesh(self) -> Mesh:
+        """The mesh."""
+
+    @property
+    @abstractmethod
+    def material(self) -> Material:
+        """What the body is made of."""
+
+    @property
+    @abstractmethod
+    def masses(self) -> npt.NDArray[np.float64]:
+        """Lumped nodal masses [kg], float64 [worlds * N]."""
+
+    @property
+    @abstractmethod
+    def held(self) -> npt.NDArray[np.bool_]:
+        """Which nodes are fixed or prescribed, bool [worlds * N]."""
+
+    @property
+    def node_count(self) -> int:
+        """Nodes of all worlds."""
+        return self.worlds * self.world_node_count
+
+    @property
+    def element_count(self) -> int:
+        """Elements of all worlds."""
+        return self.worlds * self.world_element_count
+
+    def fix(self, nodes: Nodes, *, worlds: npt.ArrayLike | None = None) -> None:
+        """Hold nodes where they are.
+
+        Args:
+            nodes: Mask bool [N] or indices into one world's nodes; an expression in the rest position, as
+                ``"z < zmin + 0.01"`` (``selection.select_nodes``), or a function of it, ``f(points [N, 3]) -> bool
+                [N]`` [m]; or a mask of all worlds' nodes, bool [worlds, N].
+            worlds: In which worlds: None for all, an index, indices or a mask bool [worlds].
+
+        Raises:
+            InputError: Mask of the wrong length, index out of range, or not such an expression or function.
+        """
+        chosen = self.node_indices(nodes, worlds)
+        self._stop_following(chosen)
+        self._constrain(chosen, np.zeros(3))
+
+    def release(self, nodes: Nodes, *, worlds: npt.ArrayLike | None = None) -> None:
+        """Let fixed or prescribed nodes go, with the velocity they have. Nodes and worlds as in ``fix``."""
+        chosen = self.node_indices(nodes, worlds)
+        self._stop_following(chosen)
+        self.held[chosen] = False
+        self.update_inverse_mass()
+        reactions = self.node_reactions.numpy().copy()
+        reactions[chosen] = 0.0
+        self.node_reactions.assign(reactions)
+
+    def prescribe(
+        self,
+        nodes: Nodes,
+        *,
+        velocity: npt.ArrayLike | None = None,
+        times: npt.ArrayLike | None = None,
+        displacements: npt.ArrayLike | None = None,
+        worlds: npt.ArrayLike | None = None,
+    ) -> None:
+        """Move nodes as told, whatever the forces: at a velocity, or along keyframes.
+
+        Args:
+            nodes: n nodes of each world, as in ``fix``.
+            velocity: Constant velocity [m/s], [3], [n, 3] or [worlds, n, 3].
+            times: Increasing times of keyframes [s], [K], at least two, in the time of the simulation, from a world's
+                last reset.
+            displacements: Displacements from rest at these times [m], [K, 3] for all nodes alike or [K, n, 3]; linear
+                in between, constant before and after.
+            worlds: As in ``fix``.
+
+        Raises:
+            InputError: Neither or both ways given, wrong shapes, times that do not increase, or non-finite values.
+        """
+        named = self._chosen_nodes(nodes, worlds)
+        chosen = named.indices
+        if (velocity is None) == (times is None and displacements is None):
+            raise InputError("prescribe takes either velocity, or times and displacements")
+        if velocity is not None:
+            values = named.vectors(velocity, "velocity")
+            self._stop_following(chosen)
+            self._constrain(chosen, values)
+            return
+        self.follow(chosen, times, None if displacements is None else named.keyframes(displacements))
+
+    def follow(
+        self, indices: npt.NDArray[np.integer], times: npt.ArrayLike | None, displacements: npt.ArrayLike | None
+    ) -> None:
+        """``prescribe`` along keyframes for nodes by their indices among those of all worlds."""
+        trajectory = Trajectory.of_keys(indices, times, displacements, self.device)
+        self._stop_following(indices)
+        self._constrain(indices, np.zeros(3))
+        if len(indices):
+            self.trajectories.append(trajectory)
+            self.revision += 1
+
+    def load(self, nodes: Nodes, force: npt.ArrayLike, *, worlds: npt.ArrayLike | None = None) -> None:
+        """Set the external force on nodes, from the next step on.
+
+        Args:
+            nodes: n nodes of each world, as in ``fix``.
+            force: Force on each node [N], [3], [n, 3], [worlds, 1, 3] or [worlds, n, 3].
+            worlds: As in ``fix``.
+
+        Raises:
+            InputError: Wrong shape or non-finite values.
+        """
+        chosen = self._chosen_nodes(nodes, worlds)
+        values = chosen.vectors(force, "force")
+        self._ensure_loads()
+        loads = self.node_loads.numpy().copy()
+        loads[chosen.indices, :3] = values
+        self.node_loads.assign(loads)
+
+    @property
+    def activation(self) -> wp.array:
+        """Active stress along the fibres [Pa], float32 [worlds * T]: a view of the live array, made on first use.
+
+        Positive stress contracts. Write to it between steps; elements that follow an ``Activation`` have in it what
+        they had in the last step.
+
+        Raises:
+            InputError: The material has no fibres.
+        """
+        if not self.has_activation and not isinstance(self.material, Anisotropic):
+            raise InputError(
+                "activation needs a material with a direction, TransverselyIsotropic or Orthotropic; "
+                f"the body's is {type(self.material).__name__}"
+            )
+        if not self.has_activation:
+            self.has_activation = True
+            if len(self.element_activation) < self.element_count:
+                self.element_activation = wp.zeros(self.element_count, dtype=wp.float32, device=self.device)
+            self.revision += 1
+        return self._views.hand_out(self.element_activation[: self.element_count])
+
+    def activate(
+        self,
+        stress: float | npt.ArrayLike | Activation,
+        elements: npt.ArrayLike | None = None,
+        *,
+        worlds: npt.ArrayLike | None = None,
+    ) -> None:
+        """Set the active stress along the fibres, from the next step on: P = s (F d) d^T in an element of direction d.
+
+        It pulls whatever the fibre's length, so that it puts work in and has no energy. It stiffens the fibres: a
+        stress beyond Young's modulus along them can need a smaller step than was found without it.
+
+        Args:
+            stress: Positive contracts [Pa]: a number, [n], [worlds, n] or [worlds, 1], or keyframes that are followed
+                over time.
+            elements: n elements of each world, mask bool [T] or indices; None for all.
+            worlds: As in ``fix``.
+
+        Raises:
+            InputError: The material has no fibres, wrong shapes, or values that are not finite.
+        """
+        activate(self, stress, elements, worlds)
+
+    @property
+    def constrained(self) -> npt.NDArray[np.bool_]:
+        """Which nodes are fixed or prescribed, bool [worlds * N] (a copy)."""
+        return self.held.copy()
+
+    @property
+    def loads(self) -> wp.array:
+        """External nodal forces [N], vec3 [worlds * N]: a view of the live array, made on first use."""
+        self._ensure_loads()
+        return self._views.hand_out(vec3_view(self.node_loads[: self.node_count]))
+
+    def node_indices(self, nodes: Nodes, worlds: npt.ArrayLike | None = None) -> npt.NDArray[np.intp]:
+        """Indices, among the nodes of all worlds, of those named as in ``fix``.
+
+        Raises:
+            InputError: Mask of the wrong length, index out of range, or neither.
+        """
+        return self._chosen_nodes(nodes, worlds).indices
+
+    # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _chosen_nodes(self, nodes: Nodes, worlds: npt.ArrayLike | None) -> ChosenNodes:
+        return chosen_nodes(nodes_at(nodes, self.mesh), self.world_node_count, self.worlds, worlds)
+
+    def _ensure_loads(self) -> None:
+        if not self.has_loads:
+            self.has_loads = True
+            if len(self.node_loads) < self.node_count:
+                self.node_loads = wp.zeros(self.node_count, dtype=wp.vec4, device=self.device)
+            self.revision += 1
+
+    def _constrain(self, chosen: np.ndarray, velocity: np.ndarray) -> None:
+        self.held[chosen] = True
+        self.update_inverse_mass()
+        velocities = self.node_velocities.numpy().copy()
+        velocities[chosen, :3] = velocity
+        self.node_velocities.assign(velocities)
+
+    def update_inverse_mass(self) -> None:
+        """Tell the device which nodes are free to move."""
+        masses, inverse = self.masses, np.zeros(self.node_count)
+        free = ~self.held & (masses > 0)
+        inverse[free] = 1.0 / masses[free]
+        self.node_inverse_mass[: self.node_count].assign(inverse.astype(np.float32))
+
+    def _stop_following(self, chosen: np.ndarray) -> None:
+        """Take nodes out of the trajectories they follow."""
+        kept = [trajectory.without(chosen) for trajectory in self.trajectories]
+        if any(now is not before for now, before in zip(kept, self.trajectories, strict=True)):
+            self.trajectories = [trajectory for trajectory in kept if trajectory]
+            self.revision += 1

@@ -1,0 +1,151 @@
+"""Arrays of other programs as a body's loads and positions: steps read and write them where they are."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from warp_corot.discretization.nodal import vec3_view
+from warp_corot.errors import InputError
+
+if TYPE_CHECKING:
+    from warp_corot.remesh.changing import Changing
+
+#: What a vec4 array starts and strides at for kernels to read a node by one load [bytes].
+ALIGNMENT = 16
+
+
+class SharedArrays:
+    """The part of ``SoftBody`` that lets somebody else's arrays stand in for its own.
+
+    An array is taken as it is: float32, of vec3, vec4 or rows of three or four numbers, one for each node in the mesh's
+    order, [worlds * N] with any stride between nodes, or [worlds, N] without gaps. A fourth number means nothing and is
+    left as it is. Whoever writes to the array sees to it that this is done before a step reads it, as it is on the same
+    CUDA stream. Steps that somebody has recorded go on with the arrays that they were recorded with.
+    """
+
+    device: wp.Device
+    worlds: int
+    world_node_count: int
+    revision: int
+    changing: Changing | None
+    has_loads: bool
+    node_loads: wp.array
+    node_positions: wp.array
+    _own_loads: tuple[wp.array, bool] | None = None
+    _own_positions: wp.array | None = None
+
+    @abstractmethod
+    def adopt_positions(self) -> None:
+        """Take over positions that somebody wrote since they were last published."""
+
+    @abstractmethod
+    def publish_positions(self) -> None:
+        """Write positions from displacements."""
+
+    def use_loads(self, loads: wp.array | None) -> None:
+        """Have steps read the external nodal forces [N] from this array, in place of the body's own.
+
+        ``loads`` and ``load`` then mean this array too. Changing its values costs nothing; another array has steps
+        recorded anew.
+
+        Args:
+            loads: See ``SharedArrays``; ``wp.from_torch``, ``wp.from_jax`` and ``wp.from_dlpack`` make one without a
+                copy. None for the body's own again, as they were.
+
+        Raises:
+            InputError: Not such an array, the one positions are written to, on another device, or the body is
+                remeshed.
+        """
+        given = None if loads is None else self._shared(loads, "loads")
+        if given is not None and given.ptr == self.node_positions.ptr:
+            raise InputError("loads is the array that positions are written to; it must be another")
+        if self._own_loads is None:
+            self._own_loads = (self.node_loads, self.has_loads)
+        before = self.node_loads, self.has_loads
+        self.node_loads, self.has_loads = self._own_loads if given is None else (given, True)
+        if not (_same(self.node_loads, before[0]) and self.has_loads == before[1]):
+            self.revision += 1
+        if given is None:
+            self._own_loads = None
+
+    def use_positions(self, positions: wp.array | None) -> None:
+        """Have steps write the nodal positions [m] to this array, in place of the body's own, and take over from it
+        what is written there between steps.
+
+        The present positions are written to it at once. ``positions`` then is a view of this array.
+
+        Args:
+            positions: As for ``use_loads``, no two nodes in one place. None for the body's own again.
+
+        Raises:
+            InputError: As for ``use_loads``, or nodes overlap.
+        """
+        given = None if positions is None else vec3_view(self._shared(positions, "positions"))
+        if given is not None and abs(given.strides[0]) < wp.types.type_size_in_bytes(wp.vec3):
+            raise InputError(f"positions has {given.strides[0]} bytes from node to node; no two nodes may overlap")
+        if given is not None and given.ptr == self.node_loads.ptr:
+            raise InputError("positions is the array that loads are read from; it must be another")
+        before = self.node_positions
+        if self._own_positions is None:
+            # Only here: an array that somebody takes back may be gone by now.
+            self.adopt_positions()
+            self._own_positions = before
+        self.node_positions = self._own_positions if given is None else given
+        self.publish_positions()
+        if not _same(self.node_positions, before):
+            self.revision += 1
+        if given is None:
+            self._own_positions = None
+
+    def check_own_arrays(self) -> None:
+        """See that the body can be remeshed as far as its arrays go.
+
+        Raises:
+            InputError: Somebody else's array stands in for one of its own.
+        """
+        for name, own in (("loads", self._own_loads), ("positions", self._own_positions)):
+            if own is not None:
+                raise InputError(
+                    f"{name} is somebody else's array; a body that is remeshed has its own: use_{name}(None)"
+                )
+
+    def _shared(self, array: Any, name: str) -> wp.array:
+        """Somebody's array as steps take it: vec4 [worlds * N] if kernels can read it whole, or vec3 with a stride."""
+        if self.changing is not None:
+            raise InputError(f"{name} cannot be somebody else's array: the body is remeshed, and its nodes change")
+        if not isinstance(array, wp.array):
+            raise InputError(
+                f"{name} is {type(array).__name__}; it must be a wp.array, "
+                "as wp.from_torch, wp.from_jax and wp.from_dlpack make one"
+            )
+        n = self.worlds * self.world_node_count
+        wanted = f"vec3 or vec4 [{n}] on {self.device}"
+        if array.device != self.device:
+            raise InputError(f"{name} is on {array.device}; it must be {wanted}")
+        vectors = _vectors(array)
+        if vectors is not None and vectors.shape == (self.worlds, self.world_node_count) and vectors.is_contiguous:
+            vectors = vectors.reshape(n)
+        if vectors is None or vectors.shape != (n,):
+            given = f"{wp.types.type_repr(array.dtype)} {list(array.shape)} with strides {list(array.strides)}"
+            raise InputError(f"{name} is {given}; it must be {wanted}, or float32 [{n}, 3] or [{n}, 4], its rows whole")
+        aligned = vectors.ptr % ALIGNMENT == 0 and vectors.strides[0] % ALIGNMENT == 0
+        return vectors if vectors.dtype == wp.vec4 and aligned else vec3_view(vectors)
+
+
+def _vectors(array: wp.array) -> wp.array | None:
+    """An array of vec3 or vec4 as it is, or rows of three or four floats as such; None for any other."""
+    if array.dtype in (wp.vec3, wp.vec4):
+        return array
+    size = wp.types.type_size_in_bytes(wp.float32)
+    if array.dtype != wp.float32 or array.ndim < 2 or array.strides[-1] != size:
+        return None
+    dtype = {3: wp.vec3, 4: wp.vec4}.get(array.shape[-1])
+    return None if dtype is None else array.view(dtype)
+
+
+def _same(a: wp.array, b: wp.array) -> bool:
+    """Whether launches with one are launches with the other."""
+    return (a.ptr, a.dtype, a.strides) == (b.ptr, b.dtype, b.strides)

@@ -1,0 +1,372 @@
+"""A soft body: a mesh, a material and the state of its nodes on a device."""
+
+from __future__ import annotations
+
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.discretization.elements import Mesh, device_elements, element_kind, parts, repeated
+from warp_corot.discretization.nodal import padded, vec3_view
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import check_float32, checked_count, checked_numbers, shown
+from warp_corot.inputs.device import checked_device
+from warp_corot.kernels.stepping.integrate import ADOPT_POSITIONS, PUBLISH_POSITIONS, RESET_NODES
+from warp_corot.materials.isotropic import Isotropic, Material
+from warp_corot.mesh import TetForest
+
+from .activation import ElementActivation
+from .controls import Controls
+from .shared_arrays import SharedArrays
+from .trajectory import Trajectory
+from .views import Views
+from .worlds import World
+
+if TYPE_CHECKING:
+    from warp_corot.discretization.changing.following import FollowingBinding
+    from warp_corot.mesh.surfaces.bound import DeviceBinding
+    from warp_corot.remesh.changing import Changing
+    from warp_corot.solvers.steps.pace import Pace
+
+#: Elements, and with them nodes, are numbered in 32 bits.
+MOST_ELEMENTS = 2**31 - 1
+
+
+class SoftBody(Controls, SharedArrays):
+    """The state of one body: displacements, velocities, masses, constraints and loads of its nodes.
+
+    Nodal vectors live in 16-byte vec4 arrays, the fourth lane unused, so that a node is one load and, where the card
+    can, one reduction. The state proper is the displacement from rest, which keeps the digits of small strains: the
+    static end of a linear beam comes out to 1e-6 of its deflection, from float32 positions to 4e-6 with the beam at the
+    origin and to 3e-5 with it one metre away. ``positions`` are published after each run of steps, and positions that
+    you write are taken over before the next.
+
+    With ``worlds`` there are that many copies of the body, each with its own state, material, loads and fixed nodes,
+    stepped together; they do not meet. Nodal arrays are [worlds * N], world after world, and ``world`` is one's view.
+
+    Args:
+        mesh: A ``TetForest`` or ``TetMesh``.
+        material: Uniform, or with values that broadcast to [worlds, elements]: one per element, [T]; one per world,
+            [worlds, 1]; or all, [worlds, T]. Functions of the rest position are evaluated at the elements' centroids.
+        worlds: How many copies.
+        device: "cpu", "cuda:0", …; None for Warp's default.
+
+    A body that is remeshed (``Simulation(…, remesh=…)``) has other nodes after a pass that changed something: ask for
+    ``node_count`` and arrays anew then; views from before raise ``StaleViewError``. Its ``node_`` arrays have as many
+    places as there may ever be nodes, and more; the first ``node_count`` of them count.
+
+    Attributes:
+        worlds, device: As given.
+        node_positions: ``positions`` as they lie in memory, vec4 [worlds * N] without gaps; for ``wp.to_jax``, which
+            takes no strided view. After ``use_positions``, the array given there.
+
+    Raises:
+        InputError: The mesh or the material is something else, the device is not there, a material array does not have
+            one value per element, stiffness, mass or size are beyond the range of float32, or there are more than 2**31
+            elements in all.
+    """
+
+    def __init__(self, mesh: Mesh, material: Material, *, worlds: int = 1, device: str | wp.Device | None = None):
+        _check_made_of(mesh, material)
+        #: What remeshes the body, if anything does.
+        self.changing: Changing | None = None
+        #: What the host knows of the present mesh, by the names of properties.
+        self._known: dict[str, Any] = {"mesh": mesh}
+        self._known["material"] = material.at(centroids(mesh)) if material.functions else material
+        self.worlds = checked_count(worlds, "worlds", least=1)
+        self.device = checked_device(device)
+        self.world_node_count, self.world_element_count = len(mesh.points), len(mesh.tets)
+        self.smallest_volume = float(np.min(mesh.volumes))
+        if self.element_count > MOST_ELEMENTS:
+            raise InputError(
+                f"worlds is {worlds}: that is {self.element_count} elements; there can be {MOST_ELEMENTS} at most"
+            )
+        self.material.check_shapes(self.worlds, len(mesh.tets))
+        isotropic = self.material.isotropic
+        check_float32(2.0 * isotropic.mu + np.abs(isotropic.lam), "the stiffness 2 mu + |lambda|", "Pa")
+        check_float32(mesh.volumes, "the volume of an element", "m^3")
+        self.element_kind = element_kind(mesh)
+        self.elements = device_elements(mesh, self.device, self.worlds)
+        self.fill = getattr(mesh, "fill", None)
+        #: Lamé's parameters [Pa] and their stride, 0 or 1; then the same times the filled share, for the forces.
+        self.lame = self._lame_arrays(isotropic, None)
+        self.mu, self.lam, self.material_stride = self._lame_arrays(isotropic, self.fill)
+        self._known["masses"] = masses = lumped_masses(mesh, self.material, self.worlds)
+        check_float32(masses[masses > 0], "the mass of a node", "kg")
+
+        n = self.node_count
+        #: How many of the nodes and elements launches go through; those beyond the counts do nothing.
+        self.launch_nodes, self.launch_elements = n, self.element_count
+        self.node_rest = wp.array(padded(self.rest_positions), dtype=wp.vec4, device=self.device)
+        self.node_positions = wp.clone(self.node_rest)
+        self.node_displacements = wp.zeros(n, dtype=wp.vec4, device=self.device)
+        self.node_velocities = wp.zeros(n, dtype=wp.vec4, device=self.device)
+        self.node_forces = wp.zeros(n, dtype=wp.vec4, device=self.device)
+        self.node_reactions = wp.zeros(n, dtype=wp.vec4, device=self.device)
+        self.node_loads = wp.zeros(1, dtype=wp.vec4, device=self.device)
+        self.has_loads = False
+        self.node_mass = wp.array(self.masses, dtype=wp.float32, device=self.device)
+        self.node_inverse_mass = wp.empty(n, dtype=wp.float32, device=self.device)
+        self.trajectories: list[Trajectory] = []
+        self.element_activation = wp.zeros(1, dtype=wp.float32, device=self.device)
+        self.has_activation = False
+        self.activations: list[ElementActivation] = []
+        #: The time when each world was last reset [s], float64 [worlds].
+        self.world_starts = wp.zeros(self.worlds, dtype=wp.float64, device=self.device)
+        #: Changes whenever the launches of a step do, so that recorded steps can be recorded anew.
+        self.revision = 0
+        self._known["held"] = np.zeros(n, bool)
+        self._views = Views()
+        #: Points that go along with the body.
+        self.bindings: list[FollowingBinding] = []
+        #: Changes whenever the mesh does.
+        self.mesh_revision = 0
+        #: Displacements and velocities that worlds are reset to; None for rest.
+        self.initial_state: tuple[wp.array, wp.array] | None = None
+        self.update_inverse_mass()
+
+    # --- what it is made of ----------------------------------------------------------------------------------------
+
+    @property
+    def mesh(self) -> Mesh:
+        """The mesh; of a body that is remeshed the present one."""
+        return self._look_up("mesh")
+
+    @property
+    def material(self) -> Any:
+        """The material as given, with values in place of functions; of a body that is remeshed that of the present
+        elements."""
+        return self._look_up("material")
+
+    @property
+    def masses(self) -> npt.NDArray[np.float64]:
+        """Lumped nodal masses [kg], float64 [worlds * N]; zero at nodes that no element names."""
+        return self._look_up("masses")
+
+    @property
+    def held(self) -> npt.NDArray[np.bool_]:
+        """Which nodes are fixed or prescribed, bool [worlds * N], as the host keeps it; ``constrained`` is a copy."""
+        return self._look_up("held")
+
+    def _look_up(self, what: str) -> Any:
+        """What the host knows, asked of the device first if that has changed the mesh."""
+        if what not in self._known:
+            self._known[what] = getattr(self.changing, what)()
+        return self._known[what]
+
+    def update_inverse_mass(self) -> None:
+        super().update_inverse_mass()
+        if self.changing is not None:
+            self.changing.hold(self.held)
+
+    def mesh_changed(self, nodes: int, elements: int) -> None:
+        """The device has changed the mesh: what the host knows of it is out of date.
+
+        Args:
+            nodes, elements: How many there are now.
+        """
+        self.world_node_count, self.world_element_count = nodes, elements
+        self.mesh_revision += 1
+        self._known.clear()
+        self._views.expire()
+
+    # --- state -----------------------------------------------------------------------------------------------------
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether the elements of a world are all alike in what forces are made of."""
+        isotropic = self.material.isotropic
+        shapes = [np.shape(value) for value in (isotropic.young, isotropic.poisson)]
+        return self.fill is None and all(not shape or shape[-1] == 1 for shape in shapes)
+
+    @property
+    def rest_positions(self) -> npt.NDArray[np.float64]:
+        """Rest positions of the nodes of all worlds [m], float64 [worlds * N, 3]."""
+        return repeated(self.mesh.points, self.worlds)
+
+    def world(self, index: int) -> World:
+        """One world's part of the arrays below.
+
+        Raises:
+            InputError: There is no such world.
+        """
+        try:
+            number = -1 if isinstance(index, bool) else int(index)
+        except (TypeError, ValueError, OverflowError):
+            number = -1
+        if number != index or not 0 <= number < self.worlds:
+            raise InputError(f"world is {index!r}; it must be a whole number from 0 to {self.worlds - 1}")
+        return World(self, number)
+
+    @property
+    def positions(self) -> wp.array:
+        """Nodal positions [m], vec3 [worlds * N], in the mesh's order. A view of the live array: write to it
+        between steps, or set the property, and the next step starts from there."""
+        return self.nodal_view(self.node_positions)
+
+    @positions.setter
+    def positions(self, values: npt.ArrayLike) -> None:
+        # In float64 and by way of the displacement, so that no digit of what is given is lost.
+        self._set_displacements(self._checked_vectors(values, "positions") - self.rest_positions)
+
+    @property
+    def displacements(self) -> wp.array:
+        """Nodal displacements from rest [m], vec3 [worlds * N]: a copy; set the property to change them."""
+        self.adopt_positions()
+        return wp.clone(vec3_view(self.node_displacements[: self.node_count]))
+
+    @displacements.setter
+    def displacements(self, values: npt.ArrayLike) -> None:
+        self._set_displacements(self._checked_vectors(values, "displacements"))
+
+    @property
+    def velocities(self) -> wp.array:
+        """Nodal velocities [m/s], vec3 [worlds * N]: a view of the live array."""
+        return self.nodal_view(self.node_velocities)
+
+    @velocities.setter
+    def velocities(self, values: npt.ArrayLike) -> None:
+        self.node_velocities[: self.node_count].assign(padded(self._checked_vectors(values, "velocities")))
+
+    @property
+    def reactions(self) -> wp.array:
+        """Forces of the supports on fixed and prescribed nodes in the last step [N], vec3 [worlds * N]; zero elsewhere.
+
+        A support carries its node's own weight too. Inertia of a prescribed node is not included.
+        """
+        return self.nodal_view(self.node_reactions)
+
+    def nodal_view(self, array: wp.array) -> wp.array:
+        """One of the nodal arrays as vec3 [worlds * N], live, until the mesh changes."""
+        return self._views.hand_out(vec3_view(array[: self.node_count]))
+
+    def bind(self, points: npt.ArrayLike, triangles: npt.ArrayLike | None = None) -> DeviceBinding:
+        """Points, or with triangles [F, 3] a surface, that go along with the body, also while it is remeshed.
+
+        ``update(body.displacements)`` brings what is returned up to date, on the body's device.
+
+        Args:
+            points: Rest positions [m], [n, 3].
+
+        Raises:
+            InputError: The mesh is not a forest, the body is in several worlds, or as ``TetForest.bind``.
+        """
+        from warp_corot.discretization.changing.following import FollowingBinding
+
+        if not isinstance(self.mesh, TetForest):
+            raise InputError(f"only a TetForest can have points bound to it, not a {type(self.mesh).__name__}")
+        if self.worlds > 1:
+            raise InputError(f"worlds is {self.worlds}; bind points to the mesh, and move them with one world's nodes")
+        leaves, _ = self.mesh.embed(points)
+        binding = FollowingBinding(self.mesh.bind(points, triangles), self.mesh, leaves, self.device)
+        self.bindings.append(binding)
+        return binding
+
+    def adopt_positions(self) -> None:
+        """Take over positions that somebody wrote since they were last published."""
+        kernel = ADOPT_POSITIONS[self.node_positions.dtype]
+        self._launch(kernel, [self.node_rest, self.node_positions], [self.node_displacements])
+
+    def publish_positions(self) -> None:
+        """Write positions from displacements."""
+        kernel = PUBLISH_POSITIONS[self.node_positions.dtype]
+        self._launch(kernel, [self.node_rest, self.node_displacements], [self.node_positions])
+
+    def set_initial_state(self) -> None:
+        """Make the present state the one that ``Simulation.reset`` goes back to; at first that is rest."""
+        self.adopt_positions()
+        if self.changing is not None:
+            self.changing.remember()
+            return
+        self.initial_state = (wp.clone(self.node_displacements), wp.clone(self.node_velocities))
+
+    def reset(self, chosen: wp.array, pace: Pace) -> None:
+        """Put chosen worlds back to their initial state; ``Simulation.reset`` does more and is what to call.
+
+        Args:
+            chosen: Not zero for worlds to be reset, int32 [worlds].
+            pace: The clock.
+        """
+        if self.changing is not None:
+            self.changing.reset(chosen, pace)
+            return
+        kept = self.initial_state is not None
+        u, v = self.initial_state or (self.node_displacements, self.node_velocities)
+        inputs = [chosen, self.world_node_count, int(kept), u, v, self.node_rest, self.node_inverse_mass, pace.arrays]
+        outputs = [self.node_displacements, self.node_velocities, self.node_positions, self.node_reactions]
+        self._launch(RESET_NODES[self.node_positions.dtype], inputs, [*outputs, self.world_starts])
+
+    # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _lame_arrays(self, material: Isotropic, fill: npt.NDArray[np.float64] | None) -> tuple[wp.array, wp.array, int]:
+        mu, lam = np.broadcast_arrays(np.atleast_1d(material.mu), np.atleast_1d(material.lam))
+        if fill is None and mu.size == 1:
+            return self._floats(mu.ravel()), self._floats(lam.ravel()), 0
+        shape = (self.worlds, len(self.mesh.tets))
+        share = 1.0 if fill is None else fill
+        mu, lam = (np.broadcast_to(a, shape) * share for a in (mu, lam))
+        return self._floats(mu.ravel()), self._floats(lam.ravel()), 1
+
+    def _floats(self, values: np.ndarray) -> wp.array:
+        return wp.array(np.ascontiguousarray(values), dtype=wp.float32, device=self.device)
+
+    def _checked_vectors(self, values: npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:
+        given = checked_numbers(values, name, f"[{self.node_count}, 3]")
+        n = self.world_node_count
+        if given.shape in ((n, 3), (self.worlds, n, 3)):
+            given = np.broadcast_to(given, (self.worlds, n, 3)).reshape(-1, 3)
+        if given.shape != (self.node_count, 3):
+            raise InputError(f"{name} has shape {given.shape}; it must be [{self.node_count}, 3]")
+        bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
+        if len(bad):
+            raise InputError(f"{name} of node {bad[0]} are {given[bad[0]].tolist()}; they must be finite")
+        return given
+
+    def _set_displacements(self, values: npt.NDArray[np.float64]) -> None:
+        self.node_displacements[: self.node_count].assign(padded(values))
+        self.publish_positions()
+
+    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=self.launch_nodes, inputs=inputs, outputs=outputs, device=self.device)
+
+
+def _check_made_of(mesh: Any, material: Any) -> None:
+    """See that a body is made of a mesh and a material.
+
+    Raises:
+        InputError: One of them is something else.
+    """
+    if not isinstance(mesh, Mesh):
+        cure = "TetMesh(points, tets) makes one of arrays"
+        if isinstance(mesh, str | PathLike):
+            cure = f"TetMesh.load({str(mesh)!r}) reads tetrahedra, Domain.from_surface({str(mesh)!r}) a surface"
+        raise InputError(f"mesh is {shown(mesh)}; it must be a TetForest or a TetMesh: {cure}")
+    if not isinstance(material, Material):
+        young = f"{material!r}" if isinstance(material, int | float) else "5e3"
+        cure = f"Isotropic(young={young}, poisson=0.45, density=1000.0)"
+        raise InputError(f"material is {shown(material)}; it must be a material such as {cure}")
+
+
+def centroids(mesh: Mesh) -> npt.NDArray[np.float64]:
+    """Centroids of the elements [m], float64 [T, 3]."""
+    found = np.empty((len(mesh.tets), 3))
+    for part in parts(len(mesh.tets)):
+        found[part] = mesh.points[mesh.tets[part]].mean(axis=1)
+    return found
+
+
+def lumped_masses(mesh: Mesh, material: Material, worlds: int = 1) -> npt.NDArray[np.float64]:
+    """A quarter of the mass that each element holds, at each of its nodes [kg], float64 [worlds * N]."""
+    fill = getattr(mesh, "fill", None)
+    density = np.atleast_2d(material.density)
+    masses = np.zeros((len(density), len(mesh.points)))
+    for of_world, row in zip(masses, np.broadcast_to(density, (len(density), len(mesh.tets))), strict=True):
+        for part in parts(len(mesh.tets)):
+            quarter = mesh.volumes[part] * row[part] / 4.0
+            if fill is not None:
+                quarter = quarter * fill[part]
+            np.add.at(of_world, mesh.tets[part].ravel(), np.repeat(quarter, 4))
+    return np.broadcast_to(masses, (worlds, len(mesh.points))).ravel()

@@ -1,0 +1,67 @@
+"""Motion that nodes are told to make: keyframes of their displacements."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_numbers
+from warp_corot.inputs.keys import checked_times, staying
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Keyframed displacements that a set of nodes follows, on the device.
+
+    Attributes:
+        nodes: int32 [n].
+        times: float64 [K] [s].
+        displacements: vec3 [K, n], or [K, 1] for all nodes alike [m].
+    """
+
+    nodes: wp.array
+    times: wp.array
+    displacements: wp.array
+
+    @classmethod
+    def of_keys(
+        cls, nodes: np.ndarray, times: npt.ArrayLike | None, displacements: npt.ArrayLike | None, device: wp.Device
+    ) -> Trajectory:
+        """From keyframes as ``SoftBody.prescribe`` takes them.
+
+        Raises:
+            InputError: One of the two is missing, wrong shapes, times that do not increase, or non-finite values.
+        """
+        if times is None or displacements is None:
+            raise InputError("prescribe needs both times and displacements")
+        t = checked_times(times)
+        d = checked_numbers(displacements, "displacements", f"[{len(t)}, 3] or [{len(t)}, {len(nodes)}, 3]")
+        if d.shape not in ((len(t), 3), (len(t), len(nodes), 3)) or not np.isfinite(d).all():
+            raise InputError(
+                f"displacements has shape {d.shape}; it must be finite, [{len(t)}, 3] or [{len(t)}, {len(nodes)}, 3]"
+            )
+        return cls(
+            wp.array(nodes, dtype=wp.int32, device=device),
+            wp.array(t, dtype=wp.float64, device=device),
+            wp.array(d.reshape(len(t), -1, 3), dtype=wp.vec3, device=device),
+        )
+
+    def keys(self) -> tuple[np.ndarray, np.ndarray]:
+        """Times and displacements as ``of_keys`` takes them."""
+        d = self.displacements.numpy()
+        return self.times.numpy(), d[:, 0] if d.shape[1] == 1 else d
+
+    def without(self, chosen: np.ndarray) -> Trajectory | None:
+        """The same for the nodes that are not among the chosen; None if all are."""
+        left = staying(self.nodes.numpy(), chosen, self.displacements.numpy())
+        if left is None:
+            return self
+        nodes, d = left
+        if not len(nodes):
+            return None
+        kept = d[:, 0] if d.shape[1] == 1 else d
+        return Trajectory.of_keys(nodes, self.times.numpy(), kept, self.nodes.device)

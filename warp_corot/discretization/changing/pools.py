@@ -1,0 +1,273 @@
+"""A forest on the device that can change there: pools of tetrahedra and nodes, and the leaves in tree order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_count
+from warp_corot.inputs.device import checked_device
+from warp_corot.kernels.remesh import pools as kernels
+from warp_corot.mesh import TetForest
+from warp_corot.mesh.tree import LIVE, VOID, Tree
+
+from .frames import all_frames
+from .snapshot import Snapshot
+from .transfer import Carriage, Column, Numbers
+
+#: Threads of a launch on CUDA for each multiprocessor.
+THREADS_PER_PROCESSOR = 1024
+
+
+class PassCounts(NamedTuple):
+    """What the host asks for after a pass.
+
+    Attributes:
+        leaves, nodes: How many there are; nodes that only void tetrahedra name are not counted.
+        added, removed: Nodes made and removed in the last pass. If both are zero the mesh is what it was.
+        full: Whether a refinement ever had to be left out for want of room.
+    """
+
+    leaves: int
+    nodes: int
+    added: int
+    removed: int
+    full: bool
+
+    @classmethod
+    def of(cls, counts: npt.NDArray[np.int32]) -> PassCounts:
+        """From a copy of ``pools.counts``."""
+        leaves, nodes, added, removed, full = (
+            int(counts[which])
+            for which in (kernels.LEAVES, kernels.NODE_TOP, kernels.ADDED, kernels.REMOVED, kernels.FULL)
+        )
+        return cls(leaves, nodes, added, removed, bool(full))
+
+
+class DeviceForest:
+    """A forest in pools of fixed capacity.
+
+    The N nodes that leaves name are 0 … N - 1 after every pass. Those that only void tetrahedra name stand at the end
+    of the pool and stay there. Numbers of nodes stay theirs but in passes that remove some, where the last ones move
+    into the gaps; numbers of tetrahedra stay theirs as long as they are in use. Beyond N nodal arrays are zero, and
+    beyond the count ``pools.leaf_tets`` names sinks, places past the last node, so that a launch may go through more
+    nodes, up to ``node_capacity``, and more leaves, up to ``capacity + LEAF_PADDING``, than there are.
+
+    Args:
+        forest: The mesh to begin with. Its void tetrahedra stay as they are.
+        capacity: How many leaves there may ever be.
+        density: Mass per rest volume [kg/m^3], a number or one for each leaf [T]; the forest's filled share comes on
+            top.
+        values: Other quantities of leaves by name, [T] each, that are per full rest volume, as Lamé's parameters times
+            the filled share: children have their parent's, a parent its children's mean or what a ``Column`` says.
+        node_capacity: How many nodes; None: one for every two more leaves, where five or six a node are usual.
+        device: "cpu", "cuda:0", …; None for Warp's default.
+
+    Attributes:
+        pools: ``kernels.remesh.pools.Pools``.
+        carriage: What nodes and tetrahedra carry.
+        source: The forest that this began as.
+        capacity, node_capacity, tree_capacity: Places for leaves, nodes, and tetrahedra of all levels.
+        remembered: What ``restart`` goes back to.
+        virtual_count: Nodes that only void tetrahedra name.
+        threads: Threads of a launch.
+
+    Raises:
+        InputError: Not a forest, a capacity below what there is, or more than can be numbered.
+    """
+
+    def __init__(
+        self,
+        forest: TetForest,
+        capacity: int,
+        *,
+        density: npt.ArrayLike = 1.0,
+        values: Mapping[str, npt.ArrayLike | Column | Numbers] | None = None,
+        node_capacity: int | None = None,
+        device: str | wp.Device | None = None,
+    ):
+        if not isinstance(forest, TetForest):
+            raise InputError(f"only a TetForest can be remeshed; this is a {type(forest).__name__}")
+        self.source = forest
+        self.device = checked_device(device)
+        tree = forest.tree
+        leaves, nodes, elements = len(tree.leaves), len(forest.lattice), len(tree.level)
+        self.capacity = checked_count(capacity, "capacity", least=leaves)
+        more = self.capacity - leaves
+        self.node_capacity = (
+            nodes + (more + 1) // 2 if node_capacity is None else checked_count(node_capacity, "node_capacity", nodes)
+        )
+        self.virtual_count = nodes - forest.node_count
+        self.tree_capacity = elements + 2 * more
+        if self.tree_capacity >= 2**31:
+            raise InputError(f"capacity is {capacity}: that is {self.tree_capacity} tetrahedra; there can be 2**31 - 1")
+        self.threads = 1 if self.device.is_cpu else self.device.sm_count * THREADS_PER_PROCESSOR
+        self.pools = self._make_pools(tree)
+        self.carriage = Carriage(self, density, values or {})
+        self.remember()
+
+    def __repr__(self) -> str:
+        return f"DeviceForest({self.leaf_count} of {self.capacity} leaves on {self.device})"
+
+    # --- looking; each of these waits for the device ---------------------------------------------------------------
+
+    @property
+    def leaf_count(self) -> int:
+        return self.count(kernels.LEAVES)
+
+    @property
+    def node_count(self) -> int:
+        """Nodes that leaves name."""
+        return self.count(kernels.NODE_TOP)
+
+    @property
+    def free_nodes(self) -> int:
+        return self.node_capacity - self.virtual_count - self.node_count
+
+    @property
+    def free_leaves(self) -> int:
+        """By how many the leaves may still grow."""
+        return self.count(kernels.FREE_PAIRS)
+
+    @property
+    def is_full(self) -> bool:
+        """Whether a refinement ever had to be left out for want of room."""
+        return bool(self.count(kernels.FULL))
+
+    def counts(self) -> PassCounts:
+        """What the last pass came to, by one readback."""
+        return PassCounts.of(self.pools.counts.numpy())
+
+    def count(self, which: int) -> int:
+        """One of the counts of ``kernels.remesh.pools``."""
+        return int(self.pools.counts.numpy()[which])
+
+    @property
+    def nodes_in_use(self) -> npt.NDArray[np.intp]:
+        """Places of the nodes in the order of ``to_forest``: those of the leaves, 0 … N - 1, then the others."""
+        limit = self.node_capacity - self.virtual_count
+        return np.concatenate([np.arange(self.node_count), np.arange(limit, self.node_capacity)])
+
+    @property
+    def leaf_elements(self) -> npt.NDArray[np.int32]:
+        """The leaves' places in the pool of tetrahedra, in tree order, int32 [T]."""
+        return self.pools.leaves.numpy()[: self.leaf_count]
+
+    @property
+    def leaf_tets(self) -> npt.NDArray[np.int32]:
+        """The leaves' nodes by their places in the pool, in tree order, int32 [T, 4]."""
+        return self.pools.leaf_tets.numpy()[: self.leaf_count]
+
+    def tree(self) -> tuple[Tree, npt.NDArray[np.intp]]:
+        """The tree without unused places, nodes still by their places in the pool, and where each of it stands."""
+        pools = self.pools
+        level = pools.level.numpy()
+        used = np.flatnonzero(level != kernels.UNUSED)
+        number = np.full(len(level), -1, np.int32)
+        number[used] = np.arange(len(used), dtype=np.int32)
+        parent, child = pools.parent.numpy()[used], pools.first_child.numpy()[used]
+        parent = np.where(parent < 0, np.int32(-1), number[parent])
+        child = np.where(child < 0, child, number[child])
+        return Tree(pools.tets.numpy()[used], level[used], parent, child), used
+
+    def to_forest(self) -> TetForest:
+        """The present mesh on the host, its leaves as here in tree order.
+
+        Node i is node i here for all that leaves name. Of a domain's mesh the function's values at new nodes
+        are means, as in ``TetForest.refine``; ``fill`` and ``labels`` are what the leaves carry.
+        """
+        from .export import exported
+
+        return exported(self)
+
+    def compact(self) -> None:
+        """Number nodes and tetrahedra anew in the order of the leaves, which are in tree order after every pass.
+
+        For memory that has become scattered. Arrays stay the same, but numbers of nodes held elsewhere are void.
+        """
+        from .compaction import compact
+
+        compact(self)
+
+    def remember(self) -> None:
+        """Keep the present mesh and all that it carries, for ``restart``; it is done once when this is made."""
+        self.remembered = Snapshot.of(self)
+
+    def restart(self) -> None:
+        """Go back to what was kept last. Arrays stay the same, so that recorded passes and steps stay valid."""
+        self.remembered.restore(self)
+
+    # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _make_pools(self, tree: Tree) -> Any:
+        forest, device = self.source, self.device
+        leaves, elements = tree.leaves, len(tree.level)
+        number = self._numbers()
+        tets, frames = number[tree.tets], all_frames()
+        pools = kernels.Pools()
+        pools.roots = int(np.count_nonzero(tree.parent < 0))
+        pools.node_limit = self.node_capacity - self.virtual_count
+        pools.sink = self.node_capacity
+        pools.tets = self._filled(tets, self.tree_capacity, wp.vec4i)
+        pools.level = self._filled(tree.level, self.tree_capacity, wp.int32, kernels.UNUSED)
+        pools.parent = self._filled(tree.parent, self.tree_capacity, wp.int32, -1)
+        pools.first_child = self._filled(tree.first_child, self.tree_capacity, wp.int32, LIVE)
+        codes = frames.codes(forest.lattice, tree.tets, tree.level)
+        pools.code = self._filled(codes, self.tree_capacity, wp.int32)
+        pools.frames = wp.array(frames.frames, dtype=wp.mat33, device=device)
+        pools.child_code = wp.array(frames.of_children, dtype=wp.int32, device=device)
+        pools.next = wp.empty(self.tree_capacity, dtype=wp.int32, device=device)
+        free_pairs = np.arange(self.tree_capacity - 2, elements - 1, -2, dtype=np.int32)
+        most_pairs = (self.tree_capacity - pools.roots) // 2
+        pools.free_pairs = self._filled(free_pairs, most_pairs, wp.int32)
+        pools.fresh = wp.empty(max(most_pairs, 1), dtype=wp.int32, device=device)
+        void = np.flatnonzero((tree.first_child == VOID) & (tree.tets.min(axis=1) < forest.node_count))
+        pools.void_leaves = self._filled(void, len(void), wp.int32)
+        pools.void_count = len(void)
+        pools.lattice = self._filled(forest.lattice, self.node_capacity, wp.vec3i, places=number)
+        ends = np.where(forest.node_ends < 0, np.int32(-1), number[forest.node_ends])
+        pools.ends = self._filled(ends, self.node_capacity, wp.vec2i, -1, places=number)
+        valence = np.bincount(tets[tree.first_child < 0].ravel(), minlength=self.node_capacity)
+        pools.valence = self._filled(valence, self.node_capacity, wp.int32)
+        pools.touched = wp.zeros(self.node_capacity, dtype=wp.int32, device=device)
+        pools.leaves = self._filled(leaves, self.capacity, wp.int32)
+        padding = self.padding(len(leaves), self.capacity + kernels.LEAF_PADDING)
+        pools.leaf_tets = wp.array(np.concatenate([tets[leaves], padding]), dtype=wp.vec4i, device=device)
+        pools.new_leaves = wp.empty(self.capacity, dtype=wp.int32, device=device)
+        pools.marks = wp.zeros(self.capacity, dtype=wp.int8, device=device)
+        counts = np.zeros(kernels.COUNTS, np.int32)
+        counts[kernels.LEAVES] = len(leaves)
+        counts[kernels.FREE_PAIRS] = len(free_pairs)
+        counts[kernels.NODE_TOP] = counts[kernels.OLD_TOP] = forest.node_count
+        pools.counts = wp.array(counts, dtype=wp.int32, device=device)
+        return pools
+
+    def padding(self, start: int, stop: int) -> npt.NDArray[np.int32]:
+        """What ``pools.leaf_tets`` holds in these places if there are no leaves, int32 [stop - start, 4]."""
+        sinks = self.node_capacity + np.arange(start, stop, dtype=np.int32) % int(kernels.SINKS)
+        return np.repeat(sinks[:, None], 4, axis=1)
+
+    def _numbers(self) -> npt.NDArray[np.int32]:
+        """Places of the source's nodes: those that leaves name first, the others at the end."""
+        real = self.source.node_count
+        number = np.arange(len(self.source.lattice), dtype=np.int32)
+        number[real:] += self.node_capacity - len(number)
+        return number
+
+    def _filled(
+        self,
+        values: npt.NDArray[Any],
+        size: int,
+        dtype: Any,
+        rest: int = 0,
+        places: npt.NDArray[np.int32] | slice | None = None,
+    ) -> wp.array:
+        """Values at these places of an array of a size, or at its beginning."""
+        padded = np.full((max(size, 1), *values.shape[1:]), rest, np.int32)
+        padded[slice(len(values)) if places is None else places] = values
+        return wp.array(padded, dtype=dtype, device=self.device)

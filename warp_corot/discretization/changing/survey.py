@@ -1,0 +1,96 @@
+"""When the stable step of a mesh that changes must be found anew."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.kernels.plan.plan import begin_counts
+from warp_corot.kernels.remesh import survey as kernels
+
+from .pools import DeviceForest
+
+#: Passes for which the stiffest elements must have been softer ones before a longer step is looked for.
+PATIENCE = 10
+#: Growth of the number of finest elements, and passes with changes, after which the step is found anew in any case. An
+#: element among its like vibrates up to half again as fast as one among larger ones.
+GROWTH = 1.5
+MOST_CHANGES = 50
+#: Stiffnesses that differ by less are the same.
+ALIKE = 1e-3
+
+
+@dataclass
+class Findings:
+    """The mesh when its step was found last, and what has been since.
+
+    Attributes:
+        stiffness: Of the stiffest element, (2 mu + lambda) / (density volume^(2/3)) [1/s^2].
+        finest: How many elements are of the finest level.
+        softer_for: Passes in which the stiffest element was softer.
+        changes: Passes that changed something.
+    """
+
+    stiffness: float = 0.0
+    finest: int = 0
+    softer_for: int = 0
+    changes: int = 0
+
+
+class Survey:
+    """Looks at the elements after each pass.
+
+    Args:
+        forest: The pools.
+        modulus: 2 mu + lambda [Pa] of all elements, if they are alike; else elements carry "mu" and "lam".
+
+    Attributes:
+        found: What launches have found, int32, for ``read``.
+        last: The mesh when its step was found last.
+        finest_level: Of the present mesh.
+    """
+
+    def __init__(self, forest: DeviceForest, modulus: float):
+        self._forest = forest
+        names = forest.carriage.names
+        self._inputs = [modulus, *(names.index(name) if name in names else -1 for name in ("mu", "lam"))]
+        self.found = wp.zeros(kernels.PLACES, dtype=wp.int32, device=forest.device)
+        self.last = Findings()
+        self.finest_level = 0
+        self._stiffness, self._finest = 0.0, 0
+
+    def launch(self, goes: wp.array) -> None:
+        """Look at the elements if ``goes`` [1] is not zero; may be recorded."""
+        forest = self._forest
+        device, threads = forest.device, forest.threads
+        wp.launch(begin_counts, dim=kernels.PLACES, inputs=[goes], outputs=[self.found], device=device)
+        inputs = [threads, goes, *self._inputs, forest.pools, forest.carriage.arrays]
+        wp.launch(kernels.find_stiffest, dim=threads, inputs=inputs, outputs=[self.found], device=device)
+        inputs = [threads, goes, forest.pools]
+        wp.launch(kernels.count_finest, dim=threads, inputs=inputs, outputs=[self.found], device=device)
+
+    def read(self, found: npt.NDArray[np.int32]) -> None:
+        """Take a copy of ``found`` of a mesh that has changed."""
+        self._stiffness = float(found[: int(kernels.STIFFEST) + 1].view(np.float32)[-1])
+        self.finest_level = int(found[kernels.FINEST_LEVEL])
+        self._finest = int(found[kernels.FINEST_COUNTS :].sum())
+        self.last.changes += 1
+
+    def step_may_change(self) -> bool:
+        """Whether the stable step is to be found anew; to be asked once a pass."""
+        last = self.last
+        softer = self._stiffness < (1.0 - ALIKE) * last.stiffness
+        last.softer_for = last.softer_for + 1 if softer else 0
+        stiffer = self._stiffness > (1.0 + ALIKE) * last.stiffness
+        grown = not softer and self._finest > GROWTH * last.finest
+        if not (stiffer or grown or last.softer_for > PATIENCE or last.changes > MOST_CHANGES):
+            return False
+        self.settle()
+        return True
+
+    def settle(self) -> None:
+        """The step has been found for the mesh as it is."""
+        self.last = Findings(self._stiffness, self._finest)

@@ -1,0 +1,188 @@
+"""What nodes and tetrahedra of a changing forest carry, as the host sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.discretization.nodal import padded
+from warp_corot.errors import InputError
+from warp_corot.kernels.remesh.pools import SINKS
+from warp_corot.kernels.remesh.state import MEAN, NO_ROW, Carried
+from warp_corot.mesh.growing.growth import lattice_spacing
+from warp_corot.mesh.lattice import MAX_LEVEL, volume_shares
+
+if TYPE_CHECKING:
+    from .pools import DeviceForest
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """Values of leaves, [T] or one for all, and what a parent has of its children's: see ``kernels.remesh.state``."""
+
+    values: npt.ArrayLike
+    merging: int = int(MEAN)
+
+
+@dataclass(frozen=True, eq=False)
+class Numbers:
+    """Whole numbers of leaves, [T] or one for all; a parent has its first child's."""
+
+    values: npt.ArrayLike
+
+
+class Carriage:
+    """State of nodes and material of tetrahedra, in arrays as large as the pools.
+
+    A new node is the midpoint of its deformed edge, so that children have their parent's deformation gradient. Mass is
+    lumped, a quarter of each leaf's at its nodes, and moves with its momentum; what a held node cannot take up of it is
+    counted in ``support_impulse``. A node between two held ones is held. A load stays where it is; that of a removed
+    node goes to both ends by halves. Children have their parent's density and values; a parent has its children's mean,
+    or what a ``Column`` says.
+
+    Attributes:
+        arrays: ``kernels.remesh.state.Carried``; nodal arrays by the nodes' places in the pool, with the places that
+            padding names behind them, others by those of the tetrahedra. ``rest``, ``u``, ``v``, ``load``,
+            ``reaction``, ``mass32`` and ``inverse_mass`` are what stepping reads and writes.
+        names, number_names: Names of the columns of ``arrays.values`` and ``arrays.numbers``.
+    """
+
+    def __init__(
+        self, forest: DeviceForest, density: npt.ArrayLike, values: Mapping[str, npt.ArrayLike | Column | Numbers]
+    ):
+        self.device = forest.device
+        self._nodes = forest.node_capacity + int(SINKS)
+        self._first_nodes = len(forest.source.points)
+        source, elements = forest.source, forest.tree_capacity
+        leaves = source.tree.leaves
+        fill = 1.0 if source.fill is None else source.fill
+        numbers = {name: given.values for name, given in values.items() if isinstance(given, Numbers)}
+        columns = {name: _as_column(given) for name, given in values.items() if name not in numbers}
+        if source.fill is not None:
+            columns["fill"] = Column(source.fill)
+        self.names, self.number_names = tuple(columns), tuple(numbers)
+        per_leaf = _of_leaves("density", density, len(leaves)) * fill
+        arrays = Carried()
+        arrays.origin = wp.vec3d(*source.origin)
+        arrays.spacing = lattice_spacing(source.cell_size)
+        volume = volume_shares(np.arange(MAX_LEVEL + 1)) * source.cell_size**3
+        arrays.volume = wp.array(volume, dtype=wp.float64, device=self.device)
+        arrays.density = self._of_elements(leaves, per_leaf, elements, wp.float64)
+        labels = np.zeros(len(leaves)) if source.labels is None else source.labels
+        arrays.label = self._of_elements(leaves, labels, elements, wp.int32)
+        arrays.values = self._table(leaves, {n: c.values for n, c in columns.items()}, elements, wp.float32)
+        merging = [column.merging for column in columns.values()]
+        arrays.merging = wp.array(merging, dtype=wp.int32, device=self.device)
+        arrays.fill_column = self.names.index("fill") if "fill" in columns else -1
+        arrays.numbers = self._table(leaves, numbers, elements, wp.int32)
+        masses = np.zeros(self._nodes)
+        np.add.at(masses, source.tets, (0.25 * per_leaf * volume[source.levels])[:, None])
+        arrays.mass = wp.array(masses, dtype=wp.float64, device=self.device)
+        arrays.mass32 = wp.array(masses, dtype=wp.float32, device=self.device)
+        arrays.inverse_mass = wp.zeros(self._nodes, dtype=wp.float32, device=self.device)
+        for name in ("u", "v", "load", "reaction"):
+            setattr(arrays, name, wp.zeros(self._nodes, dtype=wp.vec4, device=self.device))
+        rest = np.zeros((self._nodes, 4), np.float32)
+        rest[: self._first_nodes] = padded(source.points)
+        arrays.rest = wp.array(rest, dtype=wp.vec4, device=self.device)
+        arrays.held = wp.zeros(self._nodes, dtype=wp.uint8, device=self.device)
+        arrays.row = wp.full(self._nodes, int(NO_ROW), dtype=wp.int32, device=self.device)
+        arrays.gained_mass = wp.zeros(self._nodes, dtype=wp.float64, device=self.device)
+        arrays.gained_momentum = wp.zeros(self._nodes, dtype=wp.vec3d, device=self.device)
+        arrays.gain_count = wp.zeros(self._nodes, dtype=wp.int32, device=self.device)
+        arrays.gainers = wp.empty(self._nodes, dtype=wp.int32, device=self.device)
+        arrays.impulse = wp.zeros(1, dtype=wp.vec3d, device=self.device)
+        self.arrays = arrays
+        self._update_inverse_mass()
+
+    def set_nodes(
+        self,
+        *,
+        displacements: npt.ArrayLike | None = None,
+        velocities: npt.ArrayLike | None = None,
+        loads: npt.ArrayLike | None = None,
+        held: npt.ArrayLike | None = None,
+        rows: npt.ArrayLike | None = None,
+        nodes: npt.ArrayLike | None = None,
+    ) -> None:
+        """Set the state of nodes.
+
+        Args:
+            displacements, velocities, loads: [n, 3] [m], [m/s], [N].
+            held: Which are fixed or prescribed, bool [n].
+            rows: Which row of keyframes held nodes follow, -1 for none, int32 [n]. A node that is made between two held
+                ones has the row of both; -2 if they follow different ones.
+            nodes: Places in the pool [n]; None: those of the forest that this began as, before any pass.
+
+        Raises:
+            InputError: Wrong shapes.
+        """
+        places = np.arange(self._first_nodes) if nodes is None else np.asarray(nodes)
+        for name, given in (("u", displacements), ("v", velocities), ("load", loads)):
+            if given is not None:
+                found = np.asarray(given, dtype=np.float64)
+                if found.shape != (len(places), 3):
+                    raise InputError(f"the state has shape {found.shape}; it must be [{len(places)}, 3]")
+                array = getattr(self.arrays, name)
+                whole = array.numpy().copy()
+                whole[places] = padded(found)
+                array.assign(whole)
+        for name, given in (("held", held), ("row", rows)):
+            if given is not None:
+                found = np.asarray(given)
+                if found.shape != (len(places),):
+                    raise InputError(f"{name} has shape {found.shape}; it must be [{len(places)}]")
+                array = getattr(self.arrays, name)
+                whole = array.numpy().copy()
+                whole[places] = found
+                array.assign(whole)
+        if held is not None:
+            self._update_inverse_mass()
+
+    def values(self, name: str) -> npt.NDArray[np.float32]:
+        """A quantity of all places for tetrahedra; those of leaves count."""
+        return self.arrays.values.numpy()[:, self.names.index(name)]
+
+    @property
+    def support_impulse(self) -> npt.NDArray[np.float64]:
+        """What supports have given in all passes, as mass came to and from held nodes [N s], float64 [3]."""
+        return self.arrays.impulse.numpy()[0]
+
+    def _update_inverse_mass(self) -> None:
+        masses, held = self.arrays.mass.numpy(), self.arrays.held.numpy() != 0
+        free = ~held & (masses > 0)
+        inverse = np.zeros(len(masses))
+        inverse[free] = 1.0 / masses[free]
+        self.arrays.inverse_mass.assign(inverse.astype(np.float32))
+
+    def _of_elements(self, leaves: np.ndarray, values: np.ndarray, count: int, dtype: Any) -> wp.array:
+        spread = np.zeros(count, wp.dtype_to_numpy(dtype))
+        spread[leaves] = values
+        return wp.array(spread, dtype=dtype, device=self.device)
+
+    def _table(self, leaves: np.ndarray, given: Mapping[str, npt.ArrayLike], count: int, dtype: Any) -> wp.array:
+        table = np.zeros((count, len(given)), wp.dtype_to_numpy(dtype))
+        for column, (name, value) in zip(table.T, given.items(), strict=True):
+            column[leaves] = _of_leaves(name, value, len(leaves))
+        return wp.array(table, dtype=dtype, device=self.device, ndim=2)
+
+
+def _as_column(given: npt.ArrayLike | Column | Numbers) -> Column:
+    assert not isinstance(given, Numbers)
+    return given if isinstance(given, Column) else Column(given)
+
+
+def _of_leaves(name: str, given: npt.ArrayLike, count: int) -> npt.NDArray[np.float64]:
+    values = np.asarray(given, dtype=np.float64)
+    if values.shape not in ((), (count,)):
+        raise InputError(
+            f"{name} has shape {values.shape}; it must be a number or have one entry for each of {count} leaves"
+        )
+    if not np.isfinite(values).all():
+        raise InputError(f"{name} must be finite")
+    return np.broadcast_to(values, count)

@@ -1,0 +1,1 @@
+"""The corotated model, isotropic and anisotropic, on every kind of mesh."""

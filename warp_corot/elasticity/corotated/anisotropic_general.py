@@ -1,0 +1,52 @@
+"""Anisotropic general tetrahedra on CUDA, in clusters; see ``kernels.clusters.pairs``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from warp_corot.elasticity.paths.clusters import ClusterScatter
+from warp_corot.elasticity.paths.general import clustered
+from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law
+from warp_corot.kernels.corotated.definite import quaternions_of
+from warp_corot.kernels.math.rotation import quick_rotation
+from warp_corot.kernels.tables.cluster_layout import ANISOTROPIC
+from warp_corot.materials.anisotropic import TransverselyIsotropic
+
+from .anisotropic import AnisotropicField
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+
+
+class GeneralAnisotropicField(AnisotropicField):
+    """Single elements whose forces need no settled order.
+
+    Args:
+        body: Of an ``Anisotropic`` material; a general mesh's, or of a forest that has few groups of subtrees.
+    """
+
+    def __init__(self, body: SoftBody):
+        super().__init__(body, quick_rotation, deterministic=False)
+        axes = self.material.axes
+        law = anisotropic_law(isinstance(body.material, TransverselyIsotropic))
+        self.scatter = ClusterScatter(self.elements, law, ActiveMaterial, chosen=clustered(body), layout=ANISOTROPIC)
+        self._quaternions = wp.empty(len(axes), dtype=wp.quat, device=self.device)
+        self.launch(quaternions_of, len(axes), [axes], [self._quaternions])
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        self.scatter(self.active_material, u, f)
+
+    @property
+    def active_material(self) -> Any:
+        """The material with the present active stress, as the kernel takes it."""
+        return active_material(self.material, self._quaternions, *self._activation)
+
+
+def active_material(passive: Any, axes: wp.array, is_active: int, activation: wp.array) -> Any:
+    """``kernels.clusters.laws.ActiveMaterial`` of its parts."""
+    material = ActiveMaterial()
+    material.passive, material.axes = passive, axes
+    material.is_active, material.activation = is_active, activation
+    return material

@@ -1,0 +1,174 @@
+"""Force fields of the corotated model that go element by element."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import warp as wp
+
+from warp_corot.discretization.plan import Units
+from warp_corot.elasticity.model import ForceField, leaf_slots
+from warp_corot.elasticity.paths.lanes import Lanes
+from warp_corot.kernels.corotated.corotated import (
+    corotated_energies,
+    corotated_von_mises,
+    extract_rotations,
+    extract_warm_rotations,
+    reset_quaternions,
+    scatter_matrix_product,
+    scatter_own_rotation,
+    scatter_with_rotations,
+)
+from warp_corot.kernels.elements.general_cpu import repair_elements, scatter_elements
+from warp_corot.mesh import TetForest
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.changing.plan import DevicePlan
+    from warp_corot.discretization.changing.pools import DeviceForest
+
+    from .model import Corotated
+
+
+@dataclass(frozen=True)
+class Rotations:
+    """Units and their rotations, mat33 [units]."""
+
+    units: Units
+    rotations: wp.array
+
+    @classmethod
+    def of(cls, units: Units) -> Rotations:
+        return cls(units, wp.empty(units.count, dtype=wp.mat33, device=units.unit.device))
+
+
+class CorotatedField(ForceField):
+    """Rotations and forces as one kernel where each element uses its own, as two stages otherwise."""
+
+    #: Whether complete subtrees go as one.
+    takes_subtrees: ClassVar[bool] = False
+
+    def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
+        super().__init__(body, deterministic)
+        self.model = model
+        kind = body.element_kind
+        self._shared: Rotations | None = None
+        self._followed: DevicePlan | None = None
+        self._fused = model.level is None and model.rotation != "warm" and model.stiffness == "factored"
+        self._state: dict[str, wp.array] = {}
+        if model.rotation == "warm":
+            self._state["quaternions"] = wp.empty(self.unit_count, dtype=wp.quat, device=self.device)
+            self.reset(wp.ones(body.worlds, dtype=wp.int32, device=self.device))
+            self._extract = extract_warm_rotations(kind)
+        else:
+            self._extract = extract_rotations(kind, model.own_rotation)
+            self._own = scatter_own_rotation(kind, model.own_rotation)
+        if model.stiffness == "factored":
+            self._forces = scatter_with_rotations(kind)
+        else:
+            self._forces = scatter_matrix_product(model.stiffness == "sparse")
+        self._energies = corotated_energies(kind)
+        self._von_mises = corotated_von_mises(kind)
+
+    @property
+    def state(self) -> dict[str, wp.array]:
+        return self._state
+
+    def reset(self, chosen: wp.array) -> None:
+        for quaternions in self._state.values():
+            in_world = len(quaternions) // self.body.worlds
+            self.launch(reset_quaternions, len(quaternions), [chosen, in_world], [quaternions])
+
+    @property
+    def rotation_level(self) -> int | None:
+        """Level of the tree at which rotations are shared, if they are."""
+        return self.model.level
+
+    def plan_of(self, forest: DeviceForest) -> DevicePlan:
+        from warp_corot.discretization.changing.plan import DevicePlan
+
+        return DevicePlan(forest, self.rotation_level, subtrees=self.takes_subtrees)
+
+    def follow(self, plan: DevicePlan) -> None:
+        super().follow(plan)
+        self._followed = plan
+        self._shared = None
+
+    @property
+    def unit_count(self) -> int:
+        """How many rotations are found."""
+        return self._sharing().units.count
+
+    def extract_rotations(self, u: wp.array) -> wp.array:
+        """The rotation of every unit, mat33 [units]."""
+        shared = self._sharing()
+        units = shared.units
+        self.launch(self._extract, units.count, [units.elements, u], [*self.state.values(), shared.rotations])
+        return shared.rotations
+
+    def add_rotated_forces(self, u: wp.array, f: wp.array) -> None:
+        """Forces with the rotations that were extracted last."""
+        self._launch_with_rotations(self._forces, self.material_inputs, u, f)
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        if self._fused:
+            self.launch(self._own, self.element_count, [self.elements, *self.material_inputs, u], [f])
+        else:
+            self.extract_rotations(u)
+            self.add_rotated_forces(u, f)
+
+    def write_energies(self, u: wp.array, energies: wp.array) -> None:
+        self.extract_rotations(u)
+        self._launch_with_rotations(self._energies, self.material_inputs, u, energies)
+
+    def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
+        self.extract_rotations(u)
+        self._launch_with_rotations(self._von_mises, self.stress_inputs, u, stress)
+
+    def _sharing(self) -> Rotations:
+        """Who uses whose rotation; made on first use, since own rotations need none of it for their forces."""
+        if self._shared is None:
+            self._shared = Rotations.of(self._units())
+        return self._shared
+
+    def _units(self) -> Units:
+        level = self.rotation_level
+        if level is None:
+            return Units.own(self.elements, self.element_count)
+        if self._followed is not None:
+            return self._followed.all_units
+        assert isinstance(self.body.mesh, TetForest)
+        return Units.of_forest(self.body.mesh, level, self.device, self.body.worlds)
+
+    def _launch_with_rotations(self, kernel: wp.Kernel, material: list, u: wp.array, output: wp.array) -> None:
+        shared = self._sharing()
+        inputs = [self.elements, *material, u, shared.rotations, shared.units.unit]
+        self.launch(kernel, self.element_count, inputs, [output])
+
+
+class LeafField(CorotatedField):
+    """Leaf by leaf."""
+
+    def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
+        super().__init__(body, model, deterministic)
+        if self.deterministic:
+            self.slots, self.elements = leaf_slots(body)
+        if not self._fused and body.changing is None:
+            self._sharing()
+
+    def follow(self, plan: DevicePlan) -> None:
+        super().follow(plan)
+        if not self._fused:
+            self._sharing()
+
+
+class LanesField(CorotatedField):
+    """General elements on the CPU."""
+
+    def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
+        super().__init__(body, model, deterministic)
+        self._lanes = Lanes(self.elements, self.elements, scatter=scatter_elements, repair=repair_elements)
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        self._lanes.scatter_forces(self.material_inputs, u, f)

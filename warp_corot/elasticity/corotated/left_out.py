@@ -1,0 +1,84 @@
+"""Lists of the leaves that subtree kernels left out, on CUDA, and the launches that do them; see ``kernels.subtrees.repair``."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_corot.discretization.plan import Plan
+from warp_corot.discretization.subtrees import Batch, Sharing
+from warp_corot.kernels.subtrees.cuda import BLOCK
+from warp_corot.kernels.subtrees.repair import (
+    COUNT_STRIDE,
+    LIST_BLOCK,
+    LISTS,
+    LeftOut,
+    repair_listed_own,
+    repair_listed_shared,
+)
+
+#: Thread blocks a multiprocessor: as many as it has room for at once, so that a launch over an empty list soon ends.
+BLOCKS = 6
+
+
+class LeftOutLeaves:
+    """Lists of all leaves with own rotations, and of each batch that shares its roots' rotations.
+
+    Args:
+        own: How many subtrees, and single leaves, each launch has that finds own rotations.
+        shared: The batches that share their roots' rotations.
+    """
+
+    #: What a kernel gets that makes no list.
+    NONE: ClassVar[Any] = LeftOut()
+
+    def __init__(self, own: list[int], shared: list[Batch], device: wp.Device):
+        self.own = _empty_lists(own, device)
+        self._has_own = sum(own) > 0
+        self._shared = [(batch, _empty_lists([batch.count], device)) for batch in shared]
+        self._threads = LIST_BLOCK * BLOCKS * max(device.sm_count, 1) if device.is_cuda else LIST_BLOCK
+        self._device = device
+
+    @classmethod
+    def of(cls, plan: Plan, device: wp.Device) -> LeftOutLeaves:
+        own = [batch.count for batch in plan.batches if batch.sharing is Sharing.OWN]
+        return cls([*own, len(plan.flat)], [batch for batch in plan.batches if batch.sharing is Sharing.ROOT], device)
+
+    @staticmethod
+    def load(device: wp.Device) -> None:
+        """Compile now what launches will need."""
+        wp.load_module(repair_listed_own.module, device, block_dim=LIST_BLOCK)
+
+    def list_of(self, batch: Batch) -> Any:
+        """The list that a batch's kernel appends to."""
+        if batch.sharing is Sharing.OWN:
+            return self.own
+        return next((listed for other, listed in self._shared if other is batch), self.NONE)
+
+    def repair(self, elements: Any, material: list, u: wp.array, f: wp.array) -> None:
+        """Add the forces of the leaves on the lists to f, and empty them."""
+        inputs = [elements, *material, u]
+        if self._has_own:
+            self._launch(repair_listed_own, [*inputs, self.own], f)
+        for batch, listed in self._shared:
+            self._launch(repair_listed_shared, [batch.subtrees.first, batch.roots, *inputs, listed], f)
+
+    def _launch(self, kernel: wp.Kernel, inputs: list, f: wp.array) -> None:
+        wp.launch(
+            kernel,
+            dim=self._threads if self._device.is_cuda else 1,
+            inputs=[self._threads if self._device.is_cuda else 1, *inputs],
+            outputs=[f],
+            device=self._device,
+            block_dim=LIST_BLOCK,
+        )
+
+
+def _empty_lists(launches: list[int], device: wp.Device) -> Any:
+    """With room for all subtrees of these launches, whose thread blocks take the lists in turn."""
+    listed = LeftOut()
+    listed.counts = wp.zeros((LISTS + 1) * COUNT_STRIDE, dtype=wp.int32, device=device)
+    listed.room = BLOCK * sum(-(-count // (BLOCK * LISTS)) for count in launches)
+    listed.entries = wp.zeros(LISTS * listed.room, dtype=wp.vec2i, device=device)
+    return listed

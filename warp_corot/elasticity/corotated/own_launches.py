@@ -1,0 +1,109 @@
+"""All that a body's forces go through on CUDA in one or two launches; see ``kernels.subtrees.cuda`` and ``clusters``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import warp as wp
+
+from warp_corot.discretization.clusters.single import isotropic_material
+from warp_corot.discretization.plan import FlatLeaves, ForcePlan, Plan
+from warp_corot.discretization.subtrees import GROUPED_LEAVES, Batch
+from warp_corot.elasticity.paths.clusters import ChangingClusterScatter, ClusterScatter, grouped_and_others
+from warp_corot.kernels.clusters.laws import isotropic_law
+from warp_corot.kernels.corotated.algebraic import corotated_stress
+from warp_corot.kernels.subtrees.cuda import BLOCK, FLAT, Stretch, scatter_stretches
+
+#: Leaves of a uniform forest from which subtrees have a launch: fewer are sooner done in clusters, above all where some
+#: are turned over (H200: 73,728 take 6.0 us at rest and 6.3 under their weight, by subtrees 9.6 and 14.4).
+UNIFORM_LEAVES = 1 << 18
+
+
+class OwnLaunches:
+    """The launches of a plan whose leaves all have their own rotations.
+
+    Where the mesh stays as it is, leaves in no subtree, and those of subtrees in no group beside them, go in clusters;
+    where few are in groups, all leaves: one launch then, which leaves out none. Where the mesh changes and many are in
+    groups, one launch of subtrees and of single leaves is all.
+
+    Args:
+        elements: The leaves of all worlds, ``kernels.elements.elements.ForestElements``.
+        material: mu, lambda and their stride.
+        tolerance: How near a subtree root's rotation must be to be used in place of own ones [rad]; None: never.
+        changing: What adds the forces of all leaves in clusters where the mesh changes.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        elements: Any,
+        material: list,
+        tolerance: float | None = None,
+        changing: ChangingClusterScatter | None = None,
+    ):
+        self._device = elements.nodes.device
+        self._elements, self._material, self._tolerance = elements, material, tolerance
+        batches, self._flat = list(plan.batches), plan.flat
+        self._clusters: Callable[[Any, wp.array, wp.array], None] | None = None
+        if isinstance(plan, ForcePlan):
+            batches, leaves = grouped_and_others(plan, _fewest_grouped(plan))
+            if len(leaves):
+                self._clusters = ClusterScatter(elements, isotropic_law(corotated_stress), chosen=leaves)
+        elif changing is not None and 8 * sum(batch.count for batch in batches if batch.grouped) < GROUPED_LEAVES:
+            batches, self._clusters = [], changing
+        # The structs hold addresses alone: what these stand for must live as long as they do.
+        self._rows, self._blocks = _stretches(batches, None if self._clusters is not None else plan.flat)
+        self._stretches = wp.array(self._rows, dtype=Stretch, device=self._device) if self._rows else None
+        #: How many subtrees and single leaves there are, with gaps, some of which may be left out.
+        self.places = self._blocks * BLOCK
+
+    @staticmethod
+    def suit(plan: Plan) -> bool:
+        """Whether a plan of own rotations has more than one large batch, or may come to have."""
+        if not isinstance(plan, ForcePlan) or len(plan.batches) > 1 or len(plan.flat) > 0:
+            return True
+        return 8 * sum(batch.count for batch in plan.batches if batch.grouped) < UNIFORM_LEAVES
+
+    @staticmethod
+    def load(uniform: bool, tolerance: float | None, device: wp.Device) -> None:
+        """Compile now what launches over a mesh that changes will need."""
+        wp.load_module(scatter_stretches(uniform, tolerance).module, device, block_dim=BLOCK)
+
+    def scatter_forces(self, u: wp.array, f: wp.array, left_out: Any) -> None:
+        """Add the forces of displacements u to f, both vec4, and put subtrees with leaves left out on a list."""
+        mu, lam, stride = self._material
+        if self._stretches is not None:
+            wp.launch(
+                scatter_stretches(stride == 0, self._tolerance),
+                dim=self._blocks * BLOCK,
+                inputs=[self._stretches, self._flat.elements, self._flat.leaves, mu, lam, u],
+                outputs=[f, left_out],
+                device=self._device,
+                block_dim=BLOCK,
+            )
+        if self._clusters is not None:
+            self._clusters(isotropic_material(self._material), u, f)
+
+
+def _fewest_grouped(plan: Plan) -> int:
+    """Leaves in groups from which these have a launch of their own."""
+    return UNIFORM_LEAVES if len(plan.batches) == 1 and len(plan.flat) == 0 else GROUPED_LEAVES
+
+
+def _stretches(batches: list[Batch], flat: FlatLeaves | None) -> tuple[list[Any], int]:
+    """What neighbouring thread blocks go through, and how many blocks there are."""
+    rows, begin = [], 0
+    for batch in batches:
+        stretch = Stretch()
+        stretch.begin, stretch.count = begin, batch.count
+        stretch.shape, stretch.grouped = batch.shape, int(batch.grouped)
+        stretch.subtrees, stretch.flagged = batch.subtrees, batch.flagged
+        rows.append(stretch)
+        begin += -(-batch.count // BLOCK)
+    if flat is not None and len(flat):
+        stretch = Stretch()
+        stretch.begin, stretch.count, stretch.shape = begin, len(flat), FLAT
+        rows.append(stretch)
+        begin += -(-len(flat) // BLOCK)
+    return rows, begin

@@ -1,0 +1,190 @@
+"""The fast path of the corotated model: complete subtrees of a forest as units of work; see ``plan``.
+
+On CUDA with own rotations a body is at most three launches: subtrees, other leaves, and the leaves that the first
+left out.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from warp_corot.discretization.elements import with_targets
+from warp_corot.discretization.plan import FlatLeaves, ForcePlan, Plan
+from warp_corot.discretization.subtrees import Batch, Sharing
+from warp_corot.elasticity.paths.clusters import ChangingClusterScatter
+from warp_corot.elasticity.paths.lanes import Lanes, as_general
+from warp_corot.kernels.clusters.laws import isotropic_law
+from warp_corot.kernels.corotated.algebraic import corotated_stress
+from warp_corot.kernels.elements.general_cpu import repair_elements, rest_matrices, scatter_elements
+from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.subtrees import cpu as subtree_cpu
+from warp_corot.kernels.subtrees import cuda as subtree_cuda
+from warp_corot.kernels.subtrees.repair import repair_own, repair_shared
+from warp_corot.mesh import TetForest
+
+from .elements import CorotatedField, Rotations
+from .left_out import LeftOutLeaves
+from .own_launches import OwnLaunches
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.changing.plan import DevicePlan
+
+    from .model import Corotated
+
+
+class SubtreeField(CorotatedField):
+    """The fast path: complete subtrees in batches, leaf by leaf only what is left over."""
+
+    takes_subtrees = True
+
+    def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
+        super().__init__(body, model, deterministic)
+        self._uniform = body.material_stride == 0
+        self._changing: ChangingClusterScatter | None = None
+        if body.changing is None:
+            assert isinstance(body.mesh, TetForest)
+            self._go_through(
+                ForcePlan.of_forest(
+                    body.mesh, model.level, self.device, worlds=body.worlds, deterministic=self.deterministic
+                )
+            )
+
+    def follow(self, plan: DevicePlan) -> None:
+        super().follow(plan)
+        self._load_kernels(plan)
+        if self._listed and self.rotation_level is None and self._changing is None:
+            self._changing = ChangingClusterScatter(self.body, plan, isotropic_law(corotated_stress))
+        self._go_through(plan)
+
+    def derive(self, plan: DevicePlan) -> None:
+        super().derive(plan)
+        if self._changing is not None:
+            self._changing.derive()
+
+    def _load_kernels(self, plan: DevicePlan) -> None:
+        """Everything that any mesh may come to need, so that nothing is compiled once steps are made."""
+        one_launch = self._listed and self.rotation_level is None
+        for shape, grouped, sharing in () if one_launch else plan.kinds:
+            kernel = self._kernel(shape, grouped, sharing)
+            wp.load_module(kernel.module, self.device, block_dim=self._block)
+        single = [self._forces, self._own, self._extract, repair_own]
+        if self.device.is_cpu:
+            single += [scatter_elements, repair_elements]
+        for kernel in single:
+            wp.load_module(kernel.module, self.device)
+        if self._listed:
+            LeftOutLeaves.load(self.device)
+        if one_launch:
+            OwnLaunches.load(self._uniform, self.model.tolerance, self.device)
+
+    @property
+    def _block(self) -> int:
+        return subtree_cuda.BLOCK if self.device.is_cuda else 256
+
+    def _go_through(self, plan: Plan) -> None:
+        """Make the launches of a plan."""
+        self.plan = plan
+        self.slots = plan.slots
+        if plan.targets is not None:
+            self.elements = with_targets(self.elements, plan.targets)
+        self._rotations = wp.empty(0, dtype=wp.mat33, device=self.device)
+        self._no_unit = wp.empty(0, dtype=wp.int32, device=self.device)
+        if plan.units is not None:
+            self._shared = Rotations.of(plan.units)
+            self._rotations = self._shared.rotations
+        elif self.rotation_level is not None:
+            self._sharing()
+        self._left_out: LeftOutLeaves | None = None
+        self._own_launches: OwnLaunches | None = None
+        if self._listed:
+            if self.rotation_level is None and OwnLaunches.suit(plan):
+                self._own_launches = OwnLaunches(
+                    plan, self.elements, self.material_inputs, self.model.tolerance, self._changing
+                )
+                self._left_out = LeftOutLeaves([self._own_launches.places], [], self.device)
+                return
+            self._left_out = LeftOutLeaves.of(plan, self.device)
+        self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]
+        self._flat_material = self.material_inputs
+        self._flat_lanes: Lanes | None = None
+        if len(plan.flat):
+            self._prepare_flat(plan.flat)
+
+    def _prepare_flat(self, flat: FlatLeaves) -> None:
+        if flat.material is not None:
+            self._flat_material = [*flat.material, 1]
+        elif not self._uniform:
+            leaves = flat.leaves.numpy()
+            chosen = [a.numpy()[leaves] for a in (self.body.mu, self.body.lam)]
+            self._flat_material = [*(wp.array(a, dtype=wp.float32, device=self.device) for a in chosen), 1]
+        if self.device.is_cpu and flat.unit is None:
+            general = flat.general or as_general(flat.elements, rest_matrices, [flat.elements])
+            self._flat_lanes = Lanes(general, general, scatter=scatter_elements, repair=repair_elements)
+
+    @property
+    def _listed(self) -> bool:
+        """Whether leaves that are left out stand in a list; the order of its entries is any."""
+        return self.device.is_cuda and not self.deterministic
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        if self._own_launches is not None:
+            assert self._left_out is not None
+            self._own_launches.scatter_forces(u, f, self._left_out.own)
+            self._left_out.repair(self.elements, self.material_inputs, u, f)
+            return
+        if self.plan.units is not None:
+            self.extract_rotations(u)
+        for batch, kernel in zip(self.plan.batches, self._kernels, strict=True):
+            self._launch_batch(batch, kernel, u, f)
+        flat = self.plan.flat
+        if len(flat):
+            inputs = [flat.elements, *self._flat_material, u]
+            if self._flat_lanes is not None:
+                self._flat_lanes.scatter_forces(self._flat_material, u, f)
+            elif flat.unit is not None:
+                self.launch(self._forces, len(flat), [*inputs, self._rotations, flat.unit], [f])
+            else:
+                self.launch(self._own, len(flat), inputs, [f])
+        if self._left_out is not None:
+            self._left_out.repair(self.elements, self.material_inputs, u, f)
+
+    def _kernel(self, shape: int, grouped: bool, sharing: Sharing) -> wp.Kernel:
+        given = sharing is Sharing.ABOVE
+        if self.device.is_cuda:
+            if sharing is Sharing.OWN:
+                return subtree_cuda.scatter_subtrees_own(
+                    shape, grouped, self._uniform, self._listed, self.model.tolerance
+                )
+            return subtree_cuda.scatter_subtrees_shared(shape, grouped, self._uniform, given, self._listed)
+        if sharing is Sharing.OWN:
+            near = self.model.tolerance is not None
+            return subtree_cpu.scatter_subtrees_near(shape) if near else subtree_cpu.scatter_subtrees_own(shape)
+        return subtree_cpu.scatter_subtrees_shared(shape, given)
+
+    def _launch_batch(self, batch: Batch, kernel: wp.Kernel, u: wp.array, f: wp.array) -> None:
+        body = self.body
+        own = batch.sharing is Sharing.OWN
+        outputs = [f, batch.flagged]
+        if self.device.is_cuda:
+            threads = batch.count
+            inputs = [batch.subtrees, body.mu, body.lam, u]
+            outputs.append(LeftOutLeaves.NONE if self._left_out is None else self._left_out.list_of(batch))
+        else:
+            threads = -(-batch.count // LANES)
+            inputs = [batch.subtrees, batch.count, *self.material_inputs, u]
+            if own and self.model.tolerance is not None:
+                inputs.append(self.model.tolerance)
+        if not own:
+            inputs += [self._rotations, self._no_unit if batch.unit is None else batch.unit]
+        wp.launch(kernel, dim=threads, inputs=inputs, outputs=outputs, device=self.device, block_dim=self._block)
+        if self._left_out is not None:
+            return
+        flags = batch.flags_by_eights
+        inputs = [self.elements, *self.material_inputs, u]
+        if own:
+            self.launch(repair_own, len(flags), [flags, batch.subtrees.first, *inputs], [f])
+        elif batch.sharing is Sharing.ROOT:
+            self.launch(repair_shared, len(flags), [flags, batch.subtrees.first, batch.roots, *inputs], [f])

@@ -1,0 +1,153 @@
+"""The launch that adds the forces of elements in clusters (CUDA); see ``kernels.clusters.single``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.discretization.clusters.pairs import pairs_in_clusters
+from warp_corot.discretization.clusters.single import axis_words, changing_clusters, find_tables
+from warp_corot.discretization.plan import ForcePlan
+from warp_corot.discretization.subtrees import GROUPED_LEAVES, Batch
+from warp_corot.kernels.clusters.elements import AlignedElements, align_elements
+from warp_corot.kernels.clusters.laws import IsotropicMaterial
+from warp_corot.kernels.clusters.pair_elements import GeneralPairs, LatticePairs
+from warp_corot.kernels.clusters.pairs import scatter_pairs
+from warp_corot.kernels.clusters.single import scatter_clusters
+from warp_corot.kernels.elements.general_cpu import rest_matrices
+from warp_corot.kernels.tables.cluster_layout import (
+    AHEAD,
+    DEFAULT_LAYOUT,
+    GENERAL,
+    LARGE,
+    LATTICE,
+    ClusterLayout,
+    PairLayout,
+)
+
+from .lanes import as_general
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.changing.plan import DevicePlan
+
+#: Leaves of a subtree.
+SUBTREE = 8
+
+
+def grouped_and_others(plan: ForcePlan, fewest: int = GROUPED_LEAVES) -> tuple[list[Batch], npt.NDArray[np.int32]]:
+    """The batches of a plan whose subtrees are in groups, and all other leaves, int32 [n].
+
+    Fewer leaves in groups than ``fewest`` are not worth launches, and are among the others.
+    """
+    batches = [batch for batch in plan.batches if batch.grouped]
+    if SUBTREE * sum(batch.count for batch in batches) < fewest:
+        batches = []
+    first = [batch.subtrees.first.numpy() for batch in plan.batches if not any(batch is other for other in batches)]
+    single = np.concatenate([np.empty(0, np.int32), *first])
+    leaves = np.concatenate([plan.flat.leaves.numpy(), (single[:, None] + np.arange(SUBTREE)).ravel()])
+    return batches, np.sort(leaves).astype(np.int32)
+
+
+class ClusterScatter:
+    """Adds the forces of elements that stay as they are.
+
+    Args:
+        elements: All elements of a mesh, ``kernels.elements.elements.ForestElements`` or ``GeneralElements``.
+        law: A function of ``kernels.clusters.laws``.
+        Material: The struct that the law takes.
+        chosen: Which of the elements, int32 [n], as clusters shall take them one after the other; None: all.
+        layout: What the kernel is generated for; None: what suits isotropic laws.
+
+    Attributes:
+        clusters: ``kernels.clusters.pairs.PairClusters``.
+        pairs: ``kernels.clusters.pair_elements.LatticePairs`` or ``GeneralPairs``.
+        count: How many clusters.
+        Pairs, Material, law, layout: What the kernel is generated for.
+    """
+
+    def __init__(
+        self,
+        elements: Any,
+        law: wp.Function,
+        Material: Any = IsotropicMaterial,
+        *,
+        chosen: npt.NDArray[np.int32] | None = None,
+        layout: PairLayout | None = None,
+    ):
+        self._device, self.law, self.Material = elements.nodes.device, law, Material
+        is_general = hasattr(elements, "rest_inverse")
+        layout = layout or (GENERAL if is_general else LATTICE)
+        general = elements if is_general else as_general(elements, rest_matrices, [elements])
+        cell = None if is_general else float(elements.size.numpy()[0])
+        nodes = elements.nodes.numpy()
+        if chosen is None:
+            chosen = np.arange(len(nodes), dtype=np.int32)
+        self.clusters, self.pairs, self.count = pairs_in_clusters(chosen, nodes, general, cell, layout)
+        self.Pairs = GeneralPairs if is_general else LatticePairs
+        tables = (self.pairs.records, self.clusters.slots, self.clusters.nodes)
+        is_large = sum(table.capacity for table in tables) >= LARGE
+        self.layout = replace(layout, ahead=AHEAD) if is_large else layout
+        self._kernel = scatter_pairs(self.Pairs, Material, law, self.layout)
+
+    def __call__(self, material: Any, u: wp.array, f: wp.array) -> None:
+        """Add the forces [N] of displacements u to f, both vec4 [N]; ``material`` is what the law takes."""
+        threads = self.layout.threads
+        wp.launch(
+            self._kernel,
+            dim=self.count * threads,
+            inputs=[self.clusters, self.pairs, material, u],
+            outputs=[f],
+            device=self._device,
+            block_dim=threads,
+        )
+
+
+class ChangingClusterScatter:
+    """Adds the forces of all leaves of a forest that changes.
+
+    Args:
+        body: Whose mesh changes; launches go through its ``launch_elements``.
+        plan: Where the leaves stand.
+        law: A function of ``kernels.clusters.laws``, which does not mind which axes its gradients are on.
+        layout: What kernels are generated for.
+
+    Attributes:
+        clusters, elements: ``kernels.clusters.single.Clusters``, ``kernels.clusters.elements.AlignedElements``.
+    """
+
+    def __init__(self, body: SoftBody, plan: DevicePlan, law: wp.Function, layout: ClusterLayout = DEFAULT_LAYOUT):
+        self._body, self._plan, self._device, self._layout = body, plan, plan.device, layout
+        self.clusters, self._places = changing_clusters(plan.most_leaves, plan.leaf_count, layout)
+        self._words = wp.array(axis_words(plan.elements.frames.numpy()).ravel(), dtype=wp.int32, device=self._device)
+        size = plan.elements.size.numpy()
+        self.elements = AlignedElements()
+        self.elements.shape = wp.zeros(plan.most_leaves, dtype=wp.int32, device=self._device)
+        self.elements.cell, self.elements.inverse_cell = float(size[0]), 1.0 / float(size[0])
+        self._kernel = scatter_clusters(law, layout)
+        wp.load_module(self._kernel.module, self._device, block_dim=layout.threads)
+
+    def derive(self) -> None:
+        """Launch what finds the clusters, if the plan has just been derived; may be recorded."""
+        plan = self._plan
+        find_tables(self.clusters, self._places, plan.elements.nodes, plan.goes, self._layout)
+        inputs = [plan.goes, plan.leaf_count, plan.elements.code, self._words]
+        wp.launch(
+            align_elements, dim=plan.most_leaves, inputs=inputs, outputs=[self.elements.shape], device=self._device
+        )
+
+    def __call__(self, material: Any, u: wp.array, f: wp.array) -> None:
+        """As ``ClusterScatter`` does."""
+        threads, count = self._layout.threads, -(-self._body.launch_elements // self._layout.elements)
+        wp.launch(
+            self._kernel,
+            dim=count * threads,
+            inputs=[self.clusters, self.elements, material, u],
+            outputs=[f],
+            device=self._device,
+            block_dim=threads,
+        )

@@ -1,0 +1,48 @@
+"""Elements on the CPU, eight at a time in the lanes of its vector registers; see ``kernels.elements.lanes``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import GeneralElements
+from warp_corot.kernels.elements.lanes import LANES
+
+
+class Lanes:
+    """Launches that add the forces of elements: eight at a time, then one by one those that were left out.
+
+    Args:
+        elements: The elements, of either kind.
+        general: The same as general ones.
+        scatter: Kernel that goes through the general ones eight at a time and lists those that it leaves out.
+        repair: Kernel that does the listed ones among ``elements``; None where none are left out or listed.
+    """
+
+    def __init__(self, elements: Any, general: GeneralElements, *, scatter: wp.Kernel, repair: wp.Kernel | None = None):
+        self.count = len(elements.nodes)
+        self._elements = elements
+        self._general = general
+        self._scatter = scatter
+        self._repair = repair
+        #: How many, then which.
+        self._left_out = wp.zeros(self.count + 1, dtype=wp.int32, device="cpu")
+
+    def scatter_forces(self, material: list, u: wp.array, f: wp.array) -> None:
+        """Add the forces of displacements u to f, both vec4 [N]; ``material`` are kernel arguments."""
+        inputs = [self._general, *material, self.count, u]
+        outputs = [f] if self._repair is None else [f, self._left_out]
+        wp.launch(self._scatter, -(-self.count // LANES), inputs, outputs, device="cpu")
+        if self._repair is not None:
+            wp.launch(self._repair, 1, [self._elements, *material, u], [self._left_out, f], device="cpu")
+
+
+def as_general(elements: Any, kernel: wp.Kernel, inputs: list) -> GeneralElements:
+    """Elements of either kind as general ones; ``kernel`` finds their rest matrices and volumes from ``inputs``."""
+    count, device, general = len(elements.nodes), elements.nodes.device, GeneralElements()
+    general.nodes = general.targets = elements.nodes
+    general.rest_inverse = wp.empty(count, dtype=wp.mat33, device=device)
+    general.volume = wp.empty(count, dtype=wp.float32, device=device)
+    wp.launch(kernel, count, inputs, [general.rest_inverse, general.volume], device=device)
+    return general

@@ -1,0 +1,81 @@
+"""Constitutive laws on the CPU: eight subtrees, or eight elements, at a time; see ``kernels.elements.law_lanes``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from warp_corot.discretization.plan import FlatLeaves, ForcePlan, Plan
+from warp_corot.elasticity.model import LawField
+from warp_corot.kernels.elements.general_cpu import rest_matrices, scatter_law_elements
+from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.subtrees.cpu import scatter_law_subtrees
+from warp_corot.mesh import TetForest
+
+from .lanes import Lanes, as_general
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.changing.plan import DevicePlan
+    from warp_corot.discretization.changing.pools import DeviceForest
+
+
+class LawLanesField(LawField):
+    """Complete subtrees of a forest as units of work, other elements one by one, eight of each in the lanes.
+
+    Args:
+        body: On the CPU.
+        law: A key of ``kernels.elements.law_lanes.LAWS``.
+        functions: As for ``LawField``.
+    """
+
+    def __init__(self, body: SoftBody, *, law: str, **functions: Any):
+        super().__init__(body, **functions)
+        self._law = law
+        self._plan: Plan | None = None
+        self._lanes: Lanes | None = None
+        self._lanes_material = self.material_inputs
+        if not isinstance(body.mesh, TetForest):
+            self._lanes = Lanes(self.elements, self.elements, scatter=scatter_law_elements(law))
+        elif body.changing is None:
+            self._go_through(ForcePlan.of_forest(body.mesh, None, self.device, worlds=body.worlds))
+
+    def plan_of(self, forest: DeviceForest) -> DevicePlan:
+        from warp_corot.discretization.changing.plan import DevicePlan
+
+        return DevicePlan(forest)
+
+    def follow(self, plan: DevicePlan) -> None:
+        super().follow(plan)
+        # Everything that any mesh may come to need, so that nothing is compiled once steps are made.
+        kernels = [scatter_law_subtrees(shape, self._law) for shape, _grouped, _sharing in plan.kinds]
+        for kernel in (*kernels, scatter_law_elements(self._law)):
+            wp.load_module(kernel.module, self.device, block_dim=256)
+        self._go_through(plan)
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        for batch in self._plan.batches if self._plan else ():
+            inputs = [batch.subtrees, *self.material_inputs, batch.count, u]
+            self.launch(scatter_law_subtrees(batch.shape, self._law), -(-batch.count // LANES), inputs, [f])
+        if self._lanes is not None:
+            self._lanes.scatter_forces(self._lanes_material, u, f)
+
+    def _go_through(self, plan: Plan) -> None:
+        """Make the launches of a plan."""
+        self._plan, flat = plan, plan.flat
+        self._lanes = None
+        if len(flat):
+            self._lanes_material = self._material_of(flat)
+            general = flat.general or as_general(flat.elements, rest_matrices, [flat.elements])
+            self._lanes = Lanes(general, general, scatter=scatter_law_elements(self._law))
+
+    def _material_of(self, flat: FlatLeaves) -> list:
+        """The kernel arguments mu, lam and stride of leaves that are in no subtree."""
+        if flat.material is not None:
+            return [*flat.material, 1]
+        if self.body.material_stride == 0:
+            return self.material_inputs
+        leaves = flat.leaves.numpy()
+        chosen = [array.numpy()[leaves] for array in (self.body.mu, self.body.lam)]
+        return [*(wp.array(values, dtype=wp.float32, device=self.device) for values in chosen), 1]

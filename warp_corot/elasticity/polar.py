@@ -1,0 +1,88 @@
+"""Rotations of many matrices at once, by the methods that the solver uses."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.errors import InputError
+from warp_corot.inputs.device import checked_device
+from warp_corot.kernels.math.polar import rotate_all, turn_all
+from warp_corot.kernels.math.rotation import byers_xu, byers_xu_fixed, mcadams_svd
+
+METHODS = ("byers-xu", "svd", "warm")
+MAX_ITERATIONS = 12
+
+
+@functools.cache
+def rotation_function(method: str, iterations: int | None = None) -> wp.Function:
+    """The device function of a method that keeps no state.
+
+    Raises:
+        InputError: Unknown method, or a number of iterations that it does not take.
+    """
+    if iterations is not None:
+        if method != "byers-xu":
+            raise InputError(f"iterations is {iterations}; only 'byers-xu' takes a fixed number, not {method!r}")
+        if isinstance(iterations, bool) or iterations != int(iterations) or not 2 <= iterations <= MAX_ITERATIONS:
+            raise InputError(f"iterations is {iterations}; it must be None or an integer from 2 to {MAX_ITERATIONS}")
+        return byers_xu_fixed(int(iterations))
+    functions = {"byers-xu": byers_xu, "svd": mcadams_svd}
+    if method not in functions:
+        raise InputError(f"rotation method is {method!r}; it must be one of {', '.join(METHODS)}")
+    return functions[method]
+
+
+def polar_rotation(
+    F: npt.ArrayLike,
+    method: str = "byers-xu",
+    *,
+    iterations: int | None = None,
+    guess: npt.ArrayLike | None = None,
+    device: str | wp.Device | None = None,
+) -> npt.NDArray[np.float32]:
+    """The proper rotation R nearest to each matrix, the maximiser of tr(R^T F) with det R = +1.
+
+    For det F > 0 this is the rotation of the polar decomposition. Inverted, singular, huge and tiny matrices have one
+    too; a zero or non-finite matrix gives the identity (for "warm": the guess). Worked out in float32.
+
+    Args:
+        F: Matrices [n, 3, 3] (or one, [3, 3]).
+        method: "byers-xu": Newton's iteration with the scaling of Byers and Xu (2008), to the paper's tolerance;
+            "svd": U V^T of Warp's 3x3 SVD (McAdams et al. 2011), the baseline, off by up to 0.07 where singular values
+            nearly meet in an inverted F; "warm": iteration on a quaternion (Müller et al. 2016).
+        iterations: For "byers-xu": this many iterations (2 to 12) in place of the tolerance.
+        guess: For "warm": rotations to start from [n, 3, 3]; the identity by default.
+        device: Where to work; None for Warp's default.
+
+    Returns:
+        Rotations, float32, of the same shape.
+
+    Raises:
+        InputError: Wrong shape, unknown method, options of another method, or no such device.
+    """
+    matrices = np.asarray(F)
+    if matrices.shape[-2:] != (3, 3) or matrices.ndim not in (2, 3):
+        raise InputError(f"F has shape {matrices.shape}; it must be [n, 3, 3]")
+    if guess is not None and method != "warm":
+        raise InputError(f"guess goes with the method 'warm', not {method!r}")
+    where = checked_device(device)
+    with np.errstate(over="ignore"):
+        flat = np.ascontiguousarray(matrices.reshape(-1, 3, 3), dtype=np.float32)
+    rotations = wp.empty(len(flat), dtype=wp.mat33, device=where)
+    inputs = [wp.array(flat, dtype=wp.mat33, device=where)]
+    if method == "warm":
+        rotation_function("byers-xu" if iterations is None else method, iterations)
+        given = np.asarray(np.eye(3) if guess is None else guess, dtype=np.float32)
+        if given.shape not in ((3, 3), flat.shape):
+            raise InputError(f"guess has shape {given.shape}; it must be [{len(flat)}, 3, 3]")
+        start = np.broadcast_to(given, flat.shape)
+        inputs.append(wp.array(np.ascontiguousarray(start), dtype=wp.mat33, device=where))
+        kernel = turn_all
+    else:
+        kernel = rotate_all(rotation_function(method, iterations))
+    wp.launch(kernel, dim=len(flat), inputs=inputs, outputs=[rotations], device=where)
+    return rotations.numpy().reshape(matrices.shape)

@@ -1,0 +1,1 @@
+"""How a body is held where the user does not say."""

@@ -1,0 +1,254 @@
+"""How a body is held where nobody says: by what it stands on, if that carries it, else by its largest flat region or
+a broad side of it. Each separate piece is held by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.discretization.elements import Mesh
+from warp_corot.mesh.surfaces.boundary import boundary_faces, neighbours
+
+from .regions import Patch, Shape, broad_sides, flat_region, lowest_part
+from .sag import CoarseBody
+
+#: A patch carries a body that comes to rest within this share of its height.
+LARGEST_SAG = 0.3
+#: A body on a patch below its centre of mass leans by its own weight: sideways gravity must move the centre by less
+#: than this share of its height above the patch. At the whole of it a slender column buckles (Greenhill 1881).
+LARGEST_LEAN = 0.55
+#: Pieces of fewer tetrahedra, or less than this share of the largest one, are held by their lower half without a look.
+SMALL_PIECE, SMALL_SHARE = 12, 0.01
+#: Pieces that are named one by one.
+NAMED = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Hold:
+    """How a piece is held.
+
+    Attributes:
+        nodes: Held, indices into the mesh's nodes.
+        of: Nodes of the piece.
+        where: In words: "its lowest 10 %".
+        stands: Whether it stands on its lowest part.
+        why_not: Why it does not stand, in words; empty if it does.
+        sag: How far it sags, by linear statics, as a share of its height; 0 where nobody looked.
+        stiffer: How many times as stiff it would have to be for the patch to carry it; 1 if it does.
+    """
+
+    nodes: npt.NDArray[np.intp]
+    of: int
+    where: str
+    stands: bool
+    why_not: str = ""
+    sag: float = 0.0
+    stiffer: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Holds:
+    """How a body is held, piece by piece, the largest first.
+
+    Attributes:
+        pieces: One each.
+        count: Nodes of the mesh.
+    """
+
+    pieces: Sequence[Hold]
+    count: int
+
+    @property
+    def nodes(self) -> npt.NDArray[np.bool_]:
+        """Held nodes, bool [N]."""
+        mask = np.zeros(self.count, bool)
+        for hold in self.pieces:
+            mask[hold.nodes] = True
+        return mask
+
+    @property
+    def stiffer(self) -> float:
+        """How many times as stiff the body would have to be for every patch to carry its piece."""
+        return max(hold.stiffer for hold in self.pieces)
+
+    @property
+    def words(self) -> str:
+        """In words: "standing on its lowest 10 %"."""
+        named = [_words_of(hold) for hold in self.pieces[:NAMED]]
+        if len(self.pieces) == 1:
+            return named[0]
+        left = len(self.pieces) - NAMED
+        each = [f"piece {number} {words}" for number, words in enumerate(named, start=1)]
+        return ", ".join(each) + (f", and {left} more" if left > 0 else "")
+
+    @property
+    def title(self) -> str:
+        """The same in a few words: "piece 1 standing on its lowest 10 %, and 5 more"."""
+        left = len(self.pieces) - 1
+        return f"piece 1 {_words_of(self.pieces[0])}, and {left} more" if left else self.words
+
+    def reasons(self) -> list[str]:
+        """What a user should know of each piece, a line each."""
+        several = len(self.pieces) > 1
+        lines = []
+        for number, hold in enumerate(self.pieces[: NAMED if several else 1], start=1):
+            name = f"piece {number}" if several else "the body"
+            held = f"{len(hold.nodes)} of {hold.of} nodes"
+            if hold.stands:
+                lines.append(f"{name} stands on {hold.where}, {held}")
+            else:
+                lines.append(f"{name} is held by {hold.where}, {held}: {hold.why_not}")
+        if len(self.pieces) > NAMED:
+            lines.append(f"{len(self.pieces) - NAMED} more pieces are held by themselves")
+        return lines
+
+
+def _words_of(hold: Hold) -> str:
+    return f"{'standing on' if hold.stands else 'held by'} {hold.where}"
+
+
+@dataclass(eq=False)
+class _Piece:
+    """A piece of a body: its own shape, what it is made of, and gravity [m/s^2]."""
+
+    shape: Shape
+    tets: npt.NDArray[np.integer]
+    volumes: npt.NDArray[np.float64]
+    young: npt.NDArray[np.float64]
+    density: npt.NDArray[np.float64]
+    gravity: npt.NDArray[np.float64]
+
+    @cached_property
+    def coarse(self) -> CoarseBody:
+        return CoarseBody(self.shape.points, self.tets, self.volumes, self.young, self.density)
+
+    def hold(self) -> Hold:
+        standing = lowest_part(self.shape)
+        if len(standing.nodes) == len(self.shape.nodes):
+            return self.held_simply()
+        needed, sag, why = self._tried(standing, stands=True)
+        if needed <= 1.0:
+            return self._of(standing, True, "", sag, 1.0)
+        best: tuple[float, float, Patch] | None = None
+        for patch in self._others():
+            needed, sag, _ = self._tried(patch, stands=False)
+            if best is None or needed < best[0]:
+                best = needed, sag, patch
+            if needed <= 1.0:
+                break
+        if best is None:  # a few nodes, of which every patch has all
+            return self.held_simply()
+        return self._of(best[2], False, why, best[1], max(best[0], 1.0))
+
+    def held_simply(self) -> Hold:
+        """By the lower half of its nodes, three at least, but not all."""
+        shape = self.shape
+        heights = shape.points[shape.nodes] @ shape.up
+        count = min(max(len(heights) // 2, 3), len(heights) - 1)
+        nodes = np.sort(shape.nodes[np.argsort(heights, kind="stable")[:count]])
+        return Hold(nodes, len(heights), "its lower half", True)
+
+    def _others(self) -> Iterator[Patch]:
+        flat = flat_region(self.shape)
+        for patch in [*([flat] if flat else []), *broad_sides(self.shape)]:
+            if len(patch.nodes) < len(self.shape.nodes):
+                yield patch
+
+    def _tried(self, patch: Patch, *, stands: bool) -> tuple[float, float, str]:
+        """How many times as stiff the piece would have to be for a patch to carry it; how far it sags as a share of its
+        height; and what is wrong with the patch, in words."""
+        shape, g = self.shape, float(np.linalg.norm(self.gravity))
+        held = shape.points[patch.nodes]
+        footprint = shape.footprint(held)
+        if stands and g > 0.0 and not footprint.holds(self.coarse.centre):
+            return np.inf, np.inf, f"its centre of mass is not over {patch.where}"
+        across = g * shape.across
+        down, *sideways = self.coarse.sag(patch.nodes, [self.gravity, *across])
+        sag = down.largest / shape.height
+        above = float((self.coarse.centre - held.mean(axis=0)) @ shape.up)
+        lean = max(float(np.linalg.norm(shape.across @ s.centre)) for s in sideways) / above if above > 0.0 else 0.0
+        # What hangs, or is held at its side, cannot fall over.
+        lean *= above > LARGEST_SAG * shape.height or stands
+        needed = max(sag / LARGEST_SAG, lean / LARGEST_LEAN)
+        if stands and needed <= 1.0 and not footprint.holds(self.coarse.centre + down.centre):
+            return 1.01, sag, f"its centre of mass does not stay over {patch.where}"
+        return needed, sag, f"it would topple on {patch.where}"
+
+    def _of(self, patch: Patch, stands: bool, why: str, sag: float, stiffer: float) -> Hold:
+        return Hold(patch.nodes, len(self.shape.nodes), patch.where, stands, why, sag, stiffer)
+
+
+def holds_of(
+    mesh: Mesh,
+    *,
+    young: npt.ArrayLike,
+    density: npt.ArrayLike,
+    gravity: npt.ArrayLike,
+    surface: Any = None,
+) -> Holds:
+    """How a person would hold a body so that it neither falls nor topples.
+
+    A piece stands on the lowest tenth of its height if its centre of mass is over that, and stays there when the piece
+    sags. Otherwise its largest flat region holds it, or the first of its broad sides that carries it, each at least a
+    tenth of its nodes; if none does, the one in which it sags least. Sags are estimated by linear statics on a coarse
+    grid (`sag.CoarseBody`).
+
+    Args:
+        mesh: The body.
+        young: Young's modulus [Pa], a number or [T].
+        density: [kg/m^3], a number or [T].
+        gravity: [m/s^2], [3].
+        surface: A ``SurfaceMesh`` bound to the mesh where the body ends within its tetrahedra; None: their boundary.
+    """
+    g = np.asarray(gravity, dtype=np.float64)
+    up = np.eye(3)["XYZ".index(mesh.up_axis)] if not g.any() else -g / np.linalg.norm(g)
+    points = np.asarray(mesh.points, dtype=np.float64)
+    volumes = np.asarray(mesh.volumes) * (1.0 if getattr(mesh, "fill", None) is None else mesh.fill)  # type: ignore
+    if surface is None:
+        drawn, triangles = points, boundary_faces(mesh.tets, points)[0]
+        bound = np.arange(len(points))
+    else:
+        drawn, triangles, bound = surface.points, surface.triangles, surface.nodes[:, 0]
+    of_tet = pieces_of(mesh)
+    of_node = piece_of_nodes(mesh, of_tet)
+    of_triangle = of_node[bound[triangles[:, 0]]]
+    holds, count = [], int(of_tet.max()) + 1
+    largest = float(np.bincount(of_tet, volumes).max())
+    for number in range(count):
+        inside, around = of_tet == number, triangles[of_triangle == number]
+        tets = mesh.tets[inside]
+        shape = Shape(points, np.unique(tets), drawn, around, up)
+        own_young, own_density = (np.broadcast_to(np.ravel(a), len(of_tet))[inside] for a in (young, density))
+        piece = _Piece(shape, tets, volumes[inside], own_young, own_density, g)
+        small = len(tets) < SMALL_PIECE or volumes[inside].sum() < SMALL_SHARE * largest
+        holds.append(piece.held_simply() if small and count > 1 else piece.hold())
+    return Holds(holds, len(points))
+
+
+def pieces_of(mesh: Mesh) -> npt.NDArray[np.intp]:
+    """The piece of each tetrahedron, [T]; the one with most of them is number 0.
+
+    Pieces hang together by faces: what meets in a node or an edge alone would turn about it.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(mesh.tets)
+    one, other = neighbours(mesh.tets)
+    linked = coo_array((np.ones(len(one), np.int8), (one, other)), shape=(count, count))
+    _, piece = connected_components(linked, directed=False)
+    rank = np.argsort(np.argsort(-np.bincount(piece), kind="stable"), kind="stable")
+    return rank[piece]
+
+
+def piece_of_nodes(mesh: Mesh, of_tet: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+    """The piece of each node, the largest where several meet, -1 for nodes in no tetrahedron, [N]."""
+    none = len(of_tet)
+    found = np.full(len(mesh.points), none)
+    np.minimum.at(found, mesh.tets.ravel(), np.repeat(of_tet, 4))
+    return np.where(found == none, -1, found)

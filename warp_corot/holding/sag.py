@@ -1,0 +1,191 @@
+"""How far a body sags when some of its nodes are held: linear statics on a coarse grid of cubes.
+
+Each cube has the stiffness and the weight of what the body has inside it. It is a trilinear brick with incompatible
+modes (Wilson et al. 1973; Taylor, Beresford and Wilson 1976), so that parts one cube thick bend as they should.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_array, csr_array
+from scipy.spatial import cKDTree
+
+from warp_corot.mesh.surfaces.boundary import signed_volumes
+
+#: About how many full cubes a body is made of.
+CUBES = 1000
+#: Samples of the body's volume a cube.
+SAMPLES = 8
+#: More tetrahedra than this are thinned out before they are sampled.
+MOST_TETS = 200_000
+#: Of the grid only: volumetric locking would stiffen it, and how far a body sags hardly depends on it.
+POISSON = 0.3
+#: Conjugate gradients end when this many iterations add less than this share to the work of the weights.
+LAST, ENOUGH, MOST_ITERATIONS = 20, 3e-3, 1000
+#: They end, too, when something has gone this many times the body's length away.
+FAR = 10.0
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sag:
+    """What a held body does under an acceleration, in linear statics.
+
+    Attributes:
+        largest: Largest displacement of any part [m].
+        centre: Displacement of the centre of mass [m], [3].
+    """
+
+    largest: float
+    centre: Array
+
+
+class CoarseBody:
+    """A body as cubes.
+
+    Args:
+        points: Rest positions [m], [N, 3].
+        tets: Of the body, [T, 4].
+        volumes: What the body fills of each [m^3], [T].
+        young: Young's modulus [Pa], a number or [T].
+        density: [kg/m^3], a number or [T].
+    """
+
+    def __init__(self, points: Array, tets: npt.NDArray[np.integer], volumes: Array, young: Any, density: Any):
+        inside = np.broadcast_to(young, len(tets)), np.broadcast_to(density, len(tets))
+        samples, of_tet, shares = _samples(points, tets, volumes)
+        # Finer cubes than the mesh's own elements would show what the mesh cannot do.
+        own = np.average(np.cbrt(6.0 * np.abs(signed_volumes(points, tets))), weights=volumes)
+        self.edge = max(float(np.cbrt(volumes.sum() / CUBES)), float(own))
+        self._origin = samples.min(axis=0) - 0.5 * self.edge
+        cells, cube = np.unique(np.floor((samples - self._origin) / self.edge).astype(int), axis=0, return_inverse=True)
+        full = self.edge**3
+        cube = cube.ravel()
+        stiffness = np.bincount(cube, shares * inside[0][of_tet]) / full * self.edge
+        self._masses = np.bincount(cube, shares * inside[1][of_tet])
+        corners = cells[:, None] + _CORNERS
+        self._lattice, places = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+        self._places = places.reshape(-1, 8)
+        used = np.unique(tets)
+        self._points = points
+        self._nearest = used[cKDTree(points[used]).query(self._origin + self.edge * self._lattice)[1]]
+        self.centre = self._masses @ (self._origin + (cells + 0.5) * self.edge) / self._masses.sum()
+        self._matrix = self._assembled(stiffness)
+        self._weights = np.bincount(self._places.ravel(), np.repeat(self._masses / 8.0, 8))
+
+    def sag(self, held: npt.NDArray[np.integer], accelerations: npt.ArrayLike) -> list[Sag]:
+        """What the body does under each of some accelerations.
+
+        Args:
+            held: Nodes that are held, indices.
+            accelerations: [m/s^2], [k, 3].
+        """
+        free = np.repeat(~self._held(held), 3)
+        given = np.asarray(accelerations, dtype=np.float64)
+        u = np.zeros((self._matrix.shape[0], len(given)))
+        loads = (self._weights[:, None, None] * given.T).reshape(-1, len(given))
+        if free.any():
+            far = FAR * self.edge * float(np.ptp(self._lattice, axis=0).max())
+            u[free] = _solved(self._matrix[free][:, free], loads[free], far)
+        moved = np.moveaxis(u.reshape(-1, 3, len(given)), 2, 0)
+        # Corners of cubes that hold hardly anything are nowhere in the body: whole cubes are asked.
+        of_cubes = moved[:, self._places].mean(axis=2)
+        lengths = np.linalg.norm(of_cubes, axis=2).max(axis=1)
+        centres = np.einsum("c,kcx->kx", self._masses, of_cubes) / self._masses.sum()
+        return [Sag(float(length), centre) for length, centre in zip(lengths, centres, strict=True)]
+
+    def _held(self, nodes: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
+        """Corners whose nearest node is held; if there are none, those next to held nodes."""
+        mask = np.isin(self._nearest, nodes)
+        if not mask.any():
+            mask[cKDTree(self._lattice).query((self._points[nodes] - self._origin) / self.edge)[1]] = True
+        return mask
+
+    def _assembled(self, stiffness: Array) -> csr_array:
+        dofs = (3 * self._places[:, :, None] + np.arange(3)).reshape(-1, 24)
+        rows, columns = np.repeat(dofs, 24, axis=1), np.tile(dofs, (1, 24))
+        values = stiffness[:, None] * _brick().ravel()
+        size = 3 * len(self._lattice)
+        return coo_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=(size, size)).tocsr()
+
+
+_CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+
+
+def _samples(
+    points: Array, tets: npt.NDArray[np.integer], volumes: Array
+) -> tuple[Array, npt.NDArray[np.integer], Array]:
+    """Points spread evenly over the tetrahedra, the tetrahedron of each, and the volume that each stands for."""
+    stride = max(1, len(tets) // MOST_TETS)
+    chosen = np.arange(0, len(tets), stride)
+    counts = np.ceil(SAMPLES * CUBES * volumes[chosen] / volumes[chosen].sum()).astype(int)
+    counts = np.maximum(counts, 1)
+    of_tet = np.repeat(chosen, counts)
+    # The additive recurrence R3 (Roberts 2018) in the unit cube, folded into the tetrahedron (Rocchini, Cignoni 2000).
+    phi = 1.2207440846057596
+    s, t, u = np.modf(0.5 + np.arange(len(of_tet))[:, None] * phi ** -np.arange(1.0, 4.0))[0].T
+    over = s + t > 1.0
+    s, t = np.where(over, 1.0 - s, s), np.where(over, 1.0 - t, t)
+    back, far = t + u > 1.0, s + t + u > 1.0
+    s, t, u = (
+        np.select([back, far], [s, 1.0 - t - u], s),
+        np.select([back, far], [1.0 - u, t], t),
+        np.select([back, far], [1.0 - s - t, s + t + u - 1.0], u),
+    )
+    weights = np.stack([1.0 - s - t - u, s, t, u], axis=1)
+    corners = points[tets[of_tet]]
+    shares = (volumes[chosen] / counts)[np.repeat(np.arange(len(chosen)), counts)]
+    return np.einsum("nc,ncx->nx", weights, corners), of_tet, shares * volumes.sum() / volumes[chosen].sum()
+
+
+@cache
+def _brick() -> Array:
+    """Stiffness of the unit cube with Young's modulus one, [24, 24]."""
+    mu, lam = 0.5 / (1.0 + POISSON), POISSON / ((1.0 + POISSON) * (1.0 - 2.0 * POISSON))
+    law = np.diag([2.0 * mu] * 3 + [mu] * 3)
+    law[:3, :3] += lam
+    stiffness = np.zeros((33, 33))
+    at = np.array([-1.0, 1.0]) / np.sqrt(3.0)
+    for place in np.stack(np.meshgrid(at, at, at), axis=-1).reshape(-1, 3):
+        signs = 2.0 * _CORNERS - 1.0
+        factors = 1.0 + signs * place
+        gradients = np.stack([signs[:, a] * factors[:, a - 1] * factors[:, a - 2] for a in range(3)], axis=1) / 4.0
+        gradients = np.concatenate([gradients, np.diag(-4.0 * place)])
+        strain = np.zeros((6, 33))
+        for node, (x, y, z) in enumerate(gradients):
+            strain[:, 3 * node : 3 * node + 3] = [[x, 0, 0], [0, y, 0], [0, 0, z], [y, x, 0], [0, z, y], [z, 0, x]]
+        stiffness += strain.T @ law @ strain / 8.0
+    own, coupled, inner = stiffness[:24, :24], stiffness[:24, 24:], stiffness[24:, 24:]
+    return own - coupled @ np.linalg.solve(inner, coupled.T)
+
+
+def _solved(matrix: csr_array, loads: Array, far: float) -> Array:
+    """Conjugate gradients with the diagonal as preconditioner, for several right sides at once.
+
+    What is hardly held goes on growing; it is left once something is ``far`` away [m].
+    """
+    inverse = 1.0 / matrix.diagonal()[:, None]
+    x, r = np.zeros_like(loads), loads.copy()
+    p = z = inverse * r
+    rz = np.einsum("nk,nk->k", r, z)
+    works: list[Array] = []
+    for _ in range(MOST_ITERATIONS):
+        q = matrix @ p
+        pq = np.einsum("nk,nk->k", p, q)
+        alpha = np.divide(rz, pq, out=np.zeros_like(rz), where=pq > 0.0)
+        x += alpha * p
+        r -= alpha * q
+        works.append(np.einsum("nk,nk->k", loads, x))
+        settled = len(works) > LAST and (works[-1] - works[-1 - LAST] <= ENOUGH * np.abs(works[-1])).all()
+        if settled or (len(works) % LAST == 0 and np.abs(x).max() > far):
+            break
+        z = inverse * r
+        before, rz = rz, np.einsum("nk,nk->k", r, z)
+        p = z + np.divide(rz, before, out=np.zeros_like(rz), where=before > 0.0) * p
+    return x

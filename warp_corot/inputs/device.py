@@ -1,0 +1,24 @@
+"""Devices by name."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warp_corot.errors import InputError
+
+
+def checked_device(device: str | wp.Device | None) -> wp.Device:
+    """The device of that name; Warp's default for None.
+
+    Raises:
+        InputError: There is no such device; the message lists those there are.
+    """
+    wp.init()
+    try:
+        found = wp.get_device(device)
+    except Exception:
+        found = None
+    if found is None:
+        there = ", ".join(str(d) for d in wp.get_devices())
+        raise InputError(f"there is no device {str(device)!r} here; there is: {there}")
+    return found

@@ -1,0 +1,304 @@
+"""Checkpoints: everything that a simulation needs to go on, in one NumPy archive without pickles."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import warnings
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_corot.body.activation import Activation, ElementActivation
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.elasticity import MODELS, ForceField, Model
+from warp_corot.errors import InputError, StabilityWarning
+from warp_corot.inputs.checks import checked_path
+from warp_corot.io.files.quiet import bounded
+from warp_corot.io.files.whole import written_whole
+from warp_corot.materials.anisotropic import Orthotropic, TransverselyIsotropic
+from warp_corot.materials.isotropic import Isotropic
+from warp_corot.remesh.online import OnlineRemesh
+from warp_corot.simulation.simulation import Simulation
+from warp_corot.solvers import INTEGRATORS
+
+from .mesh import pack_mesh, unpack_mesh
+from .remesh import pack_changing, remesh_options, unpack_changing
+
+Remesh = OnlineRemesh | Sequence[OnlineRemesh | None] | None
+
+FORMAT = "warp-corot checkpoint"
+#: 2: worlds, deterministic runs. 3: anisotropic materials, activation, forests made from domains. 4: meshes that
+#: change, steps of changing length. 5: a step that follows the state, starts of worlds in seconds. 6: the step at the
+#: last check. All are read.
+VERSION = 6
+
+MATERIALS = {kind.__name__: kind for kind in (Isotropic, TransverselyIsotropic, Orthotropic)}
+
+
+def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
+    """Write the simulation's state to ``path``, whole or not at all: aside, to the disk, and then renamed.
+
+    Raises:
+        InputError: The folder is not there, the path is a folder, or it cannot be written to.
+    """
+    target = checked_path(path, "path")
+    if not target.parent.is_dir():
+        raise InputError(f"cannot save {target}: the folder {target.parent} is not there")
+    if target.is_dir():
+        raise InputError(f"cannot save {target}: it is a folder")
+    arrays: dict[str, np.ndarray] = {}
+    header: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
+        "device": str(sim.device),
+        "stable_dt": sim.stable_dt,
+        "steps_before_reset": sim.steps_before_reset,
+        "time_before_reset": sim.time_before_reset,
+        "gravity": sim.gravity,
+        "integrator": _described(sim.integrator, INTEGRATORS),
+        "deterministic": sim.deterministic,
+        "worlds": sim.worlds,
+        "bodies": [],
+        "kept": sorted(sim.kept),
+    }
+    for name, array in sim.kept.items():
+        arrays[f"kept.{name}"] = array.numpy()
+    for name, values in sim.guard.state.items():
+        arrays[f"guard.{name}"] = values
+    for number, (body, model, field) in enumerate(zip(sim.bodies, sim.models, sim.fields, strict=True)):
+        header["bodies"].append(_pack_body(body, model, field, f"body{number}.", arrays))
+    arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    _write_whole(target, arrays)
+
+
+def _pack_body(
+    body: SoftBody, model: Model, field: ForceField, prefix: str, arrays: dict[str, np.ndarray]
+) -> dict[str, Any]:
+    """Put a body into arrays whose names begin with ``prefix``; returns what else there is, for JSON."""
+    body.adopt_positions()
+    changing = body.changing
+    mesh, material = body.mesh, body.material
+    if changing is not None:
+        mesh, material = changing.forest.source, changing.carried_material.given
+    described = {
+        "model": _described(model, MODELS),
+        "mesh": pack_mesh(mesh, prefix, arrays),
+        "material": _name_of(material, MATERIALS),
+        "trajectories": 0,
+        "activations": len(body.activations),
+        "field": sorted(field.state),
+        "remesh": None,
+    }
+    for material_field in dataclasses.fields(material):
+        arrays[prefix + material_field.name] = np.asarray(getattr(material, material_field.name))
+    arrays[prefix + "world_starts"] = body.world_starts.numpy()
+    for name, array in field.state.items():
+        arrays[f"{prefix}field.{name}"] = array.numpy()
+    if changing is None:
+        described["trajectories"] = len(body.trajectories)
+        _pack_state(body, prefix, arrays)
+    else:
+        described["remesh"] = pack_changing(changing, f"{prefix}remesh.", arrays)
+    return described
+
+
+def _pack_state(body: SoftBody, prefix: str, arrays: dict[str, np.ndarray]) -> None:
+    arrays[prefix + "displacements"] = body.node_displacements.numpy()
+    arrays[prefix + "velocities"] = body.node_velocities.numpy()
+    arrays[prefix + "reactions"] = body.node_reactions.numpy()
+    arrays[prefix + "constrained"] = body.constrained
+    if body.initial_state is not None:
+        for name, array in zip(("displacements", "velocities"), body.initial_state, strict=True):
+            arrays[f"{prefix}initial.{name}"] = array.numpy()
+    if body.has_loads:
+        arrays[prefix + "loads"] = body.node_loads.numpy()
+    for k, trajectory in enumerate(body.trajectories):
+        arrays[f"{prefix}trajectory{k}.nodes"] = trajectory.nodes.numpy()
+        times, displacements = trajectory.keys()
+        arrays[f"{prefix}trajectory{k}.times"] = times
+        arrays[f"{prefix}trajectory{k}.displacements"] = displacements
+    if body.has_activation:
+        arrays[prefix + "activation"] = body.activation.numpy()
+    for k, activation in enumerate(body.activations):
+        for name in ("elements", "times", "stress"):
+            arrays[f"{prefix}activation{k}.{name}"] = getattr(activation, name).numpy()
+
+
+def load_checkpoint(
+    path: str | PathLike[str], device: str | wp.Device | None = None, remesh: Remesh = None
+) -> Simulation:
+    """The simulation that ``save_checkpoint`` wrote; see ``Simulation.load``."""
+    source = checked_path(path, "path")
+    if not source.is_file():
+        raise InputError(f"there is no checkpoint {source}")
+    what = f"{source} is not a whole checkpoint of warp_corot"
+    try:
+        with bounded(source), np.load(source, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        for name, array in arrays.items():
+            if not isinstance(array, np.ndarray):
+                raise InputError(f"{what}: {name} is no array")
+        header = json.loads(arrays["header"].tobytes())
+        newer = header["version"] > VERSION
+        if header["format"] != FORMAT:
+            raise InputError(what)
+    except InputError:
+        raise
+    except Exception as error:  # whatever NumPy, zip files or JSON make of it
+        raise InputError(what) from error
+    if newer:
+        raise InputError(f"{source} is of version {header['version']}; this warp_corot reads up to version {VERSION}")
+    try:
+        if header["version"] < VERSION:
+            _upgrade(header, arrays)
+        return _rebuilt_simulation(header, arrays, device, remesh)
+    except (LookupError, TypeError) as error:
+        raise InputError(f"{what}: {error} is missing or wrong") from error
+    except (ArithmeticError, AssertionError, AttributeError, MemoryError, RuntimeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{what}: {' '.join(str(error).split())[:160]}") from error
+
+
+def _upgrade(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    """Add what an older version did not know, each in the only form that there was."""
+    if header["version"] < 2:
+        header |= {"worlds": 1, "deterministic": False}
+        for number in range(len(header["bodies"])):
+            arrays[f"body{number}.world_starts"] = np.zeros(1, np.int64)
+    for described in header["bodies"]:
+        if header["version"] < 3:
+            described |= {"material": Isotropic.__name__, "activations": 0}
+            described["mesh"] |= {"of_domain": [], "label_names": []}
+        if header["version"] < 4:
+            described["remesh"] = None
+    if header["version"] < 4:
+        header |= {"stable_dt": None, "epoch": 0.0, "steps_before_reset": 0, "time_before_reset": 0.0}
+    if header["version"] < 5:
+        _upgrade_steps(header, arrays)
+    if header["version"] < 6:
+        if "kept.control" in arrays:
+            # Without by how much the step was shortened last, and whether velocities were a user's; a place is new.
+            arrays["kept.control"] = np.append(np.delete(arrays["kept.control"], (5, 7)), 0.0)
+        arrays["kept.seconds"] = np.append(arrays["kept.seconds"], 0.0)
+        arrays["guard.lately"] = np.zeros((4, header["worlds"]))
+        arrays["guard.counted"] = np.full((7, header["worlds"]), np.nan)
+
+
+def _upgrade_steps(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    """Steps were of one length, found or given, and the starts of worlds counted in such steps."""
+    dt, epoch = header["dt"], header["epoch"]
+    header["integrator"]["values"]["dt"] = dt
+    header["kept"] = ["counts", "seconds"]
+    # Whole steps since the epoch give the same time as before, digit by digit.
+    arrays["kept.counts"] = np.array([header["steps"], 0], np.int64)
+    arrays["kept.seconds"] = np.array([dt, -epoch * dt])
+    for name in ("scale", "drift"):
+        arrays[f"guard.{name}"] = np.zeros(header["worlds"])
+    arrays["guard.counted"] = np.full((6, header["worlds"]), np.nan)
+    for number in range(len(header["bodies"])):
+        starts = arrays[f"body{number}.world_starts"]
+        arrays[f"body{number}.world_starts"] = (starts - epoch) * dt
+
+
+def _rebuilt_simulation(
+    header: dict[str, Any], arrays: dict[str, np.ndarray], device: str | wp.Device | None, remesh: Remesh
+) -> Simulation:
+    place = header["device"] if device is None else device
+    bodies, models = [], []
+    for number, described in enumerate(header["bodies"]):
+        bodies.append(_rebuilt_body(described, f"body{number}.", arrays, header["worlds"], place))
+        models.append(_rebuilt(described["model"], MODELS))
+    integrator = _rebuilt(header["integrator"], INTEGRATORS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", StabilityWarning)  # it was given when the simulation was made
+        sim = Simulation(
+            bodies,
+            model=models,
+            integrator=integrator,
+            gravity=header["gravity"],
+            deterministic=header["deterministic"],
+            remesh=remesh_options(header["bodies"], arrays, place, remesh),
+        )
+    sim.steps_before_reset, sim.time_before_reset = header["steps_before_reset"], header["time_before_reset"]
+    if header["stable_dt"] is not None:
+        sim.stable_dt = header["stable_dt"]
+    for number, (described, body, field) in enumerate(zip(header["bodies"], sim.bodies, sim.fields, strict=True)):
+        if described["remesh"] is not None:
+            assert body.changing is not None
+            unpack_changing(body.changing, described["remesh"], f"body{number}.remesh.", arrays)
+        body.world_starts.assign(arrays[f"body{number}.world_starts"].astype(np.float64))
+        for name in described["field"]:
+            field.state[name].assign(arrays[f"body{number}.field.{name}"])
+    for name in header["kept"]:
+        sim.kept[name].assign(arrays[f"kept.{name}"])
+    sim.guard.resume(**{name: arrays[f"guard.{name}"] for name in ("scale", "drift", "lately", "counted")})
+    return sim
+
+
+def _rebuilt_body(
+    described: dict[str, Any], prefix: str, arrays: dict[str, np.ndarray], worlds: int, device: str | wp.Device
+) -> SoftBody:
+    mesh = unpack_mesh(described["mesh"], prefix, arrays)
+    material_kind = MATERIALS[described["material"]]
+    material = material_kind(*(arrays[prefix + f.name][()] for f in dataclasses.fields(material_kind)))
+    body = SoftBody(mesh, material, worlds=worlds, device=device)
+    if described["remesh"] is None:
+        _unpack_state(body, described, prefix, arrays)
+    elif described["remesh"]["loads"]:
+        _ = body.loads  # made on first use
+    return body
+
+
+def _unpack_state(body: SoftBody, described: dict[str, Any], prefix: str, arrays: dict[str, np.ndarray]) -> None:
+    if prefix + "initial.displacements" in arrays:
+        body.displacements = arrays[prefix + "initial.displacements"][:, :3]
+        body.velocities = arrays[prefix + "initial.velocities"][:, :3]
+        body.set_initial_state()
+    body.fix(arrays[prefix + "constrained"])
+    for k in range(described["trajectories"]):
+        motion = f"{prefix}trajectory{k}."
+        body.follow(
+            arrays[motion + "nodes"],
+            times=arrays[motion + "times"],
+            displacements=arrays[motion + "displacements"],
+        )
+    if prefix + "activation" in arrays:
+        body.activation.assign(arrays[prefix + "activation"])
+    for k in range(described["activations"]):
+        elements, times, stress = (arrays[f"{prefix}activation{k}.{name}"] for name in ("elements", "times", "stress"))
+        body.activations.append(ElementActivation.of_keys(elements, Activation(times, stress), body.device))
+    if prefix + "loads" in arrays:
+        wp.copy(body.loads, wp.array(arrays[prefix + "loads"][:, :3], dtype=wp.vec3, device=body.device))
+    body.displacements = arrays[prefix + "displacements"][:, :3]
+    body.velocities = arrays[prefix + "velocities"][:, :3]
+    body.node_reactions.assign(arrays[prefix + "reactions"])
+
+
+def _described(thing: Any, names: dict[str, Any]) -> dict[str, Any]:
+    """A listed dataclass of plain values as JSON: its name in the list and its values."""
+    return {"name": _name_of(thing, names), "values": dataclasses.asdict(thing)}
+
+
+def _name_of(thing: Any, names: dict[str, Any]) -> str:
+    for name, cls in names.items():
+        if type(thing) is cls:
+            return name
+    raise InputError(f"a {type(thing).__name__} cannot be saved; only {', '.join(c.__name__ for c in names.values())}")
+
+
+def _rebuilt(described: dict[str, Any], names: dict[str, Any]) -> Any:
+    return names[described["name"]](**described["values"])
+
+
+def _write_whole(target: Path, arrays: dict[str, np.ndarray]) -> None:
+    try:
+        with written_whole(target) as part, part.open("wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+    except OSError as error:
+        raise InputError(f"cannot save {target}: {error.strerror or error}") from error

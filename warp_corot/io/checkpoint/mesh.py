@@ -1,0 +1,87 @@
+"""Meshes in checkpoints."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from warp_corot.mesh import TetForest, TetMesh, Tree
+from warp_corot.mesh.growing.detail import Detail
+
+#: What surfaces that are finer than their mesh have.
+DETAIL = ("points", "tets", "phi", "labels")
+#: What forests have that were made from a domain.
+OF_DOMAIN = ("phi", "fill", "labels", "node_labels")
+
+
+def pack_mesh(mesh: TetForest | TetMesh, prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Put a mesh into arrays whose names begin with ``prefix``; returns what else there is, for JSON."""
+    if isinstance(mesh, TetMesh):
+        arrays[prefix + "points"], arrays[prefix + "tets"] = mesh.points, mesh.tets
+        if mesh.labels is not None:
+            arrays[prefix + "labels"] = mesh.labels
+        names = list(mesh.label_names)
+        return {"kind": "general", "up_axis": mesh.up_axis, "repaired": mesh.repaired, "label_names": names}
+    arrays[prefix + "lattice"], arrays[prefix + "node_ends"] = mesh.lattice, mesh.node_ends
+    for field in dataclasses.fields(Tree):
+        arrays[f"{prefix}tree.{field.name}"] = getattr(mesh.tree, field.name)
+    if mesh.detail is not None:
+        found = {name: getattr(mesh.detail, name) for name in DETAIL}
+        arrays.update((f"{prefix}detail.{name}", array) for name, array in found.items() if array is not None)
+    of_domain = [name for name in OF_DOMAIN if getattr(mesh, name) is not None]
+    for name in of_domain:
+        arrays[f"{prefix}domain.{name}"] = getattr(mesh, name)
+    return {
+        "kind": "forest",
+        "of_domain": of_domain,
+        "label_names": mesh.label_names,
+        "up_axis": mesh.up_axis,
+        "cells": mesh.cells,
+        "cell_size": mesh.cell_size,
+        "origin": mesh.origin,
+    }
+
+
+def unpack_mesh(described: dict[str, Any], prefix: str, arrays: dict[str, np.ndarray]) -> TetForest | TetMesh:
+    """The mesh that ``pack_mesh`` put there."""
+    if described["kind"] == "general":
+        mesh = TetMesh(
+            arrays[prefix + "points"],
+            arrays[prefix + "tets"],
+            up_axis=described["up_axis"],
+            labels=arrays.get(prefix + "labels"),
+            label_names=described.get("label_names", ()),
+        )
+        mesh.repaired = described["repaired"]
+        return mesh
+    tree = Tree(**{field.name: arrays[f"{prefix}tree.{field.name}"] for field in dataclasses.fields(Tree)})
+    x, y, z = described["cells"]
+    a, b, c = described["origin"]
+    lattice, ends = arrays[prefix + "lattice"], arrays[prefix + "node_ends"]
+    _check_tree(tree, lattice, ends)
+    detail = {name: arrays[key] for name in DETAIL if (key := f"{prefix}detail.{name}") in arrays}
+    of_domain: dict[str, Any] = {name: arrays[f"{prefix}domain.{name}"] for name in described["of_domain"]}
+    names = tuple(described["label_names"])
+    up_axis = described["up_axis"]
+    of_domain["detail"] = Detail(**detail) if detail else None
+    return TetForest(
+        (x, y, z), described["cell_size"], (a, b, c), lattice, ends, tree, up_axis, label_names=names, **of_domain
+    )
+
+
+def _check_tree(tree: Tree, lattice: np.ndarray, ends: np.ndarray) -> None:
+    """See that what indices name is there, since kernels do not look.
+
+    Raises:
+        ValueError: It is not.
+    """
+    count, nodes = len(tree.tets), len(lattice)
+    shapes = [tree.tets.shape, lattice.shape, ends.shape, tree.level.shape, tree.parent.shape, tree.first_child.shape]
+    if shapes != [(count, 4), (nodes, 3), (nodes, 2), *[(count,)] * 3]:
+        raise ValueError(f"the tree's arrays have the shapes {shapes}")
+    bounds = ((tree.tets, 0, nodes), (ends, -1, nodes), (tree.parent, -1, count), (tree.first_child, -2, count - 1))
+    for array, least, most in (*bounds, (tree.level, 0, 64)):
+        if array.dtype.kind != "i" or (array.size and not (array.min() >= least and array.max() < most)):
+            raise ValueError("the tree names what is not there")

@@ -1,0 +1,180 @@
+"""Checkpoints of bodies whose meshes change: the pools as they are and as ``reset`` finds them, and what was asked for.
+
+Pools are kept place by place, not as a mesh, so that what comes next is numbered as if the run had never stopped.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.discretization.changing.snapshot import Piece, Snapshot, array_of
+from warp_corot.discretization.changing.survey import Findings
+from warp_corot.errors import InputError
+from warp_corot.remesh.carried_activation import Keys
+from warp_corot.remesh.conditions import KEPT
+from warp_corot.remesh.keyframes import Row
+from warp_corot.remesh.online import OnlineRemesh
+
+if TYPE_CHECKING:
+    from warp_corot.discretization.changing.pools import DeviceForest
+    from warp_corot.remesh.changing import Changing
+
+Arrays = dict[str, np.ndarray]
+
+#: Of `OnlineRemesh`, what JSON takes as it is.
+PLAIN = ("refine_above", "simplify_below", "min_level", "max_level", "every", "capacity")
+#: Where criteria are that can be found again by their names.
+CRITERIA = "warp_corot.kernels."
+
+
+def pack_changing(changing: Changing, prefix: str, arrays: Arrays) -> dict[str, Any]:
+    """Put what remeshes a body into arrays whose names begin with ``prefix``; returns what else there is, for JSON."""
+    changing.body.adopt_positions()
+    conditions, forest, options = changing.conditions, changing.forest, changing.options
+    conditions.note()
+    parameters = options.parameters
+    if parameters is not None:
+        arrays[prefix + "parameters"] = parameters.numpy()
+    for name, array in conditions.kept.items():
+        arrays[f"{prefix}conditions.{name}"] = array.numpy()
+    rows = conditions.keyframes.rows
+    for k, row in rows.items():
+        arrays[f"{prefix}row{k}.times"], arrays[f"{prefix}row{k}.displacements"] = row.times, row.displacements
+    keys = conditions.activation.keys
+    for k, each in enumerate(keys):
+        arrays[f"{prefix}activation{k}.times"], arrays[f"{prefix}activation{k}.stress"] = each.times, each.stress
+    return {
+        "options": {name: getattr(options, name) for name in PLAIN},
+        "criterion": None if options.criterion is None else _name_of(options.criterion),
+        "parameters": parameters is not None,
+        "conditions": sorted(conditions.kept),
+        "rows": list(rows),
+        "between": [[*ends, row] for ends, row in conditions.keyframes.between.items()],
+        "loads": changing.body.has_loads,
+        "activation": changing.body.has_activation,
+        "activation_rows": [each.first for each in keys],
+        "at_beginning": conditions.of_present_mesh,
+        "survey": asdict(changing.survey.last),
+        "initial": _pack_snapshot(forest.remembered, f"{prefix}initial.", arrays),
+        "present": _pack_snapshot(Snapshot.of(forest), f"{prefix}present.", arrays),
+    }
+
+
+def unpack_changing(changing: Changing, described: dict[str, Any], prefix: str, arrays: Arrays) -> None:
+    """Have a body that was made as it began be remeshed as it was when ``pack_changing`` kept it."""
+    forest, keyframes, body = changing.forest, changing.conditions.keyframes, changing.body
+    _unpacked_snapshot(forest, described["initial"], f"{prefix}initial.", arrays).restore(forest)
+    forest.remember()
+    _unpacked_snapshot(forest, described["present"], f"{prefix}present.", arrays).restore(forest)
+    keyframes.rows = {
+        k: Row(arrays[f"{prefix}row{k}.times"], arrays[f"{prefix}row{k}.displacements"]) for k in described["rows"]
+    }
+    keyframes.between = {(a, b): row for a, b, row in described["between"]}
+    if described["activation"]:
+        _ = body.activation  # made on first use
+    changing.renew()
+    activation = changing.conditions.activation
+    activation.keys = [
+        Keys(first, arrays[f"{prefix}activation{k}.times"], arrays[f"{prefix}activation{k}.stress"])
+        for k, first in enumerate(described["activation_rows"])
+    ]
+    if activation.keys:
+        activation.serve()
+    rows = forest.carriage.arrays.row[: body.node_count].numpy()
+    nodes = np.flatnonzero(rows >= 0).astype(np.int32)
+    body.trajectories = keyframes.trajectories(nodes, rows[nodes], body.device)
+    body.revision += 1
+    kept = {
+        name: wp.array(arrays[f"{prefix}conditions.{name}"], dtype=KEPT[name], device=body.device)
+        for name in described["conditions"]
+    }
+    changing.conditions.set_kept(kept, of_present_mesh=described["at_beginning"])
+    changing.survey.last = Findings(**described["survey"])
+
+
+def remesh_options(
+    described: Sequence[dict[str, Any]],
+    arrays: Arrays,
+    device: str | wp.Device,
+    given: OnlineRemesh | Sequence[OnlineRemesh | None] | None,
+) -> OnlineRemesh | Sequence[OnlineRemesh | None] | None:
+    """How the bodies of a checkpoint are to be remeshed.
+
+    Args:
+        described: The bodies.
+        arrays: Of the checkpoint.
+        device: Where the simulation goes on.
+        given: In place of what was kept, but for the capacity, which stays.
+
+    Raises:
+        InputError: A criterion that is not known, and nothing is given in its place.
+    """
+    kept = [
+        None if each["remesh"] is None else _options(each["remesh"], f"body{number}.remesh.", arrays, device, given)
+        for number, each in enumerate(described)
+    ]
+    if given is None:
+        return kept if any(kept) else None
+    several = list(given) if isinstance(given, Sequence) else [given] * len(described)
+    if len(several) != len(kept) or not all(isinstance(each, OnlineRemesh | None) for each in several):
+        return given  # the simulation says what is wrong
+    found: list[OnlineRemesh | None] = []
+    for number, (own, before) in enumerate(zip(several, kept, strict=True)):
+        if before is not None and own is None:
+            raise InputError(f"remesh is None for body {number}, whose mesh has changed; it must be an OnlineRemesh")
+        found.append(own if own is None or before is None else replace(own, capacity=before.capacity))
+    return found
+
+
+def _options(described: dict[str, Any], prefix: str, arrays: Arrays, device: Any, given: Any) -> OnlineRemesh:
+    name = described["criterion"]
+    criterion = None if name is None else _criterion(name)
+    if name is not None and criterion is None and given is None:
+        raise InputError(
+            f"the criterion {name.rpartition('.')[2]!r} is a function of yours, which a checkpoint does not hold; load "
+            "with remesh=OnlineRemesh(criterion=...) as the simulation was made"
+        )
+    parameters = None
+    if described["parameters"]:
+        parameters = wp.array(arrays[prefix + "parameters"], dtype=wp.float32, device=device)
+    return OnlineRemesh(**described["options"], criterion=criterion, parameters=parameters)
+
+
+def _name_of(criterion: Any) -> str:
+    return f"{criterion.func.__module__}.{criterion.func.__name__}"
+
+
+def _criterion(name: str) -> Any:
+    """The package's own criterion of a name; None if it is none of these."""
+    module, _, function = name.rpartition(".")
+    if not module.startswith(CRITERIA):
+        return None
+    try:
+        found = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError):
+        return None
+    return found if isinstance(found, wp.Function) else None
+
+
+def _pack_snapshot(snapshot: Snapshot, prefix: str, arrays: Arrays) -> list[list[Any]]:
+    """Put a snapshot's values into arrays; returns their names and the places where they start."""
+    arrays[prefix + "counts"] = snapshot.counts
+    for name, start, values in snapshot.pieces:
+        arrays[f"{prefix}{name}.{start}"] = values.numpy()
+    return [[name, start] for name, start, _ in snapshot.pieces]
+
+
+def _unpacked_snapshot(forest: DeviceForest, pieces: list[list[Any]], prefix: str, arrays: Arrays) -> Snapshot:
+    made = [Piece(n, start, _on_device(arrays[f"{prefix}{n}.{start}"], array_of(forest, n))) for n, start in pieces]
+    return Snapshot(arrays[prefix + "counts"], tuple(made))
+
+
+def _on_device(values: npt.NDArray[Any], like: wp.array) -> wp.array:
+    return wp.array(values, dtype=like.dtype, ndim=like.ndim, device=like.device)

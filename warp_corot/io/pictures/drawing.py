@@ -1,0 +1,345 @@
+"""Shaded surfaces drawn into Matplotlib axes.
+
+A surface is drawn as many small polygons, back to front (painter's algorithm): faces turned away are left out, the
+others cut into pieces small enough for smooth shading, and each piece filled with one colour.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from warp_corot.errors import InputError
+
+from .colors import TISSUE, color_index, round_limit, srgb_to_linear, stress_colors
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Array = NDArray[np.float64]
+
+INK = "#3b3640"
+_PIECES = 60_000  # about how many polygons a body is cut into
+_CREASE = math.cos(math.radians(40.0))  # edges sharper than this stay sharp
+_DEPTH_CELLS = 60  # across the picture that says which dots are hidden
+_GHOST, _GHOST_LINE = (0.90, 0.91, 0.93), (0.74, 0.76, 0.80)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A mild perspective view. Points are seen along ``axes[2]``; picture coordinates are right and up.
+
+    Attributes:
+        center: Point in the middle of the picture [m], [3].
+        axes: Rows: right, up, towards the viewer; [3, 3].
+        distance: From the viewer to ``center`` [m].
+        world_up: The stage's up direction, [3].
+    """
+
+    center: Array
+    axes: Array
+    distance: float
+    world_up: Array
+
+    @classmethod
+    def fit(cls, points: ArrayLike, up_axis: str = "Y", azimuth: float = 35.0, elevation: float = 14.0) -> "Camera":
+        """A camera that sees all of ``points`` [n, 3] from ``azimuth`` [°] round the up axis and ``elevation`` [°].
+
+        Azimuth 0 looks along −Z where Y is up, along +Y where Z is up, along −Y where X is up.
+        """
+        right, up, front = _world_axes(up_axis)
+        a, e = math.radians(azimuth), math.radians(elevation)
+        towards = math.cos(e) * (math.cos(a) * front + math.sin(a) * right) + math.sin(e) * up
+        across = math.cos(a) * right - math.sin(a) * front
+        x = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        low, high = x.min(axis=0), x.max(axis=0)
+        size = float(np.linalg.norm(high - low)) or 1.0
+        axes = np.stack([across, np.cross(towards, across), towards])
+        return cls((low + high) / 2.0, axes, 3.5 * size, up)
+
+    def project(self, points: Array) -> tuple[Array, Array]:
+        """Picture coordinates [..., 2] and depth [...] (larger is nearer) of points [..., 3]."""
+        seen = (points - self.center) @ self.axes.T
+        depth = seen[..., 2]
+        return seen[..., :2] * (self.distance / (self.distance - depth))[..., None], depth
+
+    def rays(self, points: Array) -> Array:
+        """Unit vectors from points [..., 3] to the viewer."""
+        towards = self.center + self.distance * self.axes[2] - points
+        return towards / np.linalg.norm(towards, axis=-1, keepdims=True)
+
+
+def draw_body(
+    ax: "Axes",
+    positions: ArrayLike,
+    faces: ArrayLike,
+    *,
+    scalars: ArrayLike | None = None,
+    value_range: tuple[float, float] | None = None,
+    rest: ArrayLike | None = None,
+    camera: Camera | None = None,
+    up_axis: str = "Y",
+    color: tuple[float, float, float] = TISSUE,
+    edges: bool = False,
+    ground: float | bool = True,
+    held: ArrayLike | None = None,
+    pieces: int = _PIECES,
+) -> Camera:
+    """Draws a shaded surface into a Matplotlib Axes.
+
+    Args:
+        ax: Where to draw; its frame is switched off and its limits widened to what is drawn.
+        positions: Nodes [N, 3] [m]. Nodes that no face names do not matter.
+        faces: Triangles [F, 3], wound counter-clockwise seen from outside (`mesh.surface.boundary_faces`).
+        scalars: Values to colour by, one a node [N] or one a face [F].
+        value_range: Values at the two ends of the colour map; None: 0 to the 99th percentile, rounded up.
+        rest: Nodes at rest [N, 3] [m], drawn as a faint silhouette behind.
+        camera: None: one that sees ``positions`` and ``rest``.
+        up_axis: "X", "Y" or "Z".
+        color: Of the body where there are no scalars, sRGB.
+        edges: Draw the edges of the faces.
+        ground: Height [m] of a ground that takes the shadow; True: below the lowest node; False: none.
+        held: Nodes to be marked with dots, mask [N].
+        pieces: About how many polygons the surface is cut into.
+
+    Returns:
+        The camera used, for the next body.
+
+    Raises:
+        InputError: Arrays that do not fit each other, or positions that are not finite.
+    """
+    x, tri = checked_surface(positions, faces, "positions")
+    x_rest = None if rest is None else checked_surface(rest, faces, "rest")[0]
+    seen = [x[tri].reshape(-1, 3)] + ([x_rest[tri].reshape(-1, 3)] if x_rest is not None else [])
+    if camera is None:
+        camera = Camera.fit(np.concatenate(seen), up_axis)
+    if ground is not False:
+        height = min(float((s @ camera.world_up).min()) for s in seen) if ground is True else float(ground)
+        shadow = _draw_shadow(ax, x[tri], camera, height)
+        ax.update_datalim(shadow)
+    if x_rest is not None:
+        _draw_silhouette(ax, x_rest[tri], camera)
+
+    cut, normals, values = _cut(x, tri, _values(scalars, len(x), tri), pieces)
+    _fill(ax, camera.project(x[tri][_facing(x[tri], camera)])[0], INK, INK, width=1.6, order=3)
+    front = _facing(cut, camera)
+    cut, normals = cut[front], normals[front]
+    flat, depth = camera.project(cut)
+    order = np.argsort(depth.mean(axis=1))
+    if values is None:
+        base = np.broadcast_to(srgb_to_linear(color), (len(cut), 3))
+    else:
+        lowest, highest = value_range or value_limits(scalars)
+        base = srgb_to_linear(stress_colors())[color_index(values[front], lowest, highest)]
+    shaded = _shade(base, normals, camera.rays(cut.mean(axis=1)), camera)[order]
+    # The edge of each polygon, in its own colour, closes the seams that antialiasing leaves between neighbours.
+    _fill(ax, flat[order], shaded, shaded, width=0.2, order=4)
+    if edges:
+        _draw_edges(ax, x[tri], camera)
+    if held is not None and np.any(held):
+        _draw_dots(ax, x, tri, np.asarray(held, dtype=bool), cut, camera)
+    ax.set_aspect("equal")
+    ax.set_axis_off()
+    ax.update_datalim(np.concatenate([camera.project(s)[0] for s in seen]))
+    ax.margins(0.06)
+    ax.autoscale_view()
+    return camera
+
+
+def value_limits(scalars: ArrayLike | None) -> tuple[float, float]:
+    """The default ends of a colour map for values: 0 and the 99th percentile, rounded up to few digits."""
+    finite = np.asarray(scalars, dtype=np.float64).ravel()
+    finite = finite[np.isfinite(finite)]
+    return 0.0, (round_limit(float(np.percentile(finite, 99.0))) if len(finite) else 0.0) or 1.0
+
+
+def checked_surface(positions: ArrayLike, faces: ArrayLike, name: str) -> tuple[Array, NDArray[np.int64]]:
+    """Positions as float64 [N, 3] and faces as int64 [F, 3].
+
+    Raises:
+        InputError: Other shapes, nodes that are not there, or coordinates of the surface that are not finite.
+    """
+    x = np.asarray(positions, dtype=np.float64)
+    tri = np.asarray(faces, dtype=np.int64)
+    if x.ndim != 2 or x.shape[1] != 3:
+        raise InputError(f"{name} has shape {list(x.shape)}, should be [N, 3]")
+    if tri.ndim != 2 or tri.shape[1] != 3 or len(tri) == 0:
+        raise InputError(f"faces has shape {list(tri.shape)}, should be [F, 3] with at least one face")
+    if tri.min() < 0 or tri.max() >= len(x):
+        raise InputError(f"faces names nodes {tri.min()} to {tri.max()} but {name} has nodes 0 to {len(x) - 1}")
+    if not np.isfinite(x[tri]).all():
+        raise InputError(f"{name} has coordinates that are not finite")
+    return x, tri
+
+
+def _world_axes(up_axis: str) -> tuple[Array, Array, Array]:
+    """Right, up and front (towards a viewer at azimuth 0), a right-handed triple."""
+    if up_axis not in ("X", "Y", "Z"):
+        raise InputError(f"up_axis is {up_axis!r}, should be X, Y or Z")
+    x, y, z = np.eye(3)
+    return {"Y": (x, y, z), "Z": (x, z, -y), "X": (z, x, y)}[up_axis]
+
+
+def _values(scalars: ArrayLike | None, nodes: int, tri: NDArray[np.int64]) -> Array | None:
+    """Values at the corners of the faces [F, 3]."""
+    if scalars is None:
+        return None
+    values = np.asarray(scalars, dtype=np.float64)
+    if values.shape == (nodes,):
+        return values[tri]
+    if values.shape == (len(tri),):
+        return np.repeat(values[:, None], 3, axis=1)
+    raise InputError(f"scalars has shape {list(values.shape)}, should be [{nodes}] (nodes) or [{len(tri)}] (faces)")
+
+
+def _facing(triangles: Array, camera: Camera) -> NDArray[np.bool_]:
+    """Which triangles [n, 3, 3] show their outer side."""
+    flat, _ = camera.project(triangles)
+    (ax_, ay), (bx, by) = (flat[:, 1] - flat[:, 0]).T, (flat[:, 2] - flat[:, 0]).T
+    return ax_ * by - ay * bx > 0.0
+
+
+def _corner_normals(x: Array, tri: NDArray[np.int64]) -> Array:
+    """Unit normals at the corners of faces [F, 3, 3]: averages over the node's faces within a crease."""
+    corners = x[tri]
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    unit = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-300)
+    order = np.argsort(tri.ravel(), kind="stable")
+    nodes, first, count = np.unique(tri.ravel()[order], return_index=True, return_counts=True)
+    place = np.searchsorted(nodes, tri.ravel())
+    total = np.zeros((tri.size, 3))
+    own = np.repeat(unit, 3, axis=0)
+    for turn in range(int(count.max())):
+        there = turn < count[place]
+        neighbour = order[np.where(there, first[place] + turn, 0)] // 3
+        near = there & (np.einsum("ij,ij->i", unit[neighbour], own) > _CREASE)
+        total += np.where(near[:, None], area[neighbour], 0.0)
+    total += 1e-12 * own * np.abs(area).max()
+    return (total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)).reshape(-1, 3, 3)
+
+
+def _cut(x: Array, tri: NDArray[np.int64], values: Array | None, count: int) -> tuple[Array, Array, Array | None]:
+    """Cuts each face into n² triangles: their corners [m, 3, 3], and normals [m, 3] and values [m] at their centres."""
+    n = int(np.clip(math.sqrt(count / len(tri)), 1, 24))
+    weights = []
+    for i in range(n):
+        for j in range(n - i):
+            a, b, c = (i, j), (i + 1, j), (i, j + 1)
+            weights.append((a, b, c))
+            if i + j < n - 1:
+                weights.append((b, (i + 1, j + 1), c))
+    uv = np.array(weights, dtype=np.float64) / n
+    bary = np.stack([1.0 - uv.sum(axis=2), uv[..., 0], uv[..., 1]], axis=2)  # [n², corner, 3]
+    pieces = np.einsum("scb,fbx->fscx", bary, x[tri]).reshape(-1, 3, 3)
+    centers = bary.mean(axis=1)
+    normals = np.einsum("sb,fbx->fsx", centers, _corner_normals(x, tri)).reshape(-1, 3)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    return pieces, normals, None if values is None else np.einsum("sb,fb->fs", centers, values).ravel()
+
+
+def _shade(base: Array, normals: Array, rays: Array, camera: Camera) -> Array:
+    """sRGB colours of linear base colours under a key light from the upper left, a fill light and the sky."""
+    right, _, front = camera.axes
+    key = _unit(-0.45 * right + 0.80 * camera.world_up + 0.60 * front)
+    fill = _unit(0.9 * right + 0.1 * camera.world_up + 0.5 * front)
+    lambert = np.clip((normals @ key + 0.2) / 1.2, 0.0, None)
+    sky = 0.5 + 0.5 * normals @ camera.world_up
+    # Ambient light a little towards rose: dimmed by grey light alone the map's yellows would turn olive.
+    ambient = (0.13 + 0.24 * sky + 0.30 * np.clip(normals @ fill, 0.0, None))[:, None] * np.array([1.06, 0.96, 1.0])
+    light = ambient + 0.74 * lambert[:, None]
+    halfway = key + rays
+    halfway /= np.linalg.norm(halfway, axis=1, keepdims=True)
+    gloss = 0.06 * np.clip(np.einsum("ij,ij->i", normals, halfway), 0.0, None) ** 24
+    linear = np.clip(base * light + gloss[:, None], 0.0, 1.0)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def _draw_silhouette(ax: "Axes", triangles: Array, camera: Camera) -> None:
+    flat, _ = camera.project(triangles[_facing(triangles, camera)])
+    _fill(ax, flat, _GHOST, _GHOST_LINE, width=2.2, order=1)
+    _fill(ax, flat, _GHOST, _GHOST, width=0.3, order=2)
+
+
+def _draw_edges(ax: "Axes", triangles: Array, camera: Camera) -> None:
+    flat, _ = camera.project(triangles[_facing(triangles, camera)])
+    _fill(ax, flat, "none", (0.23, 0.21, 0.25, 0.25), width=0.4, order=5)
+
+
+def _fill(ax: "Axes", polygons: Array, face: Any, edge: Any, *, width: float, order: int) -> None:
+    from matplotlib.collections import PolyCollection
+
+    collection = PolyCollection(
+        list(polygons), facecolor=face, edgecolor=edge, linewidth=width, joinstyle="round", zorder=order
+    )
+    ax.add_collection(collection, autolim=False)
+
+
+def _draw_shadow(ax: "Axes", triangles: Array, camera: Camera, height: float, cells: int = 220) -> Array:
+    """A soft shadow on the ground: the body's points dropped along the light, counted in cells and blurred.
+
+    Returns the picture coordinates [n, 2] of the cells that are visibly dark.
+    """
+    from matplotlib.collections import QuadMesh
+
+    up = camera.world_up
+    right = camera.axes[0]
+    back = np.cross(up, right)  # with ``right`` it spans the ground
+    light = _unit(-0.30 * right + 1.0 * up - 0.12 * back)
+    bary = np.random.default_rng(0).dirichlet((1.0, 1.0, 1.0), size=max(4, 200_000 // len(triangles)))
+    points = np.einsum("sb,fbx->fsx", bary, triangles).reshape(-1, 3)
+    lift = np.maximum(points @ up - height, 0.0)
+    dropped = points - lift[:, None] / (light @ up) * light
+    flat = np.stack([dropped @ right, dropped @ back], axis=1)
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    margin = 0.22 * float((high - low).max()) + 1e-12
+    low, high = low - margin, high + margin
+    counts, us, vs = np.histogram2d(flat[:, 0], flat[:, 1], bins=cells, range=np.stack([low, high], axis=1).tolist())
+    dark = (counts > 0).astype(np.float64)
+    # Two widths: a tight contact shadow within a wide soft one.
+    dark = 0.5 * _blur(dark, 0.012 * cells, 0.012 * cells) + 0.5 * _blur(dark, 0.05 * cells, 0.05 * cells)
+    middle_u, middle_v = (us[1:] + us[:-1]) / 2.0, (vs[1:] + vs[:-1]) / 2.0
+    u, v = np.meshgrid(middle_u, middle_v, indexing="ij")
+    ground = u[..., None] * right + v[..., None] * back + height * up
+    picture, _ = camera.project(ground)
+    # Opaque on white: where cells overlap by part of a pixel, transparent ones would show their seams.
+    tint = 1.0 - 0.26 * dark[..., None] * (1.0 - np.array([0.20, 0.20, 0.27]))
+    mesh = QuadMesh(picture, facecolor=tint[:-1, :-1].reshape(-1, 3), antialiased=False, zorder=0)
+    ax.add_collection(mesh, autolim=False)
+    return picture[dark > 0.2]
+
+
+def _blur(image: Array, wide_u: float, wide_v: float) -> Array:
+    """Gaussian blur by the discrete Fourier transform (the image wraps round, its margins are empty)."""
+    fu, fv = np.fft.fftfreq(image.shape[0])[:, None], np.fft.rfftfreq(image.shape[1])[None, :]
+    kernel = np.exp(-2.0 * np.pi**2 * ((wide_u * fu) ** 2 + (wide_v * fv) ** 2))
+    return np.clip(np.fft.irfft2(np.fft.rfft2(image) * kernel, s=image.shape), 0.0, 1.0)
+
+
+def _draw_dots(
+    ax: "Axes", x: Array, tri: NDArray[np.int64], held: NDArray[np.bool_], pieces: Array, camera: Camera
+) -> None:
+    """Dots on the held nodes that can be seen: on a face that shows its outside, with none of the pieces before it."""
+    faces = tri[_facing(x[tri], camera)]
+    marked = np.unique(faces[held[faces]])
+    if not len(marked):
+        return
+    flat, depth = camera.project(x)
+    centers, nearness = camera.project(pieces.mean(axis=1))
+    low = np.minimum(centers.min(axis=0), flat[marked].min(axis=0))
+    cell = float(np.ptp(centers, axis=0).max()) / _DEPTH_CELLS or 1.0
+    nearest: dict[tuple[int, int], float] = {}
+    for place, near in zip(map(tuple, ((centers - low) / cell).astype(int).tolist()), nearness.tolist(), strict=True):
+        nearest[place] = max(near, nearest.get(place, -np.inf))
+    places = list(map(tuple, ((flat[marked] - low) / cell).astype(int).tolist()))
+    before = np.array([nearest.get(place, -np.inf) for place in places])
+    # Within a cell a surface seen at a slant is as much nearer as this.
+    seen = marked[depth[marked] > before - 4.0 * cell]
+    # So many that they do not run together.
+    _, first = np.unique(((flat[seen] - low) / (1.5 * cell)).astype(int), axis=0, return_index=True)
+    ax.plot(*flat[seen[first]].T, ".", color=INK, markersize=4.5, markeredgewidth=0.0, zorder=6)
+
+
+def _unit(vector: Array) -> Array:
+    return vector / np.linalg.norm(vector)

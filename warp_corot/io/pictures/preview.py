@@ -1,0 +1,334 @@
+"""Pictures of deformed bodies as PNG files: one body, or several side by side."""
+
+import io
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from warp_corot.errors import InputError
+from warp_corot.io.files.whole import written_whole
+
+from .colors import stress_colors
+from .drawing import INK, Array, Camera, checked_surface, draw_body, value_limits
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from PIL.Image import Image
+
+__all__ = ["Camera", "Picture", "check_picture_path", "draw_body", "render_preview", "render_strip", "value_limits"]
+
+#: Pixels from side to side of the colour bar.
+BAR = 16
+
+
+@dataclass
+class Picture:
+    """One body in a strip: see `draw_body` for what the fields mean; ``view`` is azimuth and elevation [°]."""
+
+    positions: ArrayLike
+    faces: ArrayLike
+    scalars: ArrayLike | None = None
+    rest: ArrayLike | None = None
+    title: str = ""
+    options: dict[str, Any] = field(default_factory=dict)
+    view: tuple[float, float] | None = None
+
+
+def render_preview(
+    path: str | Path,
+    positions: ArrayLike,
+    faces: ArrayLike,
+    *,
+    scalars: ArrayLike | None = None,
+    scalar_label: str = "von Mises stress [Pa]",
+    value_range: tuple[float, float] | None = None,
+    rest: ArrayLike | None = None,
+    up_axis: str = "Y",
+    azimuth: float = 35.0,
+    elevation: float = 14.0,
+    title: str | None = None,
+    size: tuple[int, int] = (1200, 900),
+    **options: Any,
+) -> None:
+    """Renders one body to a PNG file of ``size`` pixels, with a colour bar where it has scalars; see `draw_body`.
+
+    Raises:
+        InputError: Not a .png path in a folder that is there, Matplotlib is not installed, or as `draw_body`.
+        OSError: Could not be written; a picture that was there before stays.
+    """
+    picture = Picture(positions, faces, scalars, rest, title or "", options=options)
+    render_strip(
+        path,
+        [picture],
+        scalar_label=scalar_label,
+        value_range=value_range,
+        up_axis=up_axis,
+        azimuth=azimuth,
+        elevation=elevation,
+        size=size,
+    )
+
+
+def render_strip(
+    path: str | Path,
+    pictures: Sequence[Picture],
+    *,
+    scalar_label: str = "von Mises stress [Pa]",
+    value_range: tuple[float, float] | None = None,
+    up_axis: str = "Y",
+    azimuth: float = 35.0,
+    elevation: float = 14.0,
+    title: str | None = None,
+    size: tuple[int, int] | None = None,
+) -> None:
+    """Renders several bodies, or one at several times, side by side: same view, same scale, same colours.
+
+    Args:
+        path: A .png file.
+        pictures: From left to right; each may have its own title.
+        scalar_label: What the colour bar says.
+        value_range: Values at the ends of the colour map; None: 0 to the highest 99th percentile, rounded up.
+        up_axis: "X", "Y" or "Z".
+        azimuth: View round the up axis [°], see `Camera.fit`.
+        elevation: View from above [°].
+        title: Above all.
+        size: Pixels; None: 600 a picture, as high as they need.
+
+    Raises:
+        InputError, OSError: as `render_preview`.
+    """
+    target = check_picture_path(path)
+    if not pictures:
+        raise InputError("pictures is empty, should name at least one body")
+    save_picture(
+        draw_strip(
+            pictures,
+            cameras_of(pictures, up_axis, azimuth, elevation),
+            scalar_label=scalar_label,
+            value_range=value_range,
+            title=title,
+            size=size,
+        ),
+        target,
+    )
+
+
+def cameras_of(
+    pictures: Sequence[Picture], up_axis: str, azimuth: float, elevation: float, box: Array | None = None
+) -> list[Camera]:
+    """A camera for each picture, all at one distance from one place.
+
+    Args:
+        pictures: Those without a view of their own are seen from ``azimuth`` and ``elevation`` [°].
+        up_axis: "X", "Y" or "Z".
+        azimuth, elevation: See `Camera.fit`.
+        box: Lowest and highest coordinates of all that is to be seen [2, 3]; None: the pictures'.
+    """
+    if box is None:
+        box = bounds_of(pictures)
+    views = [p.view or (azimuth, elevation) for p in pictures]
+    return [Camera.fit(box, up_axis, *view) for view in views]
+
+
+def bounds_of(pictures: Sequence[Picture]) -> Array:
+    """Lowest and highest coordinates of what is seen of bodies [2, 3].
+
+    Raises:
+        InputError: Positions or faces that are none.
+    """
+    given = [(x, p.faces) for p in pictures for x in (p.positions, p.rest) if x is not None]
+    seen = [x[tri].reshape(-1, 3) for x, tri in (checked_surface(*each, "positions") for each in given)]
+    return np.stack([np.min([x.min(axis=0) for x in seen], axis=0), np.max([x.max(axis=0) for x in seen], axis=0)])
+
+
+def draw_strip(
+    pictures: Sequence[Picture],
+    cameras: Sequence[Camera],
+    *,
+    scalar_label: str = "von Mises stress [Pa]",
+    value_range: tuple[float, float] | None = None,
+    title: str | None = None,
+    size: tuple[int, int] | None = None,
+    box: Array | None = None,
+    ground: float | None = None,
+    fineness: int = 2,
+    columns: int | None = None,
+) -> "Image":
+    """Draws pictures side by side, with one colour bar; see `render_strip`.
+
+    Args:
+        pictures: From left to right, and row after row.
+        cameras: One for each.
+        scalar_label, value_range, title, size: As in `render_strip`.
+        box: Lowest and highest coordinates of what panels show, seen or not [2, 3]; None: what there is to see.
+        ground: Its height; None: below the lowest node.
+        fineness: Times as many pixels are drawn along each side, and averaged.
+        columns: Pictures in a row; None: all.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise InputError('pictures need Matplotlib: pip install "warp-corot[plot]"') from None
+    from PIL import Image
+
+    corners = [
+        checked_surface(x, p.faces, "positions") for p in pictures for x in (p.positions, p.rest) if x is not None
+    ]
+    if ground is None:
+        ground = min(float((x[tri].reshape(-1, 3) @ cameras[0].world_up).min()) for x, tri in corners)
+    with_scalars = [p.scalars for p in pictures if p.scalars is not None]
+    if with_scalars and value_range is None:
+        value_range = (0.0, max(value_limits(scalars)[1] for scalars in with_scalars))
+
+    # Pixels: the panels side by side below their titles, the colour bar at the right.
+    columns = columns or len(pictures)
+    rows = -(-len(pictures) // columns)
+    width, height = size or (600 * columns, 600 * rows)
+    figure = Figure(dpi=150, facecolor="white")
+    FigureCanvasAgg(figure)
+    figure.set_size_inches(width / 150.0, height / 150.0)
+    legend = bar = None
+    if with_scalars and value_range is not None:
+        legend = _draw_color_bar(figure, value_range, scalar_label)
+        bar = _needed_width(legend, width)
+    step = (width - (bar or 0)) / columns
+    head, own_head = 56 * (title is not None), 40 * any(p.title for p in pictures)
+    all_axes = []
+    for picture, camera in zip(pictures, cameras, strict=True):
+        ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        options = {"ground": ground, **picture.options}
+        draw_body(
+            ax,
+            picture.positions,
+            picture.faces,
+            scalars=picture.scalars,
+            value_range=value_range,
+            rest=picture.rest,
+            camera=camera,
+            **options,
+        )
+        if picture.title:
+            _fit(ax.set_title(picture.title, fontsize=11, color=INK, pad=4), step - 16)
+        all_axes.append(ax)
+    limits = np.array([[ax.get_xlim(), ax.get_ylim()] for ax in all_axes], dtype=np.float64)
+    low, high = limits[..., 0].min(axis=0), limits[..., 1].max(axis=0)
+    if box is not None:
+        low, high = _window(box, cameras)
+    if size is None:
+        height = rows * (int(step * np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.3, 1.6)) + own_head) + head
+        figure.set_size_inches(width / 150.0, height / 150.0)
+    row_height = (height - head) / rows
+    _same_window(all_axes, low, high, step / (row_height - own_head))
+    for index, ax in enumerate(all_axes):
+        row, column = divmod(index, columns)
+        place = (column * step / width, (rows - 1 - row) * row_height / height)
+        ax.set_position((*place, step / width, (row_height - own_head) / height))
+    if legend is not None and bar is not None:
+        legend.set_position(((width - bar + 10) / width, 0.2, BAR / width, 0.55))
+    if title:
+        x_middle = (width - (bar or 0)) / (2.0 * width)
+        text = figure.text(x_middle, 1.0 - 14 / height, title, ha="center", va="top", fontsize=13, color=INK)
+        _fit(text, width - (bar or 0) - 16)
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=fineness * figure.dpi)
+    with Image.open(drawn) as fine:
+        return fine.convert("RGB").reduce(fineness)
+
+
+def check_picture_path(path: str | Path, suffixes: Sequence[str] = (".png",)) -> Path:
+    """Says before a long run whether a picture can be written there.
+
+    Raises:
+        InputError: Another extension, a folder in the way, or no folder to write to.
+    """
+    target = Path(path)
+    if target.suffix.lower() not in suffixes:
+        raise InputError(f"{target}: extension {target.suffix or '(none)'}, should be {' or '.join(suffixes)}")
+    if target.is_dir():
+        raise InputError(f"{target}: is a folder, should be a file name")
+    if not target.parent.is_dir():
+        raise InputError(f"{target}: output folder {target.parent} is not there")
+    if not os.access(target if target.exists() else target.parent, os.W_OK):
+        raise InputError(f"{target}: cannot be written to")
+    return target
+
+
+def _window(box: Array, cameras: Sequence[Camera]) -> tuple[Array, Array]:
+    """Lowest and highest picture coordinates of a box, with some room, [2] and [2]."""
+    corners = np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(-1, 3)
+    flat = np.concatenate([camera.project(corners)[0] for camera in cameras])
+    room = 0.04 * float(np.ptp(flat, axis=0).max())
+    return flat.min(axis=0) - room, flat.max(axis=0) + room
+
+
+def _same_window(all_axes: Sequence["Axes"], low: Array, high: Array, aspect: float) -> None:
+    """One window for all, round ``low`` to ``high``, of the axes' aspect (width to height)."""
+    center, half = (low + high) / 2.0, (high - low) / 2.0
+    half_height = max(half[1], half[0] / aspect)
+    for ax in all_axes:
+        ax.set_xlim(center[0] - half_height * aspect, center[0] + half_height * aspect)
+        ax.set_ylim(center[1] - half_height, center[1] + half_height)
+
+
+def _draw_color_bar(figure: "Figure", limits: tuple[float, float], label: str) -> "Axes":
+    ax = figure.add_axes((0.0, 0.2, BAR / (figure.get_figwidth() * 150.0), 0.55))
+    ax.imshow(stress_colors()[:, None, :], aspect="auto", origin="lower", extent=(0.0, 1.0, *limits))
+    ax.set_xticks([])
+    ax.yaxis.tick_right()
+    ax.yaxis.set_label_position("right")
+    ax.set_ylabel(label, fontsize=9, color=INK, labelpad=6)
+    ax.yaxis.set_major_formatter(lambda value, _: f"{value:,.6g}".replace(",", " "))
+    ax.tick_params(labelsize=8, colors=INK, length=2, width=0.6)
+    for spine in ax.spines.values():
+        spine.set_visible(False)
+    return ax
+
+
+def _needed_width(legend: "Axes", width: int) -> float:
+    """Pixels that the colour bar takes with all that is written beside it; what is too high is written smaller."""
+    renderer = legend.figure.canvas.get_renderer()  # type: ignore[attr-defined]
+    height = legend.figure.bbox.height
+    label = legend.yaxis.label
+    for points in (8.0, 7.0, 6.0, 5.0):
+        if label.get_window_extent(renderer).height <= 0.95 * height:
+            break
+        label.set_fontsize(points)
+    box = legend.get_tightbbox(renderer)
+    needed = 130.0 if box is None else 10.0 + float(box.x1) - float(legend.get_window_extent(renderer).x0) + 12.0
+    return min(max(needed, 130.0), 0.7 * width)
+
+
+def _fit(text: Any, width: float) -> None:
+    """Write a line smaller, and in the end shorter, until it is no wider than so many pixels.
+
+    A few letters after its last semicolon stay.
+    """
+    renderer = text.figure.canvas.get_renderer()
+
+    def is_wide() -> bool:
+        return text.get_window_extent(renderer).width > width
+
+    while is_wide() and text.get_fontsize() > 7.0:
+        text.set_fontsize(text.get_fontsize() - 0.5)
+    end = "".join(re.findall(r"; [^;]{1,12}$", text.get_text()))
+    words = text.get_text().removesuffix(end)
+    while is_wide() and len(words) > 8:
+        words = words[:-2]
+        text.set_text(f"{words.rstrip()} …{end}")
+
+
+def save_picture(picture: "Image", target: Path) -> None:
+    """Writes aside and renames, so that a good picture is not lost to a failed one."""
+    try:
+        with written_whole(target) as part:
+            picture.save(part, format="PNG")
+    except OSError as error:
+        raise OSError(f"{target}: cannot be written: {error.strerror or error}") from None

@@ -1,0 +1,102 @@
+"""Meshes that come with Warp's wheel, each with a scale and a material under which it moves well."""
+
+import importlib.util
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+from warp_corot.errors import InputError
+
+
+@dataclass(frozen=True)
+class Asset:
+    """A mesh at hand, and defaults for it.
+
+    Attributes:
+        name: Short name, after ``warp:``.
+        file: Path below Warp's package folder.
+        scale: Factor on the file's coordinates.
+        young: Young's modulus [Pa].
+        poisson: Poisson's ratio.
+        density: Mass density [kg/m³].
+        fix: Expression in scaled rest coordinates [m] for the nodes that are held.
+        damping: Mass-proportional damping [1/s].
+        duration: Simulated time [s] after which it is about at rest.
+        note: Why these numbers.
+        is_surface: Whether it is a closed surface; tetrahedra otherwise.
+    """
+
+    name: str
+    file: str
+    scale: float
+    young: float
+    poisson: float
+    density: float
+    fix: str
+    damping: float
+    duration: float
+    note: str
+    is_surface: bool = False
+
+    @property
+    def path(self) -> Path:
+        """Where the file is.
+
+        Raises:
+            InputError: Warp is not installed, or without its examples.
+        """
+        spec = importlib.util.find_spec("warp")
+        folders = list(spec.submodule_search_locations or ()) if spec else []
+        for folder in folders:
+            candidate = Path(folder) / self.file
+            if candidate.is_file():
+                return candidate
+        raise InputError(f"warp:{self.name}: {self.file} is not in the installed Warp package")
+
+
+ASSETS: dict[str, Asset] = {
+    asset.name: asset
+    for asset in [
+        Asset(
+            name="bunny",
+            file="examples/assets/bunny.usd",
+            scale=0.1,
+            young=3.0e4,
+            poisson=0.45,
+            density=1000.0,
+            fix="y < 0.01",
+            damping=2.0,
+            duration=4.0,
+            note="the Stanford bunny, 16 cm long, of silicone gel",
+            is_surface=True,
+        ),
+        Asset(
+            name="bear",
+            file="examples/assets/bear.usd",
+            scale=0.1,
+            young=1.0e5,
+            poisson=0.45,
+            density=1000.0,
+            fix="y < 0.01",
+            damping=2.0,
+            duration=5.0,
+            note="a toy bear of 55 cm of soft silicone rubber: its back sags by 9 % of its height, its nose by 14 %, "
+            "after some seconds of swaying",
+        ),
+    ]
+}
+
+
+def find_asset(name: str | PathLike[str]) -> Asset | None:
+    """The asset that ``warp:NAME`` names, or None for a name without ``warp:``.
+
+    Raises:
+        InputError: ``warp:`` and no such asset.
+    """
+    prefix, colon, rest = str(name).partition(":")
+    if prefix != "warp" or not colon:
+        return None
+    if rest not in ASSETS:
+        known = ", ".join(f"warp:{known}" for known in ASSETS)
+        raise InputError(f"warp:{rest}: no such asset, should be {known}")
+    return ASSETS[rest]

@@ -1,0 +1,142 @@
+"""Triangle surfaces from files: .obj .stl .ply .off .glb through trimesh, Mesh prims of USD stages, mesh files."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_corot.errors import InputError
+from warp_corot.io.files.quiet import bounded, quietly
+
+from .assets import find_asset
+from .filemesh import FileMesh
+from .files import read_mesh_file, suffix_of
+from .split import triangles_of
+from .tetrahedra import USD_SUFFIXES, check_file, check_finite
+
+#: What trimesh reads here, and the up axis by habit where the format names none; glTF's is its standard's.
+UP_AXES = {".obj": "Y", ".stl": "Z", ".ply": "Z", ".off": "Z", ".glb": "Y", ".gltf": "Y"}
+GLTF = (".glb", ".gltf")
+
+
+@dataclass(frozen=True)
+class LoadedSurface:
+    """A triangle surface as it came from a file.
+
+    Attributes:
+        points: float64 [N, 3] in the file's unit; an asset's scaled to a likely size.
+        triangles: int32 [T, 3], wound as in the file.
+        metres: Metres in that unit, None if the file does not say.
+        up_axis: "X", "Y" or "Z"; None if the file does not say.
+        name: Short name, fit for a title.
+        source: The file it was read from.
+        notes: What the user should know, a line each.
+        objects: Names of the file's objects and how many of the triangles each has, in their order.
+    """
+
+    points: NDArray[np.float64]
+    triangles: NDArray[np.int32]
+    metres: float | None
+    up_axis: str | None
+    name: str
+    source: Path
+    notes: list[str] = field(default_factory=list)
+    objects: list[tuple[str, int]] = field(default_factory=list)
+
+
+def load_surface(path: str | PathLike[str], *, found: FileMesh | None = None) -> LoadedSurface:
+    """Reads all triangles of a file, placed as its scene places them; polygons are cut into fans.
+
+    Args:
+        path: A file, or ``warp:NAME`` for one in Warp's wheel.
+        found: What `read_mesh_file` has found in the file, if it has been read before.
+
+    Raises:
+        InputError: No such file, another format, not readable, or no triangles in it; one line that says which.
+    """
+    asset = find_asset(path)
+    source = asset.path if asset else Path(path)
+    check_file(source, "surface")
+    suffix = source.suffix.lower()
+    metres: float | None
+    up_axis: str | None
+    objects: list[tuple[str, int]] = []
+    if suffix in USD_SUFFIXES:
+        from warp_corot.io.read.usd.surfaces import read_usd_surface
+
+        points, triangles, metres, up_axis, notes, objects = read_usd_surface(source)
+    elif suffix in UP_AXES:
+        points, triangles, notes, objects = _read_trimesh(source)
+        metres = 1.0 if suffix in GLTF else None
+        up_axis = UP_AXES[suffix] if suffix in GLTF else None
+    elif suffix_of(source) is not None:
+        points, triangles, notes, objects = _of_mesh_file(source, found)
+        metres = up_axis = None
+    else:
+        known = ", ".join((*UP_AXES, *USD_SUFFIXES))
+        raise InputError(f"{source}: unknown format {suffix or '(no extension)'}, should be {known}")
+    if not len(triangles):
+        raise InputError(f"{source}: has no triangles")
+    outside = triangles[(triangles < 0) | (triangles >= len(points))]
+    if len(outside):
+        raise InputError(f"{source}: a triangle names point {outside[0]}, and there are {len(points)} points")
+    if asset:
+        points = points * asset.scale
+        notes.append(f"scaled by {asset.scale:g}: {asset.note}")
+    name = asset.name if asset else os.fsencode(source.stem).decode("utf-8", "replace")
+    return LoadedSurface(points, triangles.astype(np.int32), metres, up_axis, name, source, notes, objects)
+
+
+#: Points, triangles, notes and objects.
+Read = tuple[NDArray[np.float64], NDArray[Any], list[str], list[tuple[str, int]]]
+
+
+def _of_mesh_file(path: Path, found: FileMesh | None) -> Read:
+    mesh = read_mesh_file(path) if found is None else found
+    if not isinstance(mesh, FileMesh):
+        raise InputError(f"{path}: has no triangles (it holds an image)")
+    if mesh.solids:
+        raise InputError(f"{path}: has cells with volume, which TetMesh.load reads, should have triangles alone")
+    check_finite(mesh.points, path)
+    blocks = sorted(mesh.faces, key=lambda block: int(block.data.get("block", np.zeros(1))[0]))
+    triangles = triangles_of(blocks)
+    used, renumbered = np.unique(triangles, return_inverse=True)
+    objects: dict[str, int] = {}
+    for number, name in mesh.names.get("block", {}).items():
+        own = [block for block in blocks if number in block.data.get("block", ())]
+        if own:
+            objects[name if name not in objects else f"{name} {number}"] = len(triangles_of(own))
+    return mesh.points[used], renumbered.reshape(-1, 3), list(mesh.notes), list(objects.items())
+
+
+def _read_trimesh(path: Path) -> Read:
+    try:
+        import trimesh
+    except ImportError:
+        raise InputError(f'{path}: reading {path.suffix} files needs: pip install "warp-corot[surface]"') from None
+    try:
+        options = {"split_objects": True} if path.suffix.lower() == ".obj" else {}
+        with quietly(), bounded(path):
+            scene = trimesh.load_scene(path, process=False, **options)
+        places = {name: place for place, name in enumerate(scene.geometry)}
+        points, triangles, objects, offset = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], [], 0
+        for node in sorted(scene.graph.nodes_geometry, key=lambda node: (places[scene.graph[node][1]], str(node))):
+            transform, name = scene.graph[node]
+            if not isinstance(scene.geometry[name], trimesh.Trimesh):
+                continue
+            mesh = scene.geometry[name].copy()
+            mesh.apply_transform(transform)
+            points.append(np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3))
+            triangles.append(np.asarray(mesh.faces).reshape(-1, 3) + offset)
+            objects.append((str(node), len(mesh.faces)))
+            offset += len(mesh.vertices)
+    except Exception as error:
+        why = " ".join(str(error).split())[:120]
+        raise InputError(f"{path}: is not a {path.suffix} file that trimesh can read triangles from ({why})") from None
+    return np.concatenate(points), np.concatenate(triangles), [], objects

@@ -1,0 +1,196 @@
+"""Tetrahedral meshes from files: USD, and whatever the readers in ``warp_corot.io.read`` know."""
+
+import logging
+import os
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_path
+
+from .assets import find_asset
+from .filemesh import FileMesh
+from .files import read_mesh_file, suffix_of
+from .regions import Regions, find_regions
+from .split import split_solids
+
+USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
+#: Formats of surfaces alone, see `warp_corot.io.read.surfaces`.
+SURFACE_SUFFIXES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf")
+#: The formats of meshes that messages name.
+USUAL = (".msh", ".vtk", ".vtu", ".inp", ".mesh", ".node")
+#: How the note of cells that have been split ends.
+SPLIT = "are split into tetrahedra"
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class LoadedMesh:
+    """A tetrahedral mesh as it came from a file.
+
+    Attributes:
+        points: Rest positions, float64 [N, 3] [m].
+        tets: Vertex indices, int32 [T, 4]; orientation as in the file.
+        up_axis: "X", "Y" or "Z". Formats that name none get "Z", the habit of the meshers that write them.
+        metres_per_unit: Length of the file's unit [m], before ``scale``.
+        name: Short name, fit for a title.
+        source: The file it was read from.
+        regions: Its regions, if the file numbers any.
+        says_unit: Whether the file says its unit.
+        notes: What the user should know, a line each.
+    """
+
+    points: NDArray[np.float64]
+    tets: NDArray[np.int32]
+    up_axis: str
+    metres_per_unit: float
+    name: str
+    source: Path
+    regions: Regions | None = None
+    says_unit: bool = False
+    notes: list[str] = field(default_factory=list)
+
+
+def load_tets(
+    path: str | PathLike[str],
+    scale: float = 1.0,
+    *,
+    unit: str | float | None = None,
+    regions: str | None = None,
+    found: FileMesh | None = None,
+) -> LoadedMesh:
+    """Loads the tetrahedra of a file, in metres.
+
+    USD stages are read with OpenUSD (unit, up axis and world transforms applied, several prims joined); other files
+    with VTK, Gmsh, meshio or readers of this package, see `warp_corot.io.read`. Hexahedra, wedges and pyramids are
+    split into tetrahedra that fit those of their neighbours; cells of higher order are taken by their corners.
+    ``warp:NAME`` names an asset in Warp's wheel, see `warp_corot.io.read.assets`.
+
+    Args:
+        path: File, or asset name.
+        scale: Factor on all coordinates, after the unit.
+        unit: Of the coordinates, any length such as "mm" or "3.2cm", or metres as a number. None: what the file says,
+            metres if it says nothing.
+        regions: Name of the file's array that numbers regions; None: the likeliest.
+        found: What `read_mesh_file` has found in the file, if it has been read before.
+
+    Returns:
+        The mesh. Elements are not judged here (orientation, volume): `TetMesh` does that.
+
+    Raises:
+        InputError: No such file, not a mesh, no tetrahedra, coordinates that are not finite, indices out of range,
+            a scale that is not positive, no such array or unit; one line that says which.
+    """
+    if not (np.isfinite(scale) and scale > 0.0):
+        raise InputError(f"scale is {scale}, should be a positive number")
+    asset = find_asset(path)
+    source = asset.path if asset else checked_path(path, "path")
+    check_file(source, "mesh")
+    says_unit = source.suffix.lower() in USD_SUFFIXES
+    numbered: Regions | None = None
+    notes: list[str] = []
+    tets: NDArray[Any]
+    if says_unit:
+        from warp_corot.io.read.usd.tetrahedra import read_usd_tets
+
+        points, tets, up_axis, metres = read_usd_tets(source)
+        if regions is not None:
+            raise InputError(f"{source}: there is no array {regions!r} that numbers regions; USD stages have none")
+    else:
+        points, tets, numbered, notes = _read(source, regions, found)
+        up_axis, metres = "Z", 1.0
+    if len(tets) == 0:
+        raise InputError(f"{source}: has no tetrahedra")
+    if tets.min() < 0 or tets.max() >= len(points):
+        row, column = np.argwhere((tets < 0) | (tets >= len(points)))[0]
+        raise InputError(
+            f"{source}: tetrahedron {row} names point {tets[row, column]} but the points are 0 to {len(points) - 1}"
+        )
+    from warp_corot.domain.units import metres_per_unit  # late: domains read files
+
+    points = points * (scale if unit is None else scale * metres_per_unit(unit) / metres)
+    check_finite(points, source)
+    for note in notes:
+        usual = found is not None or note.endswith(SPLIT)
+        log.log(logging.INFO if usual else logging.WARNING, "%s: %s", source, note)
+    # As UTF-8 whatever the locale is; what cannot be shown becomes a question mark.
+    name = asset.name if asset else os.fsencode(source.stem).decode("utf-8", "replace")
+    return LoadedMesh(points, tets.astype(np.int32), up_axis, metres, name, source, numbered, says_unit, notes)
+
+
+def check_file(source: Path, kind: str) -> None:
+    """See that there is a file with something in it.
+
+    Args:
+        source: The file.
+        kind: What it should be, for the message.
+
+    Raises:
+        InputError: A folder, no such file, an empty one, or one that cannot be read.
+    """
+    if source.is_dir():
+        raise InputError(f"{source}: is a folder, should be a {kind} file")
+    if not source.exists():
+        raise InputError(f"{source}: no such file")
+    try:
+        with source.open("rb") as file:
+            if not file.read(1):
+                raise InputError(f"{source}: is empty")
+    except OSError as error:
+        raise InputError(f"{source}: cannot be read ({error.strerror})") from None
+
+
+def check_finite(points: NDArray[np.float64], source: Path) -> None:
+    """See that all coordinates are finite.
+
+    Raises:
+        InputError: A point's are not; the message names the first.
+    """
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        bad = int(np.argmin(finite))
+        raise InputError(f"{source}: point {bad} has coordinates {points[bad].tolist()}, should be finite")
+
+
+def unknown_format(source: Path) -> InputError:
+    """What to say of an extension that no reader takes."""
+    return InputError(
+        f"{source}: unknown format {source.suffix or '(no extension)'}, should be {', '.join(USD_SUFFIXES)}, "
+        f"{', '.join(USUAL)}, another mesh file, a surface such as .stl or a scan such as .nii.gz"
+    )
+
+
+def _read(
+    path: Path, regions: str | None, found: FileMesh | None
+) -> tuple[NDArray[np.float64], NDArray[np.int64], Regions | None, list[str]]:
+    if path.suffix.lower() in SURFACE_SUFFIXES:
+        raise InputError(f"{path}: is not a mesh of tetrahedra but a surface, which Domain.from_surface reads")
+    if suffix_of(path) is None:
+        raise unknown_format(path)
+    mesh = read_mesh_file(path) if found is None else found
+    if not isinstance(mesh, FileMesh):
+        raise InputError(f"{path}: has no tetrahedra (it holds an image)")
+    if not mesh.solids:
+        raise InputError(f"{path}: has no tetrahedra (cell types: {mesh.kinds()})")
+    check_finite(mesh.points, path)
+    tets, cells, warped = split_solids(mesh.solids, mesh.points)
+    notes = list(mesh.notes)
+    others = {block.kind: 0 for block in mesh.solids if block.kind != "tetra"}
+    for block in mesh.solids:
+        if block.kind in others:
+            others[block.kind] += len(block.nodes)
+    if others:
+        said = ", ".join(f"{count} {kind}{'s' if kind != 'hexahedron' else ''}" for kind, count in others.items())
+        notes.append(f"{said.replace('hexahedron', 'hexahedra')} {SPLIT}")
+    if warped:
+        notes.append(f"{warped} cells are so warped that their tetrahedra overlap or leave gaps")
+    try:
+        return mesh.points, tets, find_regions(mesh, cells, regions), notes
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None

@@ -1,0 +1,196 @@
+"""Mesh prims of USD stages with what they look like: faces, texture coordinates, materials."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Sdf, Usd, UsdGeom, UsdShade
+
+from warp_corot.errors import InputError
+from warp_corot.io.files.usd import metres_per_unit, open_stage, reads_stage
+from warp_corot.io.read.surfaces import UP_AXES
+from warp_corot.io.read.tetrahedra import USD_SUFFIXES
+
+from .surfaces import DrawnMesh, drawn_meshes
+
+#: What frames give anew, or what no longer holds of a prim once its points are in the world's coordinates.
+STALE = ("points", "extent", "normals", "velocities", "accelerations", "primvars:normals", "tetraIndices")
+#: Bindings are made anew; where there are several the first of these purposes counts.
+PURPOSES = (UsdShade.Tokens.allPurpose, UsdShade.Tokens.preview, UsdShade.Tokens.full)
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A Mesh prim as it stands in its stage.
+
+    Attributes:
+        name: The prim's.
+        path: Of the prim.
+        source: The file.
+        points: In the world [m], float64 [V, 3].
+        triangles: The fans of its faces, int32 [F, 3], wound as its outside is seen.
+        left_handed: Whether the faces as they are listed are wound the other way, in the world.
+        had_normals: Whether the prim gives normals.
+        smooth: Whether it is a subdivision surface, which needs none.
+        is_plain: Whether it has neither a material nor colours of its own, so that stress may colour it.
+    """
+
+    name: str
+    path: str
+    source: Path
+    points: NDArray[np.float64]
+    triangles: NDArray[np.int32]
+    left_handed: bool
+    had_normals: bool
+    smooth: bool
+    is_plain: bool
+    _stage: Any
+
+    def placed(self, scale: float) -> Look:
+        """The same, its points times a factor."""
+        return replace(self, points=scale * self.points)
+
+    def copy_to(self, layer: Sdf.Layer, target: str, materials: str) -> None:
+        """Copy the prim, without points, normals and transform, to a path of a layer, and the materials that it and
+        its subsets are bound to under another.
+
+        Textures are named by absolute paths, so that they are found from the layer's file.
+        """
+        flat = self._stage.GetRootLayer()
+        Sdf.CreatePrimInLayer(layer, Sdf.Path(target).GetParentPath())
+        Sdf.CopySpec(flat, self.path, layer, target)
+        spec = layer.GetPrimAtPath(target)
+        for child in list(spec.nameChildren):
+            if child.typeName != "GeomSubset":
+                del spec.nameChildren[child.name]
+        _without_stale(spec)
+        bound = [(self.path, target)]
+        bound += [(f"{self.path}/{child.name}", f"{target}/{child.name}") for child in spec.nameChildren]
+        for here, there in bound:
+            self._bind_material(layer, here, there, materials)
+
+    def _bind_material(self, layer: Sdf.Layer, here: str, there: str, materials: str) -> None:
+        """Have a prim of the layer bound to a copy of the material that the prim it comes from is bound to."""
+        spec = layer.GetPrimAtPath(there)
+        for name in [p.name for p in spec.properties if p.name.startswith("material:binding")]:
+            spec.RemoveProperty(spec.properties[name])
+        binding = UsdShade.MaterialBindingAPI(self._stage.GetPrimAtPath(here))
+        found = (binding.ComputeBoundMaterial(purpose)[0] for purpose in PURPOSES)
+        material = next((material for material in found if material), None)
+        if material is None:
+            return
+        origin = material.GetPath()
+        copied = f"{materials}/{origin.pathString.strip('/').replace('/', '_')}"
+        if not layer.GetPrimAtPath(copied):
+            Sdf.CreatePrimInLayer(layer, materials).typeName = "Scope"
+            layer.GetPrimAtPath(materials).specifier = Sdf.SpecifierDef
+            Sdf.CopySpec(self._stage.GetRootLayer(), origin, layer, copied)
+        stage = Usd.Stage.Open(layer)
+        UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath(there)).Bind(UsdShade.Material.Get(stage, copied))
+
+
+@reads_stage
+def has_mesh(path: Path) -> bool:
+    """Whether a stage has a Mesh prim and no tetrahedra.
+
+    Raises:
+        InputError: Not a stage.
+    """
+    stage, meshes = open_stage(path), False
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+        if prim.IsA(UsdGeom.TetMesh) or prim.HasAttribute("tetraIndices"):
+            return False
+        meshes = meshes or prim.IsA(UsdGeom.Mesh)
+    return meshes
+
+
+def has_looks(path: str | PathLike[str]) -> bool:
+    """Whether more than triangles is known of the surfaces in files of this name."""
+    return Path(path).suffix.lower() in (*USD_SUFFIXES, *UP_AXES)
+
+
+def look_of_triangles(path: str | PathLike[str], points: NDArray[Any], triangles: NDArray[Any]) -> Look:
+    """Triangles of a file as a prim of its name."""
+    from .from_surfaces import stage_of_triangles
+
+    source = Path(path)
+    stage = stage_of_triangles(source.stem, points, triangles)
+    (drawn,) = drawn_meshes(stage, source)
+    return _look(drawn, stage, source, 1.0)
+
+
+def read_looks(path: str | PathLike[str]) -> list[Look]:
+    """All Mesh prims of a stage that are drawn, at its first time, or the parts of another surface file as such.
+
+    Raises:
+        InputError: No such file, not a USD stage or another surface file, one that is wrong, or no faces in it.
+    """
+    source = Path(path)
+    if source.suffix.lower() not in (*USD_SUFFIXES, *UP_AXES):
+        known = ", ".join((*USD_SUFFIXES, *UP_AXES))
+        raise InputError(f"{source}: extension {source.suffix or '(none)'}, should be {known}")
+    if not source.is_file():
+        raise InputError(f"{source}: no such file")
+    if source.suffix.lower() in UP_AXES:
+        from .from_surfaces import stage_of_file
+
+        stage, metres = stage_of_file(source), 1.0
+    else:
+        stage = _flattened(open_stage(source))
+        metres = metres_per_unit(stage, source)
+    looks = [_look(drawn, stage, source, metres) for drawn in drawn_meshes(stage, source)]
+    if not looks:
+        raise InputError(f"{source}: has no Mesh prim with faces")
+    return looks
+
+
+def _look(drawn: DrawnMesh, stage: Any, source: Path, metres: float) -> Look:
+    prim = drawn.mesh.GetPrim()
+    normals = drawn.mesh.GetNormalsAttr().HasAuthoredValue() or prim.GetAttribute("primvars:normals").HasValue()
+    return Look(
+        prim.GetName(),
+        str(prim.GetPath()),
+        source,
+        metres * drawn.points,
+        drawn.triangles.astype(np.int32),
+        drawn.left_handed,
+        bool(normals),
+        drawn.smooth,
+        _is_plain(prim),
+        stage,
+    )
+
+
+def _is_plain(prim: Any) -> bool:
+    parts = [prim, *(child for child in prim.GetChildren() if child.IsA(UsdGeom.Subset))]
+    bound = any(
+        UsdShade.MaterialBindingAPI(part).ComputeBoundMaterial(purpose)[0] for part in parts for purpose in PURPOSES
+    )
+    return not bound and not UsdGeom.Mesh(prim).GetDisplayColorAttr().HasAuthoredValue()
+
+
+def _flattened(stage: Any) -> Any:
+    """The stage as one layer, without instances."""
+    stage.SetEditTarget(stage.GetSessionLayer())
+    while instances := [prim for prim in stage.Traverse() if prim.IsInstance()]:
+        for prim in instances:
+            prim.SetInstanceable(False)
+    return Usd.Stage.Open(stage.Flatten())
+
+
+def _without_stale(spec: Any) -> None:
+    """Take from a Mesh prim what frames will give, what moves, and transforms; of the rest keep the first values."""
+    for attribute in list(spec.attributes):
+        samples = spec.layer.ListTimeSamplesForPath(attribute.path)
+        if samples:
+            attribute.default = spec.layer.QueryTimeSample(attribute.path, samples[0])
+            for time in samples:
+                spec.layer.EraseTimeSample(attribute.path, time)
+        moved = attribute.name in STALE or attribute.name.startswith("xformOp")
+        if moved or not attribute.HasInfo("default"):
+            spec.RemoveProperty(attribute)

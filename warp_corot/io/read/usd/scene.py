@@ -1,0 +1,277 @@
+"""Stages with tetrahedra as scenes to be simulated: opened, checked, and repaired in memory, never in their files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Tf, Usd, UsdGeom, UsdPhysics
+
+from warp_corot.errors import InputError
+from warp_corot.io.files.usd import metres_per_unit, open_stage
+from warp_corot.io.read.tetrahedra import USD_SUFFIXES
+from warp_corot.mesh.surfaces.boundary import signed_volumes
+
+from .physics import is_physical, material_said, settle_gravity
+
+
+class Units(NamedTuple):
+    """What a stage's numbers are in: lengths in ``metres``, masses in ``kilograms``, time in seconds.
+
+    Everything else follows, as UsdPhysics has it: density in mass over length cubed, and so on.
+    """
+
+    metres: float
+    kilograms: float
+
+    @property
+    def density(self) -> float:
+        """[kg/m^3]."""
+        return self.kilograms / self.metres**3
+
+    @property
+    def pressure(self) -> float:
+        """[Pa]."""
+        return self.kilograms / self.metres
+
+
+class TetPrim(NamedTuple):
+    """A TetMesh prim.
+
+    Attributes:
+        path: Of the prim.
+        points: In its own space, float64 [N, 3].
+        tets: As the prim's orientation has them, after repair, int32 [T, 4].
+        repaired: How many were wound wrongly.
+        left_handed: What its orientation is.
+    """
+
+    path: str
+    points: NDArray[np.float64]
+    tets: NDArray[np.int32]
+    repaired: int
+    left_handed: bool
+
+
+@dataclass(eq=False)
+class Scene:
+    """A stage that has been opened to be simulated; what is changed in it is in its session layer.
+
+    Attributes:
+        path: The file.
+        stage: ``Usd.Stage``, without instances around what can move, and with animation stopped at its first time.
+        units: Of its numbers.
+        up_axis: "X", "Y" or "Z".
+        frame_rate: Time codes per second if the file says so.
+        tets: Its TetMesh prims.
+        animated: Paths of prims with transforms that change over time in the file.
+        uninstanced: Paths of prims that were instances.
+        stopped: Paths of prims that the file animates, and whose animation physics does not follow.
+        skipped: Paths of TetMesh prims that are only patterns, of a point instancer.
+        physics_scenes: Paths of the prims that gravity comes from; the first of them counts.
+    """
+
+    path: Path
+    stage: Any
+    units: Units
+    up_axis: str
+    frame_rate: float | None
+    tets: list[TetPrim] = field(default_factory=list)
+    animated: list[str] = field(default_factory=list)
+    uninstanced: list[str] = field(default_factory=list)
+    stopped: list[str] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+    physics_scenes: list[str] = field(default_factory=list)
+
+    @property
+    def says_metres(self) -> bool:
+        """Whether the file says how long its unit is."""
+        return bool(UsdGeom.StageHasAuthoredMetersPerUnit(self.stage))
+
+    def says(self, path: str) -> dict[str, float]:
+        """What the file says of what a TetMesh prim is made of; see ``material_said``."""
+        return material_said(self.stage.GetPrimAtPath(path))
+
+    def uses(self, file: Path) -> bool:
+        """Whether a file is one of the layers that the stage is made of."""
+        used = (layer.realPath for layer in self.stage.GetUsedLayers())
+        return any(name and file.exists() and file.samefile(name) for name in used if Path(name).exists())
+
+    def matrix(self, path: str) -> NDArray[np.float64]:
+        """From a prim's space to the world, for row vectors, float64 [4, 4]."""
+        prim = self.stage.GetPrimAtPath(path)
+        return np.array(UsdGeom.XformCache(Usd.TimeCode.Default()).GetLocalToWorldTransform(prim), dtype=np.float64)
+
+    def world_points(self, path: str) -> NDArray[np.float64]:
+        """Points of a prim in the world, float64 [N, 3]."""
+        given = UsdGeom.PointBased(self.stage.GetPrimAtPath(path)).GetPointsAttr().Get()
+        matrix = self.matrix(path)
+        return np.asarray(given, dtype=np.float64).reshape(-1, 3) @ matrix[:3, :3] + matrix[3, :3]
+
+    def bounds(self, path: str) -> NDArray[np.float64] | None:
+        """Corners of a box in the world around a prim and what is under it, float64 [2, 3]; None: it is empty."""
+        tokens = UsdGeom.Tokens
+        purposes = [tokens.default_, tokens.render, tokens.proxy, tokens.guide]
+        found = UsdGeom.BBoxCache(Usd.TimeCode.Default(), purposes).ComputeWorldBound(self.stage.GetPrimAtPath(path))
+        box = found.ComputeAlignedRange()
+        return None if box.IsEmpty() else np.array([box.GetMin(), box.GetMax()], dtype=np.float64)
+
+    def lowest(self, paths: Iterable[str]) -> float:
+        """How low prims and what is under them reach along the up axis, by their bounds; infinite if there are none."""
+        axis = "XYZ".index(self.up_axis)
+        found = [self.bounds(path) for path in paths]
+        return min((float(box[0, axis]) for box in found if box is not None), default=math.inf)
+
+    def held(self, path: str) -> NDArray[np.intp]:
+        """Points of a TetMesh prim that the file says are held, by the primvar ``fixed`` of `UsdWriter`, indices."""
+        primvar = UsdGeom.PrimvarsAPI(self.stage.GetPrimAtPath(path)).GetPrimvar("fixed")
+        given = primvar.Get(Usd.TimeCode.EarliestTime()) if primvar and primvar.HasAuthoredValue() else None
+        return np.flatnonzero(np.asarray(() if given is None else given) == 1)
+
+    def parent(self, path: str) -> str:
+        """The path of a prim's parent."""
+        return str(self.stage.GetPrimAtPath(path).GetPath().GetParentPath())
+
+    def has(self, path: str, attribute: str) -> bool:
+        """Whether the file gives an attribute of a prim a value."""
+        found = self.stage.GetPrimAtPath(path).GetAttribute(attribute)
+        return bool(found) and found.HasAuthoredValue()
+
+
+def open_scene(path: str | PathLike[str]) -> Scene:
+    """Open a stage with TetMesh prims.
+
+    Wrongly wound tetrahedra are turned round, which is counted; Newton would leave them out.
+
+    Raises:
+        InputError: No such file, no stage, units that are none, no TetMesh prim, or one that cannot be simulated.
+    """
+    source = Path(path)
+    if source.suffix.lower() not in USD_SUFFIXES:
+        raise InputError(f"{source}: extension {source.suffix or '(none)'}, should be {', '.join(USD_SUFFIXES)}")
+    if not source.is_file():
+        raise InputError(f"{source}: no such file")
+    stage = open_stage(source)
+    errors = stage.GetCompositionErrors()
+    if errors:
+        raise InputError(f"{source}: does not compose: {errors[0]}")
+    stage.SetEditTarget(stage.GetSessionLayer())
+    kilograms = float(UsdPhysics.GetStageKilogramsPerUnit(stage))
+    if not (math.isfinite(kilograms) and kilograms > 0.0):
+        raise InputError(f"{source}: kilogramsPerUnit is {kilograms}, should be a positive number")
+    given = stage.GetRootLayer().timeCodesPerSecond if stage.HasAuthoredMetadata("timeCodesPerSecond") else None
+    units = Units(metres_per_unit(stage, source), kilograms)
+    scene = Scene(source, stage, units, str(UsdGeom.GetStageUpAxis(stage)), given)
+    scene.uninstanced = _without_instances(stage)
+    scene.animated, scene.stopped = _stop_animation(stage)
+    scene.physics_scenes = settle_gravity(stage, source)
+    for prim in stage.Traverse():
+        if prim.IsA(UsdGeom.TetMesh) and _is_pattern(prim):
+            scene.skipped.append(str(prim.GetPath()))
+        elif prim.IsA(UsdGeom.TetMesh):
+            scene.tets.append(_tet_prim(prim, source))
+    if not scene.tets and scene.skipped:
+        raise InputError(f"{source}: its only TetMesh prims are patterns of a point instancer: {scene.skipped[0]}")
+    if not scene.tets:
+        raise InputError(
+            f"{source}: has no TetMesh prim; meshes of other kinds go into `warp-corot simulate`, "
+            "which writes one of what it makes of them with --draw-tets"
+        )
+    return scene
+
+
+def _without_instances(stage: Any) -> list[str]:
+    """Open up the instances that hold what can move by itself; of an instance only the whole can."""
+    opened: list[str] = []
+    while moving := [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if _moves_in_instance(prim)]:
+        instance = moving[0]
+        while not instance.IsInstance() or instance.IsInstanceProxy():
+            instance = instance.GetParent()
+        opened.append(str(instance.GetPath()))
+        instance.SetInstanceable(False)
+    return opened
+
+
+def _moves_in_instance(prim: Any) -> bool:
+    return prim.IsInstanceProxy() and (prim.IsA(UsdGeom.TetMesh) or prim.HasAPI(UsdPhysics.RigidBodyAPI))
+
+
+def _is_pattern(prim: Any) -> bool:
+    while prim and not prim.IsA(UsdGeom.PointInstancer):
+        prim = prim.GetParent()
+    return bool(prim)
+
+
+def _stop_animation(stage: Any) -> tuple[list[str], list[str]]:
+    """Have transforms and points be what they are at their first time.
+
+    Returns:
+        Paths of what has animated transforms, and of what of that, or of its points, physics would have to follow.
+    """
+    animated, stopped = [], []
+    for prim in stage.Traverse():
+        if not prim.IsA(UsdGeom.Xformable):
+            continue
+        attributes = [op.GetAttr() for op in UsdGeom.Xformable(prim).GetOrderedXformOps()]
+        if moves := any(attribute.ValueMightBeTimeVarying() for attribute in attributes):
+            animated.append(str(prim.GetPath()))
+        if prim.IsA(UsdGeom.TetMesh):
+            attributes += [UsdGeom.TetMesh(prim).GetPointsAttr(), UsdGeom.TetMesh(prim).GetTetVertexIndicesAttr()]
+            moves = any(attribute.ValueMightBeTimeVarying() for attribute in attributes)
+        if moves and is_physical(prim):
+            stopped.append(str(prim.GetPath()))
+        if prim.IsA(UsdGeom.Mesh):
+            attributes += [prim.GetAttribute(name) for name in ("points", "faceVertexCounts", "faceVertexIndices")]
+        for attribute in attributes:
+            if attribute.GetNumTimeSamples() and attribute.Get() is None:
+                attribute.Set(attribute.Get(Usd.TimeCode.EarliestTime()))
+    return animated, stopped
+
+
+def _tet_prim(prim: Any, source: Path) -> TetPrim:
+    mesh, name = UsdGeom.TetMesh(prim), f"{source}: {prim.GetPath()}"
+    given, indices = mesh.GetPointsAttr().Get(), mesh.GetTetVertexIndicesAttr().Get()
+    if given is None or len(given) == 0 or indices is None or len(indices) == 0:
+        missing = "points" if given is None or len(given) == 0 else "tetVertexIndices"
+        raise InputError(f"{name}: is a TetMesh without {missing}")
+    points = np.asarray(given, dtype=np.float64).reshape(-1, 3)
+    tets = np.array(indices, dtype=np.int32).reshape(-1, 4)
+    if not np.isfinite(points).all():
+        raise InputError(f"{name}: point {int(np.argmin(np.isfinite(points).all(axis=1)))} is not finite")
+    if tets.min() < 0 or tets.max() >= len(points):
+        bad = tets[(tets < 0) | (tets >= len(points))][0]
+        raise InputError(f"{name}: names point {bad} but has points 0 to {len(points) - 1}")
+    left_handed = mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+    volumes = signed_volumes(points, tets) * (-1.0 if left_handed else 1.0)
+    size = float(np.ptp(points, axis=0).max())
+    flat = np.flatnonzero(np.abs(volumes) <= 1e-12 * size**3 / len(tets))
+    if len(flat):
+        raise InputError(f"{name}: {len(flat)} of {len(tets)} tetrahedra have no volume, the first is {flat[0]}")
+    _check_in_world(prim, points, tets, name)
+    wrong = volumes < 0.0
+    if wrong.any():
+        tets[wrong] = tets[wrong][:, [0, 1, 3, 2]]
+        try:
+            mesh.GetTetVertexIndicesAttr().Set(tets.tolist())
+        except Tf.ErrorException as error:
+            raise InputError(f"{name}: its tetrahedra cannot be turned round: {error}") from None
+    return TetPrim(str(prim.GetPath()), points, tets, int(wrong.sum()), left_handed)
+
+
+def _check_in_world(prim: Any, points: NDArray[np.float64], tets: NDArray[np.int32], name: str) -> None:
+    """Refuse tetrahedra that lose their volume on their way into the world, where positions are float32."""
+    matrix = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim), dtype=np.float64)
+    there = (points @ matrix[:3, :3] + matrix[3, :3]).astype(np.float32).astype(np.float64)
+    before, after = signed_volumes(points, tets), signed_volumes(there, tets)
+    gone = np.count_nonzero(~(after * np.sign(before * np.linalg.det(matrix[:3, :3])) > 0.0))
+    if gone:
+        raise InputError(
+            f"{name}: {gone} of {len(tets)} tetrahedra have too little volume for float32 where they are in the world: "
+            "a scale of zero, or too far from the origin"
+        )

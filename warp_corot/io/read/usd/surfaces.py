@@ -1,0 +1,115 @@
+"""Mesh prims of USD stages as triangles in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Usd, UsdGeom
+
+from warp_corot.errors import InputError
+from warp_corot.io.files.usd import metres_per_unit, open_stage, reads_stage
+
+
+class DrawnMesh(NamedTuple):
+    """A Mesh prim that is drawn, at its first time.
+
+    Attributes:
+        mesh: The prim, a `UsdGeom.Mesh`.
+        points: In the world, in the stage's unit, float64 [N, 3].
+        triangles: The fans of its faces less its holes, int64 [T, 3], wound as its outside is seen.
+        left_handed: Whether the faces as they are listed are wound the other way, in the world.
+        smooth: Whether it is a subdivision surface.
+    """
+
+    mesh: Any
+    points: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+    left_handed: bool
+    smooth: bool
+
+
+def drawn_meshes(stage: Any, path: Path) -> Iterator[DrawnMesh]:
+    """The Mesh prims with faces that are drawn, instances included.
+
+    Raises:
+        InputError: Faces that do not fit their points.
+    """
+    time = Usd.TimeCode.EarliestTime()
+    cache = UsdGeom.XformCache(time)
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+        mesh = UsdGeom.Mesh(prim)
+        if not mesh or mesh.ComputePurpose() in ("guide", "proxy"):
+            continue
+        points, triangles = _triangles(mesh, path, time)
+        if not len(triangles):
+            continue
+        world = np.array(cache.GetLocalToWorldTransform(prim), dtype=np.float64)
+        left_handed = mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+        left_handed ^= bool(np.linalg.det(world[:3, :3]) < 0.0)
+        yield DrawnMesh(
+            mesh,
+            points @ world[:3, :3] + world[3, :3],
+            triangles[:, ::-1] if left_handed else triangles,
+            left_handed,
+            mesh.GetSubdivisionSchemeAttr().Get() != UsdGeom.Tokens.none,
+        )
+
+
+@reads_stage
+def read_usd_surface(
+    path: Path,
+) -> tuple[NDArray[np.float64], NDArray[np.int64], float, str, list[str], list[tuple[str, int]]]:
+    """All drawn Mesh prims of a stage as one surface.
+
+    Returns:
+        Points [N, 3] in the stage's unit, triangles [T, 3], metres in that unit, the up axis, notes for the user,
+        and the names of the prims with how many triangles each has.
+
+    Raises:
+        InputError: Not a stage, or one that is wrong.
+    """
+    stage = open_stage(path)
+    metres = metres_per_unit(stage, path)
+    points, triangles, notes, offset = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], [], 0
+    objects = []
+    for drawn in drawn_meshes(stage, path):
+        if drawn.smooth:
+            notes.append(f"{drawn.mesh.GetPath()} is a subdivision surface, taken as its control mesh")
+        points.append(drawn.points)
+        triangles.append(drawn.triangles + offset)
+        objects.append((drawn.mesh.GetPrim().GetName(), len(drawn.triangles)))
+        offset += len(drawn.points)
+    up_axis = str(UsdGeom.GetStageUpAxis(stage))
+    return np.concatenate(points), np.concatenate(triangles), metres, up_axis, notes, objects
+
+
+def _triangles(mesh: UsdGeom.Mesh, path: Path, time: Usd.TimeCode) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Points and the fans of a mesh's polygons, less its holes."""
+    points = np.asarray(_earliest(mesh.GetPointsAttr(), time), dtype=np.float64).reshape(-1, 3)
+    counts = np.asarray(_earliest(mesh.GetFaceVertexCountsAttr(), time), dtype=np.int64)
+    indices = np.asarray(_earliest(mesh.GetFaceVertexIndicesAttr(), time), dtype=np.int64)
+    if (counts < 3).any() or counts.sum() != len(indices):
+        raise InputError(f"{mesh.GetPath()} in {path}: its faces name {len(indices)} corners, should be {counts.sum()}")
+    bad = indices[(indices < 0) | (indices >= len(points))]
+    if len(bad):
+        raise InputError(f"{path}: prim {mesh.GetPath()} names point {bad[0]} but has points 0 to {len(points) - 1}")
+    holes = np.asarray(_earliest(mesh.GetHoleIndicesAttr(), time), dtype=np.int64)
+    kept = np.ones(len(counts), bool)
+    kept[holes[(holes >= 0) & (holes < len(counts))]] = False
+    starts = (np.cumsum(counts) - counts)[kept]
+    fans = counts[kept] - 2
+    first = np.repeat(starts, fans)
+    step = np.arange(fans.sum()) - np.repeat(np.cumsum(fans) - fans, fans)
+    return points, np.stack([indices[first], indices[first + step + 1], indices[first + step + 2]], axis=1)
+
+
+def _earliest(attribute: Usd.Attribute, time: Usd.TimeCode) -> Any:
+    """An attribute's value by default, or at the first time there is; empty without one."""
+    value = attribute.Get()
+    if value is None:
+        value = attribute.Get(time)
+    return () if value is None else value

@@ -1,0 +1,91 @@
+"""Tetrahedra from USD stages: `UsdGeom.TetMesh` prims, and Mesh prims that carry ``tetraIndices``."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Usd, UsdGeom
+
+from warp_corot.errors import InputError
+from warp_corot.io.files.usd import metres_per_unit, open_stage, reads_stage
+
+
+@reads_stage
+def read_usd_tets(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], str, float]:
+    """Reads every tetrahedral prim of a stage, joined into one mesh, in world space.
+
+    The rest shape is the primvar ``rest`` where there is one (as in files written by `UsdWriter`), else ``points`` at
+    the default time, else at the first time sample; so too where the mesh changes over time. Inactive and abstract
+    prims are left out; instances are read.
+
+    Args:
+        path: A .usd, .usda, .usdc or .usdz file.
+
+    Returns:
+        ``points`` float64 [N, 3] in metres, ``tets`` int32 [T, 4], the stage's up axis, its metres per unit.
+
+    Raises:
+        InputError: The file is no USD stage, or has no tetrahedra, or their indices are not four to a tetrahedron.
+    """
+    stage = open_stage(path)
+    metres = metres_per_unit(stage, path)
+    up_axis = str(UsdGeom.GetStageUpAxis(stage))
+    cache = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
+
+    all_points: list[NDArray[np.float64]] = []
+    all_tets: list[NDArray[np.int64]] = []
+    offset = 0
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+        indices = _tet_indices(prim, path)
+        if indices is None or len(indices) == 0:
+            continue
+        points = _rest_points(prim, path)
+        if indices.min() < 0 or indices.max() >= len(points):
+            bad = indices[(indices < 0) | (indices >= len(points))][0]
+            raise InputError(f"{path}: prim {prim.GetPath()} names point {bad} but has points 0 to {len(points) - 1}")
+        world = np.array(cache.GetLocalToWorldTransform(prim), dtype=np.float64)
+        all_points.append(points @ world[:3, :3] + world[3, :3])
+        all_tets.append(indices + offset)
+        offset += len(points)
+    if not all_tets:
+        raise InputError(f"{path}: has no tetrahedra (no TetMesh prim and no Mesh prim with tetraIndices)")
+    return np.concatenate(all_points) * metres, np.concatenate(all_tets).astype(np.int32), up_axis, metres
+
+
+def _tet_indices(prim, path: Path) -> NDArray[np.int64] | None:
+    """Tetrahedra [T, 4] of a prim, or None where it has none."""
+    if prim.IsA(UsdGeom.TetMesh):
+        attribute = UsdGeom.TetMesh(prim).GetTetVertexIndicesAttr()
+    elif prim.IsA(UsdGeom.PointBased) and prim.HasAttribute("tetraIndices"):
+        attribute = prim.GetAttribute("tetraIndices")
+    else:
+        return None
+    value = attribute.Get()
+    if value is None:
+        value = attribute.Get(Usd.TimeCode.EarliestTime())
+    if value is None:
+        return None
+    flat = np.asarray(value).reshape(-1)
+    if flat.dtype.kind not in "iu":
+        raise InputError(f"{path}: {attribute.GetPath()} is of type {attribute.GetTypeName()}, should be integers")
+    if len(flat) % 4:
+        raise InputError(f"{path}: {attribute.GetPath()} has {len(flat)} indices, not a multiple of four")
+    return flat.astype(np.int64).reshape(-1, 4)
+
+
+def _rest_points(prim, path: Path) -> NDArray[np.float64]:
+    """Points [N, 3] of a prim at rest, in its own space."""
+    attribute = UsdGeom.PointBased(prim).GetPointsAttr()
+    value = attribute.Get()
+    if value is None:
+        value = attribute.Get(Usd.TimeCode.EarliestTime())
+    if value is None or len(value) == 0:
+        raise InputError(f"{path}: prim {prim.GetPath()} has tetrahedra but no points")
+    rest = UsdGeom.PrimvarsAPI(prim).GetPrimvar("rest")
+    if rest:
+        rest_value = rest.ComputeFlattened()
+        if rest_value is None:
+            rest_value = rest.ComputeFlattened(Usd.TimeCode.EarliestTime())
+        if rest_value is not None and len(rest_value) == len(value):
+            value = rest_value
+    return np.asarray(value, dtype=np.float64).reshape(-1, 3)

@@ -1,0 +1,228 @@
+"""Scans: volumes of voxels from NIfTI and MGH (nibabel), MetaImage, NRRD and DICOM (SimpleITK) and VTK image files."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_corot.errors import InputError
+from warp_corot.io.files.quiet import bounded, quietly
+
+#: ITK's directions are left-posterior-superior; turned half round z they are NIfTI's right-anterior-superior.
+RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class LoadedVolume:
+    """A volume as it came from a file.
+
+    Attributes:
+        values: [nx, ny, nz], of the file's own number type.
+        affine: From voxel indices to positions in ``unit``, float64 [4, 4]; right-anterior-superior where the format
+            names directions.
+        unit: "m", "cm", "mm", or None if the file does not say.
+        name: Short name, fit for a title.
+        source: The file it was read from.
+        notes: What the user should know, a line each.
+    """
+
+    values: NDArray[Any]
+    affine: NDArray[np.float64]
+    unit: str | None
+    name: str
+    source: Path
+    notes: list[str] = field(default_factory=list)
+
+
+def is_volume(path: Path) -> bool:
+    """Whether a file is a scan by its extension."""
+    return any(path.name.lower().endswith(suffix) for suffix in READERS)
+
+
+def load_volume(path: str | PathLike[str]) -> LoadedVolume:
+    """Reads a scan: .nii, .nii.gz, .mgz, .mgh, .mha, .mhd, .nrrd, .nhdr, .vti, an image in a .vtk, or DICOM: a .dcm
+    with several slices or a folder with a series, of which the largest is taken.
+
+    Raises:
+        InputError: No such file, another format, not readable, not three-dimensional, more than one number a voxel, or
+            the library that reads the format is not installed; one line that says which.
+    """
+    source = Path(path)
+    if not source.exists():
+        raise InputError(f"{source}: no such file")
+    suffix = next((known for known in READERS if source.name.lower().endswith(known)), None)
+    if suffix is None and not source.is_dir():
+        raise InputError(
+            f"{source}: unknown format {source.suffix or '(no extension)'}, should be {', '.join(READERS)}"
+        )
+    try:
+        values, affine, unit, notes = _read_dicom(source) if source.is_dir() else READERS[suffix or ""](source)
+    except ImportError:
+        extra = "mesh" if suffix in (".vti", ".vtk") else "scans"
+        what = f"{suffix} files" if suffix and not source.is_dir() else "DICOM series"
+        raise InputError(f'{source}: reading {what} needs: pip install "warp-corot[{extra}]"') from None
+    name = source.name[: len(source.name) - len(suffix or "")] if not source.is_dir() else source.resolve().name
+    return _checked(values, affine, unit, notes, name, source)
+
+
+def volume_of_image(path: Path, arrays: dict[str, NDArray[Any]]) -> LoadedVolume:
+    """The volume of an image that was found in a VTK file.
+
+    Raises:
+        InputError: See `load_volume`.
+    """
+    values, affine, unit, notes = _of_image(arrays)
+    return _checked(values, affine, unit, notes, path.stem, path)
+
+
+def _checked(
+    values: NDArray[Any], affine: NDArray[np.float64], unit: str | None, notes: list[str], name: str, source: Path
+) -> LoadedVolume:
+    while values.ndim > 3 and values.shape[-1] == 1:
+        values = values[..., 0]
+    if values.ndim != 3:
+        raise InputError(f"{source}: has shape {values.shape}, should be a volume [nx, ny, nz] of single numbers")
+    return LoadedVolume(values, affine, unit, name, source, notes)
+
+
+def _read_nifti(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
+    import nibabel
+
+    try:
+        with quietly(), bounded(path):
+            image: Any = nibabel.load(path)
+            values = np.asanyarray(image.dataobj)
+    except Exception as error:
+        raise _unreadable(path, "NIfTI", error) from None
+    unit = {"meter": "m", "mm": "mm"}.get(image.header.get_xyzt_units()[0])
+    spacing = np.asarray(image.header.get_zooms(), dtype=np.float64)[:3]
+    affine = np.array(image.affine, dtype=np.float64)
+    # The format's fallback for a header without spacing is the unit matrix.
+    if not (spacing > 0.0).all():
+        affine[:3, :3] = 0.0
+    notes = []
+    if not image.header["sform_code"] and not image.header["qform_code"]:
+        notes.append("the header gives no orientation: its axes are taken as right, anterior, superior")
+    if image.header.get_xyzt_units()[0] == "micron":
+        affine[:3], unit = 1e-3 * affine[:3], "mm"
+    return values, affine, unit, notes
+
+
+def _read_mgh(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
+    import nibabel
+
+    try:
+        image: Any = nibabel.load(path)
+        values = np.asanyarray(image.dataobj)
+    except Exception as error:
+        raise _unreadable(path, path.suffix, error) from None
+    # FreeSurfer's format is in mm by definition.
+    return values, np.array(image.affine, dtype=np.float64), "mm", []
+
+
+def _read_itk(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
+    import SimpleITK
+
+    loud = SimpleITK.ProcessObject.GetGlobalWarningDisplay()
+    SimpleITK.ProcessObject.SetGlobalWarningDisplay(False)
+    try:
+        with quietly(), bounded(path):
+            image = SimpleITK.ReadImage(str(path))
+    except Exception as error:
+        # ITK names itself and its source files first; what went wrong comes last.
+        raise _unreadable(path, path.suffix, re.split(r"(?:sitk::|ITK )ERROR:", str(error))[-1]) from None
+    finally:
+        SimpleITK.ProcessObject.SetGlobalWarningDisplay(loud)
+    return _of_itk(path, image, None, [])
+
+
+def _read_dicom(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
+    from .dicom import read_series
+
+    if path.is_dir():
+        image, notes = read_series(path)
+        return _of_itk(path, image, "mm", notes)
+    values, affine, _, notes = _read_itk(path)
+    if values.shape[2] < 2:
+        raise InputError(f"{path}: has a single slice; name the folder with the whole series")
+    return values, affine, "mm", notes
+
+
+def _of_itk(
+    path: Path, image: Any, unit: str | None, notes: list[str]
+) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
+    from .dicom import array_of
+
+    dimensions, numbers = image.GetDimension(), image.GetNumberOfComponentsPerPixel()
+    if (dimensions, numbers) != (3, 1):
+        raise InputError(f"{path}: has {dimensions} dimensions and {numbers} numbers a voxel, should have 3 and 1")
+    affine = np.eye(4)
+    affine[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
+    affine[:3, 3] = image.GetOrigin()
+    notes = [*notes, "positions are turned from left-posterior-superior to right-anterior-superior"]
+    return array_of(image), RAS_FROM_LPS @ affine, unit, notes
+
+
+def _read_vti(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
+    from .isolated import read_isolated
+
+    if importlib.util.find_spec("vtkmodules") is None:
+        raise ImportError("vtkmodules")
+    arrays, reason = read_isolated("warp_corot.io.read.vtk_files", path)
+    if arrays is None or "image" not in arrays:
+        raise _unreadable(path, path.suffix, reason or "it holds a mesh, not an image")
+    return _of_image(arrays)
+
+
+def _of_image(
+    arrays: dict[str, NDArray[Any]],
+) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
+    from .filemesh import from_bytes
+
+    return arrays["values"], arrays["affine"], None, from_bytes(arrays["image"])
+
+
+def _unreadable(path: Path, kind: str, why: object) -> InputError:
+    words = " ".join(str(why).split())
+    return InputError(f"{path}: is not a {kind} file that can be read{f' ({words[:160]})' if words else ''}")
+
+
+#: What reads which extension.
+READERS: dict[str, Callable[[Path], tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]]] = {
+    ".nii.gz": _read_nifti,
+    ".nii": _read_nifti,
+    ".mgz": _read_mgh,
+    ".mgh": _read_mgh,
+    ".mha": _read_itk,
+    ".mhd": _read_itk,
+    ".nrrd": _read_itk,
+    ".nhdr": _read_itk,
+    ".dcm": _read_dicom,
+    ".vti": _read_vti,
+}
+
+
+def affine_of(spacing: Any, origin: Any) -> NDArray[np.float64]:
+    """The matrix [4, 4] from voxel indices to positions.
+
+    Raises:
+        InputError: Spacing that is not three positive numbers, origin that is not three finite ones.
+    """
+    steps = np.asarray(spacing, dtype=np.float64)
+    if steps.shape != (3,) or not all(math.isfinite(s) and s > 0.0 for s in steps):
+        raise InputError(f"spacing is {spacing!r}; it must be three positive numbers, one an axis")
+    start = np.zeros(3) if origin is None else np.asarray(origin, dtype=np.float64)
+    if start.shape != (3,) or not np.isfinite(start).all():
+        raise InputError(f"origin is {origin!r}; it must be three finite numbers")
+    affine = np.diag([*steps, 1.0])
+    affine[:3, 3] = start
+    return affine

@@ -1,0 +1,304 @@
+"""A simulation recorded frame by frame as a USD animation."""
+
+from __future__ import annotations
+
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_number, checked_path, shown
+from warp_corot.simulation.simulation import Simulation
+
+from .provenance import provenance, steps_made
+from .skins import BoundSkins, has_domain
+
+if TYPE_CHECKING:
+    from warp_corot.io.write.usd.writer import UsdWriter
+
+    from .paraview import Writer
+    from .skins import Surface
+
+Progress = Callable[[int, int], None]
+
+#: A frame of more steps would take years.
+MOST_STEPS = 1e12
+
+
+@dataclass
+class Recording:
+    """What has been recorded so far.
+
+    Attributes:
+        path: The stage.
+        frames: Frames written, the one at the beginning included.
+        steps: Time steps done.
+        simulated: Simulated time [s].
+        elements: Tetrahedra of the bodies drawn, one world of them, in each frame; they change with remeshing only.
+        stepping: Wall time of stepping [s], without writing.
+        writing: Wall time of reading the state back and writing it [s].
+        largest_displacement: Largest displacement from rest of any node in any frame [m].
+        final_displacement: The same in the last frame [m].
+    """
+
+    path: Path
+    frames: int = 0
+    steps: int = 0
+    simulated: float = 0.0
+    elements: list[int] = field(default_factory=list)
+    stepping: float = 0.0
+    writing: float = 0.0
+    largest_displacement: float = 0.0
+    final_displacement: float = 0.0
+
+
+class _Joined:
+    """The bodies of a simulation, one world of them, as one mesh and one material, body after body."""
+
+    def __init__(self, sim: Simulation, world: int):
+        self.worlds = [body.world(world) for body in sim.bodies]
+        self.up_axis = sim.bodies[0].mesh.up_axis
+        self.changing = [changing is not None for changing in sim.remeshing.changing]
+        self._join()
+
+    def has_changed(self) -> bool:
+        """Whether the mesh has become another one since this was last asked; then all is that of the present one."""
+        if self._revisions == [world.body.mesh_revision for world in self.worlds]:
+            return False
+        self._join()
+        return True
+
+    @property
+    def meshes(self) -> list[Any]:
+        return [world.body.mesh for world in self.worlds]
+
+    def skins(
+        self, surface: Surface | Sequence[Surface | None] | None, tets: bool | None, labels: bool
+    ) -> BoundSkins | None:
+        """What is drawn in place of the boundary of the tetrahedra; none where nothing but tetrahedra is known."""
+        if surface is None and not labels and tets is not False and not any(map(has_domain, self.meshes)):
+            return None
+        return BoundSkins(self.meshes, surface, labels, self.changing)
+
+    def _join(self) -> None:
+        self._revisions = [world.body.mesh_revision for world in self.worlds]
+        meshes = self.meshes
+        offsets = np.cumsum([0, *(len(mesh.points) for mesh in meshes)])
+        self.points = np.concatenate([mesh.points for mesh in meshes])
+        self.tets = np.concatenate([mesh.tets + n for mesh, n in zip(meshes, offsets[:-1], strict=True)])
+        self.tets = self.tets.astype(np.int32)
+        self.fixed = np.concatenate([w.body.constrained[w.nodes] for w in self.worlds])
+        for name in ("young", "poisson", "density"):
+            setattr(self, name, self._property(name))
+
+    def _property(self, name: str) -> float | npt.NDArray[np.float64]:
+        values = []
+        for world in self.worlds:
+            body = world.body
+            everywhere = np.broadcast_to(getattr(body.material.isotropic, name), (body.worlds, len(body.mesh.tets)))
+            values.append(everywhere[world.index])
+        joined = np.concatenate(values).astype(np.float64)
+        return float(joined[0]) if (joined == joined[0]).all() else joined
+
+
+def steps_per_frame(fps: float, dt: float) -> int:
+    """The least whole number of steps, none longer than ``dt`` [s], that makes a frame.
+
+    Raises:
+        InputError: More steps than can be counted.
+    """
+    count = 1.0 / fps / dt
+    if count > MOST_STEPS:
+        raise InputError(f"a frame of {1.0 / fps:.3g} s would take {count:.3g} steps of {dt:.3g} s")
+    return max(math.ceil(count * (1.0 - 1e-9)), 1)
+
+
+def frame_count(duration: float, fps: float) -> int:
+    """How many frames follow the first one, nearest to ``duration`` [s].
+
+    Raises:
+        InputError: Not positive and finite, or shorter than half a frame.
+    """
+    for name, value, unit in (("fps", fps, ""), ("duration", duration, " s")):
+        if not 0 < checked_number(value, name) < math.inf:
+            raise InputError(f"{name} is {value:g}{unit}; it must be a positive number")
+    count = round(duration * fps)
+    if count < 1:
+        raise InputError(f"duration is {duration:g} s; it must be at least one frame, {1.0 / fps:.3g} s")
+    return count
+
+
+def record(
+    sim: Simulation,
+    path: str | PathLike[str],
+    *,
+    duration: float,
+    fps: float = 24.0,
+    world: int | None = None,
+    surface: Surface | Sequence[Surface | None] | None = None,
+    tets: bool | None = None,
+    labels: bool = False,
+    also: Sequence[str | PathLike[str]] = (),
+    progress: Progress | None = None,
+    recording: Recording | None = None,
+    about: Mapping[str, Any] | None = None,
+) -> Recording:
+    """Advance a simulation and write a frame of it as often as ``fps`` asks, the present state first.
+
+    Several bodies become one mesh, body after body. Of a mesh made from a domain the smooth marched surface is written
+    and not the tetrahedra; of any other mesh the tetrahedra and their boundary. Of a body that is remeshed each frame
+    shows the present mesh; smooth surfaces stay the same and are bound to it. Frame k shows the state at k / fps, or,
+    of a simulation with a given step, after the whole number of steps that comes nearest. Whatever ends the run, the
+    frames written stay: Ctrl-C and SIGTERM wait while one is being written.
+
+    Args:
+        sim: Goes on from where it is.
+        path: A .usd, .usdc or .usda file; what was there stays until the first frames are safe.
+        duration: Simulated time [s], rounded to whole frames.
+        fps: Frames per second of simulated time.
+        world: Which of the bodies' copies is drawn; must be given where there are several.
+        surface: Drawn in place of the mesh's own surface, for several bodies one each (None for the mesh's own): a
+            surface from ``mesh.bind(points, triangles)``; or a USD file with Mesh prims, or another surface file, in
+            the mesh's coordinates, whose parts are bound to it and keep their names, faces, texture coordinates,
+            subsets and materials. Parts without materials and colours show the stress.
+        tets: Whether the TetMesh prim is written; None: unless a smooth surface is.
+        labels: Draw each label of the mesh as a closed surface of its own, in place of one around all.
+        also: Files for ParaView with displacement, velocity, strain and stress: .pvd or .xdmf of all frames, .vtu of
+            the last.
+        progress: Called with the frames done and their number, after each; None: terminals show a bar from two
+            seconds on.
+        recording: Filled while running, for who wants to look at it when the run has been ended early.
+        about: What the stage shall say of itself, besides what is known of every simulation: texts, numbers and
+            dictionaries of them, under "warp_corot" in the layer's custom data.
+
+    Returns:
+        What was recorded.
+
+    Raises:
+        InputError: A path that cannot be written to, a duration or frame rate out of its range, no such world, or a
+            surface that does not fit; nothing has been simulated or written then.
+        UnstableError: The state is not finite any more; the frames before are kept.
+        OSError: The file cannot be written, as when the disk is full; the frames up to seconds before are kept.
+    """
+    from warp_corot.io.write.usd.writer import UsdWriter
+
+    from . import also_writer, fields_of
+
+    if not isinstance(sim, Simulation):
+        raise InputError(f"sim is {shown(sim)}; it must be a Simulation, as Simulation(body) makes one")
+    checked_path(path, "path")
+    count = frame_count(duration, fps)
+    others = [also_writer(Path(other)) for other in also]
+    if world is None and sim.worlds > 1:
+        raise InputError(f"the simulation has {sim.worlds} worlds; say which one to draw, as in world=0")
+    joined = _Joined(sim, world or 0)
+    skins = joined.skins(surface, tets, labels)
+    writer = UsdWriter(
+        Path(path),
+        joined,
+        fps=fps,
+        fixed=joined.fixed,
+        material=joined,
+        skins=skins.on(joined.meshes) if skins else (),
+        tets=tets,
+        changing=any(joined.changing),
+        gravity=sim.gravity,
+    )
+    told = {**provenance(sim, joined.fixed), **(about or {})}
+    done = Recording(writer.path) if recording is None else recording
+    first_step, first_time = sim.total_steps, sim.total_time
+    with _closed_whole(writer, done, others), _bar(count, wanted=progress is None) as bar:
+        for frame in range(count + 1):
+            started = time.perf_counter()
+            sim.advance_until(first_time + frame / fps)
+            stepped = time.perf_counter()
+            with signals_held_back():
+                if joined.has_changed():
+                    bound = skins.on(joined.meshes) if skins else ()
+                    writer.change_mesh(joined, fixed=joined.fixed, material=joined, skins=bound)
+                writer.about = {**told, **steps_made(sim)}
+                _write_frame(writer, sim, joined, done)
+                if others:
+                    fields = fields_of(sim, joined.worlds, sim.total_time - first_time)
+                    for other in others:
+                        other.write(fields)
+            done.stepping += stepped - started
+            done.writing += time.perf_counter() - stepped
+            done.steps = sim.total_steps - first_step
+            done.simulated = sim.total_time - first_time
+            (progress or bar)(frame, count)
+    return done
+
+
+@contextmanager
+def _bar(count: int, *, wanted: bool) -> Iterator[Progress]:
+    """A bar on a terminal for runs that take a while."""
+    from tqdm import tqdm
+
+    form = "{desc}  {percentage:3.0f} % |{bar}| frame {n_fmt} of {total_fmt}, {remaining} left"
+    off = None if wanted else True
+    with tqdm(desc="simulating", total=count, delay=2.0, leave=False, disable=off, bar_format=form) as bar:
+        yield lambda frame, _: bar.update(frame - bar.n)
+
+
+def _write_frame(writer: UsdWriter, sim: Simulation, joined: _Joined, done: Recording) -> None:
+    positions = [w.positions.numpy() for w in joined.worlds]
+    velocities = [w.velocities.numpy() for w in joined.worlds]
+    stresses = [sim.von_mises(w.body)[w.elements] for w in joined.worlds]
+    writer.write(np.concatenate(positions), velocities=np.concatenate(velocities), von_mises=np.concatenate(stresses))
+    done.frames = writer.frames
+    done.elements.append(len(joined.tets))
+    # In float64: on the way to an end that is not finite, squares leave float32 first.
+    lengths = [np.linalg.norm(w.displacements.numpy().astype(np.float64), axis=1).max() for w in joined.worlds]
+    done.final_displacement = float(max(lengths))
+    done.largest_displacement = max(done.largest_displacement, done.final_displacement)
+
+
+@contextmanager
+def _closed_whole(writer: UsdWriter, done: Recording, others: Sequence[Writer] = ()) -> Iterator[None]:
+    """The writers are closed at the end, whatever the end is, with signals held back and the time taken."""
+    try:
+        yield
+    except BaseException as error:
+        with signals_held_back():
+            writer.__exit__(type(error), error, error.__traceback__)
+            with suppress(OSError):  # the first error is the one to be told
+                for other in others:
+                    other.close()
+        raise
+    started = time.perf_counter()
+    with signals_held_back():
+        writer.close()
+        for other in others:
+            other.close()
+    done.writing += time.perf_counter() - started
+
+
+@contextmanager
+def signals_held_back() -> Iterator[None]:
+    """SIGINT and SIGTERM that come inside are delivered at its end (in the main thread; elsewhere there are none)."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    held: list[int] = []
+    before = {int(number): signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    ours = {number: handler for number, handler in before.items() if handler is not None}
+    for number in ours:
+        signal.signal(number, lambda n, _: held.append(n))
+    try:
+        yield
+    finally:
+        for number, handler in ours.items():
+            signal.signal(number, handler)
+        for number in held[:1]:
+            signal.raise_signal(number)

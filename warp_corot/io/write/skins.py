@@ -1,0 +1,275 @@
+"""What is drawn of a body in place of the boundary of its tetrahedra: surfaces bound to its nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.errors import InputError
+from warp_corot.mesh.surfaces.bound import SurfaceMesh
+from warp_corot.mesh.surfaces.boundary import boundary_faces
+
+if TYPE_CHECKING:
+    from typing import TypeAlias
+
+    from warp_corot.io.read.surfaces import LoadedSurface
+    from warp_corot.io.read.usd.look import Look
+
+    Surface: TypeAlias = "SurfaceMesh | OwnSurface | str | PathLike[str]"
+
+#: A surface this many times longer or shorter than its body is in another unit, most likely.
+UNLIKELY = 3.0
+#: Bounds that differ by less than this share of the length are the same.
+SAME = 1.0e-3
+
+
+@dataclass(frozen=True, eq=False)
+class OwnSurface:
+    """A user's own surface, in the coordinates of the body's mesh.
+
+    Attributes:
+        looks: Its parts, each with its faces, texture coordinates, subsets and materials.
+    """
+
+    looks: Sequence[Look]
+
+    @classmethod
+    def of_domain(cls, path: str | PathLike[str], loaded: LoadedSurface, bounds: npt.ArrayLike) -> OwnSurface | None:
+        """The surface that a domain of these bounds [2, 3] [m] was made from; its unit is whatever makes the two
+        equally large. None if they are not the same but for that.
+
+        Args:
+            path: Of the file.
+            loaded: Its triangles, for files of which more than these is not known.
+            bounds: Of the domain.
+
+        Raises:
+            InputError: See `usd_look.read_looks`.
+        """
+        from warp_corot.io.read.usd.look import has_looks, look_of_triangles, read_looks
+
+        looks = read_looks(path) if has_looks(path) else [look_of_triangles(path, loaded.points, loaded.triangles)]
+        given = np.asarray(bounds, dtype=np.float64)
+        length = float(np.ptp(given, axis=0).max())
+        # All of the file, or where it has several bodies one part of it.
+        for some in (looks, *([look] for look in looks)):
+            used = np.concatenate([look.points[look.triangles].reshape(-1, 3) for look in some])
+            own = np.stack([used.min(axis=0), used.max(axis=0)])
+            scale = length / max(float(np.ptp(own, axis=0).max()), 1e-300)
+            if np.abs(scale * own - given).max() <= SAME * length:
+                return cls([look.placed(scale) for look in some])
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """A surface to be drawn.
+
+    Attributes:
+        name: What it is called: "surface", or a label's name.
+        surface: Bound to the nodes of the mesh that is drawn.
+        look: The USD prim whose faces, texture coordinates and materials it keeps.
+        is_boundary: Whether some of it is the boundary of the mesh itself, which is another one when the mesh is.
+    """
+
+    name: str
+    surface: SurfaceMesh
+    look: Look | None = None
+    is_boundary: bool = False
+
+    def values(self, nodal: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
+        """Nodal values [N] at the points of the surface, float32 [V]."""
+        return np.einsum("vn,vn->v", self.surface.weights, nodal[self.surface.nodes]).astype(np.float32)
+
+
+def has_domain(mesh: Any) -> bool:
+    """Whether a mesh was made from a domain, so that the body ends within its tetrahedra."""
+    return getattr(mesh, "phi", None) is not None
+
+
+def has_labels(mesh: Any) -> bool:
+    """Whether a mesh was made from a domain with labels."""
+    return bool(getattr(mesh, "label_names", ()))
+
+
+def skins_of(
+    meshes: Sequence[Any], surface: Surface | Sequence[Surface | None] | None = None, labels: bool = False
+) -> list[Skin]:
+    """The skins of meshes whose nodes are numbered one mesh after the other; those of one name are joined.
+
+    Args:
+        meshes: Forests or tetrahedral meshes.
+        surface: Drawn instead of the mesh's own: a bound surface, or a surface file whose parts are bound; for several
+            meshes one each, None for the mesh's own.
+        labels: Draw each label of a mesh by itself, closed all round.
+
+    Raises:
+        InputError: Surfaces that do not fit, or labels where no mesh has any.
+    """
+    return BoundSkins(meshes, surface, labels).on(meshes)
+
+
+class BoundSkins:
+    """The skins of bodies, bound anew where a body's mesh has become another one.
+
+    Surfaces stay as they are, whatever the mesh: only what their points are bound to changes. The boundary of a mesh
+    itself becomes that of the present one.
+
+    Args:
+        meshes, surface, labels: See `skins_of`.
+        changing: Which meshes may become others: surfaces given for them may be bound to what they were earlier.
+    """
+
+    def __init__(
+        self,
+        meshes: Sequence[Any],
+        surface: Surface | Sequence[Surface | None] | None = None,
+        labels: bool = False,
+        changing: Sequence[bool] | None = None,
+    ):
+        given = _one_each(surface, len(meshes))
+        if labels and not any(map(has_labels, meshes)):
+            raise InputError("labels is True, but there are none in the mesh; they come from a domain that has")
+        self._meshes = list(meshes)
+        may_change = [False] * len(meshes) if changing is None else changing
+        self._skins = [
+            _skins_of_one(mesh, _rebound(own, mesh) if moves and isinstance(own, SurfaceMesh) else own, labels)
+            for mesh, own, moves in zip(meshes, given, may_change, strict=True)
+        ]
+
+    def on(self, meshes: Sequence[Any]) -> list[Skin]:
+        """The skins, bound to the nodes of what the meshes are now, numbered one mesh after the other."""
+        found, offset = [], 0
+        for index, mesh in enumerate(meshes):
+            if mesh is not self._meshes[index]:
+                self._skins[index] = [_bound_anew(skin, mesh) for skin in self._skins[index]]
+                self._meshes[index] = mesh
+            found += [_shifted(skin, offset) for skin in self._skins[index]]
+            offset += len(mesh.points)
+        return _joined(found)
+
+
+def _bound_anew(skin: Skin, mesh: Any) -> Skin:
+    surface = boundary_surface(mesh) if skin.is_boundary else _rebound(skin.surface, mesh)
+    return replace(skin, surface=surface)
+
+
+def _one_each(surface: Any, count: int) -> list[Any]:
+    if surface is None:
+        return [None] * count
+    several = isinstance(surface, Sequence) and not isinstance(surface, str | SurfaceMesh | OwnSurface)
+    given = list(surface) if several else [surface]
+    if len(given) != count:
+        raise InputError(f"surface names {len(given)} surfaces; there must be one for each of the {count} bodies")
+    return given
+
+
+def _skins_of_one(mesh: Any, surface: Any, labels: bool) -> list[Skin]:
+    if isinstance(surface, SurfaceMesh):
+        _check_nodes(surface, len(mesh.points))
+        return [Skin("surface", surface)]
+    if isinstance(surface, OwnSurface):
+        return _bound_looks(mesh, surface.looks)
+    if isinstance(surface, str | PathLike):
+        return _bound_prims(mesh, surface)
+    if surface is not None:
+        raise InputError(f"surface is a {type(surface).__name__}; it must be a SurfaceMesh or a surface file")
+    if labels and has_labels(mesh) and not has_domain(mesh):
+        return [
+            Skin(name, boundary_surface(mesh, mesh.elements_of(name)))
+            for name in mesh.label_names
+            if mesh.elements_of(name).any()
+        ]
+    if labels and has_labels(mesh):
+        between = mesh.separating_surface()
+        there = np.unique(between.sides)
+        names = enumerate(mesh.label_names, start=1)
+        return [Skin(name, between.of_label(number)) for number, name in names if number in there]
+    if has_domain(mesh):
+        return [Skin("surface", mesh.surface())]
+    return [Skin("surface", boundary_surface(mesh), is_boundary=True)]
+
+
+def boundary_surface(mesh: Any, of: npt.NDArray[np.bool_] | None = None) -> SurfaceMesh:
+    """The boundary of any tetrahedral mesh, or of some of its elements, its points bound to the nodes that they are."""
+    faces, _ = boundary_faces(mesh.tets if of is None else mesh.tets[of], mesh.points)
+    used, triangles = np.unique(faces, return_inverse=True)
+    weights = np.tile([1.0, 0.0, 0.0, 0.0], (len(used), 1))
+    nodes = np.repeat(used[:, None], 4, axis=1).astype(np.int32)
+    return SurfaceMesh(mesh.points[used], nodes, weights, triangles.reshape(-1, 3).astype(np.int32))
+
+
+def _rebound(surface: SurfaceMesh, mesh: Any) -> SurfaceMesh:
+    """The same points, bound to what holds them in a forest."""
+    bound = mesh.bind(surface.points)
+    return replace(surface, nodes=bound.nodes, weights=bound.weights)
+
+
+def _check_nodes(surface: SurfaceMesh, count: int) -> None:
+    lowest, highest = int(surface.nodes.min(initial=0)), int(surface.nodes.max(initial=-1))
+    if lowest < 0 or not 0 <= highest < count:
+        raise InputError(
+            f"the surface is bound to nodes {lowest} to {highest}, the mesh has nodes 0 to {count - 1}; it must be "
+            "bound to this mesh"
+        )
+
+
+def _bound_prims(mesh: Any, path: str | PathLike[str]) -> list[Skin]:
+    from warp_corot.io.read.usd.look import read_looks
+
+    return _bound_looks(mesh, read_looks(path))
+
+
+def _bound_looks(mesh: Any, looks: Sequence[Look]) -> list[Skin]:
+    skins = []
+    for look in looks:
+        _check_size(look, mesh.points)
+        skins.append(Skin(look.name, mesh.bind(look.points, look.triangles), look))
+    return skins
+
+
+def _check_size(look: Look, nodes: np.ndarray) -> None:
+    low, high = nodes.min(axis=0), nodes.max(axis=0)
+    size, body = float(np.ptp(look.points, axis=0).max()), float((high - low).max())
+    apart = (look.points.min(axis=0) > high).any() or (look.points.max(axis=0) < low).any()
+    if apart or size > UNLIKELY * body:
+        raise InputError(
+            f"{look.source}: {look.path} is {size:.3g} m long and {'apart from' if apart else 'bound to'} the body, "
+            f"which is {body:.3g} m long; is its metersPerUnit right?"
+        )
+
+
+def _shifted(skin: Skin, offset: int) -> Skin:
+    nodes = (skin.surface.nodes + offset).astype(np.int32)
+    return replace(skin, surface=replace(skin.surface, nodes=nodes)) if offset else skin
+
+
+def _joined(skins: Sequence[Skin]) -> list[Skin]:
+    """Skins of one name as one, those that keep a prim's look by themselves."""
+    plain: dict[str, list[Skin]] = {}
+    for skin in skins:
+        if skin.look is None:
+            plain.setdefault(skin.name, []).append(skin)
+    whole = [
+        Skin(name, _one_surface([part.surface for part in parts]), is_boundary=any(part.is_boundary for part in parts))
+        for name, parts in plain.items()
+    ]
+    return whole + [skin for skin in skins if skin.look is not None]
+
+
+def _one_surface(parts: Sequence[SurfaceMesh]) -> SurfaceMesh:
+    if len(parts) == 1:
+        return parts[0]
+    firsts = np.cumsum([0, *(len(part.points) for part in parts[:-1])])
+    triangles = [part.triangles + first for part, first in zip(parts, firsts, strict=True)]
+    return SurfaceMesh(
+        np.concatenate([part.points for part in parts]),
+        np.concatenate([part.nodes for part in parts]),
+        np.concatenate([part.weights for part in parts]),
+        np.concatenate(triangles).astype(np.int32),
+    )

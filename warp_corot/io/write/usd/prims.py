@@ -1,0 +1,203 @@
+"""What the prims of an animated body are made of, and the prims of surfaces that are bound to it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Gf, Sdf, Tf, UsdGeom, Vt
+
+from warp_corot.errors import InputError
+from warp_corot.io.pictures.colors import TISSUE, VertexAverage, color_index, srgb_to_linear, stress_colors
+from warp_corot.io.write.skins import Skin
+from warp_corot.mesh.surfaces.bound import SurfaceMesh, vertex_normals
+
+from .pieces import Samples
+
+ROOT, TETS, SURFACE = "/SoftBody", "/SoftBody/tetrahedra", "/SoftBody/surface"
+MATERIALS = "/SoftBody/materials"
+PHYSICS = "/SoftBody/physics"
+
+Limits = tuple[float, float]
+
+
+class Frame(NamedTuple):
+    """One frame: positions [N, 3], velocities [N, 3] or None, stress [T] or None and its averages at nodes [N]."""
+
+    positions: NDArray[np.float32]
+    velocities: NDArray[np.float32] | None
+    stress: NDArray[np.float32] | None
+    nodal: NDArray[np.float64] | None
+
+
+class Present(NamedTuple):
+    """A body's mesh: points at rest [N, 3] [m], tetrahedra, all right-handed, int32 [T, 4], the average from
+    tetrahedra to nodes, held nodes (a mask or indices) or None, and the material or None."""
+
+    points: NDArray[np.float64]
+    tets: NDArray[np.int32]
+    average: VertexAverage
+    fixed: Any
+    material: Any
+
+
+@dataclass(frozen=True)
+class Statics:
+    """What holds for all frames: whether they give velocities and stress."""
+
+    velocities: bool
+    stress: bool
+
+
+class SkinPrim:
+    """The Mesh prim of a surface that is bound to the body's nodes.
+
+    Args:
+        skin: The surface.
+        path: Of the prim.
+        rest: Points of the body's mesh at rest [m], [N, 3].
+        changing: Whether the mesh may become another one, and the surface with it if it is the mesh's boundary.
+    """
+
+    def __init__(self, skin: Skin, path: str, rest: NDArray[np.float64], *, changing: bool):
+        self._path = path
+        self._changing = changing and skin.is_boundary
+        self._said: Skin | None = None
+        look = skin.look
+        self._with_normals = look is None or (look.had_normals and not look.smooth)
+        self._with_colors = look is None or look.is_plain
+        self.follow(skin, rest)
+
+    def follow(self, skin: Skin, rest: NDArray[np.float64]) -> None:
+        """Draw the surface as it is bound to a mesh of these points from the next frame on."""
+        self._skin, self._rest = skin, np.asarray(rest, dtype=np.float64)
+
+    @property
+    def follows(self) -> dict[str, str]:
+        """See `PieceStore.declare`."""
+        own = ("points", "normals", "velocities", "primvars:vonMises")
+        return {f"{self._path}.{name}": f"{self._path}.faceVertexIndices" for name in own}
+
+    def declare(self, stage: Any, statics: Statics) -> None:
+        """As `TetPrims.declare`."""
+        look, surface = self._skin.look, self._skin.surface
+        if look is not None:
+            look.copy_to(stage.GetRootLayer(), self._path, MATERIALS)
+            mesh = UsdGeom.Mesh.Get(stage, self._path)
+            handed = UsdGeom.Tokens.leftHanded if look.left_handed else UsdGeom.Tokens.rightHanded
+            mesh.CreateOrientationAttr(handed)
+        else:
+            mesh = UsdGeom.Mesh.Define(stage, self._path)
+            mesh.GetPrim().SetDisplayName(self._skin.name)
+            declare_triangles(mesh)
+            if not self._changing:
+                for path, value in triangle_samples(self._path, surface.triangles).items():
+                    stage.GetAttributeAtPath(path).Set(value)
+        if self._with_normals:
+            mesh.CreateNormalsAttr()
+            mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+        if statics.velocities:
+            mesh.CreateVelocitiesAttr()
+        if statics.stress:
+            primvars = UsdGeom.PrimvarsAPI(mesh)
+            stress = primvars.CreatePrimvar("vonMises", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex)
+            stress.GetAttr().SetDocumentation("Von Mises stress, averaged over the tetrahedra around [Pa]")
+        declare_moving(mesh, statics.stress, colored=self._with_colors)
+
+    def samples(self, frame: Frame) -> Samples:
+        """As `TetPrims.samples`."""
+        surface = self._skin.surface
+        x = surface.moved(frame.positions - self._rest).astype(np.float32)
+        samples: Samples = {
+            f"{self._path}.points": Vt.Vec3fArray.FromNumpy(x),
+            f"{self._path}.extent": extent(x),
+        }
+        if self._with_normals:
+            normals = vertex_normals(x.astype(np.float64), surface.triangles).astype(np.float32)
+            samples[f"{self._path}.normals"] = Vt.Vec3fArray.FromNumpy(normals)
+        if frame.nodal is not None:
+            samples[f"{self._path}.primvars:vonMises"] = Vt.FloatArray.FromNumpy(self._skin.values(frame.nodal))
+        if frame.velocities is not None:
+            of_points = np.einsum("vn,vnc->vc", surface.weights, frame.velocities[surface.nodes])
+            samples[f"{self._path}.velocities"] = Vt.Vec3fArray.FromNumpy(of_points.astype(np.float32))
+        if self._changing:
+            if self._said is None or not _are_same(self._said.surface, surface):
+                samples |= triangle_samples(self._path, surface.triangles)
+            self._said = self._skin
+        return samples
+
+    def colors(self, samples: Samples, limits: Limits, _: Any = None) -> Samples:
+        """As `TetPrims.colors`."""
+        stress = samples.get(f"{self._path}.primvars:vonMises")
+        if not self._with_colors or stress is None:
+            return {}
+        indices = Vt.IntArray.FromNumpy(color_index(np.asarray(stress), *limits))
+        return {f"{self._path}.primvars:displayColor:indices": indices}
+
+
+def _are_same(one: SurfaceMesh, other: SurfaceMesh) -> bool:
+    return np.array_equal(one.triangles, other.triangles) and np.array_equal(one.points, other.points)
+
+
+def skin_paths(skins: Sequence[Skin]) -> list[str]:
+    """A path for each, all different, after their names."""
+    taken = {TETS, MATERIALS, PHYSICS}
+    paths = []
+    for skin in skins:
+        name = path = f"{ROOT}/{Tf.MakeValidIdentifier(skin.name)}"
+        count = 1
+        while path in taken:
+            count += 1
+            path = f"{name}_{count}"
+        taken.add(path)
+        paths.append(path)
+    return paths
+
+
+def declare_triangles(mesh: Any) -> None:
+    """Triangles wound counter-clockwise seen from outside, without values."""
+    mesh.CreateFaceVertexCountsAttr()
+    mesh.CreateFaceVertexIndicesAttr()
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
+
+
+def triangle_samples(path: str, triangles: NDArray[np.int32]) -> Samples:
+    """Values of the faces of a Mesh prim of this path."""
+    return {
+        f"{path}.faceVertexCounts": Vt.IntArray(len(triangles), 3),
+        f"{path}.faceVertexIndices": Vt.IntArray.FromNumpy(np.ascontiguousarray(triangles).reshape(-1)),
+    }
+
+
+def declare_moving(body: Any, with_stress: bool, colored: bool = True) -> None:
+    """Points, extent and, if it has any, colours: of stress, or of tissue where none is given."""
+    body.CreatePointsAttr()
+    body.CreateExtentAttr()
+    if colored and with_stress:
+        color = body.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+        color.Set(Vt.Vec3fArray.FromNumpy(srgb_to_linear(stress_colors()).astype(np.float32)))
+        color.CreateIndicesAttr()
+    elif colored:
+        color = body.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant)
+        color.Set(Vt.Vec3fArray([Gf.Vec3f(*srgb_to_linear(TISSUE))]))
+
+
+def floats(values: Any, shape: tuple[int, ...], name: str) -> NDArray[np.float32]:
+    """As float32 of a shape.
+
+    Raises:
+        InputError: Another shape.
+    """
+    array = np.ascontiguousarray(values.numpy() if hasattr(values, "numpy") else values, dtype=np.float32)
+    if array.shape != shape:
+        raise InputError(f"{name} has shape {list(array.shape)}, should be {list(shape)}")
+    return array
+
+
+def extent(points: NDArray[np.float32]) -> Vt.Vec3fArray:
+    """Lowest and highest coordinates."""
+    return Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)]))

@@ -1,0 +1,300 @@
+"""Simulated frames as a USD stage: the tetrahedra and their surface, or smooth surfaces in place of it."""
+
+import logging
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pxr import Kind, Sdf, Usd, UsdGeom
+
+from warp_corot.errors import InputError
+from warp_corot.io.pictures.colors import COLORMAP_NAME, VertexAverage, round_limit
+from warp_corot.io.write.provenance import KEY
+from warp_corot.io.write.skins import Skin
+from warp_corot.mesh.surfaces.boundary import signed_volumes
+
+from .materials import declare_physics
+from .pieces import PieceStore, Samples
+from .prims import ROOT, SURFACE, TETS, Frame, Present, SkinPrim, Statics, floats, skin_paths
+from .tets import TetPrims
+
+__all__ = ["ROOT", "SURFACE", "TETS", "Mesh", "UsdWriter"]
+
+
+class Mesh(Protocol):
+    """What the writer needs of a mesh: ``points`` [N, 3] [m] and ``tets`` [T, 4]."""
+
+    @property
+    def points(self) -> NDArray[np.float64]: ...
+
+    @property
+    def tets(self) -> NDArray[np.int32]: ...
+
+
+class UsdWriter:
+    """Writes one body's frames to a USD stage that opens at any moment, whatever ends the run (see `usd_pieces`).
+
+    The stage, in metres: ``/SoftBody`` (the default prim) with ``tetrahedra``, a `UsdGeom.TetMesh` of purpose *guide*,
+    and ``surface``, a `UsdGeom.Mesh` of the surface nodes only, which viewers draw. Frame i is time code i. Of the
+    TetMesh: ``points``, ``velocities`` [m/s] and ``extent`` a frame, as of surfaces; primvars ``rest`` (vertex),
+    ``fixed`` (vertex, 1 where held), ``young`` [Pa], ``poisson``, ``density`` [kg/m³] (constant, or uniform: one a
+    tetrahedron) and ``vonMises`` [Pa] (uniform, a frame). Both prims show the stress as ``displayColor``: averages over
+    the tetrahedra around each node, as indices into the 256 colours of `colors.stress_colors`; custom data of
+    ``/SoftBody`` name the map and its range. ``/SoftBody/physics`` has the physics materials, and with ``gravity`` a
+    physics scene, as `usd_materials.declare_physics` says.
+
+    The colour range, unless given, starts at 0 and ends at the 99th percentile of the highest frame so far, rounded
+    up to few digits (`colors.round_limit`); on closing, earlier frames are coloured again with the last range, so that
+    one range holds for all.
+
+    Mirrored tetrahedra are written with two indices swapped, so that all are right-handed as the schema wants.
+
+    With ``skins`` these surfaces take the place of ``surface``, and the TetMesh is left out unless ``tets`` is set.
+    Each is a Mesh under its own name with ``points``, ``normals``, ``extent`` and the primvar ``vonMises`` (vertex
+    [Pa]) a frame, and coloured likewise. One that keeps a prim's look has that prim's faces, primvars, subsets and
+    materials (copied to ``/SoftBody/materials``) and colours instead, and normals, now of its vertices, if it had any.
+
+    Of a body whose mesh changes, ``tetVertexIndices`` and all that goes by tetrahedra, nodes or faces are time samples
+    too, those that are not given a frame only where the mesh is another one. They hold until then: OpenUSD interpolates
+    no integers, and no arrays of two lengths; where lengths agree by chance, a sample just before the frame (by
+    `usd_pieces.JUST_BEFORE`) keeps points of different nodes from being interpolated. Between frames points go along
+    their ``velocities``, as the schema has it for meshes that change.
+
+    Args:
+        path: Where to: .usd or .usdc (binary) or .usda (text). A file there stays until the first frames are safe.
+        mesh: The body's mesh at rest.
+        fps: Frames per second of simulated time.
+        fixed: Held nodes, mask [N] or indices.
+        material: Has ``young`` [Pa], ``poisson``, ``density`` [kg/m³], each a number or an array [T].
+        up_axis: "X", "Y" or "Z"; None: the mesh's own, else "Y".
+        stress_range: Lowest and highest stress of the colour map [Pa].
+        flush_seconds: About the most wall time [s] whose frames a sudden end may lose.
+        skins: Surfaces bound to the mesh's nodes.
+        tets: Whether the TetMesh is written; None: if there are no skins.
+        changing: Whether the mesh may become another one between frames (`change_mesh`).
+        gravity: [m/s^2], for a physics scene.
+
+    Attributes:
+        about: What the layer's custom data say of the run under "warp_corot"; may become more until it is closed.
+
+    Raises:
+        InputError: A path that cannot be written to (said now, not after the simulation), or arguments that do not fit.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        mesh: Mesh,
+        *,
+        fps: float,
+        fixed: ArrayLike | None = None,
+        material: Any = None,
+        up_axis: str | None = None,
+        stress_range: tuple[float, float] | None = None,
+        flush_seconds: float = 2.0,
+        skins: Sequence[Skin] = (),
+        tets: bool | None = None,
+        changing: bool = False,
+        gravity: Sequence[float] | None = None,
+    ):
+        up_axis = up_axis or getattr(mesh, "up_axis", "Y")
+        if up_axis not in ("X", "Y", "Z"):
+            raise InputError(f"up_axis is {up_axis!r}, should be X, Y or Z")
+        if not (np.isfinite(fps) and fps > 0.0):
+            raise InputError(f"fps is {fps}, should be a positive number")
+        if stress_range is not None and not 0.0 <= stress_range[0] < stress_range[1] < math.inf:
+            raise InputError(f"stress_range is {stress_range}, should be two rising stresses in Pa")
+        self._store = PieceStore(path, flush_seconds=flush_seconds)
+        self.path = self._store.path
+        self.frames = 0
+        self._fps = float(fps)
+        self._up_axis = up_axis
+        self._changing = changing
+        self._gravity = gravity
+        self.about: dict[str, Any] = {}
+        self._present = _present(mesh, fixed, material)
+        self._tets = TetPrims(self._present, boundary=not skins, changing=changing) if tets or not skins else None
+        named = zip(skins, skin_paths(skins), strict=True)
+        self._skins = [SkinPrim(skin, path, mesh.points, changing=changing) for skin, path in named]
+        self._prims: list[TetPrims | SkinPrim] = [*([self._tets] if self._tets else []), *self._skins]
+        self._range_given = stress_range is not None
+        self._stress_range = stress_range or (0.0, 0.0)
+        self._ranges_used: set[tuple[float, float]] = set()
+        self._given: tuple[bool, bool] | None = None  # velocities, von_mises
+        self._closed = False
+
+    @property
+    def stress_range(self) -> tuple[float, float]:
+        """Stresses [Pa] at the two ends of the colour map, so far."""
+        return self._stress_range
+
+    def change_mesh(
+        self, mesh: Mesh, *, fixed: ArrayLike | None = None, material: Any = None, skins: Sequence[Skin] = ()
+    ) -> None:
+        """From the next frame on the body has another mesh, of the same region.
+
+        Args:
+            mesh: At rest.
+            fixed, material: As when this was made.
+            skins: The same surfaces, bound to the mesh.
+
+        Raises:
+            InputError: The writer was not told that the mesh may change, or another number of skins.
+        """
+        if not self._changing:
+            raise InputError(f"{self.path}: the mesh cannot change; the writer must be made with changing=True")
+        if len(skins) != len(self._skins):
+            raise InputError(f"there are {len(skins)} skins now, should be {len(self._skins)} as before")
+        self._present = _present(mesh, fixed, material)
+        if self._tets:
+            self._tets.follow(self._present)
+        for prim, skin in zip(self._skins, skins, strict=True):
+            prim.follow(skin, mesh.points)
+
+    def write(
+        self, positions: ArrayLike, *, velocities: ArrayLike | None = None, von_mises: ArrayLike | None = None
+    ) -> None:
+        """Adds a frame; all frames give the same of the optional arguments.
+
+        Args:
+            positions: [N, 3] [m], in the mesh's node order.
+            velocities: [N, 3] [m/s].
+            von_mises: [T] [Pa].
+
+        Raises:
+            InputError: A shape that does not fit the mesh, or another choice of arguments than in the first frame.
+            OSError: Could not be written, as when the disk is full; the frames of the pieces before stay and play.
+        """
+        if self._closed:
+            raise InputError(f"{self.path}: is closed, no frame can be added")
+        given = (velocities is not None, von_mises is not None)
+        if self._given is None:
+            self._given = given
+            self._store.declare(self._static_layer(), self._follows())
+        elif given != self._given:
+            raise InputError("velocities and von_mises must be given either for every frame or for none")
+
+        x = floats(positions, self._present.points.shape, "positions")
+        v = None if velocities is None else floats(velocities, x.shape, "velocities")
+        stress = nodal = None
+        if von_mises is not None:
+            stress = floats(von_mises, (len(self._present.tets),), "von_mises")
+            nodal = self._present.average(stress)
+            self._widen_range(stress)
+            self._ranges_used.add(self._stress_range)
+            self._store.custom_data["stressColors"] = self._color_legend()
+        self._store.layer_data = {KEY: self.about} if self.about else {}
+        frame = Frame(x, v, stress, nodal)
+        samples: Samples = {}
+        for prim in self._prims:
+            own = prim.samples(frame)
+            samples |= own
+            if stress is not None:
+                samples |= prim.colors(own, self._stress_range, nodal)
+        self._store.add(float(self.frames), samples, sum(_nbytes(value) for value in samples.values()))
+        self.frames += 1
+
+    def flush(self) -> None:
+        """Makes the frames so far safe now, instead of when it is time to; the stage plays them.
+
+        Raises:
+            OSError: as `write`.
+        """
+        self._store.flush()
+
+    def close(self) -> None:
+        """Joins all frames into one file and removes the pieces; called again it does nothing.
+
+        Raises:
+            OSError: The joined file could not be written; the pieces stay, and the stage plays them.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        recolor = self._ranges_used - {self._stress_range}
+        self._store.finish(self._recolor if recolor else None)
+
+    def __enter__(self) -> "UsdWriter":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            self.close()
+        except OSError as error:
+            if kind is None:
+                raise
+            logging.getLogger(__name__).warning("%s", error)  # the first error is the one to raise
+
+    def _widen_range(self, stress: NDArray[np.float32]) -> None:
+        if self._range_given or len(stress) == 0:
+            return
+        rank = min(len(stress) - 1, int(0.99 * len(stress)))
+        top = round_limit(float(np.partition(stress, rank)[rank]))
+        if top > self._stress_range[1]:
+            self._stress_range = (0.0, top)
+
+    def _color_legend(self) -> dict[str, Any]:
+        lowest, highest = self._stress_range
+        return {
+            "map": COLORMAP_NAME,
+            "quantity": "von Mises stress",
+            "unit": "Pa",
+            "lowest": lowest,
+            "highest": highest,
+        }
+
+    def _recolor(self, samples: Samples) -> Samples:
+        colors: Samples = {}
+        for prim in self._prims:
+            colors |= prim.colors(samples, self._stress_range)
+        return colors
+
+    def _follows(self) -> dict[str, str]:
+        found: dict[str, str] = {}
+        for prim in self._prims:
+            found |= prim.follows
+        return found if self._changing else {}
+
+    def _static_layer(self) -> Sdf.Layer:
+        """Everything that does not change, and the attributes that do, without values."""
+        assert self._given is not None
+        layer = Sdf.Layer.CreateAnonymous(".usdc")
+        stage = Usd.Stage.Open(layer)
+        UsdGeom.SetStageUpAxis(stage, self._up_axis)
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        stage.SetTimeCodesPerSecond(self._fps)
+        stage.SetFramesPerSecond(self._fps)
+        root = UsdGeom.Xform.Define(stage, ROOT).GetPrim()
+        stage.SetDefaultPrim(root)
+        Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
+        statics = Statics(*self._given)
+        for prim in self._prims:
+            prim.declare(stage, statics)
+        declare_physics(
+            stage,
+            self._present,
+            with_tets=self._tets is not None,
+            changing=self._changing,
+            gravity=self._gravity,
+        )
+        return layer
+
+
+def _present(mesh: Mesh, fixed: ArrayLike | None, material: Any) -> Present:
+    points = np.asarray(mesh.points, dtype=np.float64)
+    volumes = signed_volumes(points, mesh.tets)
+    tets = _right_handed(np.asarray(mesh.tets, dtype=np.int32), volumes < 0.0)
+    return Present(points, tets, VertexAverage(tets, np.abs(volumes), len(points)), fixed, material)
+
+
+def _right_handed(tets: NDArray[np.int32], mirrored: NDArray[np.bool_]) -> NDArray[np.int32]:
+    turned = tets.copy()
+    turned[mirrored, 2], turned[mirrored, 3] = tets[mirrored, 3], tets[mirrored, 2]
+    return turned
+
+
+def _nbytes(values: Any) -> int:
+    return memoryview(values).nbytes

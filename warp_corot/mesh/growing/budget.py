@@ -1,0 +1,223 @@
+"""A mesh of so many tetrahedra: how large its cubes are and how often each is bisected, chosen together.
+
+The body is looked at once, in a forest that is finer than the mesh. There every tetrahedron of every level has a need:
+how far off its piece of the surface would be, were it not bisected [m]; where the body is thinner than a few elements a
+tenth of its edge. All whose need is above a threshold are bisected. The mesh is that of the threshold that gives the
+number asked for, which takes no more looking at the body.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .adapt import GAP_ELEMENTS, THIN_NEED, Closer, Wishes, grow
+from .resolved import Coarsening, Resolved
+
+if TYPE_CHECKING:
+    import warp as wp
+
+    from warp_corot.domain import Domain
+
+#: What share of the number asked for is aimed at and is enough; after how many thresholds and cubes any is.
+NEAR, NEAR_ENOUGH = 0.985, 0.92
+MOST_THRESHOLDS, MOST_CUBES = 14, 4
+#: What an element counts as being off by between such pieces, as a share of its edge.
+GAP_NEED = 0.5
+#: The surface that is drawn is this much closer to the body's than the mesh's threshold.
+FINER_SURFACE = 0.3
+#: Cubes are as large as gives this share of the elements when none is bisected: about six in a cube inside, four at the
+#: surface.
+UNBISECTED = 1.0 / 6.0
+#: How often cubes are bisected for the surface's sake. Where it is most curved elements are a fifth of a cube long;
+#: finer ones would bring the rest of the surface little, and make the time step smaller. From so many elements on
+#: there are too few at the surface for that. Thin parts may have finer ones.
+MAX_LEVEL, MANY, MAX_LEVEL_THIN = 7, 300_000, 13
+#: How closely the body is looked at: to which surface error over a cube's edge, and to how many tetrahedra of all
+#: levels for each one asked for, or a fixed number if that is more.
+CLOSE_ERROR, CLOSE_LEVEL = 0.01, 8
+CLOSER_LEVELS, CLOSER_ERROR = 6, 0.2
+CLOSE_ELEMENTS, CLOSE_ELEMENTS_OF_MANY = 5, 2
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a mesh of a certain number of elements may be like.
+
+    Attributes:
+        target: At most so many elements.
+        cell_size: Edge of a cube [m]; None: as suits.
+        min_level, max_level: Between which levels; a greatest level of None: as suits.
+        surface_error: How far the surface need not be followed any more [m], 0: as far as the number goes.
+        min_layers: So many elements through the thickness, where the number allows.
+        wishes: The user's functions.
+    """
+
+    target: int
+    cell_size: float | None
+    min_level: int
+    max_level: int | None
+    surface_error: float
+    min_layers: float
+    wishes: Wishes
+
+
+class Meshes:
+    """The meshes in one forest, by how many elements they have.
+
+    Attributes:
+        resolved: The forest.
+        count: Elements of the present mesh that hold something worth counting.
+        child: The present mesh, see `Coarsening`.
+    """
+
+    def __init__(self, resolved: Resolved, needs: np.ndarray, least: float, sliver: float):
+        self.resolved = resolved
+        self._needs, self._least = needs, least
+        self._coarsening = Coarsening(resolved, sliver)
+        self.count, self.threshold = 0, 0.0
+        self.child = np.empty(0, np.int32)
+
+    def choose(self, target: int) -> int:
+        """Make the present mesh the one of at most so many elements; how many it has, more where the coarsest has."""
+        meshed = self._coarsening.mesh
+        self.threshold = _threshold(lambda least: meshed(self._needs, least), self._needs, target, self._least)
+        self.count = meshed(self._needs, self.threshold)
+        self.child = self._coarsening.child
+        return self.count
+
+    def surface(self, threshold: float) -> np.ndarray:
+        """A mesh of the same forest, finer than that of a threshold, whose surface is to be drawn; as `child`."""
+        resolved = self.resolved
+        needs = resolved.largest(np.where(resolved.held > 0.0, resolved.grown.need, 0.0))
+        self._coarsening.mesh(np.maximum(needs, self._needs), FINER_SURFACE * threshold)
+        return self._coarsening.child
+
+
+def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Device) -> Meshes | None:
+    """The forest in which there is a mesh of as many elements as there may be, or nearly, and that mesh in it.
+
+    None if the coarsest has more.
+    """
+    best: Meshes | None = None
+    largest = 1.001 * float(np.ptp(domain.bounds, axis=0).max())
+    suits = min(predicted_cell_size(domain, budget.target), largest)
+    size = budget.cell_size or suits
+    for trial in range(MOST_CUBES):
+        meshes = _of_cubes(domain, budget, size, suits, sliver, device, spread=trial == MOST_CUBES - 1)
+        count = meshes.choose(budget.target)
+        if count <= budget.target and (best is None or count > best.count):
+            best = meshes
+        if budget.cell_size or NEAR_ENOUGH * budget.target <= count <= budget.target:
+            break
+        if budget.surface_error and count <= budget.target:
+            break
+        ratio = count / (NEAR * budget.target)
+        # Cubes larger than the body would be the whole of it.
+        size = min(size * float(np.clip(ratio ** (1.0 / 2.5), 0.5, 2.0)), largest)
+    return best
+
+
+def predicted_cell_size(domain: Domain, target: int) -> float:
+    """The edge [m] of cubes of which a body takes as many as suits a number of elements."""
+    from warp_corot.domain.reference import extent_of
+
+    volume, area = extent_of(domain)
+    low, high = 1e-6, 1.0
+    longest = float(np.ptp(domain.bounds, axis=0).max())
+    for _ in range(60):
+        share = np.sqrt(low * high)
+        size = share * longest
+        if 6.0 * volume / size**3 + 4.0 * area / size**2 > UNBISECTED * target:
+            low = share
+        else:
+            high = share
+    return float(high) * longest
+
+
+def _of_cubes(
+    domain: Domain, budget: Budget, size: float, suits: float, sliver: float, device: wp.Device, *, spread: bool
+) -> Meshes:
+    """The meshes of one size of cubes; where they are larger than what suits the number, of so many levels more."""
+    target, wishes = budget.target, budget.wishes
+    more = max(math.ceil(3.0 * math.log2(size / suits) - 0.5), 0)
+    most = more + MAX_LEVEL + (target > MANY) if budget.max_level is None else budget.max_level
+    deepest = more + MAX_LEVEL_THIN if budget.max_level is None else budget.max_level
+    looked = max(min(most + 1, CLOSE_LEVEL + more), min(deepest, budget.min_level))
+    error = max(CLOSE_ERROR * min(size, suits), 0.5 * budget.surface_error)
+    looking = Wishes(
+        error,
+        min(budget.min_level, looked),
+        looked,
+        wishes.refine_where,
+        wishes.field,
+        wishes.field_tolerance,
+        budget.min_layers,
+        min(deepest, looked + CLOSER_LEVELS),
+    )
+    room = (CLOSE_ELEMENTS if target <= MANY else CLOSE_ELEMENTS_OF_MANY) * target + 40_000
+    grown = grow(domain, size, looking, device, Closer(CLOSER_LEVELS, CLOSER_ERROR, room))
+    resolved = Resolved(grown, size, domain)
+    needs = needs_of(resolved, domain, budget.min_layers, most, deepest)
+    if spread:
+        needs = _told_apart(resolved, needs)
+    return Meshes(resolved, needs, budget.surface_error, sliver)
+
+
+def needs_of(resolved: Resolved, domain: Domain, layers: float, most: int, deepest: int) -> np.ndarray:
+    """How much each tetrahedron needs to be bisected [m], never less than what is below it; float32 [M].
+
+    Args:
+        resolved: The forest.
+        domain: The body.
+        layers: So many elements through the thickness.
+        most: Level below which the surface asks for no more.
+        deepest: And thickness neither.
+    """
+    level, length = resolved.grown.tree.level, resolved.lengths
+    needs = np.where(level < most, resolved.grown.need, 0.0)
+    if layers > 0:
+        thin = (layers * length > resolved.thin(domain, layers)) & (level < deepest)
+        needs[thin] = np.maximum(needs[thin], THIN_NEED * length[thin])
+    gaps = resolved.gaps()
+    if gaps is not None:
+        # Pieces come apart where elements of both, and one between them, have room; where none can have, it is in vain.
+        finest = resolved.cell_size * 0.5 ** (deepest / 3.0)
+        close = (GAP_ELEMENTS * length > gaps) & (gaps > GAP_ELEMENTS * finest) & (level < deepest)
+        needs[close] = np.maximum(needs[close], GAP_NEED * length[close])
+    return resolved.largest(np.where(resolved.held > 0.0, needs, 0.0)).astype(np.float32)
+
+
+def _told_apart(resolved: Resolved, needs: np.ndarray) -> np.ndarray:
+    """Needs that are never the same: the more so the farther along the body's longest side."""
+    grown = resolved.grown
+    axis = int(np.argmax(grown.cells))
+    along = grown.lattice[grown.tree.tets, axis].mean(axis=1)
+    return resolved.largest(needs * (1.0 + 0.05 * along / along.max())).astype(np.float32)
+
+
+def _threshold(meshed: Callable[[float], int], needs: np.ndarray, target: int, least: float) -> float:
+    """The threshold above ``least`` that gives so many elements, or nearly.
+
+    How many elements a mesh has goes about linearly with how many tetrahedra are above the threshold.
+    """
+    ordered = np.sort(needs[needs > max(least, 0.0)])[::-1]
+    if not len(ordered) or (count := meshed(float(least))) <= target:
+        return float(least)
+    few, many = (0, meshed(float(ordered[0]))), (len(ordered), count)
+    for trial in range(MOST_THRESHOLDS):
+        if few[1] > target or few[1] >= 0.97 * target or many[0] - few[0] <= 1:
+            break
+        if few[1] >= NEAR_ENOUGH * target and trial > 5:
+            break
+        share = (NEAR * target - few[1]) / max(many[1] - few[1], 1)
+        # Now and then in the middle, where the line is no good guess.
+        share = 0.5 if trial % 3 == 2 else min(max(share, 0.02), 0.98)
+        place = min(max(few[0] + round(share * (many[0] - few[0])), few[0] + 1), many[0] - 1)
+        last = (place, meshed(float(ordered[place])))
+        few, many = (last, many) if last[1] <= target else (few, last)
+    return float(ordered[few[0]])

@@ -1,0 +1,263 @@
+"""The mesh of a domain: grown, cut at the surface, numbered."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_count
+from warp_corot.inputs.device import checked_device
+from warp_corot.mesh.forest import Field, TetForest
+from warp_corot.mesh.lattice import MAX_LEVEL, checked_cell_size, checked_level
+from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, pruned, renumbered, with_virtual
+from warp_corot.mesh.tree import LIVE
+
+from .adapt import Closer, Wishes, grow
+from .budget import NEAR, NEAR_ENOUGH, Budget, chosen_meshes
+from .cut import label_shares, without_slivers
+from .detail import Detail
+from .growth import lattice_spacing
+from .resolved import LEAST, MOST_POINTS, Resolved, points_within
+
+if TYPE_CHECKING:
+    from warp_corot.domain import Domain
+
+#: How often a cube is bisected where nothing is said.
+MAX_LEVEL_BY_DEFAULT = 12
+#: After how many meshes one of nearly so many elements is good enough.
+MOST_MESHES = 4
+#: In how many points of an element its labels are looked at, where few elements have several.
+MOST_POINTS_EACH = 64
+#: How closely a body is looked at below the mesh's levels: surface error over an element's edge, and tetrahedra of all
+#: levels.
+CLOSER_ERROR, CLOSER_ELEMENTS = 0.2, 4_000_000
+
+
+def mesh_domain(
+    domain: Domain,
+    cell_size: float | None,
+    max_level: int | None,
+    surface_error: float | None,
+    min_level: int,
+    refine_where: Field | None,
+    field: Field | None,
+    field_tolerance: float,
+    target_elements: int | None,
+    min_layers: float,
+    detail: int,
+    sliver: float,
+    device: str | wp.Device | None,
+) -> TetForest:
+    """See `TetForest.from_domain`."""
+    where = checked_device(domain.device if device is None else device)
+    _check(cell_size, min_level, max_level, surface_error, field_tolerance, target_elements, min_layers, detail, sliver)
+    error = 0.0 if surface_error is None else float(surface_error)
+    wishes = Wishes(error, min_level, MAX_LEVEL, refine_where, field, float(field_tolerance))
+    if target_elements is not None:
+        size = None if cell_size is None else float(cell_size)
+        budget = Budget(target_elements, size, min_level, max_level, error, float(min_layers), wishes)
+        return _of_size(domain, budget, sliver, where)
+    if cell_size is None:
+        raise InputError("cell_size is None; it must be a length in metres where target_elements is not given")
+    wishes = replace(wishes, max_level=MAX_LEVEL_BY_DEFAULT if max_level is None else max_level)
+    closer = Closer(detail, CLOSER_ERROR, CLOSER_ELEMENTS) if detail else None
+    grown = grow(domain, float(cell_size), wishes, where, closer)
+    resolved = Resolved(grown, float(cell_size), domain if detail else None)
+    forest = _finished(resolved, resolved.as_wished(), domain, sliver)
+    if not detail:
+        return forest
+    return replace(forest, detail=_detail(resolved, grown.tree.first_child, domain))
+
+
+def _of_size(domain: Domain, budget: Budget, sliver: float, device: wp.Device) -> TetForest:
+    """The mesh of at most so many elements."""
+    meshes = chosen_meshes(domain, budget, sliver, device)
+    best: TetForest | None = None
+    counted, threshold = 0, 0.0
+    for _ in range(MOST_MESHES if meshes else 0):
+        assert meshes is not None
+        forest = _finished(meshes.resolved, meshes.child, domain, sliver)
+        found = len(forest.tets)
+        if found <= budget.target and (best is None or found > len(best.tets)):
+            best, threshold = forest, meshes.threshold
+        if NEAR_ENOUGH * budget.target <= found <= budget.target or meshes.count == counted:
+            break
+        # Slivers that were kept so that nothing comes apart were not counted, and others may be given up in vain.
+        counted = meshes.count
+        meshes.choose(int(NEAR * budget.target * counted / found))
+    if best is None:
+        raise InputError(
+            f"target_elements is {budget.target}; at the coarsest there are already more tetrahedra"
+            + (f", of cells of {budget.cell_size:g} m" if budget.cell_size else "")
+        )
+    assert meshes is not None
+    return replace(best, detail=_detail(meshes.resolved, meshes.surface(threshold), domain))
+
+
+class _EmptyError(InputError):
+    """No element holds anything of the body."""
+
+
+def _check(cell_size, min_level, max_level, surface_error, field_tolerance, target, min_layers, detail, sliver) -> None:
+    if cell_size is not None:
+        checked_cell_size(cell_size)
+    checked_level(min_level, "min_level")
+    if max_level is not None:
+        checked_level(max_level, "max_level")
+    checked_level(detail, "detail")
+    if not (np.isfinite(min_layers) and min_layers >= 0):
+        raise InputError(f"min_layers is {min_layers}; it must be a number of elements, 0 for no care")
+    if max_level is not None and min_level > max_level:
+        raise InputError(f"min_level is {min_level}, above max_level, which is {max_level}")
+    if surface_error is not None and not (np.isfinite(surface_error) and surface_error > 0):
+        raise InputError(f"surface_error is {surface_error}; it must be a positive length in metres, or None")
+    if not field_tolerance >= 0:
+        raise InputError(f"field_tolerance is {field_tolerance}; it must not be negative")
+    if target is not None:
+        checked_count(target, "target_elements", 1)
+    if not 0 <= sliver < 1:
+        raise InputError(f"sliver is {sliver}; it must be a share of an element's volume, from 0 to below 1")
+
+
+def _finished(resolved: Resolved, child: np.ndarray, domain: Domain, sliver: float) -> TetForest:
+    """A mesh in a grown forest by itself, without what holds nothing or next to nothing."""
+    grown, cell_size = resolved.grown, resolved.cell_size
+    tree, stays = resolved.tree_of(child)
+    tree, kept = pruned(tree, (tree.first_child < 0) & (resolved.held[stays] <= 0.0))
+    stays = stays[kept]
+    if not len(tree.leaves):
+        raise _EmptyError(
+            f"the body comes out empty: no tetrahedron of cells of {cell_size:g} m holds any of it, "
+            "with bounds " + " to ".join(str(np.round(b, 6).tolist()) for b in np.asarray(domain.bounds))
+        )
+    leaves = tree.leaves
+    held, given_up = without_slivers(
+        tree.leaf_tets, resolved.held[stays[leaves]], resolved.volume[stays[leaves]], sliver
+    )
+    if given_up.any():
+        live = np.zeros(len(tree.level), bool)
+        live[leaves[~given_up]] = True
+        tree = live_or_void(tree, live)
+    fill = (held / resolved.volume[stays[leaves]])[~given_up]
+    order = with_virtual(in_order_of_leaves(tree), tree, grown.lattice)
+    ends, renamed = renumbered(order, grown.ends, tree)
+    forest = TetForest(
+        grown.cells,
+        cell_size,
+        grown.origin,
+        grown.lattice[order],
+        ends,
+        renamed,
+        domain.up_axis,
+        phi=grown.phi[order],
+        fill=fill,
+    )
+    if domain.label_names:
+        labels = _labels(resolved, child, stays[leaves[~given_up]], domain)
+        node_labels = np.asarray(domain.labels_at(forest.lattice_points, nearest=True), np.int32)
+        forest = replace(forest, labels=labels, node_labels=node_labels, label_names=tuple(domain.label_names))
+        forest = replace(forest, labels=_with_lost(forest, domain))
+    return forest
+
+
+def _with_lost(forest: TetForest, domain: Domain) -> np.ndarray:
+    """Labels of elements; those that none has, and of which a point is known, have the one that holds it."""
+    assert forest.labels is not None
+    labels = forest.labels.copy()
+    count = np.bincount(labels, minlength=len(domain.label_names) + 1)
+    for number, name in enumerate(domain.label_names, start=1):
+        point = None if count[number] else domain.point_in(name)
+        if point is not None:
+            (element,), _ = forest.embed(point[None])
+            if count[labels[element]] > 1:
+                count[labels[element]] -= 1
+                labels[element] = number
+    return labels
+
+
+def _detail(resolved: Resolved, child: np.ndarray, domain: Domain) -> Detail:
+    """The leaves of a mesh in a grown forest that hold the surface, and borders of labels."""
+    grown = resolved.grown
+    tets = grown.tree.tets[child == LIVE]
+    wanted = (grown.phi[tets] < 0).any(axis=1)
+    if not domain.label_names:
+        tets = tets[wanted & (grown.phi[tets] >= 0).any(axis=1)]
+        return Detail.of(_points(resolved, slice(None)), tets, grown.phi, None)
+    tets = tets[wanted]
+    labels = _labels_of_nodes(resolved, tets, domain)
+    own = labels[tets]
+    tets = tets[(grown.phi[tets] >= 0).any(axis=1) | (own != own[:, :1]).any(axis=1)]
+    return Detail.of(_points(resolved, slice(None)), tets, grown.phi, labels)
+
+
+def _points(resolved: Resolved, nodes: Any) -> np.ndarray:
+    return np.asarray(resolved.grown.origin) + resolved.grown.lattice[nodes] * lattice_spacing(resolved.cell_size)
+
+
+def _labels_of_nodes(resolved: Resolved, tets: np.ndarray, domain: Domain) -> np.ndarray:
+    """Labels of the nodes of tetrahedra, int32, as many as there are lattice points."""
+    found = np.zeros(len(resolved.grown.lattice), np.int32)
+    used = np.unique(tets)
+    found[used] = domain.labels_at(_points(resolved, used), nearest=True)
+    return found
+
+
+def _labels(resolved: Resolved, child: np.ndarray, elements: np.ndarray, domain: Domain) -> np.ndarray:
+    """Labels of elements of the mesh.
+
+    An element has the label that takes most of it. A label that would be in none has the element of which it takes
+    most, unless that is another's only one.
+    """
+    grown, count = resolved.grown, len(domain.label_names)
+    tets = grown.tree.tets[resolved.leaves]
+    at_nodes = _labels_of_nodes(resolved, tets, domain)
+    place = np.full(len(child), -1, np.int64)
+    place[elements] = np.arange(len(elements))
+    owner = place[resolved.owners(child)[resolved.leaves]]
+    size = resolved.volume[resolved.leaves]
+    values, own = grown.phi[tets], at_nodes[tets]
+    alike = (own == own[:, :1]).all(axis=1)
+    mixed = np.flatnonzero(~alike)
+    shares = label_shares(values[mixed], own[mixed], count)
+    shares = _sampled_labels(resolved, resolved.leaves[mixed], shares, domain) * size[mixed, None]
+    some = np.nonzero(shares)
+    keys = np.concatenate([owner[alike] * (count + 1) + own[alike, 0], owner[mixed][some[0]] * (count + 1) + some[1]])
+    weights = np.concatenate([(resolved.shares * size)[alike], shares[some]])
+    there = np.concatenate([owner[alike], owner[mixed][some[0]]]) >= 0
+    found, index = np.unique(keys[there], return_inverse=True)
+    total = np.bincount(index.ravel(), weights[there])
+    whose, label = found // (count + 1), found % (count + 1)
+    labels = np.zeros(len(elements), np.int32)
+    order = np.argsort(total, kind="stable")
+    labels[whose[order]] = label[order]
+    for lost in np.setdiff1d(label[label > 0], labels):
+        mine = order[label[order] == lost][::-1]
+        free = np.bincount(labels, minlength=count + 1)[labels[whose[mine]]] > 1
+        if free.any():
+            labels[whose[mine[np.argmax(free)]]] = lost
+    return labels
+
+
+def _sampled_labels(resolved: Resolved, elements: np.ndarray, shares: np.ndarray, domain: Domain) -> np.ndarray:
+    """What share of elements each label takes, by random points in them; a little at least of what is at a corner.
+
+    Args:
+        resolved: The forest.
+        elements: Those in which labels vary [n].
+        shares: What they would be, were borders halfway between corners [n, labels + 1].
+        domain: The body.
+    """
+    rng, found = np.random.default_rng(0), np.zeros_like(shares)
+    each = int(np.clip(MOST_POINTS // max(len(elements), 1), 1, MOST_POINTS_EACH))
+    for part in np.array_split(np.arange(len(elements)), len(elements) * each // MOST_POINTS + 1):
+        points = points_within(resolved.grown, elements[part], resolved.cell_size, each, rng).reshape(-1, 3)
+        labels = domain.labels_at(points)
+        np.add.at(found, (np.repeat(part, each), labels), 1.0)
+    found[:, 0] = 0.0  # outside
+    total = found.sum(axis=1, keepdims=True)
+    found = np.divide(found * shares.sum(axis=1, keepdims=True), total, out=shares.copy(), where=total > 0)
+    return np.maximum(found, LEAST * shares)

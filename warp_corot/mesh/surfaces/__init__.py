@@ -1,0 +1,1 @@
+"""Surfaces of meshes, and points and surfaces that are bound to them."""

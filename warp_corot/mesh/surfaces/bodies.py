@@ -1,0 +1,139 @@
+"""What a forest made from a domain is as a body: its surfaces, what is bound to it, its pieces."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.errors import InputError
+from warp_corot.inputs.indices import checked_indices
+from warp_corot.mesh.growing.cut import connected
+from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, renumbered, with_virtual
+
+from .bound import BoundPoints, SurfaceMesh
+from .boundary import boundary_faces
+from .marching import marched
+from .separating import separated
+
+if TYPE_CHECKING:
+    from warp_corot.mesh.forest import TetForest
+    from warp_corot.mesh.tetmesh import TetMesh
+
+
+def surface(forest: TetForest) -> SurfaceMesh:
+    """See `TetForest.surface`."""
+    if forest.phi is None:
+        return _boundary(forest)
+    if forest.detail is not None:
+        return forest.detail.surface(forest)
+    return _on_nodes(forest, marched(forest.lattice_points, _all_cut(forest), forest.phi))
+
+
+def separating_surface(forest: TetForest) -> SurfaceMesh:
+    """See `TetForest.separating_surface`."""
+    if forest.phi is None or forest.node_labels is None:
+        raise InputError("this mesh has no labels; they come from a domain that has")
+    if forest.detail is not None:
+        return forest.detail.separating_surface(forest)
+    return _on_nodes(forest, separated(forest.lattice_points, _all_cut(forest), forest.phi, forest.node_labels))
+
+
+def bind(mesh: TetForest | TetMesh, points: np.ndarray, triangles: npt.ArrayLike | None) -> BoundPoints:
+    """See `TetForest.bind`."""
+    elements, weights = mesh.embed(points)
+    nodes = mesh.tets[elements]
+    rest = np.array(points, dtype=np.float64)
+    if triangles is None:
+        return BoundPoints(rest, nodes, weights)
+    faces = np.asarray(triangles)
+    if faces.ndim != 2 or faces.shape[1] != 3:
+        raise InputError(f"triangles has shape {faces.shape}; it must be [F, 3]")
+    checked_indices(faces.ravel(), len(rest), "point")
+    return SurfaceMesh(rest, nodes, weights, faces.astype(np.int32))
+
+
+def pieces(forest: TetForest) -> np.ndarray:
+    """See `TetForest.pieces`."""
+    piece = np.unique(connected(forest.tets), return_inverse=True)[1]
+    rank = np.argsort(np.argsort(-np.bincount(piece), kind="stable"), kind="stable")
+    return rank[piece].astype(np.int32)
+
+
+def largest_piece(forest: TetForest) -> TetForest:
+    """See `TetForest.largest_piece`."""
+    kept = pieces(forest) == 0
+    if kept.all():
+        return forest
+    live = np.zeros(len(forest.tree.level), bool)
+    live[forest.tree.leaves[kept]] = True
+    tree = live_or_void(forest.tree, live)
+    order = with_virtual(in_order_of_leaves(tree), tree, forest.lattice)
+    ends, tree = renumbered(order, forest.node_ends, tree)
+    phi = None
+    if forest.phi is not None:
+        phi = forest.phi.copy()
+        gone = np.unique(forest.tets[~kept])
+        phi[gone] = np.abs(phi[gone])
+    return replace(
+        forest,
+        lattice=forest.lattice[order],
+        node_ends=ends,
+        tree=tree,
+        phi=None if phi is None else phi[order],
+        node_labels=None if forest.node_labels is None else forest.node_labels[order],
+        fill=None if forest.fill is None else forest.fill[kept],
+        labels=None if forest.labels is None else forest.labels[kept],
+        detail=None if forest.detail is None else forest.detail.within(forest, kept),
+    )
+
+
+def summary(forest: TetForest) -> list[str]:
+    """See `TetForest.summary`."""
+    x, y, z = forest.cells
+    count = len(forest.tets)
+    lines = [f"{count} tetrahedra, {forest.node_count} nodes, from {x} x {y} x {z} cubes of {forest.cell_size:g} m"]
+    for level, number in enumerate(np.bincount(forest.levels)):
+        if number:
+            lines.append(f"level {level}, type {level % 3}: {number}")
+    volume = float(np.sum(forest.volumes))
+    if forest.fill is not None:
+        inside = float(np.sum(forest.fill * forest.volumes))
+        cut = np.count_nonzero(forest.fill != 1.0)
+        lines.append(f"{inside:.6g} m^3 of body in {volume:.6g} m^3 of tetrahedra, {cut} of which are cut")
+    lines += [f"label {name}: {np.count_nonzero(forest.elements_of(name))} tetrahedra" for name in forest.label_names]
+    sizes = np.bincount(pieces(forest))
+    if len(sizes) > 1:
+        shown = ", ".join(str(n) for n in sizes[:5]) + (", ..." if len(sizes) > 5 else "")
+        lines.append(f"{len(sizes)} separate pieces, of {shown} tetrahedra")
+    return lines
+
+
+def _all_cut(forest: TetForest) -> np.ndarray:
+    """Nodes of all leaves that hold something, also of those given up for holding too little, int32 [n, 4]."""
+    assert forest.phi is not None
+    tets = forest.tree.tets[forest.tree.first_child < 0]
+    return tets[(forest.phi[tets] < 0).any(axis=1)]
+
+
+def _on_nodes(forest: TetForest, found: SurfaceMesh) -> SurfaceMesh:
+    """The surface with points that are bound to no nodes of the mesh bound to the nearest element's."""
+    lost = np.flatnonzero(((found.nodes >= forest.node_count) & (found.weights != 0)).any(axis=1))
+    unused = found.nodes >= forest.node_count
+    nodes = np.where(unused, found.nodes.min(axis=1, keepdims=True), found.nodes)
+    weights = found.weights.copy()
+    if len(lost):
+        elements, weights[lost] = forest.embed(found.points[lost])
+        nodes[lost] = forest.tets[elements]
+    return replace(found, nodes=nodes.astype(np.int32), weights=weights)
+
+
+def _boundary(forest: TetForest) -> SurfaceMesh:
+    faces, _ = boundary_faces(forest.tets, forest.points)
+    used, triangles = np.unique(faces, return_inverse=True)
+    weights = np.zeros((len(used), 4))
+    weights[:, 0] = 1.0
+    nodes = np.repeat(used[:, None], 4, axis=1).astype(np.int32)
+    return SurfaceMesh(forest.points[used], nodes, weights, triangles.reshape(-1, 3).astype(np.int32))

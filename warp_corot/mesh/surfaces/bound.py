@@ -1,0 +1,149 @@
+"""Points and surfaces that go along with a mesh: each bound to up to four of its nodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.errors import InputError
+from warp_corot.kernels.meshing import embedding as kernels
+
+
+@dataclass(frozen=True, eq=False)
+class BoundPoints:
+    """Points that follow the deformation of a mesh.
+
+    Attributes:
+        points: Rest positions [m], float64 [V, 3].
+        nodes: The mesh's nodes that each point is bound to, int32 [V, 4].
+        weights: How much each counts, float64 [V, 4]; they sum to one.
+    """
+
+    points: np.ndarray
+    nodes: np.ndarray
+    weights: np.ndarray
+
+    def moved(self, displacements: npt.ArrayLike) -> np.ndarray:
+        """Positions [m], float64 [V, 3], when the mesh's nodes are displaced by [N, 3] [m]."""
+        u = np.asarray(displacements, dtype=np.float64)
+        return self.points + np.einsum("vn,vnc->vc", self.weights, u[self.nodes])
+
+    def on_device(self, device: str | wp.Device | None = None) -> DeviceBinding:
+        """What moves the points on a device."""
+        return DeviceBinding(self, wp.get_device(device))
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceMesh(BoundPoints):
+    """A triangle surface that follows the deformation of a mesh.
+
+    Attributes:
+        triangles: int32 [F, 3], wound counter-clockwise seen from outside.
+        sides: Labels behind and in front of each triangle, int32 [F, 2], 0 outside; None where there is one body only.
+    """
+
+    triangles: np.ndarray
+    sides: np.ndarray | None = None
+
+    @property
+    def ends(self) -> np.ndarray:
+        """The two nodes of the edge that a point of a marched surface sits on, int32 [V, 2], twice the same where it is
+        a node; its place is ``weights[:, 1]`` of the way. Points on an edge that is no part of the mesh (of an element
+        that held too little) are bound to four nodes of the nearest element instead."""
+        return self.nodes[:, :2]
+
+    @cached_property
+    def normals(self) -> np.ndarray:
+        """Unit normals of the points at rest, outward, weighted by the triangles' areas, float64 [V, 3]."""
+        return vertex_normals(self.points, self.triangles)
+
+    @property
+    def area(self) -> float:
+        """[m^2]."""
+        return float(0.5 * np.linalg.norm(self._doubled_areas, axis=1).sum())
+
+    @property
+    def volume(self) -> float:
+        """What the surface encloses [m^3]."""
+        # About its own middle, so that a body far from the origin loses no digits.
+        x = self.points - self.points.mean(axis=0)
+        return float(np.einsum("fc,fc->", x[self.triangles[:, 0]], self._doubled_areas) / 6.0)
+
+    @property
+    def euler_characteristic(self) -> int:
+        """Vertices less edges plus triangles: 2 for a ball, 0 for a torus."""
+        edges = np.sort(np.concatenate([self.triangles[:, [i, j]] for i, j in ((0, 1), (1, 2), (2, 0))]), axis=1)
+        used = len(np.unique(self.triangles))
+        return used - len(np.unique(edges, axis=0)) + len(self.triangles)
+
+    def of_label(self, label: int) -> SurfaceMesh:
+        """The closed surface around one label alone, out of a surface with ``sides``.
+
+        Args:
+            label: Its number, its place in ``label_names`` plus one.
+
+        Raises:
+            InputError: The surface has no sides, or none of that label.
+        """
+        if self.sides is None:
+            raise InputError("this surface is around one body; surfaces between labels come from separating_surface()")
+        behind, front = (self.sides == label).T
+        if not (behind | front).any():
+            raise InputError(f"label {label} has no surface; there are {np.unique(self.sides).tolist()}")
+        triangles = np.concatenate([self.triangles[behind], self.triangles[front][:, ::-1]])
+        used, triangles = np.unique(triangles, return_inverse=True)
+        return SurfaceMesh(
+            self.points[used], self.nodes[used], self.weights[used], triangles.reshape(-1, 3).astype(np.int32)
+        )
+
+    @property
+    def _doubled_areas(self) -> np.ndarray:
+        a, b, c = np.moveaxis(self.points[self.triangles], 1, 0)
+        return np.cross(b - a, c - a)
+
+
+class DeviceBinding:
+    """Bound points on a device: their positions and, of a surface, their normals, brought up to date by kernels.
+
+    Attributes:
+        positions: [m], vec3 [V].
+        normals: Unit vectors, vec3 [V]; None for points without triangles.
+    """
+
+    def __init__(self, bound: BoundPoints, device: wp.Device):
+        self.device = device
+        self.rest = wp.array(bound.points, dtype=wp.vec3, device=device)
+        self.nodes = wp.array(bound.nodes, dtype=wp.vec4i, device=device)
+        self.weights = wp.array(bound.weights, dtype=wp.vec4, device=device)
+        self.positions = wp.clone(self.rest)
+        self.triangles: Any = None
+        self.normals: Any = None
+        if isinstance(bound, SurfaceMesh):
+            self.triangles = wp.array(bound.triangles, dtype=wp.vec3i, device=device)
+            self.normals = wp.array(bound.normals, dtype=wp.vec3, device=device)
+
+    def update(self, displacements: wp.array) -> None:
+        """Move the points, and turn the normals, with displacements of the nodes [m], vec3 [N] on the same device."""
+        inputs = [self.rest, self.nodes, self.weights, displacements]
+        wp.launch(kernels.move_points, len(self.rest), inputs, [self.positions], device=self.device)
+        if self.triangles is not None:
+            self.normals.zero_()
+            inputs = [self.positions, self.triangles]
+            wp.launch(kernels.add_triangle_normals, len(self.triangles), inputs, [self.normals], device=self.device)
+            wp.launch(kernels.normalize_all, len(self.normals), [], [self.normals], device=self.device)
+
+
+def vertex_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Unit normals of vertices, weighted by the areas of their triangles, [V, 3]."""
+    a, b, c = np.moveaxis(points[triangles], 1, 0)
+    face = np.cross(b - a, c - a)
+    normals = np.column_stack(
+        [np.bincount(triangles.ravel(), np.repeat(face[:, axis], 3), len(points)) for axis in range(3)]
+    )
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)

@@ -1,0 +1,86 @@
+"""Points in tetrahedra of any shape: which one holds each, found in a tree of their boxes."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from warp_corot.errors import InputError
+from warp_corot.kernels.meshing import embedding as kernels
+
+from .boundary import boundary_faces
+
+#: Points farther away than so many lengths of the mesh count as that far: beyond, float32 tells no distances apart.
+FARTHEST = 1.0e3
+
+
+def checked_points(points: np.ndarray) -> np.ndarray:
+    """Points float64 [n, 3].
+
+    Raises:
+        InputError: Another shape, or not finite.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"points has shape {points.shape}; it must be [n, 3]")
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(bad):
+        raise InputError(f"point {bad[0]} is {points[bad[0]].tolist()}; its coordinates must be finite")
+    return points
+
+
+def embed_in_tets(nodes: np.ndarray, tets: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The tetrahedron that holds each point, or the one behind the nearest face, and the point's place in it.
+
+    Args:
+        nodes: float64 [N, 3].
+        tets: int32 [T, 4].
+        points: [n, 3].
+
+    Returns:
+        Tetrahedra int32 [n], and barycentric coordinates float64 [n, 4], some negative where a point lies outside.
+
+    Raises:
+        InputError: Not [n, 3], or not finite.
+    """
+    points = checked_points(points)
+    device = wp.get_device("cpu")
+    # About the middle of the mesh, as float32 keeps few digits far from zero.
+    middle = nodes[tets].reshape(-1, 3).mean(axis=0)
+    placed, moved = nodes - middle, points - middle
+    size = float(np.ptp(placed, axis=0).max())
+    corners = placed[tets]
+    low, high = corners.min(axis=1) - 1e-6 * size, corners.max(axis=1) + 1e-6 * size
+    lowers, uppers = (wp.array(x.astype(np.float32), dtype=wp.vec3, device=device) for x in (low, high))
+    tree = wp.Bvh(lowers, uppers)
+    moved = moved * (FARTHEST * size / np.maximum(np.abs(moved).max(axis=1, keepdims=True), FARTHEST * size))
+    at = wp.array(moved, dtype=wp.vec3d, device=device)
+    inverse = np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2))
+    inputs = [
+        tree.id,
+        at,
+        wp.array(corners[:, 0], dtype=wp.vec3d, device=device),
+        wp.array(inverse, dtype=wp.mat33d, device=device),
+    ]
+    found = wp.empty(len(points), dtype=wp.int32, device=device)
+    wp.launch(kernels.find_holders, len(points), inputs, [found], device=device)
+    elements = found.numpy()
+    outside = np.flatnonzero(elements < 0)
+    if len(outside):
+        faces, parents = boundary_faces(tets, nodes)
+        elements[outside] = parents[nearest_faces(placed, faces, moved[outside], 10.0 * FARTHEST * size)]
+    later = np.einsum("nij,nj->ni", inverse[elements], points - middle - corners[elements, 0])
+    return elements, np.column_stack([1.0 - later.sum(axis=1), later])
+
+
+def nearest_faces(nodes: np.ndarray, faces: np.ndarray, points: np.ndarray, far: float) -> np.ndarray:
+    """The triangle closest to each point, int32 [n]."""
+    device = wp.get_device("cpu")
+    mesh = wp.Mesh(
+        wp.array(nodes, dtype=wp.vec3, device=device),
+        wp.array(np.ascontiguousarray(faces, dtype=np.int32).ravel(), dtype=wp.int32, device=device),
+    )
+    given = wp.array(points, dtype=wp.vec3, device=device)
+    closest = wp.empty(len(points), dtype=wp.int32, device=device)
+    wp.launch(kernels.nearest_faces, len(points), [given, mesh.id, far], [closest], device=device)
+    return closest.numpy()

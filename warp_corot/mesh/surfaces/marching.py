@@ -1,0 +1,99 @@
+"""Marching tetrahedra: the zero surface of the linear interpolant.
+
+A vertex sits on each edge between a node inside and one outside, so triangles share vertices by sharing edges. A node
+at exactly zero counts as a tiny bit outside: all vertices around it become one, and triangles that lose a side vanish.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from warp_corot.mesh.growing.cut import codes
+
+from .bound import SurfaceMesh
+from .boundary import signed_volumes
+
+Array = np.ndarray
+
+
+def _triangles_by_code() -> list[list[list[tuple[int, int]]]]:
+    """For each set of inside nodes the triangles, of (inside node, outside node) corners, in a right-handed element."""
+    tables: list[list[list[tuple[int, int]]]] = []
+    for code in range(16):
+        inside = [n for n in range(4) if code >> n & 1]
+        outside = [n for n in range(4) if n not in inside]
+        order = inside + outside
+        odd = sum(a > b for a, b in itertools.combinations(order, 2)) % 2
+        faces: list[list[tuple[int, int]]] = []
+        if len(inside) == 1:
+            faces = [[(inside[0], b) for b in outside]]
+        elif len(inside) == 3:
+            faces = [[(a, outside[0]) for a in inside]]
+        elif len(inside) == 2:
+            (a, b), (c, d) = inside, outside
+            faces = [[(a, c), (a, d), (b, d)], [(a, c), (b, d), (b, c)]]
+        tables.append([face[::-1] if odd else face for face in faces])
+    return tables
+
+
+TRIANGLES = _triangles_by_code()
+
+
+def marched(points: Array, tets: Array, values: Array) -> SurfaceMesh:
+    """The surface where the linear interpolant of nodal values is zero.
+
+    Args:
+        points: Positions of the nodes [m], float64 [n, 3].
+        tets: Nodes of the elements, int32 [T, 4].
+        values: Signed function at the nodes, negative inside [n].
+
+    Returns:
+        The surface, wound so that it is seen counter-clockwise from outside. Its points are bound to the two ends of
+        their edges, the inner one first.
+    """
+    inside = values[tets] < 0
+    code = codes(inside)
+    cut = np.flatnonzero((code > 0) & (code < 15))
+    code, tets = code[cut], tets[cut]
+    mirrored = signed_volumes(points, tets) < 0
+    corners = []
+    for kind in range(1, 15):
+        chosen = np.flatnonzero(code == kind)
+        for face in TRIANGLES[kind]:
+            ends = tets[chosen][:, np.array(face)]
+            turned = mirrored[chosen]
+            ends[turned] = ends[turned][:, ::-1]
+            corners.append(ends)
+    return _merged_surface(points, np.concatenate(corners), values)
+
+
+def _merged_surface(points: Array, corners: Array, values: Array) -> SurfaceMesh:
+    """Triangles with corners on edges [F, 3, 2], inner end first, as a surface with shared vertices."""
+    ends = corners.reshape(-1, 2).astype(np.int64)
+    at_node = values[ends[:, 1]] == 0
+    ends[at_node, 0] = ends[at_node, 1]
+    keys, place = np.unique(ends[:, 0] << 32 | ends[:, 1], return_inverse=True)
+    a, b = keys >> 32, keys & 0xFFFFFFFF
+    inner, outer = values[a].astype(np.float64), values[b].astype(np.float64)
+    t = np.divide(inner, inner - outer, out=np.zeros(len(keys)), where=a != b)
+    triangles = place.reshape(-1, 3)
+    triangles = _without_flat(triangles, a == b)
+    used, triangles = np.unique(triangles, return_inverse=True)
+    a, b, t = a[used], b[used], t[used]
+    x = points[a] + t[:, None] * (points[b] - points[a])
+    nodes = np.stack([a, b, a, a], axis=1).astype(np.int32)
+    weights = np.stack([1 - t, t, 0 * t, 0 * t], axis=1)
+    return SurfaceMesh(x, nodes, weights, triangles.reshape(-1, 3).astype(np.int32))
+
+
+def _without_flat(triangles: Array, at_node: Array) -> Array:
+    """Without triangles that lost a side, and without pairs that lie on one another back to back."""
+    a, b, c = triangles.T
+    triangles = triangles[(a != b) & (b != c) & (c != a)]
+    whole = np.flatnonzero(at_node[triangles].all(axis=1))
+    if not len(whole):
+        return triangles
+    _, which, count = np.unique(np.sort(triangles[whole], axis=1), axis=0, return_inverse=True, return_counts=True)
+    return np.delete(triangles, whole[count[which.ravel()] == 2], axis=0)

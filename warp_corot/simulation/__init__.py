@@ -1,0 +1,16 @@
+"""Bodies in motion: what a user steps."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .simulation import Simulation
+
+__all__ = ["Simulation"]
+
+
+def __getattr__(name: str) -> Any:
+    """The class is imported when it is asked for, since its parts lie in this folder too."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(".simulation", __name__), name)

@@ -1,0 +1,83 @@
+"""What a simulation is made of, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.elasticity import Model
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_things
+from warp_corot.solvers import Integrator
+
+
+def checked_bodies(given: SoftBody | Sequence[SoftBody]) -> tuple[SoftBody, ...]:
+    """One or several bodies that can be stepped together.
+
+    Raises:
+        InputError: None, one given twice, on different devices or in different numbers of worlds, one without a free
+            node, or something else.
+    """
+    bodies = checked_things(given, SoftBody, "body", "a SoftBody")
+    if not bodies:
+        raise InputError("a simulation needs at least one body")
+    if len(set(bodies)) < len(bodies):
+        raise InputError("a body is given twice; each can be stepped once only")
+    first = bodies[0]
+    for body in bodies:
+        if body.worlds != first.worlds:
+            raise InputError(f"bodies are in {first.worlds} and {body.worlds} worlds; they must be in as many")
+        if body.device != first.device:
+            raise InputError(f"bodies are on {first.device} and {body.device}; they must be on one device")
+        if not (body.node_inverse_mass.numpy() > 0).any():
+            raise InputError(f"all {body.node_count} nodes of the body are held; at least one must be free to move")
+    return bodies
+
+
+def checked_models(given: Model | Sequence[Model], count: int) -> tuple[Model, ...]:
+    """A model for each body; one given alone is everybody's.
+
+    Raises:
+        InputError: Another number of models, or something else.
+    """
+    models = checked_things(given, Model, "model", "a model such as Corotated()")
+    if isinstance(given, Model):
+        models *= count
+    if len(models) != count:
+        raise InputError(f"there are {len(models)} models for {count} bodies")
+    return models
+
+
+def checked_integrator(given: Any) -> Integrator:
+    """A time integrator.
+
+    Raises:
+        InputError: Something else.
+    """
+    if not isinstance(given, Integrator):
+        raise InputError(f"integrator is {given!r}; it must be an integrator such as SymplecticEuler()")
+    return given
+
+
+def checked_gravity(gravity: npt.ArrayLike | None, up_axis: str) -> tuple[float, float, float]:
+    """A vector [m/s^2], by default 9.81 against the up axis.
+
+    Raises:
+        InputError: Not three finite numbers.
+    """
+    if gravity is None:
+        down = np.zeros(3)
+        down["XYZ".index(up_axis)] = -9.81
+    else:
+        try:
+            down = np.asarray(gravity, dtype=np.float64)
+        except (TypeError, ValueError):
+            down = np.empty(0)
+        if down.shape != (3,) or not np.isfinite(down).all():
+            raise InputError(f"gravity is {gravity!r}; it must be three finite accelerations in m/s^2")
+    x, y, z = (float(a) for a in down)
+    return x, y, z

@@ -1,0 +1,300 @@
+"""Runs of a simulation: how many steps come before something else is due, and what becomes of a state gone wrong.
+
+``Simulation.advance`` asks for steps until a time. They are made in runs, which end where a check, a hook or a pass of
+remeshing is due. The host plans a run from what the device last reported, launches it (``solvers.recorded``), and waits
+once, for the report at its end (``solvers.guard``): the ordinary call of ``advance`` is one run.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from warp_corot.elasticity import StVenantKirchhoff
+from warp_corot.errors import StabilityWarning, UnstableError, depth_of_user
+from warp_corot.kernels.stepping.pace import GROWTH
+from warp_corot.solvers.guarding.energy_control import EnergyControl
+from warp_corot.solvers.guarding.guard import Fault
+from warp_corot.solvers.recorded import Segment
+
+if TYPE_CHECKING:
+    from .simulation import Simulation
+
+#: How often the step is halved to come over one place.
+MOST_RETURNS = 6
+#: How often it is halved for a little energy from nowhere, as comes with crushed elements also of the shortest steps.
+STRICT_RETURNS = 4
+#: Steps made one at a time from one look at where nodes are to the next.
+LOOK_STEPS = 256
+#: Steps after which a state is judged by elastic energies, which take as long as some steps, where a run ends; bodies
+#: that were not found calm sooner.
+JUDGED_STEPS = 64
+JUDGED_STRAINED = 16
+#: Longer runs are looked after in between.
+MOST_INTERVALS = 1000
+#: A step that was less than this share of the longest may have grown after some measurements.
+GROWN = 0.98
+#: What a measurement is expected to leave of the step of a strained body, which the state tells by this share of the
+#: longest step.
+SHRINKING = 0.95
+
+
+class Running:
+    """Makes the steps of a simulation.
+
+    Args:
+        sim: The simulation.
+    """
+
+    def __init__(self, sim: Simulation):
+        self._sim = sim
+        self._energies = EnergyControl(sim.guard, sim.recorded, sim.safe_step)
+        self._returns = 0
+        #: The time at which the state was found to be wrong, while it has not been passed.
+        self._wrong_until = -math.inf
+        self._has_warned = False
+        self._steps_called = 0
+        #: Whether the last run may have ended with steps shorter than what the state allows.
+        self._shortened = True
+        self._steps_made = 0
+        #: Steps done when elastic energies were last looked at.
+        self._judged = 0
+
+    def step(self) -> None:
+        """Make one step, with a measurement before it where one is due."""
+        sim = self._sim
+        position = sim.steps if sim.device.is_cpu else self._steps_made
+        self._steps_made = position + 1
+        recorded = sim.recorded
+        self._energies.go_on(position)
+        segment = Segment(1, adopts=True, publishes=True)
+        if sim.safe_step is not None:
+            measured = 0 if position % recorded.interval else recorded.interval
+            segment = replace(segment, resumes=self._shortened, measured=measured)
+            self._shortened = False
+        recorded.replay(segment)
+
+    def make(self, count: int) -> None:
+        """Make so many steps, with hooks and passes."""
+        sim = self._sim
+        end = sim.total_steps + count
+        self._energies.begin()
+        while (left := end - sim.total_steps) > 0:
+            self._run(left, None)
+
+    def make_until(self, total_time: float) -> None:
+        """Make steps until a time [s], exactly; only if the step is the simulation's to choose."""
+        sim = self._sim
+        self._energies.begin()
+        while sim.total_time < total_time:
+            if self._run(MOST_INTERVALS * sim.recorded.interval, total_time - sim.time_before_reset):
+                break
+
+    def look(self) -> None:
+        """See that the state is finite, and now and then that nodes are within reach.
+
+        Raises:
+            UnstableError: They are not.
+        """
+        guard = self._sim.guard
+        fault = guard.not_finite()
+        if fault is None and self._sim.steps % LOOK_STEPS == 0:
+            fault = guard.beyond_reach()
+        if fault is not None:
+            raise UnstableError(self._message(fault))
+
+    # --- one run ---------------------------------------------------------------------------------------------------
+
+    def _run(self, most: int, end: float | None) -> bool:
+        """Make steps until something is due, and do it; whether the end is reached."""
+        sim = self._sim
+        if sim.guard.begin() and sim.safe_step is not None:
+            sim.pace.take_given()
+        done = sim.steps
+        segments, stop = self._plan(done, min(most, self._until_due(done)), end)
+        now = self._steps_made = done + sum(segment.count for segment in segments)
+        whole = now % self._check_steps == 0 or bool(self._returns)
+        judged = whole or self._is_to_be_judged(now)
+        sim.guard.order(end, stop)
+        for number, segment in enumerate(segments):
+            last = number == len(segments) - 1
+            sim.recorded.replay(segment.placed(begins=number == 0, ends=last, whole=last and judged))
+        passed = self._check(now, whole, judged)
+        self._judged = sim.steps if judged or now < self._judged else self._judged
+        if sim.guard.was_given:
+            self._energies.begin_anew()
+        # Where short runs end does not count: the same run in one would take other steps.
+        if whole or not passed:
+            self._energies.choose_intervals(checked=passed)
+        if not passed:
+            return False
+        reached = end is not None and sim.time >= end
+        if sim.remeshing.is_due(now):
+            sim.follow_motion()
+            sim.guard.forget()
+        if any(now % every == 0 for every in sim.hook_intervals) and sim.total_steps > self._steps_called:
+            self._steps_called = sim.total_steps
+            sim.call_hooks()
+        return reached
+
+    def _is_to_be_judged(self, steps: int) -> bool:
+        """Whether to look at elastic energies, only to see whether the state is good, after so many steps."""
+        sim = self._sim
+        if sim.safe_step is None:
+            return False
+        return steps - self._judged >= (JUDGED_STEPS if sim.recorded.calm > 0 else JUDGED_STRAINED)
+
+    def _until_due(self, done: int) -> int:
+        """Steps until a check, a pass or a hook is due."""
+        sim = self._sim
+        every = [self._check_steps, *sim.hook_intervals]
+        if sim.remeshing.every:
+            every.append(sim.remeshing.every)
+        return min(n - done % n for n in every)
+
+    @property
+    def _check_steps(self) -> int:
+        return self._sim.recorded.interval if self._returns else self._energies.check_steps
+
+    # --- what a run is to be ---------------------------------------------------------------------------------------
+
+    def _plan(self, done: int, most: int, end: float | None) -> tuple[list[Segment], int]:
+        """At most so many steps, and how many are done when they end in time.
+
+        The last steps before ``end`` are as many as they would be of the length that the device reported last. Where a
+        measurement within the run allows longer ones they are shorter than that; where it allows only shorter ones the
+        run ends before ``end``, and another one follows.
+        """
+        sim = self._sim
+        if sim.safe_step is None:
+            return [Segment(most)], 0
+        every, last = sim.recorded.interval, done + most
+        left = math.inf if end is None else end - sim.time
+        shortened, self._shortened = sim.safe_step.is_shortened, True
+        segments: list[Segment] = []
+        sure = stop = 0
+        while done < last:
+            phase = done % every
+            if phase == 0 and not sure and not stop:
+                if any(segment.measured for segment in segments) and self._may_have_grown():
+                    break
+                sure = self._sure_intervals(left)
+            if not stop and not (sure and phase == 0):
+                needed = self._steps_for(left, -done % every)
+                stop = done + int(needed) if needed <= 2 * every else 0
+            count = min(last - done, every - phase, stop - done if stop else every)
+            measured = 0 if phase else every
+            resumes = shortened and (measured > 0 or not stop)
+            segments.append(Segment(count, resumes=resumes, measured=measured, fits=stop > 0))
+            shortened = stop > 0
+            done += count
+            left -= count * sim.safe_step.allowed
+            sure = max(sure - (phase == 0), 0)
+            if done == stop:
+                break
+        return segments, stop
+
+    def _steps_for(self, left: float, before: int) -> float:
+        """Steps for some time that is left [s], as far as can be known ``before`` so many steps, when they are measured
+        again."""
+        safe = self._sim.safe_step
+        assert safe is not None
+        if math.isinf(left):
+            return math.inf
+        allowed = safe.allowed
+        expected = allowed * (SHRINKING if allowed < SHRINKING * safe.at_rest else 1.0)
+        steps = _steps(left, allowed)
+        return steps if steps <= before else before + _steps(left - before * allowed, expected)
+
+    def _sure_intervals(self, left: float) -> int:
+        """Whole intervals after which there is still some time left, even if the step grows as fast as it may."""
+        safe = self._sim.safe_step
+        assert safe is not None
+        if math.isinf(left):
+            return MOST_INTERVALS
+        interval, longest = self._sim.recorded.interval, safe.at_rest
+        growth = float(GROWTH)
+        dt = min(growth * safe.allowed, longest)
+        count = 0
+        left -= 2 * interval * dt
+        while count < MOST_INTERVALS and left >= interval * dt:
+            left -= interval * dt
+            dt = min(growth * dt, longest)
+            count += 1
+        return count
+
+    def _may_have_grown(self) -> bool:
+        """Whether steps may have become much longer since the device reported, so that fewer do."""
+        safe = self._sim.safe_step
+        assert safe is not None
+        share, allowed, at_rest = safe.shares
+        return share * allowed < GROWN * at_rest
+
+    # --- what became of it -----------------------------------------------------------------------------------------
+
+    def _check(self, now: int, whole: bool, judged: bool) -> bool:
+        """Check the state, by elastic energies too if these were found, which count if asked to; False if it was put
+        back."""
+        sim = self._sim
+        strict = sim.safe_step is not None and self._returns < STRICT_RETURNS
+        fault = sim.guard.check(whole=judged, counts=whole, strict=strict, lenient=sim.safe_step is not None)
+        if fault is not None:
+            self._go_back(fault)
+            return False
+        if self._returns and sim.time > self._wrong_until:
+            self._returns = 0
+        if whole:
+            self._energies.follow(now)
+        return True
+
+    def _go_back(self, fault: Fault) -> None:
+        """Go on from the last good state with half the step.
+
+        Raises:
+            UnstableError: The step was given, or no shorter one helps.
+        """
+        sim = self._sim
+        if sim.safe_step is None or self._returns >= MOST_RETURNS:
+            self._returns = 0
+            sim.guard.forget()
+            raise UnstableError(self._message(fault))
+        if not self._returns:
+            self._wrong_until = sim.time
+        self._returns += 1
+        sim.guard.go_back()
+        self._energies.halve(sim.steps)
+        if not self._has_warned and not fault.is_slight:
+            self._has_warned = True
+            message = (
+                f"the state went wrong by t = {self._wrong_until:.4g} s ({fault.what}); the simulation goes on from "
+                f"t = {sim.time:.4g} s with half the step, and does the same without a word if that happens again"
+            )
+            warnings.warn(message, StabilityWarning, stacklevel=depth_of_user())
+
+    def _message(self, fault: Fault) -> str:
+        sim = self._sim
+        more = f" and {len(fault.worlds) - 3} more" if len(fault.worlds) > 3 else ""
+        where = f" in world {', '.join(map(str, fault.worlds[:3]))}{more}" if sim.worlds > 1 else ""
+        if fault.step is None:
+            when = f"at step {sim.steps} (t = {sim.time:.4g} s)"
+        else:
+            when = f"since step {fault.step} (t = {sim.pace.time_at(fault.step):.4g} s)"
+        steps = f"dt is {sim.pace.dt:.3g} s, the largest stable step at rest about {sim.stable_dt:.3g} s"
+        return f"{fault.what} {when}{where}; {steps}{self._advice()}"
+
+    def _advice(self) -> str:
+        sim = self._sim
+        if any(getattr(model, "rotation_level", None) is not None for model in sim.models):
+            return "; shared rotations have no energy, so that strong bending may need rotation_level=None"
+        if any(isinstance(model, StVenantKirchhoff) for model in sim.models):
+            return "; StVenantKirchhoff has no energy barrier against being crushed: take NeoHookean or Corotated"
+        if sim.safe_step is None:
+            return ": take a shorter step, or dt=None, which follows the state"
+        return f"; {MOST_RETURNS} times half the step did not help: look for loads or motions that crush the body"
+
+
+def _steps(seconds: float, dt: float) -> int:
+    """Whole steps that take some time, if they are as long as dt or a little shorter [s]."""
+    return max(math.ceil(seconds / dt * (1.0 - 1e-9)), 1)

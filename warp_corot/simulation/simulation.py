@@ -1,0 +1,369 @@
+"""Bodies in motion: an elastic model, an integrator and gravity, stepped in recorded graphs."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from os import PathLike
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.discretization.nodal import vec3_view
+from warp_corot.elasticity import Corotated, Model
+from warp_corot.errors import InputError, StabilityWarning, depth_of_user
+from warp_corot.inputs.checks import checked_count, checked_number, refuse_tape
+from warp_corot.inputs.indices import checked_indices
+from warp_corot.remesh.online import OnlineRemesh
+from warp_corot.remesh.remeshing import Remeshing
+from warp_corot.solvers import Integrator, SymplecticEuler, largest_frequency
+from warp_corot.solvers.guarding.guard import Guard
+from warp_corot.solvers.integrator import NEVER, StepContext
+from warp_corot.solvers.recorded import RecordedSteps, Segment
+from warp_corot.solvers.steps.pace import Pace
+from warp_corot.solvers.steps.safe_step import ANY_STEP, SafeStep
+
+from .energy import Energy, WorldEnergies, find_energies
+from .parts import checked_bodies, checked_gravity, checked_integrator, checked_models
+from .running import Running
+
+
+@dataclass(frozen=True)
+class _Hook:
+    callback: Callable[[Simulation], None]
+    every: int
+
+
+class Simulation:
+    """One or several soft bodies, stepped together.
+
+    Args:
+        bodies: A ``SoftBody`` or several on one device; they do not touch one another.
+        model: Elastic model, or one for each body.
+        integrator: Time integrator. With ``dt=None`` the step follows the state: it is measured again during the run,
+            and a state that goes wrong all the same is made again with half the step. A step that is given stays, and a
+            run in which it is too long ends with an error.
+        gravity: [m/s^2]; None for 9.81 down the up axis of the first body's mesh.
+        deterministic: Whether a run must come out the same bit by bit every time. On the CPU it always does; on CUDA
+            forces are then added up in one order, which takes time and memory (``benchmarks/README.md``).
+        remesh: How the bodies' meshes follow their motion; for several bodies also one each, None for those that stay
+            as they are.
+
+    Attributes:
+        bodies: Tuple of the bodies.
+        worlds: Copies of the bodies, the same number for each.
+        stable_dt: Largest linearly stable step at rest [s], estimated; infinite where nothing can vibrate.
+        gravity: Tuple [m/s^2].
+
+    Raises:
+        InputError: No body, one given twice, bodies on different devices or of different numbers of worlds, a number of
+            models that is not the number of bodies, a body of which no node is free to move, non-finite gravity, a
+            model that does not go with its mesh, something that is none of these, or bodies that cannot be remeshed as
+            asked (see ``OnlineRemesh``).
+
+    Warns:
+        StabilityWarning: The given step is larger than ``stable_dt``.
+        CapacityWarning: A mesh has no room left for what should be refined; once.
+    """
+
+    def __init__(
+        self,
+        bodies: SoftBody | Sequence[SoftBody],
+        *,
+        model: Model | Sequence[Model] | None = None,
+        integrator: Integrator | None = None,
+        gravity: npt.ArrayLike | None = None,
+        deterministic: bool = False,
+        remesh: OnlineRemesh | Sequence[OnlineRemesh | None] | None = None,
+    ):
+        self.bodies = checked_bodies(bodies)
+        self.device, self.worlds = self.bodies[0].device, self.bodies[0].worlds
+        self.deterministic = bool(deterministic)
+        self.models = checked_models(Corotated() if model is None else model, len(self.bodies))
+        self.integrator = checked_integrator(SymplecticEuler() if integrator is None else integrator)
+        self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
+
+        self.remeshing = Remeshing(self.bodies, self.models, remesh, deterministic=self.deterministic)
+        bound = zip(self.models, self.bodies, strict=True)
+        self.fields = tuple(m.bind(body, deterministic=self.deterministic) for m, body in bound)
+        self.remeshing.serve(self.fields)
+        self.time_before_reset = 0.0
+        self.steps_before_reset = 0
+        self._hooks: list[_Hook] = []
+        stable = self._find_stable_steps()
+        given = self.integrator.dt
+        self.pace = Pace(ANY_STEP if given is None else float(given), self.device)
+        self._context = StepContext.of(self.pace, wp.vec3(*self.gravity))
+        #: What chooses the step, if none was given.
+        self.safe_step: SafeStep | None = None
+        if given is None:
+            self.safe_step = SafeStep(self.bodies, self.fields, self.models, self.pace, stable)
+        moved = zip(self.bodies, self.fields, strict=True)
+        steppers = [self.integrator.bind(body, field, self._context) for body, field in moved]
+        self.guard = Guard(self.bodies, self.fields, self._context)
+        self.recorded = RecordedSteps(self.bodies, steppers, self.pace, self.guard, self.safe_step)
+        #: What is to be kept besides the states of bodies and fields for a run to go on as it would have.
+        self.kept = self.pace.state | ({} if self.safe_step is None else self.safe_step.state)
+        self._running = Running(self)
+
+    # --- stepping --------------------------------------------------------------------------------------------------
+
+    @property
+    def body(self) -> SoftBody:
+        """The first body."""
+        return self.bodies[0]
+
+    @property
+    def remesh(self) -> tuple[OnlineRemesh | None, ...]:
+        """How each body is remeshed, with numbers in place of None; the arrays of parameters are the live ones."""
+        return tuple(None if each is None else each.options for each in self.remeshing.changing)
+
+    @property
+    def dt(self) -> float:
+        """The time step [s]; if none was given, the one that the present state allows."""
+        return self.pace.dt if self.safe_step is None else self.safe_step.allowed
+
+    @property
+    def dt_range(self) -> tuple[float, float]:
+        """The shortest and the longest time step so far [s]."""
+        return (self.dt, self.dt) if self.safe_step is None else self.safe_step.range
+
+    @property
+    def steps(self) -> int:
+        """Time steps done, since the last ``reset()`` if there was one."""
+        return self.pace.steps
+
+    @property
+    def total_steps(self) -> int:
+        """Time steps done, whatever has been reset since."""
+        return self.steps_before_reset + self.steps
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s], since the last ``reset()`` if there was one."""
+        return self.pace.time
+
+    @property
+    def total_time(self) -> float:
+        """Simulated time [s], whatever has been reset since."""
+        return self.time_before_reset + self.time
+
+    def step(self) -> None:
+        """Advance by one time step.
+
+        Inside somebody else's capture on this device the step's launches are recorded, nothing else: no hooks are
+        called, nothing is checked, and the step has the length that the last run left. On CUDA the call does not wait
+        for the device unless hooks are set or bodies are remeshed.
+
+        Raises:
+            InputError: Somebody is capturing, and there are bodies to be remeshed; or a ``wp.Tape`` is recording, since
+                steps have no adjoint.
+            UnstableError: On the CPU: the state is not finite any more, or nodes are far beyond reach, which is looked
+                at every few hundred steps. No step is made again here, as ``advance`` does, and energies are not looked
+                at, since users may write to the state between steps.
+        """
+        refuse_tape()
+        if self.device.is_capturing:
+            if self.remeshing.every:
+                raise InputError("a simulation with remesh cannot be recorded by others: launches change with the mesh")
+            self.pace.is_shared = True
+            self.recorded.launch(Segment(1, adopts=True, publishes=True))
+            return
+        self._running.step()
+        if self.device.is_cpu or self._hooks or self.remeshing.every:
+            self._running.look()
+            if self.remeshing.every:
+                self.follow_motion()
+            self.call_hooks()
+
+    def advance(self, seconds: float) -> None:
+        """Advance by ``seconds``; the state is there when the call returns.
+
+        Exactly, in steps that are a little shorter at the end; if the step was given, by the whole number of steps that
+        comes nearest.
+
+        Raises:
+            InputError: Negative or non-finite time, or a ``wp.Tape`` is recording.
+            UnstableError: The state went wrong: it is not finite, or it has energy that nothing put in. If no step was
+                given: and shorter ones did not help.
+
+        Warns:
+            StabilityWarning: The state went wrong, and was made again with half the step; once.
+        """
+        if not 0 <= checked_number(seconds, "seconds", "s") < math.inf:
+            raise InputError(f"cannot advance by {seconds} s; it must be zero or a positive time")
+        if self.device.is_capturing:
+            raise InputError("advance cannot be called while its device is capturing; call step, which records")
+        self.advance_until(self.total_time + seconds)
+
+    def advance_until(self, total_time: float) -> None:
+        """Advance until ``total_time`` [s], nowhere if that is past; as ``advance``."""
+        refuse_tape()
+        if not checked_number(total_time, "total_time", "s") < math.inf:
+            raise InputError(f"cannot advance until {total_time} s; it must be a finite time")
+        if self.safe_step is not None:
+            self._running.make_until(total_time)
+        else:
+            self._running.make(max(round((total_time - self.total_time) / self.dt), 0))
+
+    def advance_steps(self, count: int) -> None:
+        """Advance by ``count`` time steps; as ``advance``. Steps that a hook makes count."""
+        refuse_tape()
+        self._running.make(checked_count(count, "count", least=0))
+
+    def on_step(self, callback: Callable[[Simulation], None], every: int = 1) -> None:
+        """Call ``callback(sim)`` after every ``every``-th step, counted from the beginning of the simulation.
+
+        Raises:
+            InputError: ``every`` is not a positive whole number, or the callback cannot be called.
+        """
+        if not callable(callback):
+            raise InputError(f"callback is {callback!r}; it must be a function of the simulation")
+        self._hooks.append(_Hook(callback, checked_count(every, "every", least=1)))
+
+    def reset(self, worlds: npt.ArrayLike | wp.array | None = None) -> None:
+        """Put worlds back to their initial state: rest, or what ``SoftBody.set_initial_state`` took as such.
+
+        Their prescribed motions begin anew; materials, loads and held nodes stay as they are. A body that is remeshed
+        goes back to the mesh of that state, with the loads and held nodes that this mesh had last. The clock goes on
+        unless all worlds are reset by ``reset()``.
+
+        Args:
+            worlds: None for all; an index, indices or a mask bool [worlds]; or a Warp array int32 [worlds] on the
+                device, not zero for worlds to be reset, for which nothing waits or comes back to the host.
+
+        Raises:
+            InputError: There is no such world, or an array of another type, length or device.
+        """
+        if isinstance(worlds, wp.array):
+            if worlds.dtype != wp.int32 or worlds.shape != (self.worlds,) or worlds.device != self.device:
+                raise InputError(
+                    f"worlds is {worlds.dtype.__name__} {list(worlds.shape)} on {worlds.device}; "
+                    f"it must be int32 [{self.worlds}] on {self.device}"
+                )
+            chosen = worlds
+        else:
+            mask = np.zeros(self.worlds, np.int32)
+            mask[slice(None) if worlds is None else checked_indices(worlds, self.worlds, "world")] = 1
+            chosen = wp.array(mask, dtype=wp.int32, device=self.device)
+        if worlds is None:
+            self.steps_before_reset, self.time_before_reset = self.total_steps, self.total_time
+            self.pace.restart()
+            if self.safe_step is not None:
+                self.safe_step.restart()
+            self._context.bad_step.fill_(NEVER)
+            self.guard.restart()
+        for body, field in zip(self.bodies, self.fields, strict=True):
+            body.reset(chosen, self.pace)
+            field.reset(chosen)
+        self._control_step()
+
+    # --- looking ---------------------------------------------------------------------------------------------------
+
+    def energy(self) -> Energy:
+        """Kinetic, elastic and gravitational energy of all bodies in the present state [J]."""
+        return self.world_energies().together
+
+    def world_energies(self) -> WorldEnergies:
+        """The same of each world [J], float64 [worlds]."""
+        return find_energies(self.bodies, self.fields, self.gravity)
+
+    def forces(self, body: SoftBody | None = None) -> wp.array:
+        """Elastic nodal forces in the present state [N], vec3 [worlds * N]; of the first body or the one named."""
+        chosen = self._index(body)
+        self.bodies[chosen].adopt_positions()
+        forces = self.fields[chosen].elastic_forces(self.bodies[chosen].node_displacements)
+        return vec3_view(forces[: self.bodies[chosen].node_count])
+
+    def von_mises(self, body: SoftBody | None = None) -> npt.NDArray[np.float32]:
+        """Von Mises stress of each element in the present state [Pa], float32 [worlds * T]."""
+        chosen = self._index(body)
+        self.bodies[chosen].adopt_positions()
+        return self.fields[chosen].von_mises(self.bodies[chosen].node_displacements)
+
+    # --- keeping ---------------------------------------------------------------------------------------------------
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write everything needed to go on to one file (.npz, no pickle), whole or not at all; hooks are not kept.
+
+        Raises:
+            InputError: The folder is not there or cannot be written to.
+        """
+        from warp_corot.io.checkpoint.archive import save_checkpoint
+
+        save_checkpoint(self, path)
+
+    @classmethod
+    def load(
+        cls,
+        path: str | PathLike[str],
+        *,
+        device: str | wp.Device | None = None,
+        remesh: OnlineRemesh | Sequence[OnlineRemesh | None] | None = None,
+    ) -> Simulation:
+        """Go on from a saved simulation; on the CPU bit by bit as if it had never stopped.
+
+        Args:
+            path: A file that ``save`` wrote.
+            device: Where to go on; None: where it was saved.
+            remesh: In place of what was saved, which does not hold a criterion of your own; the capacity stays.
+
+        Raises:
+            InputError: No such file, not a checkpoint, one of a newer version, no such device, or a criterion that is
+                missing.
+        """
+        from warp_corot.io.checkpoint.archive import load_checkpoint
+
+        return load_checkpoint(path, device, remesh)
+
+    # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _find_stable_steps(self) -> list[float]:
+        """The largest stable step of each body at rest [s], of which ``stable_dt`` is the smallest."""
+        frequencies = [largest_frequency(body, f) for body, f in zip(self.bodies, self.fields, strict=True)]
+        steps = [self.integrator.stable_step(frequency) for frequency in frequencies]
+        self.stable_dt = min(steps)
+        given = self.integrator.dt
+        if given is not None and float(given) > self.stable_dt:
+            warnings.warn(
+                f"the time step {float(given):.3g} s is beyond the largest stable one, about {self.stable_dt:.3g} s",
+                StabilityWarning,
+                stacklevel=depth_of_user(),
+            )
+        return steps
+
+    def follow_motion(self) -> None:
+        """Let the meshes follow the motion, and the step the meshes, where that is due."""
+        if self.remeshing.run(self.steps):
+            self._control_step()
+
+    def _control_step(self) -> None:
+        """Find the stable step anew where the elements that limit it are others now."""
+        if not self.remeshing.step_may_change():
+            return
+        stable = self._find_stable_steps()
+        if self.safe_step is not None:
+            self.safe_step.find_rest(stable)
+
+    def _index(self, body: SoftBody | None) -> int:
+        if body is None:
+            return 0
+        if body not in self.bodies:
+            raise InputError("the body is not one of this simulation's")
+        return self.bodies.index(body)
+
+    @property
+    def hook_intervals(self) -> list[int]:
+        """Steps between the calls of each hook."""
+        return [hook.every for hook in self._hooks]
+
+    def call_hooks(self) -> None:
+        """Call the hooks that are due now."""
+        steps = self.steps if self._hooks else 0
+        for hook in tuple(self._hooks):
+            if steps % hook.every == 0:
+                hook.callback(self)

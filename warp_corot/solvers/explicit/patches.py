@@ -1,0 +1,212 @@
+"""Organs on CUDA: many steps a launch, in one thread block for each patch of the mesh; see ``kernels.stepping.patches``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from warp_corot.body.trajectory import Trajectory
+from warp_corot.elasticity.corotated.subtrees import SubtreeField
+from warp_corot.elasticity.paths.general import CorotatedGeneralField
+from warp_corot.kernels.math.rotation import quick_rotation
+from warp_corot.kernels.stepping.patches import Exchange, Layout, PatchBody, step_patches
+from warp_corot.materials.anisotropic import Anisotropic
+
+from .patch_layout import NO_SLOT, Patches
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.elasticity import ForceField
+    from warp_corot.elasticity.corotated.elements import CorotatedField
+    from warp_corot.solvers.integrator import StepContext
+
+#: Elements of the bodies for which it pays: below, a launch has nothing to spread; above, patches outgrow their blocks.
+FEWEST, MOST = 500, 150_000
+#: Elements of a patch at least: with fewer, blocks of the smallest bodies only wait for one another.
+PATCH_ELEMENTS = 32
+#: Threads a block, each up to so many elements of the largest patch; more threads have fewer registers.
+THREADS = ((256, 512), (512, 1024), (384, 1536), (512, 2048))
+#: Elements whose constants a thread keeps in registers, and nodes of the halo that it waits for.
+MOST_ELEMENTS, MOST_HALO = 4, 3
+#: The first cards that read and write 16 bytes at once for all to see.
+LEAST_ARCH = 70
+#: What Warp keeps of a block's shared memory for its tiles.
+TILE_BYTES = 8192
+#: Kernels are made for rooms of whole multiples, so that bodies share them.
+NODE_ROOM, SLOT_ROOM = 128, 512
+
+
+class PatchSteps:
+    """Symplectic Euler steps of a body whose patches are all on the card at once.
+
+    Made by ``of``, which knows whether that can be.
+    """
+
+    def __init__(self, body: SoftBody, patches: Patches, layout: Layout):
+        self.body = body
+        self.patches = patches
+        self.layout = layout
+        device = body.device
+        self._tables = _device_patches(body, patches, layout)
+        self._exchange = Exchange()
+        self._exchange.published = wp.zeros(2 * body.node_count, dtype=wp.vec4, device=device)
+        self._exchange.begun = wp.array(np.ones(patches.count), dtype=wp.uint32, device=device)
+        self._trajectories: list[Trajectory] | None = None
+        self.prepare()
+
+    @classmethod
+    def of(
+        cls, body: SoftBody, field: ForceField, *, count: int | None = None, threads: int | None = None
+    ) -> PatchSteps | None:
+        """A body's steps by patches, or None: not on CUDA, too small or large, or not of the corotated model with own
+        rotations.
+
+        Args:
+            count: Patches, at most as many as multiprocessors; None: as many, or fewer of small bodies.
+            threads: A block; None: as many as suit its elements.
+        """
+        if not _suits(body, field):
+            return None
+        count = min(count or max(len(body.mesh.tets) // PATCH_ELEMENTS, 1), body.device.sm_count)
+        for each, most in THREADS if threads is None else ((threads, MOST_ELEMENTS * threads),):
+            patches = Patches.of(body.mesh.points, body.mesh.tets, count, each)
+            if patches.most_elements > most:
+                continue
+            layout = layout_of(patches, each, body.device.max_shared_memory_per_block - TILE_BYTES)
+            if layout is not None:
+                return cls(body, patches, layout)
+        return None
+
+    def prepare(self) -> None:
+        """Copy the body's keyframes to the device, if they are others now; not while launches are recorded."""
+        if self._trajectories != self.body.trajectories:
+            self._trajectories = list(self.body.trajectories)
+            _set_keyframes(self._tables, self._trajectories, self.body)
+
+    @property
+    def is_prepared(self) -> bool:
+        """Whether the keyframes on the device are the body's; not if others came while somebody records."""
+        return self._trajectories == self.body.trajectories
+
+    def launch(self, count: int, damping: float, context: StepContext) -> None:
+        """Launch ``count`` steps, the first ones since the clock was last advanced."""
+        body = self.body
+        wp.launch(
+            step_patches(self.layout, body.node_loads.dtype),
+            dim=self.patches.count * self.layout.threads,
+            block_dim=self.layout.threads,
+            inputs=[
+                self._tables,
+                count,
+                damping,
+                context.gravity,
+                body.mu,
+                body.lam,
+                body.material_stride,
+                body.node_mass,
+                body.node_inverse_mass,
+                int(body.has_loads),
+                body.node_loads,
+                context.pace.arrays,
+                body.world_starts,
+                self._exchange,
+                body.node_displacements,
+                body.node_velocities,
+            ],
+            outputs=[body.node_reactions, context.support_work, context.bad_step],
+            device=body.device,
+        )
+
+
+def layout_of(patches: Patches, threads: int, most_bytes: int) -> Layout | None:
+    """What the kernel for these patches is generated for, or None if they do not fit into blocks of so much memory."""
+    elements = -(-patches.most_elements // threads)
+    halo = max(-(-patches.most_halo // threads), 1)
+    nodes = -(-patches.most_nodes // NODE_ROOM) * NODE_ROOM
+    slots = -(-(patches.most_slots + 1) // SLOT_ROOM) * SLOT_ROOM - 1
+    layout = Layout(threads, elements, halo, patches.lanes, nodes, slots)
+    fits = 4 * layout.floats <= most_bytes and patches.most_own * patches.lanes <= threads
+    return layout if fits and elements <= MOST_ELEMENTS and halo <= MOST_HALO else None
+
+
+def _suits(body: SoftBody, field: ForceField) -> bool:
+    if body.changing is not None or body.worlds != 1:
+        return False
+    if not body.device.is_cuda or body.device.arch < LEAST_ARCH:
+        return False
+    if isinstance(body.material, Anisotropic) or field.deterministic:
+        return False
+    return FEWEST <= len(body.mesh.tets) <= MOST and _has_own_rotations(field)
+
+
+def _has_own_rotations(field: ForceField) -> bool:
+    """Whether it is the corotated model on a fast path, with the rotation of each element."""
+    if not isinstance(field, (SubtreeField, CorotatedGeneralField)):
+        return False
+    of_model: CorotatedField = field
+    model = of_model.model
+    return model.rotation_level is None and model.own_rotation is quick_rotation
+
+
+def _device_patches(body: SoftBody, patches: Patches, layout: Layout) -> PatchBody:
+    """The patches as the kernel reads them, still without keyframes."""
+    device = body.device
+    tables = PatchBody()
+    for name in (
+        "own",
+        "own_start",
+        "halo",
+        "halo_start",
+        "elements",
+        "element_start",
+        "interior",
+        "bases",
+        "base_start",
+    ):
+        setattr(tables, name, wp.array(getattr(patches, name), dtype=wp.int32, device=device))
+    slots = np.where(patches.slots == NO_SLOT, layout.slots, patches.slots)
+    tables.corners = wp.array(_packed(patches.corners), dtype=wp.uint64, device=device)
+    tables.slots = wp.array(_packed(slots), dtype=wp.uint64, device=device)
+    rest = np.ascontiguousarray(rest_rows(body.mesh.points, body.mesh.tets)[:, patches.elements])
+    tables.rest = wp.array(rest, dtype=wp.float32, device=device)
+    return tables
+
+
+def rest_rows(points: np.ndarray, tets: np.ndarray) -> np.ndarray:
+    """The inverses of the rest edges, row by row, and the volumes of elements, either way wound: float32 [10, T]."""
+    x = points[tets]
+    edges = np.swapaxes(x[:, 1:] - x[:, :1], 1, 2)
+    inverse = np.linalg.inv(edges).reshape(-1, 9)
+    volume = np.abs(np.linalg.det(edges)) / 6.0
+    return np.column_stack([inverse, volume]).T.astype(np.float32)
+
+
+def _packed(places: np.ndarray) -> np.ndarray:
+    """Four 16-bit numbers to a word, uint64 [E]."""
+    return np.ascontiguousarray(places.astype("<u2")).view("<u8").ravel()
+
+
+def _set_keyframes(tables: PatchBody, trajectories: Sequence[Trajectory], body: SoftBody) -> None:
+    """Put the keyframes of all trajectories one after another; a node follows the last that names it."""
+    follows, place = np.full(body.node_count, -1), np.zeros(body.node_count)
+    times, values, columns = [np.zeros(0)], [np.zeros((0, 3))], []
+    for k, trajectory in enumerate(trajectories):
+        nodes, d = trajectory.nodes.numpy(), trajectory.displacements.numpy()
+        follows[nodes], place[nodes] = k, np.arange(len(nodes))
+        times.append(trajectory.times.numpy())
+        values.append(d.reshape(-1, 3))
+        columns.append(d.shape[1])
+    starts = np.cumsum([len(part) for part in times]), np.cumsum([len(part) for part in values])[:-1]
+    for name, numbers in (
+        ("trajectory", follows),
+        ("place", place),
+        ("key_start", starts[0]),
+        ("value_start", starts[1]),
+        ("columns", columns),
+    ):
+        setattr(tables, name, wp.array(np.asarray(numbers), dtype=wp.int32, device=body.device))
+    tables.times = wp.array(np.concatenate(times), dtype=wp.float64, device=body.device)
+    tables.values = wp.array(np.concatenate(values), dtype=wp.vec3, device=body.device)

@@ -1,0 +1,222 @@
+"""Energies of a simulation's worlds, and the work that was put into them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.kernels.stepping import balance as kernels
+from warp_corot.kernels.stepping.pace import Pace
+from warp_corot.solvers.integrator import NEVER, StepContext
+
+from .mapped import Mapped
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.elasticity import ForceField
+
+    from .copies import Copies
+
+#: Nodes that a thread adds up, and warps of threads of all worlds at most; a CPU has one thread a world.
+NODES = 4
+WARPS = 2048
+WARP = 32
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Energies:
+    """What free nodes have at one time, of each world [worlds].
+
+    Attributes:
+        kinetic, gravitational: [J]; gravitational about the rest shape.
+        elastic: [J]; zero if not asked for.
+        exact: With symplectic Euler's own kinetic energy, velocities behind times those ahead, and the elastic energy:
+            what a linear body keeps to rounding [J]; means nothing if elastic energies were not asked for.
+        untimely: What the kinetic energy at the time of the displacements has more than that of ``exact`` [J].
+        loads: Work of loads since the last good state [J].
+        supports: Work of all moving supports since the beginning [J].
+        supports_absolute: The sum of its absolute values [J].
+        reach: The largest displacement [m].
+    """
+
+    kinetic: Floats
+    gravitational: Floats
+    elastic: Floats
+    exact: Floats
+    untimely: Floats
+    loads: Floats
+    supports: Floats
+    supports_absolute: float
+    reach: Floats
+
+
+@dataclass(frozen=True)
+class Report:
+    """What the device has found at the end of a run.
+
+    Attributes:
+        energies: Of the state then.
+        has_changed: Whether the state was another at the beginning than at the end of the run before.
+        bad_step: The first step after which something was not finite, NEVER if there was none.
+    """
+
+    energies: Energies
+    has_changed: bool
+    bad_step: int
+
+
+class Balance:
+    """Adds up energies, world by world, and reports them with the clock.
+
+    Args:
+        bodies, fields: The simulation's.
+        context: Its pace, gravity and what supports put in.
+        copies: Of its state.
+    """
+
+    def __init__(self, bodies: Sequence[SoftBody], fields: Sequence[ForceField], context: StepContext, copies: Copies):
+        self.bodies, self.fields, self.context, self._copies = tuple(bodies), tuple(fields), context, copies
+        self.worlds, self.device = bodies[0].worlds, bodies[0].device
+        self._lanes = 1 if self.device.is_cpu else WARP
+        wanted = -(-max(body.launch_nodes for body in bodies) // (self.worlds * NODES * WARP))
+        warps = 1 if self.device.is_cpu else max(min(wanted, WARPS // self.worlds), 1)
+        self._threads = warps * self._lanes
+        self._sums = wp.zeros((self.worlds, warps, kernels.COLUMNS), dtype=wp.float64, device=self.device)
+        self._energies: list[wp.array] = [wp.empty(0, dtype=wp.float64, device=self.device) for _ in bodies]
+        self._field_states: list[dict[str, wp.array]] = [{} for _ in bodies]
+        self._mapped = Mapped(self.worlds * kernels.COLUMNS + kernels.NUMBERS, self.device)
+        numbers = self.worlds * kernels.COLUMNS
+        self._totals = self._mapped.array[:numbers].reshape((self.worlds, kernels.COLUMNS))
+        self._numbers = self._mapped.array[numbers:]
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether nothing but gravity, loads and supports puts work in: active stress does."""
+        return not any(body.has_activation for body in self.bodies)
+
+    def prepare(self) -> None:
+        """Make room for the energies of the present elements; not while launches are recorded."""
+        for k, field in enumerate(self.fields):
+            if len(self._energies[k]) != field.energy_count:
+                self._energies[k] = wp.empty(field.energy_count, dtype=wp.float64, device=self.device)
+            kept = self._field_states[k]
+            if {name: len(array) for name, array in field.state.items()} != {name: len(a) for name, a in kept.items()}:
+                self._field_states[k] = {name: wp.empty_like(array) for name, array in field.state.items()}
+
+    def launch(
+        self,
+        *,
+        whole: bool,
+        keeps: bool = False,
+        at: Sequence[tuple[wp.array, wp.array]] | None = None,
+        seconds: Sequence[float] | None = None,
+    ) -> None:
+        """Launch sums and their report; may be recorded.
+
+        Args:
+            whole: Whether elastic energies are wanted, which take as long as some steps.
+            keeps: Whether the state is kept in passing.
+            at: Displacements and velocities of each body in place of the present ones.
+            seconds: Of the clock, in place of the present ones [3].
+        """
+        context, copies = self.context, self._copies
+        pace = context.pace.arrays
+        if seconds is not None:
+            pace = Pace()
+            pace.counts = context.pace.arrays.counts
+            pace.seconds = wp.array(np.array(seconds), dtype=wp.float64, device=self.device)
+        for k, (body, field) in enumerate(zip(self.bodies, self.fields, strict=True)):
+            u, v = (body.node_displacements, body.node_velocities) if at is None else at[k]
+            if whole:
+                self._add_elastic(k, body, field, u)
+            self._add_nodal(body, u, v, pace, (copies.u[k], copies.v[k]), keeps)
+            if whole:
+                body.node_forces.zero_()
+        inputs = [self._lanes, context.pace.orders, context.support_work, context.bad_step, copies.changed]
+        inputs += [context.pace.control, context.pace.arrays, self._sums]
+        dim = (self.worlds, kernels.COLUMNS, self._lanes)
+        wp.launch(kernels.report, dim, inputs, [self._totals, self._numbers], device=self.device)
+
+    def wait(self) -> Report:
+        """What was reported; waits for the device, once."""
+        wp.synchronize_stream(self.device)
+        numbers = self._mapped.values[self.worlds * kernels.COLUMNS :]
+        total = self._mapped.values[: self.worlds * kernels.COLUMNS].reshape(self.worlds, kernels.COLUMNS).copy()
+        self.context.pace.saw(numbers)
+        kinetic, ahead, elastic = (total[:, int(c)] for c in (kernels.KINETIC, kernels.AHEAD, kernels.ELASTIC))
+        done = np.full(self.worlds, numbers[int(kernels.WORK)] + total[:, int(kernels.SUPPORTS)].sum())
+        energies = Energies(
+            kinetic=kinetic,
+            gravitational=total[:, int(kernels.GRAVITATIONAL)],
+            elastic=elastic,
+            exact=kinetic + ahead + elastic,
+            untimely=total[:, int(kernels.UNTIMELY)],
+            loads=total[:, int(kernels.LOADS)],
+            supports=done,
+            supports_absolute=float(numbers[int(kernels.WORK_ABSOLUTE)]),
+            reach=total[:, int(kernels.REACH)],
+        )
+        bad_step = numbers[int(kernels.BAD_STEP)]
+        return Report(
+            energies=energies,
+            has_changed=bool(numbers[int(kernels.CHANGED)]),
+            bad_step=NEVER if bad_step >= float(NEVER) else int(bad_step),
+        )
+
+    def rounding(self) -> Floats:
+        """Energies that float32 cannot tell from none [J], of each world: of strains of about 4e-4."""
+        found = np.zeros(self.worlds)
+        for body in self.bodies:
+            stiffness = 2.0 * float(body.mu.numpy().mean()) + float(body.lam.numpy().mean())
+            found += 1e-7 * stiffness * float(np.sum(body.mesh.volumes))
+        return found
+
+    def _add_elastic(self, k: int, body: SoftBody, field: ForceField, u: wp.array) -> None:
+        """Strain energies to the sums, and elastic forces to ``node_forces``."""
+        energies, kept = self._energies[k], self._field_states[k]
+        energies.zero_()
+        for name, array in field.state.items():
+            wp.copy(kept[name], array)
+        field.write_energies(u, energies)
+        field.add_forces(u, body.node_forces)
+        for name, array in field.state.items():
+            wp.copy(array, kept[name])
+        inputs = [energies, len(energies) // self.worlds, self._threads, self._lanes]
+        wp.launch(kernels.sum_elements, (self.worlds, self._threads), inputs, [self._sums], device=self.device)
+
+    def _add_nodal(
+        self,
+        body: SoftBody,
+        u: wp.array,
+        v: wp.array,
+        pace: Pace,
+        copies: tuple[wp.array, wp.array],
+        keeps: bool,
+    ) -> None:
+        context = self.context
+        inputs = [
+            pace,
+            context.gravity,
+            body.launch_nodes // self.worlds,
+            self._threads,
+            self._lanes,
+            body.node_mass,
+            body.node_inverse_mass,
+            int(body.has_loads),
+            body.node_loads,
+            body.node_forces,
+            u,
+            v,
+            context.pace.orders,
+            int(keeps),
+        ]
+        kernel = kernels.SUM_NODES[body.node_loads.dtype]
+        outputs = [*copies, self._sums]
+        wp.launch(kernel, (self.worlds, self._threads), inputs, outputs, device=self.device)

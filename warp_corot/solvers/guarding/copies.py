@@ -1,0 +1,108 @@
+"""Two copies of a simulation's state on the device: the last good one, and room for the next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from warp_corot.kernels.stepping import balance as kernels
+from warp_corot.solvers.integrator import StepContext
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.elasticity import ForceField
+
+
+class Copies:
+    """Displacements, velocities and what fields keep, twice.
+
+    Args:
+        bodies, fields: The simulation's.
+        context: Its clock, whose orders name the last good copy.
+
+    Attributes:
+        slot: Which copy is the last good one.
+        changed: Whether the state at the beginning of a run was another than that, int32 [1].
+        revision: Changes whenever the arrays are others.
+    """
+
+    def __init__(self, bodies: Sequence[SoftBody], fields: Sequence[ForceField], context: StepContext):
+        self._bodies, self._fields, self._pace = bodies, fields, context.pace
+        self.device = context.pace.device
+        self.slot, self.revision = 0, 0
+        self.changed = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self.u: list[wp.array] = []
+        self.v: list[wp.array] = []
+        self._inverse_mass: list[wp.array] = []
+        self._words: list[wp.array] = []
+        self._kept_words: list[wp.array] = []
+        self._places: list[tuple[int, int]] = []
+
+    def prepare(self) -> None:
+        """Make room for what there is now; not while launches are recorded."""
+        words = [_words(array) for field in self._fields for array in field.state.values()]
+        places = [(array.ptr, len(array)) for array in words]
+        shapes = [(2, len(body.node_displacements)) for body in self._bodies]
+        if places == self._places and shapes == [array.shape for array in self.u]:
+            return
+        self.u = [wp.zeros(shape, dtype=wp.vec4, device=self.device) for shape in shapes]
+        self.v = [wp.zeros(shape, dtype=wp.vec4, device=self.device) for shape in shapes]
+        self._inverse_mass = [wp.zeros(shape[1], dtype=wp.float32, device=self.device) for shape in shapes]
+        self._words, self._places = words, places
+        self._kept_words = [wp.zeros((2, len(array)), dtype=wp.uint32, device=self.device) for array in words]
+        self.revision += 1
+
+    def take(self) -> None:
+        """Let the present state be the last good one."""
+        self.prepare()
+        for body, u, v, mass in zip(self._bodies, self.u, self.v, self._inverse_mass, strict=True):
+            wp.copy(u[self.slot], body.node_displacements)
+            wp.copy(v[self.slot], body.node_velocities)
+            wp.copy(mass, body.node_inverse_mass)
+        for words, kept in zip(self._words, self._kept_words, strict=True):
+            wp.copy(kept[self.slot], words)
+
+    def put_back(self) -> None:
+        """Let the last good state be the present one."""
+        for body, u, v in zip(self._bodies, self.u, self.v, strict=True):
+            wp.copy(body.node_displacements, u[self.slot])
+            wp.copy(body.node_velocities, v[self.slot])
+        for words, kept in zip(self._words, self._kept_words, strict=True):
+            wp.copy(words, kept[self.slot])
+
+    @property
+    def good(self) -> list[tuple[wp.array, wp.array]]:
+        """Displacements and velocities of the last good state, of each body."""
+        return [(u[self.slot], v[self.slot]) for u, v in zip(self.u, self.v, strict=True)]
+
+    def flip(self) -> None:
+        """The other copy, which the last run has written, is the last good one from here on."""
+        self.slot = 1 - self.slot
+
+    def launch_take_over(self) -> None:
+        """Launch the beginning of a run: the last good state is what is there now, and ``changed`` says whether it was
+        before. Positions are adopted."""
+        for body, u, v, mass in zip(self._bodies, self.u, self.v, self._inverse_mass, strict=True):
+            inputs = [body.node_rest, body.node_positions, body.node_inverse_mass, self._pace.orders]
+            inputs += [body.node_velocities]
+            outputs = [body.node_displacements, u, v, mass, self._pace.arrays, self.changed]
+            kernel = kernels.TAKE_OVER[body.node_positions.dtype]
+            wp.launch(kernel, body.launch_nodes, inputs, outputs, device=self.device)
+        self._launch_words(beside=False)
+
+    def launch_keep(self) -> None:
+        """Launch the end of a run for what fields keep; nodes are kept as their energies are summed."""
+        self._launch_words(beside=True)
+
+    def _launch_words(self, *, beside: bool) -> None:
+        for words, kept in zip(self._words, self._kept_words, strict=True):
+            inputs = [words, self._pace.orders, int(beside)]
+            wp.launch(kernels.keep_words, len(words), inputs, [kept], device=self.device)
+
+
+def _words(array: wp.array) -> wp.array:
+    """The same memory in pieces of four bytes."""
+    count = array.size * wp.types.type_size_in_bytes(array.dtype) // 4
+    return wp.array(ptr=array.ptr, shape=count, dtype=wp.uint32, device=array.device)

@@ -1,0 +1,372 @@
+"""Whether a state can be true, and the last one that could: finite, within reach, and without energy from nowhere.
+
+Every run of steps begins with ``launch_begin`` and ends with ``launch_end``, both recorded with the steps. The last
+good state is the one at the end of the last run that ``check`` found nothing wrong with, or what a user has made of it
+since.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.solvers.integrator import NEVER, StepContext
+from warp_corot.solvers.steps.pace import Known
+
+from .balance import Balance, Energies, Floats
+from .copies import Copies
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.elasticity import ForceField
+
+#: Energy that may come from nowhere between two checks, and in all, as shares of the most that gravity, loads and
+#: supports ever moved or a user gave. A stable step errs by less than a tenth, and by up to a half while elements are
+#: crushed and turned over; one that is not stable by more and more, many times within tens of steps.
+GAIN = 0.25
+DRIFT = 0.5
+#: By how much the kinetic energy may exceed the whole, since fast vibrations are not in time with their displacements;
+#: and from which excess on elastic energies are looked at.
+MOTION = 0.5
+LITTLE = 0.1
+#: So much of it is let pass where the step may be made shorter.
+STRICT = 0.02
+#: What fast vibrations may err by where the step may be made shorter: a shorter one would keep it.
+RINGING = 0.01
+#: After so long a time energy from nowhere counts for a third where the step is chosen [s]: what is left of it by then
+#: cannot be undone, and a step that is short for good would not make up for it.
+MEMORY = 10.0
+#: Time over which it is found whether there is more and more of it [s]: crushed elements take energy and give it back.
+WINDOW = 0.1
+#: So many times as much is let pass where rotations are shared, which have no energy.
+SHARED = 4.0
+#: Displacements beyond so many sizes of the body leave no digit of float32 for its strains.
+REACH = 1e6
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is wrong with a state.
+
+    Attributes:
+        what: In words.
+        worlds: In which worlds.
+        step: The first step after which it was seen, if that is known.
+        is_slight: Whether the state may still be true, roughly.
+    """
+
+    what: str
+    worlds: npt.NDArray[np.intp]
+    step: int | None = None
+    is_slight: bool = False
+
+
+class Guard:
+    """Checks states against the last good one, which it keeps on the device.
+
+    Args:
+        bodies, fields: The simulation's.
+        context: What its steps share.
+    """
+
+    def __init__(self, bodies: Sequence[SoftBody], fields: Sequence[ForceField], context: StepContext):
+        self.bodies, self.fields, self.context = tuple(bodies), tuple(fields), context
+        self.worlds = bodies[0].worlds
+        self._size = max(float(np.ptp(body.mesh.points, axis=0).max()) for body in bodies)
+        self._copies = Copies(self.bodies, self.fields, context)
+        self._balance = Balance(bodies, fields, context, self._copies)
+        self._reference: Energies | None = None
+        self._good: Known | None = None
+        shared = any(getattr(field, "rotation_level", None) is not None for field in fields)
+        self._leave = SHARED if shared else 1.0
+        #: Energy from nowhere between the last two checks on elastic energies, and lately, as shares of what was moved;
+        #: of the world that has most; and the same for what fast vibrations err by at any one time. Infinite while no
+        #: check has found them.
+        self.gain = self.surplus = self.untimely = np.inf
+        #: What came lately has grown by so much within the last window of time; None while none has just ended.
+        self.trend: float | None = None
+        #: Whether a user had written to the state before the last run that was checked.
+        self.was_given = False
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all: the next state is taken for good."""
+        self._reference = None
+        self._scale, self._drift, self._lately, self._loads = (np.zeros(self.worlds) for _ in range(4))
+        self._counted_at = self._window_at = self.context.pace.time
+        self._lately_before = np.zeros(self.worlds)
+        self._height, self._loads_since = np.zeros(self.worlds), np.zeros(self.worlds)
+        self._absolute_base = 0.0
+        self._counted: Floats | None = None
+        self.gain = self.surplus = self.untimely = np.inf
+        self._floor: Floats | None = None
+
+    def forget(self) -> None:
+        """The next state is taken for good: it does not follow from the last one."""
+        self._reference = None
+
+    # --- on the device ---------------------------------------------------------------------------------------------
+
+    @property
+    def revision(self) -> int:
+        """Changes whenever launches that were recorded are valid no more."""
+        return self._copies.revision
+
+    def prepare(self) -> None:
+        """Bring up to date what launches use; not while they are recorded."""
+        self._copies.prepare()
+        self._balance.prepare()
+
+    def order(self, end: float | None = None, stop: int = 0) -> None:
+        """Say when the next run ends [s], if it has an end, and the steps done by then."""
+        self.context.pace.order(end=end, stop=stop, slot=self._copies.slot)
+
+    def launch_begin(self) -> None:
+        """Launch the beginning of a run: what a user has written since the last one is a new state."""
+        self.context.pace.launch_orders(self._copies.changed)
+        self._copies.launch_take_over()
+
+    def launch_end(self, *, whole: bool) -> None:
+        """Launch the end of a run: the state is kept beside the last good one, and what ``check`` wants is reported."""
+        self._copies.launch_keep()
+        self._balance.launch(whole=whole, keeps=True)
+
+    # --- on the host -----------------------------------------------------------------------------------------------
+
+    def begin(self) -> bool:
+        """Take the present state for good if no run has led to it; whether a user may have written to it."""
+        given = False
+        if self._reference is None:
+            given = self._counted is None
+            self._absolute_base = 0.0
+            self.context.pace.restart_work()
+            self._copies.take()
+            self._begin_from(self._find(whole=True))
+        self._good = self.context.pace.known
+        return given
+
+    def check(self, *, whole: bool, counts: bool = True, strict: bool = False, lenient: bool = False) -> Fault | None:
+        """Look at the state to which a run has led; a good one is kept. Waits for the device, once if all is well and
+        nobody has written to the state before the run.
+
+        Args:
+            strict: Whether less energy from nowhere is let pass than would be taken for an error.
+            lenient: Whether energy from nowhere since the beginning is let pass, since a shorter step will do.
+            whole: Whether elastic energies were found too. Without them the sum of the others must not exceed what
+                there was and came in: elastic energies are never negative.
+            counts: Whether energies are counted from this state on if they were found. Else it is only judged by them.
+        """
+        report = self._balance.wait()
+        self.was_given = report.has_changed
+        if report.has_changed:
+            self._begin_before()
+        fault = self._not_finite(report.bad_step)
+        if fault is not None:
+            return fault
+        found = report.energies
+        # What is looked at besides, at the end of a short run, must not change where that run was made in one.
+        leave = self._leave * (STRICT if strict and whole else 1.0)
+        fault = self._beyond_reach(found) or self._from_nowhere(found, whole, leave, lenient)
+        if fault is not None and not whole:
+            whole, found = True, self._find(whole=True)
+            fault = self._beyond_reach(found) or self._from_nowhere(found, whole, leave, lenient)
+        if fault is None:
+            self._copies.flip()
+            self._count(found, whole=whole and counts)
+        return fault
+
+    def go_back(self) -> None:
+        """Put the last good state back."""
+        assert self._good is not None
+        self._copies.put_back()
+        self.context.pace.put_back(self._good)
+        for body in self.bodies:
+            body.node_forces.zero_()
+            body.publish_positions()
+        self.context.bad_step.fill_(NEVER)
+        # What came from nowhere before that state is not forgotten with what came after it.
+        self._count(self._find(whole=True), whole=True)
+
+    def settle(self) -> None:
+        """Count from the present energies, whose kinetic one depends on the step, which is another now."""
+        self._copies.take()
+        self._reference = self._find(whole=True)
+
+    def not_finite(self) -> Fault | None:
+        """Whether the state is not finite: the least that there is to look at."""
+        return self._not_finite(int(self.context.bad_step.numpy()[0]))
+
+    def beyond_reach(self) -> Fault | None:
+        """Whether nodes are where they cannot be: what can be seen of a state that users may write to."""
+        return self._beyond_reach(self._find(whole=False))
+
+    @property
+    def state(self) -> dict[str, Floats]:
+        """What a run that goes on needs besides the present state."""
+        counted = np.full((7, self.worlds), np.nan)
+        before = self._reference
+        if before is not None and not self._has_changed():
+            now = self._find(whole=False)
+            supports = before.supports - now.supports
+            counted[:6] = before.exact, before.gravitational, supports, self._loads_since, self._height, self._loads
+            counted[6] = before.untimely
+        times = np.broadcast_to([[self._counted_at], [self._window_at]], (2, self.worlds))
+        lately = np.array([self._lately, self._lately_before, *times])
+        return {"scale": self._scale, "drift": self._drift, "lately": lately, "counted": counted}
+
+    def resume(self, *, scale: Floats, drift: Floats, lately: Floats, counted: Floats) -> None:
+        """Go on from what ``state`` gave."""
+        self._scale, self._drift = np.array(scale, float), np.array(drift, float)
+        self._lately, self._lately_before = np.array(lately[0], float), np.array(lately[1], float)
+        self._counted_at, self._window_at = float(lately[2, 0]), float(lately[3, 0])
+        self.context.pace.forget()
+        if np.isfinite(counted).all():
+            self._counted = np.array(counted, float)
+
+    # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _begin_from(self, found: Energies) -> None:
+        """Count from the energies of a state that was given."""
+        if self._counted is not None:
+            exact, gravitational, supports, self._loads_since, self._height, self._loads, untimely = self._counted
+            found = replace(found, exact=exact, gravitational=gravitational, supports=supports, untimely=untimely)
+        else:
+            self._loads, self._height = np.zeros(self.worlds), found.gravitational
+            self._loads_since = np.zeros(self.worlds)
+        # A world that begins wrong may be set right later.
+        known = np.where(np.isfinite(found.exact), np.abs(found.exact), 0.0)
+        self._scale = np.maximum(self._scale, known)
+        self._counted = None
+        self._reference = found
+
+    def _begin_before(self) -> None:
+        """Count from the state at the beginning of the run, which a user has written; waits for the device."""
+        assert self._good is not None
+        pace = self.context.pace
+        # A user's velocities belong to no step.
+        self._good = replace(self._good, seconds=(*self._good.seconds[:2], 0.0))
+        now = pace.known
+        found = self._find(whole=True, at=self._copies.good, seconds=self._good.seconds)
+        since = now.work[0] - self._good.work[0]
+        self._absolute_base = self._good.work[1]
+        self._begin_from(replace(found, supports=found.supports - since))
+
+    def _find(
+        self,
+        *,
+        whole: bool,
+        at: Sequence[tuple[wp.array, wp.array]] | None = None,
+        seconds: Sequence[float] | None = None,
+    ) -> Energies:
+        """The energies of the present state or another; waits for the device."""
+        self.prepare()
+        self.order()
+        self.context.pace.launch_orders(self._copies.changed)
+        self._balance.launch(whole=whole, at=at, seconds=seconds)
+        return self._balance.wait().energies
+
+    def _has_changed(self) -> bool:
+        self.order()
+        self.context.pace.launch_orders(self._copies.changed)
+        self._copies.launch_take_over()
+        changed = bool(self._copies.changed.numpy()[0])
+        if changed:
+            self.forget()
+        return changed
+
+    def _not_finite(self, step: int) -> Fault | None:
+        if step == NEVER:
+            return None
+        # Said once: who sets a good state again may go on.
+        self.context.bad_step.fill_(NEVER)
+        bad = self._not_finite_worlds()
+        # Somebody may have set a good state before anybody looked.
+        return Fault("the state is not finite", bad, step) if len(bad) else None
+
+    def _not_finite_worlds(self) -> npt.NDArray[np.intp]:
+        """The worlds in which something is not finite, as ``kernels.stepping.integrate.is_finite`` has it."""
+        bad = np.zeros(self.worlds, bool)
+        for body in self.bodies:
+            sizes = np.abs(body.node_displacements.numpy().astype(np.float64)).sum(axis=1)
+            bad |= ~(sizes.reshape(self.worlds, -1) <= 3e38).all(axis=1)
+        return np.flatnonzero(bad)
+
+    def _beyond_reach(self, found: Energies) -> Fault | None:
+        bad = np.flatnonzero(~(found.reach <= REACH * self._size))
+        if not len(bad):
+            return None
+        return Fault(f"nodes are {found.reach[bad].max():.3g} m from where they were at rest", bad)
+
+    def _given(self, found: Energies) -> tuple[Floats, Floats, Floats]:
+        """The energy that there should be, the most that was ever moved, and the work of loads since what is counted
+        from [J]."""
+        before = self._reference
+        assert before is not None
+        fallen = before.gravitational - found.gravitational
+        loads = self._loads_since + found.loads
+        given = before.exact + fallen + loads + found.supports - before.supports
+        # What has come from nowhere is no measure of what may.
+        moved = np.abs(self._height - found.gravitational) + np.abs(self._loads + loads)
+        return given, np.maximum(self._scale, moved + found.supports_absolute - self._absolute_base), loads
+
+    def _from_nowhere(self, found: Energies, whole: bool, leave: float, lenient: bool) -> Fault | None:
+        if not self._balance.is_closed:
+            return None
+        if self._floor is None:
+            self._floor = self._balance.rounding()
+        given, scale, _ = self._given(found)
+        # Elastic energies are never negative.
+        gain = found.kinetic - given
+        bad = ~(gain <= (MOTION if whole else LITTLE) * self._leave * scale + self._floor)
+        if whole:
+            drift = np.maximum(self._drift + found.exact - given, 0.0)
+            gain = np.maximum(np.maximum(gain, found.exact - given), drift)
+            bad |= ~(found.exact - given <= GAIN * leave * scale + self._floor)
+            if leave < self._leave:
+                bad |= ~(found.untimely <= RINGING * self._leave * scale + self._floor)
+            if not lenient:
+                bad |= ~(drift <= DRIFT * self._leave * scale + 10.0 * self._floor)
+        if not bad.any():
+            return None
+        worlds = np.flatnonzero(bad)
+        worst = worlds[np.argmax(gain[worlds])]
+        most = f"gravity, loads and supports have moved {scale[worst]:.3g} J at most"
+        is_slight = bool((gain[worlds] <= GAIN * self._leave * scale[worlds] + self._floor).all())
+        return Fault(f"{gain[worst]:.3g} J of energy came from nowhere ({most})", worlds, is_slight=is_slight)
+
+    def _count(self, found: Energies, *, whole: bool) -> None:
+        """Go on from a good state; if its whole energies count, from these."""
+        given, self._scale, self._loads_since = self._given(found)
+        before = self._reference
+        assert before is not None
+        if not whole:
+            return
+        if self._balance.is_closed and self._floor is not None:
+            now = self.context.pace.time
+            left = math.exp(min(self._counted_at - now, 0.0) / MEMORY)
+            self._counted_at = now
+            self._drift = np.maximum(self._drift + found.exact - given, 0.0)
+            # At the time of the displacements, since that energy is the same whatever the next step is. What was lost
+            # may come back.
+            more = found.exact + found.untimely - given - before.untimely
+            self._lately = np.where(self._lately > 0.0, left, 1.0) * self._lately + more
+            known = 1.0 / np.maximum(self._scale, 1e-300) / self._leave
+            self.gain = float(np.max(np.maximum(found.exact - given - self._floor, 0.0) * known))
+            shares = np.maximum(self._lately - 10.0 * self._floor, 0.0) * known
+            most = int(np.argmax(shares))
+            self.surplus, self.trend = float(shares[most]), None
+            if not 0.0 <= now - self._window_at < WINDOW:
+                self.trend = float((self._lately - self._lately_before)[most] * known[most])
+                self._window_at, self._lately_before = now, self._lately
+            self.untimely = float(np.max(np.maximum(found.untimely - self._floor, 0.0) * known))
+        else:
+            self.gain = self.surplus = self.untimely = 0.0
+            self.trend = None
+        self._loads, self._loads_since = self._loads + self._loads_since, np.zeros(self.worlds)
+        self._reference = found

@@ -1,0 +1,1 @@
+"""How long a stable step is, at rest and while the state changes."""

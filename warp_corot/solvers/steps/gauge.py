@@ -1,0 +1,105 @@
+"""How large a step may be about the present state of a body; see ``kernels.stepping.gauge``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from warp_corot.kernels.stepping import gauge as kernels
+
+from .pace import Pace
+from .stable_step import PROBE
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.elasticity import ForceField
+
+#: Turns of the directions after which the largest curvature at rest is taken. It is found to 1 % by then, and one that
+#: is too small makes later steps shorter, not longer.
+REST_TURNS = 32
+
+
+class Gauge:
+    """Finds the largest curvature and the largest strain of a body, by launches that may be recorded.
+
+    Args:
+        body: The body.
+        field: Its force field.
+        found: Where to, float32 [2], zero before: ``CURVATURE`` and ``STRAIN`` of ``kernels.stepping.pace``.
+    """
+
+    def __init__(self, body: SoftBody, field: ForceField, found: wp.array):
+        self.body = body
+        self.field = field
+        self.found = found
+        places = body.node_displacements.shape
+        self.directions = wp.zeros(places, dtype=wp.vec4, device=body.device)
+        self._probed, self._forces = (wp.zeros(places, dtype=wp.vec4, device=body.device) for _ in range(2))
+        self._rest_directions = self.directions
+        #: Of the probing motion, float32 [1].
+        self.scale = wp.zeros(1, dtype=wp.float32, device=body.device)
+        self.rescale()
+        # Loading within a recording would end it on some drivers.
+        wp.load_module(kernels.find_strains(body.element_kind).module, body.device)
+
+    def rescale(self) -> None:
+        """Fit the probing motion to the present mesh: the lightest free node moves a share of the smallest element."""
+        inverse = self.body.node_inverse_mass[: self.body.node_count].numpy()
+        lightest = float(inverse.max())
+        size = self.body.smallest_volume ** (1.0 / 3.0)
+        self.scale.fill_(PROBE * size / np.sqrt(lightest) if lightest > 0 else 0.0)
+
+    def restart(self) -> None:
+        """Go on from the directions that were found at rest."""
+        wp.copy(self.directions, self._rest_directions)
+
+    def launch(self, pace: Pace, ahead: int) -> None:
+        """Measure about the present state, whose elastic forces are in ``body.node_forces``.
+
+        Args:
+            pace: The length of the steps to come.
+            ahead: How many steps come before the next measurement.
+        """
+        body = self.body
+        self._find_curvature(body.node_displacements, body.node_forces)
+        wp.launch(
+            kernels.find_strains(body.element_kind),
+            dim=-(-body.launch_elements // int(kernels.TURNS)),
+            inputs=[
+                body.elements,
+                body.node_displacements,
+                body.node_velocities,
+                pace.arrays,
+                ahead,
+                body.launch_elements,
+            ],
+            outputs=[self.found],
+            device=body.device,
+        )
+
+    def curvature_at_rest(self) -> float:
+        """The largest curvature about the rest shape [1/s^2]; waits for the device."""
+        u, f = (wp.zeros_like(self.body.node_displacements) for _ in range(2))
+        with self.field.state_kept():
+            self.field.add_forces(u, f)
+            for _ in range(REST_TURNS):
+                self.found.zero_()
+                self._find_curvature(u, f)
+        self._rest_directions = wp.clone(self.directions)
+        value = float(self.found.numpy()[0])
+        self.found.zero_()
+        return value
+
+    def _find_curvature(self, u: wp.array, f: wp.array) -> None:
+        inverse_mass = self.body.node_inverse_mass
+        outputs = [self.directions, self._probed, self._forces]
+        self._launch(kernels.probe_directions, [self.scale, inverse_mass, u], outputs)
+        self.field.add_forces(self._probed, self._forces)
+        inputs = [inverse_mass, u, self._probed, f, self._forces]
+        self._launch(kernels.find_curvatures, inputs, [self.directions, self.found])
+
+    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+        body = self.body
+        wp.launch(kernel, dim=body.launch_nodes, inputs=inputs, outputs=outputs, device=body.device)

@@ -1,0 +1,159 @@
+"""The clock of a simulation, seen from the host."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.kernels.stepping import balance
+from warp_corot.kernels.stepping import pace as kernels
+from warp_corot.solvers.guarding.mapped import Mapped
+
+
+@dataclass(frozen=True)
+class Known:
+    """What the host knows of the clock.
+
+    Attributes:
+        counts, seconds, control, work: As the arrays of ``Pace`` have them.
+    """
+
+    counts: tuple[int, int]
+    seconds: tuple[float, float, float]
+    control: npt.NDArray[np.float64]
+    work: tuple[float, float]
+
+
+class Pace:
+    """Steps done, their length and the time now, kept on the device.
+
+    The host knows what the device last reported, and asks only where something has been launched since then.
+
+    Args:
+        dt: Length of a step [s].
+        device: Where.
+
+    Attributes:
+        arrays: What kernels take.
+        control: What sets the length of steps, if none was given; see ``kernels.stepping.pace``.
+        support_work: What moving supports have put in, and the sum of its absolute values [J], float64 [2].
+        orders: What the host asked of the present run, float64 [ORDERS].
+        is_shared: Whether others may launch steps that they have recorded, so that the host never knows.
+    """
+
+    def __init__(self, dt: float, device: wp.Device):
+        self.device = device
+        self.arrays = kernels.Pace()
+        self.arrays.counts = wp.zeros(2, dtype=wp.int64, device=device)
+        self.arrays.seconds = wp.array([dt, 0.0, 0.0], dtype=wp.float64, device=device)
+        self.control = wp.zeros(kernels.CONTROLS, dtype=wp.float64, device=device)
+        self.support_work = wp.zeros(2, dtype=wp.float64, device=device)
+        self.orders = wp.zeros(kernels.ORDERS, dtype=wp.float64, device=device)
+        self._given = Mapped(kernels.ORDERS, device)
+        self.is_shared = False
+        self._known: Known | None = None
+
+    @property
+    def known(self) -> Known:
+        """The clock; waits for the device if something has been launched since the last report."""
+        if self._known is None or self.is_shared:
+            counts, seconds, work = (
+                tuple(array.numpy().tolist()) for array in (self.arrays.counts, self.arrays.seconds, self.support_work)
+            )
+            self._known = Known(counts, seconds, self.control.numpy().copy(), work)
+        return self._known
+
+    def saw(self, numbers: npt.NDArray[np.float64]) -> None:
+        """Take what ``kernels.stepping.balance.report`` has written."""
+        steps, then, dt, time, before, work, absolute = numbers[: int(balance.WORK_ABSOLUTE) + 1].tolist()
+        control = numbers[int(balance.CONTROL) :].copy()
+        self._known = Known((int(steps), int(then)), (dt, time, before), control, (work, absolute))
+
+    def take_given(self) -> None:
+        """Let velocities belong to steps of any length: a user gave them."""
+        known = self.known
+        self.arrays.seconds[int(kernels.BEFORE) : int(kernels.BEFORE) + 1].fill_(0.0)
+        self._known = replace(known, seconds=(*known.seconds[:2], 0.0))
+
+    def forget(self) -> None:
+        """Something has been launched that changes the clock, and reports nothing."""
+        self._known = None
+
+    def put_back(self, known: Known) -> None:
+        """Let the clock be what it was."""
+        self.arrays.counts.assign(np.array(known.counts, np.int64))
+        self.arrays.seconds.assign(np.array(known.seconds))
+        self.control.assign(known.control)
+        self.support_work.assign(np.array(known.work))
+        self._known = known
+
+    def write_control(self, control: npt.NDArray[np.float64]) -> None:
+        """Let ``control`` be this."""
+        self.control.assign(control)
+        self._known = replace(self.known, control=np.array(control))
+
+    def note_control(self, places: Sequence[int], values: Sequence[float]) -> None:
+        """Something has been launched that writes these numbers to ``control``."""
+        if self._known is not None:
+            control = self._known.control.copy()
+            control[list(places)] = values
+            self._known = replace(self._known, control=control)
+
+    def order(self, *, end: float | None, stop: int, slot: int) -> None:
+        """Say what is asked of the next run, which begins with ``launch_orders``; no other may be under way.
+
+        Args:
+            end: When it ends [s], if it has an end.
+            stop: The steps done by then.
+            slot: Which copy of the state is the last good one.
+        """
+        self._given.values[:] = kernels.NEVER if end is None else end, stop, slot
+
+    def launch_orders(self, changed: wp.array) -> None:
+        """Launch that the device takes its orders."""
+        wp.launch(kernels.take_orders, dim=1, inputs=[self._given.array, self.orders, changed], device=self.device)
+
+    @property
+    def steps(self) -> int:
+        """Steps done."""
+        return self.known.counts[0]
+
+    @property
+    def dt(self) -> float:
+        """The length of the next step [s]."""
+        return self.known.seconds[0]
+
+    @property
+    def time(self) -> float:
+        """The time now [s]."""
+        return self.time_at(self.steps)
+
+    def time_at(self, steps: int) -> float:
+        """The time after so many steps in all, if no step after the last change of their length is left out [s]."""
+        dt, then, _ = self.known.seconds
+        return then + (steps - self.known.counts[1]) * dt
+
+    def restart(self) -> None:
+        """Begin again at time and step zero; the length of a step stays."""
+        self.arrays.counts.zero_()
+        wp.launch(kernels.set_time, dim=1, inputs=[wp.float64(0.0), self.arrays], device=self.device)
+        self.forget()
+
+    def restart_work(self) -> None:
+        """Count the work of supports from here on."""
+        self.support_work.zero_()
+        if self._known is not None:
+            self._known = replace(self._known, work=(0.0, 0.0))
+
+    def advance(self, steps: int) -> None:
+        """Launch that so many steps have been made."""
+        wp.launch(kernels.advance_clock, dim=1, inputs=[steps, self.arrays], device=self.device)
+
+    @property
+    def state(self) -> dict[str, wp.array]:
+        """Arrays from which it goes on."""
+        return {"counts": self.arrays.counts, "seconds": self.arrays.seconds}

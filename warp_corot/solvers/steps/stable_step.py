@@ -1,0 +1,119 @@
+"""How large an explicit step may be: the largest frequency of the body about its rest shape."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.kernels.stepping import lanczos
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.elasticity import ForceField
+
+LANCZOS_STEPS = 30
+#: Of how many steps the best one is taken.
+LAST_STEPS = 8
+
+# Probing displacements as a share of the smallest element's size: small enough to be linear, large enough for float32.
+PROBE = 1e-3
+
+
+def largest_frequency(body: SoftBody, field: ForceField) -> float:
+    """Largest angular frequency [rad/s] of small motions about rest; explicit central differences need dt < 2 / it.
+
+    Lanczos' iteration on M^-1/2 K M^-1/2, where K is applied as the force field itself does it for small displacements,
+    so that whatever model and elements there are is what is measured. The Ritz value's residual is added to it. Zero if
+    no node is free to move.
+    """
+    free = int((body.node_inverse_mass[: body.node_count].numpy() > 0).sum())
+    if not free:
+        return 0.0
+    iteration = _Lanczos(body, field)
+    with field.state_kept():
+        iteration.find_rest_forces()
+        for step in range(min(LANCZOS_STEPS, 3 * free)):
+            iteration.launch(step)
+    return float(np.sqrt(max(_largest_value(*iteration.coefficients()), 0.0)))
+
+
+def _largest_value(diagonal: npt.NDArray[np.float64], off: npt.NDArray[np.float64]) -> float:
+    """The largest Ritz value with its residual, of the last step or of one shortly before where that is less: rounding
+    brings copies of values that are found already, and with them residuals that mean nothing."""
+    bounds = []
+    for size in range(max(len(diagonal) - LAST_STEPS, 0) + 1, len(diagonal) + 1):
+        tridiagonal = np.diag(diagonal[:size]) + np.diag(off[1:size], 1) + np.diag(off[1:size], -1)
+        values, vectors = np.linalg.eigh(tridiagonal)
+        bounds.append(values[-1] + off[size] * abs(vectors[-1, -1]))
+    return float(max(min(bounds), values[-1]))
+
+
+class _Lanczos:
+    """The iteration's vectors on the device, vec4, as long as launches: the present one, the one before, the next."""
+
+    def __init__(self, body: SoftBody, field: ForceField):
+        self.body = body
+        self.field = field
+        self.probe = PROBE * body.smallest_volume ** (1.0 / 3.0)
+        self.q, self.before, self.next = (
+            wp.empty(body.launch_nodes, dtype=wp.vec4, device=body.device) for _ in range(3)
+        )
+        self.u, self.f, self._rest = (wp.zeros_like(body.node_displacements) for _ in range(3))
+        parts = min(body.launch_nodes, lanczos.PARTS)
+        self._parts, self._sums, self._largest, self._diagonal, self._off = (
+            wp.empty(size, dtype=wp.float64, device=body.device)
+            for size in (parts, lanczos.FOLDED, lanczos.FOLDED, LANCZOS_STEPS, LANCZOS_STEPS + 1)
+        )
+        self._scale = wp.empty(1, dtype=wp.float32, device=body.device)
+        self._steps = 0
+        self._launch(lanczos.random_motion, [0, body.node_inverse_mass, self.q])
+        self._normalise(self.q, 0)
+
+    def find_rest_forces(self) -> None:
+        """What forces there are without displacements, by active stress: of those with any, only the rest counts."""
+        self.field.add_forces(self.u, self._rest)
+        self._launch(lanczos.scale_by, [-1.0, self._rest])
+
+    def launch(self, step: int) -> None:
+        """Launch a step; each is one after the last."""
+        inverse_mass = self.body.node_inverse_mass
+        self._launch(lanczos.largest_motions, [inverse_mass, self.q, self._parts], len(self._parts))
+        self._launch(lanczos.fold, [self._parts, self._sums, self._largest], lanczos.FOLDED)
+        self._launch(lanczos.take_scale, [self.probe, self._largest, self._scale], 1)
+        self._launch(lanczos.probe_motion, [self._scale, inverse_mass, self.q, self.u])
+        wp.copy(self.f, self._rest, count=self.body.launch_nodes)
+        self.field.add_forces(self.u, self.f)
+        arguments = [self._scale, self._off, step, inverse_mass, self.f, self.before, self.next]
+        self._launch(lanczos.apply_stiffness, arguments)
+        self._sum(self.q, self.next, self._diagonal, step)
+        self._launch(lanczos.take_away, [self._diagonal, step, self.q, self.next])
+        self._normalise(self.next, step + 1)
+        self.before, self.q, self.next = self.q, self.next, self.before
+        self._steps = step + 1
+
+    def coefficients(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Diagonal and off-diagonal entries [1/s^2], of these one more at either end; of steps that mean something.
+
+        Waits for the device.
+        """
+        diagonal, off = self._diagonal.numpy()[: self._steps], self._off.numpy()[: self._steps + 1]
+        ended = off[1:] <= 1e-6 * np.maximum.accumulate(np.abs(diagonal))
+        size = int(np.argmax(ended)) + 1 if ended.any() else self._steps
+        return diagonal[:size], off[: size + 1]
+
+    def _normalise(self, a: wp.array, place: int) -> None:
+        """Divide a vector by its length, which goes into its place among off-diagonal entries."""
+        self._sum(a, a, self._off, place, root=True)
+        self._launch(lanczos.divide_by, [self._off, place, a])
+
+    def _sum(self, a: wp.array, b: wp.array, numbers: wp.array, place: int, *, root: bool = False) -> None:
+        self._launch(lanczos.inner_products, [a, b, self._parts], len(self._parts))
+        self._launch(lanczos.fold, [self._parts, self._sums, self._largest], lanczos.FOLDED)
+        self._launch(lanczos.take_sum, [self._sums, int(root), place, numbers], 1)
+
+    def _launch(self, kernel: wp.Kernel, arguments: list, dim: int | None = None) -> None:
+        count = self.body.launch_nodes if dim is None else dim
+        wp.launch(kernel, dim=count, inputs=arguments, device=self.body.device)
