@@ -139,7 +139,7 @@ class OurSteps(Steppable):
         self.levels_up = levels_up
         self.body = problem.new_body(problem.mesh)
         self.body.fix(problem.held)
-        self.start = wp.clone(self.body.node_displacements)
+        self.start = wp.clone(self.body.state.displacements)
         self.sim = self._simulation(None)
 
     @property

@@ -105,7 +105,7 @@ def force_case(
     **options: Callable[[], np.ndarray],
 ) -> Case:
     """The forces of one field on a body in the problem's state; ``of`` names the oracle's model."""
-    u = body.node_displacements
+    u = body.state.displacements
     f = wp.zeros_like(u)
 
     def error() -> float:
@@ -145,7 +145,7 @@ def integration_case(problem: Problem) -> Case:
 
     def error() -> float:
         body.velocities = v
-        body.node_forces.assign(padded(f))
+        body.state.forces.assign(padded(f))
         stepper.steps(1)
         w = np.where(body.constrained, 0.0, 1.0 / body.masses)[:, None]
         reference = (v + dt * (f * w)) / (1.0 + dt * DAMPING)
@@ -253,10 +253,10 @@ def _stepping(
 
 def put_back(body: wc.SoftBody, start: wp.array) -> None:
     """Displacements vec4 [N] back to ``start``, at rest."""
-    wp.copy(body.node_displacements, start)
-    body.node_velocities.zero_()
-    body.node_forces.zero_()
-    body.publish_positions()
+    wp.copy(body.state.displacements, start)
+    body.state.velocities.zero_()
+    body.state.forces.zero_()
+    body.state.publish_positions()
 
 
 def step_error(

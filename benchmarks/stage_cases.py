@@ -52,7 +52,7 @@ def _rotation_case(
     tets = elements.nodes.numpy()
     rotations = wp.zeros(len(units), dtype=wp.mat33, device=problem.device)
     kernel = extract_rotations(ForestElements, rotation)
-    u = problem.body.node_displacements
+    u = problem.body.state.displacements
 
     def run() -> None:
         wp.launch(kernel, len(units), [elements, u], [rotations], device=problem.device)
@@ -79,7 +79,7 @@ def _warm_case(problem: Problem) -> Case:
     kernel = extract_warm_rotations(ForestElements)
     rng = np.random.default_rng(2)
     moved = problem.u + (1e-3 * problem.edge * rng.uniform(-1, 1, problem.u.shape)).astype(np.float32)
-    states = [wp.array(padded(moved), dtype=wp.vec4, device=problem.device), problem.body.node_displacements]
+    states = [wp.array(padded(moved), dtype=wp.vec4, device=problem.device), problem.body.state.displacements]
 
     def run() -> None:
         for u in states:
@@ -109,7 +109,7 @@ def product_cases(problem: Problem) -> list[Case]:
     units, unit = problem.units(SUBTREE_LEVELS)
     elements = forest_elements(problem.mesh, units, device)
     rotations = wp.zeros(len(units), dtype=wp.mat33, device=device)
-    u = problem.body.node_displacements
+    u = problem.body.state.displacements
     wp.launch(extract_rotations(ForestElements, byers_xu), len(units), [elements, u], [rotations], device=device)
     unit_of = wp.array(unit, dtype=wp.int32, device=device)
     squares = wp.zeros(count, dtype=wp.float32, device=device)

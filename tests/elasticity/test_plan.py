@@ -103,10 +103,10 @@ def test_what_the_fast_iteration_cannot_turn_is_flagged_and_done_all_the_same(ro
     error = np.abs(fast - slow).max(axis=1) / np.abs(slow).max()
     assert np.percentile(error, 95) < 1e-5
     field = model.bind(body)
-    field.add_forces(body.node_displacements, body.node_forces)
+    field.add_forces(body.state.displacements, body.state.forces)
     assert sum(np.count_nonzero(batch.flagged.numpy()) for batch in field.plan.batches) == 0  # at rest: none
     body.displacements = u
-    field.add_forces(body.node_displacements, body.node_forces)
+    field.add_forces(body.state.displacements, body.state.forces)
     flagged = sum(np.count_nonzero(batch.flagged.numpy()) for batch in field.plan.batches)
     assert 0 < flagged < sum(batch.count for batch in field.plan.batches)
 

@@ -33,8 +33,8 @@ def forces(forest, u, tolerance, way, device):
     body = wc.SoftBody(forest, wc.Isotropic(1e4, 0.4, 1000.0), device=device)
     body.displacements = u
     (batch,) = ForcePlan.of_forest(forest, None, body.device, grouped=False).batches
-    f = wp.zeros_like(body.node_displacements)
-    material, u, outputs = [body.mu, body.lam], body.node_displacements, [f, batch.flagged]
+    f = wp.zeros_like(body.state.displacements)
+    material, u, outputs = [body.mu, body.lam], body.state.displacements, [f, batch.flagged]
     if way == LANES:
         if body.device.is_cuda:
             pytest.skip("for the CPU")
@@ -177,5 +177,5 @@ def test_energies_are_those_of_own_rotations(device, rng):
     body = wc.SoftBody(forest, wc.Isotropic(1e4, 0.4, 1000.0), device=device)
     body.displacements = bent(forest.points, 1.0)
     with_own, near = (wc.Corotated(rotation_level=level).bind(body) for level in (None, "auto"))
-    u = body.node_displacements
+    u = body.state.displacements
     assert near.elastic_energy(u) == with_own.elastic_energy(u)

@@ -17,7 +17,7 @@ def forces(mesh, displacements, velocities, device, seconds=0.1, deterministic=F
     body = wc.SoftBody(mesh, wc.Isotropic(1e5, 0.3, 1000.0), device=device, **options)
     body.displacements, body.velocities = displacements, velocities
     field = wc.Corotated().bind(body, deterministic=deterministic)
-    f = wp.zeros_like(body.node_forces)
+    f = wp.zeros_like(body.state.forces)
     Viscosity(body, field, seconds).add_forces(f)
     return f.numpy()[:, :3].astype(np.float64)
 

@@ -156,8 +156,8 @@ def test_anisotropic_general_elements(kind, device, rng):
     on_device, active = strained(mesh, rng, device)
     f = wp.zeros_like(on_device)
     field = GeneralAnisotropicField(body)
-    body.has_activation = True
-    body.element_activation = active
+    body.conditions.has_activation = True
+    body.conditions.activation = active
     add_forces(field.scatter, field.active_material, on_device, f)
     assert_right(f.numpy()[:, :3], leaf_by_leaf(field, active, on_device))
 

@@ -108,8 +108,8 @@ def test_every_leaf_may_be_listed(share, device, rng):
         counts[of * COUNT_STRIDE] += 1
     listed.own.counts.assign(counts)
     listed.own.entries.assign(entries.reshape(-1, 2))
-    f = wp.zeros_like(body.node_displacements)
-    listed.repair(body.elements, [body.mu, body.lam, body.material_stride], body.node_displacements, f)
+    f = wp.zeros_like(body.state.displacements)
+    listed.repair(body.elements, [body.mu, body.lam, body.material_stride], body.state.displacements, f)
     forces, sound = expected(forest, u, young)
     assert np.abs(f.numpy()[:, :3] - forces)[sound].max() < TOLERANCE * np.abs(forces).max()
     assert (listed.own.counts.numpy()[: LISTS * COUNT_STRIDE] == 0).all()
@@ -130,8 +130,8 @@ def test_what_was_left_out_before_changes_nothing(turned, rng):
     fast, leaf = (wc.Corotated(subtrees=subtrees).bind(body) for subtrees in (True, False))
     found, flags = [], []
     for field in (fast, fast, leaf, *([fast] * 20)):
-        f = wp.zeros_like(body.node_displacements)
-        field.scatter_forces(body.node_displacements, f)
+        f = wp.zeros_like(body.state.displacements)
+        field.scatter_forces(body.state.displacements, f)
         found.append(f.numpy()[:, :3])
         flags.append(fast.plan.batches[0].flagged.numpy())
     assert (flags[0] == 255).mean() > 0.9 * turned
@@ -140,5 +140,5 @@ def test_what_was_left_out_before_changes_nothing(turned, rng):
     # Once it is the right way round again that is found out.
     body.displacements = np.zeros_like(x)
     for _ in range(40):
-        fast.scatter_forces(body.node_displacements, f)
+        fast.scatter_forces(body.state.displacements, f)
     assert (fast.plan.batches[0].flagged.numpy() == 0).all()

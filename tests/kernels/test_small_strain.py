@@ -74,12 +74,12 @@ def test_shared_rotations_by_subtrees(leaf_level, amount, device, rng):
     if body.device.is_cpu:
         nodes = wp.array(np.ascontiguousarray(batch.subtrees.nodes.numpy().T), dtype=wp.int32, device=body.device)
         batch.subtrees.nodes = batch.subtrees.targets = nodes
-    f = wp.zeros_like(body.node_displacements)
+    f = wp.zeros_like(body.state.displacements)
     none = wp.empty(0, dtype=wp.mat33, device=body.device), wp.empty(0, dtype=wp.int32, device=body.device)
     wp.launch(
         scatter_subtrees_shared(batch.shape, False, True, False, False),
         dim=batch.count,
-        inputs=[batch.subtrees, body.mu, body.lam, body.node_displacements, *none],
+        inputs=[batch.subtrees, body.mu, body.lam, body.state.displacements, *none],
         outputs=[f, batch.flagged, LeftOut()],
         device=body.device,
         block_dim=128,

@@ -58,7 +58,7 @@ def test_new_nodes_come_after_all_others(device, rng):
     # Their rest positions, too, are those that a body on this mesh would have.
     body = wc.SoftBody(mesh, wc.Isotropic(1e3, 0.3, DENSITY), device=device)
     rest = adaptive.carriage.arrays.rest.numpy()[: adaptive.node_count]
-    assert np.allclose(rest, body.node_rest.numpy(), rtol=2e-7, atol=0)
+    assert np.allclose(rest, body.state.rest.numpy(), rtol=2e-7, atol=0)
 
 
 def test_nodes_that_move_keep_what_they_carry(device, rng):

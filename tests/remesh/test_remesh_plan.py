@@ -227,7 +227,7 @@ def followed(forest, material, model):
     body.elements = plan.elements
     if body.material_stride:
         body.mu, body.lam = plan.values["mu"], plan.values["lam"]
-    body.launch_elements = launch_size(forest.leaf_count, 0, 64, plan.most_leaves)
+    body.sizes.launch_elements = launch_size(forest.leaf_count, 0, 64, plan.most_leaves)
     field.follow(plan)
     return field, body
 

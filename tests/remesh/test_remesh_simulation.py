@@ -111,7 +111,7 @@ def test_reset_has_nodes_follow_what_those_of_the_first_mesh_did(device):
     body.prescribe(body.mesh.points[:, 0] > 0.2 - 1e-9, times=[0.0, 0.01], displacements=[[0, 0, 0], [0.01, 0, 0]])
     sim.advance_steps(20)
     body.fix(body.mesh.points[:, 0] > 0.2 - 1e-9)
-    assert not body.trajectories
+    assert not body.conditions.trajectories
     sim.advance_steps(10)
     sim.reset()
     sim.advance(0.015)
@@ -297,12 +297,12 @@ def test_a_turning_body_turns_on_as_fast(device):
         arm = x - m @ x / m.sum()
         return m @ np.cross(arm, v)[:, 2], m @ (arm[:, :2] ** 2).sum(axis=1), sim.energy().total
 
-    (momentum, inertia, energy), revision = motion(), body.mesh_revision
+    (momentum, inertia, energy), revision = motion(), body.sizes.version
     assert momentum / inertia == pytest.approx(3.0, rel=1e-5)
     for x in np.linspace(0.0, 0.2, 11):
         remesh.parameters.assign([x, 0.02])
         sim.advance_steps(20)
-    assert body.mesh_revision > revision + 10
+    assert body.sizes.version > revision + 10
     found = motion()
     assert found[1] > 1.005 * inertia
     # A pass keeps neither to the last digit where velocities vary along an edge: -0.4 % here.

@@ -222,7 +222,7 @@ def test_arrays_that_do_not_fit_are_refused_in_one_line(device):
     ]
     if wp.get_device(device).is_cuda:
         wrong.append((vec3(n, "cpu"), "on cpu"))
-    own = sim.body.node_loads, sim.body.node_positions
+    own = sim.body.conditions.loads, sim.body.state.positions
     for use, name in ((sim.body.use_loads, "loads"), (sim.body.use_positions, "positions")):
         for array, said in wrong:
             with pytest.raises(wc.InputError, match=f"^{name} .*{said}") as refusal:
@@ -230,7 +230,7 @@ def test_arrays_that_do_not_fit_are_refused_in_one_line(device):
             assert "\n" not in str(refusal.value)
             if isinstance(array, wp.array):
                 assert f"[{n}] on {device}" in str(refusal.value)
-    assert own == (sim.body.node_loads, sim.body.node_positions)
+    assert own == (sim.body.conditions.loads, sim.body.state.positions)
 
 
 def test_one_array_cannot_be_both(form, device):

@@ -159,7 +159,7 @@ def test_held_nodes_of_chosen_worlds(device):
 
     def check():
         np.testing.assert_array_equal(body.constrained.reshape(WORLDS, n), held)
-        inverse = body.node_inverse_mass.numpy().reshape(WORLDS, n)
+        inverse = body.conditions.inverse_mass.numpy().reshape(WORLDS, n)
         np.testing.assert_array_equal(inverse == 0, held)
 
     body.fix([0, -1])

@@ -287,9 +287,9 @@ def test_an_unstable_step_is_named(share, up, device):
     assert step > 5
     # Without checks, which would end the run before.
     sims[1].recorded.replay_many(step - 1)
-    assert np.isfinite(sims[1].body.node_displacements.numpy()).all()
+    assert np.isfinite(sims[1].body.state.displacements.numpy()).all()
     sims[1].recorded.replay_many(1)
-    assert not np.isfinite(sims[1].body.node_displacements.numpy()).all()
+    assert not np.isfinite(sims[1].body.state.displacements.numpy()).all()
 
 
 def test_a_world_that_is_not_finite_leaves_the_others(device):

@@ -37,6 +37,6 @@ def twin(body, model, sim):
     other.fix(body.constrained)
     other.displacements = body.displacements
     other.velocities = body.velocities.numpy()
-    if body.has_loads:
+    if body.conditions.has_loads:
         wp.copy(other.loads, body.loads)
     return wc.Simulation(other, model=model, integrator=wc.SymplecticEuler(dt=sim.dt, damping=1.0), gravity=sim.gravity)

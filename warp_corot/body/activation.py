@@ -107,11 +107,11 @@ def activate(
         values[chosen] = _constant(stress, len(which), len(own)).ravel()
         live.assign(values)
         added = []
-    kept = [left for a in body.activations if (left := a.without(chosen))]
+    before = body.conditions.activations
+    kept = [left for a in before if (left := a.without(chosen))]
     # Other numbers in the same array are no other launches.
-    if added or kept != body.activations:
-        body.activations = kept + added
-        body.revision += 1
+    if added or kept != before:
+        body.conditions.set_activations(kept + added)
 
 
 def _constant(stress: float | npt.ArrayLike, worlds: int, count: int) -> npt.NDArray[np.float64]:

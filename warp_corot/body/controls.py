@@ -10,12 +10,15 @@ import warp as wp
 
 from warp_corot.discretization.elements import Mesh
 from warp_corot.discretization.nodal import vec3_view
+from warp_corot.discretization.sizes import Sizes
 from warp_corot.errors import InputError
 from warp_corot.materials.anisotropic import Anisotropic
 from warp_corot.materials.isotropic import Material
 
-from .activation import Activation, ElementActivation, activate
+from .activation import Activation, activate
+from .conditions import Conditions
 from .places import Nodes, nodes_at
+from .state import State
 from .trajectory import Trajectory
 from .views import Views
 from .worlds import ChosenNodes, chosen_nodes
@@ -29,19 +32,9 @@ class Controls:
 
     device: wp.Device
     worlds: int
-    #: Nodes and elements of one world.
-    world_node_count: int
-    world_element_count: int
-    node_velocities: wp.array
-    node_inverse_mass: wp.array
-    node_reactions: wp.array
-    node_loads: wp.array
-    element_activation: wp.array
-    trajectories: list[Trajectory]
-    activations: list[ElementActivation]
-    revision: int
-    has_loads: bool
-    has_activation: bool
+    sizes: Sizes
+    state: State
+    conditions: Conditions
     _views: Views
 
     @property
@@ -55,24 +48,24 @@ class Controls:
         """What the body is made of."""
 
     @property
-    @abstractmethod
-    def masses(self) -> npt.NDArray[np.float64]:
-        """Lumped nodal masses [kg], float64 [worlds * N]."""
-
-    @property
-    @abstractmethod
-    def held(self) -> npt.NDArray[np.bool_]:
-        """Which nodes are fixed or prescribed, bool [worlds * N]."""
-
-    @property
     def node_count(self) -> int:
         """Nodes of all worlds."""
-        return self.worlds * self.world_node_count
+        return self.sizes.nodes
 
     @property
     def element_count(self) -> int:
         """Elements of all worlds."""
-        return self.worlds * self.world_element_count
+        return self.sizes.elements
+
+    @property
+    def world_node_count(self) -> int:
+        """Nodes of one world."""
+        return self.sizes.world_nodes
+
+    @property
+    def world_element_count(self) -> int:
+        """Elements of one world."""
+        return self.sizes.world_elements
 
     def fix(self, nodes: Nodes, *, worlds: npt.ArrayLike | None = None) -> None:
         """Hold nodes where they are.
@@ -86,19 +79,13 @@ class Controls:
         Raises:
             InputError: Mask of the wrong length, index out of range, or not such an expression or function.
         """
-        chosen = self.node_indices(nodes, worlds)
-        self._stop_following(chosen)
-        self._constrain(chosen, np.zeros(3))
+        self._hold(self.node_indices(nodes, worlds), np.zeros((1, 3)))
 
     def release(self, nodes: Nodes, *, worlds: npt.ArrayLike | None = None) -> None:
         """Let fixed or prescribed nodes go, with the velocity they have. Nodes and worlds as in ``fix``."""
         chosen = self.node_indices(nodes, worlds)
-        self._stop_following(chosen)
-        self.held[chosen] = False
-        self.update_inverse_mass()
-        reactions = self.node_reactions.numpy().copy()
-        reactions[chosen] = 0.0
-        self.node_reactions.assign(reactions)
+        self.conditions.stop_following(chosen)
+        self.conditions.release(self._on_device(chosen))
 
     def prescribe(
         self,
@@ -113,7 +100,7 @@ class Controls:
 
         Args:
             nodes: n nodes of each world, as in ``fix``.
-            velocity: Constant velocity [m/s], [3], [n, 3] or [worlds, n, 3].
+            velocity: Constant velocity [m/s], [3], [n, 3] or [worlds, n, 3]; or an array on the device, as in ``load``.
             times: Increasing times of keyframes [s], [K], at least two, in the time of the simulation, from a world's
                 last reset.
             displacements: Displacements from rest at these times [m], [K, 3] for all nodes alike or [K, n, 3]; linear
@@ -128,9 +115,7 @@ class Controls:
         if (velocity is None) == (times is None and displacements is None):
             raise InputError("prescribe takes either velocity, or times and displacements")
         if velocity is not None:
-            values = named.vectors(velocity, "velocity")
-            self._stop_following(chosen)
-            self._constrain(chosen, values)
+            self._hold(chosen, named.vectors(velocity, "velocity", self.device))
             return
         self.follow(chosen, times, None if displacements is None else named.keyframes(displacements))
 
@@ -139,29 +124,29 @@ class Controls:
     ) -> None:
         """``prescribe`` along keyframes for nodes by their indices among those of all worlds."""
         trajectory = Trajectory.of_keys(indices, times, displacements, self.device)
-        self._stop_following(indices)
-        self._constrain(indices, np.zeros(3))
         if len(indices):
-            self.trajectories.append(trajectory)
-            self.revision += 1
+            self.conditions.hold(trajectory.nodes, self._vectors(np.zeros((1, 3))))
+            self.conditions.follow(trajectory)
 
     def load(self, nodes: Nodes, force: npt.ArrayLike, *, worlds: npt.ArrayLike | None = None) -> None:
         """Set the external force on nodes, from the next step on.
 
         Args:
             nodes: n nodes of each world, as in ``fix``.
-            force: Force on each node [N], [3], [n, 3], [worlds, 1, 3] or [worlds, n, 3].
+            force: Force on each node [N], [3], [n, 3], [worlds, 1, 3] or [worlds, n, 3]. An array on the device is
+                read there without waiting, and its values are not checked: a ``wp.array`` of vec3 [n] or float32
+                [n, 3], or PyTorch's or JAX's float32 [n, 3].
             worlds: As in ``fix``.
 
         Raises:
             InputError: Wrong shape or non-finite values.
         """
         chosen = self._chosen_nodes(nodes, worlds)
-        values = chosen.vectors(force, "force")
-        self._ensure_loads()
-        loads = self.node_loads.numpy().copy()
-        loads[chosen.indices, :3] = values
-        self.node_loads.assign(loads)
+        values = self._vectors(chosen.vectors(force, "force", self.device))
+        if len(chosen.indices):
+            self.conditions.load(self._on_device(chosen.indices), values)
+        else:
+            self.conditions.make_loads()
 
     @property
     def activation(self) -> wp.array:
@@ -173,17 +158,14 @@ class Controls:
         Raises:
             InputError: The material has no fibres.
         """
-        if not self.has_activation and not isinstance(self.material, Anisotropic):
+        conditions = self.conditions
+        if not conditions.has_activation and not isinstance(self.material, Anisotropic):
             raise InputError(
                 "activation needs a material with a direction, TransverselyIsotropic or Orthotropic; "
                 f"the body's is {type(self.material).__name__}"
             )
-        if not self.has_activation:
-            self.has_activation = True
-            if len(self.element_activation) < self.element_count:
-                self.element_activation = wp.zeros(self.element_count, dtype=wp.float32, device=self.device)
-            self.revision += 1
-        return self._views.hand_out(self.element_activation[: self.element_count])
+        conditions.make_activation()
+        return self._views.hand_out(conditions.activation[: self.element_count])
 
     def activate(
         self,
@@ -210,14 +192,14 @@ class Controls:
 
     @property
     def constrained(self) -> npt.NDArray[np.bool_]:
-        """Which nodes are fixed or prescribed, bool [worlds * N] (a copy)."""
-        return self.held.copy()
+        """Which nodes are fixed or prescribed, bool [worlds * N] (a copy); waits for the device."""
+        return self.conditions.held_mask()
 
     @property
     def loads(self) -> wp.array:
         """External nodal forces [N], vec3 [worlds * N]: a view of the live array, made on first use."""
-        self._ensure_loads()
-        return self._views.hand_out(vec3_view(self.node_loads[: self.node_count]))
+        self.conditions.make_loads()
+        return self._views.hand_out(vec3_view(self.conditions.loads[: self.node_count]))
 
     def node_indices(self, nodes: Nodes, worlds: npt.ArrayLike | None = None) -> npt.NDArray[np.intp]:
         """Indices, among the nodes of all worlds, of those named as in ``fix``.
@@ -230,32 +212,18 @@ class Controls:
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _chosen_nodes(self, nodes: Nodes, worlds: npt.ArrayLike | None) -> ChosenNodes:
-        return chosen_nodes(nodes_at(nodes, self.mesh), self.world_node_count, self.worlds, worlds)
+        return chosen_nodes(nodes_at(nodes, lambda: self.mesh), self.world_node_count, self.worlds, worlds)
 
-    def _ensure_loads(self) -> None:
-        if not self.has_loads:
-            self.has_loads = True
-            if len(self.node_loads) < self.node_count:
-                self.node_loads = wp.zeros(self.node_count, dtype=wp.vec4, device=self.device)
-            self.revision += 1
+    def _hold(self, chosen: npt.NDArray[np.intp], velocities: npt.NDArray[np.float64] | wp.array) -> None:
+        """Hold nodes that move at these velocities, and follow nothing else."""
+        if len(chosen):
+            self.conditions.stop_following(chosen)
+            self.conditions.hold(self._on_device(chosen), self._vectors(velocities))
 
-    def _constrain(self, chosen: np.ndarray, velocity: np.ndarray) -> None:
-        self.held[chosen] = True
-        self.update_inverse_mass()
-        velocities = self.node_velocities.numpy().copy()
-        velocities[chosen, :3] = velocity
-        self.node_velocities.assign(velocities)
+    def _on_device(self, indices: npt.NDArray[np.intp]) -> wp.array:
+        return wp.array(indices, dtype=wp.int32, device=self.device)
 
-    def update_inverse_mass(self) -> None:
-        """Tell the device which nodes are free to move."""
-        masses, inverse = self.masses, np.zeros(self.node_count)
-        free = ~self.held & (masses > 0)
-        inverse[free] = 1.0 / masses[free]
-        self.node_inverse_mass[: self.node_count].assign(inverse.astype(np.float32))
-
-    def _stop_following(self, chosen: np.ndarray) -> None:
-        """Take nodes out of the trajectories they follow."""
-        kept = [trajectory.without(chosen) for trajectory in self.trajectories]
-        if any(now is not before for now, before in zip(kept, self.trajectories, strict=True)):
-            self.trajectories = [trajectory for trajectory in kept if trajectory]
-            self.revision += 1
+    def _vectors(self, given: npt.NDArray[np.float64] | wp.array) -> wp.array:
+        if isinstance(given, wp.array):
+            return given
+        return wp.array(given.reshape(-1, 3), dtype=wp.vec3, device=self.device)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import warp as wp
 
 from warp_corot.discretization.elements import Mesh
 from warp_corot.errors import InputError
@@ -17,19 +18,26 @@ from warp_corot.inputs.selection import select_nodes
 Nodes = npt.ArrayLike | str | Callable[[npt.NDArray[np.float64]], npt.ArrayLike]
 
 
-def nodes_at(nodes: Nodes, mesh: Mesh) -> Any:
+def nodes_at(nodes: Nodes, mesh_of: Callable[[], Mesh]) -> Any:
     """A mask bool [N] in place of an expression or a function; anything else as it is.
 
     In expressions ``zmin`` and the like are bounds of the nodes that elements name.
 
+    Args:
+        nodes: What a user gave.
+        mesh_of: Gives the mesh, which is asked for only if it is needed.
+
     Raises:
         InputError: Not such an expression, or the function gives something else than a truth for each node.
     """
+    if isinstance(nodes, wp.array):
+        return nodes.numpy()
+    if not isinstance(nodes, str) and not callable(nodes):
+        return nodes
+    mesh = mesh_of()
     if isinstance(nodes, str):
         used = mesh.points[np.unique(mesh.tets)]
         return select_nodes(nodes, mesh.points, bounds=[used.min(axis=0), used.max(axis=0)])
-    if not callable(nodes):
-        return nodes
     count = len(mesh.points)
     try:
         found = np.asarray(nodes(mesh.points.copy()))

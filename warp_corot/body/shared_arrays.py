@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
 from warp_corot.discretization.nodal import vec3_view
+from warp_corot.discretization.sizes import Sizes
 from warp_corot.errors import InputError
+
+from .conditions import Conditions
+from .state import State
 
 if TYPE_CHECKING:
     from warp_corot.remesh.changing import Changing
@@ -28,22 +31,12 @@ class SharedArrays:
 
     device: wp.Device
     worlds: int
-    world_node_count: int
-    revision: int
+    sizes: Sizes
+    state: State
+    conditions: Conditions
     changing: Changing | None
-    has_loads: bool
-    node_loads: wp.array
-    node_positions: wp.array
     _own_loads: tuple[wp.array, bool] | None = None
     _own_positions: wp.array | None = None
-
-    @abstractmethod
-    def adopt_positions(self) -> None:
-        """Take over positions that somebody wrote since they were last published."""
-
-    @abstractmethod
-    def publish_positions(self) -> None:
-        """Write positions from displacements."""
 
     def use_loads(self, loads: wp.array | None) -> None:
         """Have steps read the external nodal forces [N] from this array, in place of the body's own.
@@ -60,14 +53,12 @@ class SharedArrays:
                 remeshed.
         """
         given = None if loads is None else self._shared(loads, "loads")
-        if given is not None and given.ptr == self.node_positions.ptr:
+        conditions = self.conditions
+        if given is not None and given.ptr == self.state.positions.ptr:
             raise InputError("loads is the array that positions are written to; it must be another")
         if self._own_loads is None:
-            self._own_loads = (self.node_loads, self.has_loads)
-        before = self.node_loads, self.has_loads
-        self.node_loads, self.has_loads = self._own_loads if given is None else (given, True)
-        if not (_same(self.node_loads, before[0]) and self.has_loads == before[1]):
-            self.revision += 1
+            self._own_loads = (conditions.loads, conditions.has_loads)
+        conditions.use_loads(*(self._own_loads if given is None else (given, True)))
         if given is None:
             self._own_loads = None
 
@@ -86,17 +77,14 @@ class SharedArrays:
         given = None if positions is None else vec3_view(self._shared(positions, "positions"))
         if given is not None and abs(given.strides[0]) < wp.types.type_size_in_bytes(wp.vec3):
             raise InputError(f"positions has {given.strides[0]} bytes from node to node; no two nodes may overlap")
-        if given is not None and given.ptr == self.node_loads.ptr:
+        if given is not None and given.ptr == self.conditions.loads.ptr:
             raise InputError("positions is the array that loads are read from; it must be another")
-        before = self.node_positions
+        state = self.state
         if self._own_positions is None:
             # Only here: an array that somebody takes back may be gone by now.
-            self.adopt_positions()
-            self._own_positions = before
-        self.node_positions = self._own_positions if given is None else given
-        self.publish_positions()
-        if not _same(self.node_positions, before):
-            self.revision += 1
+            state.adopt_positions()
+            self._own_positions = state.positions
+        state.use_positions(self._own_positions if given is None else given)
         if given is None:
             self._own_positions = None
 
@@ -121,12 +109,12 @@ class SharedArrays:
                 f"{name} is {type(array).__name__}; it must be a wp.array, "
                 "as wp.from_torch, wp.from_jax and wp.from_dlpack make one"
             )
-        n = self.worlds * self.world_node_count
+        n = self.sizes.nodes
         wanted = f"vec3 or vec4 [{n}] on {self.device}"
         if array.device != self.device:
             raise InputError(f"{name} is on {array.device}; it must be {wanted}")
         vectors = _vectors(array)
-        if vectors is not None and vectors.shape == (self.worlds, self.world_node_count) and vectors.is_contiguous:
+        if vectors is not None and vectors.shape == (self.worlds, self.sizes.world_nodes) and vectors.is_contiguous:
             vectors = vectors.reshape(n)
         if vectors is None or vectors.shape != (n,):
             given = f"{wp.types.type_repr(array.dtype)} {list(array.shape)} with strides {list(array.strides)}"
@@ -145,7 +133,3 @@ def _vectors(array: wp.array) -> wp.array | None:
     dtype = {3: wp.vec3, 4: wp.vec4}.get(array.shape[-1])
     return None if dtype is None else array.view(dtype)
 
-
-def _same(a: wp.array, b: wp.array) -> bool:
-    """Whether launches with one are launches with the other."""
-    return (a.ptr, a.dtype, a.strides) == (b.ptr, b.dtype, b.strides)

@@ -10,18 +10,20 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.discretization.elements import Mesh, device_elements, element_kind, parts, repeated
-from warp_corot.discretization.nodal import padded, vec3_view
+from warp_corot.discretization.nodal import vec3_view
+from warp_corot.discretization.sizes import Sizes
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import check_float32, checked_count, checked_numbers, shown
 from warp_corot.inputs.device import checked_device
-from warp_corot.kernels.stepping.integrate import ADOPT_POSITIONS, PUBLISH_POSITIONS, RESET_NODES
+from warp_corot.kernels.stepping.integrate import RESET_NODES
 from warp_corot.materials.isotropic import Isotropic, Material
 from warp_corot.mesh import TetForest
 
-from .activation import ElementActivation
+from .conditions import Conditions
 from .controls import Controls
+from .node_arrays import NodeArrays
 from .shared_arrays import SharedArrays
-from .trajectory import Trajectory
+from .state import State
 from .views import Views
 from .worlds import World
 
@@ -35,14 +37,11 @@ if TYPE_CHECKING:
 MOST_ELEMENTS = 2**31 - 1
 
 
-class SoftBody(Controls, SharedArrays):
+class SoftBody(Controls, SharedArrays, NodeArrays):
     """The state of one body: displacements, velocities, masses, constraints and loads of its nodes.
 
-    Nodal vectors live in 16-byte vec4 arrays, the fourth lane unused, so that a node is one load and, where the card
-    can, one reduction. The state proper is the displacement from rest, which keeps the digits of small strains: the
-    static end of a linear beam comes out to 1e-6 of its deflection, from float32 positions to 4e-6 with the beam at the
-    origin and to 3e-5 with it one metre away. ``positions`` are published after each run of steps, and positions that
-    you write are taken over before the next.
+    What steps read and write are displacements from rest (``body.state.State`` says why). ``positions`` are published
+    after each run of steps, and positions that you write are taken over before the next.
 
     With ``worlds`` there are that many copies of the body, each with its own state, material, loads and fixed nodes,
     stepped together; they do not meet. Nodal arrays are [worlds * N], world after world, and ``world`` is one's view.
@@ -60,8 +59,9 @@ class SoftBody(Controls, SharedArrays):
 
     Attributes:
         worlds, device: As given.
-        node_positions: ``positions`` as they lie in memory, vec4 [worlds * N] without gaps; for ``wp.to_jax``, which
-            takes no strided view. After ``use_positions``, the array given there.
+        sizes: How many nodes and elements there are.
+        state: Displacements, velocities and forces of the nodes.
+        conditions: Supports, loads and active stress.
 
     Raises:
         InputError: The mesh or the material is something else, the device is not there, a material array does not have
@@ -78,7 +78,7 @@ class SoftBody(Controls, SharedArrays):
         self._known["material"] = material.at(centroids(mesh)) if material.functions else material
         self.worlds = checked_count(worlds, "worlds", least=1)
         self.device = checked_device(device)
-        self.world_node_count, self.world_element_count = len(mesh.points), len(mesh.tets)
+        self.sizes = Sizes.of(self.worlds, len(mesh.points), len(mesh.tets))
         self.smallest_volume = float(np.min(mesh.volumes))
         if self.element_count > MOST_ELEMENTS:
             raise InputError(
@@ -97,36 +97,12 @@ class SoftBody(Controls, SharedArrays):
         self._known["masses"] = masses = lumped_masses(mesh, self.material, self.worlds)
         check_float32(masses[masses > 0], "the mass of a node", "kg")
 
-        n = self.node_count
-        #: How many of the nodes and elements launches go through; those beyond the counts do nothing.
-        self.launch_nodes, self.launch_elements = n, self.element_count
-        self.node_rest = wp.array(padded(self.rest_positions), dtype=wp.vec4, device=self.device)
-        self.node_positions = wp.clone(self.node_rest)
-        self.node_displacements = wp.zeros(n, dtype=wp.vec4, device=self.device)
-        self.node_velocities = wp.zeros(n, dtype=wp.vec4, device=self.device)
-        self.node_forces = wp.zeros(n, dtype=wp.vec4, device=self.device)
-        self.node_reactions = wp.zeros(n, dtype=wp.vec4, device=self.device)
-        self.node_loads = wp.zeros(1, dtype=wp.vec4, device=self.device)
-        self.has_loads = False
-        self.node_mass = wp.array(self.masses, dtype=wp.float32, device=self.device)
-        self.node_inverse_mass = wp.empty(n, dtype=wp.float32, device=self.device)
-        self.trajectories: list[Trajectory] = []
-        self.element_activation = wp.zeros(1, dtype=wp.float32, device=self.device)
-        self.has_activation = False
-        self.activations: list[ElementActivation] = []
-        #: The time when each world was last reset [s], float64 [worlds].
-        self.world_starts = wp.zeros(self.worlds, dtype=wp.float64, device=self.device)
-        #: Changes whenever the launches of a step do, so that recorded steps can be recorded anew.
-        self.revision = 0
-        self._known["held"] = np.zeros(n, bool)
+        self.state = State(self.sizes, self.rest_positions, self.device)
+        mass = wp.array(masses, dtype=wp.float32, device=self.device)
+        self.conditions = Conditions(self.sizes, self.state, mass)
         self._views = Views()
         #: Points that go along with the body.
         self.bindings: list[FollowingBinding] = []
-        #: Changes whenever the mesh does.
-        self.mesh_revision = 0
-        #: Displacements and velocities that worlds are reset to; None for rest.
-        self.initial_state: tuple[wp.array, wp.array] | None = None
-        self.update_inverse_mass()
 
     # --- what it is made of ----------------------------------------------------------------------------------------
 
@@ -146,21 +122,11 @@ class SoftBody(Controls, SharedArrays):
         """Lumped nodal masses [kg], float64 [worlds * N]; zero at nodes that no element names."""
         return self._look_up("masses")
 
-    @property
-    def held(self) -> npt.NDArray[np.bool_]:
-        """Which nodes are fixed or prescribed, bool [worlds * N], as the host keeps it; ``constrained`` is a copy."""
-        return self._look_up("held")
-
     def _look_up(self, what: str) -> Any:
         """What the host knows, asked of the device first if that has changed the mesh."""
         if what not in self._known:
             self._known[what] = getattr(self.changing, what)()
         return self._known[what]
-
-    def update_inverse_mass(self) -> None:
-        super().update_inverse_mass()
-        if self.changing is not None:
-            self.changing.hold(self.held)
 
     def mesh_changed(self, nodes: int, elements: int) -> None:
         """The device has changed the mesh: what the host knows of it is out of date.
@@ -168,10 +134,19 @@ class SoftBody(Controls, SharedArrays):
         Args:
             nodes, elements: How many there are now.
         """
-        self.world_node_count, self.world_element_count = nodes, elements
-        self.mesh_revision += 1
+        self.sizes.mesh_changed(nodes, elements)
         self._known.clear()
         self._views.expire()
+
+    @property
+    def launch_revision(self) -> int:
+        """Changes whenever the launches of a step do, so that steps must be recorded again."""
+        return self.conditions.revision + self.state.revision + self.sizes.revision
+
+    @property
+    def version(self) -> int:
+        """Changes whenever the mesh does; views from before then say that they are stale."""
+        return self.sizes.version
 
     # --- state -----------------------------------------------------------------------------------------------------
 
@@ -205,31 +180,31 @@ class SoftBody(Controls, SharedArrays):
     def positions(self) -> wp.array:
         """Nodal positions [m], vec3 [worlds * N], in the mesh's order. A view of the live array: write to it
         between steps, or set the property, and the next step starts from there."""
-        return self.nodal_view(self.node_positions)
+        return self.nodal_view(self.state.positions)
 
     @positions.setter
     def positions(self, values: npt.ArrayLike) -> None:
         # In float64 and by way of the displacement, so that no digit of what is given is lost.
-        self._set_displacements(self._checked_vectors(values, "positions") - self.rest_positions)
+        self.state.set_displacements(self._checked_vectors(values, "positions") - self.rest_positions)
 
     @property
     def displacements(self) -> wp.array:
         """Nodal displacements from rest [m], vec3 [worlds * N]: a copy; set the property to change them."""
-        self.adopt_positions()
-        return wp.clone(vec3_view(self.node_displacements[: self.node_count]))
+        self.state.adopt_positions()
+        return wp.clone(vec3_view(self.state.displacements[: self.node_count]))
 
     @displacements.setter
     def displacements(self, values: npt.ArrayLike) -> None:
-        self._set_displacements(self._checked_vectors(values, "displacements"))
+        self.state.set_displacements(self._checked_vectors(values, "displacements"))
 
     @property
     def velocities(self) -> wp.array:
         """Nodal velocities [m/s], vec3 [worlds * N]: a view of the live array."""
-        return self.nodal_view(self.node_velocities)
+        return self.nodal_view(self.state.velocities)
 
     @velocities.setter
     def velocities(self, values: npt.ArrayLike) -> None:
-        self.node_velocities[: self.node_count].assign(padded(self._checked_vectors(values, "velocities")))
+        self.state.set_velocities(self._checked_vectors(values, "velocities"))
 
     @property
     def reactions(self) -> wp.array:
@@ -237,7 +212,7 @@ class SoftBody(Controls, SharedArrays):
 
         A support carries its node's own weight too. Inertia of a prescribed node is not included.
         """
-        return self.nodal_view(self.node_reactions)
+        return self.nodal_view(self.state.reactions)
 
     def nodal_view(self, array: wp.array) -> wp.array:
         """One of the nodal arrays as vec3 [worlds * N], live, until the mesh changes."""
@@ -265,23 +240,12 @@ class SoftBody(Controls, SharedArrays):
         self.bindings.append(binding)
         return binding
 
-    def adopt_positions(self) -> None:
-        """Take over positions that somebody wrote since they were last published."""
-        kernel = ADOPT_POSITIONS[self.node_positions.dtype]
-        self._launch(kernel, [self.node_rest, self.node_positions], [self.node_displacements])
-
-    def publish_positions(self) -> None:
-        """Write positions from displacements."""
-        kernel = PUBLISH_POSITIONS[self.node_positions.dtype]
-        self._launch(kernel, [self.node_rest, self.node_displacements], [self.node_positions])
-
     def set_initial_state(self) -> None:
         """Make the present state the one that ``Simulation.reset`` goes back to; at first that is rest."""
-        self.adopt_positions()
         if self.changing is not None:
             self.changing.remember()
-            return
-        self.initial_state = (wp.clone(self.node_displacements), wp.clone(self.node_velocities))
+        else:
+            self.state.remember()
 
     def reset(self, chosen: wp.array, pace: Pace) -> None:
         """Put chosen worlds back to their initial state; ``Simulation.reset`` does more and is what to call.
@@ -293,11 +257,13 @@ class SoftBody(Controls, SharedArrays):
         if self.changing is not None:
             self.changing.reset(chosen, pace)
             return
-        kept = self.initial_state is not None
-        u, v = self.initial_state or (self.node_displacements, self.node_velocities)
-        inputs = [chosen, self.world_node_count, int(kept), u, v, self.node_rest, self.node_inverse_mass, pace.arrays]
-        outputs = [self.node_displacements, self.node_velocities, self.node_positions, self.node_reactions]
-        self._launch(RESET_NODES[self.node_positions.dtype], inputs, [*outputs, self.world_starts])
+        state, conditions = self.state, self.conditions
+        u, v = state.initial or (state.displacements, state.velocities)
+        inputs = [chosen, self.world_node_count, int(state.initial is not None), u, v, state.rest]
+        inputs += [conditions.inverse_mass, pace.arrays]
+        outputs = [state.displacements, state.velocities, state.positions, state.reactions, conditions.world_starts]
+        kernel = RESET_NODES[state.positions.dtype]
+        wp.launch(kernel, dim=self.sizes.launch_nodes, inputs=inputs, outputs=outputs, device=self.device)
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
@@ -324,13 +290,6 @@ class SoftBody(Controls, SharedArrays):
         if len(bad):
             raise InputError(f"{name} of node {bad[0]} are {given[bad[0]].tolist()}; they must be finite")
         return given
-
-    def _set_displacements(self, values: npt.NDArray[np.float64]) -> None:
-        self.node_displacements[: self.node_count].assign(padded(values))
-        self.publish_positions()
-
-    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim=self.launch_nodes, inputs=inputs, outputs=outputs, device=self.device)
 
 
 def _check_made_of(mesh: Any, material: Any) -> None:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.device_arrays import vectors_on_device
 from warp_corot.inputs.indices import checked_indices
 
 if TYPE_CHECKING:
@@ -83,12 +84,18 @@ class ChosenNodes:
     worlds: int
     each: int | None
 
-    def vectors(self, given: npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:
-        """Vectors for the chosen nodes, [3] or [k, 3], from one for all, one for each, or one for each in each world.
+    def vectors(self, given: Any, name: str, device: wp.Device) -> npt.NDArray[np.float64] | wp.array:
+        """Vectors for the chosen nodes, one for all, one for each, or one for each in each world.
+
+        Returns:
+            [3] or [k, 3]; or, if they were on a device already, vec3 [1], [k] or [k / worlds] there.
 
         Raises:
-            InputError: Another shape, or values that are not finite numbers.
+            InputError: Another shape, or values that are not finite numbers, which those on a device may be.
         """
+        there = vectors_on_device(given, name, (len(self.indices), self.each or len(self.indices)), device)
+        if there is not None:
+            return there
         try:
             values = np.asarray(given, dtype=np.float64)
         except (TypeError, ValueError):

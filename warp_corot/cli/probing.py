@@ -66,7 +66,7 @@ class Probe:
 
     def values(self) -> list[float]:
         """Displacement [m], velocity [m/s] and reaction [N], nine numbers."""
-        if not self.is_patch and self._revision != self.body.mesh_revision:
+        if not self.is_patch and self._revision != self.body.version:
             self._place()
         u, v = (array.numpy()[self._nodes].astype(float) for array in (self.body.displacements, self.body.velocities))
         r = self.body.reactions.numpy()[self._nodes].astype(float)
@@ -87,7 +87,7 @@ class Probe:
         size = float(np.linalg.norm(np.ptp(mesh.points[mesh.tets.ravel()], axis=0)))
         if away > OUTSIDE * size:
             raise InputError(f"--probe {self.text!r}: the point is {away:.3g} m outside the body")
-        self._revision = self.body.mesh_revision
+        self._revision = self.body.version
 
 
 def probes_body(text: str, patches: Patches) -> bool:

@@ -114,7 +114,7 @@ class Stages:
 
     def record(self) -> None:
         """Record each stage of the force many times over; forces go to an array that nobody reads."""
-        model_field, u = self.sim.fields[0], self.sim.body.node_displacements
+        model_field, u = self.sim.fields[0], self.sim.body.state.displacements
         f = wp.zeros_like(u)
         if self._staged:
             assert isinstance(model_field, CorotatedField)

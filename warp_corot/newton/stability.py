@@ -5,17 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import warp as wp
 
 from warp_corot.kernels.elements.constitutive import linear_stress
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.forces import scatter_forces
 from warp_corot.kernels.stepping.lanczos import add_scaled, scale_by
-from warp_corot.solvers import largest_frequency
+from warp_corot.solvers.steps.stable_step import SmallForces, largest_eigenvalue
 
 from .library import newton
 from .others import Others
@@ -24,19 +23,6 @@ from .tetrahedra import Tetrahedra
 #: How often a step is lengthened, and from which largest eigenvalue on, of 4, it is long enough.
 LENGTHENINGS = 6
 ENOUGH = 3.95
-
-
-class _Particles:
-    """What of a body ``largest_frequency`` looks at."""
-
-    def __init__(self, model: newton.Model, volumes: npt.NDArray[np.float64]):
-        active = (model.particle_flags.numpy() & int(newton.ParticleFlags.ACTIVE)) != 0
-        inverse = np.where(active, model.particle_inv_mass.numpy(), 0.0)
-        self.device = model.device
-        self.node_count = self.launch_nodes = model.particle_count
-        self.node_inverse_mass = wp.array(inverse, dtype=wp.float32, device=model.device)
-        self.node_displacements = wp.zeros(model.particle_count, dtype=wp.vec4, device=model.device)
-        self.smallest_volume = float(volumes.min())
 
 
 class _SmallMotions:
@@ -97,27 +83,29 @@ def stable_step(
             are touched in several places need no shorter steps; see ``kernels.newton.yielding``.
     """
     model = tets.model
-    body = cast(Any, _Particles(model, tets.elements.volume.numpy().astype(np.float64)))
+    active = (model.particle_flags.numpy() & int(newton.ParticleFlags.ACTIVE)) != 0
+    inverse = np.where(active, model.particle_inv_mass.numpy(), 0.0)
+    inverse_mass = wp.array(inverse, dtype=wp.float32, device=model.device)
+    smallest = float(tets.elements.volume.numpy().astype(np.float64).min())
+
+    def largest(motions: SmallForces) -> float:
+        return largest_eigenvalue(motions, inverse_mass, smallest, model.particle_count)
+
     elastic = _SmallMotions(tets.elements, tets.mu, tets.lam, others, False, stiffness)
-    w2 = _largest(body, elastic) + of_bodies
+    w2 = largest(elastic) + of_bodies
     if not (tets.damped or others.damped or damping > 0):
         return 2.0 / math.sqrt(w2) if w2 > 0 else math.inf
     viscosity = model.tet_materials.numpy().reshape(-1, 3)[:, 2]
     half, whole = (wp.array(s * viscosity, dtype=wp.float32, device=model.device) for s in (0.5, 1.0))
     viscous = _SmallMotions(tets.elements, half, whole, others, True, damping)
-    c = _largest(body, viscous)
+    c = largest(viscous)
     if w2 == 0.0 and c == 0.0:
         return math.inf
     dt = 4.0 / (c + math.sqrt(c * c + 4.0 * w2))
     for _ in range(LENGTHENINGS if w2 > 0 and c > 0 else 0):
-        found = _largest(body, _Sum(dt, elastic, viscous)) + dt * dt * of_bodies
+        found = largest(_Sum(dt, elastic, viscous)) + dt * dt * of_bodies
         if found >= ENOUGH:
             break
         # Eigenvalues grow no faster than dt^2.
         dt *= math.sqrt(4.0 / found)
     return dt
-
-
-def _largest(body: Any, motions: _SmallMotions | _Sum) -> float:
-    """The largest eigenvalue of M^-1 times what gives such forces."""
-    return largest_frequency(body, cast(Any, motions)) ** 2

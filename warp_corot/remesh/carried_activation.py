@@ -62,16 +62,16 @@ class CarriedActivation:
             kept_rows: Rows that ``put_back`` may be asked to write, whose keyframes are still wanted then.
         """
         body = self._body
-        if not body.has_activation:
+        if not body.conditions.has_activation:
             return
-        self._write(ACTIVATION, body.element_activation[: body.element_count])
-        now = body.activations
+        self._write(ACTIVATION, body.conditions.activation[: body.element_count])
+        now = body.conditions.activations
         if len(now) != len(self._made) or any(a is not b for a, b in zip(now, self._made, strict=True)):
             self._write(ACTIVATION_ROW, self._adopt(now, kept_rows))
 
     def kept(self) -> dict[str, wp.array]:
         """What ``put_back`` takes, of the present mesh."""
-        if not self._body.has_activation:
+        if not self._body.conditions.has_activation:
             return {}
         return {name: self._read(name) for name in (ACTIVATION, ACTIVATION_ROW)}
 
@@ -90,8 +90,7 @@ class CarriedActivation:
         """Let the body's elements follow the keyframes that they carry the rows of."""
         rows = self._read(ACTIVATION_ROW).numpy()
         self._made = [made for keys in self.keys if (made := _of_keys(keys, rows, self._body.device))]
-        self._body.activations = list(self._made)
-        self._body.revision += 1
+        self._body.conditions.set_activations(self._made)
 
     def _adopt(self, activations: Sequence[ElementActivation], kept_rows: wp.array | None) -> wp.array:
         """Number the keyframes of these, and say which row each element follows, int32 [T]."""

@@ -1,4 +1,4 @@
-"""What is done to a changing mesh: which nodes are held and loaded, how fibres pull, which keyframes both follow."""
+"""The conditions of a body whose mesh changes: supports, loads, active stress, and the keyframes of both."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ KEPT: dict[str, Any] = {
 }
 
 
-class Conditions:
+class CarriedConditions:
     """Held nodes, loads, active stress and keyframes, handed between body and pools.
 
     Args:
@@ -62,17 +62,17 @@ class Conditions:
     @property
     def of_present_mesh(self) -> bool:
         """Whether what is kept is that of the present mesh."""
-        return self._body.mesh_revision == self._revision
+        return self._body.sizes.version == self._revision
 
     def keep(self) -> None:
         """From now on, what this mesh has last is what ``put_back`` writes."""
-        self._revision = self._body.mesh_revision
+        self._revision = self._body.sizes.version
         self.note()
 
     def set_kept(self, kept: dict[str, wp.array], *, of_present_mesh: bool) -> None:
         """Write this from now on, of the present mesh or of another."""
         self.kept, self._kept_rows = kept, None
-        self._revision = self._body.mesh_revision if of_present_mesh else -1
+        self._revision = self._body.sizes.version if of_present_mesh else -1
 
     def note(self) -> None:
         """Take over what the user has done; to be called before the mesh changes."""
@@ -113,7 +113,7 @@ class Conditions:
         self.activation.follow()
         body = self._body
         # Nodes that were let go later follow again what they did on the mesh that is back.
-        if not (body.trajectories or self._is_back):
+        if not (body.conditions.trajectories or self._is_back):
             return
         self._is_back = False
         if found[kernels.MIXED]:
@@ -123,9 +123,8 @@ class Conditions:
         nodes, rows = nodes[order], rows[order]
         self._forget(rows)
         trajectories = self.keyframes.trajectories(nodes, rows, body.device)
-        if trajectories is not body.trajectories:
-            body.trajectories = trajectories
-            body.revision += 1
+        if trajectories is not body.conditions.trajectories:
+            body.conditions.set_trajectories(trajectories)
 
     def _settle(self) -> None:
         """Give rows to nodes between such as follow different ones."""
@@ -140,8 +139,8 @@ class Conditions:
     def _take_trajectories(self) -> None:
         """Tell the device which keyframes nodes follow, if the user has changed them."""
         body = self._body
-        if not self.keyframes.are(body.trajectories):
-            rows = self.keyframes.adopt(body.trajectories, body.node_count)
+        if not self.keyframes.are(body.conditions.trajectories):
+            rows = self.keyframes.adopt(body.conditions.trajectories, body.node_count)
             self._forest.carriage.arrays.row[: len(rows)].assign(rows)
             self._forget(rows)
 

@@ -54,12 +54,12 @@ def find_energies(
     worlds = bodies[0].worlds
     kinetic, elastic, gravitational = (np.zeros(worlds) for _ in range(3))
     for body, field in zip(bodies, fields, strict=True):
-        body.adopt_positions()
+        body.state.adopt_positions()
         masses = body.masses.reshape(worlds, -1)
         v = body.velocities.numpy().astype(np.float64)
-        u = body.node_displacements[: body.node_count].numpy()[:, :3].astype(np.float64)
+        u = body.state.displacements[: body.node_count].numpy()[:, :3].astype(np.float64)
         height = (body.rest_positions + u) @ np.asarray(gravity)
         kinetic += 0.5 * np.einsum("wn,wn->w", masses, np.einsum("ni,ni->n", v, v).reshape(worlds, -1))
-        elastic += field.elastic_energies(body.node_displacements)
+        elastic += field.elastic_energies(body.state.displacements)
         gravitational -= np.einsum("wn,wn->w", masses, height.reshape(worlds, -1))
     return WorldEnergies(kinetic, elastic, gravitational)

@@ -33,7 +33,7 @@ def checked_bodies(given: SoftBody | Sequence[SoftBody]) -> tuple[SoftBody, ...]
             raise InputError(f"bodies are in {first.worlds} and {body.worlds} worlds; they must be in as many")
         if body.device != first.device:
             raise InputError(f"bodies are on {first.device} and {body.device}; they must be on one device")
-        if not (body.node_inverse_mass.numpy() > 0).any():
+        if not (body.conditions.inverse_mass.numpy() > 0).any():
             raise InputError(f"all {body.node_count} nodes of the body are held; at least one must be free to move")
     return bodies
 

@@ -275,15 +275,15 @@ class Simulation:
     def forces(self, body: SoftBody | None = None) -> wp.array:
         """Elastic nodal forces in the present state [N], vec3 [worlds * N]; of the first body or the one named."""
         chosen = self._index(body)
-        self.bodies[chosen].adopt_positions()
-        forces = self.fields[chosen].elastic_forces(self.bodies[chosen].node_displacements)
+        self.bodies[chosen].state.adopt_positions()
+        forces = self.fields[chosen].elastic_forces(self.bodies[chosen].state.displacements)
         return vec3_view(forces[: self.bodies[chosen].node_count])
 
     def von_mises(self, body: SoftBody | None = None) -> npt.NDArray[np.float32]:
         """Von Mises stress of each element in the present state [Pa], float32 [worlds * T]."""
         chosen = self._index(body)
-        self.bodies[chosen].adopt_positions()
-        return self.fields[chosen].von_mises(self.bodies[chosen].node_displacements)
+        self.bodies[chosen].state.adopt_positions()
+        return self.fields[chosen].von_mises(self.bodies[chosen].state.displacements)
 
     # --- keeping ---------------------------------------------------------------------------------------------------
 

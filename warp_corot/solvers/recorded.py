@@ -110,6 +110,7 @@ class RecordedSteps:
         #: How calm the bodies are, as a ``Schedule`` has it.
         self.calm = UNKNOWN
         self._revisions: tuple[int, ...] = ()
+        self._rewritten: tuple[int, ...] = ()
 
     @property
     def in_blocks(self) -> bool:
@@ -172,7 +173,12 @@ class RecordedSteps:
 
     def _follow_bodies(self) -> None:
         """Forget recordings where the bodies' launches have changed."""
-        revisions = (self._guard.revision, *(body.revision for body in self._bodies))
+        revisions = (self._guard.revision, *(body.launch_revision for body in self._bodies))
+        rewritten = tuple(body.conditions.rewritten for body in self._bodies)
+        if revisions == self._revisions and rewritten != self._rewritten:
+            for stepper in self._steppers:
+                stepper.prepare()
+        self._rewritten = rewritten
         if revisions != self._revisions:
             self._graphs.clear()
             self._asked.clear()
@@ -194,8 +200,8 @@ class RecordedSteps:
     def adopt_positions(self) -> None:
         """Take over what somebody wrote to positions since they were published."""
         for body in self._bodies:
-            body.adopt_positions()
+            body.state.adopt_positions()
 
     def publish_positions(self) -> None:
         for body in self._bodies:
-            body.publish_positions()
+            body.state.publish_positions()

@@ -80,7 +80,7 @@ def _pack_body(
     body: SoftBody, model: Model, field: ForceField, prefix: str, arrays: dict[str, np.ndarray]
 ) -> dict[str, Any]:
     """Put a body into arrays whose names begin with ``prefix``; returns what else there is, for JSON."""
-    body.adopt_positions()
+    body.state.adopt_positions()
     changing = body.changing
     mesh, material = body.mesh, body.material
     if changing is not None:
@@ -90,17 +90,17 @@ def _pack_body(
         "mesh": pack_mesh(mesh, prefix, arrays),
         "material": _name_of(material, MATERIALS),
         "trajectories": 0,
-        "activations": len(body.activations),
+        "activations": len(body.conditions.activations),
         "field": sorted(field.state),
         "remesh": None,
     }
     for material_field in dataclasses.fields(material):
         arrays[prefix + material_field.name] = np.asarray(getattr(material, material_field.name))
-    arrays[prefix + "world_starts"] = body.world_starts.numpy()
+    arrays[prefix + "world_starts"] = body.conditions.world_starts.numpy()
     for name, array in field.state.items():
         arrays[f"{prefix}field.{name}"] = array.numpy()
     if changing is None:
-        described["trajectories"] = len(body.trajectories)
+        described["trajectories"] = len(body.conditions.trajectories)
         _pack_state(body, prefix, arrays)
     else:
         described["remesh"] = pack_changing(changing, f"{prefix}remesh.", arrays)
@@ -108,23 +108,23 @@ def _pack_body(
 
 
 def _pack_state(body: SoftBody, prefix: str, arrays: dict[str, np.ndarray]) -> None:
-    arrays[prefix + "displacements"] = body.node_displacements.numpy()
-    arrays[prefix + "velocities"] = body.node_velocities.numpy()
-    arrays[prefix + "reactions"] = body.node_reactions.numpy()
+    arrays[prefix + "displacements"] = body.state.displacements.numpy()
+    arrays[prefix + "velocities"] = body.state.velocities.numpy()
+    arrays[prefix + "reactions"] = body.state.reactions.numpy()
     arrays[prefix + "constrained"] = body.constrained
-    if body.initial_state is not None:
-        for name, array in zip(("displacements", "velocities"), body.initial_state, strict=True):
+    if body.state.initial is not None:
+        for name, array in zip(("displacements", "velocities"), body.state.initial, strict=True):
             arrays[f"{prefix}initial.{name}"] = array.numpy()
-    if body.has_loads:
-        arrays[prefix + "loads"] = body.node_loads.numpy()
-    for k, trajectory in enumerate(body.trajectories):
+    if body.conditions.has_loads:
+        arrays[prefix + "loads"] = body.conditions.loads.numpy()
+    for k, trajectory in enumerate(body.conditions.trajectories):
         arrays[f"{prefix}trajectory{k}.nodes"] = trajectory.nodes.numpy()
         times, displacements = trajectory.keys()
         arrays[f"{prefix}trajectory{k}.times"] = times
         arrays[f"{prefix}trajectory{k}.displacements"] = displacements
-    if body.has_activation:
+    if body.conditions.has_activation:
         arrays[prefix + "activation"] = body.activation.numpy()
-    for k, activation in enumerate(body.activations):
+    for k, activation in enumerate(body.conditions.activations):
         for name in ("elements", "times", "stress"):
             arrays[f"{prefix}activation{k}.{name}"] = getattr(activation, name).numpy()
 
@@ -232,7 +232,7 @@ def _rebuilt_simulation(
         if described["remesh"] is not None:
             assert body.changing is not None
             unpack_changing(body.changing, described["remesh"], f"body{number}.remesh.", arrays)
-        body.world_starts.assign(arrays[f"body{number}.world_starts"].astype(np.float64))
+        body.conditions.world_starts.assign(arrays[f"body{number}.world_starts"].astype(np.float64))
         for name in described["field"]:
             field.state[name].assign(arrays[f"body{number}.field.{name}"])
     for name in header["kept"]:
@@ -270,14 +270,16 @@ def _unpack_state(body: SoftBody, described: dict[str, Any], prefix: str, arrays
         )
     if prefix + "activation" in arrays:
         body.activation.assign(arrays[prefix + "activation"])
+    activations = []
     for k in range(described["activations"]):
         elements, times, stress = (arrays[f"{prefix}activation{k}.{name}"] for name in ("elements", "times", "stress"))
-        body.activations.append(ElementActivation.of_keys(elements, Activation(times, stress), body.device))
+        activations.append(ElementActivation.of_keys(elements, Activation(times, stress), body.device))
+    body.conditions.set_activations(activations)
     if prefix + "loads" in arrays:
         wp.copy(body.loads, wp.array(arrays[prefix + "loads"][:, :3], dtype=wp.vec3, device=body.device))
     body.displacements = arrays[prefix + "displacements"][:, :3]
     body.velocities = arrays[prefix + "velocities"][:, :3]
-    body.node_reactions.assign(arrays[prefix + "reactions"])
+    body.state.reactions.assign(arrays[prefix + "reactions"])
 
 
 def _described(thing: Any, names: dict[str, Any]) -> dict[str, Any]:

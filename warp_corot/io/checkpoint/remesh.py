@@ -36,7 +36,7 @@ CRITERIA = "warp_corot.kernels."
 
 def pack_changing(changing: Changing, prefix: str, arrays: Arrays) -> dict[str, Any]:
     """Put what remeshes a body into arrays whose names begin with ``prefix``; returns what else there is, for JSON."""
-    changing.body.adopt_positions()
+    changing.body.state.adopt_positions()
     conditions, forest, options = changing.conditions, changing.forest, changing.options
     conditions.note()
     parameters = options.parameters
@@ -57,8 +57,8 @@ def pack_changing(changing: Changing, prefix: str, arrays: Arrays) -> dict[str, 
         "conditions": sorted(conditions.kept),
         "rows": list(rows),
         "between": [[*ends, row] for ends, row in conditions.keyframes.between.items()],
-        "loads": changing.body.has_loads,
-        "activation": changing.body.has_activation,
+        "loads": changing.body.conditions.has_loads,
+        "activation": changing.body.conditions.has_activation,
         "activation_rows": [each.first for each in keys],
         "at_beginning": conditions.of_present_mesh,
         "survey": asdict(changing.survey.last),
@@ -89,8 +89,7 @@ def unpack_changing(changing: Changing, described: dict[str, Any], prefix: str, 
         activation.serve()
     rows = forest.carriage.arrays.row[: body.node_count].numpy()
     nodes = np.flatnonzero(rows >= 0).astype(np.int32)
-    body.trajectories = keyframes.trajectories(nodes, rows[nodes], body.device)
-    body.revision += 1
+    body.conditions.set_trajectories(keyframes.trajectories(nodes, rows[nodes], body.device))
     kept = {
         name: wp.array(arrays[f"{prefix}conditions.{name}"], dtype=KEPT[name], device=body.device)
         for name in described["conditions"]

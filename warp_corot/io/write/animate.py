@@ -73,7 +73,7 @@ class _Joined:
 
     def has_changed(self) -> bool:
         """Whether the mesh has become another one since this was last asked; then all is that of the present one."""
-        if self._revisions == [world.body.mesh_revision for world in self.worlds]:
+        if self._revisions == [world.body.version for world in self.worlds]:
             return False
         self._join()
         return True
@@ -91,7 +91,7 @@ class _Joined:
         return BoundSkins(self.meshes, surface, labels, self.changing)
 
     def _join(self) -> None:
-        self._revisions = [world.body.mesh_revision for world in self.worlds]
+        self._revisions = [world.body.version for world in self.worlds]
         meshes = self.meshes
         offsets = np.cumsum([0, *(len(mesh.points) for mesh in meshes)])
         self.points = np.concatenate([mesh.points for mesh in meshes])

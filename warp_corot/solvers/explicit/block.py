@@ -79,7 +79,7 @@ class BlockSteps:
         """Launch ``count`` steps, the first ones since the clock was last advanced."""
         body = self.body
         wp.launch(
-            step_block(self._layout, body.node_loads.dtype),
+            step_block(self._layout, body.conditions.loads.dtype),
             dim=body.worlds * self._layout.threads,
             block_dim=self._layout.threads,
             inputs=[
@@ -90,15 +90,15 @@ class BlockSteps:
                 body.mu,
                 body.lam,
                 body.material_stride,
-                body.node_mass,
-                body.node_inverse_mass,
-                int(body.has_loads),
-                body.node_loads,
+                body.conditions.mass,
+                body.conditions.inverse_mass,
+                int(body.conditions.has_loads),
+                body.conditions.loads,
                 context.pace.arrays,
-                body.node_displacements,
-                body.node_velocities,
+                body.state.displacements,
+                body.state.velocities,
             ],
-            outputs=[body.node_reactions, context.support_work, context.bad_step],
+            outputs=[body.state.reactions, context.support_work, context.bad_step],
             device=body.device,
         )
 

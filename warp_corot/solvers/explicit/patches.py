@@ -82,20 +82,25 @@ class PatchSteps:
 
     def prepare(self) -> None:
         """Copy the body's keyframes to the device, if they are others now; not while launches are recorded."""
-        if self._trajectories != self.body.trajectories:
-            self._trajectories = list(self.body.trajectories)
-            _set_keyframes(self._tables, self._trajectories, self.body)
+        before, now = self._trajectories, list(self.body.conditions.trajectories)
+        if now == before:
+            return
+        self._trajectories = now
+        if len(now) == len(before) and all(a.times is b.times for a, b in zip(now, before, strict=True)):
+            _rewrite_keyframes(self._tables, now)  # others in the same arrays
+        else:
+            _set_keyframes(self._tables, now, self.body)
 
     @property
     def is_prepared(self) -> bool:
         """Whether the keyframes on the device are the body's; not if others came while somebody records."""
-        return self._trajectories == self.body.trajectories
+        return self._trajectories == self.body.conditions.trajectories
 
     def launch(self, count: int, damping: float, context: StepContext) -> None:
         """Launch ``count`` steps, the first ones since the clock was last advanced."""
         body = self.body
         wp.launch(
-            step_patches(self.layout, body.node_loads.dtype),
+            step_patches(self.layout, body.conditions.loads.dtype),
             dim=self.patches.count * self.layout.threads,
             block_dim=self.layout.threads,
             inputs=[
@@ -106,17 +111,17 @@ class PatchSteps:
                 body.mu,
                 body.lam,
                 body.material_stride,
-                body.node_mass,
-                body.node_inverse_mass,
-                int(body.has_loads),
-                body.node_loads,
+                body.conditions.mass,
+                body.conditions.inverse_mass,
+                int(body.conditions.has_loads),
+                body.conditions.loads,
                 context.pace.arrays,
-                body.world_starts,
+                body.conditions.world_starts,
                 self._exchange,
-                body.node_displacements,
-                body.node_velocities,
+                body.state.displacements,
+                body.state.velocities,
             ],
-            outputs=[body.node_reactions, context.support_work, context.bad_step],
+            outputs=[body.state.reactions, context.support_work, context.bad_step],
             device=body.device,
         )
 
@@ -210,3 +215,13 @@ def _set_keyframes(tables: PatchBody, trajectories: Sequence[Trajectory], body: 
         setattr(tables, name, wp.array(np.asarray(numbers), dtype=wp.int32, device=body.device))
     tables.times = wp.array(np.concatenate(times), dtype=wp.float64, device=body.device)
     tables.values = wp.array(np.concatenate(values), dtype=wp.vec3, device=body.device)
+
+
+def _rewrite_keyframes(tables: PatchBody, trajectories: Sequence[Trajectory]) -> None:
+    """Copy times and displacements of trajectories whose nodes and numbers are those that were put there before."""
+    key = value = 0
+    for trajectory in trajectories:
+        displacements = trajectory.displacements.flatten()
+        wp.copy(tables.times, trajectory.times, dest_offset=key)
+        wp.copy(tables.values, displacements, dest_offset=value)
+        key, value = key + len(trajectory.times), value + len(displacements)

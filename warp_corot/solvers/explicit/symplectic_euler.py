@@ -87,7 +87,7 @@ class SymplecticEulerStepper(Stepper):
     def _launched(self) -> BlockSteps | PatchSteps | None:
         """What makes many steps in one launch, if anything does."""
         if self.block is not None:
-            return None if self.body.trajectories else self.block
+            return None if self.body.conditions.trajectories else self.block
         return self.patches
 
     def prepare(self) -> None:
@@ -96,26 +96,26 @@ class SymplecticEulerStepper(Stepper):
 
     def forces(self, offset: int = 0) -> None:
         self.field.begin_step(self.context.pace, offset)
-        self.field.add_forces(self.body.node_displacements, self.body.node_forces)
+        self.field.add_forces(self.body.state.displacements, self.body.state.forces)
 
     def steps(self, count: int, *, forces_known: bool = False) -> None:
         many = self._launched
         if many is not None and many.is_prepared:
             if forces_known:
-                self.body.node_forces.zero_()  # a block finds its own
+                self.body.state.forces.zero_()  # a block finds its own
             many.launch(count, self.damping, self.context)
             return
         for offset in range(count):
             if offset > 0 or not forces_known:
                 self.forces(offset)
             if self.viscosity is not None:
-                self.viscosity.add_forces(self.body.node_forces)
+                self.viscosity.add_forces(self.body.state.forces)
             self._move(offset)
 
     def _move(self, offset: int) -> None:
         """Launch the motion of the ``offset``-th step since the clock was last advanced."""
         body, context = self.body, self.context
-        for trajectory in body.trajectories:
+        for trajectory in body.conditions.trajectories:
             wp.launch(
                 follow_trajectory,
                 dim=len(trajectory.nodes),
@@ -124,31 +124,31 @@ class SymplecticEulerStepper(Stepper):
                     trajectory.times,
                     trajectory.displacements,
                     context.pace.arrays,
-                    body.world_starts,
+                    body.conditions.world_starts,
                     body.world_node_count,
                     offset,
-                    body.node_forces,
-                    body.node_displacements,
+                    body.state.forces,
+                    body.state.displacements,
                 ],
-                outputs=[body.node_velocities, context.support_work],
+                outputs=[body.state.velocities, context.support_work],
                 device=body.device,
             )
         wp.launch(
-            STEP_SYMPLECTIC_EULER[body.node_loads.dtype],
-            dim=body.launch_nodes,
+            STEP_SYMPLECTIC_EULER[body.conditions.loads.dtype],
+            dim=body.sizes.launch_nodes,
             inputs=[
                 self.damping,
                 context.gravity,
-                body.node_mass,
-                body.node_inverse_mass,
-                int(body.has_loads),
-                body.node_loads,
+                body.conditions.mass,
+                body.conditions.inverse_mass,
+                int(body.conditions.has_loads),
+                body.conditions.loads,
                 context.pace.arrays,
                 offset,
-                body.node_forces,
-                body.node_displacements,
-                body.node_velocities,
+                body.state.forces,
+                body.state.displacements,
+                body.state.velocities,
             ],
-            outputs=[body.node_reactions, context.support_work, context.bad_step],
+            outputs=[body.state.reactions, context.support_work, context.bad_step],
             device=body.device,
         )

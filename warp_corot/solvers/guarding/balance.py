@@ -85,7 +85,7 @@ class Balance:
         self.bodies, self.fields, self.context, self._copies = tuple(bodies), tuple(fields), context, copies
         self.worlds, self.device = bodies[0].worlds, bodies[0].device
         self._lanes = 1 if self.device.is_cpu else WARP
-        wanted = -(-max(body.launch_nodes for body in bodies) // (self.worlds * NODES * WARP))
+        wanted = -(-max(body.sizes.launch_nodes for body in bodies) // (self.worlds * NODES * WARP))
         warps = 1 if self.device.is_cpu else max(min(wanted, WARPS // self.worlds), 1)
         self._threads = warps * self._lanes
         self._sums = wp.zeros((self.worlds, warps, kernels.COLUMNS), dtype=wp.float64, device=self.device)
@@ -99,7 +99,7 @@ class Balance:
     @property
     def is_closed(self) -> bool:
         """Whether nothing but gravity, loads and supports puts work in: active stress does."""
-        return not any(body.has_activation for body in self.bodies)
+        return not any(body.conditions.has_activation for body in self.bodies)
 
     def prepare(self) -> None:
         """Make room for the energies of the present elements; not while launches are recorded."""
@@ -133,12 +133,12 @@ class Balance:
             pace.counts = context.pace.arrays.counts
             pace.seconds = wp.array(np.array(seconds), dtype=wp.float64, device=self.device)
         for k, (body, field) in enumerate(zip(self.bodies, self.fields, strict=True)):
-            u, v = (body.node_displacements, body.node_velocities) if at is None else at[k]
+            u, v = (body.state.displacements, body.state.velocities) if at is None else at[k]
             if whole:
                 self._add_elastic(k, body, field, u)
             self._add_nodal(body, u, v, pace, (copies.u[k], copies.v[k]), keeps)
             if whole:
-                body.node_forces.zero_()
+                body.state.forces.zero_()
         inputs = [self._lanes, context.pace.orders, context.support_work, context.bad_step, copies.changed]
         inputs += [context.pace.control, context.pace.arrays, self._sums]
         dim = (self.worlds, kernels.COLUMNS, self._lanes)
@@ -185,7 +185,7 @@ class Balance:
         for name, array in field.state.items():
             wp.copy(kept[name], array)
         field.write_energies(u, energies)
-        field.add_forces(u, body.node_forces)
+        field.add_forces(u, body.state.forces)
         for name, array in field.state.items():
             wp.copy(array, kept[name])
         inputs = [energies, len(energies) // self.worlds, self._threads, self._lanes]
@@ -204,19 +204,19 @@ class Balance:
         inputs = [
             pace,
             context.gravity,
-            body.launch_nodes // self.worlds,
+            body.sizes.launch_nodes // self.worlds,
             self._threads,
             self._lanes,
-            body.node_mass,
-            body.node_inverse_mass,
-            int(body.has_loads),
-            body.node_loads,
-            body.node_forces,
+            body.conditions.mass,
+            body.conditions.inverse_mass,
+            int(body.conditions.has_loads),
+            body.conditions.loads,
+            body.state.forces,
             u,
             v,
             context.pace.orders,
             int(keeps),
         ]
-        kernel = kernels.SUM_NODES[body.node_loads.dtype]
+        kernel = kernels.SUM_NODES[body.conditions.loads.dtype]
         outputs = [*copies, self._sums]
         wp.launch(kernel, (self.worlds, self._threads), inputs, outputs, device=self.device)

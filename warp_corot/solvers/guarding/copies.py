@@ -44,7 +44,7 @@ class Copies:
         """Make room for what there is now; not while launches are recorded."""
         words = [_words(array) for field in self._fields for array in field.state.values()]
         places = [(array.ptr, len(array)) for array in words]
-        shapes = [(2, len(body.node_displacements)) for body in self._bodies]
+        shapes = [(2, len(body.state.displacements)) for body in self._bodies]
         if places == self._places and shapes == [array.shape for array in self.u]:
             return
         self.u = [wp.zeros(shape, dtype=wp.vec4, device=self.device) for shape in shapes]
@@ -58,17 +58,17 @@ class Copies:
         """Let the present state be the last good one."""
         self.prepare()
         for body, u, v, mass in zip(self._bodies, self.u, self.v, self._inverse_mass, strict=True):
-            wp.copy(u[self.slot], body.node_displacements)
-            wp.copy(v[self.slot], body.node_velocities)
-            wp.copy(mass, body.node_inverse_mass)
+            wp.copy(u[self.slot], body.state.displacements)
+            wp.copy(v[self.slot], body.state.velocities)
+            wp.copy(mass, body.conditions.inverse_mass)
         for words, kept in zip(self._words, self._kept_words, strict=True):
             wp.copy(kept[self.slot], words)
 
     def put_back(self) -> None:
         """Let the last good state be the present one."""
         for body, u, v in zip(self._bodies, self.u, self.v, strict=True):
-            wp.copy(body.node_displacements, u[self.slot])
-            wp.copy(body.node_velocities, v[self.slot])
+            wp.copy(body.state.displacements, u[self.slot])
+            wp.copy(body.state.velocities, v[self.slot])
         for words, kept in zip(self._words, self._kept_words, strict=True):
             wp.copy(words, kept[self.slot])
 
@@ -85,11 +85,11 @@ class Copies:
         """Launch the beginning of a run: the last good state is what is there now, and ``changed`` says whether it was
         before. Positions are adopted."""
         for body, u, v, mass in zip(self._bodies, self.u, self.v, self._inverse_mass, strict=True):
-            inputs = [body.node_rest, body.node_positions, body.node_inverse_mass, self._pace.orders]
-            inputs += [body.node_velocities]
-            outputs = [body.node_displacements, u, v, mass, self._pace.arrays, self.changed]
-            kernel = kernels.TAKE_OVER[body.node_positions.dtype]
-            wp.launch(kernel, body.launch_nodes, inputs, outputs, device=self.device)
+            inputs = [body.state.rest, body.state.positions, body.conditions.inverse_mass, self._pace.orders]
+            inputs += [body.state.velocities]
+            outputs = [body.state.displacements, u, v, mass, self._pace.arrays, self.changed]
+            kernel = kernels.TAKE_OVER[body.state.positions.dtype]
+            wp.launch(kernel, body.sizes.launch_nodes, inputs, outputs, device=self.device)
         self._launch_words(beside=False)
 
     def launch_keep(self) -> None:

@@ -187,8 +187,8 @@ class Guard:
         self._copies.put_back()
         self.context.pace.put_back(self._good)
         for body in self.bodies:
-            body.node_forces.zero_()
-            body.publish_positions()
+            body.state.forces.zero_()
+            body.state.publish_positions()
         self.context.bad_step.fill_(NEVER)
         # What came from nowhere before that state is not forgotten with what came after it.
         self._count(self._find(whole=True), whole=True)
@@ -293,7 +293,7 @@ class Guard:
         """The worlds in which something is not finite, as ``kernels.stepping.integrate.is_finite`` has it."""
         bad = np.zeros(self.worlds, bool)
         for body in self.bodies:
-            sizes = np.abs(body.node_displacements.numpy().astype(np.float64)).sum(axis=1)
+            sizes = np.abs(body.state.displacements.numpy().astype(np.float64)).sum(axis=1)
             bad |= ~(sizes.reshape(self.worlds, -1) <= 3e38).all(axis=1)
         return np.flatnonzero(bad)
 

@@ -34,7 +34,7 @@ class Gauge:
         self.body = body
         self.field = field
         self.found = found
-        places = body.node_displacements.shape
+        places = body.state.displacements.shape
         self.directions = wp.zeros(places, dtype=wp.vec4, device=body.device)
         self._probed, self._forces = (wp.zeros(places, dtype=wp.vec4, device=body.device) for _ in range(2))
         self._rest_directions = self.directions
@@ -46,7 +46,7 @@ class Gauge:
 
     def rescale(self) -> None:
         """Fit the probing motion to the present mesh: the lightest free node moves a share of the smallest element."""
-        inverse = self.body.node_inverse_mass[: self.body.node_count].numpy()
+        inverse = self.body.conditions.inverse_mass[: self.body.node_count].numpy()
         lightest = float(inverse.max())
         size = self.body.smallest_volume ** (1.0 / 3.0)
         self.scale.fill_(PROBE * size / np.sqrt(lightest) if lightest > 0 else 0.0)
@@ -56,24 +56,24 @@ class Gauge:
         wp.copy(self.directions, self._rest_directions)
 
     def launch(self, pace: Pace, ahead: int) -> None:
-        """Measure about the present state, whose elastic forces are in ``body.node_forces``.
+        """Measure about the present state, whose elastic forces are in ``body.state.forces``.
 
         Args:
             pace: The length of the steps to come.
             ahead: How many steps come before the next measurement.
         """
         body = self.body
-        self._find_curvature(body.node_displacements, body.node_forces)
+        self._find_curvature(body.state.displacements, body.state.forces)
         wp.launch(
             kernels.find_strains(body.element_kind),
-            dim=-(-body.launch_elements // int(kernels.TURNS)),
+            dim=-(-body.sizes.launch_elements // int(kernels.TURNS)),
             inputs=[
                 body.elements,
-                body.node_displacements,
-                body.node_velocities,
+                body.state.displacements,
+                body.state.velocities,
                 pace.arrays,
                 ahead,
-                body.launch_elements,
+                body.sizes.launch_elements,
             ],
             outputs=[self.found],
             device=body.device,
@@ -81,7 +81,7 @@ class Gauge:
 
     def curvature_at_rest(self) -> float:
         """The largest curvature about the rest shape [1/s^2]; waits for the device."""
-        u, f = (wp.zeros_like(self.body.node_displacements) for _ in range(2))
+        u, f = (wp.zeros_like(self.body.state.displacements) for _ in range(2))
         with self.field.state_kept():
             self.field.add_forces(u, f)
             for _ in range(REST_TURNS):
@@ -93,7 +93,7 @@ class Gauge:
         return value
 
     def _find_curvature(self, u: wp.array, f: wp.array) -> None:
-        inverse_mass = self.body.node_inverse_mass
+        inverse_mass = self.body.conditions.inverse_mass
         outputs = [self.directions, self._probed, self._forces]
         self._launch(kernels.probe_directions, [self.scale, inverse_mass, u], outputs)
         self.field.add_forces(self._probed, self._forces)
@@ -102,4 +102,4 @@ class Gauge:
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         body = self.body
-        wp.launch(kernel, dim=body.launch_nodes, inputs=inputs, outputs=outputs, device=body.device)
+        wp.launch(kernel, dim=body.sizes.launch_nodes, inputs=inputs, outputs=outputs, device=body.device)

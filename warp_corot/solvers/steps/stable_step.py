@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +13,6 @@ from warp_corot.kernels.stepping import lanczos
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
-    from warp_corot.elasticity import ForceField
 
 LANCZOS_STEPS = 30
 #: Of how many steps the best one is taken.
@@ -22,22 +22,53 @@ LAST_STEPS = 8
 PROBE = 1e-3
 
 
-def largest_frequency(body: SoftBody, field: ForceField) -> float:
+class SmallForces(Protocol):
+    """Forces of small displacements, whatever they come from."""
+
+    def add_forces(self, u: wp.array, f: wp.array) -> None:
+        """Add the forces [N] of displacements u to f; both vec4, a place for each node."""
+        ...
+
+    def state_kept(self) -> AbstractContextManager[None]:
+        """Whatever is launched inside leaves no trace in the state that steps go on from."""
+        ...
+
+
+def largest_frequency(body: SoftBody, field: SmallForces) -> float:
     """Largest angular frequency [rad/s] of small motions about rest; explicit central differences need dt < 2 / it.
 
-    Lanczos' iteration on M^-1/2 K M^-1/2, where K is applied as the force field itself does it for small displacements,
-    so that whatever model and elements there are is what is measured. The Ritz value's residual is added to it. Zero if
-    no node is free to move.
+    Zero if no node is free to move.
     """
-    free = int((body.node_inverse_mass[: body.node_count].numpy() > 0).sum())
+    largest = largest_eigenvalue(
+        field, body.conditions.inverse_mass, body.smallest_volume, body.sizes.nodes, body.sizes.launch_nodes
+    )
+    return float(np.sqrt(largest))
+
+
+def largest_eigenvalue(
+    forces: SmallForces, inverse_mass: wp.array, smallest_volume: float, nodes: int, launch_nodes: int | None = None
+) -> float:
+    """The largest eigenvalue of M^-1 K [1/s^2], with K what gives such forces of small displacements from rest.
+
+    Lanczos' iteration on M^-1/2 K M^-1/2, where K is applied as the forces themselves do it, so that whatever model and
+    elements there are is what is measured. The Ritz value's residual is added to it. Zero if no node is free to move.
+
+    Args:
+        forces: The forces.
+        inverse_mass: Of the nodes [1/kg], float32, zero for those that are held; nodal arrays are as long.
+        smallest_volume: Of an element [m^3], which says what is small.
+        nodes: How many nodes there are.
+        launch_nodes: How many launches go through; None: as many.
+    """
+    free = int((inverse_mass[:nodes].numpy() > 0).sum())
     if not free:
         return 0.0
-    iteration = _Lanczos(body, field)
-    with field.state_kept():
+    iteration = _Lanczos(forces, inverse_mass, PROBE * smallest_volume ** (1.0 / 3.0), launch_nodes or nodes)
+    with forces.state_kept():
         iteration.find_rest_forces()
         for step in range(min(LANCZOS_STEPS, 3 * free)):
             iteration.launch(step)
-    return float(np.sqrt(max(_largest_value(*iteration.coefficients()), 0.0)))
+    return max(_largest_value(*iteration.coefficients()), 0.0)
 
 
 def _largest_value(diagonal: npt.NDArray[np.float64], off: npt.NDArray[np.float64]) -> float:
@@ -54,38 +85,36 @@ def _largest_value(diagonal: npt.NDArray[np.float64], off: npt.NDArray[np.float6
 class _Lanczos:
     """The iteration's vectors on the device, vec4, as long as launches: the present one, the one before, the next."""
 
-    def __init__(self, body: SoftBody, field: ForceField):
-        self.body = body
-        self.field = field
-        self.probe = PROBE * body.smallest_volume ** (1.0 / 3.0)
-        self.q, self.before, self.next = (
-            wp.empty(body.launch_nodes, dtype=wp.vec4, device=body.device) for _ in range(3)
-        )
-        self.u, self.f, self._rest = (wp.zeros_like(body.node_displacements) for _ in range(3))
-        parts = min(body.launch_nodes, lanczos.PARTS)
+    def __init__(self, forces: SmallForces, inverse_mass: wp.array, probe: float, count: int):
+        self.forces, self.inverse_mass, self.probe, self.count = forces, inverse_mass, probe, count
+        self.device = inverse_mass.device
+        self.q, self.before, self.next = (wp.empty(count, dtype=wp.vec4, device=self.device) for _ in range(3))
+        places = len(inverse_mass)
+        self.u, self.f, self._rest = (wp.zeros(places, dtype=wp.vec4, device=self.device) for _ in range(3))
+        parts = min(count, lanczos.PARTS)
         self._parts, self._sums, self._largest, self._diagonal, self._off = (
-            wp.empty(size, dtype=wp.float64, device=body.device)
+            wp.empty(size, dtype=wp.float64, device=self.device)
             for size in (parts, lanczos.FOLDED, lanczos.FOLDED, LANCZOS_STEPS, LANCZOS_STEPS + 1)
         )
-        self._scale = wp.empty(1, dtype=wp.float32, device=body.device)
+        self._scale = wp.empty(1, dtype=wp.float32, device=self.device)
         self._steps = 0
-        self._launch(lanczos.random_motion, [0, body.node_inverse_mass, self.q])
+        self._launch(lanczos.random_motion, [0, inverse_mass, self.q])
         self._normalise(self.q, 0)
 
     def find_rest_forces(self) -> None:
         """What forces there are without displacements, by active stress: of those with any, only the rest counts."""
-        self.field.add_forces(self.u, self._rest)
+        self.forces.add_forces(self.u, self._rest)
         self._launch(lanczos.scale_by, [-1.0, self._rest])
 
     def launch(self, step: int) -> None:
         """Launch a step; each is one after the last."""
-        inverse_mass = self.body.node_inverse_mass
+        inverse_mass = self.inverse_mass
         self._launch(lanczos.largest_motions, [inverse_mass, self.q, self._parts], len(self._parts))
         self._launch(lanczos.fold, [self._parts, self._sums, self._largest], lanczos.FOLDED)
         self._launch(lanczos.take_scale, [self.probe, self._largest, self._scale], 1)
         self._launch(lanczos.probe_motion, [self._scale, inverse_mass, self.q, self.u])
-        wp.copy(self.f, self._rest, count=self.body.launch_nodes)
-        self.field.add_forces(self.u, self.f)
+        wp.copy(self.f, self._rest, count=self.count)
+        self.forces.add_forces(self.u, self.f)
         arguments = [self._scale, self._off, step, inverse_mass, self.f, self.before, self.next]
         self._launch(lanczos.apply_stiffness, arguments)
         self._sum(self.q, self.next, self._diagonal, step)
@@ -115,5 +144,5 @@ class _Lanczos:
         self._launch(lanczos.take_sum, [self._sums, int(root), place, numbers], 1)
 
     def _launch(self, kernel: wp.Kernel, arguments: list, dim: int | None = None) -> None:
-        count = self.body.launch_nodes if dim is None else dim
-        wp.launch(kernel, dim=count, inputs=arguments, device=self.body.device)
+        count = self.count if dim is None else dim
+        wp.launch(kernel, dim=count, inputs=arguments, device=self.device)

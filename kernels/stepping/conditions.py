@@ -1,0 +1,89 @@
+"""What users do to nodes between steps: hold them, let them go, load them. A launch is as large as the patch is.
+
+Values are repeated where there are fewer of them than nodes: one for all, or those of one world for each.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import store_node
+
+from .integrate import by_vectors, write_vector
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def inverse_of(mass: float):
+    """1/m, as every node that is free to move has it, or zero without mass [1/kg]."""
+    if mass > 0.0:
+        return float(wp.float64(1.0) / wp.float64(mass))
+    return float(0.0)
+
+
+@wp.kernel(enable_backward=False)
+def free_nodes(
+    # In
+    mass: wp.array[wp.float32],
+    held: wp.array[wp.uint8],
+    # Out
+    inverse_mass: wp.array[wp.float32],
+):
+    """Give every node that is not held its inverse mass, and none to the others."""
+    i = wp.tid()
+    inverse = float(0.0)
+    if held[i] == wp.uint8(0):
+        inverse = inverse_of(mass[i])
+    inverse_mass[i] = inverse
+
+
+@wp.kernel(enable_backward=False)
+def hold_nodes(
+    # In
+    nodes: wp.array[wp.int32],
+    velocities: wp.array[wp.vec3],
+    # Out
+    held: wp.array[wp.uint8],
+    inverse_mass: wp.array[wp.float32],
+    v: wp.array[wp.vec4],
+):
+    """Hold nodes; they move with the velocities given, zero to stay where they are."""
+    k = wp.tid()
+    i = nodes[k]
+    held[i] = wp.uint8(1)
+    inverse_mass[i] = 0.0
+    store_node(v, i, velocities[k % velocities.shape[0]])
+
+
+@wp.kernel(enable_backward=False)
+def release_nodes(
+    # In
+    nodes: wp.array[wp.int32],
+    mass: wp.array[wp.float32],
+    # Out
+    held: wp.array[wp.uint8],
+    inverse_mass: wp.array[wp.float32],
+    reactions: wp.array[wp.vec4],
+):
+    """Let nodes go with the velocity they have."""
+    i = nodes[wp.tid()]
+    held[i] = wp.uint8(0)
+    inverse_mass[i] = inverse_of(mass[i])
+    store_node(reactions, i, wp.vec3())
+
+
+@wp.kernel(enable_backward=False)
+def load_nodes(
+    # In
+    nodes: wp.array[wp.int32],
+    forces: wp.array[wp.vec3],
+    # Out
+    loads: wp.array[Any],
+):
+    """Set the loads of nodes."""
+    k = wp.tid()
+    write_vector(loads, nodes[k], forces[k % forces.shape[0]])
+
+
+LOAD_NODES = by_vectors(load_nodes, "loads")

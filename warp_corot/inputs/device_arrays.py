@@ -1,0 +1,57 @@
+"""Vectors that are on a device already, of Warp, PyTorch or JAX: taken as they are, without a way through the host."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_corot.errors import InputError
+
+from .checks import shown
+
+
+def vectors_on_device(given: Any, name: str, counts: tuple[int, ...], device: wp.Device) -> wp.array | None:
+    """One vector, or one for each of some nodes, if they are in an array of a device; None for anything else.
+
+    Nothing waits for the device, so values are not checked.
+
+    Args:
+        given: A ``wp.array`` of vec3 [n] or float32 [n, 3], or an array of float32 [n, 3] of another program that knows
+            DLPack, as PyTorch's and JAX's do. float32 [3] is one vector.
+        name: What they are, for the message.
+        counts: How many there may be, besides one.
+        device: Where they must be, or are copied to.
+
+    Returns:
+        vec3 [n].
+
+    Raises:
+        InputError: Another type, or another number of vectors.
+    """
+    array = _as_warp(given)
+    if array is None:
+        return None
+    if array.dtype == wp.float32 and array.shape == (3,):
+        array = array.reshape((1, 3))
+    if array.dtype == wp.float32 and array.ndim == 2 and array.shape[1] == 3:
+        rows = array if array.strides[1] == wp.types.type_size_in_bytes(wp.float32) else array.contiguous()
+        array = rows.view(wp.vec3)
+    if array.dtype != wp.vec3 or array.ndim != 1 or len(array) not in (1, *counts):
+        allowed = " or ".join(f"[{count}, 3]" for count in dict.fromkeys(counts))
+        found = f"{wp.types.type_repr(array.dtype)} {list(array.shape)}"
+        raise InputError(f"{name} is {found}; it must be float32 [3] or {allowed}, or vec3 of as many")
+    return array if array.device == device else array.to(device)
+
+
+def _as_warp(given: Any) -> wp.array | None:
+    if isinstance(given, wp.array):
+        return given
+    if isinstance(given, np.ndarray | np.generic) or not hasattr(given, "__dlpack__"):
+        return None
+    try:
+        array = wp.from_dlpack(given)
+    except Exception as error:  # whatever the other program raises
+        raise InputError(f"{shown(given)} cannot be read through DLPack: {error}") from None
+    return array if array.dtype == wp.float32 else None
