@@ -128,6 +128,11 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
             self._known[what] = getattr(self.changing, what)()
         return self._known[what]
 
+    def follow_mesh(self, changing: Changing) -> None:
+        """The mesh changes from now on, and is what this says."""
+        self.changing = changing
+        self.mesh_changed(self.world_node_count, self.world_element_count)
+
     def mesh_changed(self, nodes: int, elements: int) -> None:
         """The device has changed the mesh: what the host knows of it is out of date.
 

@@ -99,7 +99,7 @@ class ForceField(ABC):
     @property
     def element_count(self) -> int:
         """How many elements launches go through; those beyond the body's do nothing."""
-        return self.body.launch_elements
+        return self.body.sizes.launch_elements
 
     @property
     def energy_count(self) -> int:

@@ -45,5 +45,5 @@ class Viscosity:
     def _launch(self, elements: object, f: wp.array) -> None:
         body = self.body
         inputs = [elements, self.seconds, body.mu, body.lam, body.material_stride]
-        inputs += [body.node_displacements, body.node_velocities]
+        inputs += [body.state.displacements, body.state.velocities]
         wp.launch(self._kernel, self.field.element_count, inputs, [f], device=body.device)

@@ -97,13 +97,13 @@ class CarriedAnisotropic(CarriedMaterial):
             self.values |= _columns(STIFFNESS_ENTRIES, stiffness, count, int(MEAN_OF_CONTENTS))
         if self._axes_vary:
             self.values |= _columns(FRAME_ENTRIES, frames, count, int(FIRST))
-        active = body.element_activation.numpy() if body.has_activation else 0.0
+        active = body.conditions.activation.numpy() if body.conditions.has_activation else 0.0
         self.values[ACTIVATION] = Column(active, int(MEAN_IF_ALIKE))
         self.values[ACTIVATION_ROW] = Numbers(int(NO_ROW))
 
     def serve(self, body: SoftBody, plan: DevicePlan) -> None:
         super().serve(body, plan)
-        body.element_activation = plan.values[ACTIVATION]
+        body.conditions.activation = plan.values[ACTIVATION]
 
     def present(self, forest: DeviceForest) -> Material:
         changed: dict[str, Any] = {"density": self._present_density(forest)}

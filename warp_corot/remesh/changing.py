@@ -21,7 +21,7 @@ from warp_corot.mesh import TetForest
 from warp_corot.mesh.lattice import volume_shares
 
 from .carried_material import carried_material
-from .conditions import Conditions
+from .conditions import CarriedConditions
 from .online import OnlineRemesh
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class Changing:
             values=self.carried_material.values,
             device=self.device,
         )
-        self.conditions = Conditions(body, self.forest)
+        self.conditions = CarriedConditions(body, self.forest)
         self.passes = RemeshPass(
             self.forest,
             criterion=self.options.criterion or elongation,
@@ -104,17 +104,9 @@ class Changing:
         """Lumped nodal masses [kg], float64 [N]."""
         return self._of_nodes(self.forest.carriage.arrays.mass)
 
-    def held(self) -> npt.NDArray[np.bool_]:
-        """Which nodes are held, bool [N]."""
-        return self._of_nodes(self.forest.carriage.arrays.held) != 0
-
-    def hold(self, held: npt.NDArray[np.bool_]) -> None:
-        """Say which nodes are held, bool [N]."""
-        self.forest.carriage.arrays.held[: len(held)].assign(held.astype(np.uint8))
-
     def remember(self) -> None:
         """Make the present mesh and state what ``reset`` goes back to."""
-        self.body.adopt_positions()
+        self.body.state.adopt_positions()
         self.forest.remember()
         self.conditions.keep()
 
@@ -141,7 +133,7 @@ class Changing:
 
     def run(self) -> None:
         """One pass over the mesh, and what follows from it if anything has changed."""
-        self.body.adopt_positions()
+        self.body.state.adopt_positions()
         self.conditions.note()
         if self._graph is None:
             self._launch()
@@ -166,35 +158,20 @@ class Changing:
         self.conditions.note()
         self.forest.restart()
         self.conditions.put_back()
-        wp.launch(set_start, dim=1, inputs=[pace.arrays], outputs=[self.body.world_starts], device=self.device)
+        wp.launch(set_start, dim=1, inputs=[pace.arrays], outputs=[self.body.conditions.world_starts], device=self.device)
         self.renew()
         self.conditions.keep()
-        self.body.update_inverse_mass()
+        self.body.conditions.find_inverse_masses()
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _give_pools_to(self, body: SoftBody) -> None:
         """The body's arrays are the pools' from now on, with what was in them."""
-        arrays, count = self.forest.carriage.arrays, body.node_count
-        body.adopt_positions()
-        for array, given in (
-            (arrays.u, body.node_displacements),
-            (arrays.v, body.node_velocities),
-            (arrays.reaction, body.node_reactions),
-        ):
-            wp.copy(array, given, count=count)
-        if body.has_loads:
-            wp.copy(arrays.load, body.node_loads, count=count)
-        body.node_rest, body.node_displacements, body.node_velocities = arrays.rest, arrays.u, arrays.v
-        body.node_reactions, body.node_loads = arrays.reaction, arrays.load
-        body.node_mass, body.node_inverse_mass = arrays.mass32, arrays.inverse_mass
-        body.node_positions, body.node_forces = wp.clone(arrays.rest), wp.zeros_like(arrays.u)
-        held = body.held.copy()
-        body.changing = self
-        self.hold(held)
-        body.mesh_changed(count, body.element_count)
-        body.update_inverse_mass()
-        self._keep_initial_state(body.initial_state)
+        arrays, initial = self.forest.carriage.arrays, body.state.initial
+        body.state.move_into(arrays.rest, arrays.u, arrays.v, arrays.reaction)
+        body.conditions.move_into(arrays.held, arrays.mass32, arrays.inverse_mass, arrays.load)
+        body.follow_mesh(self)
+        self._keep_initial_state(initial)
 
     def _launch(self) -> None:
         """Launch a pass and all that is derived from the mesh, or record it."""
@@ -228,17 +205,16 @@ class Changing:
             return
         body = self.body
         limit = self.forest.node_capacity
-        nodes = launch_size(counts.nodes, body.launch_nodes, NODE_GRANULE, limit)
-        elements = launch_size(counts.leaves, body.launch_elements, 1, len(self.plan.elements.code))
-        moved = (nodes, elements) != (body.launch_nodes, body.launch_elements)
-        body.launch_nodes, body.launch_elements = nodes, elements
+        nodes = launch_size(counts.nodes, body.sizes.launch_nodes, NODE_GRANULE, limit)
+        elements = launch_size(counts.leaves, body.sizes.launch_elements, 1, len(self.plan.elements.code))
+        moved = body.sizes.set_launches(nodes, elements)
         if self.plan.refresh(classes) or moved:
             self.field.follow(self.plan)
-            body.revision += 1
+            body.sizes.relaunch()
         body.mesh_changed(counts.nodes, counts.leaves)
         self.survey.read(surveyed)
         body.smallest_volume = float(volume_shares(self.survey.finest_level)) * self.forest.source.cell_size**3
-        body.publish_positions()
+        body.state.publish_positions()
         self.conditions.follow(followers)
         for binding in body.bindings:
             binding.rebind(self.forest.pools)
@@ -248,18 +224,18 @@ class Changing:
         arrays, count = self.forest.carriage.arrays, self.body.node_count
         present = [wp.clone(array) for array in (arrays.u, arrays.v)]
         arrays.u.zero_()
-        free = ~self.body.held
+        free = ~self.body.constrained
         velocities = self._of_nodes(arrays.v)
         velocities[free] = 0.0
         arrays.v[:count].assign(velocities)
         if initial is not None:
             for array, kept in zip((arrays.u, arrays.v), initial, strict=True):
                 wp.copy(array, kept, count=count)
-        self.body.publish_positions()
+        self.body.state.publish_positions()
         self.remember()
         for array, kept in zip((arrays.u, arrays.v), present, strict=True):
             wp.copy(array, kept)
-        self.body.publish_positions()
+        self.body.state.publish_positions()
 
     def _of_nodes(self, array: wp.array) -> npt.NDArray[Any]:
         return array[: self.body.node_count].numpy().copy()

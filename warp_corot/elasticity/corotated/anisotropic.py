@@ -88,14 +88,14 @@ class AnisotropicField(ForceField):
 
     def begin_step(self, pace: Pace, offset: int) -> None:
         body = self.body
-        for activation in body.activations:
-            inputs = [activation.elements, activation.times, activation.stress, pace.arrays, body.world_starts]
+        for activation in body.conditions.activations:
+            inputs = [activation.elements, activation.times, activation.stress, pace.arrays, body.conditions.world_starts]
             inputs += [body.world_element_count, offset]
-            self.launch(follow_activation, len(activation.elements), inputs, [body.element_activation])
+            self.launch(follow_activation, len(activation.elements), inputs, [body.conditions.activation])
 
     @property
     def _activation(self) -> list:
-        return [int(self.body.has_activation), self.body.element_activation]
+        return [int(self.body.conditions.has_activation), self.body.conditions.activation]
 
 
 class AnisotropicLanesField(AnisotropicField):

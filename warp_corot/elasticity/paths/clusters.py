@@ -142,7 +142,7 @@ class ChangingClusterScatter:
 
     def __call__(self, material: Any, u: wp.array, f: wp.array) -> None:
         """As ``ClusterScatter`` does."""
-        threads, count = self._layout.threads, -(-self._body.launch_elements // self._layout.elements)
+        threads, count = self._layout.threads, -(-self._body.sizes.launch_elements // self._layout.elements)
         wp.launch(
             self._kernel,
             dim=count * threads,
