@@ -14,8 +14,8 @@ import warp_corot as wc
 from warp_corot.body.worlds import World
 from warp_corot.elasticity import ForceField, Model
 from warp_corot.experiments import paper
-from warp_corot.solvers.integrator import StepContext
 from warp_corot.solvers.steps.pace import Pace
+from warp_corot.solvers.system import System
 
 #: Steps of one sample of a whole-step row.
 STEPS = 64
@@ -140,8 +140,8 @@ def integration_case(problem: Problem) -> Case:
     v, f = (rng.uniform(-1, 1, problem.u.shape).astype(np.float32) for _ in range(2))
     v[body.constrained] = 0
     f *= np.float32(body.masses.mean() * 10.0)
-    context = StepContext.of(Pace(dt, problem.device), wp.vec3(0.0, 0.0, 0.0))
-    stepper = wc.SymplecticEuler(dt, DAMPING).bind(body, _NoForces(body), context)
+    system = System([body], [_NoForces(body)], Pace(dt, problem.device), (0.0, 0.0, 0.0))
+    stepper = wc.SymplecticEuler(dt, DAMPING).bind(system)
 
     def error() -> float:
         body.velocities = v

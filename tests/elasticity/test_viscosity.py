@@ -17,9 +17,8 @@ def forces(mesh, displacements, velocities, device, seconds=0.1, deterministic=F
     body = wc.SoftBody(mesh, wc.Isotropic(1e5, 0.3, 1000.0), device=device, **options)
     body.displacements, body.velocities = displacements, velocities
     field = wc.Corotated().bind(body, deterministic=deterministic)
-    f = wp.zeros_like(body.state.forces)
-    Viscosity(body, field, seconds).add_forces(f)
-    return f.numpy()[:, :3].astype(np.float64)
+    Viscosity(body, field, seconds).add_forces()
+    return body.state.forces.numpy()[:, :3].astype(np.float64)
 
 
 def strained(mesh, rng, amount=0.25) -> np.ndarray:

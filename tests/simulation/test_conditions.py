@@ -107,7 +107,9 @@ def test_a_hand_that_drags_leaves_recorded_steps_as_they_are(device):
     for k in range(1, 4):
         there = np.array([0.0, 0.0, 1e-3 * k])
         body.load(top, [1e-3 * k, 0.0, 0.0])
-        body.prescribe(top, times=[sim.time, sim.time + 0.01], displacements=[body.displacements.numpy()[top[0]], there])
+        body.prescribe(
+            top, times=[sim.time, sim.time + 0.01], displacements=[body.displacements.numpy()[top[0]], there]
+        )
         sim.advance(0.012)
         np.testing.assert_allclose(body.displacements.numpy()[top], np.tile(there, (len(top), 1)), atol=1e-7)
     assert body.launch_revision == revision

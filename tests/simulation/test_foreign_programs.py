@@ -197,7 +197,7 @@ def test_small_bodies_in_blocks_take_any_array(form, device, rng):
         pytest.skip("blocks are for CUDA")
     own, theirs = bar(device, level=3), bar(device, level=3)
     own, theirs = (wc.Simulation(sim.body, integrator=sim.integrator, gravity=(0, 0, 0)) for sim in (own, theirs))
-    assert all(stepper.many_a_launch for sim in (own, theirs) for stepper in sim._recorded._steppers)
+    assert all(sim.recorded.in_blocks for sim in (own, theirs))
     loads = form(theirs.body.node_count, device)
     theirs.body.use_loads(loads)
     for _ in range(3):

@@ -157,10 +157,10 @@ def run(general, steps, by_patches, *, keyframes=False, loads=False):
     if loads:
         body.load(np.arange(len(y)), 1e-4 * rng.normal(size=(len(y), 3)))
     sim = wc.Simulation(body, integrator=wc.SymplecticEuler(dt=1e-5, damping=10.0))
-    stepper = sim.recorded._steppers[0]
-    assert stepper.patches is not None
+    many = sim.recorded._stepper._many
+    assert isinstance(many[0], PatchSteps)
     if not by_patches:
-        stepper.patches = None
+        many[0] = None
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         sim.advance_steps(steps)

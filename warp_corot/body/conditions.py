@@ -146,4 +146,3 @@ class Conditions:
         """Have active stress follow these keyframes and no others."""
         self.activations = list(activations)
         self.revision += 1
-

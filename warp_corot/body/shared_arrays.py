@@ -132,4 +132,3 @@ def _vectors(array: wp.array) -> wp.array | None:
         return None
     dtype = {3: wp.vec3, 4: wp.vec4}.get(array.shape[-1])
     return None if dtype is None else array.view(dtype)
-

@@ -18,6 +18,7 @@ def vec3_view(a: wp.array) -> wp.array:
     """The first three lanes of a vec4 array as a live (strided) vec3 array; a vec3 array as it is."""
     return a if a.dtype == wp.vec3 else a.view(wp.float32)[:, :3].view(wp.vec3)
 
+
 def same_array(a: wp.array, b: wp.array) -> bool:
     """Whether launches with one are launches with the other."""
     return (a.ptr, a.dtype, a.strides) == (b.ptr, b.dtype, b.strides)

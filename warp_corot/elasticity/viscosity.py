@@ -31,8 +31,9 @@ class Viscosity:
         #: Where sums must come out the same every time, the elements' own places for them.
         self._slots = leaf_slots(body) if field.deterministic else None
 
-    def add_forces(self, f: wp.array) -> None:
-        """Launch the forces of the present displacements and velocities [N], added to f, vec4 [worlds * N]."""
+    def add_forces(self) -> None:
+        """Launch what adds the forces of the present displacements and velocities to the body's [N]."""
+        f = self.body.state.forces
         if self._slots is None:
             # Forces go to the nodes also where the field's own kernels take them elsewhere.
             self._launch(self.field.elements if self.body.changing is not None else self.body.elements, f)

@@ -22,8 +22,8 @@ from warp_corot.elasticity import Corotated, ForceField
 from warp_corot.elasticity.corotated.model import CorotatedField
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import SymplecticEuler
-from warp_corot.solvers.integrator import StepContext
 from warp_corot.solvers.steps.pace import Pace
+from warp_corot.solvers.system import System
 
 #: Launches of one stage recorded in a graph.
 LAUNCHES = 64
@@ -205,8 +205,8 @@ def _integration(sim: Simulation) -> tuple[wp.Graph, list]:
     body.fix(original.constrained)
     body.displacements = original.displacements.numpy()
     assert isinstance(sim.integrator, SymplecticEuler)
-    context = StepContext.of(Pace(sim.dt, sim.device), wp.vec3(0.0, 0.0, 0.0))
-    stepper = sim.integrator.bind(body, _NoForces(body), context)
+    system = System([body], [_NoForces(body)], Pace(sim.dt, sim.device), (0.0, 0.0, 0.0))
+    stepper = sim.integrator.bind(system)
     return recorded(lambda: stepper.steps(1), sim.device), [body, stepper]
 
 

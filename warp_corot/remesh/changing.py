@@ -158,7 +158,9 @@ class Changing:
         self.conditions.note()
         self.forest.restart()
         self.conditions.put_back()
-        wp.launch(set_start, dim=1, inputs=[pace.arrays], outputs=[self.body.conditions.world_starts], device=self.device)
+        wp.launch(
+            set_start, dim=1, inputs=[pace.arrays], outputs=[self.body.conditions.world_starts], device=self.device
+        )
         self.renew()
         self.conditions.keep()
         self.body.conditions.find_inverse_masses()

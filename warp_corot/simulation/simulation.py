@@ -22,10 +22,10 @@ from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.remesh.remeshing import Remeshing
 from warp_corot.solvers import Integrator, SymplecticEuler, largest_frequency
 from warp_corot.solvers.guarding.guard import Guard
-from warp_corot.solvers.integrator import NEVER, StepContext
 from warp_corot.solvers.recorded import RecordedSteps, Segment
 from warp_corot.solvers.steps.pace import Pace
 from warp_corot.solvers.steps.safe_step import ANY_STEP, SafeStep
+from warp_corot.solvers.system import NEVER, System
 
 from .energy import Energy, WorldEnergies, find_energies
 from .parts import checked_bodies, checked_gravity, checked_integrator, checked_models
@@ -97,15 +97,12 @@ class Simulation:
         stable = self._find_stable_steps()
         given = self.integrator.dt
         self.pace = Pace(ANY_STEP if given is None else float(given), self.device)
-        self._context = StepContext.of(self.pace, wp.vec3(*self.gravity))
+        self.system = System(self.bodies, self.fields, self.pace, self.gravity)
         #: What chooses the step, if none was given.
-        self.safe_step: SafeStep | None = None
-        if given is None:
-            self.safe_step = SafeStep(self.bodies, self.fields, self.models, self.pace, stable)
-        moved = zip(self.bodies, self.fields, strict=True)
-        steppers = [self.integrator.bind(body, field, self._context) for body, field in moved]
-        self.guard = Guard(self.bodies, self.fields, self._context)
-        self.recorded = RecordedSteps(self.bodies, steppers, self.pace, self.guard, self.safe_step)
+        self.safe_step = SafeStep(self.system, self.models, stable) if given is None else None
+        self.guard = Guard(self.system)
+        stepper = self.integrator.bind(self.system)
+        self.recorded = RecordedSteps(self.system, stepper, self.guard, self.safe_step)
         #: What is to be kept besides the states of bodies and fields for a run to go on as it would have.
         self.kept = self.pace.state | ({} if self.safe_step is None else self.safe_step.state)
         self._running = Running(self)
@@ -255,7 +252,7 @@ class Simulation:
             self.pace.restart()
             if self.safe_step is not None:
                 self.safe_step.restart()
-            self._context.bad_step.fill_(NEVER)
+            self.system.bad_step.fill_(NEVER)
             self.guard.restart()
         for body, field in zip(self.bodies, self.fields, strict=True):
             body.reset(chosen, self.pace)

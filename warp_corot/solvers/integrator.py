@@ -1,59 +1,25 @@
-"""What every time integrator is: a small description, and the stepper that it becomes for one body."""
+"""What every time integrator is: a small description, and the stepper that it becomes for a system of bodies."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-import warp as wp
-
-from warp_corot.elasticity import ForceField
-from warp_corot.solvers.steps.pace import Pace
-
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
-
-
-#: No step: later than all.
-NEVER = np.iinfo(np.int64).max
-
-
-@dataclass(frozen=True)
-class StepContext:
-    """What the steppers of a simulation share.
-
-    Attributes:
-        pace: The clock and the length of a step; steps recorded in one run add their offset.
-        gravity: [m/s^2].
-        support_work: What moving supports have put in, and the sum of its absolute values [J], float64 [2].
-        bad_step: The first step after which something was not finite, int64 [1] on the device.
-    """
-
-    pace: Pace
-    gravity: wp.vec3
-    support_work: wp.array
-    bad_step: wp.array
-
-    @classmethod
-    def of(cls, pace: Pace, gravity: wp.vec3) -> StepContext:
-        """A new one, in which nothing has happened."""
-        bad_step = wp.array([NEVER], dtype=wp.int64, device=pace.device)
-        return cls(pace, gravity, pace.support_work, bad_step)
+    from .system import System
 
 
 class Stepper(ABC):
-    """One body's time steps as launches that can be recorded."""
+    """Time steps of all bodies of a system as launches that can be recorded."""
 
     @property
     def many_a_launch(self) -> bool:
-        """Whether many steps are one launch."""
+        """Whether many steps are one launch, for every body."""
         return False
 
     def prepare(self) -> None:  # noqa: B027 (most need nothing)
-        """Bring up to date what launches read of the body's controls; called before steps are recorded."""
+        """Bring up to date what launches read of the bodies' conditions; called before steps are recorded."""
 
     @abstractmethod
     def forces(self, offset: int = 0) -> None:
@@ -80,5 +46,5 @@ class Integrator(ABC):
         return 2.0 / frequency if frequency > 0.0 else math.inf
 
     @abstractmethod
-    def bind(self, body: SoftBody, field: ForceField, context: StepContext) -> Stepper:
-        """The stepper of a body under a force field."""
+    def bind(self, system: System) -> Stepper:
+        """The stepper of a system."""

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import warp as wp
 
 from warp_corot.solvers.guarding.guard import Guard
-from warp_corot.solvers.steps.pace import Pace
 from warp_corot.solvers.steps.safe_step import (
     BLOCK_INTERVAL,
     CALM_CHECKS,
@@ -24,9 +22,7 @@ from warp_corot.solvers.steps.safe_step import (
 
 from .integrator import Stepper
 from .subnormals import FlushedSubnormals
-
-if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+from .system import System
 
 #: Steps recorded in one graph; more where a launch is many steps.
 GRAPH_STEPS = 64
@@ -84,38 +80,36 @@ class RecordedSteps:
     """Steps that all bodies make together.
 
     Args:
-        bodies: On one device.
-        steppers: One for each body.
-        pace: The clock.
+        system: The bodies, and their clock.
+        stepper: Of their integrator.
         guard: Looks at where runs begin and end.
         safe_step: What measures how long a step may be, if none was given.
     """
 
     def __init__(
         self,
-        bodies: Sequence[SoftBody],
-        steppers: Sequence[Stepper],
-        pace: Pace,
+        system: System,
+        stepper: Stepper,
         guard: Guard,
         safe_step: SafeStep | None = None,
     ):
-        self._bodies = bodies
-        self._steppers = steppers
-        self._pace = pace
+        self._system = system
+        self._stepper = stepper
+        self._pace = system.pace
         self._guard = guard
         self._safe_step = safe_step
-        self._flushed = FlushedSubnormals(pace.device)
+        self._flushed = FlushedSubnormals(system.device)
         self._graphs: dict[Segment, wp.Graph] = {}
         self._asked: set[Segment] = set()
         #: How calm the bodies are, as a ``Schedule`` has it.
         self.calm = UNKNOWN
-        self._revisions: tuple[int, ...] = ()
-        self._rewritten: tuple[int, ...] = ()
+        self._revisions = (-1, -1)
+        self._rewritten = -1
 
     @property
     def in_blocks(self) -> bool:
         """Whether many steps are one launch."""
-        return all(stepper.many_a_launch for stepper in self._steppers)
+        return self._stepper.many_a_launch
 
     @property
     def interval(self) -> int:
@@ -131,11 +125,11 @@ class RecordedSteps:
         if segment.begins:
             self._guard.launch_begin()
         if segment.adopts:
-            self.adopt_positions()
+            self._system.adopt_positions()
         with self._flushed():
             self._launch_steps(segment)
         if segment.publishes:
-            self.publish_positions()
+            self._system.publish_positions()
         if segment.ends:
             self._guard.launch_end(whole=segment.whole)
 
@@ -146,14 +140,12 @@ class RecordedSteps:
             safe_step.launch_resumption()
         if segment.measured:
             assert safe_step is not None
-            for stepper in self._steppers:
-                stepper.forces()
+            self._stepper.forces()
             safe_step.launch(segment.measured)
         if segment.fits:
             assert safe_step is not None
             safe_step.launch_fit()
-        for stepper in self._steppers:
-            stepper.steps(segment.count, forces_known=segment.measured > 0)
+        self._stepper.steps(segment.count, forces_known=segment.measured > 0)
         self._pace.advance(segment.count)
 
     def replay(self, segment: Segment) -> None:
@@ -173,19 +165,17 @@ class RecordedSteps:
 
     def _follow_bodies(self) -> None:
         """Forget recordings where the bodies' launches have changed."""
-        revisions = (self._guard.revision, *(body.launch_revision for body in self._bodies))
-        rewritten = tuple(body.conditions.rewritten for body in self._bodies)
-        if revisions == self._revisions and rewritten != self._rewritten:
-            for stepper in self._steppers:
-                stepper.prepare()
-        self._rewritten = rewritten
-        if revisions != self._revisions:
+        revision = self._system.launch_revision
+        if (self._guard.revision, revision) == self._revisions:
+            if self._system.rewritten != self._rewritten:
+                self._stepper.prepare()
+        else:
             self._graphs.clear()
             self._asked.clear()
-            for stepper in self._steppers:
-                stepper.prepare()
+            self._stepper.prepare()
             self._guard.prepare()
-            self._revisions = (self._guard.revision, *revisions[1:])
+            self._revisions = (self._guard.revision, revision)
+        self._rewritten = self._system.rewritten
 
     def _replay_recording(self, segment: Segment) -> None:
         if segment not in self._graphs:
@@ -196,12 +186,3 @@ class RecordedSteps:
             self._graphs[segment] = capture.graph
         wp.capture_launch(self._graphs[segment])
         self._pace.forget()
-
-    def adopt_positions(self) -> None:
-        """Take over what somebody wrote to positions since they were published."""
-        for body in self._bodies:
-            body.state.adopt_positions()
-
-    def publish_positions(self) -> None:
-        for body in self._bodies:
-            body.state.publish_positions()

@@ -89,7 +89,13 @@ class AnisotropicField(ForceField):
     def begin_step(self, pace: Pace, offset: int) -> None:
         body = self.body
         for activation in body.conditions.activations:
-            inputs = [activation.elements, activation.times, activation.stress, pace.arrays, body.conditions.world_starts]
+            inputs = [
+                activation.elements,
+                activation.times,
+                activation.stress,
+                pace.arrays,
+                body.conditions.world_starts,
+            ]
             inputs += [body.world_element_count, offset]
             self.launch(follow_activation, len(activation.elements), inputs, [body.conditions.activation])
 

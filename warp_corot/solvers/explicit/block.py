@@ -27,7 +27,7 @@ from warp_corot.mesh import TetForest
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
     from warp_corot.elasticity import ForceField
-    from warp_corot.solvers.integrator import StepContext
+    from warp_corot.solvers.system import System
 
 
 class BlockSteps:
@@ -75,7 +75,7 @@ class BlockSteps:
     #: Whether the device has all that a launch reads of the body's controls.
     is_prepared = True
 
-    def launch(self, count: int, damping: float, context: StepContext) -> None:
+    def launch(self, count: int, damping: float, system: System) -> None:
         """Launch ``count`` steps, the first ones since the clock was last advanced."""
         body = self.body
         wp.launch(
@@ -86,7 +86,7 @@ class BlockSteps:
                 self._block,
                 count,
                 damping,
-                context.gravity,
+                system.gravity,
                 body.mu,
                 body.lam,
                 body.material_stride,
@@ -94,11 +94,11 @@ class BlockSteps:
                 body.conditions.inverse_mass,
                 int(body.conditions.has_loads),
                 body.conditions.loads,
-                context.pace.arrays,
+                system.pace.arrays,
                 body.state.displacements,
                 body.state.velocities,
             ],
-            outputs=[body.state.reactions, context.support_work, context.bad_step],
+            outputs=[body.state.reactions, system.support_work, system.bad_step],
             device=body.device,
         )
 

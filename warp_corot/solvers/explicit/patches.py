@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
     from warp_corot.elasticity import ForceField
     from warp_corot.elasticity.corotated.elements import CorotatedField
-    from warp_corot.solvers.integrator import StepContext
+    from warp_corot.solvers.system import System
 
 #: Elements of the bodies for which it pays: below, a launch has nothing to spread; above, patches outgrow their blocks.
 FEWEST, MOST = 500, 150_000
@@ -86,7 +86,11 @@ class PatchSteps:
         if now == before:
             return
         self._trajectories = now
-        if len(now) == len(before) and all(a.times is b.times for a, b in zip(now, before, strict=True)):
+        if (
+            before is not None
+            and len(now) == len(before)
+            and all(a.times is b.times for a, b in zip(now, before, strict=True))
+        ):
             _rewrite_keyframes(self._tables, now)  # others in the same arrays
         else:
             _set_keyframes(self._tables, now, self.body)
@@ -96,7 +100,7 @@ class PatchSteps:
         """Whether the keyframes on the device are the body's; not if others came while somebody records."""
         return self._trajectories == self.body.conditions.trajectories
 
-    def launch(self, count: int, damping: float, context: StepContext) -> None:
+    def launch(self, count: int, damping: float, system: System) -> None:
         """Launch ``count`` steps, the first ones since the clock was last advanced."""
         body = self.body
         wp.launch(
@@ -107,7 +111,7 @@ class PatchSteps:
                 self._tables,
                 count,
                 damping,
-                context.gravity,
+                system.gravity,
                 body.mu,
                 body.lam,
                 body.material_stride,
@@ -115,13 +119,13 @@ class PatchSteps:
                 body.conditions.inverse_mass,
                 int(body.conditions.has_loads),
                 body.conditions.loads,
-                context.pace.arrays,
+                system.pace.arrays,
                 body.conditions.world_starts,
                 self._exchange,
                 body.state.displacements,
                 body.state.velocities,
             ],
-            outputs=[body.state.reactions, context.support_work, context.bad_step],
+            outputs=[body.state.reactions, system.support_work, system.bad_step],
             device=body.device,
         )
 

@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from warp_corot.elasticity import ForceField
 from warp_corot.elasticity.viscosity import Viscosity
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number
 from warp_corot.kernels.stepping.integrate import STEP_SYMPLECTIC_EULER, follow_trajectory
-from warp_corot.solvers.integrator import Integrator, StepContext, Stepper
+from warp_corot.solvers.integrator import Integrator, Stepper
 
 from .block import BlockSteps
 from .patches import PatchSteps
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
+    from warp_corot.solvers.system import System
 
 
 #: The shortest step that float32 holds with all its digits [s].
@@ -64,57 +64,62 @@ class SymplecticEuler(Integrator):
         # The positive root without cancellation.
         return elastic**2 / (self.viscosity + math.hypot(self.viscosity, elastic)) if frequency > 0.0 else elastic
 
-    def bind(self, body: SoftBody, field: ForceField, context: StepContext) -> Stepper:
-        return SymplecticEulerStepper(body, field, context, self.damping, self.viscosity)
+    def bind(self, system: System) -> Stepper:
+        return SymplecticEulerStepper(system, self.damping, self.viscosity)
 
 
 class SymplecticEulerStepper(Stepper):
-    def __init__(self, body: SoftBody, field: ForceField, context: StepContext, damping: float, viscosity: float = 0.0):
-        self.body = body
-        self.field = field
-        self.context = context
+    def __init__(self, system: System, damping: float, viscosity: float = 0.0):
+        self.system = system
         self.damping = damping
-        self.viscosity = Viscosity(body, field, viscosity) if viscosity else None
-        # One body is sooner done by all multiprocessors, many small ones by one each.
-        self.patches = PatchSteps.of(body, field) if self.viscosity is None else None
-        self.block = BlockSteps.of(body, field) if self.patches is None and self.viscosity is None else None
+        if viscosity:
+            bound = zip(system.bodies, system.fields, strict=True)
+            system.forces += [Viscosity(body, field, viscosity) for body, field in bound]
+        self._many = [_steps_in_one_launch(system, k) for k in range(len(system.bodies))]
 
     @property
     def many_a_launch(self) -> bool:
-        return self._launched is not None
+        return all(self._launched(k) is not None for k in range(len(self._many)))
 
-    @property
-    def _launched(self) -> BlockSteps | PatchSteps | None:
-        """What makes many steps in one launch, if anything does."""
-        if self.block is not None:
-            return None if self.body.conditions.trajectories else self.block
-        return self.patches
+    def _launched(self, k: int) -> BlockSteps | PatchSteps | None:
+        """What makes many steps of a body in one launch, if anything does."""
+        many = self._many[k]
+        follows = isinstance(many, BlockSteps) and self.system.bodies[k].conditions.trajectories
+        return None if follows or self.system.forces else many
 
     def prepare(self) -> None:
-        if self.patches is not None:
-            self.patches.prepare()
+        for many in self._many:
+            if isinstance(many, PatchSteps):
+                many.prepare()
 
     def forces(self, offset: int = 0) -> None:
-        self.field.begin_step(self.context.pace, offset)
-        self.field.add_forces(self.body.state.displacements, self.body.state.forces)
+        for k in range(len(self._many)):
+            self.system.add_elastic_forces(k, offset)
 
     def steps(self, count: int, *, forces_known: bool = False) -> None:
-        many = self._launched
-        if many is not None and many.is_prepared:
+        one_by_one = []
+        for k, body in enumerate(self.system.bodies):
+            many = self._launched(k)
+            if many is None or not many.is_prepared:
+                one_by_one.append(k)
+                continue
             if forces_known:
-                self.body.state.forces.zero_()  # a block finds its own
-            many.launch(count, self.damping, self.context)
+                body.state.forces.zero_()  # a block finds its own
+            many.launch(count, self.damping, self.system)
+        if not one_by_one:
             return
         for offset in range(count):
             if offset > 0 or not forces_known:
-                self.forces(offset)
-            if self.viscosity is not None:
-                self.viscosity.add_forces(self.body.state.forces)
-            self._move(offset)
+                for k in one_by_one:
+                    self.system.add_elastic_forces(k, offset)
+            for forces in self.system.forces:
+                forces.add_forces()
+            for k in one_by_one:
+                self._move(self.system.bodies[k], offset)
 
-    def _move(self, offset: int) -> None:
+    def _move(self, body: SoftBody, offset: int) -> None:
         """Launch the motion of the ``offset``-th step since the clock was last advanced."""
-        body, context = self.body, self.context
+        system = self.system
         for trajectory in body.conditions.trajectories:
             wp.launch(
                 follow_trajectory,
@@ -123,14 +128,14 @@ class SymplecticEulerStepper(Stepper):
                     trajectory.nodes,
                     trajectory.times,
                     trajectory.displacements,
-                    context.pace.arrays,
+                    system.pace.arrays,
                     body.conditions.world_starts,
                     body.world_node_count,
                     offset,
                     body.state.forces,
                     body.state.displacements,
                 ],
-                outputs=[body.state.velocities, context.support_work],
+                outputs=[body.state.velocities, system.support_work],
                 device=body.device,
             )
         wp.launch(
@@ -138,17 +143,23 @@ class SymplecticEulerStepper(Stepper):
             dim=body.sizes.launch_nodes,
             inputs=[
                 self.damping,
-                context.gravity,
+                system.gravity,
                 body.conditions.mass,
                 body.conditions.inverse_mass,
                 int(body.conditions.has_loads),
                 body.conditions.loads,
-                context.pace.arrays,
+                system.pace.arrays,
                 offset,
                 body.state.forces,
                 body.state.displacements,
                 body.state.velocities,
             ],
-            outputs=[body.state.reactions, context.support_work, context.bad_step],
+            outputs=[body.state.reactions, system.support_work, system.bad_step],
             device=body.device,
         )
+
+
+def _steps_in_one_launch(system: System, k: int) -> BlockSteps | PatchSteps | None:
+    """One body is sooner stepped by all multiprocessors, many small ones by one each; None where neither can be."""
+    body, field = system.bodies[k], system.fields[k]
+    return PatchSteps.of(body, field) or BlockSteps.of(body, field)

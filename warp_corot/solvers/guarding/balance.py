@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_corot.kernels.stepping import balance as kernels
 from warp_corot.kernels.stepping.pace import Pace
-from warp_corot.solvers.integrator import NEVER, StepContext
+from warp_corot.solvers.system import NEVER, System
 
 from .mapped import Mapped
 
@@ -76,21 +76,20 @@ class Balance:
     """Adds up energies, world by world, and reports them with the clock.
 
     Args:
-        bodies, fields: The simulation's.
-        context: Its pace, gravity and what supports put in.
+        system: The simulation's.
         copies: Of its state.
     """
 
-    def __init__(self, bodies: Sequence[SoftBody], fields: Sequence[ForceField], context: StepContext, copies: Copies):
-        self.bodies, self.fields, self.context, self._copies = tuple(bodies), tuple(fields), context, copies
-        self.worlds, self.device = bodies[0].worlds, bodies[0].device
+    def __init__(self, system: System, copies: Copies):
+        self.system, self.bodies, self.fields, self._copies = system, system.bodies, system.fields, copies
+        self.worlds, self.device = system.worlds, system.device
         self._lanes = 1 if self.device.is_cpu else WARP
-        wanted = -(-max(body.sizes.launch_nodes for body in bodies) // (self.worlds * NODES * WARP))
+        wanted = -(-max(body.sizes.launch_nodes for body in self.bodies) // (self.worlds * NODES * WARP))
         warps = 1 if self.device.is_cpu else max(min(wanted, WARPS // self.worlds), 1)
         self._threads = warps * self._lanes
         self._sums = wp.zeros((self.worlds, warps, kernels.COLUMNS), dtype=wp.float64, device=self.device)
-        self._energies: list[wp.array] = [wp.empty(0, dtype=wp.float64, device=self.device) for _ in bodies]
-        self._field_states: list[dict[str, wp.array]] = [{} for _ in bodies]
+        self._energies: list[wp.array] = [wp.empty(0, dtype=wp.float64, device=self.device) for _ in self.bodies]
+        self._field_states: list[dict[str, wp.array]] = [{} for _ in self.bodies]
         self._mapped = Mapped(self.worlds * kernels.COLUMNS + kernels.NUMBERS, self.device)
         numbers = self.worlds * kernels.COLUMNS
         self._totals = self._mapped.array[:numbers].reshape((self.worlds, kernels.COLUMNS))
@@ -126,11 +125,11 @@ class Balance:
             at: Displacements and velocities of each body in place of the present ones.
             seconds: Of the clock, in place of the present ones [3].
         """
-        context, copies = self.context, self._copies
-        pace = context.pace.arrays
+        system, copies = self.system, self._copies
+        pace = system.pace.arrays
         if seconds is not None:
             pace = Pace()
-            pace.counts = context.pace.arrays.counts
+            pace.counts = system.pace.arrays.counts
             pace.seconds = wp.array(np.array(seconds), dtype=wp.float64, device=self.device)
         for k, (body, field) in enumerate(zip(self.bodies, self.fields, strict=True)):
             u, v = (body.state.displacements, body.state.velocities) if at is None else at[k]
@@ -139,8 +138,8 @@ class Balance:
             self._add_nodal(body, u, v, pace, (copies.u[k], copies.v[k]), keeps)
             if whole:
                 body.state.forces.zero_()
-        inputs = [self._lanes, context.pace.orders, context.support_work, context.bad_step, copies.changed]
-        inputs += [context.pace.control, context.pace.arrays, self._sums]
+        inputs = [self._lanes, system.pace.orders, system.support_work, system.bad_step, copies.changed]
+        inputs += [system.pace.control, system.pace.arrays, self._sums]
         dim = (self.worlds, kernels.COLUMNS, self._lanes)
         wp.launch(kernels.report, dim, inputs, [self._totals, self._numbers], device=self.device)
 
@@ -149,7 +148,7 @@ class Balance:
         wp.synchronize_stream(self.device)
         numbers = self._mapped.values[self.worlds * kernels.COLUMNS :]
         total = self._mapped.values[: self.worlds * kernels.COLUMNS].reshape(self.worlds, kernels.COLUMNS).copy()
-        self.context.pace.saw(numbers)
+        self.system.pace.saw(numbers)
         kinetic, ahead, elastic = (total[:, int(c)] for c in (kernels.KINETIC, kernels.AHEAD, kernels.ELASTIC))
         done = np.full(self.worlds, numbers[int(kernels.WORK)] + total[:, int(kernels.SUPPORTS)].sum())
         energies = Energies(
@@ -200,10 +199,10 @@ class Balance:
         copies: tuple[wp.array, wp.array],
         keeps: bool,
     ) -> None:
-        context = self.context
+        system = self.system
         inputs = [
             pace,
-            context.gravity,
+            system.gravity,
             body.sizes.launch_nodes // self.worlds,
             self._threads,
             self._lanes,
@@ -214,7 +213,7 @@ class Balance:
             body.state.forces,
             u,
             v,
-            context.pace.orders,
+            system.pace.orders,
             int(keeps),
         ]
         kernel = kernels.SUM_NODES[body.conditions.loads.dtype]

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
 import warp as wp
 
 from warp_corot.kernels.stepping import balance as kernels
-from warp_corot.solvers.integrator import StepContext
-
-if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
-    from warp_corot.elasticity import ForceField
+from warp_corot.solvers.system import System
 
 
 class Copies:
     """Displacements, velocities and what fields keep, twice.
 
     Args:
-        bodies, fields: The simulation's.
-        context: Its clock, whose orders name the last good copy.
+        system: The simulation's; the orders of its clock name the last good copy.
 
     Attributes:
         slot: Which copy is the last good one.
@@ -28,9 +20,8 @@ class Copies:
         revision: Changes whenever the arrays are others.
     """
 
-    def __init__(self, bodies: Sequence[SoftBody], fields: Sequence[ForceField], context: StepContext):
-        self._bodies, self._fields, self._pace = bodies, fields, context.pace
-        self.device = context.pace.device
+    def __init__(self, system: System):
+        self._bodies, self._fields, self._pace, self.device = system.bodies, system.fields, system.pace, system.device
         self.slot, self.revision = 0, 0
         self.changed = wp.zeros(1, dtype=wp.int32, device=self.device)
         self.u: list[wp.array] = []

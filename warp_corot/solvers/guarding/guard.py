@@ -10,21 +10,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.solvers.integrator import NEVER, StepContext
 from warp_corot.solvers.steps.pace import Known
+from warp_corot.solvers.system import NEVER, System
 
 from .balance import Balance, Energies, Floats
 from .copies import Copies
-
-if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
-    from warp_corot.elasticity import ForceField
 
 #: Energy that may come from nowhere between two checks, and in all, as shares of the most that gravity, loads and
 #: supports ever moved or a user gave. A stable step errs by less than a tenth, and by up to a half while elements are
@@ -71,19 +66,17 @@ class Guard:
     """Checks states against the last good one, which it keeps on the device.
 
     Args:
-        bodies, fields: The simulation's.
-        context: What its steps share.
+        system: The simulation's.
     """
 
-    def __init__(self, bodies: Sequence[SoftBody], fields: Sequence[ForceField], context: StepContext):
-        self.bodies, self.fields, self.context = tuple(bodies), tuple(fields), context
-        self.worlds = bodies[0].worlds
-        self._size = max(float(np.ptp(body.mesh.points, axis=0).max()) for body in bodies)
-        self._copies = Copies(self.bodies, self.fields, context)
-        self._balance = Balance(bodies, fields, context, self._copies)
+    def __init__(self, system: System):
+        self.system, self.bodies, self.worlds = system, system.bodies, system.worlds
+        self._size = max(float(np.ptp(body.mesh.points, axis=0).max()) for body in system.bodies)
+        self._copies = Copies(system)
+        self._balance = Balance(system, self._copies)
         self._reference: Energies | None = None
         self._good: Known | None = None
-        shared = any(getattr(field, "rotation_level", None) is not None for field in fields)
+        shared = any(getattr(field, "rotation_level", None) is not None for field in system.fields)
         self._leave = SHARED if shared else 1.0
         #: Energy from nowhere between the last two checks on elastic energies, and lately, as shares of what was moved;
         #: of the world that has most; and the same for what fast vibrations err by at any one time. Infinite while no
@@ -99,7 +92,7 @@ class Guard:
         """Forget all: the next state is taken for good."""
         self._reference = None
         self._scale, self._drift, self._lately, self._loads = (np.zeros(self.worlds) for _ in range(4))
-        self._counted_at = self._window_at = self.context.pace.time
+        self._counted_at = self._window_at = self.system.pace.time
         self._lately_before = np.zeros(self.worlds)
         self._height, self._loads_since = np.zeros(self.worlds), np.zeros(self.worlds)
         self._absolute_base = 0.0
@@ -125,11 +118,11 @@ class Guard:
 
     def order(self, end: float | None = None, stop: int = 0) -> None:
         """Say when the next run ends [s], if it has an end, and the steps done by then."""
-        self.context.pace.order(end=end, stop=stop, slot=self._copies.slot)
+        self.system.pace.order(end=end, stop=stop, slot=self._copies.slot)
 
     def launch_begin(self) -> None:
         """Launch the beginning of a run: what a user has written since the last one is a new state."""
-        self.context.pace.launch_orders(self._copies.changed)
+        self.system.pace.launch_orders(self._copies.changed)
         self._copies.launch_take_over()
 
     def launch_end(self, *, whole: bool) -> None:
@@ -145,10 +138,10 @@ class Guard:
         if self._reference is None:
             given = self._counted is None
             self._absolute_base = 0.0
-            self.context.pace.restart_work()
+            self.system.pace.restart_work()
             self._copies.take()
             self._begin_from(self._find(whole=True))
-        self._good = self.context.pace.known
+        self._good = self.system.pace.known
         return given
 
     def check(self, *, whole: bool, counts: bool = True, strict: bool = False, lenient: bool = False) -> Fault | None:
@@ -185,11 +178,11 @@ class Guard:
         """Put the last good state back."""
         assert self._good is not None
         self._copies.put_back()
-        self.context.pace.put_back(self._good)
+        self.system.pace.put_back(self._good)
         for body in self.bodies:
             body.state.forces.zero_()
             body.state.publish_positions()
-        self.context.bad_step.fill_(NEVER)
+        self.system.bad_step.fill_(NEVER)
         # What came from nowhere before that state is not forgotten with what came after it.
         self._count(self._find(whole=True), whole=True)
 
@@ -200,7 +193,7 @@ class Guard:
 
     def not_finite(self) -> Fault | None:
         """Whether the state is not finite: the least that there is to look at."""
-        return self._not_finite(int(self.context.bad_step.numpy()[0]))
+        return self._not_finite(int(self.system.bad_step.numpy()[0]))
 
     def beyond_reach(self) -> Fault | None:
         """Whether nodes are where they cannot be: what can be seen of a state that users may write to."""
@@ -225,7 +218,7 @@ class Guard:
         self._scale, self._drift = np.array(scale, float), np.array(drift, float)
         self._lately, self._lately_before = np.array(lately[0], float), np.array(lately[1], float)
         self._counted_at, self._window_at = float(lately[2, 0]), float(lately[3, 0])
-        self.context.pace.forget()
+        self.system.pace.forget()
         if np.isfinite(counted).all():
             self._counted = np.array(counted, float)
 
@@ -248,7 +241,7 @@ class Guard:
     def _begin_before(self) -> None:
         """Count from the state at the beginning of the run, which a user has written; waits for the device."""
         assert self._good is not None
-        pace = self.context.pace
+        pace = self.system.pace
         # A user's velocities belong to no step.
         self._good = replace(self._good, seconds=(*self._good.seconds[:2], 0.0))
         now = pace.known
@@ -267,13 +260,13 @@ class Guard:
         """The energies of the present state or another; waits for the device."""
         self.prepare()
         self.order()
-        self.context.pace.launch_orders(self._copies.changed)
+        self.system.pace.launch_orders(self._copies.changed)
         self._balance.launch(whole=whole, at=at, seconds=seconds)
         return self._balance.wait().energies
 
     def _has_changed(self) -> bool:
         self.order()
-        self.context.pace.launch_orders(self._copies.changed)
+        self.system.pace.launch_orders(self._copies.changed)
         self._copies.launch_take_over()
         changed = bool(self._copies.changed.numpy()[0])
         if changed:
@@ -284,7 +277,7 @@ class Guard:
         if step == NEVER:
             return None
         # Said once: who sets a good state again may go on.
-        self.context.bad_step.fill_(NEVER)
+        self.system.bad_step.fill_(NEVER)
         bad = self._not_finite_worlds()
         # Somebody may have set a good state before anybody looked.
         return Fault("the state is not finite", bad, step) if len(bad) else None
@@ -348,7 +341,7 @@ class Guard:
         if not whole:
             return
         if self._balance.is_closed and self._floor is not None:
-            now = self.context.pace.time
+            now = self.system.pace.time
             left = math.exp(min(self._counted_at - now, 0.0) / MEMORY)
             self._counted_at = now
             self._drift = np.maximum(self._drift + found.exact - given, 0.0)

@@ -12,11 +12,10 @@ import warp as wp
 from warp_corot.kernels.stepping import pace as kernels
 
 from .gauge import Gauge
-from .pace import Pace
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
-    from warp_corot.elasticity import ForceField, Model
+    from warp_corot.elasticity import Model
+    from warp_corot.solvers.system import System
 
 #: Steps from one measurement to the next, and the same where many steps are one launch, which is cut short by it; of
 #: bodies that change fast; and while nothing is known of how they move. A measurement takes about as long as a step.
@@ -54,28 +53,25 @@ class SafeStep:
     """The step of a simulation that was given none.
 
     Args:
-        bodies, fields, models: The simulation's.
-        pace: Whose step it sets.
+        system: The simulation's, whose step it sets.
+        models: Of its bodies.
         stable: The largest stable step of each body at rest [s], infinite where nothing can vibrate.
     """
 
     def __init__(
         self,
-        bodies: Sequence[SoftBody],
-        fields: Sequence[ForceField],
+        system: System,
         models: Sequence[Model],
-        pace: Pace,
         stable: Sequence[float],
     ):
-        self.device = pace.device
-        self.pace = pace
-        self._bodies, self._models = bodies, models
-        self._found = wp.zeros((len(bodies), 2), dtype=wp.float32, device=self.device)
-        self._at_rest = wp.zeros((len(bodies), 4), dtype=wp.float64, device=self.device)
-        self._control = pace.control
-        self.gauges = [
-            Gauge(body, field, self._found[k]) for k, (body, field) in enumerate(zip(bodies, fields, strict=True))
-        ]
+        self.device, self.pace = system.device, system.pace
+        self._models = models
+        count = len(system.bodies)
+        self._found = wp.zeros((count, 2), dtype=wp.float32, device=self.device)
+        self._at_rest = wp.zeros((count, 4), dtype=wp.float64, device=self.device)
+        self._control = system.pace.control
+        bound = zip(system.bodies, system.fields, strict=True)
+        self.gauges = [Gauge(body, field, self._found[k]) for k, (body, field) in enumerate(bound)]
         self.find_rest(stable)
 
     @property
