@@ -11,7 +11,6 @@ import warp as wp
 from scipy.spatial import ConvexHull
 
 import warp_corot as wc
-from warp_corot.kernels.remesh.criteria import nearness
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--device", help="cpu or cuda:0")
@@ -40,7 +39,8 @@ ball = wc.SoftBody(fan, material, device=args.device)
 ball.prescribe(np.arange(1, 501), times=times, displacements=way - way[0])
 
 place = wp.array([*way[0], 0, 0, 0, RADIUS, 0.003], dtype=wp.float32, device=args.device)
-near = wc.OnlineRemesh(refine_above=1.0, simplify_below=0.4, max_level=10, criterion=nearness, parameters=place)
+criterion = wc.remesh.nearness
+near = wc.OnlineRemesh(refine_above=1.0, simplify_below=0.4, max_level=10, criterion=criterion, parameters=place)
 sim = wc.Simulation([slab, ball], integrator=wc.SymplecticEuler(damping=20.0), remesh=[near, None])
 
 

@@ -10,6 +10,7 @@ from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.simulation.energy import Energy, WorldEnergies
 from warp_corot.simulation.simulation import Simulation
 
+from . import remesh
 from .domain import Domain
 from .elasticity import Corotated, EdgeStVK, Linear, MassSpring, NeoHookean, StVenantKirchhoff
 from .errors import CapacityWarning, InputError, StabilityWarning, StaleViewError, UnstableError
@@ -44,4 +45,5 @@ __all__ = [
     "WorldEnergies",
     "polar_rotation",
     "record",
+    "remesh",
 ]

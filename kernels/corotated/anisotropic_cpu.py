@@ -16,7 +16,6 @@ from warp_corot.kernels.elements.general_cpu import rest_inverse_of
 from warp_corot.kernels.elements.lanes import COMPILER_FLAGS, constants, native, on_cpu
 from warp_corot.kernels.elements.law_lanes import ROTATION
 from warp_corot.kernels.math.rotation import byers_xu
-from warp_corot.kernels.plan.plan import Plan, extent, leaf_row
 
 from .anisotropic import OrthotropicMaterial, axes_of, element_forces, filled
 
@@ -100,15 +99,20 @@ def turn_elements(Elements: Any) -> wp.Kernel:
 def turn_changed(
     # In
     threads: int,
-    plan: Plan,
+    goes: wp.array[wp.int32],
+    now: wp.array[wp.int32],
+    before: wp.array[wp.int32],
     elements: ForestElements,
     material: OrthotropicMaterial,
     # Out
     rest_inverse: wp.array[wp.mat33],
     volume: wp.array[wp.float32],
 ):
-    """The same of leaves that have changed, and of what padding there is in their place."""
-    for t in range(wp.tid(), extent(leaf_row(plan), plan), threads):
+    """The same of leaves that have changed, and of what padding there is in their place; nothing if ``goes`` is 0."""
+    count = wp.max(now[0], before[0])
+    if goes[0] == 0:
+        count = 0
+    for t in range(wp.tid(), count, threads):
         turn_element(elements, material, t, rest_inverse, volume)
 
 

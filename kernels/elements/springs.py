@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.tables.shapes import EDGES, REST, edge_stiffness, fingerprint
+from warp_corot.kernels.tables.shapes import FIRST_NODE, REST, SECOND_NODE, edge_stiffness, fingerprint
 
 from .elements import ForestElements, GeneralElements, add_force, edge_length, frame, load_node, mirror_sign, shape_of
 
@@ -19,9 +19,6 @@ wp.set_module_options({"enable_backward": False})
 
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
 mat43 = wp.types.matrix(shape=(4, 3), dtype=wp.float32)
-
-FIRST_NODE = wp.constant(wp.types.vector(length=6, dtype=wp.int32)(*(i for i, _ in EDGES)))
-SECOND_NODE = wp.constant(wp.types.vector(length=6, dtype=wp.int32)(*(j for _, j in EDGES)))
 
 _EDGE_STIFFNESS = tuple(edge_stiffness(shape) for shape in range(3))
 

@@ -6,7 +6,7 @@ other bisections than those that the forest has. So nothing is made here, and no
 
 import warp as wp
 
-from warp_corot.kernels.elements.springs import FIRST_NODE, SECOND_NODE
+from warp_corot.kernels.tables.shapes import FIRST_NODE, SECOND_NODE
 
 from .bisection import refinement_end
 from .growth import LIVE, VOID, find_midpoint

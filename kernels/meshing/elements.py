@@ -5,7 +5,7 @@ The body's signed function is known at the nodes; between them it changes by no 
 
 import warp as wp
 
-from warp_corot.kernels.elements.springs import FIRST_NODE, SECOND_NODE
+from warp_corot.kernels.tables.shapes import FIRST_NODE, SECOND_NODE
 
 from .growth import VOID
 

@@ -7,7 +7,7 @@ and must be bisected too. Midpoints that are not active are places at which the 
 
 import warp as wp
 
-from warp_corot.kernels.elements.springs import FIRST_NODE, SECOND_NODE
+from warp_corot.kernels.tables.shapes import FIRST_NODE, SECOND_NODE
 
 from .bisection import first_half, halfway, refinement_end, second_half
 

@@ -2,10 +2,9 @@
 
 import warp as wp
 
-from warp_corot.kernels.elements.springs import FIRST_NODE, SECOND_NODE
 from warp_corot.kernels.meshing.bisection import first_half, halfway, refinement_end, second_half
 from warp_corot.kernels.meshing.growth import LIVE, find_slot
-from warp_corot.kernels.tables.shapes import FRAME_SHIFT
+from warp_corot.kernels.tables.shapes import FIRST_NODE, FRAME_SHIFT, SECOND_NODE
 
 from .edges import LOW_HALF, WantedEdges
 from .pools import (

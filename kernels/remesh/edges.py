@@ -7,9 +7,9 @@ inwards, and each single bisection leaves the mesh conforming: it may stop at an
 
 import warp as wp
 
-from warp_corot.kernels.elements.springs import FIRST_NODE, SECOND_NODE
 from warp_corot.kernels.meshing.bisection import refinement_end
 from warp_corot.kernels.meshing.growth import EMPTY, LIVE, claim_slot, edge_key, find_slot
+from warp_corot.kernels.tables.shapes import FIRST_NODE, SECOND_NODE
 
 from .blocks import STRETCH, Blocks, heat_blocks, is_hot
 from .pools import (

@@ -4,11 +4,14 @@ A tetrahedron of level ``l`` has type ``l mod 3`` and edge length ``h = cell / 2
 frame the hat functions have gradients ``GRADIENT[type][c][n] / h`` (column ``c`` of the frame, node ``n`` in Maubach
 order), so the local-frame displacement gradient is a handful of sums and differences of nodal displacements.
 
-Plain Python numbers: kernels read them through ``wp.static`` and tests read the very same tables.
+Plain Python numbers: kernels read them through ``wp.static`` and tests read the very same tables. The nodes of the
+edges are Warp constants too, for kernels that loop over edges.
 """
 
 import math
 import zlib
+
+import warp as wp
 
 SQRT2 = math.sqrt(2.0)
 
@@ -31,6 +34,18 @@ REST: tuple[tuple[tuple[float, float, float], ...], ...] = (
 
 #: The six edges of a tetrahedron as pairs of local nodes.
 EDGES: tuple[tuple[int, int], ...] = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+
+#: Both nodes of each edge, for kernels.
+FIRST_NODE = wp.constant(wp.types.vector(length=6, dtype=wp.int32)(*(i for i, _ in EDGES)))
+SECOND_NODE = wp.constant(wp.types.vector(length=6, dtype=wp.int32)(*(j for _, j in EDGES)))
+
+#: Lengths of the edges over h.
+EDGE_LENGTHS: tuple[tuple[float, ...], ...] = tuple(
+    tuple(math.dist(corners[i], corners[j]) for i, j in EDGES) for corners in REST
+)
+
+#: Radius of the circumscribed sphere over h.
+CIRCUMRADIUS: tuple[float, ...] = (math.sqrt(0.75), math.sqrt(0.5625), math.sqrt(0.3125))
 
 # How an element's shape is packed into one integer (see ``warp_corot.discretization.elements``).
 LEVEL_BITS = 6

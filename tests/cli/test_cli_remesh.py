@@ -80,14 +80,26 @@ def test_of_a_surface_the_one_given_is_drawn(folder, capsys):
         (["missing.vtk", "--remesh"], "missing.vtk: no such file"),
         (["box", "--refine-above", 1.1], "--refine-above is for --remesh"),
         (["box", "--remesh-levels", 1, 2], "--remesh-levels is for --remesh"),
-        (["box", "--remesh", "--refine-above", 1.0], "--simplify-below is 1.08 and --refine-above 1.0"),
-        (["box", "--remesh", "--refine-above", "nan"], "--refine-above nan"),
-        (["box", "--remesh", "--remesh-levels", 5, 4], "--remesh-levels MIN is 5 and --remesh-levels MAX 4"),
-        (["box", "--remesh", "--remesh-levels", 5, 49], "--remesh-levels MAX is 49"),
+        (
+            ["box", "--remesh", "--refine-above", 1.0],
+            "--simplify-below is 1.08; it must be below --refine-above, which is 1,",
+        ),
+        (["box", "--remesh", "--refine-above", "nan"], "--refine-above is nan; it must be a finite number"),
+        (
+            ["box", "--remesh", "--remesh-levels", 5, 4],
+            "--remesh-levels MIN is 5; it must be at most --remesh-levels MAX, which is 4",
+        ),
+        (
+            ["box", "--remesh", "--remesh-levels", 5, 49],
+            "--remesh-levels MAX is 49; it must be a whole number from 0 to 48",
+        ),
         (["box", "--remesh", "--remesh-levels", 5], "expected 2 arguments"),
-        (["box", "--remesh", "--remesh-every", 0], "--remesh-every is 0"),
-        (["box", "--remesh", "--capacity", 0], "--capacity is 0"),
-        (["box", "--remesh", "--capacity", 10], "--capacity is 10; the mesh has 1152 elements"),
+        (["box", "--remesh", "--remesh-every", 0], "--remesh-every is 0; it must be a whole number, at least 1"),
+        (["box", "--remesh", "--capacity", 0], "--capacity is 0; it must be a whole number, at least 1"),
+        (
+            ["box", "--remesh", "--capacity", 10],
+            "--capacity is 10; it must be at least 1152, as many elements as the mesh has",
+        ),
         (["box", "--remesh", "--model", "mass-spring"], "MassSpring"),
     ],
 )

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import warp as wp
 
 import warp_corot as wc
 from warp_corot.elasticity.viscosity import Viscosity

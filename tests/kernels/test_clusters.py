@@ -12,6 +12,7 @@ import warp_corot as wc
 from warp_corot.discretization.clusters.pairing import paired
 from warp_corot.discretization.clusters.single import changing_clusters, find_tables, isotropic_material
 from warp_corot.discretization.elements import device_elements
+from warp_corot.discretization.plan import LeafCounts
 from warp_corot.elasticity.paths.clusters import ChangingClusterScatter, ClusterScatter
 from warp_corot.kernels.clusters.elements import (
     AlignedElements,
@@ -80,11 +81,9 @@ def test_leaves_that_change_have_the_oracles_forces(ball, moved, layout, device)
     elements, count = device_elements(ball, wp.get_device(device)), len(ball.tets)
     share = np.random.default_rng(3).uniform(0.5, 2.0, count) if elements.nodes.device.is_cuda else np.ones(count)
     number, goes = (wp.array([n], dtype=wp.int32, device=device) for n in (count, 1))
-    plan = SimpleNamespace(
-        device=elements.nodes.device, most_leaves=count, elements=elements, leaf_count=number, goes=goes
-    )
+    counts = LeafCounts(most=count, now=number, before=number, goes=goes, threads=1)
     body = SimpleNamespace(launch_elements=count)
-    scatter = ChangingClusterScatter(body, plan, isotropic_law(corotated_stress), layout)
+    scatter = ChangingClusterScatter(body, elements, counts, isotropic_law(corotated_stress), layout)
     material = isotropic_material([*(wp.array(v * share, dtype=wp.float32, device=device) for v in (MU, LAM)), 1])
     u = wp.array(in_four(moved), dtype=wp.vec4, device=device)
     for present in (count // 2, count):

@@ -136,7 +136,7 @@ def test_an_empty_body_is_said_so():
         ({"max_level": 49}, "max_level"),
         ({"max_level": 2.5}, "max_level"),
         ({"max_level": np.nan}, "max_level is nan"),
-        ({"min_level": "three"}, "min_level is three"),
+        ({"min_level": "three"}, "min_level is 'three'"),
         ({"min_level": 5, "max_level": 4}, "min_level"),
         ({"surface_error": 0.0}, "surface_error"),
         ({"surface_error": np.inf}, "surface_error"),

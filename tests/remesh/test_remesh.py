@@ -226,10 +226,15 @@ def test_wrong_input_is_named(device):
     with pytest.raises(wc.InputError, match="density has shape"):
         DeviceForest(forest, 100, density=[1.0, 2.0], device=device)
     adaptive = DeviceForest(forest, 100, device=device)
-    with pytest.raises(wc.InputError, match="must be smaller"):
+    with pytest.raises(wc.InputError, match=r"simplify_below is 1\.2; it must be below refine_above, which is 1\.1"):
         RemeshPass(adaptive, refine_above=1.1, simplify_below=1.2)
-    for levels in ((5, 4), (-1, 4), (0, 49), (0.5, 3)):
-        with pytest.raises(wc.InputError, match="from 0 to 48"):
+    for levels, said in (
+        ((5, 4), "min_level is 5; it must be at most max_level, which is 4"),
+        ((-1, 4), "min_level is -1; it must be a whole number from 0 to 48"),
+        ((0, 49), "max_level is 49; it must be a whole number from 0 to 48"),
+        ((0.5, 3), "min_level is 0.5; it must be a whole number from 0 to 48"),
+    ):
+        with pytest.raises(wc.InputError, match=said):
             RemeshPass(adaptive, min_level=levels[0], max_level=levels[1])
     with pytest.raises(wc.InputError, match="Warp function"):
         RemeshPass(adaptive, criterion=lambda element: 1.0)

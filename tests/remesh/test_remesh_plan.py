@@ -154,7 +154,7 @@ def check(plan, forest, rotation_level, grouped=None):
     """By the launches as they are, and then all that there is room for: nothing is left over from before."""
     Comparison(plan, forest, rotation_level, grouped).check()
     counts = plan.class_counts.numpy()
-    plan.refresh(np.full_like(counts, plan.most_leaves - 1))
+    plan.refresh(np.full_like(counts, plan.counts.most - 1))
     Comparison(plan, forest, rotation_level, grouped).check()
     plan.refresh(counts)
 
@@ -186,7 +186,7 @@ def test_a_pass_that_changes_nothing_leaves_the_plan_alone(device):
     plan = DevicePlan(forest, 3)
     RemeshPass(forest).apply(np.zeros(forest.leaf_count, int))
     plan.launch()
-    assert not plan.goes.numpy()[0]
+    assert not plan.counts.goes.numpy()[0]
     assert not plan.refresh(plan.class_counts.numpy())
     check(plan, forest, 3)
 
@@ -219,17 +219,17 @@ def test_the_plan_can_be_recorded_with_the_pass(device, rng):
 # --- forces ---------------------------------------------------------------------------------------------------------
 
 
-def followed(forest, material, model):
-    """A force field of the mesh as it was that goes through what it is now, and its body."""
-    body = wc.SoftBody(forest.source, material, device=forest.device)
-    field = model.bind(body)
-    plan = field.plan_of(forest)
-    body.elements = plan.elements
-    if body.material_stride:
-        body.mu, body.lam = plan.values["mu"], plan.values["lam"]
-    body.sizes.launch_elements = launch_size(forest.leaf_count, 0, 64, plan.most_leaves)
-    field.follow(plan)
-    return field, body
+def remeshed(mesh, material, model, device, rng):
+    """The force field of a simulation whose mesh has changed three times, and the forest on the device."""
+    body = wc.SoftBody(mesh, material, device=device)
+    options = wc.OnlineRemesh(capacity=4 * len(mesh.tets), min_level=0, max_level=48)
+    sim = wc.Simulation(body, model=model, remesh=options)
+    changing = sim.remeshing.changing[0]
+    for _ in range(3):
+        changing.passes.apply(random_marks(changing.forest, rng, 0.02, 0.2))
+    changing.renew()
+    assert sim.fields[0].plan is body.discretization.kept
+    return sim.fields[0], changing.forest
 
 
 def forces_and_energy(field, u):
@@ -256,13 +256,9 @@ def compare_forces(model, uniform, device, rng):
     source = MESHES["uniform"]()
     young = 1e4 if uniform else 1e4 * (1 + rng.random(len(source.tets)))
     material = wc.Isotropic(young, 0.4, 1000.0)
-    values = {} if uniform else {"mu": material.mu, "lam": material.lam}
-    forest = made("uniform", device, values=values)
-    remesh = RemeshPass(forest)
-    for _ in range(3):
-        remesh.apply(random_marks(forest, rng, 0.02, 0.2))
-    field, _ = followed(forest, material, model)
+    field, forest = remeshed(source, material, model, device, rng)
     mesh = forest.to_forest()
+    assert len(mesh.tets) != len(source.tets)
     if not uniform:
         mu, lam = (forest.carriage.values(name)[forest.leaf_elements].astype(float) for name in ("mu", "lam"))
         material = wc.Isotropic(mu * (3 * lam + 2 * mu) / (lam + mu), 0.5 * lam / (lam + mu), 1000.0)

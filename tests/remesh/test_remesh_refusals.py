@@ -26,11 +26,15 @@ def test_criteria_that_cannot_work_are_named(device):
         return wp.zeros(count, dtype=wp.float32, device=where)
 
     for criterion, parameters, said in [
-        (of_one_argument, None, "'of_one_argument' takes 1 arguments; it must take two"),
+        (of_one_argument, None, "criterion is 'of_one_argument', which takes 1 arguments; it must take two"),
         (wp.sin, None, "it must be a Warp function"),
-        (strain, None, "'strain' has 0 parameters; it reads 1"),
-        (von_mises_stress, None, "'von_mises_stress' has 0 parameters; it reads 1"),
-        (nearness, numbers(7), "'nearness' has 7 parameters; it reads 8"),
+        (strain, None, "parameters has 0 numbers; it must have 1, which the criterion 'strain' reads"),
+        (
+            von_mises_stress,
+            None,
+            "parameters has 0 numbers; it must have 1, which the criterion 'von_mises_stress' reads",
+        ),
+        (nearness, numbers(7), "parameters has 7 numbers; it must have 8, which the criterion 'nearness' reads"),
         (strain, numbers(0), "not empty"),
         (None, numbers(0), "not empty"),
     ]:

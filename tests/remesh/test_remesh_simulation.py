@@ -239,9 +239,14 @@ def test_bound_points_stay_with_the_mesh(device):
 def test_wrong_input_is_named(device):
     body = bar(device)
     for options, said in [
-        ({"refine_above": 1.0, "simplify_below": 1.1}, "simplify_below is 1.1 and refine_above 1.0"),
-        ({"refine_above": float("nan")}, "refine_above nan"),
-        ({"min_level": 5, "max_level": 4}, "min_level is 5 and max_level 4"),
+        (
+            {"refine_above": 1.0, "simplify_below": 1.1},
+            "simplify_below is 1.1; it must be below refine_above, which is 1,",
+        ),
+        ({"refine_above": float("nan")}, "refine_above is nan; it must be a finite number"),
+        ({"simplify_below": -float("inf")}, "simplify_below is -inf; it must be a finite number"),
+        ({"simplify_below": "1"}, "simplify_below is '1'; it must be a number"),
+        ({"min_level": 5, "max_level": 4}, "min_level is 5; it must be at most max_level, which is 4"),
         ({"max_level": 49}, "max_level is 49; it must be a whole number from 0 to 48"),
         ({"every": 0}, "every is 0"),
         ({"capacity": -1}, "capacity is -1"),
@@ -250,7 +255,9 @@ def test_wrong_input_is_named(device):
     ]:
         with pytest.raises(wc.InputError, match=said):
             wc.OnlineRemesh(**options)
-    with pytest.raises(wc.InputError, match=r"capacity is 10; the mesh has 1536 elements already"):
+    with pytest.raises(
+        wc.InputError, match="capacity is 10; it must be at least 1536, as many elements as the mesh has"
+    ):
         wc.Simulation(body, remesh=wc.OnlineRemesh(capacity=10))
     with pytest.raises(wc.InputError, match="remesh is 3; it must be an OnlineRemesh"):
         wc.Simulation(body, remesh=3)

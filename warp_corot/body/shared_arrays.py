@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import warp as wp
 
+from warp_corot.discretization.discretization import MeshChanges
 from warp_corot.discretization.nodal import vec3_view
 from warp_corot.discretization.sizes import Sizes
 from warp_corot.errors import InputError
 
 from .conditions import Conditions
 from .state import State
-
-if TYPE_CHECKING:
-    from warp_corot.remesh.changing import Changing
 
 #: What a vec4 array starts and strides at for kernels to read a node by one load [bytes].
 ALIGNMENT = 16
@@ -34,7 +32,7 @@ class SharedArrays:
     sizes: Sizes
     state: State
     conditions: Conditions
-    changing: Changing | None
+    changing: MeshChanges | None
     _own_loads: tuple[wp.array, bool] | None = None
     _own_positions: wp.array | None = None
 

@@ -9,6 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.discretization.clock import Clock
+from warp_corot.discretization.discretization import Discretization, FixedMesh, MeshChanges
 from warp_corot.discretization.elements import Mesh, device_elements, element_kind, parts, repeated
 from warp_corot.discretization.nodal import vec3_view
 from warp_corot.discretization.sizes import Sizes
@@ -30,8 +32,6 @@ from .worlds import World
 if TYPE_CHECKING:
     from warp_corot.discretization.changing.following import FollowingBinding
     from warp_corot.mesh.surfaces.bound import DeviceBinding
-    from warp_corot.remesh.changing import Changing
-    from warp_corot.solvers.steps.pace import Pace
 
 #: Elements, and with them nodes, are numbered in 32 bits.
 MOST_ELEMENTS = 2**31 - 1
@@ -72,7 +72,7 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
     def __init__(self, mesh: Mesh, material: Material, *, worlds: int = 1, device: str | wp.Device | None = None):
         _check_made_of(mesh, material)
         #: What remeshes the body, if anything does.
-        self.changing: Changing | None = None
+        self.changing: MeshChanges | None = None
         #: What the host knows of the present mesh, by the names of properties.
         self._known: dict[str, Any] = {"mesh": mesh}
         self._known["material"] = material.at(centroids(mesh)) if material.functions else material
@@ -94,6 +94,7 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
         #: Lamé's parameters [Pa] and their stride, 0 or 1; then the same times the filled share, for the forces.
         self.lame = self._lame_arrays(isotropic, None)
         self.mu, self.lam, self.material_stride = self._lame_arrays(isotropic, self.fill)
+        self.discretization: Discretization = FixedMesh(mesh, self.elements, self.worlds, self.material, self.lame)
         self._known["masses"] = masses = lumped_masses(mesh, self.material, self.worlds)
         check_float32(masses[masses > 0], "the mass of a node", "kg")
 
@@ -128,9 +129,9 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
             self._known[what] = getattr(self.changing, what)()
         return self._known[what]
 
-    def follow_mesh(self, changing: Changing) -> None:
-        """The mesh changes from now on, and is what this says."""
-        self.changing = changing
+    def follow_mesh(self, changing: MeshChanges, discretization: Discretization) -> None:
+        """The mesh changes from now on, and is what these say."""
+        self.changing, self.discretization = changing, discretization
         self.mesh_changed(self.world_node_count, self.world_element_count)
 
     def mesh_changed(self, nodes: int, elements: int) -> None:
@@ -252,20 +253,20 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
         else:
             self.state.remember()
 
-    def reset(self, chosen: wp.array, pace: Pace) -> None:
+    def reset(self, chosen: wp.array, clock: Clock) -> None:
         """Put chosen worlds back to their initial state; ``Simulation.reset`` does more and is what to call.
 
         Args:
             chosen: Not zero for worlds to be reset, int32 [worlds].
-            pace: The clock.
+            clock: The simulation's.
         """
         if self.changing is not None:
-            self.changing.reset(chosen, pace)
+            self.changing.reset(chosen, clock)
             return
         state, conditions = self.state, self.conditions
         u, v = state.initial or (state.displacements, state.velocities)
         inputs = [chosen, self.world_node_count, int(state.initial is not None), u, v, state.rest]
-        inputs += [conditions.inverse_mass, pace.arrays]
+        inputs += [conditions.inverse_mass, clock.arrays]
         outputs = [state.displacements, state.velocities, state.positions, state.reactions, conditions.world_starts]
         kernel = RESET_NODES[state.positions.dtype]
         wp.launch(kernel, dim=self.sizes.launch_nodes, inputs=inputs, outputs=outputs, device=self.device)

@@ -98,7 +98,7 @@ def as_remesh_options() -> Iterator[None]:
     except InputError as error:
         text = str(error)
         for name, option in ARGUMENTS.items():
-            text = re.sub(rf"\b{name}(?= (is )?[-\d])|(?<=and ){name}\b", option, text)
+            text = re.sub(rf"\b{name}(?=,? (which )?is )", option, text)
         raise InputError(text) from None
 
 

@@ -6,7 +6,9 @@ as it is, and on the device after each pass where it changes (``remesh.plan``).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,11 +17,11 @@ import warp as wp
 
 from warp_corot.mesh import TetForest
 
-from .elements import forest_elements, in_worlds, with_targets
+from .elements import device_elements, forest_elements, in_worlds, with_targets
 from .slots import Slots
 from .subtrees import Batch, Sharing, chosen, in_batches
 
-__all__ = ["Batch", "FlatLeaves", "ForcePlan", "Plan", "Sharing", "Units"]
+__all__ = ["Batch", "FlatLeaves", "ForcePlan", "LeafCounts", "Plan", "Sharing", "Units"]
 
 
 @dataclass(frozen=True)
@@ -74,15 +76,38 @@ class FlatLeaves:
         return len(self.leaves)
 
 
+@dataclass(frozen=True)
+class LeafCounts:
+    """How many leaves there are where their number changes, for launches that derive something of each.
+
+    Attributes:
+        most: How many there may be, padding included.
+        now, before: How many there are, and were when the plan was last derived; int32 [1] on the device.
+        goes: Whether the plan has just been derived, int32 [1] on the device.
+        threads: Threads of a launch that goes through all of them.
+    """
+
+    most: int
+    now: wp.array
+    before: wp.array
+    goes: wp.array
+    threads: int
+
+
 class Plan(Protocol):
     """What a force field goes through, however it came about.
 
     Attributes:
-        batches: Subtrees by type, grouped or not, and sharing.
+        elements: All leaves, ``kernels.elements.elements.ForestElements``; of a general mesh ``GeneralElements``. Their forces
+            go to the slots if there are any.
+        batches: Subtrees by type, grouped or not, and sharing; none where the field goes leaf by leaf.
         flat: The other leaves.
         slots: Where forces go first if their sums must have one order, else None.
-        targets: Then each leaf's slots, int32 [worlds * T, 4], else None.
+        counts: How many leaves there are, if that changes, else None.
     """
+
+    @property
+    def elements(self) -> Any: ...
 
     @property
     def batches(self) -> tuple[Batch, ...]: ...
@@ -96,21 +121,54 @@ class Plan(Protocol):
         ...
 
     @property
+    def all_units(self) -> Units:
+        """What rotations are found of, whether a launch of forces asks for it or not; only where they are shared."""
+        ...
+
+    @property
+    def kinds(self) -> list[tuple[int, bool, Sharing]]:
+        """Shape, whether in groups, and sharing of all batches that there may ever be."""
+        ...
+
+    @property
     def slots(self) -> Slots | None: ...
 
     @property
-    def targets(self) -> npt.NDArray[np.int32] | None: ...
+    def counts(self) -> LeafCounts | None: ...
 
 
 @dataclass(frozen=True)
 class ForcePlan:
-    """The ``Plan`` of a forest that stays as it is."""
+    """The ``Plan`` of a mesh that stays as it is.
 
+    Attributes:
+        find_units: Makes ``all_units`` of a forest whose rotations are shared.
+    """
+
+    elements: Any
     batches: tuple[Batch, ...]
     flat: FlatLeaves
-    units: Units | None
+    units: Units | None = None
     slots: Slots | None = None
-    targets: npt.NDArray[np.int32] | None = None
+    find_units: Callable[[], Units] | None = None
+    counts: None = None
+
+    @cached_property
+    def all_units(self) -> Units:
+        assert self.find_units is not None
+        return self.units or self.find_units()
+
+    @property
+    def kinds(self) -> list[tuple[int, bool, Sharing]]:
+        return [(batch.shape, batch.grouped, batch.sharing) for batch in self.batches]
+
+    @classmethod
+    def leaf_by_leaf(
+        cls, elements: Any, slots: Slots | None = None, find_units: Callable[[], Units] | None = None
+    ) -> ForcePlan:
+        """The plan of a field that goes through the elements of a mesh one by one."""
+        none = wp.empty(0, dtype=wp.int32, device=elements.nodes.device)
+        return cls(elements, (), FlatLeaves(none, elements), slots=slots, find_units=find_units)
 
     @classmethod
     def of_forest(
@@ -120,6 +178,7 @@ class ForcePlan:
         device: wp.Device,
         *,
         worlds: int = 1,
+        elements: Any = None,
         grouped: bool | None = None,
         deterministic: bool = False,
     ) -> ForcePlan:
@@ -128,14 +187,19 @@ class ForcePlan:
         Args:
             rotation_level: Level of the tree at which rotations are shared; None: not shared.
             worlds: How many copies of the body there are.
+            elements: All leaves, if they are on the device already.
             grouped: Whether complete subtrees go in groups where they can, as launches on CUDA alone do; None: there.
             deterministic: Whether every unit has slots of its own for its forces.
         """
         grouped = device.is_cuda if grouped is None else grouped
         members, flat = in_batches(forest, rotation_level, grouped=grouped)
+        elements = device_elements(forest, device, worlds) if elements is None else elements
+        find_units = (
+            None if rotation_level is None else partial(Units.of_forest, forest, rotation_level, device, worlds)
+        )
         units = None
-        if rotation_level is not None and (len(flat) or any(m.sharing is Sharing.ABOVE for m in members)):
-            units = Units.of_forest(forest, rotation_level, device, worlds)
+        if find_units and (len(flat) or any(m.sharing is Sharing.ABOVE for m in members)):
+            units = find_units()
         of_nodes = [m.of_leaves(forest.tets) for m in members]
         of_targets, target_count = of_nodes, 0
         slots = targets = None
@@ -148,11 +212,13 @@ class ForcePlan:
             for m, own in zip(members, of_targets, strict=True):
                 m.hand_down(own, targets)
             targets = in_worlds(targets, worlds, target_count)
+            elements = with_targets(elements, targets)
         batches = [
             m.batch(forest, device, worlds, n, t, target_count, units.unit if units else None)
             for m, n, t in zip(members, of_nodes, of_targets, strict=True)
         ]
-        return cls(tuple(batches), _flat_leaves(forest, flat, device, worlds, targets, units), units, slots, targets)
+        leaves = _flat_leaves(forest, flat, device, worlds, targets, units)
+        return cls(elements, tuple(batches), leaves, units, slots, find_units)
 
 
 def _flat_leaves(

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
+from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.elements import in_worlds, repeated
+from warp_corot.discretization.plan import Plan
 from warp_corot.discretization.slots import Slots
-from warp_corot.errors import InputError
 from warp_corot.kernels.elements.constitutive import stvk_cauchy
 from warp_corot.kernels.elements.forces import element_von_mises
 from warp_corot.kernels.elements.springs import mass_spring_energies, scatter_mass_spring
+from warp_corot.kernels.tables.shapes import EDGES
 
 from .model import ForceField, Model
 
@@ -31,18 +32,22 @@ class MassSpring(Model):
     material's own is ignored. Von Mises stress is that of Hooke's law with E and 1/4 on the Green strain.
     """
 
-    def check_remeshable(self) -> None:
-        raise InputError("the model MassSpring has springs along the edges that it begins with; it cannot be remeshed")
+    @property
+    def kept_of_elements(self) -> str | None:
+        return "the model MassSpring has springs along the edges that it begins with"
 
     def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
         return MassSpringField(body, deterministic)
 
 
 class MassSpringField(ForceField):
+    def plan_of(self, discretization: Discretization) -> Plan:
+        return discretization.plan(subtrees=False)  # the slots are the edges' own
+
     def __init__(self, body: SoftBody, deterministic: bool = False):
         super().__init__(body, deterministic)
         points, tets, worlds = body.mesh.points, body.mesh.tets, body.worlds
-        pairs = np.stack([tets[:, [i, j]] for i, j in itertools.combinations(range(4), 2)], axis=1)
+        pairs = np.stack([tets[:, edge] for edge in EDGES], axis=1)
         lengths = np.linalg.norm(points[pairs[..., 1]] - points[pairs[..., 0]], axis=-1)
         key = pairs.min(axis=-1).astype(np.int64) * len(points) + pairs.max(axis=-1)
         unique, which = np.unique(key.ravel(), return_inverse=True)

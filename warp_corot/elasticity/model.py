@@ -5,23 +5,21 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.discretization.elements import in_worlds, with_targets
-from warp_corot.discretization.slots import Slots
+from warp_corot.discretization.clock import Clock
+from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.plan import Plan
 from warp_corot.errors import InputError
 from warp_corot.kernels.elements.forces import element_energies, element_von_mises, scatter_forces
 from warp_corot.materials.anisotropic import Anisotropic
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
-    from warp_corot.discretization.changing.plan import DevicePlan
-    from warp_corot.discretization.changing.pools import DeviceForest
-    from warp_corot.solvers.steps.pace import Pace
 
 
 class ForceField(ABC):
@@ -32,7 +30,11 @@ class ForceField(ABC):
     Args:
         body: The body.
         deterministic: Whether forces must come out the same bit by bit every time, also on CUDA, where threads run in
-            any order; a subclass then says by ``slots`` where its kernels add them first.
+            any order; ``slots`` are then where kernels add them first.
+
+    Attributes:
+        plan: What launches go through.
+        elements: All of its elements.
 
     Raises:
         InputError: The body's material is anisotropic and the field does not know such.
@@ -45,10 +47,10 @@ class ForceField(ABC):
             raise InputError(f"the material is {type(body.material).__name__}; only the model Corotated knows such")
         self.body = body
         self.device = body.device
-        self.elements = body.elements
         #: On the CPU there is one thread, and nothing to settle.
         self.deterministic = deterministic and body.device.is_cuda
-        self.slots: Slots | None = None
+        self.plan = self.plan_of(body.discretization)
+        self.elements, self.slots = self.plan.elements, self.plan.slots
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
         """Add the elastic nodal forces [N] of displacements u to f; both vec4 [worlds * N]."""
@@ -63,28 +65,33 @@ class ForceField(ABC):
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         """Launch the kernels that add the forces to the nodes, or to the slots if there are any."""
 
-    def plan_of(self, forest: DeviceForest) -> DevicePlan:
-        """What the field wants to know of a mesh that changes, derived there."""
-        from warp_corot.discretization.changing.plan import DevicePlan
+    def plan_of(self, discretization: Discretization) -> Plan:
+        """The plan that the field goes through; by default the elements one by one."""
+        return discretization.plan(subtrees=False, deterministic=self.deterministic)
 
-        return DevicePlan(forest, subtrees=False)
+    def load_kernels(self) -> None:  # noqa: B027 (most have none)
+        """Load every kernel that a later plan may need, so that none is compiled once steps are made.
 
-    def follow(self, plan: DevicePlan) -> None:
-        """Go through the elements of a mesh that changes.
-
-        Called before the first launch, and again, before others are recorded, whenever a pass has changed the size of
-        any launch.
+        Called where plans change, before the first step.
         """
-        self.elements = plan.elements
 
-    def derive(self, plan: DevicePlan) -> None:  # noqa: B027 (most need nothing)
-        """Launch what brings up to date what is kept of such elements, if ``plan.goes``; may be recorded."""
+    def derive(self) -> None:  # noqa: B027 (most need nothing)
+        """Launch what brings up to date what is kept of the elements, if the plan has changed; may be recorded.
 
-    def begin_step(self, pace: Pace, offset: int) -> None:  # noqa: B027 (most do not change)
+        Called where plans change, after each time that one is derived.
+        """
+
+    def follow(self) -> None:  # noqa: B027 (most need nothing)
+        """Make launches of the sizes that the plan has now.
+
+        Called where plans change, before steps are recorded, whenever a size is another one.
+        """
+
+    def begin_step(self, clock: Clock, offset: int) -> None:  # noqa: B027 (most do not change)
         """Launch what sets the field for a step, where it changes with time.
 
         Args:
-            pace: The clock.
+            clock: The simulation's.
             offset: How many steps are launched that it does not count yet.
         """
 
@@ -185,12 +192,13 @@ class Model(ABC):
             InputError: The model cannot be used with this body's mesh.
         """
 
-    def check_remeshable(self) -> None:  # noqa: B027 (most are)
-        """See that a body under this model can be remeshed.
+    @property
+    def kept_of_elements(self) -> str | None:
+        """What a force field keeps of the elements that it is bound to, for a message; None: it can go on with others.
 
-        Raises:
-            InputError: The model keeps something of the elements or edges that it was bound to.
+        A body whose elements change cannot have a model that keeps something of them.
         """
+        return None
 
 
 class ElementField(ForceField):
@@ -209,11 +217,6 @@ class ElementField(ForceField):
         self._forces = forces
         self._energies = energies
         self._von_mises = von_mises
-        if self.deterministic:
-            self._take_slots()
-
-    def _take_slots(self) -> None:
-        self.slots, self.elements = leaf_slots(self.body)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         self.launch(self._forces, self.element_count, [self.elements, *self.material_inputs, u], [f])
@@ -245,9 +248,3 @@ class LawField(ElementField):
             energies=element_energies(kind, energy),
             von_mises=element_von_mises(kind, cauchy),
         )
-
-
-def leaf_slots(body: SoftBody) -> tuple[Slots, Any]:
-    """A slot for each node of each element, and the elements that add to them."""
-    slots, (targets,) = Slots.of_units([body.mesh.tets], body.world_node_count, body.device, body.worlds)
-    return slots, with_targets(body.elements, in_worlds(targets, body.worlds, slots.per_world))

@@ -8,8 +8,6 @@ import warp as wp
 
 from warp_corot.kernels.elements.viscosity import scatter_viscous
 
-from .model import leaf_slots
-
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
 
@@ -29,18 +27,18 @@ class Viscosity:
         self.body, self.field, self.seconds = body, field, seconds
         self._kernel = scatter_viscous(body.element_kind)
         #: Where sums must come out the same every time, the elements' own places for them.
-        self._slots = leaf_slots(body) if field.deterministic else None
+        self._slotted = body.discretization.plan(subtrees=False, deterministic=True) if field.deterministic else None
 
     def add_forces(self) -> None:
         """Launch what adds the forces of the present displacements and velocities to the body's [N]."""
         f = self.body.state.forces
-        if self._slots is None:
-            # Forces go to the nodes also where the field's own kernels take them elsewhere.
-            self._launch(self.field.elements if self.body.changing is not None else self.body.elements, f)
+        if self._slotted is None:
+            self._launch(self.field.elements, f)
             return
-        slots, elements = self._slots
+        slots = self._slotted.slots
+        assert slots is not None
         slots.values.zero_()
-        self._launch(elements, slots.values)
+        self._launch(self._slotted.elements, slots.values)
         slots.gather(f)
 
     def _launch(self, elements: object, f: wp.array) -> None:

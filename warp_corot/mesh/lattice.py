@@ -6,6 +6,7 @@ import numpy as np
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number
+from warp_corot.kernels.tables.shapes import VOLUME
 
 #: A root cube has 2**LATTICE_BITS lattice intervals a side, so levels may go to 3 * LATTICE_BITS.
 LATTICE_BITS = 16
@@ -18,7 +19,7 @@ MAX_CELLS = 2 ** (31 - LATTICE_BITS) - 1
 def volume_shares(level: np.ndarray | int) -> np.ndarray:
     """Volume of tetrahedra of these levels over that of a root cube."""
     all_levels = np.arange(MAX_LEVEL + 1)
-    return (0.125 ** (all_levels // 3) / np.array([6.0, 12.0, 24.0])[all_levels % 3])[level]
+    return (0.125 ** (all_levels // 3) * np.array(VOLUME)[all_levels % 3])[level]
 
 
 def checked_level(level: Any, name: str) -> int:
@@ -32,8 +33,20 @@ def checked_level(level: Any, name: str) -> int:
     except (TypeError, ValueError, OverflowError):
         found = -1
     if isinstance(level, bool) or found != level or not 0 <= found <= MAX_LEVEL:
-        raise InputError(f"{name} is {level}; it must be a whole number from 0 to {MAX_LEVEL}")
+        raise InputError(f"{name} is {level!r}; it must be a whole number from 0 to {MAX_LEVEL}")
     return found
+
+
+def check_levels(min_level: Any, max_level: Any) -> None:
+    """See that two levels, or None where one is left open, are in order.
+
+    Raises:
+        InputError: One of them is no level, or the first is above the second.
+    """
+    levels = {"min_level": min_level, "max_level": max_level}
+    found = [checked_level(level, name) for name, level in levels.items() if level is not None]
+    if len(found) == 2 and found[0] > found[1]:
+        raise InputError(f"min_level is {min_level}; it must be at most max_level, which is {max_level}")
 
 
 def checked_cells(cells: Any) -> tuple[int, int, int]:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_numbers
+from warp_corot.kernels.tables.shapes import EDGES
 from warp_corot.mesh.surfaces.boundary import signed_volumes
 
 if TYPE_CHECKING:
@@ -198,5 +199,4 @@ def _checked_labels(given: np.ndarray, count: int, names: int) -> np.ndarray:
 
 def _longest_edges(points: np.ndarray, tets: np.ndarray) -> np.ndarray:
     x = points[tets]
-    pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
-    return np.max([np.linalg.norm(x[:, i] - x[:, j], axis=1) for i, j in pairs], axis=0)
+    return np.max([np.linalg.norm(x[:, i] - x[:, j], axis=1) for i, j in EDGES], axis=0)

@@ -1,5 +1,9 @@
 """Online remeshing: a forest that refines and simplifies on the device while the tissue deforms.
 
+For users: ``OnlineRemesh`` says when elements are refined and simplified; ``elongation``, ``strain``,
+``von_mises_stress`` and ``nearness`` are its criteria. A criterion of your own is a ``@wp.func`` of an ``ElementState``
+and an array of float32; it may call ``displacement_gradient``, ``green_strain`` and ``longest_edge``.
+
 ``pools.DeviceForest`` holds the tree, its leaves and nodes in pools of fixed capacity, with what they carry;
 ``passes.RemeshPass`` is one pass over it:
 
@@ -35,6 +39,26 @@ their bounds. What lies beyond is padding: nodes without mass, and elements on p
 zero.
 """
 
+from warp_corot.kernels.remesh.criteria import (
+    displacement_gradient,
+    green_strain,
+    longest_edge,
+    nearness,
+    strain,
+    von_mises_stress,
+)
+from warp_corot.kernels.remesh.mark import ElementState, elongation
+
 from .online import OnlineRemesh
 
-__all__ = ["OnlineRemesh"]
+__all__ = [
+    "ElementState",
+    "OnlineRemesh",
+    "displacement_gradient",
+    "elongation",
+    "green_strain",
+    "longest_edge",
+    "nearness",
+    "strain",
+    "von_mises_stress",
+]

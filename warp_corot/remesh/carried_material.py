@@ -8,10 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+import warp as wp
 
 from warp_corot.discretization.changing.plan import DevicePlan
 from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.discretization.changing.transfer import Column, Numbers
+from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial, vec9
+from warp_corot.kernels.remesh.anisotropic import assemble_materials
 from warp_corot.kernels.remesh.state import FIRST, MEAN_IF_ALIKE, MEAN_OF_CONTENTS, NO_ROW
 from warp_corot.materials.anisotropic import FRAME_ENTRIES, STIFFNESS_ENTRIES, Anisotropic, constants_of
 from warp_corot.materials.isotropic import Isotropic, Material
@@ -63,6 +66,14 @@ class CarriedMaterial:
         if self._lame:
             body.lame = (*(plan.values[name] for name in self._lame), 1)
 
+    def derive(self, plan: DevicePlan) -> None:
+        """Launch what writes the material that kernels read, if the plan has just been derived; may be recorded."""
+
+    @property
+    def anisotropic(self) -> OrthotropicMaterial:
+        """The material of leaves and of padding as kernels read it, if it is anisotropic."""
+        raise TypeError(f"the material is {type(self.given).__name__}, which is not anisotropic")
+
     def present(self, forest: DeviceForest) -> Material:
         """The material of the present elements."""
         density = self._present_density(forest)
@@ -100,10 +111,33 @@ class CarriedAnisotropic(CarriedMaterial):
         active = body.conditions.activation.numpy() if body.conditions.has_activation else 0.0
         self.values[ACTIVATION] = Column(active, int(MEAN_IF_ALIKE))
         self.values[ACTIVATION_ROW] = Numbers(int(NO_ROW))
+        self._anisotropic = body.discretization.anisotropic_material()
+
+    @property
+    def anisotropic(self) -> OrthotropicMaterial:
+        return self._anisotropic
 
     def serve(self, body: SoftBody, plan: DevicePlan) -> None:
         super().serve(body, plan)
         body.conditions.activation = plan.values[ACTIVATION]
+        given, material, count = self._anisotropic, OrthotropicMaterial(), plan.counts.most
+        material.assign(given)
+        material.mu, material.lam, material.stride = body.lame
+        if given.axes_stride:
+            material.axes = wp.array(np.tile(np.eye(3), (count, 1, 1)), dtype=wp.mat33, device=body.device)
+        if given.stride:
+            material.stiffness = wp.zeros(count, dtype=vec9, device=body.device)
+        if "fill" in plan.values:
+            material.fill = plan.values["fill"]
+        self._anisotropic = material
+
+    def derive(self, plan: DevicePlan) -> None:
+        rows = [plan.values_row(names[0]) for names in (FRAME_ENTRIES, STIFFNESS_ENTRIES)]
+        if max(rows) >= 0:
+            forest, material = plan.forest, self._anisotropic
+            inputs = [forest.threads, forest.pools, plan.arrays, *rows]
+            outputs = [material.axes, material.stiffness]
+            wp.launch(assemble_materials, forest.threads, inputs=inputs, outputs=outputs, device=forest.device)
 
     def present(self, forest: DeviceForest) -> Material:
         changed: dict[str, Any] = {"density": self._present_density(forest)}

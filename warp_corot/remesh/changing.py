@@ -13,6 +13,7 @@ from warp_corot.discretization.changing.plan import DevicePlan
 from warp_corot.discretization.changing.pools import DeviceForest, PassCounts
 from warp_corot.discretization.changing.sizes import launch_size
 from warp_corot.discretization.changing.survey import Survey
+from warp_corot.discretization.clock import Clock
 from warp_corot.errors import InputError
 from warp_corot.kernels.remesh.mark import elongation, marking_kernel
 from warp_corot.kernels.stepping.integrate import set_start
@@ -21,13 +22,13 @@ from warp_corot.mesh import TetForest
 from warp_corot.mesh.lattice import volume_shares
 
 from .carried_material import carried_material
+from .changing_mesh import ChangingMesh
 from .conditions import CarriedConditions
 from .online import OnlineRemesh
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
     from warp_corot.elasticity import ForceField
-    from warp_corot.solvers.steps.pace import Pace
 
 #: Nodes are launched in multiples of this.
 NODE_GRANULE = 256
@@ -46,6 +47,7 @@ class Changing:
         carried_material: What elements carry of the material.
         conditions: What is done to nodes and fibres.
         survey: What limits the time step.
+        discretization: The mesh as the force field sees it.
         is_full: Whether refinement had to be left out for want of room.
 
     Raises:
@@ -82,7 +84,7 @@ class Changing:
             lame=self.carried_material.lame,
         )
         self.survey = Survey(self.forest, self.carried_material.modulus)
-        self.plan: DevicePlan | None = None
+        self.discretization = ChangingMesh(body, self.forest, self.carried_material)
         #: What is looked at after a pass: counts of the pools and of the plan, the survey, and who follows keyframes.
         self._report: wp.array | None = None
         self._report_parts: list[int] = []
@@ -113,13 +115,9 @@ class Changing:
     # --- passes ----------------------------------------------------------------------------------------------------
 
     def serve(self, field: ForceField) -> None:
-        """Let a force field go through what the leaves are, now and after each pass."""
+        """Keep the plan of a force field that was bound to the body up to date, and tell the field after each pass."""
         self.field = field
-        self.plan = field.plan_of(self.forest)
-        body = self.body
-        body.elements = self.plan.elements
-        self.carried_material.serve(body, self.plan)
-        field.follow(self.plan)
+        field.load_kernels()
         parts = self._found()
         self._report_parts = [len(part) for part in parts]
         self._report = wp.zeros(sum(self._report_parts), dtype=wp.int32, device=self.device)
@@ -143,12 +141,11 @@ class Changing:
 
     def renew(self) -> None:
         """Derive everything from the mesh as it is."""
-        assert self.plan is not None
-        self.plan.outdate()
+        self._plan.outdate()
         self._launch_derived()
         self._look(anyway=True)
 
-    def reset(self, chosen: wp.array, pace: Pace) -> None:
+    def reset(self, chosen: wp.array, clock: Clock) -> None:
         """Go back to the mesh and state of the beginning, or of the last ``remember``, if the world is chosen.
 
         Loads and held nodes, and what these follow, are those that this mesh had last.
@@ -158,21 +155,25 @@ class Changing:
         self.conditions.note()
         self.forest.restart()
         self.conditions.put_back()
-        wp.launch(
-            set_start, dim=1, inputs=[pace.arrays], outputs=[self.body.conditions.world_starts], device=self.device
-        )
+        starts = self.body.conditions.world_starts
+        wp.launch(set_start, dim=1, inputs=[clock.arrays], outputs=[starts], device=self.device)
         self.renew()
         self.conditions.keep()
         self.body.conditions.find_inverse_masses()
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
+    @property
+    def _plan(self) -> DevicePlan:
+        assert self.discretization.kept is not None
+        return self.discretization.kept
+
     def _give_pools_to(self, body: SoftBody) -> None:
         """The body's arrays are the pools' from now on, with what was in them."""
         arrays, initial = self.forest.carriage.arrays, body.state.initial
         body.state.move_into(arrays.rest, arrays.u, arrays.v, arrays.reaction)
         body.conditions.move_into(arrays.held, arrays.mass32, arrays.inverse_mass, arrays.load)
-        body.follow_mesh(self)
+        body.follow_mesh(self, self.discretization)
         self._keep_initial_state(initial)
 
     def _launch(self) -> None:
@@ -181,11 +182,11 @@ class Changing:
         self._launch_derived()
 
     def _launch_derived(self) -> None:
-        assert self.plan is not None
-        self.plan.launch()
-        self.field.derive(self.plan)
-        self.survey.launch(self.plan.goes)
-        self.conditions.launch(self.plan.goes)
+        self.discretization.launch()
+        self.field.derive()
+        goes = self._plan.counts.goes
+        self.survey.launch(goes)
+        self.conditions.launch(goes)
         start = 0
         for part in self._found():
             wp.copy(self._report, part, dest_offset=start)
@@ -193,12 +194,10 @@ class Changing:
 
     def _found(self) -> tuple[wp.array, ...]:
         """What launches find that the host looks at, int32."""
-        assert self.plan is not None
-        return self.forest.pools.counts, self.plan.class_counts, self.survey.found, self.conditions.found
+        return self.forest.pools.counts, self._plan.class_counts, self.survey.found, self.conditions.found
 
     def _look(self, *, anyway: bool = False) -> None:
         """The one look at what the device has done: if the mesh is another one, body and field go through that."""
-        assert self.plan is not None
         assert self._report is not None
         counted, classes, surveyed, followers = np.split(self._report.numpy(), np.cumsum(self._report_parts)[:-1])
         counts = PassCounts.of(counted)
@@ -208,10 +207,10 @@ class Changing:
         body = self.body
         limit = self.forest.node_capacity
         nodes = launch_size(counts.nodes, body.sizes.launch_nodes, NODE_GRANULE, limit)
-        elements = launch_size(counts.leaves, body.sizes.launch_elements, 1, len(self.plan.elements.code))
+        elements = launch_size(counts.leaves, body.sizes.launch_elements, 1, self._plan.counts.most)
         moved = body.sizes.set_launches(nodes, elements)
-        if self.plan.refresh(classes) or moved:
-            self.field.follow(self.plan)
+        if self._plan.refresh(classes) or moved:
+            self.field.follow()
             body.sizes.relaunch()
         body.mesh_changed(counts.nodes, counts.leaves)
         self.survey.read(surveyed)

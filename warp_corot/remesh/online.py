@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import inspect
-import math
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import warp as wp
 
-from warp_corot.errors import InputError
+from warp_corot.discretization.changing.checks import (
+    checked_capacity,
+    checked_criterion,
+    checked_parameters,
+    checked_thresholds,
+)
 from warp_corot.inputs.checks import checked_count
-from warp_corot.kernels.remesh.criteria import PARAMETER_COUNTS
 from warp_corot.mesh import TetForest
-from warp_corot.mesh.lattice import MAX_LEVEL
+from warp_corot.mesh.lattice import MAX_LEVEL, check_levels
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +42,8 @@ class OnlineRemesh:
         every: Steps between passes.
         capacity: How many elements there may be; None: four times those of the mesh, at least 100,000. When it is
             reached refinement stops, with one warning, and the simulation goes on.
-        criterion: In place of the elongation: one of ``kernels.remesh.criteria``, ``strain``, ``von_mises_stress`` or
-            ``nearness``, or a Warp function (``@wp.func``) of your own of a ``kernels.remesh.mark.ElementState`` and an
-            array of numbers.
+        criterion: In place of the elongation: ``remesh.strain``, ``von_mises_stress`` or ``nearness``, or a Warp
+            function (``@wp.func``) of your own of a ``remesh.ElementState`` and an array of numbers.
         parameters: Those numbers, float32 [n] on the simulation's device, which may be written to between steps. They
             must be all that the criterion reads: there is no check within kernels.
 
@@ -63,22 +63,14 @@ class OnlineRemesh:
     parameters: wp.array | None = None
 
     def __post_init__(self) -> None:
-        above, below = self.refine_above, self.simplify_below
-        if not (_is_finite(above) and _is_finite(below) and below < above):
-            raise InputError(
-                f"simplify_below is {below} and refine_above {above}; "
-                "the first must be smaller, or a leaf would be refined and simplified at once"
-            )
-        for name in ("min_level", "max_level"):
-            level = getattr(self, name)
-            if level is not None and not _is_level(level):
-                raise InputError(f"{name} is {level!r}; it must be a whole number from 0 to {MAX_LEVEL}")
-        if self.min_level is not None and self.max_level is not None and self.min_level > self.max_level:
-            raise InputError(f"min_level is {self.min_level} and max_level {self.max_level}; the first is the smaller")
+        checked_thresholds(self.refine_above, self.simplify_below)
+        check_levels(self.min_level, self.max_level)
         checked_count(self.every, "every", least=1)
         if self.capacity is not None:
             checked_count(self.capacity, "capacity", least=1)
-        _check_criterion(self.criterion, self.parameters)
+        if self.criterion is not None:
+            checked_criterion(self.criterion)
+        checked_parameters(self.parameters, self.criterion)
 
     def on(self, mesh: TetForest) -> OnlineRemesh:
         """The same with numbers in place of what is found from a mesh.
@@ -93,34 +85,4 @@ class OnlineRemesh:
         if low is None:
             low = min(int(levels.min()), high)
         capacity = max(4 * count, 100_000) if self.capacity is None else self.capacity
-        if capacity < count:
-            raise InputError(f"capacity is {capacity}; the mesh has {count} elements already")
-        return replace(self, min_level=low, max_level=high, capacity=capacity)
-
-
-def _is_finite(given: Any) -> bool:
-    return isinstance(given, int | float | np.number) and math.isfinite(given)
-
-
-def _is_level(given: Any) -> bool:
-    return isinstance(given, int | np.integer) and not isinstance(given, bool) and bool(0 <= given <= MAX_LEVEL)
-
-
-def _check_criterion(criterion: Any, numbers: Any) -> None:
-    """See that the criterion is a function of an element and numbers, and that there are as many as it reads."""
-    if criterion is not None:
-        if not isinstance(criterion, wp.Function) or criterion.func is None:
-            raise InputError(f"criterion is {criterion!r}; it must be a Warp function (@wp.func) of an ElementState")
-        count = len(inspect.signature(criterion.func).parameters)
-        if count != 2:
-            raise InputError(
-                f"the criterion {criterion.func.__name__!r} takes {count} arguments; "
-                "it must take two, an ElementState and an array of float32"
-            )
-    if numbers is not None and not (
-        isinstance(numbers, wp.array) and numbers.dtype == wp.float32 and numbers.ndim == 1 and len(numbers) > 0
-    ):
-        raise InputError(f"parameters is {numbers!r}; it must be a Warp array of float32, [n], not empty")
-    needed, given = PARAMETER_COUNTS.get(criterion, 0), 0 if numbers is None else len(numbers)
-    if given < needed:
-        raise InputError(f"the criterion {criterion.func.__name__!r} has {given} parameters; it reads {needed}")
+        return replace(self, min_level=low, max_level=high, capacity=checked_capacity(capacity, count))

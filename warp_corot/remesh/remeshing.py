@@ -57,7 +57,8 @@ class Remeshing:
         for each, body, model in zip(options, bodies, models, strict=True):
             if each is not None:
                 body.check_own_arrays()
-                model.check_remeshable()
+                if model.kept_of_elements is not None:
+                    raise InputError(f"{model.kept_of_elements}; a body that is remeshed must have another model")
                 fitted(each, body)
 
         self.changing = tuple(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -20,8 +19,9 @@ from warp_corot.kernels.remesh import simplify as remesh_simplify
 from warp_corot.kernels.remesh import state as remesh_state
 from warp_corot.kernels.remesh.mark import Contents, elongation, marking_kernel
 from warp_corot.mesh.growing.growth import lattice_spacing
-from warp_corot.mesh.lattice import MAX_LEVEL
+from warp_corot.mesh.lattice import MAX_LEVEL, check_levels
 
+from .checks import checked_criterion, checked_thresholds
 from .pools import DeviceForest
 
 
@@ -56,24 +56,13 @@ class RemeshPass:
         parameters: wp.array | None = None,
         lame: tuple[float, float] | tuple[str, str] = (0.0, 0.0),
     ):
-        if not (math.isfinite(refine_above) and math.isfinite(simplify_below) and simplify_below < refine_above):
-            raise InputError(
-                f"simplify_below is {simplify_below} and refine_above {refine_above}; "
-                "the first must be smaller, or a leaf would be refined and simplified at once"
-            )
-        if not (_is_level(min_level) and _is_level(max_level) and min_level <= max_level):
-            raise InputError(
-                f"min_level is {min_level} and max_level {max_level}; "
-                f"they must be whole numbers from 0 to {MAX_LEVEL}, in this order"
-            )
-        if not isinstance(criterion, wp.Function):
-            raise InputError(f"criterion is {criterion!r}; it must be a Warp function (@wp.func) of an ElementState")
+        self.thresholds = checked_thresholds(refine_above, simplify_below)
+        check_levels(min_level, max_level)
         self.forest = forest
         self.device = forest.device
-        self.thresholds = (float(refine_above), float(simplify_below))
         self.levels = (int(min_level), int(max_level))
         self.parameters = wp.zeros(1, dtype=wp.float32, device=self.device) if parameters is None else parameters
-        self._mark = marking_kernel(criterion)
+        self._mark = marking_kernel(checked_criterion(criterion))
         self._origin = wp.vec3d(*forest.source.origin)
         self._spacing = lattice_spacing(forest.source.cell_size)
         self._contents = self._make_contents(lame)
@@ -225,7 +214,3 @@ class RemeshPass:
             wp.empty(nodes, dtype=wp.int32, device=self.device) for _ in range(3)
         )
         return moves
-
-
-def _is_level(given: Any) -> bool:
-    return isinstance(given, int | np.integer) and not isinstance(given, bool) and bool(0 <= given <= MAX_LEVEL)

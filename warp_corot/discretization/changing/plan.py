@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.discretization.plan import FlatLeaves, Units
+from warp_corot.discretization.plan import FlatLeaves, LeafCounts, Units
 from warp_corot.discretization.subtrees import Batch, Sharing
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements, Subtrees
 from warp_corot.kernels.plan import batches as remesh_batches
@@ -36,14 +36,12 @@ class DevicePlan:
     Attributes:
         elements: The leaves as ``kernels.elements.elements.ForestElements``.
         values: What leaves carry by name, float32 [capacity + LEAF_PADDING] each; zero beyond the leaves.
-        most_leaves: Up to how many leaves launches may go through.
         class_counts: What ``refresh`` wants, int32 on the device.
-        goes: Whether the last launches have derived anything, int32 [1] on the device.
-        batches, flat, units: As in ``plan.Plan``.
-        slots, targets: None.
+        batches, flat, units, counts: As in ``plan.Plan``.
+        slots: None.
     """
 
-    slots = targets = None
+    slots = None
 
     def __init__(
         self,
@@ -58,15 +56,22 @@ class DevicePlan:
         self._with_subtrees = subtrees
         grouped = self.device.is_cuda if grouped is None else grouped
         made = PlanArrays(forest, rotation_level, subtrees=subtrees, grouped=grouped)
-        self.most_leaves = len(made.plan.code)
         self._kinds, self._most_subtrees = made.kinds, made.most_subtrees
         self._plan, self._batches, self._leaves = made.plan, made.batches, made.leaves
         self._rows = self._plan.classes + 2
+        all_leaves = slice(self._rows, self._rows + 1)
+        self.counts = LeafCounts(
+            most=len(made.plan.code),
+            now=self._plan.counts[all_leaves],
+            before=self._plan.before[all_leaves],
+            goes=self._plan.goes,
+            threads=forest.threads,
+        )
         self._flagged = wp.zeros((self._plan.classes, self._most_subtrees), dtype=wp.uint8, device=self.device)
         self._sums, self._ends = (
             wp.zeros(self._rows * forest.threads, dtype=wp.int32, device=self.device) for _ in range(2)
         )
-        self.class_counts, self.goes = self._plan.counts, self._plan.goes
+        self.class_counts = self._plan.counts
         self._edge_lengths = made.edge_lengths
         self.elements = self._elements(forest.pools.leaf_tets, self._plan.code)
         self.values = {name: self._plan.values[n] for n, name in enumerate(forest.carriage.names)}
@@ -110,7 +115,7 @@ class DevicePlan:
             Whether ``batches``, ``flat`` or ``units`` are other ones now, so that launches must be made anew.
         """
         classes = self._plan.classes
-        limits = [self._most_subtrees] * classes + [self.most_leaves] * 2
+        limits = [self._most_subtrees] * classes + [self.counts.most] * 2
         granules = [GRANULE] * classes + [1, 1]
         wanted = counts[: self._rows].tolist()
         wanted[-1] += 1  # the first unit is padding
@@ -121,11 +126,10 @@ class DevicePlan:
         self._refit()
         return True
 
-    @property
-    def leaf_count(self) -> wp.array:
-        """How many leaves there are, int32 [1] on the device."""
-        row = self._plan.classes + 2
-        return self._plan.counts[row : row + 1]
+    def values_row(self, name: str) -> int:
+        """Where leaves' values of a name stand in ``arrays.values``; -1 if they carry none."""
+        names = self.forest.carriage.names
+        return names.index(name) if name in names else -1
 
     @property
     def arrays(self) -> Any:

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warp_corot.discretization.plan import ForcePlan, Plan
-from warp_corot.elasticity.paths.clusters import ClusterScatter, grouped_and_others
+from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.plan import Plan
+from warp_corot.elasticity.paths.clusters import others_in_clusters
 from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law
 from warp_corot.kernels.corotated.definite import quaternions_of
 from warp_corot.kernels.math.rotation import quick_rotation
@@ -15,15 +16,12 @@ from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_aniso
 from warp_corot.kernels.subtrees.cuda import BLOCK
 from warp_corot.kernels.tables.cluster_layout import ANISOTROPIC
 from warp_corot.materials.anisotropic import TransverselyIsotropic
-from warp_corot.mesh import TetForest
 
 from .anisotropic import AnisotropicField
 from .anisotropic_general import active_material
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
-    from warp_corot.discretization.changing.plan import DevicePlan
-    from warp_corot.discretization.changing.pools import DeviceForest
 
 
 class AnisotropicSubtreeField(AnisotropicField):
@@ -36,31 +34,21 @@ class AnisotropicSubtreeField(AnisotropicField):
     def __init__(self, body: SoftBody):
         super().__init__(body, quick_rotation, deterministic=False)
         self._transverse = isinstance(body.material, TransverselyIsotropic)
-        if body.changing is None:
-            assert isinstance(body.mesh, TetForest)
-            self._quaternions = self._turned_axes()
-            self._go_through(ForcePlan.of_forest(body.mesh, None, self.device, worlds=body.worlds))
+        self._quaternions = wp.empty(len(self.material.axes), dtype=wp.quat, device=self.device)
+        self.derive()
+        self.follow()
 
-    def plan_of(self, forest: DeviceForest) -> DevicePlan:
-        from warp_corot.discretization.changing.plan import DevicePlan
+    def plan_of(self, discretization: Discretization) -> Plan:
+        return discretization.plan()
 
-        return DevicePlan(forest)
-
-    def follow(self, plan: DevicePlan) -> None:
-        is_new = self.elements is not plan.elements
-        super().follow(plan)
-        if is_new:
-            self._quaternions = self._turned_axes()
-        # Everything that any mesh may come to need, so that nothing is compiled once steps are made.
-        for shape, grouped, _sharing in plan.kinds:
+    def load_kernels(self) -> None:
+        for shape, grouped, _sharing in self.plan.kinds:
             wp.load_module(self._kernel(shape, grouped).module, self.device, block_dim=BLOCK)
         for kernel in (scatter_flat, repair_leaves):
             wp.load_module(kernel.module, self.device)
-        self._go_through(plan)
 
-    def derive(self, plan: DevicePlan) -> None:
-        super().derive(plan)
-        self._turn_axes(self._quaternions)
+    def derive(self) -> None:
+        self.launch(quaternions_of, len(self._quaternions), [self.material.axes], [self._quaternions])
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         material, flat = [self.material, *self._activation], self._flat
@@ -75,29 +63,16 @@ class AnisotropicSubtreeField(AnisotropicField):
         if self._clusters is not None:
             self._clusters(active_material(self.material, self._quaternions, *self._activation), u, f)
 
-    def _go_through(self, plan: Plan) -> None:
-        self.plan = plan
-        self._batches, self._flat = list(plan.batches), plan.flat if len(plan.flat) else None
-        self._clusters: ClusterScatter | None = None
-        if isinstance(plan, ForcePlan) and len(plan.flat) and self.device.is_cuda:
-            self._batches, leaves = grouped_and_others(plan)
-            law = anisotropic_law(self._transverse)
-            self._clusters = ClusterScatter(self.elements, law, ActiveMaterial, chosen=leaves, layout=ANISOTROPIC)
-            self._flat = None
+    def follow(self) -> None:
+        self._batches, self._flat, self._clusters = others_in_clusters(
+            self.plan, anisotropic_law(self._transverse), ActiveMaterial, ANISOTROPIC
+        )
         self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in self._batches]
         self._flags = [wp.zeros(-(-b.count // 8), dtype=wp.uint64, device=self.device) for b in self._batches]
 
     def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
         one_axes, one_stiffness = self.material.axes_stride == 0, self.material.stride == 0
         return scatter_anisotropic_subtrees(shape, grouped, self._transverse, one_axes, one_stiffness)
-
-    def _turned_axes(self) -> wp.array:
-        quaternions = wp.empty(len(self.material.axes), dtype=wp.quat, device=self.device)
-        self._turn_axes(quaternions)
-        return quaternions
-
-    def _turn_axes(self, quaternions: wp.array) -> None:
-        self.launch(quaternions_of, len(quaternions), [self.material.axes], [quaternions])
 
 
 def as_bytes(flags: wp.array) -> wp.array:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, ClassVar
 
 import warp as wp
 
-from warp_corot.discretization.plan import Units
-from warp_corot.elasticity.model import ForceField, leaf_slots
+from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.plan import Plan, Units
+from warp_corot.elasticity.model import ForceField
 from warp_corot.elasticity.paths.lanes import Lanes
 from warp_corot.kernels.corotated.corotated import (
     corotated_energies,
@@ -21,12 +22,9 @@ from warp_corot.kernels.corotated.corotated import (
     scatter_with_rotations,
 )
 from warp_corot.kernels.elements.general_cpu import repair_elements, scatter_elements
-from warp_corot.mesh import TetForest
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
-    from warp_corot.discretization.changing.plan import DevicePlan
-    from warp_corot.discretization.changing.pools import DeviceForest
 
     from .model import Corotated
 
@@ -50,11 +48,10 @@ class CorotatedField(ForceField):
     takes_subtrees: ClassVar[bool] = False
 
     def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
-        super().__init__(body, deterministic)
         self.model = model
+        super().__init__(body, deterministic)
         kind = body.element_kind
         self._shared: Rotations | None = None
-        self._followed: DevicePlan | None = None
         self._fused = model.level is None and model.rotation != "warm" and model.stiffness == "factored"
         self._state: dict[str, wp.array] = {}
         if model.rotation == "warm":
@@ -85,14 +82,10 @@ class CorotatedField(ForceField):
         """Level of the tree at which rotations are shared, if they are."""
         return self.model.level
 
-    def plan_of(self, forest: DeviceForest) -> DevicePlan:
-        from warp_corot.discretization.changing.plan import DevicePlan
+    def plan_of(self, discretization: Discretization) -> Plan:
+        return discretization.plan(self.rotation_level, subtrees=self.takes_subtrees, deterministic=self.deterministic)
 
-        return DevicePlan(forest, self.rotation_level, subtrees=self.takes_subtrees)
-
-    def follow(self, plan: DevicePlan) -> None:
-        super().follow(plan)
-        self._followed = plan
+    def follow(self) -> None:
         self._shared = None
 
     @property
@@ -133,13 +126,9 @@ class CorotatedField(ForceField):
         return self._shared
 
     def _units(self) -> Units:
-        level = self.rotation_level
-        if level is None:
+        if self.rotation_level is None:
             return Units.own(self.elements, self.element_count)
-        if self._followed is not None:
-            return self._followed.all_units
-        assert isinstance(self.body.mesh, TetForest)
-        return Units.of_forest(self.body.mesh, level, self.device, self.body.worlds)
+        return self.plan.all_units
 
     def _launch_with_rotations(self, kernel: wp.Kernel, material: list, u: wp.array, output: wp.array) -> None:
         shared = self._sharing()
@@ -152,13 +141,11 @@ class LeafField(CorotatedField):
 
     def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
         super().__init__(body, model, deterministic)
-        if self.deterministic:
-            self.slots, self.elements = leaf_slots(body)
-        if not self._fused and body.changing is None:
+        if not self._fused:
             self._sharing()
 
-    def follow(self, plan: DevicePlan) -> None:
-        super().follow(plan)
+    def follow(self) -> None:
+        super().follow()
         if not self._fused:
             self._sharing()
 

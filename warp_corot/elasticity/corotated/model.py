@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warp_corot.discretization.subtrees import pays_in_groups
 from warp_corot.elasticity.model import Model
 from warp_corot.elasticity.paths.general import CorotatedGeneralField
 from warp_corot.elasticity.polar import METHODS, rotation_function
@@ -92,9 +91,9 @@ class Corotated(Model):
             return None
         return AUTO_TOLERANCE if level == "auto" else float(level)
 
-    def check_remeshable(self) -> None:
-        if self.rotation == "warm":
-            raise InputError("rotation is 'warm', which is kept from step to step; to be remeshed it must be another")
+    @property
+    def kept_of_elements(self) -> str | None:
+        return "rotation is 'warm', which is kept from step to step" if self.rotation == "warm" else None
 
     def bind(self, body: SoftBody, *, deterministic: bool = False) -> CorotatedField | AnisotropicField:
         if isinstance(body.material, Anisotropic):
@@ -125,8 +124,7 @@ class Corotated(Model):
             raise InputError("rotation is 'warm'; with an anisotropic material it must be 'byers-xu' or 'svd'")
         quick = self.own_rotation is quick_rotation
         if quick and body.device.is_cuda and not deterministic:
-            forest = body.mesh if isinstance(body.mesh, TetForest) else None
-            subtrees = forest and (body.changing is not None or pays_in_groups(forest, body.worlds))
+            subtrees = body.discretization.prefers_subtrees
             return (AnisotropicSubtreeField if subtrees else GeneralAnisotropicField)(body)
         lanes = quick and body.device.is_cpu
         return (AnisotropicLanesField if lanes else AnisotropicField)(body, self.own_rotation, deterministic)

@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from warp_corot.discretization.clusters.single import isotropic_material
-from warp_corot.discretization.plan import FlatLeaves, ForcePlan, Plan
+from warp_corot.discretization.plan import FlatLeaves, Plan
 from warp_corot.discretization.subtrees import GROUPED_LEAVES, Batch
 from warp_corot.elasticity.paths.clusters import ChangingClusterScatter, ClusterScatter, grouped_and_others
 from warp_corot.kernels.clusters.laws import isotropic_law
@@ -28,7 +28,7 @@ class OwnLaunches:
     groups, one launch of subtrees and of single leaves is all.
 
     Args:
-        elements: The leaves of all worlds, ``kernels.elements.elements.ForestElements``.
+        plan: What launches go through.
         material: mu, lambda and their stride.
         tolerance: How near a subtree root's rotation must be to be used in place of own ones [rad]; None: never.
         changing: What adds the forces of all leaves in clusters where the mesh changes.
@@ -37,19 +37,18 @@ class OwnLaunches:
     def __init__(
         self,
         plan: Plan,
-        elements: Any,
         material: list,
         tolerance: float | None = None,
         changing: ChangingClusterScatter | None = None,
     ):
-        self._device = elements.nodes.device
-        self._elements, self._material, self._tolerance = elements, material, tolerance
+        self._device = plan.elements.nodes.device
+        self._material, self._tolerance = material, tolerance
         batches, self._flat = list(plan.batches), plan.flat
         self._clusters: Callable[[Any, wp.array, wp.array], None] | None = None
-        if isinstance(plan, ForcePlan):
+        if plan.counts is None:
             batches, leaves = grouped_and_others(plan, _fewest_grouped(plan))
             if len(leaves):
-                self._clusters = ClusterScatter(elements, isotropic_law(corotated_stress), chosen=leaves)
+                self._clusters = ClusterScatter(plan.elements, isotropic_law(corotated_stress), chosen=leaves)
         elif changing is not None and 8 * sum(batch.count for batch in batches if batch.grouped) < GROUPED_LEAVES:
             batches, self._clusters = [], changing
         # The structs hold addresses alone: what these stand for must live as long as they do.
@@ -61,7 +60,7 @@ class OwnLaunches:
     @staticmethod
     def suit(plan: Plan) -> bool:
         """Whether a plan of own rotations has more than one large batch, or may come to have."""
-        if not isinstance(plan, ForcePlan) or len(plan.batches) > 1 or len(plan.flat) > 0:
+        if plan.counts is not None or len(plan.batches) > 1 or len(plan.flat) > 0:
             return True
         return 8 * sum(batch.count for batch in plan.batches if batch.grouped) < UNIFORM_LEAVES
 

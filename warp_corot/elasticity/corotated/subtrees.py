@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warp_corot.discretization.elements import with_targets
-from warp_corot.discretization.plan import FlatLeaves, ForcePlan, Plan
+from warp_corot.discretization.plan import FlatLeaves
 from warp_corot.discretization.subtrees import Batch, Sharing
 from warp_corot.elasticity.paths.clusters import ChangingClusterScatter
 from warp_corot.elasticity.paths.lanes import Lanes, as_general
@@ -22,7 +21,6 @@ from warp_corot.kernels.elements.lanes import LANES
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
 from warp_corot.kernels.subtrees.repair import repair_own, repair_shared
-from warp_corot.mesh import TetForest
 
 from .elements import CorotatedField, Rotations
 from .left_out import LeftOutLeaves
@@ -30,7 +28,6 @@ from .own_launches import OwnLaunches
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
-    from warp_corot.discretization.changing.plan import DevicePlan
 
     from .model import Corotated
 
@@ -43,31 +40,19 @@ class SubtreeField(CorotatedField):
     def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
         super().__init__(body, model, deterministic)
         self._uniform = body.material_stride == 0
-        self._changing: ChangingClusterScatter | None = None
-        if body.changing is None:
-            assert isinstance(body.mesh, TetForest)
-            self._go_through(
-                ForcePlan.of_forest(
-                    body.mesh, model.level, self.device, worlds=body.worlds, deterministic=self.deterministic
-                )
-            )
+        #: What adds the forces of all leaves, whatever they come to be.
+        self._clusters: ChangingClusterScatter | None = None
+        if self._listed and self.rotation_level is None:
+            self._clusters = ChangingClusterScatter.of(body, self.plan, isotropic_law(corotated_stress))
+        self.follow()
 
-    def follow(self, plan: DevicePlan) -> None:
-        super().follow(plan)
-        self._load_kernels(plan)
-        if self._listed and self.rotation_level is None and self._changing is None:
-            self._changing = ChangingClusterScatter(self.body, plan, isotropic_law(corotated_stress))
-        self._go_through(plan)
+    def derive(self) -> None:
+        if self._clusters is not None:
+            self._clusters.derive()
 
-    def derive(self, plan: DevicePlan) -> None:
-        super().derive(plan)
-        if self._changing is not None:
-            self._changing.derive()
-
-    def _load_kernels(self, plan: DevicePlan) -> None:
-        """Everything that any mesh may come to need, so that nothing is compiled once steps are made."""
+    def load_kernels(self) -> None:
         one_launch = self._listed and self.rotation_level is None
-        for shape, grouped, sharing in () if one_launch else plan.kinds:
+        for shape, grouped, sharing in () if one_launch else self.plan.kinds:
             kernel = self._kernel(shape, grouped, sharing)
             wp.load_module(kernel.module, self.device, block_dim=self._block)
         single = [self._forces, self._own, self._extract, repair_own]
@@ -84,12 +69,9 @@ class SubtreeField(CorotatedField):
     def _block(self) -> int:
         return subtree_cuda.BLOCK if self.device.is_cuda else 256
 
-    def _go_through(self, plan: Plan) -> None:
-        """Make the launches of a plan."""
-        self.plan = plan
-        self.slots = plan.slots
-        if plan.targets is not None:
-            self.elements = with_targets(self.elements, plan.targets)
+    def follow(self) -> None:
+        super().follow()
+        plan = self.plan
         self._rotations = wp.empty(0, dtype=wp.mat33, device=self.device)
         self._no_unit = wp.empty(0, dtype=wp.int32, device=self.device)
         if plan.units is not None:
@@ -101,9 +83,7 @@ class SubtreeField(CorotatedField):
         self._own_launches: OwnLaunches | None = None
         if self._listed:
             if self.rotation_level is None and OwnLaunches.suit(plan):
-                self._own_launches = OwnLaunches(
-                    plan, self.elements, self.material_inputs, self.model.tolerance, self._changing
-                )
+                self._own_launches = OwnLaunches(plan, self.material_inputs, self.model.tolerance, self._clusters)
                 self._left_out = LeftOutLeaves([self._own_launches.places], [], self.device)
                 return
             self._left_out = LeftOutLeaves.of(plan, self.device)

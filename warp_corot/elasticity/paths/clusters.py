@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_corot.discretization.clusters.pairs import pairs_in_clusters
 from warp_corot.discretization.clusters.single import axis_words, changing_clusters, find_tables
-from warp_corot.discretization.plan import ForcePlan
+from warp_corot.discretization.plan import FlatLeaves, LeafCounts, Plan
 from warp_corot.discretization.subtrees import GROUPED_LEAVES, Batch
 from warp_corot.kernels.clusters.elements import AlignedElements, align_elements
 from warp_corot.kernels.clusters.laws import IsotropicMaterial
@@ -33,13 +33,12 @@ from .lanes import as_general
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
-    from warp_corot.discretization.changing.plan import DevicePlan
 
 #: Leaves of a subtree.
 SUBTREE = 8
 
 
-def grouped_and_others(plan: ForcePlan, fewest: int = GROUPED_LEAVES) -> tuple[list[Batch], npt.NDArray[np.int32]]:
+def grouped_and_others(plan: Plan, fewest: int = GROUPED_LEAVES) -> tuple[list[Batch], npt.NDArray[np.int32]]:
     """The batches of a plan whose subtrees are in groups, and all other leaves, int32 [n].
 
     Fewer leaves in groups than ``fewest`` are not worth launches, and are among the others.
@@ -51,6 +50,22 @@ def grouped_and_others(plan: ForcePlan, fewest: int = GROUPED_LEAVES) -> tuple[l
     single = np.concatenate([np.empty(0, np.int32), *first])
     leaves = np.concatenate([plan.flat.leaves.numpy(), (single[:, None] + np.arange(SUBTREE)).ravel()])
     return batches, np.sort(leaves).astype(np.int32)
+
+
+def others_in_clusters(
+    plan: Plan, law: wp.Function, Material: Any = IsotropicMaterial, layout: PairLayout | None = None
+) -> tuple[list[Batch], FlatLeaves | None, ClusterScatter | None]:
+    """Which batches of a plan go as subtrees, which leaves one by one, and what adds the forces of all others.
+
+    Clusters of pairs are found on the host, and their sums have any order: so where leaves change, where sums must have
+    one order, and on the CPU, the plan's batches and leaves go as they are.
+    """
+    if not len(plan.flat):
+        return list(plan.batches), None, None
+    if plan.counts is not None or plan.slots is not None or not plan.elements.nodes.device.is_cuda:
+        return list(plan.batches), plan.flat, None
+    batches, leaves = grouped_and_others(plan)
+    return batches, None, ClusterScatter(plan.elements, law, Material, chosen=leaves, layout=layout)
 
 
 class ClusterScatter:
@@ -112,7 +127,8 @@ class ChangingClusterScatter:
 
     Args:
         body: Whose mesh changes; launches go through its ``launch_elements``.
-        plan: Where the leaves stand.
+        elements: The leaves, with padding.
+        counts: How many there are.
         law: A function of ``kernels.clusters.laws``, which does not mind which axes its gradients are on.
         layout: What kernels are generated for.
 
@@ -120,25 +136,36 @@ class ChangingClusterScatter:
         clusters, elements: ``kernels.clusters.single.Clusters``, ``kernels.clusters.elements.AlignedElements``.
     """
 
-    def __init__(self, body: SoftBody, plan: DevicePlan, law: wp.Function, layout: ClusterLayout = DEFAULT_LAYOUT):
-        self._body, self._plan, self._device, self._layout = body, plan, plan.device, layout
-        self.clusters, self._places = changing_clusters(plan.most_leaves, plan.leaf_count, layout)
-        self._words = wp.array(axis_words(plan.elements.frames.numpy()).ravel(), dtype=wp.int32, device=self._device)
-        size = plan.elements.size.numpy()
+    def __init__(
+        self,
+        body: SoftBody,
+        elements: Any,
+        counts: LeafCounts,
+        law: wp.Function,
+        layout: ClusterLayout = DEFAULT_LAYOUT,
+    ):
+        self._body, self._leaves, self._counts, self._layout = body, elements, counts, layout
+        self._device = elements.nodes.device
+        self.clusters, self._places = changing_clusters(counts.most, counts.now, layout)
+        self._words = wp.array(axis_words(elements.frames.numpy()).ravel(), dtype=wp.int32, device=self._device)
+        size = elements.size.numpy()
         self.elements = AlignedElements()
-        self.elements.shape = wp.zeros(plan.most_leaves, dtype=wp.int32, device=self._device)
+        self.elements.shape = wp.zeros(counts.most, dtype=wp.int32, device=self._device)
         self.elements.cell, self.elements.inverse_cell = float(size[0]), 1.0 / float(size[0])
         self._kernel = scatter_clusters(law, layout)
         wp.load_module(self._kernel.module, self._device, block_dim=layout.threads)
 
+    @classmethod
+    def of(cls, body: SoftBody, plan: Plan, law: wp.Function) -> ChangingClusterScatter | None:
+        """The clusters of all leaves of a plan whose leaves change, None where they do not."""
+        return None if plan.counts is None else cls(body, plan.elements, plan.counts, law)
+
     def derive(self) -> None:
         """Launch what finds the clusters, if the plan has just been derived; may be recorded."""
-        plan = self._plan
-        find_tables(self.clusters, self._places, plan.elements.nodes, plan.goes, self._layout)
-        inputs = [plan.goes, plan.leaf_count, plan.elements.code, self._words]
-        wp.launch(
-            align_elements, dim=plan.most_leaves, inputs=inputs, outputs=[self.elements.shape], device=self._device
-        )
+        leaves, counts = self._leaves, self._counts
+        find_tables(self.clusters, self._places, leaves.nodes, counts.goes, self._layout)
+        inputs = [counts.goes, counts.now, leaves.code, self._words]
+        wp.launch(align_elements, dim=counts.most, inputs=inputs, outputs=[self.elements.shape], device=self._device)
 
     def __call__(self, material: Any, u: wp.array, f: wp.array) -> None:
         """As ``ClusterScatter`` does."""

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from warp_corot.discretization.plan import FlatLeaves, ForcePlan, Plan
+from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.plan import FlatLeaves, Plan
 from warp_corot.elasticity.model import LawField
 from warp_corot.kernels.elements.general_cpu import rest_matrices, scatter_law_elements
 from warp_corot.kernels.elements.lanes import LANES
@@ -17,8 +18,6 @@ from .lanes import Lanes, as_general
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
-    from warp_corot.discretization.changing.plan import DevicePlan
-    from warp_corot.discretization.changing.pools import DeviceForest
 
 
 class LawLanesField(LawField):
@@ -33,37 +32,30 @@ class LawLanesField(LawField):
     def __init__(self, body: SoftBody, *, law: str, **functions: Any):
         super().__init__(body, **functions)
         self._law = law
-        self._plan: Plan | None = None
         self._lanes: Lanes | None = None
         self._lanes_material = self.material_inputs
         if not isinstance(body.mesh, TetForest):
             self._lanes = Lanes(self.elements, self.elements, scatter=scatter_law_elements(law))
-        elif body.changing is None:
-            self._go_through(ForcePlan.of_forest(body.mesh, None, self.device, worlds=body.worlds))
+        else:
+            self.follow()
 
-    def plan_of(self, forest: DeviceForest) -> DevicePlan:
-        from warp_corot.discretization.changing.plan import DevicePlan
+    def plan_of(self, discretization: Discretization) -> Plan:
+        return discretization.plan()
 
-        return DevicePlan(forest)
-
-    def follow(self, plan: DevicePlan) -> None:
-        super().follow(plan)
-        # Everything that any mesh may come to need, so that nothing is compiled once steps are made.
-        kernels = [scatter_law_subtrees(shape, self._law) for shape, _grouped, _sharing in plan.kinds]
+    def load_kernels(self) -> None:
+        kernels = [scatter_law_subtrees(shape, self._law) for shape, _grouped, _sharing in self.plan.kinds]
         for kernel in (*kernels, scatter_law_elements(self._law)):
             wp.load_module(kernel.module, self.device, block_dim=256)
-        self._go_through(plan)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        for batch in self._plan.batches if self._plan else ():
+        for batch in self.plan.batches:
             inputs = [batch.subtrees, *self.material_inputs, batch.count, u]
             self.launch(scatter_law_subtrees(batch.shape, self._law), -(-batch.count // LANES), inputs, [f])
         if self._lanes is not None:
             self._lanes.scatter_forces(self._lanes_material, u, f)
 
-    def _go_through(self, plan: Plan) -> None:
-        """Make the launches of a plan."""
-        self._plan, flat = plan, plan.flat
+    def follow(self) -> None:
+        flat = self.plan.flat
         self._lanes = None
         if len(flat):
             self._lanes_material = self._material_of(flat)

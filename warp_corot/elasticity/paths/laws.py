@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warp_corot.discretization.subtrees import pays_in_groups
 from warp_corot.elasticity.model import LawField
 from warp_corot.mesh import TetForest
 
@@ -39,9 +38,7 @@ def law_field(
     if body.device.is_cpu:
         return LawLanesField(body, law=law, **functions, deterministic=deterministic)
     kind = LawField
-    if isinstance(body.mesh, TetForest) and (
-        deterministic or body.changing is not None or pays_in_groups(body.mesh, body.worlds)
-    ):
+    if isinstance(body.mesh, TetForest) and (deterministic or body.discretization.prefers_subtrees):
         kind = LawSubtreeField
     elif not deterministic:
         kind = LawGeneralField

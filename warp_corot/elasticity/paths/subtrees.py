@@ -7,20 +7,18 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from warp_corot.discretization.clusters.single import isotropic_material
-from warp_corot.discretization.plan import FlatLeaves, ForcePlan, Plan
+from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.plan import FlatLeaves, Plan
 from warp_corot.discretization.subtrees import chosen
 from warp_corot.elasticity.model import LawField
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
 from warp_corot.kernels.subtrees.laws import scatter_subtrees
-from warp_corot.mesh import TetForest
 
-from .clusters import ClusterScatter, grouped_and_others
+from .clusters import others_in_clusters
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
-    from warp_corot.discretization.changing.plan import DevicePlan
-    from warp_corot.discretization.changing.pools import DeviceForest
 
 
 class LawSubtreeField(LawField):
@@ -45,38 +43,20 @@ class LawSubtreeField(LawField):
         super().__init__(body, stress=stress, energy=energy, cauchy=cauchy, deterministic=deterministic)
         self._stress = stress
         self._uniform = body.material_stride == 0
-        if body.changing is None:
-            assert isinstance(body.mesh, TetForest)
-            self._go_through(
-                ForcePlan.of_forest(body.mesh, None, self.device, worlds=body.worlds, deterministic=self.deterministic)
-            )
+        self.follow()
 
-    def _take_slots(self) -> None:
-        """The plan has them."""
+    def plan_of(self, discretization: Discretization) -> Plan:
+        return discretization.plan(deterministic=self.deterministic)
 
-    def plan_of(self, forest: DeviceForest) -> DevicePlan:
-        from warp_corot.discretization.changing.plan import DevicePlan
-
-        return DevicePlan(forest)
-
-    def follow(self, plan: DevicePlan) -> None:
-        super().follow(plan)
-        # Everything that any mesh may come to need, so that nothing is compiled once steps are made.
-        for shape, grouped, _sharing in plan.kinds:
+    def load_kernels(self) -> None:
+        for shape, grouped, _sharing in self.plan.kinds:
             wp.load_module(self._kernel(shape, grouped).module, self.device, block_dim=subtree_cuda.BLOCK)
         wp.load_module(self._forces.module, self.device)
-        self._go_through(plan)
 
-    def _go_through(self, plan: Plan) -> None:
-        self.plan = plan
-        self.slots = plan.slots
-        self._batches, self._flat = list(plan.batches), plan.flat if len(plan.flat) else None
-        self._clusters: ClusterScatter | None = None
-        if isinstance(plan, ForcePlan) and len(plan.flat) and self.device.is_cuda and not self.deterministic:
-            self._batches, leaves = grouped_and_others(plan)
-            self._clusters, self._flat = ClusterScatter(self.elements, isotropic_law(self._stress), chosen=leaves), None
+    def follow(self) -> None:
+        self._batches, self._flat, self._clusters = others_in_clusters(self.plan, isotropic_law(self._stress))
         self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in self._batches]
-        self._flat_material = self._material_of(plan.flat)
+        self._flat_material = self._material_of(self.plan.flat)
 
     def _material_of(self, flat: FlatLeaves) -> list:
         if flat.material is not None:

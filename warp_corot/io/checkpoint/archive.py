@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -28,6 +28,9 @@ from warp_corot.solvers import INTEGRATORS
 
 from .mesh import pack_mesh, unpack_mesh
 from .remesh import pack_changing, remesh_options, unpack_changing
+
+if TYPE_CHECKING:
+    from warp_corot.remesh.changing import Changing
 
 Remesh = OnlineRemesh | Sequence[OnlineRemesh | None] | None
 
@@ -70,18 +73,23 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
         arrays[f"kept.{name}"] = array.numpy()
     for name, values in sim.guard.state.items():
         arrays[f"guard.{name}"] = values
-    for number, (body, model, field) in enumerate(zip(sim.bodies, sim.models, sim.fields, strict=True)):
-        header["bodies"].append(_pack_body(body, model, field, f"body{number}.", arrays))
+    packed = zip(sim.bodies, sim.models, sim.fields, sim.remeshing.changing, strict=True)
+    for number, (body, model, field, changing) in enumerate(packed):
+        header["bodies"].append(_pack_body(body, model, field, changing, f"body{number}.", arrays))
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
     _write_whole(target, arrays)
 
 
 def _pack_body(
-    body: SoftBody, model: Model, field: ForceField, prefix: str, arrays: dict[str, np.ndarray]
+    body: SoftBody,
+    model: Model,
+    field: ForceField,
+    changing: Changing | None,
+    prefix: str,
+    arrays: dict[str, np.ndarray],
 ) -> dict[str, Any]:
     """Put a body into arrays whose names begin with ``prefix``; returns what else there is, for JSON."""
     body.state.adopt_positions()
-    changing = body.changing
     mesh, material = body.mesh, body.material
     if changing is not None:
         mesh, material = changing.forest.source, changing.carried_material.given
@@ -230,8 +238,9 @@ def _rebuilt_simulation(
         sim.stable_dt = header["stable_dt"]
     for number, (described, body, field) in enumerate(zip(header["bodies"], sim.bodies, sim.fields, strict=True)):
         if described["remesh"] is not None:
-            assert body.changing is not None
-            unpack_changing(body.changing, described["remesh"], f"body{number}.remesh.", arrays)
+            changing = sim.remeshing.changing[number]
+            assert changing is not None
+            unpack_changing(changing, described["remesh"], f"body{number}.remesh.", arrays)
         body.conditions.world_starts.assign(arrays[f"body{number}.world_starts"].astype(np.float64))
         for name in described["field"]:
             field.state[name].assign(arrays[f"body{number}.field.{name}"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,7 @@ import warp as wp
 
 from warp_corot.errors import InputError
 from warp_corot.kernels.meshing import elements as kernels
-from warp_corot.kernels.tables.shapes import EDGES, REST
+from warp_corot.kernels.tables.shapes import CIRCUMRADIUS, EDGE_LENGTHS
 from warp_corot.mesh.bisection import path_tetrahedra
 from warp_corot.mesh.lattice import LATTICE_BITS, MAX_CELLS, MAX_LEVEL
 from warp_corot.mesh.tree import LIVE, Tree
@@ -30,10 +29,6 @@ THIN_NEED, GAP_ELEMENTS = 0.4, 2.0
 LOOKED = 1.0e-12
 #: What an element that holds two labels counts as being off by, as a share of its edge.
 LABEL_NEED = 0.05
-
-#: Circumradius and lengths of the edges of the three types, over h.
-CIRCUMRADIUS = np.sqrt([0.75, 0.5625, 0.3125])
-EDGE_LENGTHS = np.array([[math.dist(corners[i], corners[j]) for i, j in EDGES] for corners in REST])
 
 
 @dataclass(frozen=True)
@@ -147,8 +142,8 @@ class _Adaptation:
         self.spacing = lattice_spacing(cell_size)
         level = np.arange(MAX_LEVEL + 1)
         h = cell_size * 0.5 ** (level // 3)
-        self.circumradius = wp.array(h * CIRCUMRADIUS[level % 3], dtype=wp.float32, device=device)
-        self.edges = wp.array(h[:, None] * EDGE_LENGTHS[level % 3], dtype=wp.float32, device=device)
+        self.circumradius = wp.array(h * np.array(CIRCUMRADIUS)[level % 3], dtype=wp.float32, device=device)
+        self.edges = wp.array(h[:, None] * np.array(EDGE_LENGTHS)[level % 3], dtype=wp.float32, device=device)
         #: What float32 coordinates leave open of a value.
         reach = float(np.abs(np.asarray(origin)).max() + max(cells) * cell_size)
         self.noise = float(domain.lipschitz) * reach * 2.0**-22

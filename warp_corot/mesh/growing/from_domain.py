@@ -12,7 +12,7 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count
 from warp_corot.inputs.device import checked_device
 from warp_corot.mesh.forest import Field, TetForest
-from warp_corot.mesh.lattice import MAX_LEVEL, checked_cell_size, checked_level
+from warp_corot.mesh.lattice import MAX_LEVEL, check_levels, checked_cell_size, checked_level
 from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, pruned, renumbered, with_virtual
 from warp_corot.mesh.tree import LIVE
 
@@ -105,14 +105,10 @@ class _EmptyError(InputError):
 def _check(cell_size, min_level, max_level, surface_error, field_tolerance, target, min_layers, detail, sliver) -> None:
     if cell_size is not None:
         checked_cell_size(cell_size)
-    checked_level(min_level, "min_level")
-    if max_level is not None:
-        checked_level(max_level, "max_level")
+    check_levels(min_level, max_level)
     checked_level(detail, "detail")
     if not (np.isfinite(min_layers) and min_layers >= 0):
         raise InputError(f"min_layers is {min_layers}; it must be a number of elements, 0 for no care")
-    if max_level is not None and min_level > max_level:
-        raise InputError(f"min_level is {min_level}, above max_level, which is {max_level}")
     if surface_error is not None and not (np.isfinite(surface_error) and surface_error > 0):
         raise InputError(f"surface_error is {surface_error}; it must be a positive length in metres, or None")
     if not field_tolerance >= 0:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from warp_corot.kernels.tables.shapes import EDGES
 from warp_corot.mesh.growing.cut import codes
 
 from .bound import SurfaceMesh
@@ -60,7 +61,7 @@ def _add_pairs(pieces: _Pieces, tets: Array, own: Array, mirrored: Array) -> Non
 def _add_triples(pieces: _Pieces, tets: Array, own: Array, mirrored: Array) -> None:
     """Elements with three labels, one of them at two nodes a and a2: two quads and a triangle along the line from the
     point in the face a-b-c to that in a2-b-c."""
-    for a, a2 in itertools.combinations(range(4), 2):
+    for a, a2 in EDGES:
         b, c = (n for n in range(4) if n not in (a, a2))
         chosen = np.flatnonzero(own[:, a] == own[:, a2])
         nodes, labels = tets[chosen], own[chosen]
@@ -76,7 +77,7 @@ def _add_triples(pieces: _Pieces, tets: Array, own: Array, mirrored: Array) -> N
 
 def _add_quadruples(pieces: _Pieces, tets: Array, own: Array, mirrored: Array) -> None:
     """Elements with four labels: a quad across each edge, through the points in its two faces and the centre."""
-    for i, j in itertools.combinations(range(4), 2):
+    for i, j in EDGES:
         k, m = (n for n in range(4) if n not in (i, j))
         face = [(i, j), (i, j, k), (i, j, k, m), (i, j, m)]
         pieces.add(tets, face, own[:, i], own[:, j], mirrored ^ _odd((i, j, k, m)))
@@ -136,7 +137,7 @@ class _Pieces:
         """Each point is the mean of the points on the edges between its nodes."""
         weights = np.zeros(keys.shape)
         pairs = np.zeros(len(keys))
-        for i, j in itertools.combinations(range(4), 2):
+        for i, j in EDGES:
             there = np.flatnonzero((keys[:, i] >= 0) & (keys[:, j] >= 0))
             a, b = self.values[keys[there, i]], self.values[keys[there, j]]
             crossed = (a < 0) != (b < 0)

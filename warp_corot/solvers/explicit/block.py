@@ -61,7 +61,7 @@ class BlockSteps:
             return None
         if not any(layout.fits for layout in _layouts(body, 0, False, len(body.mesh.tets) // 8)):
             return None
-        plan = ForcePlan.of_forest(body.mesh, field.rotation_level, body.device, grouped=False)
+        plan = ForcePlan.of_forest(body.mesh, field.rotation_level, body.device, elements=body.elements, grouped=False)
         if len(plan.batches) != 1 or len(plan.flat) or plan.batches[0].sharing is Sharing.ABOVE:
             return None
         batch = plan.batches[0]

@@ -1,0 +1,191 @@
+"""The graph of imports within ``warp_corot``, lazy ones and those for type checkers included.
+
+``python tests/support/imports.py`` prints its circles and the imports that go from a lower floor to a higher one.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = "warp_corot"
+
+#: Floors from the ground up, and what belongs to each: a module with all that is below it. The longest name counts.
+FLOORS: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("inputs, kernels", ("kernels", "errors", "inputs", "io.files")),
+    ("materials", ("materials",)),
+    ("mesh, domain, readers", ("mesh", "domain", "io.read", "io.pictures")),
+    ("discretization", ("discretization",)),
+    ("body", ("body",)),
+    ("elasticity, holding", ("elasticity", "holding")),
+    ("solvers", ("solvers",)),
+    ("remesh", ("remesh",)),
+    ("simulation", ("simulation",)),
+    ("io, newton, experiments", ("io", "newton", "experiments")),
+    ("cli", ("cli", "api", "__init__", "__main__")),
+)
+
+
+@dataclass(frozen=True)
+class Import:
+    """That one module imports another.
+
+    Attributes:
+        source, target: Names below ``warp_corot``, as "mesh.forest"; a package's own module is "mesh.__init__".
+        kind: "load", "lazy" within a function, or "type" for type checkers alone.
+        line: Where.
+    """
+
+    source: str
+    target: str
+    kind: str
+    line: int
+
+
+def modules(root: Path = ROOT) -> dict[str, Path]:
+    """All modules by their names below ``warp_corot``."""
+    found = {}
+    for folder, prefix in ((root / PACKAGE, ""), (root / "kernels", "kernels.")):
+        for path in folder.rglob("*.py"):
+            name = prefix + ".".join(path.relative_to(folder).with_suffix("").parts)
+            if prefix or not name.startswith("kernels."):
+                found[name] = path
+    return dict(sorted(found.items()))
+
+
+def imports(root: Path = ROOT) -> list[Import]:
+    """All imports of one module of the package by another."""
+    files = modules(root)
+    return [each for name, path in files.items() for each in _imports_of(name, path, files)]
+
+
+def circles(edges: Iterable[Import]) -> list[list[str]]:
+    """Modules that import one another, directly or by way of others: strongly connected components, largest first."""
+    graph: dict[str, set[str]] = defaultdict(set)
+    for edge in edges:
+        graph[edge.source].add(edge.target)
+    return sorted((sorted(each) for each in _components(graph) if len(each) > 1), key=len, reverse=True)
+
+
+def floor_of(module: str) -> int:
+    """The number of a module's floor from the ground up.
+
+    Raises:
+        KeyError: The module has none.
+    """
+    name = module.removesuffix(".__init__")
+    named = [(each, floor) for floor, (_, names) in enumerate(FLOORS) for each in names]
+    fits = [(len(each), floor) for each, floor in named if name == each or name.startswith(f"{each}.")]
+    if not fits:
+        raise KeyError(f"{module} has no floor")
+    return max(fits)[1]
+
+
+def against_the_floors(edges: Iterable[Import]) -> list[Import]:
+    """The imports of modules on higher floors by modules on lower ones, one for each pair of modules."""
+    found = {(e.source, e.target): e for e in edges if floor_of(e.source) < floor_of(e.target)}
+    return list(found.values())
+
+
+def _imports_of(name: str, path: Path, files: dict[str, Path]) -> Iterator[Import]:
+    package = name.split(".")[:-1]
+    for node, kind in _statements(ast.parse(path.read_text()), "load"):
+        for target in _targets(node, package, files):
+            if target != name:
+                yield Import(name, target, kind, node.lineno)
+
+
+def _statements(node: ast.AST, kind: str) -> Iterator[tuple[ast.Import | ast.ImportFrom, str]]:
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Import | ast.ImportFrom):
+            yield child, kind
+        elif isinstance(child, ast.If) and _names_type_checking(child.test):
+            for inside in child.body:
+                yield from _statements(ast.Module([inside], []), "type")
+            for inside in child.orelse:
+                yield from _statements(ast.Module([inside], []), kind)
+        else:
+            is_function = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+            yield from _statements(child, "lazy" if is_function else kind)
+
+
+def _names_type_checking(test: ast.expr) -> bool:
+    return (isinstance(test, ast.Name) and test.id == "TYPE_CHECKING") or (
+        isinstance(test, ast.Attribute) and test.attr == "TYPE_CHECKING"
+    )
+
+
+def _targets(node: ast.Import | ast.ImportFrom, package: list[str], files: dict[str, Path]) -> Iterator[str]:
+    """The modules that a statement names, the most particular ones: a package only where a name in it is meant."""
+    if isinstance(node, ast.Import):
+        bases = [(alias.name.split("."), [""]) for alias in node.names]
+    else:
+        above = [PACKAGE, *package][: 1 + len(package) - (node.level - 1)] if node.level else []
+        bases = [(above + (node.module.split(".") if node.module else []), [alias.name for alias in node.names])]
+    for base, names in bases:
+        if base[0] != PACKAGE:
+            continue
+        for name in names:
+            for candidate in ([*base[1:], name], base[1:], [*base[1:], "__init__"]):
+                if ".".join(candidate) in files:
+                    yield ".".join(candidate)
+                    break
+
+
+def _components(graph: dict[str, set[str]]) -> list[set[str]]:
+    """Strongly connected components (Tarjan 1972), without recursion."""
+    index: dict[str, int] = {}
+    low: dict[str, int] = {}
+    path: list[str] = []
+    on_path: set[str] = set()
+    found = []
+    for root in list(graph):
+        work = [] if root in index else [(root, iter(sorted(graph[root])))]
+        if work:
+            index[root] = low[root] = len(index)
+            path.append(root)
+            on_path.add(root)
+        while work:
+            node, targets = work[-1]
+            target = next(targets, None)
+            if target is None:
+                work.pop()
+                if work:
+                    low[work[-1][0]] = min(low[work[-1][0]], low[node])
+                if low[node] == index[node]:
+                    at = path.index(node)
+                    found.append(set(path[at:]))
+                    on_path.difference_update(path[at:])
+                    del path[at:]
+            elif target not in index:
+                index[target] = low[target] = len(index)
+                path.append(target)
+                on_path.add(target)
+                work.append((target, iter(sorted(graph.get(target, ())))))
+            elif target in on_path:
+                low[node] = min(low[node], index[target])
+    return found
+
+
+def main() -> None:
+    edges = imports()
+    print(f"{len(modules())} modules, {len(edges)} imports")
+    for kinds in (("load",), ("load", "lazy"), ("load", "lazy", "type")):
+        sizes = [len(each) for each in circles(e for e in edges if e.kind in kinds)]
+        print(f"circles of {', '.join(kinds)} imports: {sizes}")
+    for circle in circles(edges):
+        print(f"\n{len(circle)} modules: {', '.join(circle)}")
+    against = against_the_floors(edges)
+    print(f"\n{len(against)} imports against the floors:")
+    for edge in against:
+        floors = (FLOORS[floor_of(name)][0] for name in (edge.source, edge.target))
+        print(f"  {edge.source}:{edge.line} -> {edge.target} ({edge.kind}): {' -> '.join(floors)}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

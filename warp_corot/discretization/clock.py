@@ -1,0 +1,16 @@
+"""The clock of a simulation, as those below it read it."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+
+class Clock(Protocol):
+    """Steps and seconds of a simulation; ``solvers.pace.Pace`` is one.
+
+    Attributes:
+        arrays: ``kernels.stepping.pace.Pace``, what kernels read.
+    """
+
+    @property
+    def arrays(self) -> Any: ...
