@@ -119,7 +119,14 @@ def product_cases(problem: Problem) -> list[Case]:
 
     def case(name: str, kernel: wp.Kernel, flops: float) -> Case:
         def run() -> None:
-            inputs = [body.elements, body.mu, body.lam, u, rotations, unit_of]
+            inputs = [
+                body.discretization.elements,
+                body.discretization.mu,
+                body.discretization.lam,
+                u,
+                rotations,
+                unit_of,
+            ]
             wp.launch(kernel, count, inputs, [squares], device=device)
 
         def error() -> float:

@@ -141,7 +141,7 @@ def test_another_number_needs_no_new_recording(device):
     """What steps launch changes with the keyframes that there are, not with the stress that is set."""
     _, body, _ = held_bar(muscle([0, 0, 1]), device)
     body.activate(1.0)
-    recorded = [body.revision]
+    recorded = [body.launch_revision]
     for stress, elements, changes in (
         (2.0, None, False),
         (wc.Activation(TIMES, STRESS), [3, 4], True),
@@ -151,7 +151,7 @@ def test_another_number_needs_no_new_recording(device):
         (7.0, None, False),
     ):
         body.activate(stress, elements)
-        recorded.append(body.revision)
+        recorded.append(body.launch_revision)
         assert (recorded[-1] != recorded[-2]) == changes
 
 

@@ -34,7 +34,11 @@ def forces(forest, u, tolerance, way, device):
     body.displacements = u
     (batch,) = ForcePlan.of_forest(forest, None, body.device, grouped=False).batches
     f = wp.zeros_like(body.state.displacements)
-    material, u, outputs = [body.mu, body.lam], body.state.displacements, [f, batch.flagged]
+    material, u, outputs = (
+        [body.discretization.mu, body.discretization.lam],
+        body.state.displacements,
+        [f, batch.flagged],
+    )
     if way == LANES:
         if body.device.is_cuda:
             pytest.skip("for the CPU")

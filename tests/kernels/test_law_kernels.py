@@ -91,7 +91,7 @@ def test_subtrees_one_by_one(name, law, device, rng):
     for batch in plan.batches:
         by_node(batch.subtrees, body.device)
         kernel = scatter_subtrees(batch.shape, False, uniform, LAWS[law])
-        inputs = [batch.subtrees, body.mu, body.lam, on_device]
+        inputs = [batch.subtrees, body.discretization.mu, body.discretization.lam, on_device]
         wp.launch(kernel, batch.count, inputs=inputs, outputs=[f], device=device, block_dim=BLOCK)
     inside = np.ones(len(mesh.tets), bool)
     inside[plan.flat.leaves.numpy()] = False
@@ -111,8 +111,10 @@ def test_general_elements(law, uniform, device, rng):
     on_device = wp.array(u, dtype=wp.vec4, device=device)
     f = wp.zeros_like(on_device)
     stress = LAWS.get(law) or corotated_law(quick_rotation)
-    material = isotropic_material([body.mu, body.lam, body.material_stride])
-    add_forces(ClusterScatter(body.elements, isotropic_law(stress)), material, on_device, f)
+    material = isotropic_material(
+        [body.discretization.mu, body.discretization.lam, body.discretization.material_stride]
+    )
+    add_forces(ClusterScatter(body.discretization.elements, isotropic_law(stress)), material, on_device, f)
     assert_right(f.numpy()[:, :3], oracle.evaluate(law, oracle_mesh(mesh), x, mu, lam)[1])
 
 
@@ -136,7 +138,7 @@ def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
         kernel = scatter_anisotropic_subtrees(batch.shape, False, *options)
         inputs = [batch.subtrees, whole.material, axes, 1, active, on_device]
         wp.launch(kernel, batch.count, inputs=inputs, outputs=[f, as_bytes(left)], device=device, block_dim=BLOCK)
-        inputs = [left, batch.subtrees.first, body.elements, whole.material, 1, active, on_device]
+        inputs = [left, batch.subtrees.first, body.discretization.elements, whole.material, 1, active, on_device]
         wp.launch(repair_leaves, 8 * len(left), inputs=inputs, outputs=[f], device=device)
         flags += np.unpackbits(as_bytes(left).numpy()).sum()
     flat = plan.flat
@@ -156,8 +158,8 @@ def test_anisotropic_general_elements(kind, device, rng):
     on_device, active = strained(mesh, rng, device)
     f = wp.zeros_like(on_device)
     field = GeneralAnisotropicField(body)
-    body.conditions.has_activation = True
-    body.conditions.activation = active
+    body.discretization.has_activation = True
+    body.discretization.activation = active
     add_forces(field.scatter, field.active_material, on_device, f)
     assert_right(f.numpy()[:, :3], leaf_by_leaf(field, active, on_device))
 

@@ -109,7 +109,12 @@ def test_every_leaf_may_be_listed(share, device, rng):
     listed.own.counts.assign(counts)
     listed.own.entries.assign(entries.reshape(-1, 2))
     f = wp.zeros_like(body.state.displacements)
-    listed.repair(body.elements, [body.mu, body.lam, body.material_stride], body.state.displacements, f)
+    listed.repair(
+        body.discretization.elements,
+        [body.discretization.mu, body.discretization.lam, body.discretization.material_stride],
+        body.state.displacements,
+        f,
+    )
     forces, sound = expected(forest, u, young)
     assert np.abs(f.numpy()[:, :3] - forces)[sound].max() < TOLERANCE * np.abs(forces).max()
     assert (listed.own.counts.numpy()[: LISTS * COUNT_STRIDE] == 0).all()

@@ -79,7 +79,7 @@ def test_shared_rotations_by_subtrees(leaf_level, amount, device, rng):
     wp.launch(
         scatter_subtrees_shared(batch.shape, False, True, False, False),
         dim=batch.count,
-        inputs=[batch.subtrees, body.mu, body.lam, body.state.displacements, *none],
+        inputs=[batch.subtrees, body.discretization.mu, body.discretization.lam, body.state.displacements, *none],
         outputs=[f, batch.flagged, LeftOut()],
         device=body.device,
         block_dim=128,

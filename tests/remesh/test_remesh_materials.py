@@ -56,7 +56,7 @@ def depth(body):
 def active_twin(body, model, sim):
     """A body of fixed topology in the same state, whose fibres do the same."""
     fixed = twin(body, model, sim)
-    if body.conditions.has_activation:
+    if body.discretization.has_activation:
         fixed.body.activate(body.activation.numpy())
     for each in body.conditions.activations:
         keys = wc.Activation(each.times.numpy() - sim.time, each.stress.numpy())

@@ -37,14 +37,21 @@ class Launches:
         body, flat = self.body, self.plan.flat
         f = wp.zeros_like(body.state.displacements)
         wp.launch(
-            scatter_stretches(body.material_stride == 0),
+            scatter_stretches(body.discretization.material_stride == 0),
             dim=self.blocks * BLOCK,
-            inputs=[self.stretches, flat.elements, flat.leaves, body.mu, body.lam, body.state.displacements],
+            inputs=[
+                self.stretches,
+                flat.elements,
+                flat.leaves,
+                body.discretization.mu,
+                body.discretization.lam,
+                body.state.displacements,
+            ],
             outputs=[f, self.listed.own],
             device=self.device,
             block_dim=BLOCK,
         )
         self.count = int(self.listed.own.counts.numpy().sum())
-        material = [body.mu, body.lam, body.material_stride]
-        self.listed.repair(body.elements, material, body.state.displacements, f)
+        material = [body.discretization.mu, body.discretization.lam, body.discretization.material_stride]
+        self.listed.repair(body.discretization.elements, material, body.state.displacements, f)
         return f.numpy()[:, :3]

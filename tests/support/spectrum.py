@@ -109,7 +109,10 @@ def stable_step(law, body, ancestors=None):
     mesh = oracle.Mesh(body.mesh.points, body.mesh.tets)
     x = mesh.points + body.displacements.numpy().astype(float)
     # The solver's own mu and lambda: with the share of each element that the body fills.
-    mu, lam = (a.numpy().astype(float) if body.material_stride else float(a.numpy()[0]) for a in (body.mu, body.lam))
+    mu, lam = (
+        a.numpy().astype(float) if body.discretization.material_stride else float(a.numpy()[0])
+        for a in (body.discretization.mu, body.discretization.lam)
+    )
     state = mesh, x, mu, lam
     K = stiffness(law, *state) if ancestors is None else shared_stiffness(ancestors, *state)
     omega = largest_frequency(K, body.masses, ~body.constrained)

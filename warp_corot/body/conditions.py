@@ -8,8 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.discretization.clock import Clock
+from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.nodal import same_array
-from warp_corot.discretization.sizes import Sizes
+from warp_corot.kernels.stepping.activation import follow_activation
 from warp_corot.kernels.stepping.conditions import LOAD_NODES, free_nodes, hold_nodes, release_nodes
 
 from .activation import ElementActivation
@@ -25,7 +27,7 @@ class Conditions:
     leave recorded steps as they are, too.
 
     Args:
-        sizes: How many nodes and elements there are.
+        discretization: The mesh.
         state: The state of the nodes.
         mass: Of each node [kg], float32.
 
@@ -35,8 +37,6 @@ class Conditions:
         inverse_mass: Of nodes that are free to move [1/kg], float32; zero for others.
         loads: External forces [N], vec4, or another program's array; one place until there are any.
         has_loads: Whether there are any.
-        activation: Active stress of elements [Pa], float32; one place until there is any.
-        has_activation: Whether there is any.
         trajectories: Keyframes that nodes follow.
         activations: Keyframes that active stress follows.
         world_starts: The time when each world was last reset [s], float64 [worlds].
@@ -44,17 +44,16 @@ class Conditions:
         rewritten: Changes whenever keyframes do that launches go on with.
     """
 
-    def __init__(self, sizes: Sizes, state: State, mass: wp.array):
-        self.sizes, self.state, self.device, self.mass = sizes, state, state.device, mass
+    def __init__(self, discretization: Discretization, state: State, mass: wp.array):
+        self.discretization, self.sizes = discretization, discretization.sizes
+        self.state, self.device, self.mass = state, state.device, mass
         self.held = wp.zeros(len(mass), dtype=wp.uint8, device=self.device)
         self.inverse_mass = wp.empty(len(mass), dtype=wp.float32, device=self.device)
         self.loads = wp.zeros(1, dtype=wp.vec4, device=self.device)
         self.has_loads = False
-        self.activation = wp.zeros(1, dtype=wp.float32, device=self.device)
-        self.has_activation = False
         self.trajectories: list[Trajectory] = []
         self.activations: list[ElementActivation] = []
-        self.world_starts = wp.zeros(sizes.worlds, dtype=wp.float64, device=self.device)
+        self.world_starts = wp.zeros(self.sizes.worlds, dtype=wp.float64, device=self.device)
         self.revision = self.rewritten = 0
         self.find_inverse_masses()
 
@@ -136,11 +135,20 @@ class Conditions:
 
     def make_activation(self) -> None:
         """See that there is an active stress for every element."""
-        if not self.has_activation:
-            if len(self.activation) < self.sizes.elements:
-                self.activation = wp.zeros(self.sizes.elements, dtype=wp.float32, device=self.device)
-            self.has_activation = True
-            self.revision += 1
+        self.revision += int(self.discretization.make_activation())
+
+    def follow_activations(self, clock: Clock, offset: int) -> None:
+        """Launch what sets the active stress of elements that follow keyframes.
+
+        Args:
+            clock: The simulation's.
+            offset: How many steps are launched that it does not count yet.
+        """
+        for each in self.activations:
+            inputs = [each.elements, each.times, each.stress, clock.arrays, self.world_starts]
+            inputs += [self.sizes.world_elements, offset]
+            outputs = [self.discretization.activation]
+            wp.launch(follow_activation, len(each.elements), inputs, outputs, device=self.device)
 
     def set_activations(self, activations: Sequence[ElementActivation]) -> None:
         """Have active stress follow these keyframes and no others."""

@@ -159,13 +159,13 @@ class Controls:
             InputError: The material has no fibres.
         """
         conditions = self.conditions
-        if not conditions.has_activation and not isinstance(self.material, Anisotropic):
+        if not conditions.discretization.has_activation and not isinstance(self.material, Anisotropic):
             raise InputError(
                 "activation needs a material with a direction, TransverselyIsotropic or Orthotropic; "
                 f"the body's is {type(self.material).__name__}"
             )
         conditions.make_activation()
-        return self._views.hand_out(conditions.activation[: self.element_count])
+        return self._views.hand_out(conditions.discretization.activation[: self.element_count])
 
     def activate(
         self,

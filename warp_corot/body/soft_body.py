@@ -11,14 +11,13 @@ import warp as wp
 
 from warp_corot.discretization.clock import Clock
 from warp_corot.discretization.discretization import Discretization, FixedMesh, MeshChanges
-from warp_corot.discretization.elements import Mesh, device_elements, element_kind, parts, repeated
+from warp_corot.discretization.elements import Mesh, repeated
 from warp_corot.discretization.nodal import vec3_view
-from warp_corot.discretization.sizes import Sizes
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import check_float32, checked_count, checked_numbers, shown
+from warp_corot.inputs.checks import checked_count, checked_numbers, shown
 from warp_corot.inputs.device import checked_device
 from warp_corot.kernels.stepping.integrate import RESET_NODES
-from warp_corot.materials.isotropic import Isotropic, Material
+from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest
 
 from .conditions import Conditions
@@ -32,9 +31,6 @@ from .worlds import World
 if TYPE_CHECKING:
     from warp_corot.discretization.changing.following import FollowingBinding
     from warp_corot.mesh.surfaces.bound import DeviceBinding
-
-#: Elements, and with them nodes, are numbered in 32 bits.
-MOST_ELEMENTS = 2**31 - 1
 
 
 class SoftBody(Controls, SharedArrays, NodeArrays):
@@ -59,6 +55,7 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
 
     Attributes:
         worlds, device: As given.
+        discretization: The mesh and the material on the device.
         sizes: How many nodes and elements there are.
         state: Displacements, velocities and forces of the nodes.
         conditions: Supports, loads and active stress.
@@ -71,36 +68,15 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
 
     def __init__(self, mesh: Mesh, material: Material, *, worlds: int = 1, device: str | wp.Device | None = None):
         _check_made_of(mesh, material)
-        #: What remeshes the body, if anything does.
-        self.changing: MeshChanges | None = None
-        #: What the host knows of the present mesh, by the names of properties.
-        self._known: dict[str, Any] = {"mesh": mesh}
-        self._known["material"] = material.at(centroids(mesh)) if material.functions else material
         self.worlds = checked_count(worlds, "worlds", least=1)
         self.device = checked_device(device)
-        self.sizes = Sizes.of(self.worlds, len(mesh.points), len(mesh.tets))
-        self.smallest_volume = float(np.min(mesh.volumes))
-        if self.element_count > MOST_ELEMENTS:
-            raise InputError(
-                f"worlds is {worlds}: that is {self.element_count} elements; there can be {MOST_ELEMENTS} at most"
-            )
-        self.material.check_shapes(self.worlds, len(mesh.tets))
-        isotropic = self.material.isotropic
-        check_float32(2.0 * isotropic.mu + np.abs(isotropic.lam), "the stiffness 2 mu + |lambda|", "Pa")
-        check_float32(mesh.volumes, "the volume of an element", "m^3")
-        self.element_kind = element_kind(mesh)
-        self.elements = device_elements(mesh, self.device, self.worlds)
-        self.fill = getattr(mesh, "fill", None)
-        #: Lamé's parameters [Pa] and their stride, 0 or 1; then the same times the filled share, for the forces.
-        self.lame = self._lame_arrays(isotropic, None)
-        self.mu, self.lam, self.material_stride = self._lame_arrays(isotropic, self.fill)
-        self.discretization: Discretization = FixedMesh(mesh, self.elements, self.worlds, self.material, self.lame)
-        self._known["masses"] = masses = lumped_masses(mesh, self.material, self.worlds)
-        check_float32(masses[masses > 0], "the mass of a node", "kg")
-
+        self.discretization: Discretization = FixedMesh(mesh, material, self.worlds, self.device)
+        self.sizes = self.discretization.sizes
+        #: What changes the mesh, if anything does.
+        self.changing: MeshChanges | None = None
         self.state = State(self.sizes, self.rest_positions, self.device)
-        mass = wp.array(masses, dtype=wp.float32, device=self.device)
-        self.conditions = Conditions(self.sizes, self.state, mass)
+        mass = wp.array(self.masses, dtype=wp.float32, device=self.device)
+        self.conditions = Conditions(self.discretization, self.state, mass)
         self._views = Views()
         #: Points that go along with the body.
         self.bindings: list[FollowingBinding] = []
@@ -110,38 +86,27 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
     @property
     def mesh(self) -> Mesh:
         """The mesh; of a body that is remeshed the present one."""
-        return self._look_up("mesh")
+        return self.discretization.mesh
 
     @property
     def material(self) -> Any:
         """The material as given, with values in place of functions; of a body that is remeshed that of the present
         elements."""
-        return self._look_up("material")
+        return self.discretization.material
 
     @property
     def masses(self) -> npt.NDArray[np.float64]:
         """Lumped nodal masses [kg], float64 [worlds * N]; zero at nodes that no element names."""
-        return self._look_up("masses")
-
-    def _look_up(self, what: str) -> Any:
-        """What the host knows, asked of the device first if that has changed the mesh."""
-        if what not in self._known:
-            self._known[what] = getattr(self.changing, what)()
-        return self._known[what]
+        return self.discretization.masses
 
     def follow_mesh(self, changing: MeshChanges, discretization: Discretization) -> None:
         """The mesh changes from now on, and is what these say."""
         self.changing, self.discretization = changing, discretization
-        self.mesh_changed(self.world_node_count, self.world_element_count)
+        self.conditions.discretization = discretization
+        self.expire_views()
 
-    def mesh_changed(self, nodes: int, elements: int) -> None:
-        """The device has changed the mesh: what the host knows of it is out of date.
-
-        Args:
-            nodes, elements: How many there are now.
-        """
-        self.sizes.mesh_changed(nodes, elements)
-        self._known.clear()
+    def expire_views(self) -> None:
+        """Views of the nodes are of a mesh that was, from now on."""
         self._views.expire()
 
     @property
@@ -155,13 +120,6 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
         return self.sizes.version
 
     # --- state -----------------------------------------------------------------------------------------------------
-
-    @property
-    def is_uniform(self) -> bool:
-        """Whether the elements of a world are all alike in what forces are made of."""
-        isotropic = self.material.isotropic
-        shapes = [np.shape(value) for value in (isotropic.young, isotropic.poisson)]
-        return self.fill is None and all(not shape or shape[-1] == 1 for shape in shapes)
 
     @property
     def rest_positions(self) -> npt.NDArray[np.float64]:
@@ -273,18 +231,6 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
-    def _lame_arrays(self, material: Isotropic, fill: npt.NDArray[np.float64] | None) -> tuple[wp.array, wp.array, int]:
-        mu, lam = np.broadcast_arrays(np.atleast_1d(material.mu), np.atleast_1d(material.lam))
-        if fill is None and mu.size == 1:
-            return self._floats(mu.ravel()), self._floats(lam.ravel()), 0
-        shape = (self.worlds, len(self.mesh.tets))
-        share = 1.0 if fill is None else fill
-        mu, lam = (np.broadcast_to(a, shape) * share for a in (mu, lam))
-        return self._floats(mu.ravel()), self._floats(lam.ravel()), 1
-
-    def _floats(self, values: np.ndarray) -> wp.array:
-        return wp.array(np.ascontiguousarray(values), dtype=wp.float32, device=self.device)
-
     def _checked_vectors(self, values: npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:
         given = checked_numbers(values, name, f"[{self.node_count}, 3]")
         n = self.world_node_count
@@ -313,25 +259,3 @@ def _check_made_of(mesh: Any, material: Any) -> None:
         young = f"{material!r}" if isinstance(material, int | float) else "5e3"
         cure = f"Isotropic(young={young}, poisson=0.45, density=1000.0)"
         raise InputError(f"material is {shown(material)}; it must be a material such as {cure}")
-
-
-def centroids(mesh: Mesh) -> npt.NDArray[np.float64]:
-    """Centroids of the elements [m], float64 [T, 3]."""
-    found = np.empty((len(mesh.tets), 3))
-    for part in parts(len(mesh.tets)):
-        found[part] = mesh.points[mesh.tets[part]].mean(axis=1)
-    return found
-
-
-def lumped_masses(mesh: Mesh, material: Material, worlds: int = 1) -> npt.NDArray[np.float64]:
-    """A quarter of the mass that each element holds, at each of its nodes [kg], float64 [worlds * N]."""
-    fill = getattr(mesh, "fill", None)
-    density = np.atleast_2d(material.density)
-    masses = np.zeros((len(density), len(mesh.points)))
-    for of_world, row in zip(masses, np.broadcast_to(density, (len(density), len(mesh.tets))), strict=True):
-        for part in parts(len(mesh.tets)):
-            quarter = mesh.volumes[part] * row[part] / 4.0
-            if fill is not None:
-                quarter = quarter * fill[part]
-            np.add.at(of_world, mesh.tets[part].ravel(), np.repeat(quarter, 4))
-    return np.broadcast_to(masses, (worlds, len(mesh.points))).ravel()

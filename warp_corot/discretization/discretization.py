@@ -1,7 +1,8 @@
-"""What force fields ask of a body's mesh: they need not know whether it stays as it is or changes."""
+"""What forces read of a body: its mesh and material on a device, whether the mesh stays as it is or changes."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from functools import partial
 from typing import Any, Protocol
 
@@ -9,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.errors import InputError
 from warp_corot.inputs.checks import check_float32
 from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial, vec9
 from warp_corot.materials.anisotropic import Anisotropic
@@ -16,20 +18,67 @@ from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest
 
 from .clock import Clock
-from .elements import Mesh, in_worlds, with_targets
+from .elements import Mesh, device_elements, element_kind, in_worlds, parts, with_targets
 from .plan import ForcePlan, Plan, Units
+from .sizes import Sizes
 from .slots import Slots
 from .subtrees import pays_in_groups
 
+#: Elements, and with them nodes, are numbered in 32 bits.
+MOST_ELEMENTS = 2**31 - 1
 
-class Discretization(Protocol):
-    """A mesh on the device, with its material."""
+
+class Discretization(ABC):
+    """A mesh on a device, with its material: all that forces read of a body but where its nodes are.
+
+    Attributes:
+        worlds, device: Copies of the body, and where they are.
+        sizes: How many nodes and elements there are.
+        element_kind: The struct that the elements are in, ``ForestElements`` or ``GeneralElements``.
+        elements: The elements, world after world.
+        fill: The share of each element that the body takes up, [T] as the mesh had it at first; None: all of it.
+        lame: Lamé's parameters of the material [Pa], and their stride, 0 or 1: for stresses.
+        mu, lam, material_stride: The same times the filled share: for forces and energies.
+        activation: Active stress of elements [Pa], float32; one place until there is any.
+        has_activation: Whether there is any.
+        smallest_volume: Of an element [m^3].
+    """
+
+    worlds: int
+    device: wp.Device
+    sizes: Sizes
+    element_kind: Any
+    elements: Any
+    fill: npt.NDArray[np.float64] | None
+    lame: tuple[wp.array, wp.array, int]
+    mu: wp.array
+    lam: wp.array
+    material_stride: int
+    activation: wp.array
+    has_activation: bool
+    smallest_volume: float
 
     @property
+    @abstractmethod
+    def mesh(self) -> Mesh:
+        """The present mesh."""
+
+    @property
+    @abstractmethod
+    def material(self) -> Any:
+        """The material of the present elements, with values in place of functions."""
+
+    @property
+    @abstractmethod
+    def masses(self) -> npt.NDArray[np.float64]:
+        """Lumped nodal masses [kg], float64 [worlds * N]; zero at nodes that no element names."""
+
+    @property
+    @abstractmethod
     def prefers_subtrees(self) -> bool:
         """Whether launches of subtrees are faster on CUDA than launches of single elements."""
-        ...
 
+    @abstractmethod
     def plan(self, rotation_level: int | None = None, *, subtrees: bool = True, deterministic: bool = False) -> Plan:
         """What a force field goes through.
 
@@ -40,27 +89,35 @@ class Discretization(Protocol):
             subtrees: Whether complete subtrees go as units; False: the field goes leaf by leaf.
             deterministic: Whether every unit has slots of its own for its forces.
         """
-        ...
 
+    @abstractmethod
     def anisotropic_material(self) -> OrthotropicMaterial:
         """The anisotropic material as kernels read it, world after world where it is not uniform."""
-        ...
+
+    @property
+    def is_anisotropic(self) -> bool:
+        """Whether the material is."""
+        return isinstance(self.material, Anisotropic)
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether the elements of a world are all alike in what forces are made of."""
+        isotropic = self.material.isotropic
+        shapes = [np.shape(value) for value in (isotropic.young, isotropic.poisson)]
+        return self.fill is None and all(not shape or shape[-1] == 1 for shape in shapes)
+
+    def make_activation(self) -> bool:
+        """See that there is an active stress for every element; whether there was none."""
+        if self.has_activation:
+            return False
+        if len(self.activation) < self.sizes.elements:
+            self.activation = wp.zeros(self.sizes.elements, dtype=wp.float32, device=self.device)
+        self.has_activation = True
+        return True
 
 
 class MeshChanges(Protocol):
     """What changes the mesh of a body, as the body calls it; arrays are of the present nodes."""
-
-    def mesh(self) -> TetForest:
-        """The present mesh."""
-        ...
-
-    def material(self) -> Material:
-        """The material of the present elements."""
-        ...
-
-    def masses(self) -> npt.NDArray[np.float64]:
-        """Lumped nodal masses [kg], float64 [N]."""
-        ...
 
     def remember(self) -> None:
         """Make the present mesh and state what ``reset`` goes back to."""
@@ -71,30 +128,93 @@ class MeshChanges(Protocol):
         ...
 
 
-class FixedMesh:
-    """The ``Discretization`` of a mesh that stays as it is.
+class Discretized(Protocol):
+    """Something that has a discretization, as a body does."""
+
+    @property
+    def discretization(self) -> Discretization: ...
+
+
+def discretization_of(body: Discretized | Discretization) -> Discretization:
+    """A body's discretization, or one given as such."""
+    return body if isinstance(body, Discretization) else body.discretization
+
+
+class FixedMesh(Discretization):
+    """A mesh that stays as it is.
 
     Args:
         mesh: The mesh.
-        elements: Its elements on the device, world after world.
+        material: The material; functions of the rest position are evaluated at the elements' centroids.
         worlds: How many copies of the body there are.
-        material: The body's material, with values in place of functions.
-        lame: Lamé's parameters [Pa] of the nearest isotropic material, and their stride.
+        device: Where.
+
+    Raises:
+        InputError: Too many elements, a material array of another shape, or values that float32 does not hold.
     """
 
-    def __init__(self, mesh: Mesh, elements: Any, worlds: int, material: Any, lame: tuple[wp.array, wp.array, int]):
-        self._mesh, self._elements, self._worlds = mesh, elements, worlds
-        self._material, self._lame = material, lame
-        self._device = elements.nodes.device
+    def __init__(self, mesh: Mesh, material: Material, worlds: int, device: wp.Device):
+        given = material.at(centroids(mesh)) if material.functions else material
+        count = worlds * len(mesh.tets)
+        if count > MOST_ELEMENTS:
+            raise InputError(f"worlds is {worlds}: that is {count} elements; there can be {MOST_ELEMENTS} at most")
+        given.check_shapes(worlds, len(mesh.tets))
+        isotropic = given.isotropic
+        check_float32(2.0 * isotropic.mu + np.abs(isotropic.lam), "the stiffness 2 mu + |lambda|", "Pa")
+        check_float32(mesh.volumes, "the volume of an element", "m^3")
+        self._material: Any = given
+        self._fill_in(mesh, isotropic.mu, isotropic.lam, worlds, device)
+        self._masses = lumped_masses(mesh, given, worlds)
+        check_float32(self._masses[self._masses > 0], "the mass of a node", "kg")
+
+    @classmethod
+    def of_lame(cls, mesh: Mesh, mu: npt.ArrayLike, lam: npt.ArrayLike, worlds: int, device: wp.Device) -> FixedMesh:
+        """One of which nothing is known but Lamé's parameters [Pa], numbers or [worlds, T]: enough for forces."""
+        made = cls.__new__(cls)
+        made._material = None
+        made._fill_in(mesh, mu, lam, worlds, device)
+        return made
+
+    def _fill_in(self, mesh: Mesh, mu: npt.ArrayLike, lam: npt.ArrayLike, worlds: int, device: wp.Device) -> None:
+        self._mesh, self.worlds, self.device = mesh, worlds, device
+        self.sizes = Sizes.of(worlds, len(mesh.points), len(mesh.tets))
+        self.smallest_volume = float(np.min(mesh.volumes))
+        self.element_kind = element_kind(mesh)
+        self.elements = device_elements(mesh, device, worlds)
+        self.fill = getattr(mesh, "fill", None)
+        self._is_uniform = self.fill is None and all(np.ndim(a) == 0 or np.shape(a)[-1] == 1 for a in (mu, lam))
+        self.lame = self._lame_arrays(mu, lam, None)
+        self.mu, self.lam, self.material_stride = self._lame_arrays(mu, lam, self.fill)
+        self.activation, self.has_activation = wp.zeros(1, dtype=wp.float32, device=device), False
+
+    @property
+    def mesh(self) -> Mesh:
+        return self._mesh
+
+    @property
+    def material(self) -> Any:
+        return self._material
+
+    @property
+    def masses(self) -> npt.NDArray[np.float64]:
+        return self._masses
+
+    @property
+    def is_uniform(self) -> bool:
+        return self._is_uniform
+
+    @property
+    def is_anisotropic(self) -> bool:
+        return isinstance(self._material, Anisotropic)
 
     @property
     def prefers_subtrees(self) -> bool:
-        return isinstance(self._mesh, TetForest) and pays_in_groups(self._mesh, self._worlds)
+        return isinstance(self._mesh, TetForest) and pays_in_groups(self._mesh, self.worlds)
 
     def plan(
         self, rotation_level: int | None = None, *, subtrees: bool = True, deterministic: bool = False
     ) -> ForcePlan:
-        mesh, elements, device, worlds = self._mesh, self._elements, self._device, self._worlds
+        mesh, elements, device, worlds = self._mesh, self.elements, self.device, self.worlds
         if isinstance(mesh, TetForest) and subtrees:
             return ForcePlan.of_forest(
                 mesh, rotation_level, device, worlds=worlds, elements=elements, deterministic=deterministic
@@ -108,14 +228,14 @@ class FixedMesh:
         return ForcePlan.leaf_by_leaf(elements, slots, find_units)
 
     def anisotropic_material(self) -> OrthotropicMaterial:
-        given, fill = self._material, getattr(self._mesh, "fill", None)
+        given, fill = self._material, self.fill
         assert isinstance(given, Anisotropic)
         stiffness = given.stiffness()
         check_float32(np.abs(stiffness[..., [0, 1, 2, 6, 7, 8]]).ravel(), "the stiffness", "Pa")
         material = OrthotropicMaterial()
         material.axes, material.axes_stride = self._of_elements(given.frames(), 2, wp.mat33)
         material.stiffness, material.stride = self._of_elements(stiffness, 1, vec9)
-        material.mu, material.lam, _stride = self._lame
+        material.mu, material.lam, _stride = self.lame
         material.fill, material.fill_stride = self._of_elements(np.ones(()) if fill is None else fill, 0, wp.float32)
         return material
 
@@ -123,7 +243,41 @@ class FixedMesh:
         """One value, or one for each element of each world; and the stride by which to go through them."""
         head, tail = values.shape[: values.ndim - rank], values.shape[values.ndim - rank :]
         if np.prod(head, dtype=int) == 1:
-            return wp.array(values.reshape(1, *tail), dtype=dtype, device=self._device), 0
-        shape = (self._worlds, len(self._mesh.tets), *tail)
+            return wp.array(values.reshape(1, *tail), dtype=dtype, device=self.device), 0
+        shape = (self.worlds, len(self._mesh.tets), *tail)
         everywhere = np.broadcast_to(values, shape).astype(np.float32)
-        return wp.array(everywhere.reshape(-1, *tail), dtype=dtype, device=self._device), 1
+        return wp.array(everywhere.reshape(-1, *tail), dtype=dtype, device=self.device), 1
+
+    def _lame_arrays(
+        self, mu: npt.ArrayLike, lam: npt.ArrayLike, fill: npt.NDArray[np.float64] | None
+    ) -> tuple[wp.array, wp.array, int]:
+        mu, lam = np.broadcast_arrays(np.atleast_1d(mu), np.atleast_1d(lam))
+        stride = int(fill is not None or mu.size > 1)
+        if stride:
+            shape = (self.worlds, len(self._mesh.tets))
+            mu, lam = (np.broadcast_to(a, shape) * (1.0 if fill is None else fill) for a in (mu, lam))
+        made = (np.ascontiguousarray(a.ravel()) for a in (mu, lam))
+        on_device = (wp.array(a, dtype=wp.float32, device=self.device) for a in made)
+        return *on_device, stride
+
+
+def centroids(mesh: Mesh) -> npt.NDArray[np.float64]:
+    """Centroids of the elements [m], float64 [T, 3]."""
+    found = np.empty((len(mesh.tets), 3))
+    for part in parts(len(mesh.tets)):
+        found[part] = mesh.points[mesh.tets[part]].mean(axis=1)
+    return found
+
+
+def lumped_masses(mesh: Mesh, material: Material, worlds: int = 1) -> npt.NDArray[np.float64]:
+    """A quarter of the mass that each element holds, at each of its nodes [kg], float64 [worlds * N]."""
+    fill = getattr(mesh, "fill", None)
+    density = np.atleast_2d(material.density)
+    masses = np.zeros((len(density), len(mesh.points)))
+    for of_world, row in zip(masses, np.broadcast_to(density, (len(density), len(mesh.tets))), strict=True):
+        for part in parts(len(mesh.tets)):
+            quarter = mesh.volumes[part] * row[part] / 4.0
+            if fill is not None:
+                quarter = quarter * fill[part]
+            np.add.at(of_world, mesh.tets[part].ravel(), np.repeat(quarter, 4))
+    return np.broadcast_to(masses, (worlds, len(mesh.points))).ravel()

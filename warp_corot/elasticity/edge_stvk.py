@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from warp_corot.discretization.discretization import discretization_of
 from warp_corot.errors import InputError
 from warp_corot.kernels.elements.constitutive import stvk_cauchy
 from warp_corot.kernels.elements.forces import element_von_mises
@@ -13,7 +14,7 @@ from warp_corot.kernels.elements.springs import edge_stvk_energies, scatter_edge
 from .model import ElementField, ForceField, Model
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.discretization import Discretization, Discretized
 
 
 @dataclass(frozen=True)
@@ -31,10 +32,11 @@ class EdgeStVK(Model):
         if self.springs not in ("biquadratic", "quadratic"):
             raise InputError(f"springs is {self.springs!r}; it must be 'biquadratic' or 'quadratic'")
 
-    def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
-        kind, biquadratic = body.element_kind, self.springs == "biquadratic"
+    def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
+        discretization = discretization_of(body)
+        kind, biquadratic = discretization.element_kind, self.springs == "biquadratic"
         return ElementField(
-            body,
+            discretization,
             forces=scatter_edge_stvk(kind, biquadratic),
             energies=edge_stvk_energies(kind, biquadratic),
             von_mises=element_von_mises(kind, stvk_cauchy),

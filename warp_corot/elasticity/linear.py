@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
+from warp_corot.discretization.discretization import discretization_of
 from warp_corot.elasticity.paths.laws import law_field
 from warp_corot.kernels.elements.constitutive import linear_cauchy, linear_energy, linear_stress
 
 from .model import ForceField, Model
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.discretization import Discretization, Discretized
 
 
 @dataclass(frozen=True)
@@ -20,10 +21,11 @@ class Linear(Model):
 
     strained_safety: ClassVar[float] = 0.9  # its stiffness never changes
 
-    def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
+    def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
+        discretization = discretization_of(body)
         return law_field(
             "linear",
-            body,
+            discretization,
             stress=linear_stress,
             energy=linear_energy,
             cauchy=linear_cauchy,

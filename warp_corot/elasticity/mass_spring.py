@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.discretization import Discretization, Discretized, discretization_of
 from warp_corot.discretization.elements import in_worlds, repeated
 from warp_corot.discretization.plan import Plan
 from warp_corot.discretization.slots import Slots
@@ -20,7 +20,7 @@ from warp_corot.kernels.tables.shapes import EDGES
 from .model import ForceField, Model
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.discretization import Discretization, Discretized
 
 
 @dataclass(frozen=True)
@@ -36,24 +36,29 @@ class MassSpring(Model):
     def kept_of_elements(self) -> str | None:
         return "the model MassSpring has springs along the edges that it begins with"
 
-    def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
-        return MassSpringField(body, deterministic)
+    def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
+        discretization = discretization_of(body)
+        return MassSpringField(discretization, deterministic)
 
 
 class MassSpringField(ForceField):
     def plan_of(self, discretization: Discretization) -> Plan:
         return discretization.plan(subtrees=False)  # the slots are the edges' own
 
-    def __init__(self, body: SoftBody, deterministic: bool = False):
-        super().__init__(body, deterministic)
-        points, tets, worlds = body.mesh.points, body.mesh.tets, body.worlds
+    def __init__(self, discretization: Discretization, deterministic: bool = False):
+        super().__init__(discretization, deterministic)
+        points, tets, worlds = discretization.mesh.points, discretization.mesh.tets, discretization.worlds
         pairs = np.stack([tets[:, edge] for edge in EDGES], axis=1)
         lengths = np.linalg.norm(points[pairs[..., 1]] - points[pairs[..., 0]], axis=-1)
         key = pairs.min(axis=-1).astype(np.int64) * len(points) + pairs.max(axis=-1)
         unique, which = np.unique(key.ravel(), return_inverse=True)
         # A row for each world whose stiffness may differ.
-        young = np.atleast_2d(body.material.young)
-        held = body.mesh.volumes if body.fill is None else body.mesh.volumes * body.fill
+        young = np.atleast_2d(discretization.material.young)
+        held = (
+            discretization.mesh.volumes
+            if discretization.fill is None
+            else discretization.mesh.volumes * discretization.fill
+        )
         stiffness = np.stack(
             [
                 np.bincount(which.ravel(), ((row * held)[:, None] / lengths**2).ravel())
@@ -75,7 +80,7 @@ class MassSpringField(ForceField):
         lame = 0.4 * (young if young.size == 1 else np.broadcast_to(young, (worlds, len(tets))))
         self._lame = wp.array(lame.ravel(), dtype=wp.float32, device=self.device)
         self._lame_stride = int(lame.size > 1)
-        self._von_mises = element_von_mises(body.element_kind, stvk_cauchy)
+        self._von_mises = element_von_mises(discretization.element_kind, stvk_cauchy)
 
     @property
     def energy_count(self) -> int:

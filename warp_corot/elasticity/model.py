@@ -1,4 +1,4 @@
-"""What every elastic model is: a small description, and the force field that it becomes on a body."""
+"""What every elastic model is: a small description, and the force field that it becomes on a discretization."""
 
 from __future__ import annotations
 
@@ -11,15 +11,13 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.discretization.clock import Clock
-from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.discretization import Discretization, Discretized, discretization_of
 from warp_corot.discretization.plan import Plan
 from warp_corot.errors import InputError
 from warp_corot.kernels.elements.forces import element_energies, element_von_mises, scatter_forces
-from warp_corot.materials.anisotropic import Anisotropic
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.discretization import Discretization
 
 
 class ForceField(ABC):
@@ -28,7 +26,7 @@ class ForceField(ABC):
     Launches only; nothing here waits for the device or comes back to the host but ``elastic_energies``.
 
     Args:
-        body: The body.
+        body: A body, or its discretization.
         deterministic: Whether forces must come out the same bit by bit every time, also on CUDA, where threads run in
             any order; ``slots`` are then where kernels add them first.
 
@@ -42,14 +40,16 @@ class ForceField(ABC):
 
     takes_anisotropic: ClassVar[bool] = False
 
-    def __init__(self, body: SoftBody, deterministic: bool = False):
-        if isinstance(body.material, Anisotropic) and not self.takes_anisotropic:
-            raise InputError(f"the material is {type(body.material).__name__}; only the model Corotated knows such")
-        self.body = body
-        self.device = body.device
+    def __init__(self, body: Discretized | Discretization, deterministic: bool = False):
+        discretization = discretization_of(body)
+        if discretization.is_anisotropic and not self.takes_anisotropic:
+            name = type(discretization.material).__name__
+            raise InputError(f"the material is {name}; only the model Corotated supports anisotropic materials")
+        self.discretization = discretization
+        self.device = discretization.device
         #: On the CPU there is one thread, and nothing to settle.
-        self.deterministic = deterministic and body.device.is_cuda
-        self.plan = self.plan_of(body.discretization)
+        self.deterministic = deterministic and discretization.device.is_cuda
+        self.plan = self.plan_of(discretization)
         self.elements, self.slots = self.plan.elements, self.plan.slots
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
@@ -87,14 +87,6 @@ class ForceField(ABC):
         Called where plans change, before steps are recorded, whenever a size is another one.
         """
 
-    def begin_step(self, clock: Clock, offset: int) -> None:  # noqa: B027 (most do not change)
-        """Launch what sets the field for a step, where it changes with time.
-
-        Args:
-            clock: The simulation's.
-            offset: How many steps are launched that it does not count yet.
-        """
-
     @abstractmethod
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         """Write the strain energies [J] that make up the whole, world after world; float64."""
@@ -106,7 +98,7 @@ class ForceField(ABC):
     @property
     def element_count(self) -> int:
         """How many elements launches go through; those beyond the body's do nothing."""
-        return self.body.sizes.launch_elements
+        return self.discretization.sizes.launch_elements
 
     @property
     def energy_count(self) -> int:
@@ -147,27 +139,27 @@ class ForceField(ABC):
         energies = wp.zeros(self.energy_count, dtype=wp.float64, device=self.device)
         with self.state_kept():
             self.write_energies(u, energies)
-        return energies.numpy().reshape(self.body.worlds, -1).sum(axis=1)
+        return energies.numpy().reshape(self.discretization.worlds, -1).sum(axis=1)
 
     def von_mises(self, u: wp.array) -> npt.NDArray[np.float32]:
         """Von Mises stress of each element [Pa], float32 [T]."""
         stress = wp.zeros(self.element_count, dtype=wp.float32, device=self.device)
         with self.state_kept():
             self.write_von_mises(u, stress)
-        return stress.numpy()[: self.body.element_count]
+        return stress.numpy()[: self.discretization.sizes.elements]
 
     def launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
     @property
     def material_inputs(self) -> list:
-        """The kernel arguments mu, lam and stride for forces and energies: those of what elements hold of the body."""
-        return [self.body.mu, self.body.lam, self.body.material_stride]
+        """The kernel arguments mu, lam and stride for forces and energies: those of what elements hold of the discretization."""
+        return [self.discretization.mu, self.discretization.lam, self.discretization.material_stride]
 
     @property
     def stress_inputs(self) -> list:
         """The same for stresses: those of the material."""
-        return list(self.body.lame)
+        return list(self.discretization.lame)
 
 
 class Model(ABC):
@@ -182,8 +174,8 @@ class Model(ABC):
     strained_safety: ClassVar[float] = 0.6
 
     @abstractmethod
-    def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
-        """The model's force field on a body.
+    def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
+        """The model's force field on a discretization.
 
         Args:
             deterministic: Whether forces must come out the same bit by bit every time also on CUDA.
@@ -206,7 +198,7 @@ class ElementField(ForceField):
 
     def __init__(
         self,
-        body: SoftBody,
+        body: Discretized | Discretization,
         *,
         forces: wp.Kernel,
         energies: wp.Kernel,
@@ -233,14 +225,14 @@ class LawField(ElementField):
 
     def __init__(
         self,
-        body: SoftBody,
+        body: Discretized | Discretization,
         *,
         stress: wp.Function,
         energy: wp.Function,
         cauchy: wp.Function,
         deterministic: bool = False,
     ):
-        kind = body.element_kind
+        kind = discretization_of(body).element_kind
         super().__init__(
             body,
             deterministic=deterministic,

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from warp_corot.discretization.discretization import discretization_of
 from warp_corot.elasticity.paths.laws import law_field
 from warp_corot.kernels.elements.constitutive import neo_hookean_cauchy, neo_hookean_energy, neo_hookean_stress
 
 from .model import ForceField, Model
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.discretization import Discretization, Discretized
 
 
 @dataclass(frozen=True)
@@ -27,10 +28,11 @@ class NeoHookean(Model):
     Total-Lagrangian too: with explicit central differences, TLED (Miller et al. 2007).
     """
 
-    def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
+    def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
+        discretization = discretization_of(body)
         return law_field(
             "neo-hookean",
-            body,
+            discretization,
             stress=neo_hookean_stress,
             energy=neo_hookean_energy,
             cauchy=neo_hookean_cauchy,

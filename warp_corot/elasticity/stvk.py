@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from warp_corot.discretization.discretization import discretization_of
 from warp_corot.elasticity.paths.laws import law_field
 from warp_corot.kernels.elements.constitutive import stvk_cauchy, stvk_energy, stvk_stress
 
 from .model import ForceField, Model
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.discretization import Discretization, Discretized
 
 
 @dataclass(frozen=True)
@@ -22,10 +23,11 @@ class StVenantKirchhoff(Model):
     TLED (Miller et al. 2007). Softens when compressed and lets elements invert at large strain; the paper's reference.
     """
 
-    def bind(self, body: SoftBody, *, deterministic: bool = False) -> ForceField:
+    def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
+        discretization = discretization_of(body)
         return law_field(
             "stvk",
-            body,
+            discretization,
             stress=stvk_stress,
             energy=stvk_energy,
             cauchy=stvk_cauchy,

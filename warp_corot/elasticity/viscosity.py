@@ -25,7 +25,7 @@ class Viscosity:
 
     def __init__(self, body: SoftBody, field: ForceField, seconds: float):
         self.body, self.field, self.seconds = body, field, seconds
-        self._kernel = scatter_viscous(body.element_kind)
+        self._kernel = scatter_viscous(body.discretization.element_kind)
         #: Where sums must come out the same every time, the elements' own places for them.
         self._slotted = body.discretization.plan(subtrees=False, deterministic=True) if field.deterministic else None
 
@@ -43,6 +43,12 @@ class Viscosity:
 
     def _launch(self, elements: object, f: wp.array) -> None:
         body = self.body
-        inputs = [elements, self.seconds, body.mu, body.lam, body.material_stride]
+        inputs = [
+            elements,
+            self.seconds,
+            body.discretization.mu,
+            body.discretization.lam,
+            body.discretization.material_stride,
+        ]
         inputs += [body.state.displacements, body.state.velocities]
         wp.launch(self._kernel, self.field.element_count, inputs, [f], device=body.device)

@@ -8,10 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.body.soft_body import SoftBody
+from warp_corot.discretization.discretization import FixedMesh
 from warp_corot.elasticity import Corotated
 from warp_corot.kernels.newton.particles import add_nodes, gather_nodes
-from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest
 
 from .library import newton
@@ -20,9 +19,7 @@ from .state import attribute_of
 
 
 class ForestGroup:
-    """All copies of one forest in a model, as the worlds of one body.
-
-    The body's state is not used; it holds the forest's elements and materials for the force field.
+    """All copies of one forest in a model, as the worlds of one discretization.
 
     Args:
         forest: The forest.
@@ -67,12 +64,9 @@ class ForestGroup:
     def set_material(self, mu: npt.NDArray[np.float64], lam: npt.NDArray[np.float64]) -> None:
         """Take over Lamé's parameters of the model's tetrahedra [Pa], float64 [all T]."""
         share = mesh_fill(self.forest)
-        own_mu, own_lam = (a[self.tets].reshape(self.copies, -1) / share for a in (mu, lam))
-        young = own_mu * (3 * own_lam + 2 * own_mu) / (own_lam + own_mu)
-        poisson = own_lam / (2 * (own_lam + own_mu))
-        material = Isotropic(young=_squeezed(young), poisson=_squeezed(poisson), density=1000.0)
-        body = SoftBody(self.forest, material, worlds=self.copies, device=self.device)
-        self._field = Corotated(rotation_level=self.rotation_level).bind(body)
+        own_mu, own_lam = (_squeezed(a[self.tets].reshape(self.copies, -1) / share) for a in (mu, lam))
+        made_of = FixedMesh.of_lame(self.forest, own_mu, own_lam, self.copies, self.device)
+        self._field = Corotated(rotation_level=self.rotation_level).bind(made_of)
 
     def add_forces(self, x: wp.array, u: wp.array, f: wp.array) -> None:
         """Add the elastic forces of particles at x, displaced by u, to f, all vec4 [P].

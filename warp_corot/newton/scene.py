@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from warp_corot.body.soft_body import centroids, lumped_masses
+from warp_corot.discretization.discretization import centroids, lumped_masses
 from warp_corot.errors import InputError
 from warp_corot.inputs.indices import checked_indices
 from warp_corot.materials.isotropic import Isotropic

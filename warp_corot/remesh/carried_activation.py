@@ -62,16 +62,16 @@ class CarriedActivation:
             kept_rows: Rows that ``put_back`` may be asked to write, whose keyframes are still wanted then.
         """
         body = self._body
-        if not body.conditions.has_activation:
+        if not body.discretization.has_activation:
             return
-        self._write(ACTIVATION, body.conditions.activation[: body.element_count])
+        self._write(ACTIVATION, body.discretization.activation[: body.element_count])
         now = body.conditions.activations
         if len(now) != len(self._made) or any(a is not b for a, b in zip(now, self._made, strict=True)):
             self._write(ACTIVATION_ROW, self._adopt(now, kept_rows))
 
     def kept(self) -> dict[str, wp.array]:
         """What ``put_back`` takes, of the present mesh."""
-        if not self._body.conditions.has_activation:
+        if not self._body.discretization.has_activation:
             return {}
         return {name: self._read(name) for name in (ACTIVATION, ACTIVATION_ROW)}
 

@@ -20,16 +20,16 @@ from warp_corot.materials.anisotropic import FRAME_ENTRIES, STIFFNESS_ENTRIES, A
 from warp_corot.materials.isotropic import Isotropic, Material
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.discretization import Discretization
 
 #: The active stress, and, of whole numbers, the row of keyframes that it follows.
 ACTIVATION = "activation"
 ACTIVATION_ROW = "activation_row"
 
 
-def carried_material(body: SoftBody) -> CarriedMaterial:
+def carried_material(former: Discretization) -> CarriedMaterial:
     """What the body's elements are to carry of its material."""
-    return (CarriedAnisotropic if isinstance(body.material, Anisotropic) else CarriedMaterial)(body)
+    return (CarriedAnisotropic if isinstance(former.material, Anisotropic) else CarriedMaterial)(former)
 
 
 class CarriedMaterial:
@@ -41,30 +41,38 @@ class CarriedMaterial:
             latter a parent has the mean that counts by what its children hold.
     """
 
-    def __init__(self, body: SoftBody):
-        self.given: Any = body.material
+    def __init__(self, former: Discretization):
+        self.given: Any = former.material
         self.values: dict[str, npt.NDArray[np.floating] | Column | Numbers] = {}
-        if body.material_stride:
-            self.values = {"mu": body.mu.numpy(), "lam": body.lam.numpy()}
-        if body.lame[2] and body.fill is not None:
-            own = (Column(array.numpy(), int(MEAN_OF_CONTENTS)) for array in body.lame[:2])
+        if former.material_stride:
+            self.values = {"mu": former.mu.numpy(), "lam": former.lam.numpy()}
+        if former.lame[2] and former.fill is not None:
+            own = (Column(array.numpy(), int(MEAN_OF_CONTENTS)) for array in former.lame[:2])
             self.values |= dict(zip(("own_mu", "own_lam"), own, strict=True))
-        self._lame = ("own_mu", "own_lam") if "own_mu" in self.values else ("mu", "lam") if body.lame[2] else ()
+        self._lame = ("own_mu", "own_lam") if "own_mu" in self.values else ("mu", "lam") if former.lame[2] else ()
         #: Lamé's parameters of the material itself [Pa], or what elements carry them as.
-        self.lame: Any = self._lame or tuple(float(array.numpy()[0]) for array in body.lame[:2])
+        self.lame: Any = self._lame or tuple(float(array.numpy()[0]) for array in former.lame[:2])
         #: 2 mu + lambda [Pa] of all elements if they are alike, else 0.
-        self.modulus = 0.0 if self.values else float(2.0 * body.mu.numpy()[0] + body.lam.numpy()[0])
+        self.modulus = 0.0 if self.values else float(2.0 * former.mu.numpy()[0] + former.lam.numpy()[0])
 
     def density(self, count: int) -> npt.NDArray[np.float64]:
         """Mass per rest volume of what elements hold [kg/m^3], [count]."""
         return np.broadcast_to(self.given.density, (1, count))[0]
 
-    def serve(self, body: SoftBody, plan: DevicePlan) -> None:
-        """Let the body have what its present elements carry."""
-        if body.material_stride:
-            body.mu, body.lam = (plan.values[name] for name in ("mu", "lam"))
-        if self._lame:
-            body.lame = (*(plan.values[name] for name in self._lame), 1)
+    def lame_of(self, plan: DevicePlan) -> tuple[wp.array, wp.array, int] | None:
+        """Lamé's parameters of the present elements and their stride, if they vary."""
+        if not self._lame:
+            return None
+        mu, lam = (plan.values[name] for name in self._lame)
+        return mu, lam, 1
+
+    def serve(self, plan: DevicePlan, lame: tuple[wp.array, wp.array, int]) -> None:
+        """Have ``derive`` write what the present elements carry.
+
+        Args:
+            plan: Of these elements.
+            lame: Their Lamé parameters.
+        """
 
     def derive(self, plan: DevicePlan) -> None:
         """Launch what writes the material that kernels read, if the plan has just been derived; may be recorded."""
@@ -98,9 +106,9 @@ class CarriedAnisotropic(CarriedMaterial):
     same row or none; otherwise that is the first child's.
     """
 
-    def __init__(self, body: SoftBody):
-        super().__init__(body)
-        count = len(body.mesh.tets)
+    def __init__(self, former: Discretization):
+        super().__init__(former)
+        count = len(former.mesh.tets)
         stiffness, frames = self.given.stiffness(), self.given.frames()
         self._stiffness_varies = stiffness.size > 9
         self._axes_vary = frames.size > 9
@@ -108,25 +116,23 @@ class CarriedAnisotropic(CarriedMaterial):
             self.values |= _columns(STIFFNESS_ENTRIES, stiffness, count, int(MEAN_OF_CONTENTS))
         if self._axes_vary:
             self.values |= _columns(FRAME_ENTRIES, frames, count, int(FIRST))
-        active = body.conditions.activation.numpy() if body.conditions.has_activation else 0.0
+        active = former.activation.numpy() if former.has_activation else 0.0
         self.values[ACTIVATION] = Column(active, int(MEAN_IF_ALIKE))
         self.values[ACTIVATION_ROW] = Numbers(int(NO_ROW))
-        self._anisotropic = body.discretization.anisotropic_material()
+        self._anisotropic = former.anisotropic_material()
 
     @property
     def anisotropic(self) -> OrthotropicMaterial:
         return self._anisotropic
 
-    def serve(self, body: SoftBody, plan: DevicePlan) -> None:
-        super().serve(body, plan)
-        body.conditions.activation = plan.values[ACTIVATION]
+    def serve(self, plan: DevicePlan, lame: tuple[wp.array, wp.array, int]) -> None:
         given, material, count = self._anisotropic, OrthotropicMaterial(), plan.counts.most
         material.assign(given)
-        material.mu, material.lam, material.stride = body.lame
+        material.mu, material.lam, material.stride = lame
         if given.axes_stride:
-            material.axes = wp.array(np.tile(np.eye(3), (count, 1, 1)), dtype=wp.mat33, device=body.device)
+            material.axes = wp.array(np.tile(np.eye(3), (count, 1, 1)), dtype=wp.mat33, device=plan.forest.device)
         if given.stride:
-            material.stiffness = wp.zeros(count, dtype=vec9, device=body.device)
+            material.stiffness = wp.zeros(count, dtype=vec9, device=plan.forest.device)
         if "fill" in plan.values:
             material.fill = plan.values["fill"]
         self._anisotropic = material

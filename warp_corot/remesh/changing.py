@@ -17,7 +17,6 @@ from warp_corot.discretization.clock import Clock
 from warp_corot.errors import InputError
 from warp_corot.kernels.remesh.mark import elongation, marking_kernel
 from warp_corot.kernels.stepping.integrate import set_start
-from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.lattice import volume_shares
 
@@ -61,7 +60,7 @@ class Changing:
         self.body = body
         self.device = body.device
         self.is_full = False
-        self.carried_material = carried_material(body)
+        self.carried_material = carried_material(body.discretization)
         assert self.options.capacity is not None
         assert self.options.min_level is not None
         assert self.options.max_level is not None
@@ -84,7 +83,7 @@ class Changing:
             lame=self.carried_material.lame,
         )
         self.survey = Survey(self.forest, self.carried_material.modulus)
-        self.discretization = ChangingMesh(body, self.forest, self.carried_material)
+        self.discretization = ChangingMesh(body.discretization, self.forest, self.carried_material)
         #: What is looked at after a pass: counts of the pools and of the plan, the survey, and who follows keyframes.
         self._report: wp.array | None = None
         self._report_parts: list[int] = []
@@ -93,18 +92,6 @@ class Changing:
         self._give_pools_to(body)
 
     # --- what the body asks for ------------------------------------------------------------------------------------
-
-    def mesh(self) -> TetForest:
-        """The present mesh."""
-        return self.forest.to_forest()
-
-    def material(self) -> Material:
-        """The material of the present elements."""
-        return self.carried_material.present(self.forest)
-
-    def masses(self) -> npt.NDArray[np.float64]:
-        """Lumped nodal masses [kg], float64 [N]."""
-        return self._of_nodes(self.forest.carriage.arrays.mass)
 
     def remember(self) -> None:
         """Make the present mesh and state what ``reset`` goes back to."""
@@ -212,9 +199,10 @@ class Changing:
         if self._plan.refresh(classes) or moved:
             self.field.follow()
             body.sizes.relaunch()
-        body.mesh_changed(counts.nodes, counts.leaves)
         self.survey.read(surveyed)
-        body.smallest_volume = float(volume_shares(self.survey.finest_level)) * self.forest.source.cell_size**3
+        smallest = float(volume_shares(self.survey.finest_level)) * self.forest.source.cell_size**3
+        self.discretization.mesh_changed(counts.nodes, counts.leaves, smallest)
+        body.expire_views()
         body.state.publish_positions()
         self.conditions.follow(followers)
         for binding in body.bindings:

@@ -2,35 +2,74 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from warp_corot.discretization.changing.plan import DevicePlan
 from warp_corot.discretization.changing.pools import DeviceForest
+from warp_corot.discretization.discretization import Discretization
 from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial
+from warp_corot.materials.anisotropic import Anisotropic
+from warp_corot.mesh import TetForest
 
-from .carried_material import CarriedMaterial
-
-if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+from .carried_material import ACTIVATION, CarriedMaterial
 
 
-class ChangingMesh:
-    """The ``discretization.Discretization`` of a forest that changes.
+class ChangingMesh(Discretization):
+    """A forest that changes.
 
     Args:
-        body: The body, which has the elements of the plan that is kept.
+        former: What it was so far.
         forest: The pools.
-        carried: What elements carry of the body's material.
+        carried: What elements carry of the material.
 
     Attributes:
         kept: The plan that is kept up to date: the first one that is asked for. Others are of the mesh as it is then.
     """
 
-    prefers_subtrees = True
-
-    def __init__(self, body: SoftBody, forest: DeviceForest, carried: CarriedMaterial):
-        self._body, self._forest, self._carried = body, forest, carried
+    def __init__(self, former: Discretization, forest: DeviceForest, carried: CarriedMaterial):
+        self._forest, self._carried = forest, carried
+        self.worlds, self.device, self.sizes = former.worlds, former.device, former.sizes
+        self.element_kind, self.elements, self.fill = former.element_kind, former.elements, former.fill
+        self.lame, self.mu, self.lam, self.material_stride = former.lame, former.mu, former.lam, former.material_stride
+        self.activation, self.has_activation = former.activation, former.has_activation
+        self.smallest_volume = former.smallest_volume
+        self._is_uniform = former.is_uniform
         self.kept: DevicePlan | None = None
+        #: What the host knows of the present mesh, by name.
+        self._known: dict[str, Any] = {}
+
+    @property
+    def mesh(self) -> TetForest:
+        if "mesh" not in self._known:
+            self._known["mesh"] = self._forest.to_forest()
+        return self._known["mesh"]
+
+    @property
+    def material(self) -> Any:
+        if "material" not in self._known:
+            self._known["material"] = self._carried.present(self._forest)
+        return self._known["material"]
+
+    @property
+    def masses(self) -> npt.NDArray[np.float64]:
+        if "masses" not in self._known:
+            self._known["masses"] = self._forest.carriage.arrays.mass[: self.sizes.nodes].numpy().copy()
+        return self._known["masses"]
+
+    @property
+    def is_uniform(self) -> bool:
+        return self._is_uniform
+
+    @property
+    def is_anisotropic(self) -> bool:
+        return isinstance(self._carried.given, Anisotropic)
+
+    @property
+    def prefers_subtrees(self) -> bool:
+        return True
 
     def plan(
         self, rotation_level: int | None = None, *, subtrees: bool = True, deterministic: bool = False
@@ -38,13 +77,27 @@ class ChangingMesh:
         assert not deterministic
         plan = DevicePlan(self._forest, rotation_level, subtrees=subtrees)
         if self.kept is None:
-            self.kept = plan
-            self._body.elements = plan.elements
-            self._carried.serve(self._body, plan)
+            self.kept, self.elements = plan, plan.elements
+            if self.material_stride:
+                self.mu, self.lam = (plan.values[name] for name in ("mu", "lam"))
+            self.lame = self._carried.lame_of(plan) or self.lame
+            self.activation = plan.values.get(ACTIVATION, self.activation)
+            self._carried.serve(plan, self.lame)
         return plan
 
     def anisotropic_material(self) -> OrthotropicMaterial:
         return self._carried.anisotropic
+
+    def mesh_changed(self, nodes: int, elements: int, smallest_volume: float) -> None:
+        """The device has changed the mesh: what the host knows of it is out of date.
+
+        Args:
+            nodes, elements: How many there are now.
+            smallest_volume: Of an element [m^3].
+        """
+        self._known.clear()
+        self.sizes.mesh_changed(nodes, elements)
+        self.smallest_volume = smallest_volume
 
     def launch(self) -> None:
         """Launch what brings the plan and the material up to date, or record it."""

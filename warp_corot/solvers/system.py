@@ -61,8 +61,8 @@ class System:
 
     def add_elastic_forces(self, k: int, offset: int = 0) -> None:
         """Launch the elastic forces of the k-th body, of the ``offset``-th step since the clock was last advanced."""
-        state, field = self.bodies[k].state, self.fields[k]
-        field.begin_step(self.pace, offset)
+        body, state, field = self.bodies[k], self.bodies[k].state, self.fields[k]
+        body.conditions.follow_activations(self.pace, offset)
         field.add_forces(state.displacements, state.forces)
 
     def adopt_positions(self) -> None:

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import warp as wp
 
-from warp_corot.discretization.clock import Clock
 from warp_corot.elasticity.model import ForceField
 from warp_corot.elasticity.paths.lanes import Lanes, as_general
 from warp_corot.kernels.corotated.anisotropic import anisotropic_energies, anisotropic_von_mises, scatter_anisotropic
@@ -16,10 +15,9 @@ from warp_corot.kernels.corotated.anisotropic_cpu import (
     turn_changed,
     turn_elements,
 )
-from warp_corot.kernels.stepping.activation import follow_activation
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.discretization import Discretization
 
 
 class AnisotropicField(ForceField):
@@ -34,20 +32,20 @@ class AnisotropicField(ForceField):
     both momenta; it puts work in, so that there is no energy of it.
 
     Args:
-        body: Of an ``Anisotropic`` material.
+        discretization: Of an ``Anisotropic`` material.
         rotation: Device function that finds rotations.
         deterministic: As for every field.
     """
 
     takes_anisotropic: ClassVar[bool] = True
 
-    def __init__(self, body: SoftBody, rotation: wp.Function, deterministic: bool):
-        super().__init__(body, deterministic)
-        kind = body.element_kind
+    def __init__(self, discretization: Discretization, rotation: wp.Function, deterministic: bool):
+        super().__init__(discretization, deterministic)
+        kind = discretization.element_kind
         self._forces = scatter_anisotropic(kind, rotation)
         self._energies = anisotropic_energies(kind, rotation)
         self._von_mises = anisotropic_von_mises(kind, rotation)
-        self.material = body.discretization.anisotropic_material()
+        self.material = discretization.anisotropic_material()
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         self.launch(self._forces, self.element_count, [self.elements, self.material, *self._activation, u], [f])
@@ -59,31 +57,23 @@ class AnisotropicField(ForceField):
         inputs = [self.elements, self.material, *self._activation, u]
         self.launch(self._von_mises, self.element_count, inputs, [stress])
 
-    def begin_step(self, clock: Clock, offset: int) -> None:
-        body = self.body
-        conditions = body.conditions
-        for activation in conditions.activations:
-            inputs = [activation.elements, activation.times, activation.stress, clock.arrays, conditions.world_starts]
-            inputs += [body.world_element_count, offset]
-            self.launch(follow_activation, len(activation.elements), inputs, [body.conditions.activation])
-
     @property
     def _activation(self) -> list:
-        return [int(self.body.conditions.has_activation), self.body.conditions.activation]
+        return [int(self.discretization.has_activation), self.discretization.activation]
 
 
 class AnisotropicLanesField(AnisotropicField):
     """On the CPU, eight elements at a time."""
 
-    def __init__(self, body: SoftBody, rotation: wp.Function, deterministic: bool):
-        super().__init__(body, rotation, deterministic)
+    def __init__(self, discretization: Discretization, rotation: wp.Function, deterministic: bool):
+        super().__init__(discretization, rotation, deterministic)
         # The elements as general ones, their rest matrices turned into the material's axes.
         inputs = [self.elements, self.material]
-        self._general = as_general(self.elements, turn_elements(body.element_kind), inputs)
+        self._general = as_general(self.elements, turn_elements(discretization.element_kind), inputs)
         self.follow()
 
     def follow(self) -> None:
-        count, repair = self.element_count, repair_anisotropic(self.body.element_kind)
+        count, repair = self.element_count, repair_anisotropic(self.discretization.element_kind)
         elements, general = _first(self.elements, count), _first(self._general, count)
         self._lanes = Lanes(elements, general, scatter=scatter_anisotropic_lanes, repair=repair)
 

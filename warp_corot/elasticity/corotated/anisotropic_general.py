@@ -17,21 +17,23 @@ from warp_corot.materials.anisotropic import TransverselyIsotropic
 from .anisotropic import AnisotropicField
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.discretization import Discretization
 
 
 class GeneralAnisotropicField(AnisotropicField):
     """Single elements whose forces need no settled order.
 
     Args:
-        body: Of an ``Anisotropic`` material; a general mesh's, or of a forest that has few groups of subtrees.
+        discretization: Of an ``Anisotropic`` material; a general mesh's, or of a forest that has few groups of subtrees.
     """
 
-    def __init__(self, body: SoftBody):
-        super().__init__(body, quick_rotation, deterministic=False)
+    def __init__(self, discretization: Discretization):
+        super().__init__(discretization, quick_rotation, deterministic=False)
         axes = self.material.axes
-        law = anisotropic_law(isinstance(body.material, TransverselyIsotropic))
-        self.scatter = ClusterScatter(self.elements, law, ActiveMaterial, chosen=clustered(body), layout=ANISOTROPIC)
+        law = anisotropic_law(isinstance(discretization.material, TransverselyIsotropic))
+        self.scatter = ClusterScatter(
+            self.elements, law, ActiveMaterial, chosen=clustered(discretization), layout=ANISOTROPIC
+        )
         self._quaternions = wp.empty(len(axes), dtype=wp.quat, device=self.device)
         self.launch(quaternions_of, len(axes), [axes], [self._quaternions])
 

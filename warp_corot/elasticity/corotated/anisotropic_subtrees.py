@@ -21,19 +21,19 @@ from .anisotropic import AnisotropicField
 from .anisotropic_general import active_material
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.discretization import Discretization
 
 
 class AnisotropicSubtreeField(AnisotropicField):
     """Complete subtrees in batches; what is left over leaf by leaf, or where the mesh stays as it is in clusters.
 
     Args:
-        body: A forest's, of an ``Anisotropic`` material, on CUDA.
+        discretization: A forest's, of an ``Anisotropic`` material, on CUDA.
     """
 
-    def __init__(self, body: SoftBody):
-        super().__init__(body, quick_rotation, deterministic=False)
-        self._transverse = isinstance(body.material, TransverselyIsotropic)
+    def __init__(self, discretization: Discretization):
+        super().__init__(discretization, quick_rotation, deterministic=False)
+        self._transverse = isinstance(discretization.material, TransverselyIsotropic)
         self._quaternions = wp.empty(len(self.material.axes), dtype=wp.quat, device=self.device)
         self.derive()
         self.follow()

@@ -24,7 +24,7 @@ from warp_corot.kernels.corotated.corotated import (
 from warp_corot.kernels.elements.general_cpu import repair_elements, scatter_elements
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.discretization import Discretization
 
     from .model import Corotated
 
@@ -47,16 +47,16 @@ class CorotatedField(ForceField):
     #: Whether complete subtrees go as one.
     takes_subtrees: ClassVar[bool] = False
 
-    def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
+    def __init__(self, discretization: Discretization, model: Corotated, deterministic: bool):
         self.model = model
-        super().__init__(body, deterministic)
-        kind = body.element_kind
+        super().__init__(discretization, deterministic)
+        kind = discretization.element_kind
         self._shared: Rotations | None = None
         self._fused = model.level is None and model.rotation != "warm" and model.stiffness == "factored"
         self._state: dict[str, wp.array] = {}
         if model.rotation == "warm":
             self._state["quaternions"] = wp.empty(self.unit_count, dtype=wp.quat, device=self.device)
-            self.reset(wp.ones(body.worlds, dtype=wp.int32, device=self.device))
+            self.reset(wp.ones(discretization.worlds, dtype=wp.int32, device=self.device))
             self._extract = extract_warm_rotations(kind)
         else:
             self._extract = extract_rotations(kind, model.own_rotation)
@@ -74,7 +74,7 @@ class CorotatedField(ForceField):
 
     def reset(self, chosen: wp.array) -> None:
         for quaternions in self._state.values():
-            in_world = len(quaternions) // self.body.worlds
+            in_world = len(quaternions) // self.discretization.worlds
             self.launch(reset_quaternions, len(quaternions), [chosen, in_world], [quaternions])
 
     @property
@@ -139,8 +139,8 @@ class CorotatedField(ForceField):
 class LeafField(CorotatedField):
     """Leaf by leaf."""
 
-    def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
-        super().__init__(body, model, deterministic)
+    def __init__(self, discretization: Discretization, model: Corotated, deterministic: bool):
+        super().__init__(discretization, model, deterministic)
         if not self._fused:
             self._sharing()
 
@@ -153,8 +153,8 @@ class LeafField(CorotatedField):
 class LanesField(CorotatedField):
     """General elements on the CPU."""
 
-    def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
-        super().__init__(body, model, deterministic)
+    def __init__(self, discretization: Discretization, model: Corotated, deterministic: bool):
+        super().__init__(discretization, model, deterministic)
         self._lanes = Lanes(self.elements, self.elements, scatter=scatter_elements, repair=repair_elements)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
+from warp_corot.discretization.discretization import discretization_of
 from warp_corot.elasticity.model import Model
 from warp_corot.elasticity.paths.general import CorotatedGeneralField
 from warp_corot.elasticity.polar import METHODS, rotation_function
 from warp_corot.errors import InputError
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
-from warp_corot.materials.anisotropic import Anisotropic
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.forest import MAX_LEVEL
 
@@ -24,7 +24,7 @@ from .elements import CorotatedField, LanesField, LeafField
 from .subtrees import SubtreeField
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.discretization import Discretization, Discretized
 
 STIFFNESSES = ("factored", "sparse", "dense")
 #: The tolerance that "auto" stands for [rad]: it moves the end of the paper's beam by 0.24 mm where it sinks by 87, a
@@ -95,25 +95,28 @@ class Corotated(Model):
     def kept_of_elements(self) -> str | None:
         return "rotation is 'warm', which is kept from step to step" if self.rotation == "warm" else None
 
-    def bind(self, body: SoftBody, *, deterministic: bool = False) -> CorotatedField | AnisotropicField:
-        if isinstance(body.material, Anisotropic):
-            return self._bind_anisotropic(body, deterministic)
+    def bind(
+        self, body: Discretized | Discretization, *, deterministic: bool = False
+    ) -> CorotatedField | AnisotropicField:
+        discretization = discretization_of(body)
+        if discretization.is_anisotropic:
+            return self._bind_anisotropic(discretization, deterministic)
         fast = self.rotation == "byers-xu" and self.iterations is None and self.stiffness == "factored"
         fast = fast and self.subtrees
-        if isinstance(body.mesh, TetForest):
+        if isinstance(discretization.mesh, TetForest):
             if fast:
-                return SubtreeField(body, self, deterministic)
+                return SubtreeField(discretization, self, deterministic)
         elif self.level is not None:
             raise InputError(f"rotation_level {self.rotation_level} needs a forest; a general mesh has no tree")
         elif self.stiffness != "factored":
             raise InputError(f"stiffness {self.stiffness!r} needs a forest; general elements have no three shapes")
-        elif fast and body.device.is_cpu:
-            return LanesField(body, self, deterministic)
+        elif fast and discretization.device.is_cpu:
+            return LanesField(discretization, self, deterministic)
         elif fast and not deterministic:
-            return CorotatedGeneralField(body, self)
-        return LeafField(body, self, deterministic)
+            return CorotatedGeneralField(discretization, self)
+        return LeafField(discretization, self, deterministic)
 
-    def _bind_anisotropic(self, body: SoftBody, deterministic: bool) -> AnisotropicField:
+    def _bind_anisotropic(self, discretization: Discretization, deterministic: bool) -> AnisotropicField:
         for name, given, wanted in (
             ("rotation_level", self.rotation_level, None),
             ("stiffness", self.stiffness, "factored"),
@@ -123,11 +126,11 @@ class Corotated(Model):
         if self.rotation == "warm":
             raise InputError("rotation is 'warm'; with an anisotropic material it must be 'byers-xu' or 'svd'")
         quick = self.own_rotation is quick_rotation
-        if quick and body.device.is_cuda and not deterministic:
-            subtrees = body.discretization.prefers_subtrees
-            return (AnisotropicSubtreeField if subtrees else GeneralAnisotropicField)(body)
-        lanes = quick and body.device.is_cpu
-        return (AnisotropicLanesField if lanes else AnisotropicField)(body, self.own_rotation, deterministic)
+        if quick and discretization.device.is_cuda and not deterministic:
+            subtrees = discretization.prefers_subtrees
+            return (AnisotropicSubtreeField if subtrees else GeneralAnisotropicField)(discretization)
+        lanes = quick and discretization.device.is_cpu
+        return (AnisotropicLanesField if lanes else AnisotropicField)(discretization, self.own_rotation, deterministic)
 
     @property
     def own_rotation(self) -> wp.Function:

@@ -27,7 +27,7 @@ from .left_out import LeftOutLeaves
 from .own_launches import OwnLaunches
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.discretization import Discretization
 
     from .model import Corotated
 
@@ -37,13 +37,13 @@ class SubtreeField(CorotatedField):
 
     takes_subtrees = True
 
-    def __init__(self, body: SoftBody, model: Corotated, deterministic: bool):
-        super().__init__(body, model, deterministic)
-        self._uniform = body.material_stride == 0
+    def __init__(self, discretization: Discretization, model: Corotated, deterministic: bool):
+        super().__init__(discretization, model, deterministic)
+        self._uniform = discretization.material_stride == 0
         #: What adds the forces of all leaves, whatever they come to be.
         self._clusters: ChangingClusterScatter | None = None
         if self._listed and self.rotation_level is None:
-            self._clusters = ChangingClusterScatter.of(body, self.plan, isotropic_law(corotated_stress))
+            self._clusters = ChangingClusterScatter.of(discretization, self.plan, isotropic_law(corotated_stress))
         self.follow()
 
     def derive(self) -> None:
@@ -98,7 +98,7 @@ class SubtreeField(CorotatedField):
             self._flat_material = [*flat.material, 1]
         elif not self._uniform:
             leaves = flat.leaves.numpy()
-            chosen = [a.numpy()[leaves] for a in (self.body.mu, self.body.lam)]
+            chosen = [a.numpy()[leaves] for a in (self.discretization.mu, self.discretization.lam)]
             self._flat_material = [*(wp.array(a, dtype=wp.float32, device=self.device) for a in chosen), 1]
         if self.device.is_cpu and flat.unit is None:
             general = flat.general or as_general(flat.elements, rest_matrices, [flat.elements])
@@ -145,12 +145,12 @@ class SubtreeField(CorotatedField):
         return subtree_cpu.scatter_subtrees_shared(shape, given)
 
     def _launch_batch(self, batch: Batch, kernel: wp.Kernel, u: wp.array, f: wp.array) -> None:
-        body = self.body
+        discretization = self.discretization
         own = batch.sharing is Sharing.OWN
         outputs = [f, batch.flagged]
         if self.device.is_cuda:
             threads = batch.count
-            inputs = [batch.subtrees, body.mu, body.lam, u]
+            inputs = [batch.subtrees, discretization.mu, discretization.lam, u]
             outputs.append(LeftOutLeaves.NONE if self._left_out is None else self._left_out.list_of(batch))
         else:
             threads = -(-batch.count // LANES)

@@ -32,7 +32,7 @@ from warp_corot.kernels.tables.cluster_layout import (
 from .lanes import as_general
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.discretization import Discretization
 
 #: Leaves of a subtree.
 SUBTREE = 8
@@ -126,7 +126,7 @@ class ChangingClusterScatter:
     """Adds the forces of all leaves of a forest that changes.
 
     Args:
-        body: Whose mesh changes; launches go through its ``launch_elements``.
+        discretization: Whose mesh changes; launches go through its ``launch_elements``.
         elements: The leaves, with padding.
         counts: How many there are.
         law: A function of ``kernels.clusters.laws``, which does not mind which axes its gradients are on.
@@ -138,13 +138,13 @@ class ChangingClusterScatter:
 
     def __init__(
         self,
-        body: SoftBody,
+        discretization: Discretization,
         elements: Any,
         counts: LeafCounts,
         law: wp.Function,
         layout: ClusterLayout = DEFAULT_LAYOUT,
     ):
-        self._body, self._leaves, self._counts, self._layout = body, elements, counts, layout
+        self._discretization, self._leaves, self._counts, self._layout = discretization, elements, counts, layout
         self._device = elements.nodes.device
         self.clusters, self._places = changing_clusters(counts.most, counts.now, layout)
         self._words = wp.array(axis_words(elements.frames.numpy()).ravel(), dtype=wp.int32, device=self._device)
@@ -156,9 +156,9 @@ class ChangingClusterScatter:
         wp.load_module(self._kernel.module, self._device, block_dim=layout.threads)
 
     @classmethod
-    def of(cls, body: SoftBody, plan: Plan, law: wp.Function) -> ChangingClusterScatter | None:
+    def of(cls, discretization: Discretization, plan: Plan, law: wp.Function) -> ChangingClusterScatter | None:
         """The clusters of all leaves of a plan whose leaves change, None where they do not."""
-        return None if plan.counts is None else cls(body, plan.elements, plan.counts, law)
+        return None if plan.counts is None else cls(discretization, plan.elements, plan.counts, law)
 
     def derive(self) -> None:
         """Launch what finds the clusters, if the plan has just been derived; may be recorded."""
@@ -169,7 +169,7 @@ class ChangingClusterScatter:
 
     def __call__(self, material: Any, u: wp.array, f: wp.array) -> None:
         """As ``ClusterScatter`` does."""
-        threads, count = self._layout.threads, -(-self._body.sizes.launch_elements // self._layout.elements)
+        threads, count = self._layout.threads, -(-self._discretization.sizes.launch_elements // self._layout.elements)
         wp.launch(
             self._kernel,
             dim=count * threads,

@@ -18,38 +18,38 @@ from warp_corot.mesh import TetForest
 from .clusters import ClusterScatter
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.discretization import Discretization
     from warp_corot.elasticity.corotated.model import Corotated
 
 
-def clustered(body: SoftBody) -> np.ndarray:
+def clustered(discretization: Discretization) -> np.ndarray:
     """A body's elements, of all worlds, in the order of clusters: int32 [worlds * T]."""
-    mesh = body.mesh
+    mesh = discretization.mesh
     if isinstance(mesh, TetForest):
-        return np.arange(body.worlds * len(mesh.tets), dtype=np.int32)
-    return in_worlds(order_in_clusters(mesh.points, mesh.tets), body.worlds, len(mesh.tets))
+        return np.arange(discretization.worlds * len(mesh.tets), dtype=np.int32)
+    return in_worlds(order_in_clusters(mesh.points, mesh.tets), discretization.worlds, len(mesh.tets))
 
 
 class LawGeneralField(LawField):
     """A law on single elements whose forces need no settled order.
 
     Args:
-        body: A general mesh's, or of a forest that has few groups of subtrees.
+        discretization: A general mesh's, or of a forest that has few groups of subtrees.
         stress, energy, cauchy: The law, functions of ``kernels.elements.constitutive``.
         deterministic: False; slots of elements are not shared, so there is nothing to add up.
     """
 
     def __init__(
         self,
-        body: SoftBody,
+        discretization: Discretization,
         *,
         stress: wp.Function,
         energy: wp.Function,
         cauchy: wp.Function,
         deterministic: bool = False,
     ):
-        super().__init__(body, stress=stress, energy=energy, cauchy=cauchy, deterministic=deterministic)
-        self._scatter = ClusterScatter(self.elements, isotropic_law(stress), chosen=clustered(body))
+        super().__init__(discretization, stress=stress, energy=energy, cauchy=cauchy, deterministic=deterministic)
+        self._scatter = ClusterScatter(self.elements, isotropic_law(stress), chosen=clustered(discretization))
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         self._scatter(isotropic_material(self.material_inputs), u, f)
@@ -58,10 +58,10 @@ class LawGeneralField(LawField):
 class CorotatedGeneralField(LeafField):
     """The corotated law with own rotations on general elements whose forces need no settled order."""
 
-    def __init__(self, body: SoftBody, model: Corotated):
-        super().__init__(body, model, deterministic=False)
+    def __init__(self, discretization: Discretization, model: Corotated):
+        super().__init__(discretization, model, deterministic=False)
         law = isotropic_law(corotated_law(model.own_rotation))
-        self._scatter = ClusterScatter(self.elements, law, chosen=clustered(body))
+        self._scatter = ClusterScatter(self.elements, law, chosen=clustered(discretization))
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         self._scatter(isotropic_material(self.material_inputs), u, f)

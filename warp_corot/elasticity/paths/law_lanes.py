@@ -17,24 +17,24 @@ from warp_corot.mesh import TetForest
 from .lanes import Lanes, as_general
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.discretization import Discretization
 
 
 class LawLanesField(LawField):
     """Complete subtrees of a forest as units of work, other elements one by one, eight of each in the lanes.
 
     Args:
-        body: On the CPU.
+        discretization: On the CPU.
         law: A key of ``kernels.elements.law_lanes.LAWS``.
         functions: As for ``LawField``.
     """
 
-    def __init__(self, body: SoftBody, *, law: str, **functions: Any):
-        super().__init__(body, **functions)
+    def __init__(self, discretization: Discretization, *, law: str, **functions: Any):
+        super().__init__(discretization, **functions)
         self._law = law
         self._lanes: Lanes | None = None
         self._lanes_material = self.material_inputs
-        if not isinstance(body.mesh, TetForest):
+        if not isinstance(discretization.mesh, TetForest):
             self._lanes = Lanes(self.elements, self.elements, scatter=scatter_law_elements(law))
         else:
             self.follow()
@@ -66,8 +66,8 @@ class LawLanesField(LawField):
         """The kernel arguments mu, lam and stride of leaves that are in no subtree."""
         if flat.material is not None:
             return [*flat.material, 1]
-        if self.body.material_stride == 0:
+        if self.discretization.material_stride == 0:
             return self.material_inputs
         leaves = flat.leaves.numpy()
-        chosen = [array.numpy()[leaves] for array in (self.body.mu, self.body.lam)]
+        chosen = [array.numpy()[leaves] for array in (self.discretization.mu, self.discretization.lam)]
         return [*(wp.array(values, dtype=wp.float32, device=self.device) for values in chosen), 1]

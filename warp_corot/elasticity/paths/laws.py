@@ -14,32 +14,32 @@ from .law_lanes import LawLanesField
 from .subtrees import LawSubtreeField
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.discretization import Discretization
 
 
 def law_field(
     law: str,
-    body: SoftBody,
+    discretization: Discretization,
     *,
     stress: wp.Function,
     energy: wp.Function,
     cauchy: wp.Function,
     deterministic: bool = False,
 ) -> LawField:
-    """The fastest force field of a law on a body.
+    """The fastest force field of a law on a discretization.
 
     Args:
         law: Its name among those that run in lanes on the CPU, a key of ``kernels.elements.law_lanes.LAWS``.
-        body: The body.
+        discretization: The mesh and the material.
         stress, energy, cauchy: The law, functions of ``kernels.elements.constitutive``.
         deterministic: As for every field.
     """
     functions = {"stress": stress, "energy": energy, "cauchy": cauchy}
-    if body.device.is_cpu:
-        return LawLanesField(body, law=law, **functions, deterministic=deterministic)
-    kind = LawField
-    if isinstance(body.mesh, TetForest) and (deterministic or body.discretization.prefers_subtrees):
+    if discretization.device.is_cpu:
+        return LawLanesField(discretization, law=law, **functions, deterministic=deterministic)
+    kind: type[LawField] = LawField
+    if isinstance(discretization.mesh, TetForest) and (deterministic or discretization.prefers_subtrees):
         kind = LawSubtreeField
     elif not deterministic:
         kind = LawGeneralField
-    return kind(body, **functions, deterministic=deterministic)
+    return kind(discretization, **functions, deterministic=deterministic)

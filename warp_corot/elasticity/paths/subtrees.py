@@ -18,7 +18,7 @@ from warp_corot.kernels.subtrees.laws import scatter_subtrees
 from .clusters import others_in_clusters
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.discretization.discretization import Discretization
 
 
 class LawSubtreeField(LawField):
@@ -26,23 +26,23 @@ class LawSubtreeField(LawField):
     it is these go in clusters, and with them the subtrees that are in no group.
 
     Args:
-        body: A forest's, on CUDA.
+        discretization: A forest's, on CUDA.
         stress, energy, cauchy: The law, functions of ``kernels.elements.constitutive``.
         deterministic: As for every field.
     """
 
     def __init__(
         self,
-        body: SoftBody,
+        discretization: Discretization,
         *,
         stress: wp.Function,
         energy: wp.Function,
         cauchy: wp.Function,
         deterministic: bool = False,
     ):
-        super().__init__(body, stress=stress, energy=energy, cauchy=cauchy, deterministic=deterministic)
+        super().__init__(discretization, stress=stress, energy=energy, cauchy=cauchy, deterministic=deterministic)
         self._stress = stress
-        self._uniform = body.material_stride == 0
+        self._uniform = discretization.material_stride == 0
         self.follow()
 
     def plan_of(self, discretization: Discretization) -> Plan:
@@ -63,15 +63,15 @@ class LawSubtreeField(LawField):
             return [*flat.material, 1]
         if self._uniform or not len(flat):
             return self.material_inputs
-        return [*(chosen(values, flat.leaves) for values in (self.body.mu, self.body.lam)), 1]
+        return [*(chosen(values, flat.leaves) for values in (self.discretization.mu, self.discretization.lam)), 1]
 
     def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
         return scatter_subtrees(shape, grouped, self._uniform, self._stress)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        body, flat = self.body, self._flat
+        discretization, flat = self.discretization, self._flat
         for batch, kernel in zip(self._batches, self._kernels, strict=True):
-            inputs = [batch.subtrees, body.mu, body.lam, u]
+            inputs = [batch.subtrees, discretization.mu, discretization.lam, u]
             wp.launch(kernel, batch.count, inputs=inputs, outputs=[f], device=self.device, block_dim=subtree_cuda.BLOCK)
         if flat is not None:
             self.launch(self._forces, len(flat), [flat.elements, *self._flat_material, u], [f])

@@ -130,7 +130,7 @@ def _pack_state(body: SoftBody, prefix: str, arrays: dict[str, np.ndarray]) -> N
         times, displacements = trajectory.keys()
         arrays[f"{prefix}trajectory{k}.times"] = times
         arrays[f"{prefix}trajectory{k}.displacements"] = displacements
-    if body.conditions.has_activation:
+    if body.discretization.has_activation:
         arrays[prefix + "activation"] = body.activation.numpy()
     for k, activation in enumerate(body.conditions.activations):
         for name in ("elements", "times", "stress"):

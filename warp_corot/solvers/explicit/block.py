@@ -61,7 +61,9 @@ class BlockSteps:
             return None
         if not any(layout.fits for layout in _layouts(body, 0, False, len(body.mesh.tets) // 8)):
             return None
-        plan = ForcePlan.of_forest(body.mesh, field.rotation_level, body.device, elements=body.elements, grouped=False)
+        plan = ForcePlan.of_forest(
+            body.mesh, field.rotation_level, body.device, elements=body.discretization.elements, grouped=False
+        )
         if len(plan.batches) != 1 or len(plan.flat) or plan.batches[0].sharing is Sharing.ABOVE:
             return None
         batch = plan.batches[0]
@@ -87,9 +89,9 @@ class BlockSteps:
                 count,
                 damping,
                 system.gravity,
-                body.mu,
-                body.lam,
-                body.material_stride,
+                body.discretization.mu,
+                body.discretization.lam,
+                body.discretization.material_stride,
                 body.conditions.mass,
                 body.conditions.inverse_mass,
                 int(body.conditions.has_loads),
@@ -111,7 +113,7 @@ def _layouts(body: SoftBody, shape: int, shared: bool, subtrees: int, tolerance:
     """
     parts = (2, 1) if body.worlds <= body.device.sm_count else (1,)
     capacity = -(-subtrees // WARP) * WARP
-    uniform = body.is_uniform
+    uniform = body.discretization.is_uniform
     return [
         Layout(shape, shared, uniform, count, capacity, body.world_node_count, tolerance=tolerance) for count in parts
     ]

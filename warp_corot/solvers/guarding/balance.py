@@ -98,7 +98,7 @@ class Balance:
     @property
     def is_closed(self) -> bool:
         """Whether nothing but gravity, loads and supports puts work in: active stress does."""
-        return not any(body.conditions.has_activation for body in self.bodies)
+        return not any(body.discretization.has_activation for body in self.bodies)
 
     def prepare(self) -> None:
         """Make room for the energies of the present elements; not while launches are recorded."""
@@ -173,7 +173,9 @@ class Balance:
         """Energies that float32 cannot tell from none [J], of each world: of strains of about 4e-4."""
         found = np.zeros(self.worlds)
         for body in self.bodies:
-            stiffness = 2.0 * float(body.mu.numpy().mean()) + float(body.lam.numpy().mean())
+            stiffness = 2.0 * float(body.discretization.mu.numpy().mean()) + float(
+                body.discretization.lam.numpy().mean()
+            )
             found += 1e-7 * stiffness * float(np.sum(body.mesh.volumes))
         return found
 

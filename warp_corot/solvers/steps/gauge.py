@@ -42,13 +42,13 @@ class Gauge:
         self.scale = wp.zeros(1, dtype=wp.float32, device=body.device)
         self.rescale()
         # Loading within a recording would end it on some drivers.
-        wp.load_module(kernels.find_strains(body.element_kind).module, body.device)
+        wp.load_module(kernels.find_strains(body.discretization.element_kind).module, body.device)
 
     def rescale(self) -> None:
         """Fit the probing motion to the present mesh: the lightest free node moves a share of the smallest element."""
         inverse = self.body.conditions.inverse_mass[: self.body.node_count].numpy()
         lightest = float(inverse.max())
-        size = self.body.smallest_volume ** (1.0 / 3.0)
+        size = self.body.discretization.smallest_volume ** (1.0 / 3.0)
         self.scale.fill_(PROBE * size / np.sqrt(lightest) if lightest > 0 else 0.0)
 
     def restart(self) -> None:
@@ -65,10 +65,10 @@ class Gauge:
         body = self.body
         self._find_curvature(body.state.displacements, body.state.forces)
         wp.launch(
-            kernels.find_strains(body.element_kind),
+            kernels.find_strains(body.discretization.element_kind),
             dim=-(-body.sizes.launch_elements // int(kernels.TURNS)),
             inputs=[
-                body.elements,
+                body.discretization.elements,
                 body.state.displacements,
                 body.state.velocities,
                 pace.arrays,

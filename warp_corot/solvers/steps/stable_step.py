@@ -40,7 +40,11 @@ def largest_frequency(body: SoftBody, field: SmallForces) -> float:
     Zero if no node is free to move.
     """
     largest = largest_eigenvalue(
-        field, body.conditions.inverse_mass, body.smallest_volume, body.sizes.nodes, body.sizes.launch_nodes
+        field,
+        body.conditions.inverse_mass,
+        body.discretization.smallest_volume,
+        body.sizes.nodes,
+        body.sizes.launch_nodes,
     )
     return float(np.sqrt(largest))
 
