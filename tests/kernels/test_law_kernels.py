@@ -181,7 +181,7 @@ def strained(mesh, rng, device):
 def leaf_by_leaf(field, active, u):
     """Forces [N, 3] of the kernel that test_anisotropy compares with the oracle."""
     f = wp.zeros_like(u)
-    kernel = scatter_anisotropic(field.body.element_kind, byers_xu)
-    inputs = [field.body.elements, field.material, 1, active, u]
+    kernel = scatter_anisotropic(field.discretization.element_kind, byers_xu)
+    inputs = [field.discretization.elements, field.material, 1, active, u]
     wp.launch(kernel, field.element_count, inputs=inputs, outputs=[f], device=u.device)
     return f.numpy()[:, :3]

@@ -99,7 +99,7 @@ def test_pulled_and_pressed_at_random(seconds, device):
             assert body.mesh.volumes.sum() == pytest.approx(volume, rel=1e-12)
             assert body.masses.min() > 0
             memory.append(resident(device))
-    print(f"{sim.total_steps} steps, {body.sizes.version} meshes of {min(counts)} to {max(counts)} elements")
+    print(f"{sim.total_steps} steps, {body.version} meshes of {min(counts)} to {max(counts)} elements")
     print("memory [MB]", [m >> 20 for m in memory])
     assert sim.total_time == pytest.approx(seconds, abs=sim.dt)
     assert max(counts) > 3 * min(counts)

@@ -304,12 +304,12 @@ def test_a_turning_body_turns_on_as_fast(device):
         arm = x - m @ x / m.sum()
         return m @ np.cross(arm, v)[:, 2], m @ (arm[:, :2] ** 2).sum(axis=1), sim.energy().total
 
-    (momentum, inertia, energy), revision = motion(), body.sizes.version
+    (momentum, inertia, energy), revision = motion(), body.version
     assert momentum / inertia == pytest.approx(3.0, rel=1e-5)
     for x in np.linspace(0.0, 0.2, 11):
         remesh.parameters.assign([x, 0.02])
         sim.advance_steps(20)
-    assert body.sizes.version > revision + 10
+    assert body.version > revision + 10
     found = motion()
     assert found[1] > 1.005 * inertia
     # A pass keeps neither to the last digit where velocities vary along an edge: -0.4 % here.
