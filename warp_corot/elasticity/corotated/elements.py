@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import warp as wp
 
@@ -26,7 +26,27 @@ from warp_corot.kernels.elements.general_cpu import repair_elements, scatter_ele
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
 
-    from .model import Corotated
+
+class CorotatedOptions(Protocol):
+    """What fields read of the model; see ``corotated.Corotated``."""
+
+    @property
+    def rotation_level(self) -> int | float | str | None: ...
+
+    @property
+    def level(self) -> int | None: ...
+
+    @property
+    def tolerance(self) -> float | None: ...
+
+    @property
+    def rotation(self) -> str: ...
+
+    @property
+    def own_rotation(self) -> wp.Function: ...
+
+    @property
+    def stiffness(self) -> str: ...
 
 
 @dataclass(frozen=True)
@@ -47,7 +67,7 @@ class CorotatedField(ForceField):
     #: Whether complete subtrees go as one.
     takes_subtrees: ClassVar[bool] = False
 
-    def __init__(self, discretization: Discretization, model: Corotated, deterministic: bool):
+    def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
         self.model = model
         super().__init__(discretization, deterministic)
         kind = discretization.element_kind
@@ -139,7 +159,7 @@ class CorotatedField(ForceField):
 class LeafField(CorotatedField):
     """Leaf by leaf."""
 
-    def __init__(self, discretization: Discretization, model: Corotated, deterministic: bool):
+    def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
         super().__init__(discretization, model, deterministic)
         if not self._fused:
             self._sharing()
@@ -153,7 +173,7 @@ class LeafField(CorotatedField):
 class LanesField(CorotatedField):
     """General elements on the CPU."""
 
-    def __init__(self, discretization: Discretization, model: Corotated, deterministic: bool):
+    def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
         super().__init__(discretization, model, deterministic)
         self._lanes = Lanes(self.elements, self.elements, scatter=scatter_elements, repair=repair_elements)
 

@@ -22,14 +22,12 @@ from warp_corot.kernels.subtrees import cpu as subtree_cpu
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
 from warp_corot.kernels.subtrees.repair import repair_own, repair_shared
 
-from .elements import CorotatedField, Rotations
+from .elements import CorotatedField, CorotatedOptions, Rotations
 from .left_out import LeftOutLeaves
 from .own_launches import OwnLaunches
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
-
-    from .model import Corotated
 
 
 class SubtreeField(CorotatedField):
@@ -37,7 +35,7 @@ class SubtreeField(CorotatedField):
 
     takes_subtrees = True
 
-    def __init__(self, discretization: Discretization, model: Corotated, deterministic: bool):
+    def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
         super().__init__(discretization, model, deterministic)
         self._uniform = discretization.material_stride == 0
         #: What adds the forces of all leaves, whatever they come to be.

@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_corot.discretization.clusters.single import isotropic_material, order_in_clusters
 from warp_corot.discretization.elements import in_worlds
-from warp_corot.elasticity.corotated.elements import LeafField
+from warp_corot.elasticity.corotated.elements import CorotatedOptions, LeafField
 from warp_corot.elasticity.model import LawField
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.elements.general_cuda import corotated_law
@@ -19,7 +19,6 @@ from .clusters import ClusterScatter
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
-    from warp_corot.elasticity.corotated.model import Corotated
 
 
 def clustered(discretization: Discretization) -> np.ndarray:
@@ -58,7 +57,7 @@ class LawGeneralField(LawField):
 class CorotatedGeneralField(LeafField):
     """The corotated law with own rotations on general elements whose forces need no settled order."""
 
-    def __init__(self, discretization: Discretization, model: Corotated):
+    def __init__(self, discretization: Discretization, model: CorotatedOptions):
         super().__init__(discretization, model, deterministic=False)
         law = isotropic_law(corotated_law(model.own_rotation))
         self._scatter = ClusterScatter(self.elements, law, chosen=clustered(discretization))
