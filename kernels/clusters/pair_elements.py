@@ -115,14 +115,14 @@ def lower_half(word: wp.uint32):
 
 
 @wp.func
-def scaled_displacement(pairs: LatticePairs, u: wp.vec3):
-    """A displacement in what B is the inverse of."""
-    return pairs.inverse_cell * u
+def scaled_difference(pairs: LatticePairs, difference: wp.vec3):
+    """A difference of displacements in what B is the inverse of: scaled before, it would lose digits."""
+    return pairs.inverse_cell * difference
 
 
 @wp.func
-def scaled_displacement(pairs: GeneralPairs, u: wp.vec3):
-    return u
+def scaled_difference(pairs: GeneralPairs, difference: wp.vec3):
+    return difference
 
 
 @wp.func
@@ -186,7 +186,7 @@ def second_scale(pairs: GeneralPairs, record: general_record):
 
 @functools.cache
 def pair_forces(law: wp.Function) -> wp.Function:
-    """Forces on the five nodes of the i-th pair, of their scaled displacements, by a law of ``laws``."""
+    """Forces on the five nodes of the i-th pair, of their displacements, by a law of ``laws``."""
 
     @wp.func
     def pair_forces(
@@ -201,14 +201,14 @@ def pair_forces(law: wp.Function) -> wp.Function:
         ud: wp.vec3,
         ue: wp.vec3,
     ):
-        e1 = ub - ua
-        e2 = uc - ua
+        e1 = scaled_difference(pairs, ub - ua)
+        e2 = scaled_difference(pairs, uc - ua)
         b = first_matrix(record)
-        w = wp.matrix_from_cols(e1, e2, ud - ua) * b
+        w = wp.matrix_from_cols(e1, e2, scaled_difference(pairs, ud - ua)) * b
         h = law(material, listed, 2 * i, first_scale(pairs, record), w) * wp.transpose(b)
         f1, f2, f3 = -column(h, 0), -column(h, 1), -column(h, 2)
         b = second_matrix(record)
-        w = wp.matrix_from_cols(e1, e2, ue - ua) * b
+        w = wp.matrix_from_cols(e1, e2, scaled_difference(pairs, ue - ua)) * b
         h = law(material, listed, 2 * i + 1, second_scale(pairs, record), w) * wp.transpose(b)
         f1 -= column(h, 0)
         f2 -= column(h, 1)

@@ -23,7 +23,6 @@ from .pair_elements import (
     pair_forces,
     quad_of,
     record_of,
-    scaled_displacement,
     vec4u,
 )
 from .single import add_sum, shared_quads, vector_of
@@ -124,7 +123,7 @@ def scatter_pairs(Pairs: Any, Material: Any, law: wp.Function, layout: PairLayou
                     fetch_quad(pairs.records, k * pairs.count + later)
         at = wp.static(QUAD_BYTES) * thread
         if node >= 0:
-            displacement(wp.static(STORE), at, scaled_displacement(pairs, vector_of(u, node)))
+            displacement(wp.static(STORE), at, vector_of(u, node))
         if thread < wp.static(BANK_GROUPS):
             slot(wp.static(STORE), at + wp.static(QUAD_BYTES * zero), wp.vec3())
         synchronize_block()

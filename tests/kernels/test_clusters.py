@@ -159,6 +159,20 @@ def test_pairs_have_the_oracles_forces(ball, moved, of_forest, device):
     assert np.abs(f.numpy()[:, :3] - wanted).max() < 2e-6 * np.abs(wanted).max()
 
 
+@pytest.mark.parametrize("of_forest", [True, False])
+def test_pairs_that_have_moved_far_keep_their_digits(ball, moved, of_forest, device):
+    """Displacements of hundreds of elements, as at the end of a beam that hangs: only their differences count."""
+    mesh = ball if of_forest else wc.TetMesh(ball.points, ball.tets)
+    far = in_four(moved + np.float32([3.0, -7.0, 5.0]))
+    scatter = ClusterScatter(device_elements(mesh, wp.get_device(device)), isotropic_law(corotated_stress))
+    material = isotropic_material([*(wp.array([v], dtype=wp.float32, device=device) for v in (MU, LAM)), 0])
+    u = wp.array(far, dtype=wp.vec4, device=device)
+    f = wp.zeros_like(u)
+    add_forces(scatter, material, u, f)
+    wanted = wanted_forces(ball, far[:, :3].astype(np.float64), np.ones(len(ball.tets)))
+    assert np.abs(f.numpy()[:, :3] - wanted).max() < 2e-6 * np.abs(wanted).max()
+
+
 @pytest.mark.parametrize("shuffled", [False, True])
 def test_tasks_of_pairs_add_up_every_slot_once(ball, shuffled):
     """Neighbours that follow one another fill the threads; where all are strangers fewer pairs have room."""

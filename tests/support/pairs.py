@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import warp as wp
 
-from warp_corot.kernels.clusters.pair_elements import half_word, pair_forces, record_of, scaled_displacement
+from warp_corot.kernels.clusters.pair_elements import half_word, pair_forces, record_of
 from warp_corot.kernels.clusters.pairs import PairClusters
 from warp_corot.kernels.elements.elements import load_node
 from warp_corot.kernels.tables.cluster_layout import QUAD_BYTES
@@ -51,11 +51,11 @@ def forces_of_pairs(Pairs, Material, law):
             material,
             clusters.elements,
             i,
-            scaled_displacement(pairs, load_node(u, nodes[i, 0])),
-            scaled_displacement(pairs, load_node(u, nodes[i, 1])),
-            scaled_displacement(pairs, load_node(u, nodes[i, 2])),
-            scaled_displacement(pairs, load_node(u, nodes[i, 3])),
-            scaled_displacement(pairs, load_node(u, nodes[i, 4])),
+            load_node(u, nodes[i, 0]),
+            load_node(u, nodes[i, 1]),
+            load_node(u, nodes[i, 2]),
+            load_node(u, nodes[i, 3]),
+            load_node(u, nodes[i, 4]),
         )
         forces[i, 0] = fa
         forces[i, 1] = fb
