@@ -22,7 +22,8 @@ try:
     import oracle
 except ImportError as error:
     sys.exit(
-        f"benchmarks check every result against tests/support/oracle.py, which needs {error.name}: pip install {error.name}"
+        "benchmarks check every result against tests/support/oracle.py, "
+        f"which needs {error.name}: pip install {error.name}"
     )
 
 #: Nodal displacements are uniform in this share of the edge length, to either side along each axis.

@@ -3,9 +3,9 @@
 On suitable axes, which are those of the lattice in some order and direction, an element of a forest has the
 displacement gradient W = (D0, D1, D2) / h with
     D0 = u1 - u0,  D1 = (u2 - u1) + [type 2] (u2 - u0),  D2 = (1 + [type 2]) (u3 - u2) + [type 1] (u3 - u0),
-nodes in Maubach order: the columns of ``tables.shapes.GRADIENT``, but for type 2 half their sum and difference, which turns
-its two diagonals into an edge and the height on it. One integer says which axes these are; isotropic laws do not mind
-whether they are right- or left-handed.
+nodes in Maubach order: the columns of ``tables.shapes.GRADIENT``, but for type 2 half their sum and difference, which
+turns its two diagonals into an edge and the height on it. One integer says which axes these are; isotropic laws do not
+mind whether they are right- or left-handed.
 """
 
 import warp as wp

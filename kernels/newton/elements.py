@@ -142,7 +142,7 @@ def scatter_posed_warm(
     scatter_stress(elements, t, corotated_stress(gradient, r, mu[t], lam[t]), f)
 
 
-# --- the same on the CPU, eight elements in the lanes of vector registers; see ``elements.lanes`` -----------------------------
+# --- the same on the CPU, eight elements in the lanes of vector registers; see ``elements.lanes`` ---------------------
 
 _FORCES = on_cpu(LAWS["corotated"], native("elements", "posed_elements", "element_forces", "left_out_elements"))
 

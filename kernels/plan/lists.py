@@ -2,7 +2,8 @@
 
 Leaves are in tree order, so that those of a subtree follow one another: eight leaves of one level of which the first
 and the last have the same ancestor three levels up are all of its leaves. Likewise 64 under an ancestor six levels up,
-which are a group (see ``tables.subtree``). Subtrees are put into classes, those that one launch may go through together.
+which are a group (see ``tables.subtree``). Subtrees are put into classes, those that one launch may go through
+together.
 
 Each thread goes through one stretch of the leaves, says of each what it begins and counts; sums over the threads tell
 it where its lists begin, which so are in tree order whatever the threads.

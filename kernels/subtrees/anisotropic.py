@@ -1,9 +1,9 @@
 """Corotated forces of orthotropic materials by complete subtrees on CUDA; one thread a subtree, as in ``laws``.
 
-The law is that of ``corotated.anisotropic``; here each leaf is worked out in its own frame, whose columns are differences of
-displacements, and rotations are found by four unscaled iterations. A leaf that these
-do not turn adds nothing and is flagged, a bit each; ``repair_leaves`` does those. Among them are all that are near
-having no definite rotation: see ``corotated.anisotropic_cpu``.
+The law is that of ``corotated.anisotropic``; here each leaf is worked out in its own frame, whose columns are
+differences of displacements, and rotations are found by four unscaled iterations. A leaf that these do not turn adds
+nothing and is flagged, a bit each; ``repair_leaves`` does those. Among them are all that are near having no definite
+rotation: see ``corotated.anisotropic_cpu``.
 """
 
 import functools

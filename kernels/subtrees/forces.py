@@ -1,8 +1,9 @@
 """Corotated forces of one complete subtree in registers: ten displacements in, ten nodal forces out.
 
 What kernels share that read and write their nodes each in its own way (``cuda``, ``stepping.block``). Stresses are
-worked out from displacement gradients, so that small strains keep their digits (``corotated.algebraic.stretch_stress``); a leaf
-that is flat, turned over or far from order one is left out and reported: bit k stands for leaf k in tree order.
+worked out from displacement gradients, so that small strains keep their digits
+(``corotated.algebraic.stretch_stress``); a leaf that is flat, turned over or far from order one is left out and
+reported: bit k stands for leaf k in tree order.
 """
 
 import functools

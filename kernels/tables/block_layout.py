@@ -1,4 +1,4 @@
-"""How a small body is dealt out to the threads of one block: numbers from which ``stepping.block``'s kernel is generated.
+"""How a small body is dealt out to the threads of one block: numbers that ``stepping.block`` is generated from.
 
 Plain Python, as ``subtree``. ``SHARED_BYTES`` is what a block may have without asking.
 """

@@ -1,4 +1,4 @@
-"""How elements are dealt out to the thread blocks of ``clusters.single``: numbers from which its kernels are generated."""
+"""How elements are dealt out to the thread blocks of ``clusters``: numbers from which its kernels are generated."""
 
 from dataclasses import dataclass
 

@@ -78,7 +78,12 @@ class Conditions:
         wp.launch(free_nodes, len(self.inverse_mass), inputs, outputs, device=self.device)
 
     def hold(self, nodes: wp.array, velocities: wp.array) -> None:
-        """Hold nodes, int32 [k], that move at these velocities [m/s], vec3 [1], [k] or, for each world, [k / worlds]."""
+        """Hold nodes that move at these velocities.
+
+        Args:
+            nodes: int32 [k].
+            velocities: [m/s], vec3 [k], [1] for all alike, or [k / worlds] for each world alike.
+        """
         outputs = [self.held, self.inverse_mass, self.state.velocities]
         wp.launch(hold_nodes, len(nodes), [nodes, velocities], outputs, device=self.device)
 
@@ -88,7 +93,7 @@ class Conditions:
         wp.launch(release_nodes, len(nodes), [nodes, self.mass], outputs, device=self.device)
 
     def follow(self, trajectory: Trajectory) -> None:
-        """Have nodes follow keyframes and no others; in place of former ones of the same nodes, if there are as many."""
+        """Have nodes follow keyframes and no others, in the arrays of former ones where these fit."""
         for k, former in enumerate(self.trajectories):
             there = trajectory.in_place_of(former)
             if there is not None:
@@ -120,7 +125,12 @@ class Conditions:
             self.revision += 1
 
     def load(self, nodes: wp.array, forces: wp.array) -> None:
-        """Set the loads of nodes, int32 [k], to these forces [N], vec3 [1], [k] or, for each world, [k / worlds]."""
+        """Set the loads of nodes.
+
+        Args:
+            nodes: int32 [k].
+            forces: [N], vec3 [k], [1] for all alike, or [k / worlds] for each world alike.
+        """
         self.make_loads()
         kernel = LOAD_NODES[self.loads.dtype]
         wp.launch(kernel, len(nodes), [nodes, forces], [self.loads], device=self.device)

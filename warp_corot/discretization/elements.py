@@ -106,8 +106,8 @@ def shape_codes(lattice: np.ndarray, tets: np.ndarray, level: np.ndarray) -> tup
 
     Returns:
         One integer per element (level, mirrored or not, frame), int32 [n], and the table of proper frames Q,
-        float64 [n_frames, 3, 3]: columns are the axes of ``kernels.tables.shapes.GRADIENT``, the third turned round where the
-        Maubach frame is left-handed.
+        float64 [n_frames, 3, 3]: columns are the axes of ``kernels.tables.shapes.GRADIENT``, the third turned
+        round where the Maubach frame is left-handed.
     """
     key = frame_keys(lattice, tets, level)
     bits, frames = frame_table(np.flatnonzero(np.bincount(key, minlength=_KEYS)))

@@ -153,7 +153,7 @@ class ForceField(ABC):
 
     @property
     def material_inputs(self) -> list:
-        """The kernel arguments mu, lam and stride for forces and energies: those of what elements hold of the discretization."""
+        """The kernel arguments mu, lam and stride for forces and energies: those of what elements hold of the body."""
         return [self.discretization.mu, self.discretization.lam, self.discretization.material_stride]
 
     @property

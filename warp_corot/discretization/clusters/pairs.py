@@ -36,8 +36,8 @@ def pairs_in_clusters(
         layout: What the kernel is generated for.
 
     Returns:
-        ``kernels.clusters.pairs.PairClusters``; ``kernels.clusters.pair_elements.LatticePairs`` or ``GeneralPairs``; and how many
-        clusters there are.
+        ``PairClusters`` of ``kernels.clusters.pairs``; ``LatticePairs`` or ``GeneralPairs`` of
+        ``kernels.clusters.pair_elements``; and how many clusters there are.
     """
     device, tets = general.nodes.device, nodes[chosen]
     pairs = paired(tets)

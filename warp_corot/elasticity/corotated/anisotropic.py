@@ -25,8 +25,8 @@ class AnisotropicField(ForceField):
 
     The force is the gradient of W, with the turning of R that isotropic materials need not account for, and conserves
     linear and angular momentum. Where F comes near having no definite rotation (inverted, or flattened to a sixth in
-    two directions, as fibres are that stretch 3.4 times; see ``kernels.corotated.anisotropic``), C goes over to that of the
-    nearest isotropic material, and the force is the gradient of that energy.
+    two directions, as fibres are that stretch 3.4 times; see ``kernels.corotated.anisotropic``), C goes over to that of
+    the nearest isotropic material, and the force is the gradient of that energy.
 
     To it comes the active stress of ``SoftBody.activation``, P = s (F d) d^T along the fibres' direction d. It keeps
     both momenta; it puts work in, so that there is no energy of it.

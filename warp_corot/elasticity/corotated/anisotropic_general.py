@@ -24,7 +24,7 @@ class GeneralAnisotropicField(AnisotropicField):
     """Single elements whose forces need no settled order.
 
     Args:
-        discretization: Of an ``Anisotropic`` material; a general mesh's, or of a forest that has few groups of subtrees.
+        discretization: Of an ``Anisotropic`` material, on a general mesh or a forest with few groups of subtrees.
     """
 
     def __init__(self, discretization: Discretization):

@@ -1,4 +1,4 @@
-"""Lists of the leaves that subtree kernels left out, on CUDA, and the launches that do them; see ``kernels.subtrees.repair``."""
+"""Leaves that subtree kernels left out, in lists on CUDA, and their launches; see ``kernels.subtrees.repair``."""
 
 from __future__ import annotations
 

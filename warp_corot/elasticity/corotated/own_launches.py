@@ -1,4 +1,4 @@
-"""All that a body's forces go through on CUDA in one or two launches; see ``kernels.subtrees.cuda`` and ``clusters``."""
+"""Forces of a whole body on CUDA in one or two launches; see ``kernels.subtrees.cuda`` and ``kernels.clusters``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Organs on CUDA: many steps a launch, in one thread block for each patch of the mesh; see ``kernels.stepping.patches``."""
+"""Organs on CUDA: many steps a launch, a thread block for each patch of the mesh; see ``kernels.stepping.patches``."""
 
 from __future__ import annotations
 
