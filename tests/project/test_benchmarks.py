@@ -254,3 +254,10 @@ def test_bodies(tmp_path):
     listed = run("bodies.py", "--list").stdout.split()
     assert len(listed) >= 44
     assert {"cube", "windpipe", "rough-ball-1-7-million"} <= set(listed)
+
+
+def test_dragging_changes_patches_and_no_recording():
+    done = run("dragging.py", "--device", "cpu", "--level", "6")
+    assert done.returncode == 0, done.stderr
+    assert len(done.stdout.splitlines()) == 2 + 6
+    assert "follow keyframes" in done.stdout

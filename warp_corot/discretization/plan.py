@@ -98,8 +98,8 @@ class Plan(Protocol):
     """What a force field goes through, however it came about.
 
     Attributes:
-        elements: All leaves, ``ForestElements`` or, of a general mesh, ``GeneralElements`` of ``kernels.elements``. Their
-            forces go to the slots if there are any.
+        elements: All leaves, ``ForestElements`` or, of a general mesh, ``GeneralElements`` of ``kernels.elements``;
+            their forces go to the slots if there are any.
         batches: Subtrees by type, grouped or not, and sharing; none where the field goes leaf by leaf.
         flat: The other leaves.
         slots: Where forces go first if their sums must have one order, else None.
