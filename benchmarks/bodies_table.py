@@ -23,10 +23,6 @@ class Row:
     name: str
     found: dict[str, Any]
 
-    @classmethod
-    def of(cls, name: str, found: dict[str, Any]) -> Row:
-        return cls(name, found)
-
     @property
     def is_meshed(self) -> bool:
         return "elements" in self.found
@@ -76,14 +72,14 @@ class Row:
 HEAD = ["body", "elements", "volume", "mean ‰", "95 % ‰", "pieces", "watertight", "angle", "s", "said"]
 
 
-def table(rows: list[Row], before: dict[str, Any] | None = None, *, fall: bool = False) -> str:
+def table(rows: list[Row], before: dict[str, Any] | None = None) -> str:
     """Markdown.
 
     Args:
         rows: In their order.
         before: Numbers of an earlier run by body; elements, volume, pieces and fall of it stand beside.
-        fall: Whether the fall has a column.
     """
+    fall = any("fall" in row.found for row in rows)
     head = HEAD + (["fall"] if fall else [])
     if before is not None:
         head = [head[0], "elements before", "volume before", "pieces before", *head[1:]]
@@ -92,7 +88,7 @@ def table(rows: list[Row], before: dict[str, Any] | None = None, *, fall: bool =
     for row in rows:
         cells = row.cells() + ([row.fall()] if fall else [])
         if before is not None:
-            was = Row.of(row.name, before.get(row.name, {"failed": "not there"}))
+            was = Row(row.name, before.get(row.name, {"failed": "not there"}))
             earlier = was.cells()
             cells = [cells[0], earlier[1], earlier[2], earlier[5], *cells[1:], *([was.fall()] if fall else [])]
         lines.append("| " + " | ".join(cell.replace("|", "/") for cell in cells) + " |")
