@@ -59,7 +59,7 @@ def measured(name: str, tets: int, device: str, folder: Path) -> dict[str, Any]:
 
 
 def together(found: list[Fidelity], size: float, tets: int) -> dict[str, Any]:
-    """Several bodies of one file as one: sums, and of distances the largest, over the size [m]; elements over those asked for."""
+    """Several bodies of one file as one: sums, and of distances the largest, over the size [m]."""
     return {
         "elements": (elements := sum(f.elements for f in found)),
         "share": elements / tets,

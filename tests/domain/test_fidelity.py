@@ -7,7 +7,9 @@ import trimesh
 from warp_corot.domain import Domain
 from warp_corot.domain.fidelity import fidelity, smallest_dihedral
 from warp_corot.domain.reference import reference_of
+from warp_corot.holding.choice import holds_of
 from warp_corot.mesh import TetForest, TetMesh
+from warp_corot.mesh.pieces import pieces_of
 
 
 def surface_of(*parts: trimesh.Trimesh) -> Domain:
@@ -60,6 +62,35 @@ def test_a_cavity_is_no_piece_and_what_lies_in_it_is() -> None:
     given = reference_of(domain, 1000)
     assert given.pieces == 2
     assert given.volume == pytest.approx(4 / 3 * np.pi * (1 - 0.8**3 + 0.4**3), rel=0.02)
+
+
+def test_shells_within_one_another_are_pieces_of_their_own() -> None:
+    """And a cavity belongs to the shell that it is in alone, or to all parts that are solid around it."""
+    shells = [ball(r) for r in (1.0, 0.9, 0.7, 0.6, 0.3)]
+    for cavity in shells[1::2]:
+        cavity.invert()
+    assert reference_of(surface_of(*shells), 1000).pieces == 3
+    buried = ball(0.2)
+    buried.invert()
+    assert reference_of(surface_of(ball(1.0), ball(0.5), buried), 1000).pieces == 1
+
+
+def test_pieces_of_a_mesh_share_faces() -> None:
+    """Three tetrahedra: two share a face, the third meets them in an edge. All who count say the same."""
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1], [-1, -1, 0], [-1, 1, 0]], float)
+    tets = np.array([[0, 1, 2, 3], [0, 2, 1, 4], [0, 3, 6, 5]])
+    assert pieces_of(tets).tolist() == [0, 0, 1]
+    mesh = TetMesh(points, tets)
+    assert len(holds_of(mesh, young=1e6, density=1e3, gravity=(0, 0, -9.81)).pieces) == 2
+    assert fidelity(mesh, surface_of(ball(1.0)), samples=100).pieces == 2
+
+
+def test_voxels_that_touch_are_one_piece() -> None:
+    numbers = np.zeros((8, 8, 8), np.int16)
+    numbers[1:3, 1:3, 1:3] = numbers[3:5, 3:5, 3:5] = numbers[6, 6, 6] = 1
+    domain = Domain.from_labels(numbers, spacing=(0.01, 0.01, 0.01))
+    assert reference_of(domain, 100).pieces == 2
+    assert any("in 2 pieces" in line for line in domain.report())
 
 
 def test_overlapping_parts_count_once() -> None:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import warp_corot as wc
-from warp_corot.holding.choice import holds_of, pieces_of
+from warp_corot.holding.choice import holds_of
 from warp_corot.holding.regions import Shape, flat_region
 from warp_corot.holding.sag import CoarseBody
+from warp_corot.mesh.pieces import pieces_of
 from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -131,7 +132,7 @@ def test_each_piece_is_held():
     other = one.tets + count
     other[other == count + int(np.argmin(one.points[:, 2]))] = top
     mesh = wc.TetMesh(np.concatenate([one.points, one.points + shift]), np.concatenate([one.tets, other]), up_axis="Z")
-    assert np.bincount(pieces_of(mesh)).tolist() == 2 * [len(one.tets)]
+    assert np.bincount(pieces_of(mesh.tets)).tolist() == 2 * [len(one.tets)]
     chosen = held(mesh, 1e6)
     assert len(chosen.pieces) == 2
     lower, upper = chosen.nodes[:count], chosen.nodes[count:]

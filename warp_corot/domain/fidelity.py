@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from warp_corot.kernels.meshing import measuring as kernels
 
@@ -36,8 +34,9 @@ class Fidelity:
         input_volume: Of the body as given.
         distance_mean: Mean distance of the mesh's surface from the given one, and of the given one from the mesh's.
         distance_95: The distances below which 95 % are, likewise.
-        pieces: Connected pieces of the mesh; elements that share a face are connected.
-        input_pieces: Of the body as given; parts of a surface that touch, cross or hold one another are one.
+        pieces: Of the mesh; elements that share a face are of one piece.
+        input_pieces: Of the body as given; parts of a surface that touch, cross or hold one another are one, and so are
+            voxels that touch, be it in a corner.
         lost_pieces: Pieces of the body that are in no element.
         lost_labels: Names of labels that no element has.
         watertight: Whether every edge of the mesh's surface is walked once each way.
@@ -120,18 +119,19 @@ def fidelity(
         InputError: A surface that encloses nothing.
     """
     domain = surface_or_domain if isinstance(surface_or_domain, Domain) else Domain.from_surface(surface_or_domain)
+    from warp_corot.mesh.pieces import pieces_of
+
     given = reference_of(domain, samples)
     surface = _own_surface(mesh) if surface is None else surface
     forth = np.abs(np.asarray(domain.phi(_spread(surface, samples)), np.float64))
     back = _distances(surface, given.points, domain.device)
-    pieces, _ = pieces_of(mesh)
     lost = tuple(n for n in domain.label_names if not (n in _labels(mesh) and mesh.elements_of(n).any()))
     return Fidelity(
         volume=held_volume(mesh),
         input_volume=given.volume,
         distance_mean=(float(forth.mean()), float(back.mean())),
         distance_95=(float(np.quantile(forth, 0.95)), float(np.quantile(back, 0.95))),
-        pieces=pieces,
+        pieces=int(pieces_of(mesh.tets).max()) + 1,
         input_pieces=given.pieces,
         lost_pieces=_lost_pieces(mesh, given.points, given.piece, back),
         lost_labels=lost,
@@ -150,17 +150,6 @@ def held_volume(mesh: TetForest | TetMesh) -> float:
         volumes = np.abs(signed_volumes(mesh.points, mesh.tets))
     fill = getattr(mesh, "fill", None)
     return float(np.sum(volumes if fill is None else volumes * fill))
-
-
-def pieces_of(mesh: TetForest | TetMesh) -> tuple[int, np.ndarray]:
-    """How many pieces elements make that are connected by faces, and which each is in, int32 [T]."""
-    from warp_corot.mesh.growing.cut import face_pairs
-
-    count = len(mesh.tets)
-    pairs = face_pairs(mesh.tets)
-    links = coo_array((np.ones(len(pairs), np.int8), pairs.T), shape=(count, count))
-    pieces, piece = connected_components(links, directed=False)
-    return pieces, piece.astype(np.int32)
 
 
 def smallest_dihedral(mesh: TetForest | TetMesh) -> float:

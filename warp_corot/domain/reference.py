@@ -13,6 +13,7 @@ from warp_corot.kernels.meshing import measuring as kernels
 from .domain import Domain
 from .labels import LabelDomain
 from .surface import SurfaceDomain
+from .voxels import piece_of_voxels
 from .winding import Parts, edge_parts, linked, part_volumes
 
 #: Points along the longest side at which a function is looked at first, and how often cells at the surface are halved.
@@ -93,18 +94,26 @@ def joined_parts(points: np.ndarray, triangles: np.ndarray, device: wp.Device) -
     links = [np.stack([at[:-1][same, 1], at[1:][same, 1]], axis=1)]
     crossings = _crossings(points, triangles, part, device)
     links.append(crossings)
-    # Parts that lie within another: a cavity in its surroundings, or what is buried in it.
+    # Parts that lie within the body of others: a cavity in its surroundings, or what is buried in it.
     groups, outward = Parts(points, triangles, part), part_volumes(points, triangles, part) > 0.0
+    holders = [groups.holders(groups.corners[groups.slices[own]][0, 0], own) for own in range(count)]
     overlap = len(crossings) > 0
     for own in range(count):
-        holders = groups.holders(groups.corners[groups.slices[own]][0, 0], own)
-        depth = int(np.sum(np.where(outward[holders], 1, -1)))
-        if len(holders) and depth > 0:
-            links.append(np.stack([np.full(len(holders), own), holders], axis=1))
-            overlap |= bool(outward[own])
+        around = _bounds_around(own, holders, outward)
+        links.append(np.stack([np.full(len(around), own), around], axis=1))
+        overlap |= len(around) > 0 and bool(outward[own])
     pairs = np.concatenate(links)
     pieces, of_part = linked(pairs[:, 0], pairs[:, 1], count)
     return pieces, of_part[part].astype(np.int32), overlap
+
+
+def _bounds_around(own: int, holders: list[np.ndarray], outward: np.ndarray) -> np.ndarray:
+    """The parts that bound the body just outside a part: from the innermost that holds it outwards, as far as the
+    body reaches."""
+    inmost_first = sorted(holders[own], key=lambda holder: -len(holders[holder]))
+    depth = np.cumsum([0, *(1 if outward[holder] else -1 for holder in reversed(inmost_first))])[::-1]
+    ends = np.flatnonzero(depth <= 0)
+    return np.array(inmost_first[: ends[0]], np.int64)
 
 
 def _crossings(points: np.ndarray, triangles: np.ndarray, part: np.ndarray, device: wp.Device) -> np.ndarray:
@@ -130,7 +139,7 @@ def _crossings(points: np.ndarray, triangles: np.ndarray, part: np.ndarray, devi
 
 def _of_voxels(domain: LabelDomain, count: int) -> Reference:
     inside = domain.numbers > 0
-    numbers, pieces = scipy.ndimage.label(inside, np.ones((3, 3, 3)))
+    numbers = piece_of_voxels(inside)
     voxel = abs(float(np.linalg.det(domain.affine[:3, :3])))
     rng = np.random.default_rng(0)
     found, owners, areas = [], [], []
@@ -147,7 +156,7 @@ def _of_voxels(domain: LabelDomain, count: int) -> Reference:
     first = np.unique(owner, return_index=True)[1]
     chosen = np.concatenate([first, rng.choice(len(places), count, p=weight / weight.sum())])
     spread = places[chosen] @ domain.affine[:3, :3].T + domain.affine[:3, 3]
-    return Reference(float(inside.sum()) * voxel, spread, owner[chosen].astype(np.int32), int(pieces))
+    return Reference(float(inside.sum()) * voxel, spread, owner[chosen].astype(np.int32), int(numbers.max()))
 
 
 def _of_samples(domain: Domain, count: int) -> Reference:

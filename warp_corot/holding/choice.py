@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.discretization.elements import Mesh
-from warp_corot.mesh.surfaces.boundary import boundary_faces, neighbours
+from warp_corot.mesh.pieces import pieces_of
+from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 from .regions import Patch, Shape, broad_sides, flat_region, lowest_part
 from .sag import CoarseBody
@@ -214,7 +215,7 @@ def holds_of(
         bound = np.arange(len(points))
     else:
         drawn, triangles, bound = surface.points, surface.triangles, surface.nodes[:, 0]
-    of_tet = pieces_of(mesh)
+    of_tet = pieces_of(mesh.tets)
     of_node = piece_of_nodes(mesh, of_tet)
     of_triangle = of_node[bound[triangles[:, 0]]]
     holds, count = [], int(of_tet.max()) + 1
@@ -230,23 +231,7 @@ def holds_of(
     return Holds(holds, len(points))
 
 
-def pieces_of(mesh: Mesh) -> npt.NDArray[np.intp]:
-    """The piece of each tetrahedron, [T]; the one with most of them is number 0.
-
-    Pieces hang together by faces: what meets in a node or an edge alone would turn about it.
-    """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    count = len(mesh.tets)
-    one, other = neighbours(mesh.tets)
-    linked = coo_array((np.ones(len(one), np.int8), (one, other)), shape=(count, count))
-    _, piece = connected_components(linked, directed=False)
-    rank = np.argsort(np.argsort(-np.bincount(piece), kind="stable"), kind="stable")
-    return rank[piece]
-
-
-def piece_of_nodes(mesh: Mesh, of_tet: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+def piece_of_nodes(mesh: Mesh, of_tet: npt.NDArray[np.integer]) -> npt.NDArray[np.intp]:
     """The piece of each node, the largest where several meet, -1 for nodes in no tetrahedron, [N]."""
     none = len(of_tet)
     found = np.full(len(mesh.points), none)

@@ -316,13 +316,13 @@ class TetForest:
         return found
 
     def pieces(self) -> np.ndarray:
-        """Which piece each leaf is in, int32 [T]: leaves that hang together by nodes; the largest piece is 0."""
-        from warp_corot.mesh.surfaces.bodies import pieces
+        """Which piece each leaf is in, int32 [T]: leaves that hang together by faces; the largest piece is 0."""
+        from .pieces import pieces_of
 
-        return pieces(self)
+        return pieces_of(self.tets)
 
     def largest_piece(self) -> TetForest:
-        """The mesh without what hangs together with its largest piece by no node, surface and all."""
+        """The mesh without what hangs together with its largest piece by no face, surface and all."""
         from warp_corot.mesh.surfaces.bodies import largest_piece
 
         return largest_piece(self)

@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.indices import checked_indices
-from warp_corot.mesh.growing.cut import connected
 from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, renumbered, with_virtual
+from warp_corot.mesh.pieces import pieces_of
 
 from .bound import BoundPoints, SurfaceMesh
 from .boundary import boundary_faces
@@ -55,16 +55,9 @@ def bind(mesh: TetForest | TetMesh, points: np.ndarray, triangles: npt.ArrayLike
     return SurfaceMesh(rest, nodes, weights, faces.astype(np.int32))
 
 
-def pieces(forest: TetForest) -> np.ndarray:
-    """See `TetForest.pieces`."""
-    piece = np.unique(connected(forest.tets), return_inverse=True)[1]
-    rank = np.argsort(np.argsort(-np.bincount(piece), kind="stable"), kind="stable")
-    return rank[piece].astype(np.int32)
-
-
 def largest_piece(forest: TetForest) -> TetForest:
     """See `TetForest.largest_piece`."""
-    kept = pieces(forest) == 0
+    kept = pieces_of(forest.tets) == 0
     if kept.all():
         return forest
     live = np.zeros(len(forest.tree.level), bool)
@@ -104,7 +97,7 @@ def summary(forest: TetForest) -> list[str]:
         cut = np.count_nonzero(forest.fill != 1.0)
         lines.append(f"{inside:.6g} m^3 of body in {volume:.6g} m^3 of tetrahedra, {cut} of which are cut")
     lines += [f"label {name}: {np.count_nonzero(forest.elements_of(name))} tetrahedra" for name in forest.label_names]
-    sizes = np.bincount(pieces(forest))
+    sizes = np.bincount(pieces_of(forest.tets))
     if len(sizes) > 1:
         shown = ", ".join(str(n) for n in sizes[:5]) + (", ..." if len(sizes) > 5 else "")
         lines.append(f"{len(sizes)} separate pieces, of {shown} tetrahedra")

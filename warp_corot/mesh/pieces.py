@@ -1,0 +1,27 @@
+"""The pieces of a mesh, wherever they are counted, held or kept."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.mesh.growing.cut import face_pairs
+
+
+def pieces_of(tets: npt.NDArray[np.integer]) -> npt.NDArray[np.int32]:
+    """Which piece each element is in, int32 [T]; the one with most elements is number 0.
+
+    Elements that share a face are of one piece. Parts that meet in a node or an edge alone are pieces of their own, as
+    one would turn about it.
+
+    Args:
+        tets: Nodes of each element [T, 4].
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    pairs, count = face_pairs(tets), len(tets)
+    links = coo_array((np.ones(len(pairs), np.int8), pairs.T), shape=(count, count))
+    _, piece = connected_components(links, directed=False)
+    rank = np.argsort(np.argsort(-np.bincount(piece), kind="stable"), kind="stable")
+    return rank[piece].astype(np.int32)
