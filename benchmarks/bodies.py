@@ -31,7 +31,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 
 from bodies_table import Row, table, totals
-from body_files import Body, all_bodies
+from body_files import Body, all_bodies, as_input
 
 TETS, FALL_TETS = 20_000, 5_000
 SECONDS, GIGABYTES = 300.0, 8.0
@@ -48,45 +48,53 @@ def limited(gigabytes: float) -> None:
 
 
 def run_one(options: argparse.Namespace) -> int:
-    """Measure one body in this process and print what was found as JSON."""
+    """Measure one body in this process and print what was found, a line of JSON for the mesh and one for the fall."""
     from body_runs import fallen, measured
 
     limited(options.gigabytes)
+    body = Body(options.one, options.path)
     with tempfile.TemporaryDirectory() as folder:
-        if options.fall:
-            found = fallen(options.one, options.fall_tets, options.device, Path(folder), options.previews)
-        else:
-            found = measured(options.one, options.tets, options.device, Path(folder))
-        print("\n" + json.dumps(found), flush=True)
+        path, given = as_input(body, Path(folder))
+        found: dict[str, Any] = {}
+        if not options.no_mesh:
+            found = measured(path, given, options.tets, options.device)
+            print("\n" + json.dumps(found), flush=True)
+        if options.fall and (options.no_mesh or {"elements", "tets"} & found.keys()):
+            found = fallen(path, given, options.fall_tets, options.device, options.previews)
+            print("\n" + json.dumps(found), flush=True)
     return 0
 
 
-def in_process(body: Body, options: argparse.Namespace, *, fall: bool = False) -> dict[str, Any]:
-    """What a process of its own found of a body, or how it ended."""
-    failed = "fall_failed" if fall else "failed"
+def in_process(body: Body, options: argparse.Namespace) -> dict[str, Any]:
+    """What a process of its own found of a body, and how it ended if it ended badly."""
     command = [sys.executable, __file__, "--one", body.name, "--tets", str(options.tets), "--device", options.device]
     command += ["--gigabytes", str(options.gigabytes), "--fall-tets", str(options.fall_tets)]
-    command += ["--fall"] if fall else []
-    command += ["--previews", str(options.previews)] if options.previews else []
+    for name in ("path", "previews"):
+        value = body.path if name == "path" else options.previews
+        command += [f"--{name}", str(value)] if value else []
+    command += [f"--{name.replace('_', '-')}" for name in ("fall", "no_mesh") if getattr(options, name)]
+    why = ""
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=options.seconds, env=os.environ)
-    except subprocess.TimeoutExpired:
-        return {failed: f"takes more than {options.seconds:g} s"}
-    if done.returncode:
-        last = (done.stderr.strip().splitlines() or [f"ended with status {done.returncode}"])[-1]
-        return {failed: last[:200]}
-    return json.loads(done.stdout.strip().splitlines()[-1])
+        printed = done.stdout
+        if done.returncode:
+            why = (done.stderr.strip().splitlines() or [f"ended with status {done.returncode}"])[-1][:200]
+    except subprocess.TimeoutExpired as late:
+        printed, why = (late.stdout or b"").decode(), f"takes more than {options.seconds:g} s"
+    found: dict[str, Any] = {}
+    for line in printed.splitlines():
+        found |= json.loads(line) if line.startswith("{") else {}
+    if why:
+        found["fall_failed" if options.no_mesh or found else "failed"] = why
+    return found
 
 
 def found_of(body: Body, earlier: dict[str, Any], options: argparse.Namespace) -> dict[str, Any]:
     """What is found of a body now, and what was before where it is not looked for."""
-    of_fall = {name: value for name, value in earlier.items() if name in FALL}
-    of_mesh = {name: value for name, value in earlier.items() if name not in FALL}
-    if not options.no_mesh:
-        of_mesh = in_process(body, options)
-    if options.fall:
-        of_fall = in_process(body, options, fall=True) if {"elements", "tets"} & of_mesh.keys() else {}
-    return of_mesh | of_fall
+    kept = {name: value for name, value in earlier.items() if (not options.fall if name in FALL else options.no_mesh)}
+    if options.no_mesh and not (options.fall and {"elements", "tets"} & earlier.keys()):
+        return kept
+    return kept | in_process(body, options)
 
 
 def main() -> int:
@@ -104,7 +112,9 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="also write the numbers")
     parser.add_argument("--before", type=Path, help="numbers of an earlier run, to stand beside")
     parser.add_argument("--list", action="store_true", help="name the bodies and stop")
+    parser.add_argument("--new", action="store_true", help="only bodies that --json does not have")
     parser.add_argument("--one", help=argparse.SUPPRESS)
+    parser.add_argument("--path", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
         return run_one(options)
@@ -113,8 +123,9 @@ def main() -> int:
         print("\n".join(body.name for body in chosen) or "no body has such a name")
         return 0 if chosen else 2
     numbers = json.loads(options.json.read_text()) if options.json and options.json.exists() else {}
-    for index, body in enumerate(chosen):
-        print(f"{index + 1} of {len(chosen)}: {body.name}", end=" ", file=sys.stderr, flush=True)
+    waiting = [body for body in chosen if not (options.new and body.name in numbers)]
+    for index, body in enumerate(waiting):
+        print(f"{index + 1} of {len(waiting)}: {body.name}", end=" ", file=sys.stderr, flush=True)
         started = time.perf_counter()
         numbers[body.name] = found_of(body, numbers.get(body.name, {}), options)
         print(f"({time.perf_counter() - started:.0f} s)", file=sys.stderr, flush=True)

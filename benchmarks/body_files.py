@@ -65,9 +65,9 @@ def has_faces(path: Path) -> bool:
     return any(len(mesh.GetFaceVertexCountsAttr().Get() or []) >= 4 for mesh in meshes)
 
 
-def as_input(name: str, folder: Path) -> tuple[Path, list[str]]:
+def as_input(body: Body, folder: Path) -> tuple[Path, list[str]]:
     """The file that the command line is given, and the options that a person would give with it."""
-    path = next(body for body in all_bodies() if body.name == name).path
+    name, path = body.name, body.path
     if path is None:
         from body_shapes import SHAPES
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import io
+import tempfile
 import time
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from body_files import as_input
 
 if TYPE_CHECKING:
     from warp_corot.domain.fidelity import Fidelity
@@ -18,8 +18,15 @@ if TYPE_CHECKING:
 FALL_SECONDS = 2.0
 
 
-def measured(name: str, tets: int, device: str, folder: Path) -> dict[str, Any]:
-    """What ``bodies_table.Row`` says of a body, as far as meshing goes."""
+def measured(path: Path, options: list[str], tets: int, device: str) -> dict[str, Any]:
+    """What ``bodies_table.Row`` says of a body, as far as meshing goes.
+
+    Args:
+        path: Its file.
+        options: Of the command line.
+        tets: Elements asked for.
+        device: Where it is meshed.
+    """
     import warp as wp
 
     from warp_corot.cli import make_parser
@@ -30,9 +37,8 @@ def measured(name: str, tets: int, device: str, folder: Path) -> dict[str, Any]:
     from warp_corot.io.read.tetrahedra import load_tets
 
     wp.config.log_level = wp.LOG_ERROR
-    path, options = as_input(name, folder)
-    line = ["simulate", str(path), "-o", str(folder / "out.usd"), "--tets", str(tets), "--device", device, *options]
-    _load_kernels(device, folder)
+    line = ["simulate", str(path), "-o", "out.usd", "--tets", str(tets), "--device", device, *options]
+    _load_kernels(device)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:
@@ -75,7 +81,7 @@ def together(found: list[Fidelity], size: float, tets: int) -> dict[str, Any]:
     }
 
 
-def _load_kernels(device: str, folder: Path) -> None:
+def _load_kernels(device: str) -> None:
     """Mesh a small ball the same way, so that kernels and libraries are loaded."""
     import trimesh
 
@@ -83,33 +89,33 @@ def _load_kernels(device: str, folder: Path) -> None:
     from warp_corot.cli.opened import open_input
     from warp_corot.cli.organs import find_organ
 
-    path = folder / "warm.ply"
-    trimesh.creation.icosphere(3, radius=0.1).export(path)
-    line = ["simulate", str(path), "-o", str(folder / "warm.usd"), "--tets", "500", "--unit", "m", "--device", device]
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder:
         warnings.simplefilter("ignore")
+        path = Path(folder) / "warm.ply"
+        trimesh.creation.icosphere(3, radius=0.1).export(path)
+        line = ["simulate", str(path), "-o", "warm.usd", "--tets", "500", "--unit", "m", "--device", device]
         find_organ(open_input(str(path)), make_parser().parse_args(line))
 
 
-def fallen(name: str, tets: int, device: str, folder: Path, preview: Path | None = None) -> dict[str, Any]:
+def fallen(path: Path, options: list[str], tets: int, device: str, previews: Path | None = None) -> dict[str, Any]:
     """What becomes of a body by defaults: how far it goes, over its height, and whether it was said to be free.
 
     Args:
-        name: Of the body.
+        path: Its file.
+        options: Of the command line.
         tets: Elements asked for.
         device: Where it is simulated.
-        folder: For files.
-        preview: A folder for a picture of its end; None: no picture.
+        previews: A folder for a picture of its two ends; None: no picture.
     """
     from warp_corot.cli import main
 
-    path, options = as_input(name, folder)
-    out, said = folder / "fall.usd", io.StringIO()
+    folder = tempfile.TemporaryDirectory()
+    out, said = Path(folder.name) / "fall.usd", io.StringIO()
     line = ["simulate", str(path), "-o", str(out), "--duration", str(FALL_SECONDS), "--device", device, *options]
     if not _has_tets(path):
         line += ["--tets", str(tets)]
-    if preview is not None:
-        picture = preview.resolve() / f"{name.replace('/', '_')}.png"
+    if previews is not None:
+        picture = previews.resolve() / f"{path.name}.png"
         line += ["--preview", str(picture), "--preview-frames", "0,-1"]
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         status = main(line)
@@ -118,8 +124,9 @@ def fallen(name: str, tets: int, device: str, folder: Path, preview: Path | None
         return {"fall_failed": text.strip().splitlines()[-1][:200] if text.strip() else f"status {status}"}
     held = [line.split(None, 1)[1] for line in text.splitlines() if line.startswith("  fixed")]
     notes = [line for line in text.splitlines() if line.startswith("warp-corot: ")]
-    free = "nothing is held" in text
-    return {"fall": largest_displacement(out), "free": free, "held": held, "fall_notes": notes}
+    with folder:
+        fall = largest_displacement(out)
+    return {"fall": fall, "free": "nothing is held" in text, "held": held, "fall_notes": notes}
 
 
 def largest_displacement(path: Path) -> float:
