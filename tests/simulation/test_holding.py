@@ -9,6 +9,7 @@ import warp_corot as wc
 from warp_corot.holding.choice import holds_of
 from warp_corot.holding.regions import Shape, flat_region
 from warp_corot.holding.sag import CoarseBody
+from warp_corot.holding.sag_mesh import MeshBody
 from warp_corot.mesh.pieces import pieces_of
 from warp_corot.mesh.surfaces.boundary import boundary_faces
 
@@ -141,19 +142,57 @@ def test_each_piece_is_held():
     assert len(chosen.reasons()) == 2
 
 
-def test_sag_is_that_of_a_beam():
+@pytest.mark.parametrize("kind", [CoarseBody, MeshBody])
+def test_sag_is_that_of_a_beam(kind):
     """Timoshenko's cantilever: bending by q L^4 / 8 E I, and shear by q L^2 / 2 k G A."""
     mesh = wc.TetForest.box((8, 1, 1), 0.1, 9)
     young, length, edge = 1e6, 0.8, 0.1
     load = DENSITY * 9.81 * edge**2
     shear_modulus = young / 2.6
     expected = load * length**4 / (8 * young * edge**4 / 12) + load * length**2 / (2 * 5 / 6 * shear_modulus * edge**2)
-    coarse = CoarseBody(mesh.points, mesh.tets, mesh.volumes, young, DENSITY)
+    body = kind(mesh.points, mesh.tets, mesh.volumes, young, DENSITY)
     ends = np.flatnonzero(mesh.points[:, 0] == 0.0)
-    down, along = coarse.sag(ends, [GRAVITY, [9.81, 0.0, 0.0]])
+    down, along = body.sag(ends, [GRAVITY, [9.81, 0.0, 0.0]])
     assert down.largest == pytest.approx(expected, rel=0.1)
     assert along.largest == pytest.approx(DENSITY * 9.81 * length**2 / (2 * young), rel=0.1)
-    assert coarse.centre == pytest.approx([0.4, 0.05, 0.05], abs=1e-3)
+    assert body.centre == pytest.approx([0.4, 0.05, 0.05], abs=1e-3)
+
+
+def hairpin():
+    """Two arms 40 cm long a slit of 12.5 mm apart, joined at one end; nodes at the other end of the upper one."""
+    box = wc.TetForest.box((4, 1, 2), 0.1, 9)
+    middle = box.points[box.tets].mean(axis=1)
+    kept = (np.abs(middle[:, 2] - 0.1) > 0.00625) | (middle[:, 0] > 0.3)
+    used, tets = np.unique(box.tets[kept], return_inverse=True)
+    mesh = wc.TetMesh(box.points[used], tets.reshape(-1, 4), up_axis="Z")
+    return mesh, np.flatnonzero((mesh.points[:, 0] == 0.0) & (mesh.points[:, 2] > 0.1))
+
+
+def test_arms_next_to_one_another_are_not_one():
+    """Linear dynamics come to rest where the estimate says."""
+    mesh, nodes = hairpin()
+    own = MeshBody(mesh.points, mesh.tets, mesh.volumes, 1e6, DENSITY).sag(nodes, [GRAVITY])[0].largest
+    body = wc.SoftBody(mesh, wc.Isotropic(1e6, 0.3, DENSITY), device="cpu")
+    body.fix(nodes)
+    sim = wc.Simulation(body, model=wc.Linear(), integrator=wc.SymplecticEuler(damping=30.0), gravity=GRAVITY)
+    sim.advance(1.5)
+    settled = np.linalg.norm(body.displacements.numpy(), axis=1).max()
+    assert own == pytest.approx(settled, rel=0.03)
+
+
+def test_a_crumb_that_dangles_says_nothing_of_the_body():
+    """A tetrahedron on a face of next to nothing."""
+    cube = wc.TetForest.box((1, 1, 1), 0.1, 6)
+    held = np.flatnonzero(cube.points[:, 2] == 0.0)
+    base = cube.tets[np.argmax(cube.points[cube.tets].mean(axis=1)[:, 2])]
+    top = base[np.argsort(cube.points[base][:, 2])[1:]]
+    points = np.concatenate([cube.points, cube.points[top].mean(axis=0, keepdims=True) + [0.0, 0.0, 0.01]])
+    tets = np.concatenate([cube.tets, [[*top, len(cube.points)]]])
+    volumes = np.concatenate([cube.volumes, [1e-3 * cube.volumes.min()]])
+    young = np.concatenate([np.full(len(cube.tets), 1e5), [1e-3]])
+    with_crumb = MeshBody(points, tets, volumes, young, DENSITY).sag(held, [GRAVITY])[0].largest
+    alone = MeshBody(cube.points, cube.tets, cube.volumes, 1e5, DENSITY).sag(held, [GRAVITY])[0].largest
+    assert with_crumb == pytest.approx(alone, rel=1e-3)
 
 
 def test_the_largest_flat_region_is_found():

@@ -17,6 +17,7 @@ from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 from .regions import Patch, Shape, broad_sides, flat_region, lowest_part
 from .sag import CoarseBody
+from .sag_mesh import MOST_TETS, MeshBody
 
 #: A patch carries a body that comes to rest within this share of its height.
 LARGEST_SAG = 0.3
@@ -125,8 +126,9 @@ class _Piece:
     gravity: npt.NDArray[np.float64]
 
     @cached_property
-    def coarse(self) -> CoarseBody:
-        return CoarseBody(self.shape.points, self.tets, self.volumes, self.young, self.density)
+    def body(self) -> CoarseBody | MeshBody:
+        kind = MeshBody if len(self.tets) <= MOST_TETS else CoarseBody
+        return kind(self.shape.points, self.tets, self.volumes, self.young, self.density)
 
     def hold(self) -> Hold:
         standing = lowest_part(self.shape)
@@ -166,17 +168,17 @@ class _Piece:
         shape, g = self.shape, float(np.linalg.norm(self.gravity))
         held = shape.points[patch.nodes]
         footprint = shape.footprint(held)
-        if stands and g > 0.0 and not footprint.holds(self.coarse.centre):
+        if stands and g > 0.0 and not footprint.holds(self.body.centre):
             return np.inf, np.inf, f"its centre of mass is not over {patch.where}"
         across = g * shape.across
-        down, *sideways = self.coarse.sag(patch.nodes, [self.gravity, *across])
+        down, *sideways = self.body.sag(patch.nodes, [self.gravity, *across])
         sag = down.largest / shape.height
-        above = float((self.coarse.centre - held.mean(axis=0)) @ shape.up)
+        above = float((self.body.centre - held.mean(axis=0)) @ shape.up)
         lean = max(float(np.linalg.norm(shape.across @ s.centre)) for s in sideways) / above if above > 0.0 else 0.0
         # What hangs, or is held at its side, cannot fall over.
         lean *= above > LARGEST_SAG * shape.height or stands
         needed = max(sag / LARGEST_SAG, lean / LARGEST_LEAN)
-        if stands and needed <= 1.0 and not footprint.holds(self.coarse.centre + down.centre):
+        if stands and needed <= 1.0 and not footprint.holds(self.body.centre + down.centre):
             return 1.01, sag, f"its centre of mass does not stay over {patch.where}"
         return needed, sag, f"it would topple on {patch.where}"
 
@@ -196,8 +198,8 @@ def holds_of(
 
     A piece stands on the lowest tenth of its height if its centre of mass is over that, and stays there when the piece
     sags. Otherwise its largest flat region holds it, or the first of its broad sides that carries it, each at least a
-    tenth of its nodes; if none does, the one in which it sags least. Sags are estimated by linear statics on a coarse
-    grid (`sag.CoarseBody`).
+    tenth of its nodes; if none does, the one in which it sags least. Sags are estimated by linear statics, of large
+    meshes on a coarse grid (`sag_mesh.MeshBody`, `sag.CoarseBody`).
 
     Args:
         mesh: The body.

@@ -6,6 +6,7 @@ modes (Wilson et al. 1973; Taylor, Beresford and Wilson 1976), so that parts one
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -27,7 +28,7 @@ MOST_TETS = 200_000
 POISSON = 0.3
 #: Conjugate gradients end when this many iterations add less than this share to the work of the weights.
 LAST, ENOUGH, MOST_ITERATIONS = 20, 3e-3, 1000
-#: They end, too, when something has gone this many times the body's length away.
+#: They end, too, when the body as a whole has gone this many times its length away.
 FAR = 10.0
 
 Array = npt.NDArray[np.float64]
@@ -91,8 +92,9 @@ class CoarseBody:
         u = np.zeros((self._matrix.shape[0], len(given)))
         loads = (self._weights[:, None, None] * given.T).reshape(-1, len(given))
         if free.any():
-            far = FAR * self.edge * float(np.ptp(self._lattice, axis=0).max())
-            u[free] = _solved(self._matrix[free][:, free], loads[free], far)
+            far = self.edge * float(np.ptp(self._lattice, axis=0).max())
+            weights = np.repeat(self._weights, 3)[free]
+            u[free] = solved(self._matrix[free][:, free], loads[free], far, weights)
         moved = np.moveaxis(u.reshape(-1, 3, len(given)), 2, 0)
         # Corners of cubes that hold hardly anything are nowhere in the body: whole cubes are asked.
         of_cubes = moved[:, self._places].mean(axis=2)
@@ -165,14 +167,24 @@ def _brick() -> Array:
     return own - coupled @ np.linalg.solve(inner, coupled.T)
 
 
-def _solved(matrix: csr_array, loads: Array, far: float) -> Array:
-    """Conjugate gradients with the diagonal as preconditioner, for several right sides at once.
+def solved(
+    matrix: csr_array, loads: Array, far: float, weights: Array, precondition: Callable[[Array], Array] | None = None
+) -> Array:
+    """Conjugate gradients for several right sides at once.
 
-    What is hardly held goes on growing; it is left once something is ``far`` away [m].
+    What is hardly held goes on growing; it is left once its centre of mass is far away.
+
+    Args:
+        matrix: [n, n].
+        loads: [n, k].
+        far: The body's length [m].
+        weights: Of what is displaced, [n].
+        precondition: Of residuals [n, k]; None: by the diagonal.
     """
-    inverse = 1.0 / matrix.diagonal()[:, None]
+    inverse = 1.0 / matrix.diagonal()[:, None] if precondition is None else 1.0
+    prepared = precondition or (lambda r: inverse * r)
     x, r = np.zeros_like(loads), loads.copy()
-    p = z = inverse * r
+    p = z = prepared(r)
     rz = np.einsum("nk,nk->k", r, z)
     works: list[Array] = []
     for _ in range(MOST_ITERATIONS):
@@ -183,9 +195,9 @@ def _solved(matrix: csr_array, loads: Array, far: float) -> Array:
         r -= alpha * q
         works.append(np.einsum("nk,nk->k", loads, x))
         settled = len(works) > LAST and (works[-1] - works[-1 - LAST] <= ENOUGH * np.abs(works[-1])).all()
-        if settled or (len(works) % LAST == 0 and np.abs(x).max() > far):
+        if settled or (len(works) % LAST == 0 and (weights @ np.abs(x)).max() > FAR * far * weights.sum()):
             break
-        z = inverse * r
+        z = prepared(r)
         before, rz = rz, np.einsum("nk,nk->k", r, z)
         p = z + np.divide(rz, before, out=np.zeros_like(rz), where=before > 0.0) * p
     return x
