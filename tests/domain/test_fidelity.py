@@ -93,6 +93,18 @@ def test_voxels_that_touch_are_one_piece() -> None:
     assert any("in 2 pieces" in line for line in domain.report())
 
 
+def test_a_body_that_no_node_lies_in_has_a_surface() -> None:
+    """Twenty pins in a few tetrahedra: what these hold is known, and what is drawn is their boundary."""
+    w, places = 0.0003, np.stack(np.mgrid[:10, :2], axis=-1).reshape(-1, 2) * [0.002, 0.0021] + [0.003, 0.004]
+    domain = surface_of(*(trimesh.creation.box((w, w, 0.01)).apply_translation((*at, 0.0)) for at in places))
+    mesh = TetForest.from_domain(domain, target_elements=100)
+    found = fidelity(mesh, domain)
+    assert found.watertight
+    assert found.volume == pytest.approx(found.input_volume, rel=0.03)
+    assert found.pieces < found.input_pieces == 20
+    assert found.doubts()
+
+
 def test_overlapping_parts_count_once() -> None:
     given = reference_of(surface_of(trimesh.creation.box((2, 1, 1)), trimesh.creation.box((1, 2, 1.0001))), 4000)
     assert given.volume == pytest.approx(3.0, rel=5e-3)

@@ -186,7 +186,7 @@ def test_a_crumb_that_dangles_says_nothing_of_the_body():
     held = np.flatnonzero(cube.points[:, 2] == 0.0)
     base = cube.tets[np.argmax(cube.points[cube.tets].mean(axis=1)[:, 2])]
     top = base[np.argsort(cube.points[base][:, 2])[1:]]
-    points = np.concatenate([cube.points, cube.points[top].mean(axis=0, keepdims=True) + [0.0, 0.0, 0.01]])
+    points = np.concatenate([cube.points, np.add(cube.points[top].mean(axis=0), [[0.0, 0.0, 0.01]])])
     tets = np.concatenate([cube.tets, [[*top, len(cube.points)]]])
     volumes = np.concatenate([cube.volumes, [1e-3 * cube.volumes.min()]])
     young = np.concatenate([np.full(len(cube.tets), 1e5), [1e-3]])

@@ -168,7 +168,11 @@ def _brick() -> Array:
 
 
 def solved(
-    matrix: csr_array, loads: Array, far: float, weights: Array, precondition: Callable[[Array], Array] | None = None
+    matrix: csr_array,
+    loads: Array,
+    far: float,
+    weights: npt.NDArray[Any],
+    precondition: Callable[[Array], Array] | None = None,
 ) -> Array:
     """Conjugate gradients for several right sides at once.
 

@@ -136,6 +136,8 @@ class Resolved:
         least of it, float64 [M] [m]; None where there is one piece, or too many to be true."""
         grown = self.grown
         tets = grown.tree.tets[self.leaves]
+        if not len(tets):
+            return None
         piece = connected(np.where(grown.phi[tets] < 0, tets, np.int32(-1)))
         sizes = np.bincount(piece, self.shares * self.volume[self.leaves])
         real = np.flatnonzero(sizes > LEAST_PIECE * sizes.sum())

@@ -28,8 +28,11 @@ def surface(forest: TetForest) -> SurfaceMesh:
     if forest.phi is None:
         return _boundary(forest)
     if forest.detail is not None:
-        return forest.detail.surface(forest)
-    return _on_nodes(forest, marched(forest.lattice_points, _all_cut(forest), forest.phi))
+        found = forest.detail.surface(forest)
+    else:
+        found = _on_nodes(forest, marched(forest.lattice_points, _all_cut(forest), forest.phi))
+    # What is thinner than all elements and between their nodes is not met by any.
+    return found if len(found.triangles) else _boundary(forest)
 
 
 def separating_surface(forest: TetForest) -> SurfaceMesh:
