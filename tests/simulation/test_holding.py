@@ -4,6 +4,7 @@ import functools
 
 import numpy as np
 import pytest
+import trimesh
 
 import warp_corot as wc
 from warp_corot.holding.choice import holds_of
@@ -204,6 +205,20 @@ def test_the_largest_flat_region_is_found():
     assert patch.where.endswith("facing up")
     assert mesh.points[patch.nodes, 2].min() > -0.02
     assert len(patch.nodes) >= 0.1 * len(mesh.points)
+
+
+def test_a_sheet_thinner_than_its_elements_is_held_to_its_corners():
+    """The nodes next to its flat side are a layer, and all of that is held."""
+    sheet = trimesh.creation.box((0.2, 0.2, 0.002))
+    domain = wc.Domain.from_surface((sheet.vertices, sheet.faces), up_axis="Z")
+    forest = wc.TetForest.from_domain(domain, target_elements=5000)
+    surface = forest.surface()
+    chosen = holds_of(forest, young=1e3, density=DENSITY, gravity=GRAVITY, surface=surface)
+    assert "flat region" in chosen.words
+    around = np.unique(surface.nodes[surface.points[:, 2] > 0.0009])
+    off = np.abs(forest.points[around, 2] - 0.001)
+    assert chosen.nodes[around[off < off.min() + 1e-6]].all()
+    assert not chosen.nodes.all()
 
 
 def test_a_thin_sheet_and_a_single_tetrahedron_keep_free_nodes():

@@ -180,7 +180,8 @@ class _Piece:
         needed = max(sag / LARGEST_SAG, lean / LARGEST_LEAN)
         if stands and needed <= 1.0 and not footprint.holds(self.body.centre + down.centre):
             return 1.01, sag, f"its centre of mass does not stay over {patch.where}"
-        return needed, sag, f"it would topple on {patch.where}"
+        topples = lean / LARGEST_LEAN > sag / LARGEST_SAG
+        return needed, sag, f"it would {'topple' if topples else 'sag too far'} on {patch.where}"
 
     def _of(self, patch: Patch, stands: bool, why: str, sag: float, stiffer: float) -> Hold:
         return Hold(patch.nodes, len(self.shape.nodes), patch.where, stands, why, sag, stiffer)
@@ -214,9 +215,9 @@ def holds_of(
     volumes = np.asarray(mesh.volumes) * (1.0 if getattr(mesh, "fill", None) is None else mesh.fill)  # type: ignore
     if surface is None:
         drawn, triangles = points, boundary_faces(mesh.tets, points)[0]
-        bound = np.arange(len(points))
+        bound, elements = np.arange(len(points)), None
     else:
-        drawn, triangles, bound = surface.points, surface.triangles, surface.nodes[:, 0]
+        drawn, triangles, bound, elements = surface.points, surface.triangles, surface.nodes[:, 0], surface.nodes
     of_tet = pieces_of(mesh.tets)
     of_node = piece_of_nodes(mesh, of_tet)
     of_triangle = of_node[bound[triangles[:, 0]]]
@@ -225,7 +226,7 @@ def holds_of(
     for number in range(count):
         inside, around = of_tet == number, triangles[of_triangle == number]
         tets = mesh.tets[inside]
-        shape = Shape(points, np.unique(tets), drawn, around, up)
+        shape = Shape(points, np.unique(tets), drawn, around, up, elements)
         own_young, own_density = (np.broadcast_to(np.ravel(a), len(of_tet))[inside] for a in (young, density))
         piece = _Piece(shape, tets, volumes[inside], own_young, own_density, g)
         small = len(tets) < SMALL_PIECE or volumes[inside].sum() < SMALL_SHARE * largest

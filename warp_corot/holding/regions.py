@@ -16,6 +16,8 @@ LEAST_NODES = 0.1
 #: A region is flat if its triangles face the same way, within this angle, in a layer of this share of the body's size;
 #: and if it is at least this share of the surface.
 SAME_WAY, LAYER, LEAST_FLAT = np.cos(np.radians(15.0)), 0.03, 0.08
+#: Nodes whose distances from it differ by less than this share are in one layer.
+SAME_LAYER = 1.0e-6
 #: Ways in which regions are looked for.
 WAYS = 200
 #: About so many triangles say which ways are worth a look.
@@ -58,6 +60,7 @@ class Shape:
         drawn: Points of the surface [m], [V, 3].
         triangles: Of the surface, those of the piece, [F, 3].
         up: Against gravity, unit vector.
+        bound: Nodes of the element that each point of the surface is bound to, [V, 4]; None: it is one of them itself.
     """
 
     points: Array
@@ -65,6 +68,7 @@ class Shape:
     drawn: Array
     triangles: npt.NDArray[np.integer]
     up: Array
+    bound: npt.NDArray[np.integer] | None = None
 
     @cached_property
     def skin(self) -> Array:
@@ -98,6 +102,10 @@ class Shape:
         doubled = np.linalg.norm(normals, axis=1)
         unit = np.divide(normals, doubled[:, None], out=np.zeros_like(normals), where=doubled[:, None] > 0.0)
         return (a + b + c) / 3.0, unit, 0.5 * doubled
+
+    def around(self, drawn: Indices) -> Indices:
+        """Nodes of the elements that hold points of the surface."""
+        return drawn if self.bound is None else np.unique(self.bound[drawn])
 
     def footprint(self, points: Array) -> Footprint:
         """What points cover of the ground."""
@@ -139,12 +147,25 @@ def flat_region(shape: Shape) -> Patch | None:
     way, chosen = _largest_flat(centroids, normals, areas, LAYER * shape.size)
     if areas[chosen].sum() < LEAST_FLAT * areas.sum():
         return None
-    corners = shape.drawn[np.unique(shape.triangles[chosen])]
-    away, _ = cKDTree(np.concatenate([centroids[chosen], corners])).query(shape.points[shape.nodes])
-    least, most = int(np.ceil(LEAST_NODES * len(away))), len(away) // 2
-    count = min(max(np.count_nonzero(away <= LAYER * shape.size), least), max(most, 1))
-    nodes = shape.nodes[np.sort(np.argsort(away, kind="stable")[:count])]
-    return Patch(nodes, f"its largest flat region, {_facing(way, shape.up)}")
+    region = np.concatenate([centroids[chosen], shape.drawn[np.unique(shape.triangles[chosen])]])
+    x = shape.points[shape.nodes]
+    away, nearest = cKDTree(region).query(x)
+    off = np.abs((x - region[nearest]) @ way)
+    least, most = int(np.ceil(LEAST_NODES * len(x))), max(len(x) // 2, 1)
+    near = (away <= LAYER * shape.size) | np.isin(shape.nodes, shape.around(np.unique(shape.triangles[chosen])))
+    held = _nearest_layers(off, near, most)
+    if np.count_nonzero(held) < least:
+        held = np.argsort(np.argsort(away, kind="stable")) < min(least, most)
+    return Patch(shape.nodes[held], f"its largest flat region, {_facing(way, shape.up)}")
+
+
+def _nearest_layers(off: Array, near: npt.NDArray[np.bool_], most: int) -> npt.NDArray[np.bool_]:
+    """Of nodes that are near a region, at most so many: whole layers of those that are least off it, for a part of one
+    would leave a corner of it loose."""
+    if np.count_nonzero(near) <= most:
+        return near
+    first_left_out = np.sort(off[near])[most]
+    return near & (off < (1.0 - SAME_LAYER) * first_left_out)
 
 
 def broad_sides(shape: Shape) -> Iterator[Patch]:
