@@ -1,82 +1,83 @@
 """A coarser mesh out of a forest: bisected again from the roots, where it is wished and conformity asks for it.
 
 All that could be asked for is in the forest: a conforming mesh that is wished for in part of its tetrahedra needs no
-other bisections than those that the forest has. So nothing is made here, and no value looked at.
+other bisections than those that the forest has. A tetrahedron must be bisected where it needs it, where a child of its
+is, and where another that shares its refinement edge is; all its other edges are edges of its children. So one sweep
+from the deepest level up tells for every tetrahedron up to which threshold it is bisected.
 """
 
 import warp as wp
 
-from warp_corot.kernels.tables.shapes import FIRST_NODE, SECOND_NODE
-
 from .bisection import refinement_end
-from .growth import LIVE, VOID, find_midpoint
+from .growth import LIVE, VOID
 
 #: In place of a first child: below the mesh.
 BELOW = wp.constant(-3)
 
 
+@wp.func
+def newest_node(element: int, tets: wp.array[wp.vec4i], level: wp.array[wp.int32], first_child: wp.array[wp.int32]):
+    """The node at which an element is bisected."""
+    return tets[first_child[element]][refinement_end(level[element])]
+
+
 @wp.kernel(enable_backward=False)
-def find_midpoints(
+def gather_needs(
     # In
+    elements: wp.array[wp.int32],
     tets: wp.array[wp.vec4i],
+    level: wp.array[wp.int32],
     first_child: wp.array[wp.int32],
-    keys: wp.array[wp.int64],
-    values: wp.array[wp.int32],
-    # Out
-    midpoints: wp.array2d[wp.int32],
+    holds: wp.array[wp.uint8],
+    # In and out
+    needs: wp.array[wp.float32],
+    of_node: wp.array[wp.float32],
 ):
-    """The nodes at the middle of the six edges of what is bisected, -1 where there is none."""
-    i = wp.tid()
-    if first_child[i] >= 0:
-        tet = tets[i]
-        for e in range(6):
-            midpoints[i, e] = find_midpoint(tet[FIRST_NODE[e]], tet[SECOND_NODE[e]], keys, values)
+    """What the bisected elements of one level need, and with each the others around the edge."""
+    element = elements[wp.tid()]
+    below = first_child[element]
+    need = wp.max(needs[element], wp.max(needs[below], needs[below + 1]))
+    needs[element] = need
+    if holds[element] != wp.uint8(0):
+        wp.atomic_max(of_node, newest_node(element, tets, level, first_child), need)
 
 
 @wp.kernel(enable_backward=False)
-def bisect_again(
+def take_needs(
     # In
-    first_child: wp.array[wp.int32],
+    elements: wp.array[wp.int32],
+    tets: wp.array[wp.vec4i],
     level: wp.array[wp.int32],
-    midpoints: wp.array2d[wp.int32],
+    first_child: wp.array[wp.int32],
+    of_node: wp.array[wp.float32],
+    # In and out
+    needs: wp.array[wp.float32],
+):
+    """An element is bisected where another around its refinement edge is."""
+    element = elements[wp.tid()]
+    node = newest_node(element, tets, level, first_child)
+    needs[element] = wp.max(needs[element], of_node[node])
+
+
+@wp.kernel(enable_backward=False)
+def cut_off(
+    # In
+    parent: wp.array[wp.int32],
+    first_child: wp.array[wp.int32],
     needs: wp.array[wp.float32],
     least: float,
     holds: wp.array[wp.uint8],
-    # In and out
-    child: wp.array[wp.int32],
-    active: wp.array[wp.uint8],
-    counts: wp.array[wp.int32],
-):
-    """One round: leaves of the mesh that need it, or hang, are bisected. Midpoints that become active in this round may
-    be seen in it or in the next one: which leaves are bisected in the end is the same."""
-    i = wp.tid()
-    if child[i] != LIVE or first_child[i] < 0:
-        return
-    split = needs[i] > least
-    if not split:
-        for e in range(6):
-            node = midpoints[i, e]
-            if node >= 0:
-                split = split or active[node] != wp.uint8(0)
-    if split:
-        below = first_child[i]
-        active[midpoints[i, refinement_end(level[i]) - 1]] = wp.uint8(1)
-        for n in range(2):
-            child[below + n] = wp.where(holds[below + n] != wp.uint8(0), LIVE, VOID)
-        child[i] = below
-        wp.atomic_add(counts, 0, 1)
-
-
-@wp.kernel(enable_backward=False)
-def count_leaves(
-    # In
-    child: wp.array[wp.int32],
-    shares: wp.array[wp.float32],
-    least: float,
     # Out
-    counts: wp.array[wp.int32],
+    child: wp.array[wp.int32],
 ):
-    """How many leaves hold no less than a share of themselves."""
+    """The mesh of a threshold. What holds nothing of the body is not bisected."""
     i = wp.tid()
-    if child[i] == LIVE and shares[i] >= least:
-        wp.atomic_add(counts, 0, 1)
+    above = parent[i]
+    found = BELOW
+    if above < 0 or (holds[above] != wp.uint8(0) and needs[above] > least):
+        found = VOID
+        if holds[i] != wp.uint8(0):
+            found = LIVE
+            if needs[i] > least and first_child[i] >= 0:
+                found = first_child[i]
+    child[i] = found

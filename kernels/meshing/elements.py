@@ -7,12 +7,13 @@ import warp as wp
 
 from warp_corot.kernels.tables.shapes import FIRST_NODE, SECOND_NODE
 
-from .growth import VOID
+from .growth import LIVE, VOID
 
 # What is known of a new element.
 DONE = wp.constant(0)
 SPLIT = wp.constant(1)
 OPEN = wp.constant(2)
+LEFT = wp.constant(3)  # not looked at again
 
 #: The need of an element that must be bisected, whatever is wished [m].
 MUST = wp.constant(1.0e30)
@@ -203,6 +204,7 @@ def judge_by_edges(
     circumradius: wp.array[wp.float32],
     lipschitz: float,
     tolerances: wp.array[wp.float32],
+    closest: wp.array[wp.float32],
     # In and out
     first_child: wp.array[wp.int32],
     states: wp.array[wp.int32],
@@ -215,7 +217,7 @@ def judge_by_edges(
 ):
     """Compare the midpoints of the six edges with the linear interpolant: of a quadratic function they tell all.
 
-    What barely passes is unsure, and looked at once more, in the middle of its piece of the surface or at its centroid:
+    What would barely pass the closest tolerance that there will be is unsure, and looked at once more, in the middle of its piece of the surface or at its centroid:
     what the quadratic function has there is ``expected``. An element's need is how far off its piece of the surface
     is [m].
     """
@@ -223,6 +225,7 @@ def judge_by_edges(
     element = elements[i]
     tet = tets[element]
     tolerance = tolerances[level[element]]
+    least = closest[level[element]]
     deviation = vec6()
     lowest = phi[tet[0]]
     highest = phi[tet[0]]
@@ -248,6 +251,7 @@ def judge_by_edges(
     elif crossed:
         slope = gradient_size(tet, phi, lattice, float(spacing), lipschitz)
         tolerance *= slope
+        least *= slope
         need = worst / slope
         if worst > tolerance:
             state = SPLIT
@@ -255,7 +259,7 @@ def judge_by_edges(
         need = worst
         if worst > tolerance:
             state = SPLIT
-    if state == OPEN and (worst < 0.25 * tolerance or wp.max(lowest, -highest) > 4.0 * worst):
+    if state == OPEN and (worst > least or worst < 0.25 * least or wp.max(lowest, -highest) > 4.0 * worst):
         state = DONE
     states[element - first] = state
     needs[element] = wp.min(need, circumradius[level[element]])
@@ -335,3 +339,69 @@ def take_wishes(
 ):
     i = wp.tid()
     wished[first + i] = wp.where(states[i] == SPLIT, wp.uint8(1), wp.uint8(0))
+
+
+@wp.kernel(enable_backward=False)
+def flag_off(
+    # In
+    first_child: wp.array[wp.int32],
+    level: wp.array[wp.int32],
+    needs: wp.array[wp.float32],
+    tolerances: wp.array[wp.float32],
+    max_level: int,
+    # Out
+    flags: wp.array[wp.int32],
+):
+    """Leaves that need to be bisected by more than they may."""
+    i = wp.tid()
+    flag = int(0)
+    if first_child[i] == LIVE and level[i] < max_level and needs[i] > tolerances[level[i]]:
+        flag = 1
+    flags[i] = flag
+
+
+@wp.kernel(enable_backward=False)
+def open_leaves(
+    # In
+    first_child: wp.array[wp.int32],
+    level: wp.array[wp.int32],
+    parent: wp.array[wp.int32],
+    tets: wp.array[wp.vec4i],
+    phi: wp.array[wp.float32],
+    needs: wp.array[wp.float32],
+    circumradius: wp.array[wp.float32],
+    lipschitz: float,
+    deepest: int,
+    rough: float,
+    # Out
+    states: wp.array[wp.int32],
+):
+    """Leaves of the deepest level, or below it, that the surface may cut and whose parents were off by a share of their size."""
+    i = wp.tid()
+    state = LEFT
+    if first_child[i] == LIVE and level[i] >= deepest:
+        size = circumradius[level[i]]
+        above = parent[i]
+        if above < 0 or needs[above] > rough * size:
+            tet = tets[i]
+            highest = wp.max(wp.vec4(phi[tet[0]], phi[tet[1]], phi[tet[2]], phi[tet[3]]))
+            if highest >= -lipschitz * size:
+                state = OPEN
+    states[i] = state
+
+
+@wp.kernel(enable_backward=False)
+def count_holding(
+    # In
+    first_child: wp.array[wp.int32],
+    tets: wp.array[wp.vec4i],
+    phi: wp.array[wp.float32],
+    # Out
+    count: wp.array[wp.int32],
+):
+    """How many leaves have a corner inside."""
+    i = wp.tid()
+    if first_child[i] == LIVE:
+        tet = tets[i]
+        if wp.min(wp.vec4(phi[tet[0]], phi[tet[1]], phi[tet[2]], phi[tet[3]])) < 0.0:
+            wp.atomic_add(count, 0, 1)

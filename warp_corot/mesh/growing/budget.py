@@ -9,13 +9,13 @@ number asked for, which takes no more looking at the body.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .adapt import GAP_ELEMENTS, THIN_NEED, Closer, Wishes, grow
+from .adapt import Closer, Enough, grow
+from .judging import GAP_ELEMENTS, THIN_NEED, Wishes
 from .resolved import Coarsening, Resolved
 
 if TYPE_CHECKING:
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 
     from warp_corot.domain import Domain
 
-#: What share of the number asked for is aimed at and is enough; after how many thresholds and cubes any is.
+#: What share of the number asked for is aimed at and is enough; after how many sizes of cubes any is.
 NEAR, NEAR_ENOUGH = 0.985, 0.92
-MOST_THRESHOLDS, MOST_CUBES = 14, 4
+MOST_CUBES = 4
 #: What an element counts as being off by between such pieces, as a share of its edge.
 GAP_NEED = 0.5
 #: The surface that is drawn is this much closer to the body's than the mesh's threshold.
-FINER_SURFACE = 0.3
+FINER_SURFACE, FINER_SURFACE_OF_MANY = 0.3, 1.0
 #: Cubes are as large as gives this share of the elements when none is bisected: about six in a cube inside, four at the
 #: surface.
 UNBISECTED = 1.0 / 6.0
@@ -37,9 +37,9 @@ UNBISECTED = 1.0 / 6.0
 #: finer ones would bring the rest of the surface little, and make the time step smaller. From so many elements on
 #: there are too few at the surface for that. Thin parts may have finer ones.
 MAX_LEVEL, MANY, MAX_LEVEL_THIN = 7, 300_000, 13
-#: How closely the body is looked at: to which surface error over a cube's edge, and to how many tetrahedra of all
+#: How closely the body is looked at: from which surface error over a cube's edge to which, and to how many tetrahedra of all
 #: levels for each one asked for, or a fixed number if that is more.
-CLOSE_ERROR, CLOSE_LEVEL = 0.01, 8
+FIRST_ERROR, CLOSE_ERROR, CLOSE_LEVEL = 0.1, 0.01, 8
 CLOSER_LEVELS, CLOSER_ERROR = 6, 0.2
 CLOSE_ELEMENTS, CLOSE_ELEMENTS_OF_MANY = 5, 2
 
@@ -77,25 +77,22 @@ class Meshes:
 
     def __init__(self, resolved: Resolved, needs: np.ndarray, least: float, sliver: float):
         self.resolved = resolved
-        self._needs, self._least = needs, least
-        self._coarsening = Coarsening(resolved, sliver)
+        self._needs, self._least, self._sliver = needs, least, sliver
+        self._coarsening = Coarsening(resolved, needs, sliver)
         self.count, self.threshold = 0, 0.0
         self.child = np.empty(0, np.int32)
 
     def choose(self, target: int) -> int:
         """Make the present mesh the one of at most so many elements; how many it has, more where the coarsest has."""
-        meshed = self._coarsening.mesh
-        self.threshold = _threshold(lambda least: meshed(self._needs, least), self._needs, target, self._least)
-        self.count = meshed(self._needs, self.threshold)
-        self.child = self._coarsening.child
+        self.threshold = self._coarsening.threshold(target, self._least)
+        self.count, self.child = self._coarsening.mesh(self.threshold)
         return self.count
 
     def surface(self, threshold: float) -> np.ndarray:
         """A mesh of the same forest, finer than that of a threshold, whose surface is to be drawn; as `child`."""
         resolved = self.resolved
-        needs = resolved.largest(np.where(resolved.held > 0.0, resolved.grown.need, 0.0))
-        self._coarsening.mesh(np.maximum(needs, self._needs), FINER_SURFACE * threshold)
-        return self._coarsening.child
+        needs = np.maximum(np.where(resolved.held > 0.0, resolved.grown.need, 0.0), self._needs)
+        return Coarsening(resolved, needs, self._sliver).mesh(FINER_SURFACE * threshold)[1]
 
 
 def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Device) -> Meshes | None:
@@ -109,7 +106,7 @@ def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Devi
     size = budget.cell_size or suits
     for trial in range(MOST_CUBES):
         meshes = _of_cubes(domain, budget, size, suits, sliver, device, spread=trial == MOST_CUBES - 1)
-        count = meshes.choose(budget.target)
+        count = meshes.choose(int(NEAR * budget.target))
         if count <= budget.target and (best is None or count > best.count):
             best = meshes
         if budget.cell_size or NEAR_ENOUGH * budget.target <= count <= budget.target:
@@ -160,7 +157,9 @@ def _of_cubes(
         min(deepest, looked + CLOSER_LEVELS),
     )
     room = (CLOSE_ELEMENTS if target <= MANY else CLOSE_ELEMENTS_OF_MANY) * target + 40_000
-    grown = grow(domain, size, looking, device, Closer(CLOSER_LEVELS, CLOSER_ERROR, room))
+    closer = Closer(CLOSER_LEVELS, CLOSER_ERROR, room)
+    enough = Enough(target, FIRST_ERROR * min(size, suits), FINER_SURFACE if target <= MANY else FINER_SURFACE_OF_MANY)
+    grown = grow(domain, size, looking, device, closer, enough)
     resolved = Resolved(grown, size, domain)
     needs = needs_of(resolved, domain, budget.min_layers, most, deepest)
     if spread:
@@ -198,26 +197,3 @@ def _told_apart(resolved: Resolved, needs: np.ndarray) -> np.ndarray:
     axis = int(np.argmax(grown.cells))
     along = grown.lattice[grown.tree.tets, axis].mean(axis=1)
     return resolved.largest(needs * (1.0 + 0.05 * along / along.max())).astype(np.float32)
-
-
-def _threshold(meshed: Callable[[float], int], needs: np.ndarray, target: int, least: float) -> float:
-    """The threshold above ``least`` that gives so many elements, or nearly.
-
-    How many elements a mesh has goes about linearly with how many tetrahedra are above the threshold.
-    """
-    ordered = np.sort(needs[needs > max(least, 0.0)])[::-1]
-    if not len(ordered) or (count := meshed(float(least))) <= target:
-        return float(least)
-    few, many = (0, meshed(float(ordered[0]))), (len(ordered), count)
-    for trial in range(MOST_THRESHOLDS):
-        if few[1] > target or few[1] >= 0.97 * target or many[0] - few[0] <= 1:
-            break
-        if few[1] >= NEAR_ENOUGH * target and trial > 5:
-            break
-        share = (NEAR * target - few[1]) / max(many[1] - few[1], 1)
-        # Now and then in the middle, where the line is no good guess.
-        share = 0.5 if trial % 3 == 2 else min(max(share, 0.02), 0.98)
-        place = min(max(few[0] + round(share * (many[0] - few[0])), few[0] + 1), many[0] - 1)
-        last = (place, meshed(float(ordered[place])))
-        few, many = (last, many) if last[1] <= target else (few, last)
-    return float(ordered[few[0]])

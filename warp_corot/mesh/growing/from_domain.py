@@ -16,11 +16,12 @@ from warp_corot.mesh.lattice import MAX_LEVEL, check_levels, checked_cell_size, 
 from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, pruned, renumbered, with_virtual
 from warp_corot.mesh.tree import LIVE
 
-from .adapt import Closer, Wishes, grow
+from .adapt import Closer, grow
 from .budget import NEAR, NEAR_ENOUGH, Budget, chosen_meshes
 from .cut import label_shares, without_slivers
 from .detail import Detail
 from .growth import lattice_spacing
+from .judging import Wishes
 from .resolved import LEAST, MOST_POINTS, Resolved, points_within
 
 if TYPE_CHECKING:

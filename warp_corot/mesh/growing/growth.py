@@ -116,13 +116,13 @@ class Growth:
         self.launch(kernels.gather_flagged, len(flags), [flags, places, first], [chosen])
         return chosen
 
-    def close(self, judge: Any = None) -> None:
+    def close(self, judge: Any = None, first: int = 0) -> None:
         """Bisect until nothing hangs.
 
         Args:
             judge: Called with the number of the first new element after each round; it may wish for more.
+            first: The first element that is new since nothing hung.
         """
-        first = 0
         while len(broken := self.hanging(first)):
             first = self.element_count
             self.bisect(broken)

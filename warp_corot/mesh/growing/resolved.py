@@ -13,9 +13,9 @@ from warp_corot.kernels.meshing import coarsening as kernels
 from warp_corot.mesh.lattice import volume_shares
 from warp_corot.mesh.tree import LIVE, VOID, Tree
 
-from .adapt import GAP_ELEMENTS, surface_points
 from .cut import connected, inside_shares
 from .growth import lattice_spacing
+from .judging import FARTHER, GAP_ELEMENTS, ROUGH, surface_points
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 BELOW = -3
 
 
-#: Leaves in which the surface is off by more than this share of their edge are filled with points, up to eight each.
-ROUGH = 0.03
 #: Pieces of less than this share of the body are none, and more of them are crumbs of what is not resolved.
 LEAST_PIECE, MOST_PIECES = 1.0e-4, 16
 #: About so many points in all.
@@ -128,7 +126,7 @@ class Resolved:
         if len(cut):
             tets, spacing = grown.tree.tets[cut], lattice_spacing(self.cell_size)
             x, inward = surface_points(grown.lattice, grown.phi, tets, grown.origin, spacing)
-            found[cut] = domain.thickness(x, inward, layers * self.cell_size)
+            found[cut] = domain.thickness(x, inward, FARTHER * layers * self.cell_size)
         return self.smallest(found)
 
     def gaps(self) -> np.ndarray | None:
@@ -153,12 +151,12 @@ class Resolved:
 
     def _upwards(self, values: np.ndarray, ufunc: np.ufunc) -> np.ndarray:
         values, first = values.copy(), self.grown.tree.first_child
-        for elements in self._deepest_first():
+        for elements in self.deepest_first():
             below = ufunc(values[first[elements]], values[first[elements] + 1])
             values[elements] = ufunc(values[elements], below)
         return values
 
-    def _deepest_first(self) -> Iterator[np.ndarray]:
+    def deepest_first(self) -> Iterator[np.ndarray]:
         return reversed(self._by_level)
 
 
@@ -170,48 +168,50 @@ class Coarsening:
 
     Args:
         resolved: The forest.
+        needs: How much each of its tetrahedra needs to be bisected [m], float32 [M].
         sliver: Leaves that hold less than this share of themselves are not counted.
     """
 
-    def __init__(self, resolved: Resolved, sliver: float):
+    def __init__(self, resolved: Resolved, needs: np.ndarray, sliver: float):
         growth, tree = resolved.grown.growth, resolved.grown.tree
-        self.device, self.sliver = growth.device, sliver
-        count = len(tree.level)
-        self._first_child = growth.first_child[:count]
-        self._level = growth.level[:count]
-        self._midpoints = wp.full((count, 6), -1, dtype=wp.int32, device=self.device)
-        inputs = [growth.tets, self._first_child, *growth.table]
-        wp.launch(kernels.find_midpoints, count, inputs, [self._midpoints], device=self.device)
+        self.device, count = growth.device, len(tree.level)
         holds = resolved.held > 0.0
         self._holds = wp.array(holds.astype(np.uint8), dtype=wp.uint8, device=self.device)
-        share = (resolved.held / resolved.volume).astype(np.float32)
-        self._shares = wp.array(share, dtype=wp.float32, device=self.device)
-        roots = np.where(tree.parent < 0, np.where(holds, LIVE, VOID), BELOW)
-        self._roots = wp.array(roots, dtype=wp.int32, device=self.device)
-        self._nodes = growth.node_count
-        self._child = wp.clone(self._roots)
+        self._parent, self._first_child = growth.parent[:count], growth.first_child[:count]
+        self._needs = wp.array(needs, dtype=wp.float32, device=self.device)
+        of_node = wp.zeros(growth.node_count, dtype=wp.float32, device=self.device)
+        for elements in resolved.deepest_first():
+            chosen = wp.array(elements, dtype=wp.int32, device=self.device)
+            inputs = [chosen, growth.tets, growth.level, self._first_child]
+            growth.launch(kernels.gather_needs, len(elements), [*inputs, self._holds], [self._needs, of_node])
+            growth.launch(kernels.take_needs, len(elements), [*inputs, of_node], [self._needs])
+        own = self._needs.numpy()
+        counted = holds & (resolved.held >= sliver * resolved.volume)
+        roots = np.count_nonzero(counted & (tree.parent < 0))
+        above = tree.parent[counted & (tree.parent >= 0)]
+        # A tetrahedron is a leaf of the meshes of thresholds from what it needs up to what its parent needs.
+        begin, end = np.sort(own[counted]), np.sort(own[above[holds[above]]])
+        last = np.append(end[1:] != end[:-1], True) if len(end) else np.empty(0, bool)
+        self._thresholds = end[last]
+        self._counts = roots + len(end) - 1 - np.flatnonzero(last)
+        self._counts -= len(begin) - np.searchsorted(begin, self._thresholds, side="right")
+        self._counted = counted
 
-    def mesh(self, needs: np.ndarray, least: float) -> int:
-        """Bisect all that needs it by more than ``least``, and what hangs then; how many leaves there are."""
-        wp.copy(self._child, self._roots)
-        need = wp.array(needs, dtype=wp.float32, device=self.device)
-        active = wp.zeros(self._nodes, dtype=wp.uint8, device=self.device)
-        counts = wp.zeros(1, dtype=wp.int32, device=self.device)
-        inputs = [self._first_child, self._level, self._midpoints, need, float(least), self._holds]
-        while True:
-            counts.zero_()
-            outputs = [self._child, active, counts]
-            wp.launch(kernels.bisect_again, len(needs), inputs, outputs, device=self.device)
-            if not int(counts.numpy()[0]):
-                break
-        inputs = [self._child, self._shares, self.sliver]
-        wp.launch(kernels.count_leaves, len(needs), inputs, [counts], device=self.device)
-        return int(counts.numpy()[0])
+    def threshold(self, target: int, least: float) -> float:
+        """The threshold, ``least`` or more, that gives the most elements up to a number."""
+        first = int(np.searchsorted(self._thresholds, np.float32(least), side="right"))
+        if self.mesh(least)[0] <= target or first == len(self._thresholds):
+            return float(least)
+        counts = np.where(self._counts[first:] <= target, self._counts[first:], -1)
+        return float(self._thresholds[first + int(np.argmax(counts))])
 
-    @property
-    def child(self) -> np.ndarray:
-        """The last mesh, int32 [M]."""
-        return self._child.numpy().copy()
+    def mesh(self, least: float) -> tuple[int, np.ndarray]:
+        """Bisect all that needs it by more than ``least``: how many leaves are counted, and the mesh, int32 [M]."""
+        child = wp.empty(len(self._needs), dtype=wp.int32, device=self.device)
+        inputs = [self._parent, self._first_child, self._needs, float(least), self._holds]
+        wp.launch(kernels.cut_off, len(child), inputs, [child], device=self.device)
+        found = child.numpy()
+        return int(np.count_nonzero(self._counted & (found == LIVE))), found
 
 
 #: Corners of the eight tetrahedra of one size that a tetrahedron is made of, as barycentric coordinates [8, 4, 4].

@@ -1,0 +1,295 @@
+"""What is to be bisected: where a body's surface, its thickness, its labels or the user's functions ask for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from warp_corot.errors import InputError
+from warp_corot.kernels.meshing import elements as kernels
+from warp_corot.kernels.tables.shapes import CIRCUMRADIUS, EDGE_LENGTHS
+from warp_corot.mesh.lattice import LATTICE_BITS, MAX_LEVEL
+from warp_corot.mesh.tree import LIVE
+
+from .growth import Growth, lattice_spacing, with_room
+
+if TYPE_CHECKING:
+    from warp_corot.domain import Domain
+    from warp_corot.mesh.forest import Field
+
+#: What an element counts as being off by where the body is thinner than its layers, as a share of its edge, and so many
+#: elements have room between pieces of the body that are not to grow together.
+THIN_NEED, GAP_ELEMENTS = 0.4, 2.0
+#: Thickness is looked for over this much more than what it is compared with, as what is thicker counts as this thick.
+FARTHER = 1.01
+#: The need [m] of what is looked at closely for its thickness alone, which counts when the mesh is chosen.
+LOOKED = 1.0e-12
+#: Elements that are off by less than this share of their edge need no closer look.
+ROUGH = 0.03
+#: What an element that holds two labels counts as being off by, as a share of its edge.
+LABEL_NEED = 0.05
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """How fine a mesh is to be.
+
+    Attributes:
+        surface_error: How far its surface may be from the domain's [m].
+        min_level, max_level: Between which levels.
+        refine_where: Function of points [n, 3] -> bool [n]: elements that have such a point are bisected.
+        field: Function of points [n, 3] -> numbers [n]: elements in which it varies are bisected ...
+        field_tolerance: ... by more than this.
+        layers: Elements at the surface are bisected to level ``thin_level`` where the body is thinner than so many of
+            them, and where pieces of it are nearer to one another.
+    """
+
+    surface_error: float
+    min_level: int
+    max_level: int
+    refine_where: Field | None = None
+    field: Field | None = None
+    field_tolerance: float = 0.0
+    layers: float = 0.0
+    thin_level: int = 0
+
+
+class Judge:
+    """Looks at new elements of a forest: which are outside, how far off the others are, and which are to be bisected.
+
+    Attributes:
+        phi: Values at the nodes, with room to spare.
+        need: How far off each element would be, were it not bisected [m], with room to spare.
+        tolerances: How far each level may be [m], float32.
+        closest: To what the tolerances may be lowered later on [m], float32.
+        max_level: Below which nothing is bisected.
+        limited: Whether the number of elements is limited, so that only what is off by more than the tolerances counts.
+        closer: Whether the body is looked at more closely than the mesh is to follow it.
+    """
+
+    def __init__(self, domain: Domain, growth: Growth, cells: Any, origin: Any, cell_size: float, wishes: Wishes):
+        self.domain, self.growth, self.wishes, self.device = domain, growth, wishes, growth.device
+        self.top = wp.vec3i(*(n << LATTICE_BITS for n in cells))
+        self.origin = wp.vec3d(*origin)
+        self.spacing = lattice_spacing(cell_size)
+        level = np.arange(MAX_LEVEL + 1)
+        h = cell_size * 0.5 ** (level // 3)
+        self.circumradius = wp.array(h * np.array(CIRCUMRADIUS)[level % 3], dtype=wp.float32, device=self.device)
+        self.edges = wp.array(h[:, None] * np.array(EDGE_LENGTHS)[level % 3], dtype=wp.float32, device=self.device)
+        #: What float32 coordinates leave open of a value.
+        reach = float(np.abs(np.asarray(origin)).max() + max(cells) * cell_size)
+        self.noise = float(domain.lipschitz) * reach * 2.0**-22
+        self.phi = wp.empty(0, dtype=wp.float32, device=self.device)
+        self.evaluated = 0
+        self.need = wp.empty(0, dtype=wp.float32, device=self.device)
+        self.tolerances = np.full(MAX_LEVEL + 1, wishes.surface_error, np.float32)
+        self.closest = self.tolerances
+        self.lengths = h
+        self.max_level = wishes.max_level
+        self.limited = self.closer = False
+
+    def evaluate(self) -> None:
+        """Values at the nodes that are new."""
+        growth, first = self.growth, self.evaluated
+        count = growth.node_count - first
+        if not count:
+            return
+        self.phi = with_room(self.phi, growth.node_count)
+        points = wp.empty(count, dtype=wp.vec3, device=self.device)
+        growth.launch(kernels.node_points, count, [growth.lattice, first, self.origin, self.spacing], [points])
+        found = self.domain.phi(points)
+        growth.launch(kernels.take_values, count, [found, growth.lattice, first, self.top, self.noise], [self.phi])
+        self.evaluated = growth.node_count
+
+    def wished(self, first: int) -> wp.array:
+        """Find out of all elements from ``first`` on whether they are outside, and which are to be bisected."""
+        growth, wishes = self.growth, self.wishes
+        self.evaluate()
+        self.need = with_room(self.need, growth.element_count)
+        count = growth.element_count - first
+        states = wp.empty(count, dtype=wp.int32, device=self.device)
+        inputs = [first, growth.tets, growth.level, self.phi, self.circumradius, self.edges]
+        inputs += [float(self.domain.lipschitz), wishes.min_level, self.max_level]
+        growth.launch(kernels.judge_by_corners, count, inputs, [growth.first_child, states, self.need])
+        self._judge_all(first, states)
+        if not self.limited:
+            growth.launch(kernels.take_wishes, count, [states, first], [growth.wished])
+        return self.of_state(states, kernels.SPLIT, first)
+
+    def off(self) -> wp.array:
+        """Leaves that are off by more than they may be now."""
+        growth = self.growth
+        flags = wp.empty(growth.element_count, dtype=wp.int32, device=self.device)
+        inputs = [growth.first_child, growth.level, self.need, self._on_device(self.tolerances), self.max_level]
+        growth.launch(kernels.flag_off, growth.element_count, inputs, [flags])
+        return growth.flagged(flags)
+
+    def unresolved(self, levels: int, error: float) -> wp.array:
+        """Begin to look closer, to so many levels more: leaves of the deepest level up to now that are to be bisected.
+
+        Args:
+            levels: How many.
+            error: How far the surface may be off there at the least, as a share of an element's edge.
+        """
+        growth, before = self.growth, self.max_level
+        self.limited = self.closer = True
+        self.max_level = min(before + levels, MAX_LEVEL)
+        self.tolerances = np.maximum(self.tolerances, error * self.lengths).astype(np.float32)
+        self.closest = self.tolerances
+        states = wp.empty(growth.element_count, dtype=wp.int32, device=self.device)
+        inputs = [growth.first_child, growth.level, growth.parent, growth.tets, self.phi, self.need, self.circumradius]
+        inputs += [float(self.domain.lipschitz), before, ROUGH]
+        growth.launch(kernels.open_leaves, growth.element_count, inputs, [states])
+        self._judge_all(0, states)
+        return self.of_state(states, kernels.SPLIT, 0)
+
+    def holding(self) -> int:
+        """How many leaves have a corner inside."""
+        growth = self.growth
+        count = wp.zeros(1, dtype=wp.int32, device=self.device)
+        inputs = [growth.first_child, growth.tets, self.phi]
+        growth.launch(kernels.count_holding, growth.element_count, inputs, [count])
+        return int(count.numpy()[0])
+
+    def of_state(self, states: wp.array, state: int, first: int) -> wp.array:
+        flags = wp.empty(len(states), dtype=wp.int32, device=self.device)
+        self.growth.launch(kernels.flag_equal, len(states), [states, state], [flags])
+        return self.growth.flagged(flags, first)
+
+    def _judge_all(self, first: int, states: wp.array) -> None:
+        self.judge_surface(first, states)
+        self.judge_thickness(first, states)
+        self.judge_fields(first, states)
+
+    def judge_surface(self, first: int, states: wp.array) -> None:
+        """Where corners leave it open: compare with the linear interpolant at midpoints, then at one point more."""
+        growth, lipschitz = self.growth, float(self.domain.lipschitz)
+        limits = [self._on_device(self.tolerances), self._on_device(self.closest)]
+        elements = self.of_state(states, kernels.OPEN, first)
+        count = len(elements)
+        if not count:
+            return
+        slots = growth.insert_edges(elements, of_refinement=False)
+        self.evaluate()
+        unsure = wp.empty(count, dtype=wp.int32, device=self.device)
+        probes = wp.empty(count, dtype=wp.vec3, device=self.device)
+        expected, deviations = (wp.empty(count, dtype=wp.float32, device=self.device) for _ in range(2))
+        inputs = [elements, first, *growth.midpoints(slots), growth.tets, growth.level, self.phi, growth.lattice]
+        inputs += [self.origin, self.spacing, self.circumradius, lipschitz, *limits]
+        outputs = [growth.first_child, states, self.need, unsure, probes, expected, deviations]
+        growth.launch(kernels.judge_by_edges, count, inputs, outputs)
+        chosen = growth.flagged(unsure)
+        if len(chosen):
+            found = self.domain.phi(probes[chosen].contiguous())
+            inputs = [chosen, elements, first, found, expected, deviations, growth.tets, growth.level, self.phi]
+            inputs += [growth.lattice, self.spacing, lipschitz, limits[0]]
+            growth.launch(kernels.judge_by_probes, len(chosen), inputs, [states, self.need])
+
+    def judge_thickness(self, first: int, states: wp.array) -> None:
+        """Bisect where the body is thinner than a few elements, or gaps between its pieces are."""
+        wishes, growth, domain = self.wishes, self.growth, self.domain
+        if not wishes.layers or not len(states):
+            return
+        state = states.numpy()
+        level = growth.level[first : growth.element_count].numpy()
+        leaf = growth.first_child[first : growth.element_count].numpy()
+        # Without a limit to their number elements are no finer for it than the rest.
+        deepest = wishes.thin_level if self.closer else wishes.max_level
+        chosen = np.flatnonzero((state == kernels.DONE) & (leaf == LIVE) & (level < deepest))
+        # Rays start well where the surface is known well.
+        chosen = chosen[self.need[first : growth.element_count].numpy()[chosen] <= self.closest[level[chosen]]]
+        tets = growth.tets[first : growth.element_count].numpy()[chosen]
+        phi = self.phi.numpy()[tets]
+        crossed = (phi < 0).any(axis=1) & (phi >= 0).any(axis=1)
+        chosen, tets = chosen[crossed], tets[crossed]
+        if not len(chosen):
+            return
+        x, inward = surface_points(growth.lattice.numpy(), self.phi.numpy(), tets, self.origin, self.spacing)
+        # By volume: a cube's edge halves in three levels.
+        length = self.lengths[0] * 0.5 ** (level[chosen] / 3.0)
+        reach = FARTHER * wishes.layers * float(length.max())
+        thin = wishes.layers * length > domain.thickness(x, inward, reach)
+        need = np.where(thin, THIN_NEED * length, 0.0)
+        wanted = THIN_NEED * length > (self.tolerances[level[chosen]] if self.limited else 0.0)
+        split = thin & wanted
+        if domain.has_pieces:
+            # Whether it is a gap between pieces is known later; the need of it is counted then.
+            reach = FARTHER * GAP_ELEMENTS * float(length.max())
+            near = GAP_ELEMENTS * length > domain.thickness(x, inward, reach, outside=True)
+            need = np.where(near, np.maximum(need, LOOKED), need)
+            split |= near & (wanted | (not self.closer))
+        state[chosen[split]] = kernels.SPLIT
+        states.assign(state)
+        needs = self.need.numpy()
+        needs[first + chosen] = np.maximum(needs[first + chosen], need)
+        self.need.assign(needs)
+
+    def judge_fields(self, first: int, states: wp.array) -> None:
+        """Bisect where labels or the user's fields ask for it, seen at corners and centroids."""
+        wishes, domain = self.wishes, self.domain
+        if not (domain.label_names or wishes.refine_where or wishes.field):
+            return
+        growth = self.growth
+        state = states.numpy()
+        leaf = growth.first_child[first : growth.element_count].numpy()
+        level = growth.level[first : growth.element_count].numpy()
+        chosen = np.flatnonzero((state == kernels.DONE) & (leaf == LIVE) & (level < wishes.max_level))
+        if not len(chosen):
+            return
+        tets = growth.tets[first : growth.element_count].numpy()[chosen]
+        nodes, corners = np.unique(tets, return_inverse=True)
+        corners = corners.reshape(-1, 4)
+        at_nodes = np.asarray(self.origin) + growth.lattice[: growth.node_count].numpy()[nodes] * self.spacing
+        at_middle = at_nodes[corners].mean(axis=1)
+
+        def sampled(function: Callable[[np.ndarray], Any]) -> np.ndarray:
+            return np.column_stack([_checked(function, at_nodes)[corners], _checked(function, at_middle)])
+
+        must = np.zeros(len(chosen), bool)
+        if wishes.refine_where is not None:
+            must |= sampled(wishes.refine_where).astype(bool).any(axis=1)
+        if wishes.field is not None:
+            must |= np.ptp(sampled(wishes.field).astype(float), axis=1) > wishes.field_tolerance
+        need = np.where(must, kernels.MUST, 0.0).astype(np.float32)
+        if domain.label_names:
+            mixed = np.ptp(sampled(lambda x: domain.labels_at(x, nearest=True)), axis=1) > 0
+            need[mixed] = np.maximum(need[mixed], LABEL_NEED * self.lengths[level[chosen[mixed]]])
+        split = need > (self.tolerances[level[chosen]] if self.limited else 0.0)
+        needs = self.need.numpy()
+        needs[first + chosen] = np.maximum(needs[first + chosen], need)
+        self.need.assign(needs)
+        state[chosen[split]] = kernels.SPLIT
+        states.assign(state)
+
+    def _on_device(self, tolerances: np.ndarray) -> wp.array:
+        return wp.array(tolerances, dtype=wp.float32, device=self.device)
+
+
+def surface_points(
+    lattice: np.ndarray, phi: np.ndarray, tets: np.ndarray, origin: Any, spacing: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """A point on the surface, or nearly, in each element that it cuts, and the direction inwards there [n, 3]."""
+    x = np.asarray(origin, dtype=np.float64) + lattice[tets] * float(spacing)
+    values = phi[tets].astype(np.float64)
+    edges = x[:, 1:] - x[:, :1]
+    gradient = np.linalg.solve(edges, (values[:, 1:] - values[:, :1])[..., None])[..., 0]
+    slope = np.linalg.norm(gradient, axis=1)
+    inward = -gradient / np.maximum(slope, 1e-30)[:, None]
+    # From the middle along the gradient to where the interpolant is zero, but no farther than the element is long.
+    size = np.linalg.norm(edges, axis=2).max(axis=1)
+    step = np.divide(values.mean(axis=1), slope, out=np.zeros(len(x)), where=slope > 0)
+    return x.mean(axis=1) + np.clip(step, -size, size)[:, None] * inward, inward
+
+
+def _checked(function: Callable[[np.ndarray], Any], points: np.ndarray) -> np.ndarray:
+    found = np.asarray(function(points))
+    if found.shape != (len(points),):
+        raise InputError(f"a field gave the shape {found.shape} for {len(points)} points; it must give [{len(points)}]")
+    if not np.isfinite(found).all():
+        bad = int(np.flatnonzero(~np.isfinite(found))[0])
+        raise InputError(f"a field is {found[bad]} at {points[bad].tolist()}; it must be finite")
+    return found
