@@ -12,6 +12,12 @@ FAR = 1.0e15
 #: quarter on closed surfaces (thin plates and shells among them), at 1.0 a few were; 2.0 takes half as long again.
 ACCURACY = 1.5
 
+#: Two directions in which rays are sent, along which hardly a face lies. After a crossing a ray goes on by this share of
+#: its coordinates, and so many crossings are counted.
+RAYS = wp.constant(wp.mat33(0.4573, -0.2689, 0.8477, -0.7346, 0.6211, 0.2729, 0.0, 0.0, 0.0))
+RAY_STEP = wp.constant(2.0e-6)
+MOST_CROSSINGS = wp.constant(64)
+
 #: A closest point whose barycentric coordinate at a corner is below this lies on the edge across from it.
 AT_EDGE = wp.constant(1.0e-4)
 
@@ -149,6 +155,31 @@ def pseudo_normal(
     return found
 
 
+@wp.func
+def crossings(mesh: wp.uint64, p: wp.vec3, direction: wp.vec3):
+    """How often more a ray leaves what a closed surface encloses than it enters it: the winding number at its start."""
+    count = int(0)
+    at = float(0.0)
+    for _ in range(MOST_CROSSINGS):
+        found = wp.mesh_query_ray(mesh, p + at * direction, direction, FAR)
+        if not found.result:
+            return count
+        leaves = wp.dot(wp.mesh_eval_face_normal(mesh, found.face), direction) > 0.0
+        count += wp.where(leaves, 1, -1)
+        at += found.t
+        at += RAY_STEP * (wp.length(p) + at)
+    return -MOST_CROSSINGS
+
+
+@wp.func
+def is_inside(mesh: wp.uint64, p: wp.vec3):
+    """Whether the winding number at a point is above one half: by two rays, and by solid angles where these differ."""
+    first = crossings(mesh, p, wp.normalize(RAYS[0]))
+    if first == crossings(mesh, p, wp.normalize(RAYS[1])) and first > -MOST_CROSSINGS:
+        return first > 0
+    return wp.mesh_query_point_sign_winding_number(mesh, p, FAR, ACCURACY).sign < 0.0
+
+
 @wp.kernel(enable_backward=False)
 def evaluate_surface(
     # In
@@ -170,7 +201,7 @@ def evaluate_surface(
     side = int(sides[found.face])
     sign = float(-1.0)
     if side == UNSURE:
-        sign = wp.mesh_query_point_sign_winding_number(mesh, p, FAR, ACCURACY).sign
+        sign = wp.where(is_inside(mesh, p), -1.0, 1.0)
     elif side == BOUNDARY:
         normal = wp.mesh_eval_face_normal(mesh, found.face)
         normal = pseudo_normal(found.face, found.u, found.v, indices, edge_normals, corner_normals, normal)

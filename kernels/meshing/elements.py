@@ -217,9 +217,9 @@ def judge_by_edges(
 ):
     """Compare the midpoints of the six edges with the linear interpolant: of a quadratic function they tell all.
 
-    What would barely pass the closest tolerance that there will be is unsure, and looked at once more, in the middle of its piece of the surface or at its centroid:
-    what the quadratic function has there is ``expected``. An element's need is how far off its piece of the surface
-    is [m].
+    What would barely pass the closest tolerance that there will be is unsure, and looked at once more, in the middle of
+    its piece of the surface or at its centroid: what the quadratic function has there is ``expected``. An element's need
+    is how far off its piece of the surface is [m].
     """
     i = wp.tid()
     element = elements[i]
@@ -376,7 +376,8 @@ def open_leaves(
     # Out
     states: wp.array[wp.int32],
 ):
-    """Leaves of the deepest level, or below it, that the surface may cut and whose parents were off by a share of their size."""
+    """Leaves of the deepest level, or below it, that the surface may cut and whose parents were off by a share of their
+    size."""
     i = wp.tid()
     state = LEFT
     if first_child[i] == LIVE and level[i] >= deepest:

@@ -6,7 +6,7 @@ from meshes import PAIRS, SHAPES, as_trimesh, assert_bound, held
 from scipy.spatial import ConvexHull
 
 import warp_corot as wc
-from warp_corot.mesh.growing.cut import inside_shares, label_shares, merged
+from warp_corot.mesh.growing.cut import face_pairs, inside_shares, label_shares, merged
 
 
 def test_share_inside_is_the_volume_of_the_convex_hull():
@@ -40,20 +40,21 @@ def test_what_elements_hold_is_what_the_surface_encloses(shape, sliver):
 
 def test_slivers_without_other_neighbours_go_to_the_fullest():
     box = wc.TetForest.box((1, 1, 1), 1.0, 3)
+    pairs = face_pairs(box.tets)
     rng = np.random.default_rng(2)
     volumes = rng.random(len(box.tets))
-    after, gone = merged(box.tets, volumes, np.ones(len(volumes), bool))
+    after, gone = merged(pairs, volumes, np.ones(len(volumes), bool))
     assert gone.sum() == len(volumes) - 1
     assert not gone[np.argmax(volumes)]
     assert after.sum() == pytest.approx(volumes.sum())
     small = rng.random(len(volumes)) < 0.4
-    after, gone = merged(box.tets, volumes, small)
+    after, gone = merged(pairs, volumes, small)
     assert np.array_equal(gone, small)
     assert after.sum() == pytest.approx(volumes.sum())
     assert (after[~gone] >= volumes[~gone]).all()
     # What a single one holds goes to the neighbour across a face that holds most.
     alone = np.arange(len(volumes)) == 17
-    after, gone = merged(box.tets, volumes, alone)
+    after, gone = merged(pairs, volumes, alone)
     shared = (box.tets[:, :, None] == box.tets[17]).any(axis=2).sum(axis=1)
     taker = max(np.flatnonzero(shared == 3), key=lambda t: volumes[t])
     assert np.flatnonzero(after > volumes).tolist() == [taker]

@@ -14,6 +14,7 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.io.read.surfaces import UP_AXES, LoadedSurface, load_surface
 from warp_corot.kernels.meshing import domain as kernels
+from warp_corot.mesh.side_by_side import in_parts
 
 from .domain import Domain
 from .sides import sides_of
@@ -64,8 +65,13 @@ class SurfaceDomain(Domain):
         mesh, key = self._mesh(points.device), str(points.device)
         if key not in self._sides:
             self._sides[key] = self.sides.arrays(points.device)
-        inputs = [points, mesh.id, mesh.indices, *self._sides[key]]
-        wp.launch(kernels.evaluate_surface, points.size, inputs, [phi], device=points.device)
+        inputs = [mesh.id, mesh.indices, *self._sides[key]]
+
+        def evaluate(start: int, stop: int) -> None:
+            part = [points[start:stop], *inputs]
+            wp.launch(kernels.evaluate_surface, stop - start, part, [phi[start:stop]], device=points.device)
+
+        in_parts(points.device, points.size, evaluate)
         return phi
 
     @property
@@ -77,8 +83,12 @@ class SurfaceDomain(Domain):
         # A little inside, so that the surface that a ray starts at is not the one that it meets.
         start = wp.array(points.numpy() + START * reach * along.numpy(), dtype=wp.vec3, device=points.device)
         mesh = self._mesh(points.device)
-        inputs = [start, along, reach, side, mesh.id]
-        wp.launch(kernels.evaluate_thickness, points.size, inputs, [found], device=points.device)
+
+        def evaluate(first: int, stop: int) -> None:
+            part = [start[first:stop], along[first:stop], reach, side, mesh.id]
+            wp.launch(kernels.evaluate_thickness, stop - first, part, [found[first:stop]], device=points.device)
+
+        in_parts(points.device, points.size, evaluate)
         return np.minimum(found.numpy() + START * reach, reach)
 
     def _mesh(self, device: wp.Device) -> wp.Mesh:

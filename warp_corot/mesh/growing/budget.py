@@ -28,8 +28,9 @@ NEAR, NEAR_ENOUGH = 0.985, 0.92
 MOST_CUBES = 4
 #: What an element counts as being off by between such pieces, as a share of its edge.
 GAP_NEED = 0.5
-#: The surface that is drawn is this much closer to the body's than the mesh's threshold.
-FINER_SURFACE, FINER_SURFACE_OF_MANY = 0.3, 1.0
+#: The surface that is drawn is this much closer to the body's than the mesh's threshold, for which the forest must be
+#: finer still; of many elements it is the mesh's own.
+FINER_SURFACE, FINER_FOREST = 0.3, 0.2
 #: Cubes are as large as gives this share of the elements when none is bisected: about six in a cube inside, four at the
 #: surface.
 UNBISECTED = 1.0 / 6.0
@@ -37,8 +38,8 @@ UNBISECTED = 1.0 / 6.0
 #: finer ones would bring the rest of the surface little, and make the time step smaller. From so many elements on
 #: there are too few at the surface for that. Thin parts may have finer ones.
 MAX_LEVEL, MANY, MAX_LEVEL_THIN = 7, 300_000, 13
-#: How closely the body is looked at: from which surface error over a cube's edge to which, and to how many tetrahedra of all
-#: levels for each one asked for, or a fixed number if that is more.
+#: How closely the body is looked at: from which surface error over a cube's edge to which, and to how many tetrahedra of
+#: all levels for each one asked for, or a fixed number if that is more.
 FIRST_ERROR, CLOSE_ERROR, CLOSE_LEVEL = 0.1, 0.01, 8
 CLOSER_LEVELS, CLOSER_ERROR = 6, 0.2
 CLOSE_ELEMENTS, CLOSE_ELEMENTS_OF_MANY = 5, 2
@@ -158,7 +159,7 @@ def _of_cubes(
     )
     room = (CLOSE_ELEMENTS if target <= MANY else CLOSE_ELEMENTS_OF_MANY) * target + 40_000
     closer = Closer(CLOSER_LEVELS, CLOSER_ERROR, room)
-    enough = Enough(target, FIRST_ERROR * min(size, suits), FINER_SURFACE if target <= MANY else FINER_SURFACE_OF_MANY)
+    enough = Enough(target, FIRST_ERROR * min(size, suits), FINER_FOREST if target <= MANY else 1.0)
     grown = grow(domain, size, looking, device, closer, enough)
     resolved = Resolved(grown, size, domain)
     needs = needs_of(resolved, domain, budget.min_layers, most, deepest)

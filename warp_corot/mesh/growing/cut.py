@@ -6,7 +6,6 @@ counts as outside, so that the surface lies in elements that hold something.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -95,13 +94,13 @@ def label_shares(values: Array, labels: Array, count: int) -> Array:
     return np.divide(found * inside_shares(values)[:, None], total, out=np.zeros_like(found), where=total > 0)
 
 
-def merged(tets: Array, held: Array, small: Array) -> tuple[Array, Array]:
+def merged(pairs: Array, held: Array, small: Array) -> tuple[Array, Array]:
     """Hand what small elements hold to a neighbour across a face, the one that holds most, and so on outwards.
 
     Where small ones have no other neighbours than small ones, the one that holds most stays.
 
     Args:
-        tets: int32 [n, 4].
+        pairs: Of elements that share a face [m, 2].
         held: Volume that each holds [n].
         small: Which are to be given up, bool [n].
 
@@ -109,8 +108,8 @@ def merged(tets: Array, held: Array, small: Array) -> tuple[Array, Array]:
         Volumes after that, and which elements are given up.
     """
     held, small = held.copy(), small.copy()
-    pairs = _neighbours(tets, small)
-    goes_to = np.full(len(tets), -1)
+    pairs = np.concatenate([pairs[small[pairs[:, 0]]], pairs[small[pairs[:, 1]]][:, ::-1]])
+    goes_to = np.full(len(held), -1)
     waiting = small.copy()
     while waiting.any():
         # From each waiting element to settled neighbours; of several to the one that holds most.
@@ -156,12 +155,12 @@ def without_slivers(tets: Array, held: Array, volume: Array, sliver: float) -> t
         volumes = np.zeros(count)
         volumes[kept], given_up[kept] = without_slivers(tets[kept], held[kept], volume[kept], sliver)
         return volumes, given_up
-    volumes, given_up = merged(tets, held, small)
+    volumes, given_up = merged(pairs, held, small)
     broken, small_parts = _broken(pairs, piece, ~given_up, volumes)
     if broken.any() or small_parts.any():
         small |= small_parts
         small &= ~_ways(pairs, piece, ~given_up & ~small_parts, broken)
-        volumes, given_up = merged(tets, held, small)
+        volumes, given_up = merged(pairs, held, small)
     return volumes, given_up
 
 
@@ -241,19 +240,20 @@ def _crumbs(tets: Array, piece: Array, small: Array, held: Array) -> tuple[Array
 
 def face_pairs(tets: Array) -> Array:
     """Pairs of elements that share a face [m, 2]."""
-    corners = np.sort(tets, axis=1).astype(np.uint64)
+    a, b, c, d = np.sort(tets, axis=1).astype(np.uint64).T
     count = np.uint64(int(tets.max()) + 1)
-    faces = [corners[:, [i for i in range(4) if i != n]] for n in range(4)]
+    ab, cd = a * count + b, c * count + d
     if int(count) ** 3 < 2**64:
-        keys = np.concatenate([(f[:, 0] * count + f[:, 1]) * count + f[:, 2] for f in faces])
-        order = np.argsort(keys, kind="stable")
-        same = keys[order[1:]] == keys[order[:-1]]
+        keys = np.concatenate([b * count**2 + cd, a * count**2 + cd, ab * count + d, ab * count + c])
+        order = np.argsort(keys)
+        keys = keys[order]
+        same = keys[1:] == keys[:-1]
     else:
-        first = np.concatenate([f[:, 0] * count + f[:, 1] for f in faces])
-        last = np.concatenate([f[:, 2] for f in faces])
+        first = np.concatenate([b * count + c, a * count + c, ab, ab])
+        last = np.concatenate([d, d, d, c])
         order = np.lexsort((last, first))
         same = (first[order[1:]] == first[order[:-1]]) & (last[order[1:]] == last[order[:-1]])
-    return np.stack([order[:-1][same], order[1:][same]], axis=1) % len(tets)
+    return np.sort(np.stack([order[:-1][same], order[1:][same]], axis=1) % len(tets), axis=1)
 
 
 def _linked(pairs: Array, count: int) -> Array:
@@ -279,20 +279,6 @@ def connected(tets: Array) -> Array:
     rows, columns = np.repeat(tets[:, 0], 3), tets[:, 1:].ravel()
     links = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(count, count))
     return connected_components(links, directed=False)[1][tets[:, 0]]
-
-
-def _neighbours(tets: Array, small: Array) -> Array:
-    """Pairs of a small element and another across a face [m, 2]."""
-    touched = np.zeros(int(tets.max()) + 1, bool)
-    touched[tets[small]] = True
-    near = np.flatnonzero(touched[tets].sum(axis=1) >= 3)
-    faces = np.concatenate([np.sort(tets[near][:, list(f)], axis=1) for f in itertools.combinations(range(4), 3)])
-    owner = np.tile(near, 4)
-    order = np.lexsort(faces.T)
-    same = (faces[order[1:]] == faces[order[:-1]]).all(axis=1)
-    pairs = np.stack([owner[order[:-1][same]], owner[order[1:][same]]], axis=1)
-    both = np.concatenate([pairs, pairs[:, ::-1]])
-    return both[small[both[:, 0]]]
 
 
 def _fullest_of_each_piece(pairs: Array, waiting: Array, held: Array) -> Array:

@@ -10,6 +10,7 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.kernels.meshing import growth as kernels
 from warp_corot.mesh.lattice import LATTICE_BITS, MAX_LEVEL
+from warp_corot.mesh.side_by_side import in_parts
 from warp_corot.mesh.tree import Tree
 
 #: Slots of the hash table per node, at least.
@@ -102,8 +103,14 @@ class Growth:
         Of those before ``first_new`` only such as got an active midpoint since this was last asked.
         """
         flags = wp.empty(self.element_count, dtype=wp.int32, device=self.device)
-        inputs = [self.tets, self.first_child, self.wished, self.bound, self._keys, self._values, self.active]
-        self.launch(kernels.flag_hanging, self.element_count, [*inputs, self.touched, first_new], [flags])
+        own = [self.tets, self.first_child, self.wished, self.bound]
+        shared = [self._keys, self._values, self.active, self.touched]
+
+        def flag(start: int, stop: int) -> None:
+            inputs = [*(array[start:stop] for array in own), *shared, first_new - start]
+            self.launch(kernels.flag_hanging, stop - start, inputs, [flags[start:stop]])
+
+        in_parts(self.device, self.element_count, flag)
         self.touched.zero_()
         return self.flagged(flags)
 

@@ -13,6 +13,7 @@ from warp_corot.errors import InputError
 from warp_corot.kernels.meshing import elements as kernels
 from warp_corot.kernels.tables.shapes import CIRCUMRADIUS, EDGE_LENGTHS
 from warp_corot.mesh.lattice import LATTICE_BITS, MAX_LEVEL
+from warp_corot.mesh.side_by_side import in_parts
 from warp_corot.mesh.tree import LIVE
 
 from .growth import Growth, lattice_spacing, with_room
@@ -178,10 +179,16 @@ class Judge:
         unsure = wp.empty(count, dtype=wp.int32, device=self.device)
         probes = wp.empty(count, dtype=wp.vec3, device=self.device)
         expected, deviations = (wp.empty(count, dtype=wp.float32, device=self.device) for _ in range(2))
-        inputs = [elements, first, *growth.midpoints(slots), growth.tets, growth.level, self.phi, growth.lattice]
-        inputs += [self.origin, self.spacing, self.circumradius, lipschitz, *limits]
-        outputs = [growth.first_child, states, self.need, unsure, probes, expected, deviations]
-        growth.launch(kernels.judge_by_edges, count, inputs, outputs)
+        (_, values), outputs = growth.midpoints(slots), [growth.first_child, states, self.need]
+        shared = [values, growth.tets, growth.level, self.phi, growth.lattice]
+        shared += [self.origin, self.spacing, self.circumradius, lipschitz, *limits]
+
+        def judge(start: int, stop: int) -> None:
+            inputs = [elements[start:stop], first, slots[6 * start : 6 * stop], *shared]
+            own = [array[start:stop] for array in (unsure, probes, expected, deviations)]
+            growth.launch(kernels.judge_by_edges, stop - start, inputs, outputs + own)
+
+        in_parts(self.device, count, judge)
         chosen = growth.flagged(unsure)
         if len(chosen):
             found = self.domain.phi(probes[chosen].contiguous())

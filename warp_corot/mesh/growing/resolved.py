@@ -185,7 +185,8 @@ class Coarsening:
             inputs = [chosen, growth.tets, growth.level, self._first_child]
             growth.launch(kernels.gather_needs, len(elements), [*inputs, self._holds], [self._needs, of_node])
             growth.launch(kernels.take_needs, len(elements), [*inputs, of_node], [self._needs])
-        own = self._needs.numpy()
+        # What has no children cannot be bisected, whatever it needs.
+        own = np.where(tree.first_child >= 0, self._needs.numpy(), np.float32(0.0))
         counted = holds & (resolved.held >= sliver * resolved.volume)
         roots = np.count_nonzero(counted & (tree.parent < 0))
         above = tree.parent[counted & (tree.parent >= 0)]

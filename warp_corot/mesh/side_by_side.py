@@ -1,0 +1,45 @@
+"""Warp's kernels run on one core of a CPU; parts of a launch that write apart from one another run side by side here."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import warp as wp
+
+#: Fewer threads of a kernel than these are not worth a second core.
+LEAST = 8192
+#: Parts for each core, as some take longer than others.
+PARTS = 4
+
+
+def in_parts(device: wp.Device, count: int, work: Callable[[int, int], None]) -> None:
+    """Have work done on numbers from 0 to ``count``: on a CPU in parts, on all its cores; otherwise at once.
+
+    Args:
+        device: Where the work launches kernels. While one runs on the CPU, Python is free for other threads.
+        count: Of threads of a kernel.
+        work: Called with where a part starts and where it ends; parts must not depend on one another.
+    """
+    cores = core_count()
+    if not device.is_cpu or count < LEAST or cores == 1:
+        work(0, count)
+        return
+    bounds = [count * part // (PARTS * cores) for part in range(PARTS * cores + 1)]
+    for _ in _pool().map(work, bounds[:-1], bounds[1:]):
+        pass
+
+
+def core_count() -> int:
+    """Cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on this system
+        return os.cpu_count() or 1
+
+
+@functools.cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(core_count(), thread_name_prefix="warp_corot")
