@@ -59,6 +59,10 @@ class FileMesh:
     ignored: dict[str, int] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
+    def __post_init__(self) -> None:
+        if self.points.ndim != 2 or self.points.shape[1] != 3:
+            raise Unreadable(f"its points have the shape {list(self.points.shape)}, should be [N, 3]")
+
     @property
     def solids(self) -> list[Block]:
         """The blocks of cells with volume."""

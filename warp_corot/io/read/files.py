@@ -141,11 +141,9 @@ def _checked(mesh: FileMesh, path: Path) -> FileMesh:
     """The mesh, if its cells name points that there are.
 
     Raises:
-        InputError: They do not, or points have no three coordinates.
+        InputError: They do not.
     """
     points = mesh.points
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"{path}: points have shape {points.shape}, should be [N, 3]")
     for block in mesh.blocks:
         bad = np.argwhere((block.nodes < 0) | (block.nodes >= len(points)))
         if len(bad):
