@@ -73,6 +73,8 @@ def close_surface(points: np.ndarray, triangles: np.ndarray) -> ClosedSurface:
     triangles, turned = wind_alike(triangles)
     parts = edge_parts(triangles)
     area = float(areas(points, triangles).sum())
+    if not area > 0.0:  # lengths whose squares are too small for a number
+        raise InputError(f"none of the {given} triangles has an area; the surface is degenerate")
     points, caps, cap_parts, open_edges, holes = cones(points, triangles, parts)
     cap_share = float(areas(points, caps).sum()) / area
     if cap_share > LARGEST_HOLES:

@@ -44,13 +44,19 @@ def _flush() -> None:
 
 #: Memory that reading a file may take [bytes]: at least, and more for each byte of the file.
 MEMORY, MEMORY_PER_BYTE = 4 << 30, 200
+#: The least for USD stages, whose arrays are hardly compressed: OpenUSD fills what it asks for, which takes time.
+USD_MEMORY = 1 << 30
 
 
 @contextmanager
-def bounded(path: Path) -> Iterator[None]:
+def bounded(path: Path, memory: int = MEMORY) -> Iterator[None]:
     """Inside no more memory can be had than such a file can need, whatever a broken one says that it holds.
 
     Libraries then say that there is not enough. Only where the system has such bounds, as Linux has.
+
+    Args:
+        path: The file.
+        memory: What it may take at least [bytes].
     """
     used = _data_in_use()
     if used is None:
@@ -60,7 +66,7 @@ def bounded(path: Path) -> Iterator[None]:
 
     size = path.stat().st_size if path.is_file() else 0
     before = resource.getrlimit(resource.RLIMIT_DATA)
-    most = used + MEMORY + MEMORY_PER_BYTE * size
+    most = used + memory + MEMORY_PER_BYTE * size
     known = [bound for bound in before if bound != resource.RLIM_INFINITY]
     resource.setrlimit(resource.RLIMIT_DATA, (min([most, *known]), before[1]))
     try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import math
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from os import PathLike
@@ -17,8 +16,8 @@ from numpy.typing import NDArray
 from warp_corot.errors import InputError
 from warp_corot.io.files.quiet import bounded, quietly
 
-#: ITK's directions are left-posterior-superior; turned half round z they are NIfTI's right-anterior-superior.
-RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+from .filemesh import from_bytes
+from .isolated import read_isolated
 
 
 @dataclass(frozen=True)
@@ -91,6 +90,8 @@ def _checked(
         values = values[..., 0]
     if values.ndim != 3:
         raise InputError(f"{source}: has shape {values.shape}, should be a volume [nx, ny, nz] of single numbers")
+    if not values.size:
+        raise InputError(f"{source}: has no voxels, its shape is {values.shape}")
     return LoadedVolume(values, affine, unit, name, source, notes)
 
 
@@ -103,7 +104,8 @@ def _read_nifti(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | No
             values = np.asanyarray(image.dataobj)
     except Exception as error:
         raise _unreadable(path, "NIfTI", error) from None
-    unit = {"meter": "m", "mm": "mm"}.get(image.header.get_xyzt_units()[0])
+    said = _nifti_unit(image.header)
+    unit = {"meter": "m", "mm": "mm"}.get(said)
     spacing = np.asarray(image.header.get_zooms(), dtype=np.float64)[:3]
     affine = np.array(image.affine, dtype=np.float64)
     # The format's fallback for a header without spacing is the unit matrix.
@@ -112,17 +114,25 @@ def _read_nifti(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | No
     notes = []
     if not image.header["sform_code"] and not image.header["qform_code"]:
         notes.append("the header gives no orientation: its axes are taken as right, anterior, superior")
-    if image.header.get_xyzt_units()[0] == "micron":
+    if said == "micron":
         affine[:3], unit = 1e-3 * affine[:3], "mm"
     return values, affine, unit, notes
+
+
+def _nifti_unit(header: Any) -> str:
+    try:
+        return header.get_xyzt_units()[0]
+    except KeyError:  # a number that the format does not know
+        return "unknown"
 
 
 def _read_mgh(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
     import nibabel
 
     try:
-        image: Any = nibabel.load(path)
-        values = np.asanyarray(image.dataobj)
+        with quietly(), bounded(path):
+            image: Any = nibabel.load(path)
+            values = np.asanyarray(image.dataobj)
     except Exception as error:
         raise _unreadable(path, path.suffix, error) from None
     # FreeSurfer's format is in mm by definition.
@@ -130,64 +140,35 @@ def _read_mgh(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None
 
 
 def _read_itk(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
-    import SimpleITK
-
-    loud = SimpleITK.ProcessObject.GetGlobalWarningDisplay()
-    SimpleITK.ProcessObject.SetGlobalWarningDisplay(False)
-    try:
-        with quietly(), bounded(path):
-            image = SimpleITK.ReadImage(str(path))
-    except Exception as error:
-        # ITK names itself and its source files first; what went wrong comes last.
-        raise _unreadable(path, path.suffix, re.split(r"(?:sitk::|ITK )ERROR:", str(error))[-1]) from None
-    finally:
-        SimpleITK.ProcessObject.SetGlobalWarningDisplay(loud)
-    return _of_itk(path, image, None, [])
+    return _of_image(_isolated("SimpleITK", "itk_files", path, path.suffix))
 
 
 def _read_dicom(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
-    from .dicom import read_series
-
-    if path.is_dir():
-        image, notes = read_series(path)
-        return _of_itk(path, image, "mm", notes)
-    values, affine, _, notes = _read_itk(path)
-    if values.shape[2] < 2:
+    values, affine, _, notes = _of_image(_isolated("SimpleITK", "itk_files", path, "DICOM"))
+    if path.is_file() and values.shape[2] < 2:
         raise InputError(f"{path}: has a single slice; name the folder with the whole series")
     return values, affine, "mm", notes
 
 
-def _of_itk(
-    path: Path, image: Any, unit: str | None, notes: list[str]
-) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
-    from .dicom import array_of
-
-    dimensions, numbers = image.GetDimension(), image.GetNumberOfComponentsPerPixel()
-    if (dimensions, numbers) != (3, 1):
-        raise InputError(f"{path}: has {dimensions} dimensions and {numbers} numbers a voxel, should have 3 and 1")
-    affine = np.eye(4)
-    affine[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
-    affine[:3, 3] = image.GetOrigin()
-    notes = [*notes, "positions are turned from left-posterior-superior to right-anterior-superior"]
-    return array_of(image), RAS_FROM_LPS @ affine, unit, notes
-
-
 def _read_vti(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
-    from .isolated import read_isolated
+    return _of_image(_isolated("vtkmodules", "vtk_files", path, path.suffix))
 
-    if importlib.util.find_spec("vtkmodules") is None:
-        raise ImportError("vtkmodules")
-    arrays, reason = read_isolated("warp_corot.io.read.vtk_files", path)
+
+def _isolated(package: str, module: str, path: Path, kind: str) -> dict[str, NDArray[Any]]:
+    """The arrays of an image, which a reader that needs a package reads in a process of its own."""
+    if importlib.util.find_spec(package) is None:
+        raise ImportError(package)
+    arrays, reason = read_isolated(f"warp_corot.io.read.{module}", path)
+    if arrays is None and reason is None:
+        raise InputError(f"{path}: is a folder without a DICOM series, should be a file or such a folder")
     if arrays is None or "image" not in arrays:
-        raise _unreadable(path, path.suffix, reason or "it holds a mesh, not an image")
-    return _of_image(arrays)
+        raise _unreadable(path, kind, reason or "it holds a mesh, not an image")
+    return arrays
 
 
 def _of_image(
     arrays: dict[str, NDArray[Any]],
 ) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
-    from .filemesh import from_bytes
-
     return arrays["values"], arrays["affine"], None, from_bytes(arrays["image"])
 
 

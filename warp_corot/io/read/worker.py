@@ -31,9 +31,15 @@ def _bound_resources(size: int) -> None:
         resource.setrlimit(what, (wanted, most))
 
 
+def _size(path: Path) -> int:
+    """Of a file, or of all files in a folder [bytes]."""
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
 def main(module: str, path: str, out: str, report: str) -> int:
     """What the other process does."""
-    _bound_resources(Path(path).stat().st_size)
+    _bound_resources(_size(Path(path)))
     said: dict[str, Any] = {}
     try:
         result = importlib.import_module(module).read(Path(path))

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.selection import select_nodes
+from warp_corot.io.files.quiet import quietly
 from warp_corot.io.read.usd.scene import Scene
 from warp_corot.io.write.usd.over import Surface
 from warp_corot.newton.library import newton
@@ -128,7 +129,7 @@ def _down(axis: str, amount: float) -> tuple[float, float, float]:
 
 def _add_usd(builder: newton.ModelBuilder, scene: Scene) -> dict[str, Any]:
     resolvers = [newton.usd.SchemaResolverNewton(), newton.usd.SchemaResolverPhysx()]
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as said, quietly():
         warnings.simplefilter("always")
         try:
             found = builder.add_usd(

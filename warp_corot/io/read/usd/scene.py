@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pxr import Tf, Usd, UsdGeom, UsdPhysics
 
 from warp_corot.errors import InputError
-from warp_corot.io.files.usd import metres_per_unit, open_stage
+from warp_corot.io.files.usd import metres_per_unit, open_stage, reads_stage
 from warp_corot.io.read.tetrahedra import USD_SUFFIXES
 from warp_corot.mesh.surfaces.boundary import signed_volumes
 
@@ -157,6 +157,11 @@ def open_scene(path: str | PathLike[str]) -> Scene:
         raise InputError(f"{source}: extension {source.suffix or '(none)'}, should be {', '.join(USD_SUFFIXES)}")
     if not source.is_file():
         raise InputError(f"{source}: no such file")
+    return _scene_of(source)
+
+
+@reads_stage
+def _scene_of(source: Path) -> Scene:
     stage = open_stage(source)
     errors = stage.GetCompositionErrors()
     if errors:

@@ -1,0 +1,107 @@
+"""SimpleITK's files: MetaImage, NRRD, single DICOM files, and folders with DICOM series."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import SimpleITK
+from numpy.typing import NDArray
+
+from .filemesh import Unreadable, as_bytes
+
+#: ITK's directions are left-posterior-superior; turned half round z they are NIfTI's right-anterior-superior.
+RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+TURNED = "positions are turned from left-posterior-superior to right-anterior-superior"
+#: Folders below the one that is named that are looked into at most.
+MOST_FOLDERS = 1000
+#: Slices whose distances differ by more than this share of the usual one [1] are unevenly spaced.
+UNEVEN = 1.0e-3
+DESCRIPTION, MODALITY, POSITION = "0008|103e", "0008|0060", "0020|0032"
+
+
+def read(path: Path) -> dict[str, NDArray[Any]] | None:
+    """The values [nx, ny, nz] of an image with their places, see `warp_corot.io.read.volumes`; of a folder those of the
+    largest series in it and in the folders below, None if it has none.
+
+    Raises:
+        Unreadable: ITK's own words; or an image of other than three dimensions, or of several numbers a voxel.
+    """
+    try:
+        if path.is_dir():
+            return _series(path)
+        return _arrays(SimpleITK.ReadImage(str(path)), [])
+    except RuntimeError as error:
+        # ITK names itself and its source files first; what went wrong comes last.
+        raise Unreadable(re.split(r"(?:sitk::|ITK )ERROR:", str(error))[-1]) from None
+
+
+def _arrays(image: Any, notes: list[str]) -> dict[str, NDArray[Any]]:
+    dimensions, numbers = image.GetDimension(), image.GetNumberOfComponentsPerPixel()
+    if (dimensions, numbers) != (3, 1):
+        raise Unreadable(f"it has {dimensions} dimensions and {numbers} numbers a voxel, should have 3 and 1")
+    affine = np.eye(4)
+    affine[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
+    affine[:3, 3] = image.GetOrigin()
+    values = np.asarray(SimpleITK.GetArrayFromImage(image)).transpose(2, 1, 0)
+    return {"image": as_bytes([*notes, TURNED]), "values": values, "affine": RAS_FROM_LPS @ affine}
+
+
+def _series(folder: Path) -> dict[str, NDArray[Any]] | None:
+    series = _all_series(folder)
+    if not series:
+        return None
+    files = max(series, key=len)
+    reader = SimpleITK.ImageSeriesReader()
+    reader.SetFileNames(files)
+    image = reader.Execute()
+    notes = [f"{len(files)} slices{_described(files[0])}"]
+    if len(series) > 1:
+        notes.append(f"the largest of {len(series)} series in {folder} is taken; for another name its own folder")
+    uneven = _unevenness(files)
+    if uneven is not None:
+        notes.append(f"slices are missing or unevenly spaced, by up to {uneven:.3g} mm")
+    return _arrays(image, notes)
+
+
+def _all_series(folder: Path) -> list[tuple[str, ...]]:
+    found = []
+    for count, (below, _, files) in enumerate(os.walk(folder)):
+        if count >= MOST_FOLDERS:
+            break
+        if not files:
+            continue
+        for name in SimpleITK.ImageSeriesReader.GetGDCMSeriesIDs(below):
+            found.append(SimpleITK.ImageSeriesReader.GetGDCMSeriesFileNames(below, name))
+    return [files for files in found if len(files)]
+
+
+def _header(file: str) -> Any:
+    reader = SimpleITK.ImageFileReader()
+    reader.SetFileName(file)
+    reader.ReadImageInformation()
+    return reader
+
+
+def _described(file: str) -> str:
+    header = _header(file)
+    words = [header.GetMetaData(key).strip() for key in (MODALITY, DESCRIPTION) if header.HasMetaDataKey(key)]
+    return f" ({', '.join(filter(None, words))})" if any(words) else ""
+
+
+def _unevenness(files: tuple[str, ...]) -> float | None:
+    """How much the distances of neighbouring slices differ [mm] from the usual one; None if they do not, or if the
+    files give no positions."""
+    places = []
+    for header in map(_header, files):
+        if not header.HasMetaDataKey(POSITION):
+            return None
+        places.append(header.GetOrigin())
+    steps = np.linalg.norm(np.diff(np.array(places), axis=0), axis=1)
+    if len(steps) < 2:
+        return None
+    off = float(np.abs(steps - np.median(steps)).max())
+    return off if off > UNEVEN * np.median(steps) else None
