@@ -52,7 +52,7 @@ def open_stage(path: Path) -> Any:
     except Tf.ErrorException as error:
         text = _text(error)
         where = re.search(rf"{re.escape(path.name)}:(\d+):\d+: ([^\n]+)", text)
-        why = f": line {where[1]}: {_short(where[2].rstrip(chr(39)))}" if where else f" ({_first_message(text)})"
+        why = f": line {where[1]}: {_short(where[2].rstrip(chr(39)))}" if where else f" ({first_message(text)})"
         raise InputError(f"{path}: is not a USD file that OpenUSD can open{why}") from None
 
 
@@ -81,7 +81,7 @@ def reads_stage(read: Callable[Concatenate[Path, P], R]) -> Callable[Concatenate
             with quietly(), bounded(path, USD_MEMORY):
                 return read(path, *args, **kwargs)
         except Tf.ErrorException as error:
-            raise InputError(f"{path}: is damaged: {_first_message(_text(error))}") from None
+            raise InputError(f"{path}: is damaged: {first_message(_text(error))}") from None
         except UnicodeDecodeError:
             raise InputError(f"{path}: is damaged: it has text that is not UTF-8") from None
 
@@ -95,8 +95,8 @@ def _text(error: Tf.ErrorException) -> str:
         return " : 'it has text that is not UTF-8'"
 
 
-def _first_message(text: str) -> str:
-    """What went wrong first, without where in OpenUSD's code."""
+def first_message(text: str) -> str:
+    """What went wrong first by OpenUSD's many lines, without where in its code."""
     found = re.search(r" : '([^\n]*)'", text)
     return _short(found[1] if found else " ".join(text.split()) or "unknown reason")
 

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from warp_corot.errors import InputError
 from warp_corot.inputs.selection import select_nodes
 from warp_corot.io.files.quiet import quietly
+from warp_corot.io.files.usd import first_message
 from warp_corot.io.read.usd.scene import Scene
 from warp_corot.io.write.usd.over import Surface
 from warp_corot.newton.library import newton
@@ -144,7 +145,7 @@ def _add_usd(builder: newton.ModelBuilder, scene: Scene) -> dict[str, Any]:
         except ImportError:
             raise InputError("Newton reads stages with newton-usd-schemas: pip install newton-usd-schemas") from None
         except (RuntimeError, ValueError) as error:
-            raise InputError(f"{scene.path}: {error}") from None
+            raise InputError(f"{scene.path}: {first_message(str(error))}") from None
     for message in dict.fromkeys(str(warning.message) for warning in said):
         if not _SEEN_TO.search(message):
             warnings.warn(message, UserWarning, stacklevel=3)

@@ -9,6 +9,7 @@ from typing import Any
 from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
 
 from warp_corot.errors import InputError
+from warp_corot.io.files.quiet import quietly
 
 EARTH = 9.81
 #: What Newton takes for a Poisson's ratio of a half.
@@ -26,7 +27,8 @@ def material_said(prim: Any) -> dict[str, float]:
     elements: then it is there, but infinite. Zero density, by UsdPhysics, is none.
     """
     found: dict[str, float] = {}
-    material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0].GetPrim()
+    with quietly():  # of bindings without their schema, which count all the same
+        material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0].GetPrim()
     if material:
         young, poisson = _number(material, "youngsModulus"), _number(material, "poissonsRatio")
         if young is not None and young >= 0.0:

@@ -172,7 +172,10 @@ def _scene_of(source: Path) -> Scene:
         raise InputError(f"{source}: kilogramsPerUnit is {kilograms}, should be a positive number")
     given = stage.GetRootLayer().timeCodesPerSecond if stage.HasAuthoredMetadata("timeCodesPerSecond") else None
     units = Units(metres_per_unit(stage, source), kilograms)
-    scene = Scene(source, stage, units, str(UsdGeom.GetStageUpAxis(stage)), given)
+    up_axis = str(UsdGeom.GetStageUpAxis(stage))
+    if up_axis not in ("X", "Y", "Z"):
+        raise InputError(f"{source}: upAxis is {up_axis!r}, should be 'Y' or 'Z'")
+    scene = Scene(source, stage, units, up_axis, given)
     scene.uninstanced = _without_instances(stage)
     scene.animated, scene.stopped = _stop_animation(stage)
     scene.physics_scenes = settle_gravity(stage, source)
