@@ -19,33 +19,10 @@ SCRIPT = Path(fuzzing.__file__)
 FEW, MANY = 200, 10_000
 #: In whose place another format stands in the short run: it has the same reader.
 LONG_ONLY = {
-    "ply-text",
-    "off",
-    "stl-text",
-    "usdz",
-    "usda-tets",
-    "msh-2",
-    "msh-2-binary",
-    "meshb",
-    "vol",
-    "vtk",
-    "vtk-text",
+    *("ply-text", "off", "stl-text", "usdz", "usda-tets", "scene", "nii", "mgh", "nrrd-gz", "mhd", "checkpoint"),
+    *("msh-2", "msh-2-binary", "meshb", "vol", "med", "avs", "f3grid", "su2"),
+    *("vtk", "vtk-text", "vtk-image", "vtu-text", "vtu-meshio", "vts", "vtr"),
 }
-LONG_ONLY |= {
-    "vtu-text",
-    "vtu-meshio",
-    "vts",
-    "vtr",
-    "vtk-image",
-    "med",
-    "avs",
-    "f3grid",
-    "su2",
-    "nii",
-    "mgh",
-    "nrrd-gz",
-}
-LONG_ONLY |= {"mhd", "checkpoint", "scene"}
 SHORT = [form for form in fuzzing.SEEDS if form not in LONG_ONLY]
 #: Tests of the short run, which run side by side.
 PARTS = 4

@@ -1,4 +1,4 @@
-"""Bytes flipped, cut, swapped, doubled, blanked, exchanged or with huge counts; what is compressed is damaged inside."""
+"""Bytes flipped, cut, swapped, doubled, blanked, words exchanged, huge counts; what is compressed is damaged inside."""
 
 from __future__ import annotations
 

@@ -83,11 +83,8 @@ def _objects(folder: Path) -> Path:
     moved = [f"v {float(x) + 0.3} {y} {z}" for _, x, y, z in (place.split()[:4] for place in places)]
     textured = [f"f {' '.join(f'{corner}/1' for corner in face)}" for face in corners]
     second = [f"f {' '.join(str(int(corner) + len(places)) for corner in face)}" for face in corners]
-    ball.write_text(
-        "\n".join(
-            ["mtllib seed.mtl", "o one", *places, "vt 0.5 0.5", "usemtl red", *textured, "o two", *moved, *second]
-        )
-    )
+    both = ["mtllib seed.mtl", "o one", *places, "vt 0.5 0.5", "usemtl red", *textured, "o two", *moved, *second]
+    ball.write_text("\n".join(both))
     (folder / "seed.mtl").write_text("newmtl red\nKd 1 0 0\n")
     return ball
 
@@ -116,6 +113,13 @@ def _meshio(suffix: str, kind: str = "tetra", **options) -> Callable[[Path], Pat
         return folder / f"seed{suffix}"
 
     return make
+
+
+def _nastran(folder: Path) -> Path:
+    grids = [",".join(["GRID", str(k + 1), "", *map(str, point)]) for k, point in enumerate(POINTS.tolist())]
+    cells = [",".join(map(str, ["CTETRA", k + 1, k + 1, *(tet + 1)])) for k, tet in enumerate(TETS)]
+    (folder / "seed.bdf").write_text("\n".join(["BEGIN BULK", *grids, *cells, "ENDDATA", ""]))
+    return folder / "seed.bdf"
 
 
 def _gmsh_1(folder: Path) -> Path:
@@ -385,7 +389,7 @@ SEEDS: dict[str, Callable[[Path], Path]] = {
     "msh-4-binary": _meshio(".msh", file_format="gmsh", binary=True),
     "mesh": _meshio(".mesh"),
     "meshb": _meshio(".meshb"),
-    "bdf": _meshio(".bdf"),
+    "bdf": _nastran,
     "inp": _abaqus,
     "tetgen": _tetgen,
     "vol": _netgen,

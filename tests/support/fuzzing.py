@@ -1,9 +1,9 @@
 """Damaged files and random option lists for the command line, in processes of their own.
 
-``python fuzzing.py FOLDER FORMATS FIRST COUNT`` damages the seed of each format (their names with commas), as the number
-of each case from FIRST up to COUNT says, and has ``warp-corot simulate`` read it. A line of JSON a case goes to the
-file ``cases``: before it begins, so that a crash is known by its number, and again with what was wrong. A case ends well
-in a body or in one line and status 2. FORMAT ``options`` makes random option lists in place of files.
+``python fuzzing.py FOLDER FORMATS FIRST COUNT`` damages the seed of each format (their names with commas), as the
+number of each case from FIRST up to COUNT says, and has ``warp-corot simulate`` read it. A line of JSON a case goes to
+the file ``cases``: before it begins, so that a crash is known by its number, and again with what was wrong. A case ends
+well in a body or in one line and status 2. FORMAT ``options`` makes random option lists in place of files.
 """
 
 from __future__ import annotations
@@ -38,18 +38,22 @@ MESHED_EVERY, HELD_EVERY, MADE_EVERY = 100, 4, 10
 TETRAHEDRA = {
     "usda-tets",
     "usdc-tets",
-    "inp",
-    "mesh",
-    "meshb",
     "bdf",
-    "neutral",
+    "inp",
+    "tetgen",
     "vol",
     "vol.gz",
-    "tetgen",
-    "vtm",
-    "vts",
+    "neutral",
+    "run",
+    "mesh",
+    "meshb",
+    "vtk",
 }
 TETRAHEDRA |= {
+    "vtk-4",
+    "vtk-text",
+    "vtm",
+    "vts",
     "vtr",
     "pvtu",
     "vtkhdf",
@@ -59,10 +63,6 @@ TETRAHEDRA |= {
     "su2",
     "avs",
     "f3grid",
-    "vtk",
-    "vtk-4",
-    "vtk-text",
-    "run",
 }
 TETRAHEDRA |= {form for form in SEEDS if form.startswith(("msh", "vtu"))}
 
@@ -100,8 +100,9 @@ def read_here(module: str, path: Path):
     except (Exception, SystemExit) as error:
         return None, " ".join(str(error).split()) or type(error).__name__
     finally:
-        if "gmsh" in sys.modules:
-            sys.modules["gmsh"].finalize()
+        gmsh = sys.modules.get("gmsh")
+        if gmsh is not None and gmsh.isInitialized():
+            gmsh.finalize()
         say({"has read": module})
     if found is None:
         return None, None
@@ -264,7 +265,8 @@ def wrong_with(command: list[str], folder: Path) -> str | None:
         return None if not errors else f"a body in spite of {errors}"
     if outcome != 2 or len(errors) != 1:
         return f"status {outcome}, {said[:5]}"
-    return None if len(errors[0]) < 600 else f"a line of {len(errors[0])} characters: {errors[0]}"
+    own = functools.reduce(lambda line, word: line.replace(word, "") if len(word) > 100 else line, command, errors[0])
+    return None if len(own) < 600 else f"a line of {len(own)} characters, beside what was typed: {errors[0]}"
 
 
 def wrong_with_checkpoint(path: Path) -> str | None:

@@ -16,6 +16,7 @@ from typing import NoReturn
 
 from warp_corot.errors import InputError, UnstableError
 
+from .parsing import StrictParser
 from .say import EXIT_CODES, complain, interrupt_status, open_streams, silence
 from .signals import terminable
 
@@ -27,11 +28,10 @@ def commands() -> dict[str, ModuleType]:
     return {"simulate": simulate, "scene": scene, "paper": paper}
 
 
-class Parser(argparse.ArgumentParser):
+class Parser(StrictParser):
     """Complains in one line, and takes -1e3 for a number."""
 
     def __init__(self, **options):
-        options.setdefault("allow_abbrev", False)
         options.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
         super().__init__(**options)
         self._negative_number_matcher = re.compile(r"^-(\d|\.\d|inf|nan)")

@@ -14,6 +14,7 @@ from warp_corot.errors import InputError
 from warp_corot.io.files.whole import written_whole
 
 from .loading import FORMS, Load, value_of
+from .parsing import StrictParser
 
 HELP = """a run may be written down: run.toml has the options' names for keys, lists for several values, and true for
 options without any; what the command line says in addition counts for all its bodies, paths are beside the file:
@@ -34,7 +35,7 @@ SHARED = (
 VALUES = {"pull": "by", "twist": "degrees", "press": "pressure"}
 
 
-class _Parser(argparse.ArgumentParser):
+class _Parser(StrictParser):
     """Complains about a file."""
 
     path = Path()
@@ -117,7 +118,7 @@ def check_run_path(path: Path, source: str) -> None:
 def _parser(path: Path) -> tuple[_Parser, dict[str, argparse.Action]]:
     from .options import add_options
 
-    parser = _Parser(allow_abbrev=False, add_help=False, prog="simulate")
+    parser = _Parser(add_help=False, prog="simulate")
     parser.path = path
     parser._negative_number_matcher = _Numbers()  # type: ignore[assignment]
     add_options(parser)
