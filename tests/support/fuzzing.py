@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 from fuzz_damage import damaged
-from fuzz_options import FILES, random_options
+from fuzz_options import FILES, LONG_WORD, random_options
 from fuzz_seeds import SEEDS
 
 #: The most that a case may take: processor time and time [s], memory beyond that of the process at its start [bytes].
@@ -265,7 +265,7 @@ def wrong_with(command: list[str], folder: Path) -> str | None:
         return None if not errors else f"a body in spite of {errors}"
     if outcome != 2 or len(errors) != 1:
         return f"status {outcome}, {said[:5]}"
-    own = functools.reduce(lambda line, word: line.replace(word, "") if len(word) > 100 else line, command, errors[0])
+    own = errors[0].replace(LONG_WORD, "")
     return None if len(own) < 600 else f"a line of {len(own)} characters, beside what was typed: {errors[0]}"
 
 

@@ -32,7 +32,7 @@ def bodies_in(opened: Opened, args: argparse.Namespace) -> list[tuple[Opened, ar
         return [(opened, args)]
     parts = _parts(surface)
     volumes = np.array([_volume(part) for part in parts])
-    if not all(map(_is_closed, parts)) or (volumes <= 0.0).any():
+    if not all(map(_is_closed, parts)) or not (volumes > 0.0).all() or not np.isfinite(volumes.sum()):
         return [(opened, args)]
     names = ", ".join(part.name for part in parts[:8]) + (", ..." if len(parts) > 8 else "")
     opened.notes.append(f"{len(parts)} bodies, each for itself: {names} (--join takes them as one)")
@@ -83,5 +83,6 @@ def _is_closed(part: LoadedSurface) -> bool:
 
 
 def _volume(part: LoadedSurface) -> float:
-    corners = part.points[part.triangles] - part.points.mean(axis=0)
-    return float(np.linalg.det(corners).sum() / 6.0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        corners = part.points[part.triangles] - part.points.mean(axis=0)
+        return float(np.linalg.det(corners).sum() / 6.0)
