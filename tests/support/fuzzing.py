@@ -305,6 +305,7 @@ class Cases:
 
     def __init__(self, form: str, folder: Path):
         self.form, self.folder, self.seed = form, folder, None
+        making.add("bodies")  # some seeds are made of one
         if form == "options":
             for kind in FILES:
                 SEEDS[kind](folder)
