@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.kernels.meshing.growth import LIVE, VOID
 from warp_corot.kernels.remesh import pools as kernels
 from warp_corot.kernels.remesh.state import NO_ROW
+from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 
 from .fields import CARRIED_BY_NODES, CARRIED_BY_TETRAHEDRA, OF_NODES, OF_TETRAHEDRA
 
@@ -69,6 +71,36 @@ class Snapshot:
         # Rounds are counted on, so that what was touched in later ones is not taken for new.
         counts[kernels.STAMP] = present[kernels.STAMP]
         pools.counts.assign(counts)
+
+
+def check_places(forest: DeviceForest, counts: npt.NDArray[np.int32], pieces: dict[str, npt.NDArray[Any]]) -> None:
+    """See that kernels that are given stretches of arrays stay within these.
+
+    Args:
+        forest: Where they are to go.
+        counts: ``Pools.counts``.
+        pieces: Values, by the name of their array and, after a dot, where the stretch begins.
+
+    Raises:
+        ValueError: A place that there is not, in one line.
+    """
+    pools, levels = forest.pools, len(forest.carriage.arrays.volume)
+    places, nodes, named = len(pools.level), len(pools.lattice), len(forest.carriage.arrays.rest)
+    bounds = {"tets": (-1, nodes), "ends": (-1, nodes), "leaf_tets": (0, named), "level": (-1, levels)}
+    bounds |= {name: (0, places) for name in ("leaves", "free_pairs", "void_leaves")}
+    bounds |= {"parent": (-1, places), "first_child": (min(int(LIVE), int(VOID)), places)}
+    for key, values in pieces.items():
+        name, _, _ = key.partition(".")
+        lowest, end = bounds.get(name, (None, None))
+        if name == "code":
+            values, lowest, end = values >> FRAME_SHIFT, 0, len(pools.frames)
+        if end is not None and values.size and (values.min() < lowest or values.max() >= end):
+            raise ValueError(f"{name} has {values.min()} to {values.max()}, should be {lowest} to {end - 1}")
+    for place, most in ((kernels.LEAVES, pools.leaves), (kernels.FREE_PAIRS, pools.free_pairs)):
+        if not 0 <= counts[place] <= len(most):
+            raise ValueError(f"{counts[place]} places are counted, and there are {len(most)}")
+    if not 0 <= counts[kernels.NODE_TOP] <= pools.node_limit:
+        raise ValueError(f"{counts[kernels.NODE_TOP]} nodes are counted, and there are {pools.node_limit}")
 
 
 def array_of(forest: DeviceForest, name: str) -> wp.array:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.discretization.changing.snapshot import Piece, Snapshot, array_of
+from warp_corot.discretization.changing.snapshot import Piece, Snapshot, array_of, check_places
 from warp_corot.discretization.changing.survey import Findings
 from warp_corot.errors import InputError
 from warp_corot.remesh.carried_activation import Keys
@@ -171,6 +171,7 @@ def _pack_snapshot(snapshot: Snapshot, prefix: str, arrays: Arrays) -> list[list
 
 
 def _unpacked_snapshot(forest: DeviceForest, pieces: list[list[Any]], prefix: str, arrays: Arrays) -> Snapshot:
+    check_places(forest, arrays[prefix + "counts"], {f"{n}.{k}": arrays[f"{prefix}{n}.{k}"] for n, k in pieces})
     made = [Piece(n, start, _on_device(arrays[f"{prefix}{n}.{start}"], array_of(forest, n))) for n, start in pieces]
     return Snapshot(arrays[prefix + "counts"], tuple(made))
 
