@@ -16,14 +16,14 @@ SLOW_SCAN = """
 import sys, time
 from warp_corot.cli import waiting, simulate, main
 waiting.SILENT = waiting.EVERY = 0.05
-found = simulate._found
+found = simulate.find_body
 def slow(body):
     from warp_corot.cli.say import complain
     time.sleep(1.0)
     complain("of something", kind="note")
     time.sleep(1.0)
     return found(body)
-simulate._found = slow
+simulate.find_body = slow
 sys.exit(main(["simulate", "box", "-o", "a.usd", "--duration", "0.05", "--fps", "40", "--device", "cpu"]))
 """
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .simulate import Body
+    from .bodies import Body
 
 #: What stands for bytes that are not UTF-8, which USD's strings must be.
 _ERRORS = "backslashreplace"

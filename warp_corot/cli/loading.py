@@ -116,6 +116,11 @@ def loads_of(args: argparse.Namespace) -> list[Load]:
     return found
 
 
+def ramp_of(args: argparse.Namespace, duration: float) -> float:
+    """The time over which loads grow [s]."""
+    return 0.5 * duration if args.ramp is None else args.ramp
+
+
 def value_of(kind: str, text: str) -> float:
     """A displacement [m], an angle [degrees] or a pressure [Pa], as a number or with a unit of its own.
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from warp_corot.simulation.simulation import Simulation
 
-    from .simulate import Body
+    from .bodies import Body
 
 #: Views by name: azimuth and elevation [°].
 VIEWS = {

@@ -1,10 +1,15 @@
 """How a command ends: its exit status, and the line on stderr that says why."""
 
+from __future__ import annotations
+
 import os
 import signal
 import sys
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
+
+if TYPE_CHECKING:
+    from warp_corot.io.write.animate import Recording
 
 EXIT_CODES = """exit status:
   0    done
@@ -21,6 +26,13 @@ class Terminated(KeyboardInterrupt):
 def interrupt_status(signalled: KeyboardInterrupt) -> int:
     """What a shell expects of a program that a signal has ended."""
     return 128 + (signal.SIGTERM if isinstance(signalled, Terminated) else signal.SIGINT)
+
+
+def kept_so_far(done: Recording) -> str:
+    """What there is of a run that has ended early."""
+    if not done.frames:
+        return "no frame was written"
+    return f"{done.frames} frames, {done.simulated:.3g} s, are kept in {done.path}"
 
 
 def complain(message: str, kind: str = "error") -> None:

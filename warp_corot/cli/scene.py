@@ -15,9 +15,9 @@ from warp_corot.inputs.device import checked_device
 
 from . import quantities
 from .compiling import compiling_said
-from .say import EXIT_CODES, complain, interrupt_status
-from .simulate import kept_so_far, progress_bar
+from .say import EXIT_CODES, complain, interrupt_status, kept_so_far
 from .summary import length, milliseconds, pressure
+from .waiting import progress_bar
 
 if TYPE_CHECKING:
     from warp_corot.io.write.animate import Recording

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_corot.elasticity import MODELS
+from warp_corot.holding.choice import NAMED
 from warp_corot.mesh import TetForest
 
 from .remesh import remesh_rows
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from warp_corot.materials.isotropic import Isotropic
     from warp_corot.simulation.simulation import Simulation
 
-    from .simulate import Body
+    from .bodies import Body
     from .subject import Subject
 
 #: Materials of regions that are named.
@@ -62,6 +63,14 @@ def summary(bodies: Sequence[Body], sim: Simulation, done: Recording) -> str:
         if path:
             rows.append((name, str(path)))
     return "\n".join([*lines, *([] if len(bodies) == 1 else ["all together"]), *_aligned(rows)])
+
+
+def title_of(bodies: Sequence[Body]) -> str:
+    """The title of a picture: what is simulated, and what holds it."""
+    names, held = [body.subject.name for body in bodies], bodies[0].held
+    left = len(names) - NAMED
+    name = ", ".join(names[:NAMED]) + (f" and {left} more" if left > 0 else "")
+    return f"{name}, {(held.title or held.words) if len(bodies) == 1 else 'dots where they are held'}"
 
 
 def _of_body(body: Body) -> list[tuple[str, str]]:

@@ -1,4 +1,4 @@
-"""Waits of which nobody knows how long they take: after two seconds a terminal shows what is done and since when."""
+"""What a terminal shows while a command works: after two seconds what it does and since when, and how far a run is."""
 
 from __future__ import annotations
 
@@ -6,6 +6,10 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from warp_corot.io.write.animate import Progress
 
 #: What passes without a word [s], and how often the time is shown anew.
 SILENT, EVERY = 2.0, 0.5
@@ -29,6 +33,16 @@ def waiting(what: str) -> Iterator[None]:
     finally:
         over.set()
         shown.join()
+
+
+@contextmanager
+def progress_bar(count: int) -> Iterator[Progress]:
+    """A bar of the frames of a run, on terminals only."""
+    from tqdm import tqdm
+
+    form = "{desc}  {percentage:3.0f} % |{bar}| frame {n_fmt} of {total_fmt}, {remaining} left"
+    with tqdm(desc="simulating", total=count, leave=False, disable=None, file=sys.stderr, bar_format=form) as bar:
+        yield lambda frame, _: bar.update(frame - bar.n)
 
 
 def _show(what: str, over: threading.Event) -> None:

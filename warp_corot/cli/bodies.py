@@ -1,0 +1,156 @@
+"""The bodies of a run: from options and an input to a mesh with its material, held and moved."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.elasticity import MODELS, Corotated, Model
+from warp_corot.errors import InputError
+from warp_corot.materials.isotropic import Isotropic
+from warp_corot.remesh.online import OnlineRemesh
+from warp_corot.simulation.parts import checked_gravity
+
+from .applies import refuse_options
+from .holding import Held, held_as_told, held_by_default, up_of
+from .label_materials import covers_all, label_material, region_material
+from .loading import Load, loads_of, move_patches, ramp_of
+from .opened import Opened, open_input
+from .organs import find_organ
+from .patches import Patches
+from .probing import probes_body
+from .remesh import remesh_of
+from .several import bodies_in
+from .subject import Subject, find_subject
+from .summary import pressure
+
+
+@dataclass(eq=False)
+class Body:
+    """A body of a run.
+
+    Attributes:
+        args: Its options.
+        subject: What is simulated, and defaults for it.
+        opened: Its input.
+        model: Its elastic model.
+        remesh: How its mesh follows the motion, if it does.
+        loads: What is done to it.
+        patches: Its patches.
+        held: What holds it.
+        soft: The body itself.
+        probes: What is measured of it.
+    """
+
+    args: argparse.Namespace
+    opened: Opened
+    model: Model
+    remesh: OnlineRemesh | None
+    loads: list[Load]
+    subject: Subject = field(init=False)
+    patches: Patches = field(init=False)
+    held: Held = field(init=False)
+    soft: SoftBody = field(init=False)
+    probes: list[str] = field(default_factory=list)
+
+
+def asked_bodies(args: argparse.Namespace) -> list[Body]:
+    """The bodies of an input, their options looked at as far as that goes before there are meshes."""
+    model = _model(args.model, args.rotation_level)
+    opened = open_input(args.input)
+    refuse_options(args, opened)
+    remesh, loads = remesh_of(args, opened.kind), loads_of(args)
+    return [Body(own, part, model, remesh, loads) for part, own in bodies_in(opened, args)]
+
+
+def find_body(body: Body) -> Subject:
+    args = body.args
+    find = find_subject if body.opened.kind in ("box", "tets") else find_organ
+    subject = find(body.opened, args)
+    for output in (args.output, *(args.also or ())):
+        if subject.source and output.exists() and output.samefile(subject.source):
+            raise InputError(f"{output}: is the input, should be another file")
+    return subject
+
+
+def find_patches(bodies: Sequence[Body]) -> None:
+    """Find the patches of all bodies of an input, each of which has the loads and probes whose patch it has."""
+    args = bodies[0].args
+    probes, loads = list(args.probe or ()), bodies[0].loads
+    if probes and args.csv is None:
+        raise InputError("--probe is for --csv, which is not given")
+    for body in bodies:
+        gravity = gravity_of(args, body.subject)
+        body.patches = Patches(body.subject, up_of(body.subject, gravity), args.patch or ())
+        body.loads, body.probes = loads, probes
+        if len(bodies) > 1:
+            body.loads = [load for load in loads if body.patches.nodes(load.patch).any()]
+            body.probes = [text for text in probes if probes_body(text, body.patches)]
+    for load in loads:
+        if not any(load in body.loads for body in bodies):
+            raise InputError(f"--{load.kind} {load.patch!r}: there are no nodes in it")
+    for text in probes:
+        if not any(text in body.probes for body in bodies):
+            raise InputError(f"--probe {text!r}: is in none of the bodies")
+
+
+def make_body(body: Body, duration: float) -> None:
+    """Make the body, held, and have its patches move as told."""
+    args, subject = body.args, body.subject
+    gravity = gravity_of(args, subject)
+    material, chosen = _material(args, subject, body.patches)
+    expressions = args.fix if args.fix is not None else None if subject.fix is None else [subject.fix]
+    if expressions is None:
+        body.held, stiffer = held_by_default(subject, material, gravity, may_stiffen=chosen is not None)
+        if stiffer > 1.0:
+            material, chosen = _material(args, subject, body.patches, stiffer)
+    else:
+        moved = any(load.kind != "press" for load in body.loads)
+        body.held = held_as_told(subject, body.patches, expressions, moved)
+    if chosen is not None:
+        rest = " of the others" if subject.labels else ""
+        subject.notes.append(f"Young's modulus{rest} is {pressure(chosen)}, chosen for the weight (--young)")
+    body.soft = SoftBody(subject.mesh, material, device=args.device)
+    body.soft.fix(body.held.nodes)
+    move_patches(body.soft, body.loads, body.patches, ramp_of(args, duration))
+
+
+def gravity_of(args: argparse.Namespace, subject: Subject) -> np.ndarray:
+    given = subject.gravity if args.gravity is None else tuple(args.gravity)
+    return np.array(checked_gravity(given, subject.mesh.up_axis))
+
+
+def _model(name: str, rotation_level: int | None) -> Model:
+    if rotation_level is None:
+        return MODELS[name]()
+    if name != "corotated":
+        raise InputError(f"--rotation-level is {rotation_level}, but only --model corotated has rotations, not {name}")
+    return Corotated(rotation_level=rotation_level)
+
+
+def _material(
+    args: argparse.Namespace, subject: Subject, patches: Patches, stiffer: float = 1.0
+) -> tuple[Isotropic, float | None]:
+    """The material, and Young's modulus [Pa] where it was chosen for the body's weight, so many times as stiff."""
+    density = subject.density if args.density is None else args.density
+    poisson = subject.poisson if args.poisson is None else args.poisson
+    Isotropic(1.0, poisson, density)  # both must be checked before they are used
+    young = subject.young if args.young is None else args.young
+    covered = bool(subject.labels) and covers_all(subject.mesh, subject.labels)
+    if covered and args.young is not None:
+        raise InputError("--young is given, but --materials gives each label its own")
+    chosen = None
+    if young is None:
+        young = float(f"{stiffer * subject.young_from_weight(density, args.gravity):.1e}")
+        chosen = None if covered else young
+    if subject.labels:
+        material = label_material(subject.mesh, subject.labels, young, poisson, density)
+    else:
+        material = Isotropic(young, poisson, density)
+    if args.region:
+        material = region_material(subject.mesh, patches, args.region, material)
+    return material, chosen

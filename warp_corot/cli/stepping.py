@@ -1,0 +1,56 @@
+"""The simulation of a run's bodies, with a time step that has been tried."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.simulation.simulation import Simulation
+from warp_corot.solvers import SymplecticEuler
+
+from .bodies import Body, gravity_of
+from .remesh import as_remesh_options
+
+
+def make_simulation(args: argparse.Namespace, bodies: Sequence[Body]) -> Simulation:
+    """The simulation, its kernels compiled; a given step is shortened until a whole number of them makes a frame."""
+    from warp_corot.io.write.animate import steps_per_frame
+
+    first = bodies[0].subject
+    damping = first.damping if args.damping is None else args.damping
+    viscosity = args.viscosity or 0.0
+    SymplecticEuler(args.dt, damping, viscosity)  # checks all, the step before it is shortened
+    tried = min(_tried_step(body, damping, viscosity) for body in bodies)
+    steps = steps_per_frame(args.fps, args.dt or tried)  # refuses more than anybody can wait for
+    dt = None if args.dt is None else 1.0 / (args.fps * steps)
+    with as_remesh_options():
+        return Simulation(
+            [body.soft for body in bodies],
+            model=[body.model for body in bodies],
+            integrator=SymplecticEuler(dt, damping, viscosity),
+            gravity=gravity_of(args, first),
+            remesh=[body.remesh for body in bodies] if any(body.remesh for body in bodies) else None,
+        )
+
+
+def _tried_step(one: Body, damping: float, viscosity: float) -> float:
+    """The length of a step [s] that was made at rest and without weight: it loads every kernel and moves nothing."""
+    tried = body = one.soft
+    model, remesh = one.model, one.remesh
+    if remesh:
+        # The body's own mesh is not to change before it begins.
+        tried, remesh = SoftBody(body.mesh, body.material, device=body.device), replace(remesh, every=1)
+        tried.fix(body.constrained)
+    integrator = SymplecticEuler(damping=damping, viscosity=viscosity)
+    with as_remesh_options():
+        trial = Simulation(tried, model=model, integrator=integrator, gravity=(0, 0, 0), remesh=remesh)
+    dt = trial.dt
+    trial.step()
+    trial.von_mises()
+    if tried is body:
+        body.displacements = body.velocities = np.zeros_like(body.mesh.points)
+    return dt
