@@ -8,7 +8,8 @@ pytest.importorskip("matplotlib")
 from pictures import CUBE, FACES, picture_of
 from PIL import Image, ImageChops
 
-from warp_corot.io.pictures.preview import Picture, _fit, render_preview, render_strip
+from warp_corot.io.pictures.lettering import fit_line
+from warp_corot.io.pictures.preview import Picture, render_preview, render_strip
 
 RUN = ["box", "-o", "a.usd", *SHORT]  # frames 0, 1 and 2
 
@@ -48,7 +49,7 @@ def test_titles_are_never_cut(tmp_path):
 def test_a_title_that_is_too_long_keeps_its_time(tmp_path, monkeypatch):
     written = []
     monkeypatch.setattr(
-        "warp_corot.io.pictures.preview._fit", lambda text, width: (_fit(text, width), written.append(text))
+        "warp_corot.io.pictures.preview.fit_line", lambda text, width: (fit_line(text, width), written.append(text))
     )
     words = "; ".join(["held where " + " or ".join(f"x < {n}" for n in range(40))] * 2)
     render_preview(tmp_path / "a.png", CUBE, FACES, title=f"{words}; 0.25 s", size=(400, 300))

@@ -189,3 +189,19 @@ def test_held_nodes_are_marked_where_they_can_be_seen(tmp_path):
         pictures[name] = picture_of(tmp_path / "a.png").astype(int)
     assert np.abs(pictures["near"] - pictures["none"]).max() > 60
     np.testing.assert_array_equal(pictures["far"], pictures["none"])
+
+
+def test_dots_are_hidden_by_what_is_before_them(tmp_path):
+    """The near corner of a second cube behind the first is hidden, however coarse the first one is drawn."""
+    towards = np.array([1.0, 1.0, 2.0])
+    both = np.concatenate([CUBE, CUBE - 1.5 * (CUBE.max() - CUBE.min()) * towards / 2.0])
+    faces = np.concatenate([FACES, FACES + len(CUBE)])
+    pictures = {}
+    for name, node in (("none", None), ("hidden", len(CUBE) + int(np.argmax(CUBE @ towards)))):
+        held = np.arange(len(both)) == (-1 if node is None else node)
+        # From along that diagonal, so that the corner is behind the middle of the first.
+        azimuth, elevation = np.degrees([np.arctan2(1.0, 2.0), np.arctan2(1.0, np.sqrt(5.0))])
+        view = {"azimuth": azimuth, "elevation": elevation}
+        render_preview(tmp_path / "a.png", both, faces, held=held, size=SIZE, pieces=1, **view)
+        pictures[name] = picture_of(tmp_path / "a.png").astype(int)
+    np.testing.assert_array_equal(pictures["hidden"], pictures["none"])

@@ -10,16 +10,20 @@ from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from warp_corot.errors import InputError
 from warp_corot.io.pictures.film import FILMS, check_film, frames_shown, write_film
 
+from .shown import Shown, shown_now
+
 if TYPE_CHECKING:
     from PIL.Image import Image
 
+    from warp_corot.io.pictures.camera import Camera
+    from warp_corot.io.pictures.preview import Picture
     from warp_corot.simulation.simulation import Simulation
 
     from .bodies import Body
@@ -56,25 +60,23 @@ def add_preview_options(group: argparse._ArgumentGroup) -> None:
     )
 
 
-@dataclass
-class Shown:
-    """One frame of all bodies as it is drawn, and as it waits on the disk."""
+@dataclass(frozen=True)
+class Look:
+    """What all frames of a preview have in common.
 
-    positions: np.ndarray
-    triangles: np.ndarray
-    values: np.ndarray
-    rest: np.ndarray
-    held: np.ndarray
-    time: float
+    Attributes:
+        box: Lowest and highest coordinates of all frames [m], [2, 3].
+        cameras: One for each view.
+        window: Lowest and highest picture coordinates of all frames.
+        limits: Values at the ends of the colour map.
+        ground: Its height [m].
+    """
 
-    def write(self, file: IO[bytes]) -> None:
-        for array in (self.positions, self.triangles, self.values, self.rest, self.held, np.float64(self.time)):
-            np.save(file, array, allow_pickle=False)
-
-    @classmethod
-    def read(cls, file: IO[bytes]) -> Shown:
-        positions, triangles, values, rest, held, time = (np.load(file, allow_pickle=False) for _ in range(6))
-        return cls(positions, triangles, values, rest, held, float(time))
+    box: np.ndarray
+    cameras: Sequence[Camera]
+    window: tuple[np.ndarray, np.ndarray]
+    limits: tuple[float, float]
+    ground: float
 
 
 @dataclass
@@ -131,31 +133,8 @@ class Previews:
             return
         from tqdm import tqdm
 
-        from warp_corot.io.pictures.drawing import value_limits
-        from warp_corot.io.pictures.preview import Picture, bounds_of, cameras_of, draw_strip, save_picture
-
         up_axis = bodies[0].soft.mesh.up_axis
-        boxes, highest, ground = [], 0.0, np.inf
-        up = "XYZ".index(up_axis)
-        for shown in self._kept():
-            boxes.append(bounds_of([Picture(shown.positions, shown.triangles, rest=shown.rest)]))
-            highest = max(highest, value_limits(shown.values)[1])
-            ground = min(ground, boxes[-1][0, up])
-        box = np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
-
-        def pictures(shown: Shown, frame_title: str) -> list[Picture]:
-            named = (self.args.preview_views or "").split(",") if len(self.views) > 1 else [""]
-            titles = [", ".join(filter(None, (name, frame_title))) for name in named]
-            options: dict[str, Any] = {"held": shown.held} if shown.held.any() else {}
-            if is_film(self.args.preview):
-                options["pieces"] = FILM_PIECES
-            return [
-                Picture(shown.positions, shown.triangles, shown.values, shown.rest, words, dict(options), view)
-                for view, words in zip(self.views, titles, strict=True)
-            ]
-
-        limits = (0.0, highest)
-        path = self.args.preview
+        look = self._look(up_axis)
         with tqdm(
             total=len(self._places),
             desc="drawing",
@@ -165,69 +144,79 @@ class Previews:
             file=sys.stderr,
             bar_format="{desc}  {percentage:3.0f} % |{bar}| {remaining} left",
         ) as bar:
-            if not is_film(path):
-                panels: list[Picture] = []
-                for shown in self._kept():
-                    panels += pictures(shown, f"{shown.time:.3g} s" if len(self.frames) > 1 else "")
-                    bar.update()
-                cameras = cameras_of(panels, up_axis, *VIEWS["corner"], box)
-                size = (1200, 900) if len(panels) == 1 else None
-                several = len(self.views) > 1 and len(self.frames) > 1
-                columns = len(self.views) if several else min(len(panels), MOST_COLUMNS)
-                words = name if len(self.frames) > 1 else f"{name}; {shown.time:.3g} s"
-                drawn = draw_strip(panels, cameras, value_range=limits, title=words, size=size, columns=columns)
-                save_picture(drawn, path)
-                return
+            if is_film(self.args.preview):
+                with contextlib.closing(self._images(name, look, bar)) as drawing:
+                    write_film(self.args.preview, drawing, self.fps)
+            else:
+                self._draw_picture(name, up_axis, look, bar)
 
-            def images() -> Generator[Image, None, None]:
-                width, height = FILM_SIZE
-                for shown in self._kept():
-                    views = pictures(shown, "")
-                    yield draw_strip(
-                        views,
-                        cameras_of(views, up_axis, *VIEWS["corner"], box),
-                        value_range=limits,
-                        title=f"{name}; {shown.time:.2f} s",
-                        size=(width * len(views), height),
-                        box=box,
-                        ground=float(ground),
-                        fineness=1,
-                    )
-                    bar.update()
+    def _look(self, up_axis: str) -> Look:
+        """What all frames have in common."""
+        from warp_corot.io.pictures.drawing import value_limits
+        from warp_corot.io.pictures.preview import Picture, bounds_of, cameras_of, window_of
 
-            with contextlib.closing(images()) as drawing:
-                write_film(path, drawing, self.fps)
+        boxes, highest, ground = [], 0.0, np.inf
+        for shown in self._kept():
+            boxes.append(bounds_of([Picture(shown.positions, shown.triangles, rest=shown.rest)]))
+            highest = max(highest, value_limits(shown.values)[1])
+            ground = min(ground, boxes[-1][0, "XYZ".index(up_axis)])
+        box = np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
+        cameras = cameras_of(self._pictures(shown, ""), up_axis, *VIEWS["corner"], box)
+        window = window_of((self._pictures(each, "") for each in self._kept()), cameras)
+        return Look(box, cameras, window, (0.0, highest), float(ground))
+
+    def _pictures(self, shown: Shown, frame_title: str) -> list[Picture]:
+        """A frame from all sides."""
+        from warp_corot.io.pictures.preview import Picture
+
+        named = (self.args.preview_views or "").split(",") if len(self.views) > 1 else [""]
+        titles = [", ".join(filter(None, (name, frame_title))) for name in named]
+        options: dict[str, Any] = {"held": shown.held} if shown.held.any() else {}
+        if is_film(self.args.preview):
+            options["pieces"] = FILM_PIECES
+        return [
+            Picture(shown.positions, shown.triangles, shown.values, shown.rest, words, dict(options), view)
+            for view, words in zip(self.views, titles, strict=True)
+        ]
+
+    def _draw_picture(self, name: str, up_axis: str, look: Look, bar: Any) -> None:
+        from warp_corot.io.pictures.preview import cameras_of, draw_strip, save_picture
+
+        panels: list[Picture] = []
+        for shown in self._kept():
+            panels += self._pictures(shown, f"{shown.time:.3g} s" if len(self.frames) > 1 else "")
+            bar.update()
+        cameras = cameras_of(panels, up_axis, *VIEWS["corner"], look.box)
+        size = (1200, 900) if len(panels) == 1 else None
+        several = len(self.views) > 1 and len(self.frames) > 1
+        columns = len(self.views) if several else min(len(panels), MOST_COLUMNS)
+        words = name if len(self.frames) > 1 else f"{name}; {shown.time:.3g} s"
+        drawn = draw_strip(panels, cameras, value_range=look.limits, title=words, size=size, columns=columns)
+        save_picture(drawn, self.args.preview)
+
+    def _images(self, name: str, look: Look, bar: Any) -> Generator[Image, None, None]:
+        """The frames of a film."""
+        from warp_corot.io.pictures.preview import draw_strip
+
+        width, height = FILM_SIZE
+        for shown in self._kept():
+            views = self._pictures(shown, "")
+            yield draw_strip(
+                views,
+                look.cameras,
+                value_range=look.limits,
+                title=f"{name}; {shown.time:.2f} s",
+                size=(width * len(views), height),
+                window=look.window,
+                ground=look.ground,
+                fineness=1,
+            )
+            bar.update()
 
     def _kept(self) -> Iterator[Shown]:
         for place in self._places:
             self._file.seek(place)
             yield Shown.read(self._file)
-
-
-def shown_now(bodies: Sequence[Body], sim: Simulation) -> Shown:
-    """The present state of all bodies as it is drawn."""
-    from warp_corot.io.pictures.colors import VertexAverage
-    from warp_corot.io.write.skins import BoundSkins
-    from warp_corot.mesh.surfaces.boundary import signed_volumes
-
-    moved: list[np.ndarray] = []
-    rest: list[np.ndarray] = []
-    triangles, values, held = [], [], []
-    for body in bodies:
-        subject, mesh = body.subject, body.soft.mesh
-        drawn = subject.skin or subject.surface
-        average = VertexAverage(mesh.tets, np.abs(signed_volumes(mesh.points, mesh.tets)), len(mesh.points))
-        stress = average(sim.von_mises(body.soft))
-        for skin in BoundSkins([mesh], drawn, changing=[mesh is not subject.mesh]).on([mesh]):
-            triangles.append(skin.surface.triangles + sum(len(points) for points in rest))
-            moved.append(skin.surface.moved(body.soft.displacements.numpy()))
-            rest.append(skin.surface.points)
-            values.append(skin.values(stress))
-            held.append(skin.values(body.soft.constrained.astype(float)) > 0.5)
-    arrays = [np.concatenate(each) for each in (moved, triangles, values, rest, held)]
-    return Shown(
-        arrays[0].astype(np.float32), arrays[1], arrays[2].astype(np.float32), arrays[3], arrays[4], time=sim.time
-    )
 
 
 def is_film(path: Path) -> bool:

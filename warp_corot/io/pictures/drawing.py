@@ -5,7 +5,6 @@ others cut into pieces small enough for smooth shading, and each piece filled wi
 """
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,62 +12,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from warp_corot.errors import InputError
 
+from .camera import Array, Camera
 from .colors import TISSUE, color_index, round_limit, srgb_to_linear, stress_colors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Array = NDArray[np.float64]
-
 INK = "#3b3640"
 _PIECES = 60_000  # about how many polygons a body is cut into
 _CREASE = math.cos(math.radians(40.0))  # edges sharper than this stay sharp
-_DEPTH_CELLS = 60  # across the picture that says which dots are hidden
+_DOTS_ACROSS = 160  # as many dots at most from the body to the viewer, at their spacing
+_BEFORE = 5e-3  # of the body's size: a surface that much nearer than a dot hides it
 _GHOST, _GHOST_LINE = (0.90, 0.91, 0.93), (0.74, 0.76, 0.80)
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A mild perspective view. Points are seen along ``axes[2]``; picture coordinates are right and up.
-
-    Attributes:
-        center: Point in the middle of the picture [m], [3].
-        axes: Rows: right, up, towards the viewer; [3, 3].
-        distance: From the viewer to ``center`` [m].
-        world_up: The stage's up direction, [3].
-    """
-
-    center: Array
-    axes: Array
-    distance: float
-    world_up: Array
-
-    @classmethod
-    def fit(cls, points: ArrayLike, up_axis: str = "Y", azimuth: float = 35.0, elevation: float = 14.0) -> "Camera":
-        """A camera that sees all of ``points`` [n, 3] from ``azimuth`` [°] round the up axis and ``elevation`` [°].
-
-        Azimuth 0 looks along −Z where Y is up, along +Y where Z is up, along −Y where X is up.
-        """
-        right, up, front = _world_axes(up_axis)
-        a, e = math.radians(azimuth), math.radians(elevation)
-        towards = math.cos(e) * (math.cos(a) * front + math.sin(a) * right) + math.sin(e) * up
-        across = math.cos(a) * right - math.sin(a) * front
-        x = np.asarray(points, dtype=np.float64).reshape(-1, 3)
-        low, high = x.min(axis=0), x.max(axis=0)
-        size = float(np.linalg.norm(high - low)) or 1.0
-        axes = np.stack([across, np.cross(towards, across), towards])
-        return cls((low + high) / 2.0, axes, 3.5 * size, up)
-
-    def project(self, points: Array) -> tuple[Array, Array]:
-        """Picture coordinates [..., 2] and depth [...] (larger is nearer) of points [..., 3]."""
-        seen = (points - self.center) @ self.axes.T
-        depth = seen[..., 2]
-        return seen[..., :2] * (self.distance / (self.distance - depth))[..., None], depth
-
-    def rays(self, points: Array) -> Array:
-        """Unit vectors from points [..., 3] to the viewer."""
-        towards = self.center + self.distance * self.axes[2] - points
-        return towards / np.linalg.norm(towards, axis=-1, keepdims=True)
 
 
 def draw_body(
@@ -86,6 +41,7 @@ def draw_body(
     ground: float | bool = True,
     held: ArrayLike | None = None,
     pieces: int = _PIECES,
+    seams: float = 0.2,
 ) -> Camera:
     """Draws a shaded surface into a Matplotlib Axes.
 
@@ -103,6 +59,7 @@ def draw_body(
         ground: Height [m] of a ground that takes the shadow; True: below the lowest node; False: none.
         held: Nodes to be marked with dots, mask [N].
         pieces: About how many polygons the surface is cut into.
+        seams: Width of the polygons' edges [pt]; those thinner than a pixel leave the seams between polygons visible.
 
     Returns:
         The camera used, for the next body.
@@ -123,8 +80,8 @@ def draw_body(
         _draw_silhouette(ax, x_rest[tri], camera)
 
     cut, normals, values = _cut(x, tri, _values(scalars, len(x), tri), pieces)
-    _fill(ax, camera.project(x[tri][_facing(x[tri], camera)])[0], INK, INK, width=1.6, order=3)
-    front = _facing(cut, camera)
+    _fill(ax, camera.project(x[tri][camera.sees_outside(x[tri])])[0], INK, INK, width=1.6, order=3)
+    front = camera.sees_outside(cut)
     cut, normals = cut[front], normals[front]
     flat, depth = camera.project(cut)
     order = np.argsort(depth.mean(axis=1))
@@ -135,11 +92,11 @@ def draw_body(
         base = srgb_to_linear(stress_colors())[color_index(values[front], lowest, highest)]
     shaded = _shade(base, normals, camera.rays(cut.mean(axis=1)), camera)[order]
     # The edge of each polygon, in its own colour, closes the seams that antialiasing leaves between neighbours.
-    _fill(ax, flat[order], shaded, shaded, width=0.2, order=4)
+    _fill(ax, flat[order], shaded, shaded, width=seams, order=4)
     if edges:
         _draw_edges(ax, x[tri], camera)
     if held is not None and np.any(held):
-        _draw_dots(ax, x, tri, np.asarray(held, dtype=bool), cut, camera)
+        _draw_dots(ax, x, tri, np.asarray(held, dtype=bool), camera)
     ax.set_aspect("equal")
     ax.set_axis_off()
     ax.update_datalim(np.concatenate([camera.project(s)[0] for s in seen]))
@@ -174,14 +131,6 @@ def checked_surface(positions: ArrayLike, faces: ArrayLike, name: str) -> tuple[
     return x, tri
 
 
-def _world_axes(up_axis: str) -> tuple[Array, Array, Array]:
-    """Right, up and front (towards a viewer at azimuth 0), a right-handed triple."""
-    if up_axis not in ("X", "Y", "Z"):
-        raise InputError(f"up_axis is {up_axis!r}, should be X, Y or Z")
-    x, y, z = np.eye(3)
-    return {"Y": (x, y, z), "Z": (x, z, -y), "X": (z, x, y)}[up_axis]
-
-
 def _values(scalars: ArrayLike | None, nodes: int, tri: NDArray[np.int64]) -> Array | None:
     """Values at the corners of the faces [F, 3]."""
     if scalars is None:
@@ -192,13 +141,6 @@ def _values(scalars: ArrayLike | None, nodes: int, tri: NDArray[np.int64]) -> Ar
     if values.shape == (len(tri),):
         return np.repeat(values[:, None], 3, axis=1)
     raise InputError(f"scalars has shape {list(values.shape)}, should be [{nodes}] (nodes) or [{len(tri)}] (faces)")
-
-
-def _facing(triangles: Array, camera: Camera) -> NDArray[np.bool_]:
-    """Which triangles [n, 3, 3] show their outer side."""
-    flat, _ = camera.project(triangles)
-    (ax_, ay), (bx, by) = (flat[:, 1] - flat[:, 0]).T, (flat[:, 2] - flat[:, 0]).T
-    return ax_ * by - ay * bx > 0.0
 
 
 def _corner_normals(x: Array, tri: NDArray[np.int64]) -> Array:
@@ -257,13 +199,13 @@ def _shade(base: Array, normals: Array, rays: Array, camera: Camera) -> Array:
 
 
 def _draw_silhouette(ax: "Axes", triangles: Array, camera: Camera) -> None:
-    flat, _ = camera.project(triangles[_facing(triangles, camera)])
+    flat, _ = camera.project(triangles[camera.sees_outside(triangles)])
     _fill(ax, flat, _GHOST, _GHOST_LINE, width=2.2, order=1)
     _fill(ax, flat, _GHOST, _GHOST, width=0.3, order=2)
 
 
 def _draw_edges(ax: "Axes", triangles: Array, camera: Camera) -> None:
-    flat, _ = camera.project(triangles[_facing(triangles, camera)])
+    flat, _ = camera.project(triangles[camera.sees_outside(triangles)])
     _fill(ax, flat, "none", (0.23, 0.21, 0.25, 0.25), width=0.4, order=5)
 
 
@@ -317,28 +259,41 @@ def _blur(image: Array, wide_u: float, wide_v: float) -> Array:
     return np.clip(np.fft.irfft2(np.fft.rfft2(image) * kernel, s=image.shape), 0.0, 1.0)
 
 
-def _draw_dots(
-    ax: "Axes", x: Array, tri: NDArray[np.int64], held: NDArray[np.bool_], pieces: Array, camera: Camera
-) -> None:
-    """Dots on the held nodes that can be seen: on a face that shows its outside, with none of the pieces before it."""
-    faces = tri[_facing(x[tri], camera)]
+def _draw_dots(ax: "Axes", x: Array, tri: NDArray[np.int64], held: NDArray[np.bool_], camera: Camera) -> None:
+    """Dots on the held nodes that can be seen, so few that they do not run together."""
+    faces = tri[camera.sees_outside(x[tri])]
     marked = np.unique(faces[held[faces]])
     if not len(marked):
         return
-    flat, depth = camera.project(x)
-    centers, nearness = camera.project(pieces.mean(axis=1))
-    low = np.minimum(centers.min(axis=0), flat[marked].min(axis=0))
-    cell = float(np.ptp(centers, axis=0).max()) / _DEPTH_CELLS or 1.0
-    nearest: dict[tuple[int, int], float] = {}
-    for place, near in zip(map(tuple, ((centers - low) / cell).astype(int).tolist()), nearness.tolist(), strict=True):
-        nearest[place] = max(near, nearest.get(place, -np.inf))
-    places = list(map(tuple, ((flat[marked] - low) / cell).astype(int).tolist()))
-    before = np.array([nearest.get(place, -np.inf) for place in places])
-    # Within a cell a surface seen at a slant is as much nearer as this.
-    seen = marked[depth[marked] > before - 4.0 * cell]
-    # So many that they do not run together.
-    _, first = np.unique(((flat[seen] - low) / (1.5 * cell)).astype(int), axis=0, return_index=True)
-    ax.plot(*flat[seen[first]].T, ".", color=INK, markersize=4.5, markeredgewidth=0.0, zorder=6)
+    flat, _ = camera.project(x[marked])
+    # Cells of the picture, not of the body, lest the dots of a film change with what moves.
+    cells = np.floor(flat / (camera.distance / _DOTS_ACROSS)).astype(int)
+    _, first = np.unique(cells, axis=0, return_index=True)
+    seen = first[_visible(x[marked[first]], x[faces], camera)]
+    ax.plot(*flat[seen].T, ".", color=INK, markersize=4.5, markeredgewidth=0.0, zorder=6)
+
+
+def _visible(points: Array, triangles: Array, camera: Camera) -> NDArray[np.bool_]:
+    """Which points [n, 3] have none of the triangles [F, 3, 3] before them."""
+    flat, depth = camera.project(points)
+    corners, corner_depth = camera.project(triangles)
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    size = float(np.linalg.norm(np.ptp(triangles.reshape(-1, 3), axis=0)))
+    found = np.ones(len(points), bool)
+    for index, (place, own) in enumerate(zip(flat, depth, strict=True)):
+        near = np.flatnonzero(((low <= place) & (place <= high)).all(axis=1))
+        ends = corners[near] - place
+        weights = np.stack([_cross(ends[:, (k + 1) % 3], ends[:, (k + 2) % 3]) for k in range(3)], axis=1)
+        inside = (weights >= 0.0).all(axis=1) & (weights.sum(axis=1) > 0.0)
+        weights = weights[inside] / weights[inside].sum(axis=1, keepdims=True)
+        # Along a line of the picture, one over the distance from the viewer is linear.
+        away = 1.0 / (weights / (camera.distance - corner_depth[near][inside])).sum(axis=1)
+        found[index] = not (away < camera.distance - own - _BEFORE * size).any()
+    return found
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def _unit(vector: Array) -> Array:

@@ -2,8 +2,7 @@
 
 import io
 import os
-import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,18 +13,20 @@ from numpy.typing import ArrayLike
 from warp_corot.errors import InputError
 from warp_corot.io.files.whole import written_whole
 
-from .colors import stress_colors
-from .drawing import INK, Array, Camera, checked_surface, draw_body, value_limits
+from .camera import Array, Camera
+from .drawing import INK, checked_surface, draw_body, value_limits
+from .lettering import BAR, draw_color_bar, fit_line, needed_width
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
     from PIL.Image import Image
 
 __all__ = ["Camera", "Picture", "check_picture_path", "draw_body", "render_preview", "render_strip", "value_limits"]
 
-#: Pixels from side to side of the colour bar.
-BAR = 16
+#: Width of polygons' edges [pt] where each pixel of a picture is drawn once: about a pixel.
+SEAMS = 0.4
+#: Of a film's window, around what is seen.
+ROOM = 0.06
 
 
 @dataclass
@@ -156,7 +157,7 @@ def draw_strip(
     value_range: tuple[float, float] | None = None,
     title: str | None = None,
     size: tuple[int, int] | None = None,
-    box: Array | None = None,
+    window: tuple[Array, Array] | None = None,
     ground: float | None = None,
     fineness: int = 2,
     columns: int | None = None,
@@ -167,7 +168,7 @@ def draw_strip(
         pictures: From left to right, and row after row.
         cameras: One for each.
         scalar_label, value_range, title, size: As in `render_strip`.
-        box: Lowest and highest coordinates of what panels show, seen or not [2, 3]; None: what there is to see.
+        window: Lowest and highest picture coordinates that panels show, see `window_of`; None: what there is to see.
         ground: Its height; None: below the lowest node.
         fineness: Times as many pixels are drawn along each side, and averaged.
         columns: Pictures in a row; None: all.
@@ -197,14 +198,14 @@ def draw_strip(
     figure.set_size_inches(width / 150.0, height / 150.0)
     legend = bar = None
     if with_scalars and value_range is not None:
-        legend = _draw_color_bar(figure, value_range, scalar_label)
-        bar = _needed_width(legend, width)
+        legend = draw_color_bar(figure, value_range, scalar_label)
+        bar = needed_width(legend, width)
     step = (width - (bar or 0)) / columns
     head, own_head = 56 * (title is not None), 40 * any(p.title for p in pictures)
     all_axes = []
     for picture, camera in zip(pictures, cameras, strict=True):
         ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        options = {"ground": ground, **picture.options}
+        options = {"ground": ground, "seams": SEAMS / fineness, **picture.options}
         draw_body(
             ax,
             picture.positions,
@@ -216,12 +217,12 @@ def draw_strip(
             **options,
         )
         if picture.title:
-            _fit(ax.set_title(picture.title, fontsize=11, color=INK, pad=4), step - 16)
+            fit_line(ax.set_title(picture.title, fontsize=11, color=INK, pad=4), step - 16)
         all_axes.append(ax)
     limits = np.array([[ax.get_xlim(), ax.get_ylim()] for ax in all_axes], dtype=np.float64)
     low, high = limits[..., 0].min(axis=0), limits[..., 1].max(axis=0)
-    if box is not None:
-        low, high = _window(box, cameras)
+    if window is not None:
+        low, high = window
     if size is None:
         height = rows * (int(step * np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.3, 1.6)) + own_head) + head
         figure.set_size_inches(width / 150.0, height / 150.0)
@@ -236,7 +237,7 @@ def draw_strip(
     if title:
         x_middle = (width - (bar or 0)) / (2.0 * width)
         text = figure.text(x_middle, 1.0 - 14 / height, title, ha="center", va="top", fontsize=13, color=INK)
-        _fit(text, width - (bar or 0) - 16)
+        fit_line(text, width - (bar or 0) - 16)
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png", dpi=fineness * figure.dpi)
     with Image.open(drawn) as fine:
@@ -261,12 +262,23 @@ def check_picture_path(path: str | Path, suffixes: Sequence[str] = (".png",)) ->
     return target
 
 
-def _window(box: Array, cameras: Sequence[Camera]) -> tuple[Array, Array]:
-    """Lowest and highest picture coordinates of a box, with some room, [2] and [2]."""
-    corners = np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(-1, 3)
-    flat = np.concatenate([camera.project(corners)[0] for camera in cameras])
-    room = 0.04 * float(np.ptp(flat, axis=0).max())
-    return flat.min(axis=0) - room, flat.max(axis=0) + room
+def window_of(pictures: Iterable[Sequence[Picture]], cameras: Sequence[Camera]) -> tuple[Array, Array]:
+    """What panels show in all frames of a film: lowest and highest picture coordinates, with some room, [2] and [2].
+
+    Args:
+        pictures: Of each frame, one for each camera.
+        cameras: Of the panels.
+    """
+    ends = []
+    for frame in pictures:
+        for picture, camera in zip(frame, cameras, strict=True):
+            for points in (picture.positions, picture.rest):
+                if points is not None:
+                    flat, _ = camera.project(np.asarray(points, dtype=np.float64)[np.unique(picture.faces)])
+                    ends += [flat.min(axis=0), flat.max(axis=0)]
+    low, high = np.min(ends, axis=0), np.max(ends, axis=0)
+    room = ROOM * float((high - low).max())
+    return low - room, high + room
 
 
 def _same_window(all_axes: Sequence["Axes"], low: Array, high: Array, aspect: float) -> None:
@@ -276,53 +288,6 @@ def _same_window(all_axes: Sequence["Axes"], low: Array, high: Array, aspect: fl
     for ax in all_axes:
         ax.set_xlim(center[0] - half_height * aspect, center[0] + half_height * aspect)
         ax.set_ylim(center[1] - half_height, center[1] + half_height)
-
-
-def _draw_color_bar(figure: "Figure", limits: tuple[float, float], label: str) -> "Axes":
-    ax = figure.add_axes((0.0, 0.2, BAR / (figure.get_figwidth() * 150.0), 0.55))
-    ax.imshow(stress_colors()[:, None, :], aspect="auto", origin="lower", extent=(0.0, 1.0, *limits))
-    ax.set_xticks([])
-    ax.yaxis.tick_right()
-    ax.yaxis.set_label_position("right")
-    ax.set_ylabel(label, fontsize=9, color=INK, labelpad=6)
-    ax.yaxis.set_major_formatter(lambda value, _: f"{value:,.6g}".replace(",", " "))
-    ax.tick_params(labelsize=8, colors=INK, length=2, width=0.6)
-    for spine in ax.spines.values():
-        spine.set_visible(False)
-    return ax
-
-
-def _needed_width(legend: "Axes", width: int) -> float:
-    """Pixels that the colour bar takes with all that is written beside it; what is too high is written smaller."""
-    renderer = legend.figure.canvas.get_renderer()  # type: ignore[attr-defined]
-    height = legend.figure.bbox.height
-    label = legend.yaxis.label
-    for points in (8.0, 7.0, 6.0, 5.0):
-        if label.get_window_extent(renderer).height <= 0.95 * height:
-            break
-        label.set_fontsize(points)
-    box = legend.get_tightbbox(renderer)
-    needed = 130.0 if box is None else 10.0 + float(box.x1) - float(legend.get_window_extent(renderer).x0) + 12.0
-    return min(max(needed, 130.0), 0.7 * width)
-
-
-def _fit(text: Any, width: float) -> None:
-    """Write a line smaller, and in the end shorter, until it is no wider than so many pixels.
-
-    A few letters after its last semicolon stay.
-    """
-    renderer = text.figure.canvas.get_renderer()
-
-    def is_wide() -> bool:
-        return text.get_window_extent(renderer).width > width
-
-    while is_wide() and text.get_fontsize() > 7.0:
-        text.set_fontsize(text.get_fontsize() - 0.5)
-    end = "".join(re.findall(r"; [^;]{1,12}$", text.get_text()))
-    words = text.get_text().removesuffix(end)
-    while is_wide() and len(words) > 8:
-        words = words[:-2]
-        text.set_text(f"{words.rstrip()} …{end}")
 
 
 def save_picture(picture: "Image", target: Path) -> None:

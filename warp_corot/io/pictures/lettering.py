@@ -1,0 +1,61 @@
+"""What is written into pictures: the colour bar with its numbers, and titles that fit."""
+
+import re
+from typing import TYPE_CHECKING, Any
+
+from .colors import stress_colors
+from .drawing import INK
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: Pixels from side to side of the colour bar.
+BAR = 16
+
+
+def draw_color_bar(figure: "Figure", limits: tuple[float, float], label: str) -> "Axes":
+    ax = figure.add_axes((0.0, 0.2, BAR / (figure.get_figwidth() * 150.0), 0.55))
+    ax.imshow(stress_colors()[:, None, :], aspect="auto", origin="lower", extent=(0.0, 1.0, *limits))
+    ax.set_xticks([])
+    ax.yaxis.tick_right()
+    ax.yaxis.set_label_position("right")
+    ax.set_ylabel(label, fontsize=9, color=INK, labelpad=6)
+    ax.yaxis.set_major_formatter(lambda value, _: f"{value:,.6g}".replace(",", " "))
+    ax.tick_params(labelsize=8, colors=INK, length=2, width=0.6)
+    for spine in ax.spines.values():
+        spine.set_visible(False)
+    return ax
+
+
+def needed_width(legend: "Axes", width: int) -> float:
+    """Pixels that the colour bar takes with all that is written beside it; what is too high is written smaller."""
+    renderer = legend.figure.canvas.get_renderer()  # type: ignore[attr-defined]
+    height = legend.figure.bbox.height
+    label = legend.yaxis.label
+    for points in (8.0, 7.0, 6.0, 5.0):
+        if label.get_window_extent(renderer).height <= 0.95 * height:
+            break
+        label.set_fontsize(points)
+    box = legend.get_tightbbox(renderer)
+    needed = 130.0 if box is None else 10.0 + float(box.x1) - float(legend.get_window_extent(renderer).x0) + 12.0
+    return min(max(needed, 130.0), 0.7 * width)
+
+
+def fit_line(text: Any, width: float) -> None:
+    """Write a line smaller, and in the end shorter, until it is no wider than so many pixels.
+
+    A few letters after its last semicolon stay.
+    """
+    renderer = text.figure.canvas.get_renderer()
+
+    def is_wide() -> bool:
+        return text.get_window_extent(renderer).width > width
+
+    while is_wide() and text.get_fontsize() > 7.0:
+        text.set_fontsize(text.get_fontsize() - 0.5)
+    end = "".join(re.findall(r"; [^;]{1,12}$", text.get_text()))
+    words = text.get_text().removesuffix(end)
+    while is_wide() and len(words) > 8:
+        words = words[:-2]
+        text.set_text(f"{words.rstrip()} …{end}")
