@@ -1,7 +1,9 @@
 """``warp-corot simulate --remesh``: what it says, writes and refuses."""
 
+import csv
 import os
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -55,6 +57,48 @@ def test_it_is_what_the_library_simulates(folder):
 def test_a_given_step_stays(folder, capsys):
     assert simulate("box", "-o", "a.usd", *BENT, "--dt", 1e-4, "--duration", 0.1, "--fps", 10) == 0
     assert re.search(r"time step +0\.1 ms", capsys.readouterr().out)
+
+
+def table(path) -> dict[str, np.ndarray]:
+    with Path(path).open() as file:
+        header, *rows = csv.reader(file)
+    return dict(zip(header, np.array(rows, float).T, strict=True))
+
+
+def test_a_pressure_stays_what_it_is_while_the_mesh_changes(folder, capsys):
+    """On one side of the free half: the supports answer with pressure times area, and the beam bends to that side."""
+    still = ["--gravity", 0, 0, 0, "--device", "cpu"]
+    follows = [
+        "--remesh",
+        "--refine-above",
+        1.03,
+        "--simplify-below",
+        1.01,
+        "--remesh-levels",
+        3,
+        8,
+        "--remesh-every",
+        40,
+    ]
+    press = ["--press", "y > ymax - 1e-6 and z > 0.09", 10.0, "--ramp", 0.3, "--damping", 15, "--duration", 0.9]
+    probes = ["--probe", "z < zmin + 1e-6", "--probe", "z > zmax - 1e-6", "--fps", 10]
+    assert simulate("box", "-o", "a.usd", *still, *follows, *press, *probes, "--csv", "a.csv") == 0
+    first, most, _ = counts(capsys.readouterr().out)
+    assert most > 1.3 * first
+    columns = table(folder / "a.csv")
+    area = 0.064 * 0.096
+    assert columns["z < zmin + 1e-6 reaction y [N]"][-1] == pytest.approx(10.0 * area, rel=0.02)
+    assert columns["z > zmax - 1e-6 uy [m]"][-1] < -0.01
+    # The probe of the free end is the mean over the nodes that it has now.
+    _, tets = opened(folder / "a.usd")
+    rest = np.array(UsdGeom.PrimvarsAPI(tets).GetPrimvar("rest").Get(9))
+    end = rest[:, 2] > 0.192 - 1e-6
+    moved = (np.array(tets.GetPointsAttr().Get(9)) - rest)[end, 1]
+    assert columns["z > zmax - 1e-6 uy [m]"][-1] == pytest.approx(moved.mean(), rel=0.03)
+    # The same pressure bends the mesh that stays about as far.
+    assert simulate("box", "-o", "b.usd", *still, *press, *probes, "--csv", "b.csv") == 0
+    stays = table(folder / "b.csv")["z > zmax - 1e-6 uy [m]"][-1]
+    assert columns["z > zmax - 1e-6 uy [m]"][-1] == pytest.approx(stays, rel=0.1)
 
 
 def test_of_a_surface_the_one_given_is_drawn(folder, capsys):

@@ -15,13 +15,12 @@ from scipy.spatial.transform import Rotation
 from warp_corot.domain.units import in_units
 from warp_corot.errors import InputError
 from warp_corot.inputs.keys import checked_times
-from warp_corot.io.write.skins import boundary_surface
 
+from .pressing import pressed, surface_of
 from .quantities import seconds
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
-    from warp_corot.simulation.simulation import Simulation
 
     from .patches import Patches
 
@@ -29,8 +28,6 @@ if TYPE_CHECKING:
 FORMS = {"pull": (3, "DX DY DZ"), "twist": (1, "DEGREES"), "press": (1, "PASCALS")}
 #: Their units where they name none.
 UNITS = {"pull": "m", "twist": "degree", "press": "Pa"}
-#: A pressure that changes is set anew at least so often while it does.
-UPDATES = 200
 #: Largest angle from one keyframe of a twist to the next [degrees]: in between nodes go straight.
 KEY_ANGLE = 5.0
 
@@ -111,8 +108,6 @@ def loads_of(args: argparse.Namespace) -> list[Load]:
             raise InputError(f"--ramp is {args.ramp:g} s; it must be a positive time")
         if not found:
             raise InputError("--ramp is for --pull, --twist and --press, none of which is given")
-    if args.remesh and any(load.kind == "press" for load in found):
-        raise InputError("--press is for meshes that stay, and --remesh changes the mesh")
     return found
 
 
@@ -157,65 +152,15 @@ def move_patches(body: SoftBody, loads: Sequence[Load], patches: Patches, ramp: 
         raise InputError("all nodes are moved by options; at least one must be free to move")
 
 
-def press_patches(sim: Simulation, body: SoftBody, loads: Sequence[Load], patches: Patches, ramp: float) -> None:
-    """Have the pressures of ``--press`` act and grow.
-
-    Raises:
-        InputError: A patch without surface.
-    """
-    pressing = [load for load in loads if load.kind == "press"]
-    if not pressing:
-        return
-    pressures = [(load.values[0] * _inward(load, patches), *load.curve(ramp)) for load in pressing]
-    loaded = np.flatnonzero(np.any([forces.any(axis=1) for forces, *_ in pressures], axis=0))
-
-    pressing_on = np.stack([forces[loaded] for forces, *_ in pressures])
-
-    def at(time: float) -> Array:
-        shares = [np.interp(time, times, shares) for _, times, shares in pressures]
-        return np.einsum("p,pnx->nx", shares, pressing_on)
-
-    body.load(loaded, at(0.0))
-    first = min(times[0] for _, times, _ in pressures)
-    last = max(times[-1] for _, times, _ in pressures)
-    every = max(1, int((last - first) / UPDATES / sim.dt))
-    done = False
-
-    def update(sim: Simulation) -> None:
-        nonlocal done
-        if not done and sim.time >= first:
-            body.load(loaded, at(sim.time))
-            done = sim.time >= last
-
-    sim.on_step(update, every=every)
-
-
-def _inward(load: Load, patches: Patches) -> Array:
-    """Nodal forces of one pascal on the patch's surface [N], [N, 3].
-
-    Raises:
-        InputError: It has none.
-    """
-    mesh = patches.subject.mesh
-    surface = patches.subject.surface or boundary_surface(mesh)
-    inside = patches.on_surface(load.patch, surface)
-    triangles = surface.triangles[inside[surface.triangles].all(axis=1)]
-    if not len(triangles):
-        raise InputError(f"--{load.kind} {load.patch!r}: no part of the surface is in it")
-    a, b, c = np.moveaxis(surface.points[triangles], 1, 0)
-    at_corners = np.repeat(-np.cross(b - a, c - a) / 6.0, 3, axis=0)
-    at_points = np.zeros_like(surface.points)
-    np.add.at(at_points, triangles.ravel(), at_corners)
-    forces = np.zeros((len(mesh.points), 3))
-    np.add.at(forces, surface.nodes.ravel(), (surface.weights[:, :, None] * at_points[:, None]).reshape(-1, 3))
-    return forces
-
-
 def _turned(
     load: Load, patches: Patches, mask: npt.NDArray[np.bool_], times: Array, shares: Array
 ) -> tuple[Array, Array]:
     """Keyframes of a twist: times [K], and displacements [K, n, 3]."""
-    axis = -_inward(load, patches).sum(axis=0) if load.axis is None else np.asarray(load.axis, dtype=np.float64)
+    axis = (
+        -pressed(load, patches, surface_of(patches)).sum(axis=0)
+        if load.axis is None
+        else np.asarray(load.axis, dtype=np.float64)
+    )
     length = np.linalg.norm(axis)
     if not (np.isfinite(axis).all() and length > 0.0):
         raise InputError(f"{load}: has no axis; it must be three numbers, not all zero")

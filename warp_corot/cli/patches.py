@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ from warp_corot.inputs.selection import CONSTANTS, FUNCTIONS, REGIONS, select_no
 from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 if TYPE_CHECKING:
+    from warp_corot.discretization.elements import Mesh
     from warp_corot.mesh.surfaces.bound import SurfaceMesh
 
     from .subject import Subject
@@ -49,7 +51,7 @@ class Patches:
     def __init__(self, subject: Subject, up: npt.NDArray[np.float64], given: Sequence[str] = ()):
         self.subject = subject
         self.used = subject.used
-        self._up = up
+        self._up, self._given = up, given
         self._named: dict[str, Callable[[], Mask]] = {
             "bottom": lambda: self._end(-up),
             "top": lambda: self._end(up),
@@ -66,6 +68,10 @@ class Patches:
             if name in _TAKEN or name in self._named:
                 raise InputError(f"--patch {text!r}: {name} is a name already; take another one")
             self._named[name] = partial(np.array, self.nodes(expression)[self.used])
+
+    def of_mesh(self, mesh: Mesh) -> Patches:
+        """The same patches on what the body's mesh has become."""
+        return self if mesh is self.subject.mesh else Patches(replace(self.subject, mesh=mesh), self._up, self._given)
 
     def nodes(self, expression: str) -> Mask:
         """Nodes of a patch, bool [N]; those in no tetrahedron are in none.

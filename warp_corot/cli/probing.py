@@ -32,7 +32,7 @@ class Probe:
     """A point of a body, or a patch, and what becomes of it.
 
     A point is what the tetrahedron around it makes of its four nodes. Of a patch it is the mean over its nodes, each
-    counted with its mass; reactions are summed.
+    counted with its mass; reactions are summed. Both are found again where the mesh has become another one.
 
     Args:
         text: "X Y Z" [m] at rest, or a patch's expression.
@@ -40,23 +40,15 @@ class Probe:
         patches: Of the body.
 
     Raises:
-        InputError: A point that is not in the body, a patch without nodes, or no expression; or a patch of a body that
-            is remeshed.
+        InputError: A point that is not in the body, a patch without nodes, or no expression.
     """
 
     def __init__(self, text: str, body: SoftBody, patches: Patches):
-        self.text, self.body = text, body
+        self.text, self.body, self._patches = text, body, patches
         match = _POINT.fullmatch(text)
         self.point = np.array([float(part) for part in match.groups()] if match else 3 * [np.nan])
-        self._revision = -1
         self.is_patch = match is None
-        if self.is_patch:
-            mask = patches.some(text, "--probe")
-            weights = body.masses * mask
-            self._nodes = np.flatnonzero(mask)
-            self._weights = weights[self._nodes] / weights.sum()
-        else:
-            self._place()
+        self._find()
 
     @property
     def columns(self) -> list[str]:
@@ -66,12 +58,23 @@ class Probe:
 
     def values(self) -> list[float]:
         """Displacement [m], velocity [m/s] and reaction [N], nine numbers."""
-        if not self.is_patch and self._revision != self.body.version:
-            self._place()
+        if self._revision != self.body.version:
+            self._find()
         u, v = (array.numpy()[self._nodes].astype(float) for array in (self.body.displacements, self.body.velocities))
         r = self.body.reactions.numpy()[self._nodes].astype(float)
         share = np.ones(len(r)) if self.is_patch else self._weights
         return [float(x) for x in (*(self._weights @ u), *(self._weights @ v), *(share @ r))]
+
+    def _find(self) -> None:
+        """Find the nodes in the present mesh, and how much each counts."""
+        self._revision = self.body.version
+        if not self.is_patch:
+            self._place()
+            return
+        mask = self._patches.of_mesh(self.body.mesh).some(self.text, "--probe")
+        weights = self.body.masses * mask
+        self._nodes = np.flatnonzero(mask)
+        self._weights = weights[self._nodes] / weights.sum()
 
     def _place(self) -> None:
         """Find the tetrahedron that the point is in, or the nearest."""
@@ -87,7 +90,6 @@ class Probe:
         size = float(np.linalg.norm(np.ptp(mesh.points[mesh.tets.ravel()], axis=0)))
         if away > OUTSIDE * size:
             raise InputError(f"--probe {self.text!r}: the point is {away:.3g} m outside the body")
-        self._revision = self.body.version
 
 
 def probes_body(text: str, patches: Patches) -> bool:

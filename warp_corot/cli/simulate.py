@@ -16,8 +16,9 @@ from warp_corot.simulation.simulation import Simulation
 from .about import about
 from .bodies import Body, asked_bodies, find_body, find_patches, make_body
 from .compiling import compiling_said
-from .loading import press_patches, ramp_of
+from .loading import ramp_of
 from .options import add_parser
+from .pressing import press_patches
 from .previews import Previews, check_preview
 from .probing import Probe, Table, check_table_path
 from .run_file import bodies_of, check_run_path, write_run
