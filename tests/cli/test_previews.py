@@ -8,6 +8,7 @@ pytest.importorskip("matplotlib")
 from pictures import CUBE, FACES, picture_of
 from PIL import Image, ImageChops
 
+from warp_corot.io.pictures.film import write_film
 from warp_corot.io.pictures.lettering import fit_line
 from warp_corot.io.pictures.preview import Picture, render_preview, render_strip
 
@@ -90,6 +91,16 @@ def test_a_gif_has_all_frames_in_time(folder):
             sizes.append(film.size)
     assert len(set(sizes)) == 1
     assert {file.name for file in folder.iterdir()} == {"a.usd", "a.gif"}
+
+
+def test_a_gif_keeps_colors_that_its_last_frame_has_not(tmp_path):
+    ramp = np.linspace(0, 255, 256).astype(np.uint8)
+    grey, purple = (np.stack([ramp, ramp * share, ramp], axis=1)[None].repeat(8, axis=0) for share in (1, 0))
+    write_film(tmp_path / "a.gif", (Image.fromarray(each) for each in (grey, purple, grey)), 10.0)
+    with Image.open(tmp_path / "a.gif") as film:
+        film.seek(1)
+        shown = np.asarray(film.convert("RGB")).astype(int)
+    assert np.abs(shown - purple).mean() < 4.0
 
 
 def test_an_mp4_has_all_frames(folder):

@@ -162,7 +162,7 @@ class Previews:
             ground = min(ground, boxes[-1][0, "XYZ".index(up_axis)])
         box = np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
         cameras = cameras_of(self._pictures(shown, ""), up_axis, *VIEWS["corner"], box)
-        window = window_of((self._pictures(each, "") for each in self._kept()), cameras)
+        window = window_of((self._pictures(each, "") for each in self._kept()), cameras, float(ground))
         return Look(box, cameras, window, (0.0, highest), float(ground))
 
     def _pictures(self, shown: Shown, frame_title: str) -> list[Picture]:

@@ -14,6 +14,7 @@ from warp_corot.errors import InputError
 
 from .camera import Array, Camera
 from .colors import TISSUE, color_index, round_limit, srgb_to_linear, stress_colors
+from .shadow import draw_shadow
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -74,7 +75,7 @@ def draw_body(
         camera = Camera.fit(np.concatenate(seen), up_axis)
     if ground is not False:
         height = min(float((s @ camera.world_up).min()) for s in seen) if ground is True else float(ground)
-        shadow = _draw_shadow(ax, x[tri], camera, height)
+        shadow = draw_shadow(ax, x[tri], camera, height)
         ax.update_datalim(shadow)
     if x_rest is not None:
         _draw_silhouette(ax, x_rest[tri], camera)
@@ -216,47 +217,6 @@ def _fill(ax: "Axes", polygons: Array, face: Any, edge: Any, *, width: float, or
         list(polygons), facecolor=face, edgecolor=edge, linewidth=width, joinstyle="round", zorder=order
     )
     ax.add_collection(collection, autolim=False)
-
-
-def _draw_shadow(ax: "Axes", triangles: Array, camera: Camera, height: float, cells: int = 220) -> Array:
-    """A soft shadow on the ground: the body's points dropped along the light, counted in cells and blurred.
-
-    Returns the picture coordinates [n, 2] of the cells that are visibly dark.
-    """
-    from matplotlib.collections import QuadMesh
-
-    up = camera.world_up
-    right = camera.axes[0]
-    back = np.cross(up, right)  # with ``right`` it spans the ground
-    light = _unit(-0.30 * right + 1.0 * up - 0.12 * back)
-    bary = np.random.default_rng(0).dirichlet((1.0, 1.0, 1.0), size=max(4, 200_000 // len(triangles)))
-    points = np.einsum("sb,fbx->fsx", bary, triangles).reshape(-1, 3)
-    lift = np.maximum(points @ up - height, 0.0)
-    dropped = points - lift[:, None] / (light @ up) * light
-    flat = np.stack([dropped @ right, dropped @ back], axis=1)
-    low, high = flat.min(axis=0), flat.max(axis=0)
-    margin = 0.22 * float((high - low).max()) + 1e-12
-    low, high = low - margin, high + margin
-    counts, us, vs = np.histogram2d(flat[:, 0], flat[:, 1], bins=cells, range=np.stack([low, high], axis=1).tolist())
-    dark = (counts > 0).astype(np.float64)
-    # Two widths: a tight contact shadow within a wide soft one.
-    dark = 0.5 * _blur(dark, 0.012 * cells, 0.012 * cells) + 0.5 * _blur(dark, 0.05 * cells, 0.05 * cells)
-    middle_u, middle_v = (us[1:] + us[:-1]) / 2.0, (vs[1:] + vs[:-1]) / 2.0
-    u, v = np.meshgrid(middle_u, middle_v, indexing="ij")
-    ground = u[..., None] * right + v[..., None] * back + height * up
-    picture, _ = camera.project(ground)
-    # Opaque on white: where cells overlap by part of a pixel, transparent ones would show their seams.
-    tint = 1.0 - 0.26 * dark[..., None] * (1.0 - np.array([0.20, 0.20, 0.27]))
-    mesh = QuadMesh(picture, facecolor=tint[:-1, :-1].reshape(-1, 3), antialiased=False, zorder=0)
-    ax.add_collection(mesh, autolim=False)
-    return picture[dark > 0.2]
-
-
-def _blur(image: Array, wide_u: float, wide_v: float) -> Array:
-    """Gaussian blur by the discrete Fourier transform (the image wraps round, its margins are empty)."""
-    fu, fv = np.fft.fftfreq(image.shape[0])[:, None], np.fft.rfftfreq(image.shape[1])[None, :]
-    kernel = np.exp(-2.0 * np.pi**2 * ((wide_u * fu) ** 2 + (wide_v * fv) ** 2))
-    return np.clip(np.fft.irfft2(np.fft.rfft2(image) * kernel, s=image.shape), 0.0, 1.0)
 
 
 def _draw_dots(ax: "Axes", x: Array, tri: NDArray[np.int64], held: NDArray[np.bool_], camera: Camera) -> None:

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 FILMS = (".gif", ".mp4")
 #: Viewers show no more frames of a GIF a second; those between are left out.
 GIF_FPS = 25.0
+#: Of about so many frames the colours of a GIF are found.
+PALETTE_FRAMES = 16
 
 
 def check_film(path: Path) -> None:
@@ -60,9 +62,13 @@ def write_film(path: Path, images: Iterator[Image], fps: float) -> None:
 def _write_gif(path: Path, images: Iterator[Image], fps: float) -> None:
     from PIL import Image
 
-    # One palette for all, that of the last picture, which has most colours, or it would flicker.
+    # One palette for all, or they would flicker; of pictures from the whole film, whose colours differ.
     frames = list(images)
-    palette = frames[-1].quantize(colors=256, method=Image.Quantize.MEDIANCUT)
+    some = frames[:: -(-len(frames) // PALETTE_FRAMES)]
+    together = Image.new("RGB", (some[0].width, some[0].height * len(some)))
+    for number, frame in enumerate(some):
+        together.paste(frame, (0, number * frame.height))
+    palette = together.quantize(colors=256, method=Image.Quantize.MEDIANCUT)
     flat = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     hundredths = max(round(100.0 / fps), 2)
     flat[0].save(

@@ -16,6 +16,7 @@ from warp_corot.io.files.whole import written_whole
 from .camera import Array, Camera
 from .drawing import INK, checked_surface, draw_body, value_limits
 from .lettering import BAR, draw_color_bar, fit_line, needed_width
+from .shadow import dropped_shadow
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,10 +24,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Camera", "Picture", "check_picture_path", "draw_body", "render_preview", "render_strip", "value_limits"]
 
-#: Width of polygons' edges [pt] where each pixel of a picture is drawn once: about a pixel.
-SEAMS = 0.4
-#: Of a film's window, around what is seen.
-ROOM = 0.06
+#: Width of polygons' edges [pt] where pixels are drawn once, about a pixel; and room around what a film shows.
+SEAMS, ROOM = 0.4, 0.06
 
 
 @dataclass
@@ -262,20 +261,22 @@ def check_picture_path(path: str | Path, suffixes: Sequence[str] = (".png",)) ->
     return target
 
 
-def window_of(pictures: Iterable[Sequence[Picture]], cameras: Sequence[Camera]) -> tuple[Array, Array]:
+def window_of(pictures: Iterable[Sequence[Picture]], cameras: Sequence[Camera], ground: float) -> tuple[Array, Array]:
     """What panels show in all frames of a film: lowest and highest picture coordinates, with some room, [2] and [2].
 
     Args:
         pictures: Of each frame, one for each camera.
         cameras: Of the panels.
+        ground: Its height, with the shadows on it.
     """
     ends = []
     for frame in pictures:
         for picture, camera in zip(frame, cameras, strict=True):
-            for points in (picture.positions, picture.rest):
-                if points is not None:
-                    flat, _ = camera.project(np.asarray(points, dtype=np.float64)[np.unique(picture.faces)])
-                    ends += [flat.min(axis=0), flat.max(axis=0)]
+            used = np.unique(picture.faces)
+            given = [np.asarray(x, dtype=np.float64)[used] for x in (picture.positions, picture.rest) if x is not None]
+            for points in (*given, dropped_shadow(given[0], camera, ground)):
+                flat, _ = camera.project(points)
+                ends += [flat.min(axis=0), flat.max(axis=0)]
     low, high = np.min(ends, axis=0), np.max(ends, axis=0)
     room = ROOM * float((high - low).max())
     return low - room, high + room
