@@ -32,6 +32,7 @@ class Opened:
         found: What its mesh file holds, if it is one.
         surface: Its triangles, if it is a surface.
         volume: Its voxels, if it is a scan.
+        tets: Its tetrahedra in the file's unit [m where it has one], where they are one body of several in the file.
         notes: What the user should know, a line each.
         size: Longest side in the file's unit of all that is in it, where this is only one body of several.
     """
@@ -42,6 +43,7 @@ class Opened:
     found: FileMesh | None = None
     surface: LoadedSurface | None = None
     volume: LoadedVolume | None = None
+    tets: LoadedMesh | None = None
     notes: list[str] = field(default_factory=list)
     size: float | None = None
 
@@ -97,12 +99,12 @@ def placed_tets(opened: Opened, args: argparse.Namespace) -> LoadedMesh:
     Raises:
         InputError: See `load_tets`.
     """
-    loaded = load_tets(opened.name, unit=_unit(args), regions=args.regions_by, found=opened.found)
+    loaded = opened.tets or loaded_tets(opened, args)
     asset, scale = opened.asset, 1.0 if args.scale is None else args.scale
     if asset and args.scale is None and args.unit is None:
         scale = asset.scale
     points = loaded.points * scale
-    size = longest_side(points[np.unique(loaded.tets)])
+    size = opened.size * scale if opened.size else longest_side(points[np.unique(loaded.tets)])
     if args.unit is None and not loaded.says_unit:
         likely = likely_unit(size / scale)
         if likely and args.scale is None:
@@ -111,7 +113,21 @@ def placed_tets(opened: Opened, args: argparse.Namespace) -> LoadedMesh:
         elif size > LARGEST_PLAUSIBLE:
             opened.notes.append(f"the mesh is {size:.3g} m long; if its coordinates are in mm, add --unit mm")
     opened.notes += loaded.notes
-    return replace(loaded, points=points, up_axis=args.up or loaded.up_axis)
+    return replace(loaded, points=points + offset_of(args), up_axis=args.up or loaded.up_axis)
+
+
+def loaded_tets(opened: Opened, args: argparse.Namespace) -> LoadedMesh:
+    """All tetrahedra of an input, before scale and offset.
+
+    Raises:
+        InputError: See `load_tets`.
+    """
+    return load_tets(opened.name, unit=_unit(args), regions=args.regions_by, found=opened.found)
+
+
+def offset_of(args: argparse.Namespace) -> np.ndarray:
+    """How far a body is moved before it begins [m], [3]."""
+    return np.zeros(3) if args.offset is None else np.array(args.offset, dtype=np.float64)
 
 
 def placed_surface(opened: Opened, args: argparse.Namespace) -> tuple[LoadedSurface, str | None]:
@@ -131,7 +147,8 @@ def placed_surface(opened: Opened, args: argparse.Namespace) -> tuple[LoadedSurf
         elif LARGEST_PLAUSIBLE < size <= LARGEST:  # beyond, there is a warning
             opened.notes.append(f"the body is taken to be {size:.3g} m long: the file names no unit (--unit)")
     notes = [*own_notes, *([f"scaled by {args.scale:g}, as asked for"] if args.scale is not None else [])]
-    return replace(loaded, points=loaded.points * scale, up_axis=args.up or loaded.up_axis, notes=notes), unit
+    points = loaded.points * scale + offset_of(args) / (metres_per_unit(unit) if unit else loaded.metres or 1.0)
+    return replace(loaded, points=points, up_axis=args.up or loaded.up_axis, notes=notes), unit
 
 
 def placed_volume(opened: Opened, args: argparse.Namespace) -> tuple[LoadedVolume, str | None]:
@@ -145,6 +162,7 @@ def placed_volume(opened: Opened, args: argparse.Namespace) -> tuple[LoadedVolum
         if unit:
             opened.notes.append(_guessed(unit, size, "scan"))
     affine = np.diag([scale, scale, scale, 1.0]) @ loaded.affine
+    affine[:3, 3] += offset_of(args) / metres_per_unit(unit or loaded.unit or 1.0)
     notes = [*loaded.notes, *([f"scaled by {args.scale:g}, as asked for"] if args.scale is not None else [])]
     return replace(loaded, affine=affine, notes=notes), unit
 

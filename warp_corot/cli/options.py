@@ -92,10 +92,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     body.add_argument(
         "--join",
         action="store_true",
-        help="take all objects of a surface's file as one body, and nodes of tetrahedra in the same place as one node "
-        "(default: objects that are closed are bodies of their own)",
+        help="take all that is in the file as one body, and nodes of tetrahedra in the same place as one node "
+        "(default: closed surfaces, and prims, blocks and instances of tetrahedra, are bodies of their own)",
     )
     body.add_argument("--scale", type=float, metavar="S", help="factor on the coordinates, after their unit")
+    body.add_argument(
+        "--offset",
+        type=metres,
+        nargs=3,
+        metavar=("DX", "DY", "DZ"),
+        help="move the body by so much before it begins [m], after --scale: places the bodies of a run file",
+    )
     body.add_argument(
         "--up",
         type=str.upper,

@@ -17,7 +17,7 @@ from warp_corot.errors import InputError
 from warp_corot.mesh import TetForest
 
 from .label_materials import LabelMaterial, numbers_by_name, parse_labels
-from .opened import Opened, placed_surface, placed_volume
+from .opened import Opened, offset_of, placed_surface, placed_volume
 from .subject import Subject
 
 if TYPE_CHECKING:
@@ -176,7 +176,7 @@ def _own_surface(opened: Opened, args: argparse.Namespace, domain: Domain) -> Ow
         return None
     from warp_corot.io.write.skins import OwnSurface
 
-    found = OwnSurface.of_domain(opened.source, opened.surface, domain.bounds)
+    found = OwnSurface.of_domain(opened.source, opened.surface, domain.bounds, offset_of(args))
     if found is None:
         opened.notes.append("the surface is not what it was before it was closed: the marched one is drawn")
     return found

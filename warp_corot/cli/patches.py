@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import keyword
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -11,9 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from warp_corot.body.places import TAKEN, named_nodes
 from warp_corot.errors import InputError
 from warp_corot.holding.regions import LOWEST, Shape, flat_region
-from warp_corot.inputs.selection import CONSTANTS, FUNCTIONS, REGIONS, select_nodes
+from warp_corot.inputs.selection import select_nodes
 from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 if TYPE_CHECKING:
@@ -24,14 +26,11 @@ if TYPE_CHECKING:
 
 HELP = """patches, for --fix, --pull, --press, --twist and --probe, are expressions:
   names      bottom top (tenths of the height), flat (the largest flat region), surface, all, none; labels of a scan;
-             those of --patch
+             regions and sets of nodes of the file (*NSET, groups of points and surfaces, point data); those of --patch
   regions    sphere(x, y, z, radius), box(x, y, z, x, y, z), nearest(x, y, z), nearest(x, y, z, n): the n nearest nodes
   numbers    x y z (rest coordinates [m], after --scale), xmin xmax ymin ymax zmin zmax, pi
   operators  + - * / // % **   < <= > >= == !=   and or not   ( )
   functions  abs sqrt exp log sin cos tan atan2 hypot min max"""
-
-_TAKEN = {"x", "y", "z", *(f"{axis}{end}" for axis in "xyz" for end in ("min", "max")), "and", "or", "not"}
-_TAKEN |= {*CONSTANTS, *FUNCTIONS, *REGIONS}
 
 Mask = npt.NDArray[np.bool_]
 
@@ -58,14 +57,13 @@ class Patches:
             "flat": self._flat,
             "surface": self._surface,
         }
-        for number, name in enumerate(getattr(subject.mesh, "label_names", ()), start=1):
-            if name.isidentifier() and name not in _TAKEN:
-                self._named[name] = partial(self._label, number)
+        for name, mask in named_nodes(subject.mesh).items():
+            self._named[name] = partial(self._among_used, mask)
         for text in given:
             name, equals, expression = (part.strip() for part in text.partition("="))
             if not equals or not re.fullmatch(r"[A-Za-z_]\w*", name) or not expression:
                 raise InputError(f"--patch {text!r}: it must be NAME=EXPR, such as tip=nearest(0, 0, 0.1)")
-            if name in _TAKEN or name in self._named:
+            if name in TAKEN or keyword.iskeyword(name) or name in self._named:
                 raise InputError(f"--patch {text!r}: {name} is a name already; take another one")
             self._named[name] = partial(np.array, self.nodes(expression)[self.used])
 
@@ -140,9 +138,8 @@ class Patches:
         inside[self.used] = nodes()
         return np.einsum("vn,vn->v", surface.weights, inside[surface.nodes]) >= 0.5
 
-    def _label(self, number: int) -> Mask:
-        mesh = self.subject.mesh
-        return np.isin(self.used, mesh.tets[np.asarray(mesh.labels) == number])
+    def _among_used(self, mask: Callable[[], Mask]) -> Mask:
+        return mask()[self.used]
 
 
 def _all_four(nodes: Callable[[], Mask], places: npt.NDArray[np.integer]) -> Mask:

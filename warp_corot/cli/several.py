@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_corot.io.read.surfaces import LoadedSurface
+from warp_corot.io.read.tetrahedra import LoadedMesh
 
-from .opened import Opened, longest_side
+from .opened import Opened, loaded_tets, longest_side
 from .organs import TETS
 
 #: More objects than these are taken as one: each would be a body, with a mesh of its own.
@@ -25,8 +27,11 @@ def bodies_in(opened: Opened, args: argparse.Namespace) -> list[tuple[Opened, ar
     """The bodies of an input with their options.
 
     The objects of a surface's file are bodies of their own if each is closed, none is a cavity of another, and
-    ``--join`` is not given. They share the number of tetrahedra by their volumes.
+    ``--join`` is not given. They share the number of tetrahedra by their volumes. So are prims, blocks and instances of
+    tetrahedra.
     """
+    if opened.kind == "tets":
+        return _of_tets(opened, args)
     surface = opened.surface
     if surface is None or args.join or not 2 <= len(surface.objects) <= MOST_BODIES:
         return [(opened, args)]
@@ -34,8 +39,7 @@ def bodies_in(opened: Opened, args: argparse.Namespace) -> list[tuple[Opened, ar
     volumes = np.array([_volume(part) for part in parts])
     if not all(map(_is_closed, parts)) or not (volumes > 0.0).all() or not np.isfinite(volumes.sum()):
         return [(opened, args)]
-    names = ", ".join(part.name for part in parts[:8]) + (", ..." if len(parts) > 8 else "")
-    opened.notes.append(f"{len(parts)} bodies, each for itself: {names} (--join takes them as one)")
+    opened.notes.append(_told(parts))
     size = longest_side(surface.points[np.unique(surface.triangles)])
     found = []
     for place, (part, share) in enumerate(zip(parts, volumes / volumes.sum(), strict=True)):
@@ -46,12 +50,54 @@ def bodies_in(opened: Opened, args: argparse.Namespace) -> list[tuple[Opened, ar
     return found
 
 
+def _of_tets(opened: Opened, args: argparse.Namespace) -> list[tuple[Opened, argparse.Namespace]]:
+    """The parts of a file with tetrahedra, which share no nodes."""
+    loaded = loaded_tets(opened, args)
+    if args.join or not 2 <= len(loaded.objects) <= MOST_BODIES:
+        return [(replace(opened, tets=loaded), args)]
+    ends = np.cumsum([count for _, count in loaded.objects])
+    parts = [
+        _part(loaded, name, tets)
+        for (name, _), tets in zip(loaded.objects, np.split(np.arange(len(loaded.tets)), ends[:-1]), strict=True)
+    ]
+    opened.notes.append(_told(parts))
+    size = longest_side(loaded.points[np.unique(loaded.tets)])
+    return [
+        (replace(opened, tets=part, size=size, notes=opened.notes if place == 0 else []), args)
+        for place, part in enumerate(parts)
+    ]
+
+
+def _part(loaded: LoadedMesh, name: str, chosen: npt.NDArray[np.integer]) -> LoadedMesh:
+    """The body of some of the tetrahedra."""
+    used, tets = np.unique(loaded.tets[chosen], return_inverse=True)
+    sets = {known: np.flatnonzero(np.isin(used, nodes)) for known, nodes in loaded.node_sets.items()}
+    regions = loaded.regions
+    if regions is not None:
+        regions = replace(regions, of_tet=regions.of_tet[chosen])
+    return replace(
+        loaded,
+        points=loaded.points[used],
+        tets=tets.reshape(-1, 4).astype(np.int32),
+        name=name,
+        regions=regions,
+        notes=loaded.notes if not chosen[0] else [],
+        node_sets={known: nodes for known, nodes in sets.items() if len(nodes)},
+        objects=[],
+    )
+
+
+def _told(parts: Sequence[LoadedMesh] | Sequence[LoadedSurface]) -> str:
+    names = ", ".join(part.name for part in parts[:8]) + (", ..." if len(parts) > 8 else "")
+    return f"{len(parts)} bodies, each for itself: {names} (--join takes them as one)"
+
+
 def merged_nodes(
     points: npt.NDArray[np.float64], tets: npt.NDArray[np.int32]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32], int]:
-    """Tetrahedra whose nodes in the same place are one node, and how many nodes went into others."""
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32], npt.NDArray[np.int64]]:
+    """Tetrahedra whose nodes in the same place are one node, and which node each of the points has become."""
     kept, place = _welded(points)
-    return points[kept], place[tets].astype(np.int32), len(points) - len(kept)
+    return points[kept], place[tets].astype(np.int32), place
 
 
 def _welded(points: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from warp_corot.body.places import named_nodes
 from warp_corot.errors import InputError
 from warp_corot.experiments import paper
+from warp_corot.io.read.tetrahedra import LoadedMesh
 from warp_corot.mesh import TetForest, TetMesh
 
 from .label_materials import of_regions, parse_labels
-from .opened import Opened, placed_tets
+from .opened import Opened, offset_of, placed_tets
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
@@ -102,7 +105,7 @@ class Subject:
         if args.unit is None and args.scale in (None, asset.scale):
             self.young = asset.young
             if args.young is None or args.young >= asset.young:
-                self.fix = asset.fix
+                self.fix = f"y < {float(f'{asset.fix_below + offset_of(args)[1]:.9g}'):g}"
 
 
 def find_subject(opened: Opened, args: argparse.Namespace) -> Subject:
@@ -118,28 +121,27 @@ def find_subject(opened: Opened, args: argparse.Namespace) -> Subject:
     if args.scale is not None and not (np.isfinite(args.scale) and args.scale > 0):
         raise InputError(f"scale is {args.scale:g}; it must be a positive number")
     if opened.kind == "box":
-        return _box(1.0 if args.scale is None else args.scale)
+        return _box(1.0 if args.scale is None else args.scale, offset_of(args))
     loaded = placed_tets(opened, args)
     points, tets = loaded.points, loaded.tets
+    sets = {name: np.isin(np.arange(len(points)), nodes) for name, nodes in loaded.node_sets.items()}
     if args.join:
-        from .several import merged_nodes
-
-        points, tets, merged = merged_nodes(points, tets)
-        if not merged:
-            raise InputError(f"{loaded.source}: no two nodes are in the same place, so that --join does nothing")
-        opened.notes.append(f"{merged} nodes are in the places of others, and joined with them")
+        points, tets, sets = _joined(loaded, sets, opened.notes)
     entries, found = parse_labels(args.materials, "--materials") if args.materials else [], loaded.regions
     try:
         if entries and found is None:
             raise InputError("its arrays number no regions, so that --materials does nothing")
         names, entries = of_regions(entries, found) if found is not None else ((), entries)
         labels = None if found is None else found.of_tet
-        mesh = TetMesh(points, tets, up_axis=loaded.up_axis, labels=labels, label_names=names)
+        mesh = TetMesh(points, tets, up_axis=loaded.up_axis, labels=labels, label_names=names, node_sets=sets)
     except InputError as error:
         raise InputError(f"{loaded.source}: {error}") from None
     subject = Subject(mesh, loaded.name, loaded.source, labels=entries, notes=opened.notes)
-    if found is not None and not entries:
-        shown = ", ".join(found.names[:12]) + (", ..." if len(found.names) > 12 else "")
+    entries[:] = [entry for entry in entries if mesh.elements_of(entry.name).any()]
+    if sets:
+        subject.notes.append(f"its sets of nodes, for --fix and the like: {_listed(list(named_nodes(mesh)))}")
+    if found is not None and not args.materials:
+        shown = _listed(found.names)
         subject.notes.append(f"its regions by {found.array!r}: {shown} (--materials gives each its own)")
     asset = opened.asset
     if asset:
@@ -147,8 +149,32 @@ def find_subject(opened: Opened, args: argparse.Namespace) -> Subject:
     return subject
 
 
-def _box(scale: float) -> Subject:
-    mesh = TetForest.box(paper.CELLS, paper.CELL_SIZE * scale, BOX_LEVEL)
+def _joined(
+    loaded: LoadedMesh, sets: dict[str, np.ndarray], notes: list[str]
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Points, tetrahedra and sets of nodes, with the nodes in the same place as one.
+
+    Raises:
+        InputError: There is nothing to join.
+    """
+    from .several import merged_nodes
+
+    points, tets, place = merged_nodes(loaded.points, loaded.tets)
+    merged = len(place) - len(points)
+    if not merged and not loaded.objects:
+        raise InputError(f"{loaded.source}: no two nodes are in the same place, so that --join does nothing")
+    if merged:
+        notes.append(f"{merged} nodes are in the places of others, and joined with them")
+    return points, tets, {name: np.bincount(place, mask, len(points)) > 0 for name, mask in sets.items()}
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+
+
+def _box(scale: float, offset: np.ndarray) -> Subject:
+    x, y, z = offset.tolist()
+    mesh = TetForest.box(paper.CELLS, paper.CELL_SIZE * scale, BOX_LEVEL, origin=(x, y, z))
     return Subject(
         mesh,
         "box",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING
@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_numbers
+from warp_corot.inputs.indices import checked_indices
 from warp_corot.kernels.tables.shapes import EDGES
 from warp_corot.mesh.surfaces.boundary import signed_volumes
 
@@ -35,6 +36,7 @@ class TetMesh:
         scale: Factor by which the points are multiplied.
         labels: Each tetrahedron's region, its place in ``label_names`` plus one, 0 for none, [T]; None: no regions.
         label_names: Names of the regions.
+        node_sets: Nodes with a name, masks bool [N] or indices; ``SoftBody.fix`` and the like take the names.
 
     Attributes:
         points: float64 [N, 3] [m].
@@ -43,6 +45,7 @@ class TetMesh:
         up_axis: As given.
         labels: int32 [T] or None, as given.
         label_names: As given.
+        node_sets: Masks bool [N] by name.
 
     Raises:
         InputError: Wrong shapes, non-finite coordinates, indices out of range, or a degenerate tetrahedron; the message
@@ -58,6 +61,7 @@ class TetMesh:
         scale: float = 1.0,
         labels: np.ndarray | None = None,
         label_names: Sequence[str] = (),
+        node_sets: Mapping[str, npt.ArrayLike] | None = None,
     ):
         points = checked_numbers(points, "points", "[N, 3]; TetMesh.load reads a file").copy()
         try:
@@ -95,6 +99,7 @@ class TetMesh:
         self.repaired = int(turned.sum())
         self.label_names = tuple(label_names)
         self.labels = None if labels is None else _checked_labels(labels, len(self.tets), len(self.label_names))
+        self.node_sets = {name: _mask(nodes, len(points)) for name, nodes in (node_sets or {}).items()}
 
     @classmethod
     def load(
@@ -110,7 +115,8 @@ class TetMesh:
         TetGen, NetGen and whatever else meshio reads; or of ``warp:bear``.
 
         Hexahedra, wedges and pyramids become tetrahedra that fit one another; cells of higher order are taken by their
-        corners. Physical groups, sets and cell data become ``labels``.
+        corners. Physical groups, sets and cell data become ``labels``; sets of nodes, groups of points, curves and
+        surfaces, and point data of few whole numbers ``node_sets``.
 
         Args:
             path: File, or the name of an asset.
@@ -133,6 +139,7 @@ class TetMesh:
             up_axis=up_axis or loaded.up_axis,
             labels=None if found is None else found.of_tet,
             label_names=() if found is None else found.names,
+            node_sets=loaded.node_sets,
         )
 
     @cached_property
@@ -186,6 +193,12 @@ class TetMesh:
         from warp_corot.mesh.surfaces.bodies import bind
 
         return bind(self, np.asarray(points), triangles)
+
+
+def _mask(nodes: npt.ArrayLike, count: int) -> npt.NDArray[np.bool_]:
+    mask = np.zeros(count, bool)
+    mask[checked_indices(nodes, count, "node")] = True
+    return mask
 
 
 def _checked_labels(given: np.ndarray, count: int, names: int) -> np.ndarray:

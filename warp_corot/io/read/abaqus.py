@@ -46,10 +46,11 @@ class Part:
     of_lines: dict[str, list[int]] = field(default_factory=dict)
     sets: dict[str, list[int]] = field(default_factory=dict)
     sections: list[str] = field(default_factory=list)
+    node_sets: dict[str, list[int]] = field(default_factory=dict)
 
 
 def read(path: Path) -> FileMesh:
-    """The elements of all instances, with sets as arrays of numbers.
+    """The elements of all instances, with sets as arrays of numbers, and sets of nodes, those of sets of elements too.
 
     Regions are the sets that sections give a material; without sections those that elements are listed in; without
     those the others, where several hold an element the smallest.
@@ -59,6 +60,7 @@ def read(path: Path) -> FileMesh:
     """
     parts: dict[str, Part] = {"": Part()}
     instances: list[tuple[str, str, NDArray[np.float64]]] = []
+    of_instances: list[tuple[str, str, list[int]]] = []
     here, names = parts[""], {"": ""}
     notes: list[str] = []
     ignored: dict[str, int] = {}
@@ -79,18 +81,28 @@ def read(path: Path) -> FileMesh:
         elif word == "NODE":
             for row in card.numbers():
                 here.nodes[whole(row[0])] = [*((real(word) if word else 0.0) for word in row[1:4]), 0.0, 0.0, 0.0][:3]
+            if given.get("NSET"):
+                members = here.node_sets.setdefault(_known(names, given["NSET"]), [])
+                members.extend(whole(row[0]) for row in card.numbers())
         elif word == "ELEMENT":
             _elements(card, here, ignored, notes)
         elif word == "ELSET":
             placed = _part_of(instances, given.get("INSTANCE", ""))
             owner = here if placed is None else parts[placed]
             name = given.get("ELSET", "")
-            owner.sets.setdefault(_known(names, name), []).extend(_members(card, owner, names))
+            owner.sets.setdefault(_known(names, name), []).extend(_members(card, owner.of_lines | owner.sets, names))
+        elif word == "NSET":
+            instance, name = given.get("INSTANCE", ""), _known(names, given.get("NSET", ""))
+            placed = _part_of(instances, instance)
+            if placed is None:
+                here.node_sets.setdefault(name, []).extend(_members(card, here.node_sets, names))
+            else:
+                of_instances.append((name, instance.upper(), _members(card, parts[placed].node_sets, names)))
         elif word in ("SOLIDSECTION", "SHELLSECTION"):
             here.sections.append(_known(names, given.get("ELSET", "")))
     if not instances or parts[""].nodes:
         instances.insert(0, ("", "", np.eye(4)))
-    return _joined(parts, instances, ignored, list(dict.fromkeys(notes)))
+    return _joined(parts, instances, of_instances, ignored, list(dict.fromkeys(notes)))
 
 
 def _cards(path: Path, depth: int) -> Iterator[Card]:
@@ -178,8 +190,8 @@ def _elements(card: Card, part: Part, ignored: dict[str, int], notes: list[str])
         part.of_lines.setdefault(card.given["ELSET"], []).extend(row[0] for row in rows)
 
 
-def _members(card: Card, part: Part, names: dict[str, str]) -> list[int]:
-    """Numbers of the elements of a set: listed, in ranges, or by other sets."""
+def _members(card: Card, sets: dict[str, list[int]], names: dict[str, str]) -> list[int]:
+    """Numbers of the elements or nodes of a set: listed, in ranges, or by other sets."""
     rows = card.numbers()
     if "GENERATE" in card.given:
         found: list[int] = []
@@ -195,18 +207,23 @@ def _members(card: Card, part: Part, names: dict[str, str]) -> list[int]:
             found.append(int(word))
         else:
             name = names.get(word.upper(), word)
-            found += part.sets.get(name, part.of_lines.get(name, []))
+            found += sets.get(name, [])
     return found
 
 
 def _joined(
-    parts: dict[str, Part], instances: list[tuple[str, str, NDArray]], ignored: dict[str, int], notes: list[str]
+    parts: dict[str, Part],
+    instances: list[tuple[str, str, NDArray]],
+    of_instances: list[tuple[str, str, list[int]]],
+    ignored: dict[str, int],
+    notes: list[str],
 ) -> FileMesh:
     points: list[NDArray[np.float64]] = [np.empty((0, 3))]
     blocks: list[Block] = []
     numbers: dict[str, int] = {}
+    sets: dict[str, list[NDArray[np.int64]]] = {}
     offset = 0
-    for place, (_, name, affine) in enumerate(instances, start=1):
+    for place, (instance, name, affine) in enumerate(instances, start=1):
         part = parts[name]
         tags = np.array(sorted(part.nodes), np.int64)
         own = np.array([part.nodes[tag] for tag in tags.tolist()], np.float64).reshape(-1, 3)
@@ -222,13 +239,25 @@ def _joined(
                 data[INSTANCES] = np.full(len(table), place)
             blocks.append(Block(kind, index + offset, data))
         points.append(own @ affine[:3, :3].T + affine[:3, 3])
+        mine = {known: members for known, owner, members in of_instances if owner == instance.upper()}
+        for known, members in (_nodes_of_sets(part) | part.node_sets | mine).items():
+            found = np.intersect1d(np.array(members, np.int64), tags)
+            sets.setdefault(known, []).append(np.searchsorted(tags, found) + offset)
         offset += len(own)
     if not blocks and not offset:
         raise Unreadable("it has no *NODE and no *ELEMENT")
     names = {SETS: {number: name for name, number in numbers.items()}}
     if len(instances) > 1:
         names[INSTANCES] = {k: name or f"instance {k}" for k, (name, _, _) in enumerate(instances, start=1)}
-    return FileMesh(np.concatenate(points), blocks, names, ignored, notes)
+    joined = {known: np.concatenate(parts_of) for known, parts_of in sets.items() if sum(map(len, parts_of))}
+    return FileMesh(np.concatenate(points), blocks, names, ignored, notes, joined)
+
+
+def _nodes_of_sets(part: Part) -> dict[str, list[int]]:
+    """The nodes of the elements of each set of elements."""
+    corners = {row[0]: row[1:] for rows in part.elements.values() for row in rows}
+    sets = part.of_lines | part.sets
+    return {name: [node for tag in members for node in corners.get(tag, ())] for name, members in sets.items()}
 
 
 def _regions(part: Part, numbers: dict[str, int]) -> dict[int, int]:

@@ -19,7 +19,7 @@ class Asset:
         young: Young's modulus [Pa].
         poisson: Poisson's ratio.
         density: Mass density [kg/m³].
-        fix: Expression in scaled rest coordinates [m] for the nodes that are held.
+        fix_below: Nodes lower than this are held: the scaled rest coordinate along y [m].
         damping: Mass-proportional damping [1/s].
         duration: Simulated time [s] after which it is about at rest.
         note: Why these numbers.
@@ -32,7 +32,7 @@ class Asset:
     young: float
     poisson: float
     density: float
-    fix: str
+    fix_below: float
     damping: float
     duration: float
     note: str
@@ -64,7 +64,7 @@ ASSETS: dict[str, Asset] = {
             young=3.0e4,
             poisson=0.45,
             density=1000.0,
-            fix="y < 0.01",
+            fix_below=0.01,
             damping=2.0,
             duration=4.0,
             note="the Stanford bunny, 16 cm long, of silicone gel",
@@ -77,7 +77,7 @@ ASSETS: dict[str, Asset] = {
             young=1.0e5,
             poisson=0.45,
             density=1000.0,
-            fix="y < 0.01",
+            fix_below=0.01,
             damping=2.0,
             duration=5.0,
             note="a toy bear of 55 cm of soft silicone rubber: its back sags by 9 % of its height, its nose by 14 %, "

@@ -15,6 +15,8 @@ SOLIDS = {"tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8}
 #: Corners of the kinds of cells that make surfaces.
 FACES = {"triangle": 3, "quad": 4}
 CORNERS = {**SOLIDS, **FACES}
+#: Arrays of more different numbers than these name no sets of nodes.
+MOST_SETS = 32
 
 
 class Unreadable(Exception):
@@ -51,6 +53,7 @@ class FileMesh:
         names: What the numbers of an array stand for, by array and number.
         ignored: How many cells of other kinds (lines, vertices) the file has, by kind.
         notes: What the user should know, a line each.
+        node_sets: Nodes that the file gives a name, indices int64 [n].
     """
 
     points: NDArray[np.float64]
@@ -58,6 +61,7 @@ class FileMesh:
     names: dict[str, dict[int, str]] = field(default_factory=dict)
     ignored: dict[str, int] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    node_sets: dict[str, NDArray[np.int64]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3:
@@ -86,12 +90,15 @@ class FileMesh:
             "data": [list(block.data) for block in self.blocks],
             "ignored": self.ignored,
             "notes": self.notes,
+            "sets": list(self.node_sets),
         }
         arrays: dict[str, NDArray[Any]] = {"mesh": as_bytes(described), "points": self.points}
         for place, block in enumerate(self.blocks):
             arrays[f"nodes{place}"] = block.nodes
             for index, values in enumerate(block.data.values()):
                 arrays[f"data{place}_{index}"] = values
+        for place, nodes in enumerate(self.node_sets.values()):
+            arrays[f"set{place}"] = nodes
         return arrays
 
     @classmethod
@@ -103,7 +110,23 @@ class FileMesh:
             for place, (kind, data) in enumerate(zip(described["kinds"], described["data"], strict=True))
         ]
         names = {array: {int(n): name for n, name in of.items()} for array, of in described["names"].items()}
-        return cls(arrays["points"], blocks, names, described["ignored"], described["notes"])
+        sets = {name: arrays[f"set{place}"] for place, name in enumerate(described["sets"])}
+        return cls(arrays["points"], blocks, names, described["ignored"], described["notes"], sets)
+
+
+def sets_of_numbers(name: str, values: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
+    """The sets of nodes that an array of whole numbers, one a node, tells apart.
+
+    Of an array of zeros and ones there is one set, called as the array is; of one with a few other numbers a set each,
+    ``NAME_NUMBER``; zero is none. Of an array of many numbers, as those that count nodes are, there is no set.
+    """
+    numbers = np.unique(values)
+    numbers = numbers[numbers != 0]
+    if len(numbers) > MOST_SETS:
+        return {}
+    if numbers.tolist() == [1]:
+        return {name: np.flatnonzero(values)}
+    return {f"{name}_{number}": np.flatnonzero(values == number) for number in numbers.tolist()}
 
 
 def whole(word: str) -> int:

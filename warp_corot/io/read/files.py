@@ -144,6 +144,9 @@ def _checked(mesh: FileMesh, path: Path) -> FileMesh:
         InputError: They do not.
     """
     points = mesh.points
+    for name, nodes in mesh.node_sets.items():
+        if len(nodes) and not 0 <= nodes.min() <= nodes.max() < len(points):
+            raise InputError(f"{path}: the set {name!r} names points that are not there")
     for block in mesh.blocks:
         bad = np.argwhere((block.nodes < 0) | (block.nodes >= len(points)))
         if len(bad):

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .filemesh import Block, FileMesh, Unreadable, corners_note
 
@@ -18,6 +19,8 @@ KINDS = {
     "Triangle": "triangle",
     "Quadrilateral": "quad",
 }
+#: What groups without a name are called, by their dimension.
+DIMENSIONS = ("point", "curve", "surface")
 #: How files of .msh begin. Gmsh takes others for scripts, and runs them.
 BEGINNINGS = (b"$MeshFormat", b"$NOD", b"$Comments", b"$PhysicalNames")
 
@@ -85,4 +88,15 @@ def _mesh(gmsh: Any) -> FileMesh:
                 said = gmsh.model.getPhysicalName(dimension, group)
                 if said and dimension == 3:
                     names.setdefault("physical group", {})[group] = said
-    return FileMesh(points, blocks, names, ignored, list(dict.fromkeys(notes)))
+    return FileMesh(points, blocks, names, ignored, list(dict.fromkeys(notes)), _node_sets(gmsh, tags))
+
+
+def _node_sets(gmsh: Any, tags: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
+    """The nodes of physical groups of points, curves and surfaces."""
+    found = {}
+    for dimension, group in gmsh.model.getPhysicalGroups():
+        if dimension < 3:
+            name = gmsh.model.getPhysicalName(dimension, group) or f"{DIMENSIONS[dimension]}_{group}"
+            nodes, _ = gmsh.model.mesh.getNodesForPhysicalGroup(dimension, group)
+            found[name] = np.unique(np.searchsorted(tags, np.asarray(nodes, np.int64)))
+    return found

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .filemesh import CORNERS, Block, FileMesh, Unreadable, corners_note, whole_numbers
+from .filemesh import CORNERS, Block, FileMesh, Unreadable, corners_note, sets_of_numbers, whole_numbers
 
 #: Names of arrays elsewhere.
 RENAMED = {"gmsh:physical": "physical group", "gmsh:geometrical": "entity", "netgen:index": "material"}
@@ -54,7 +55,27 @@ def _mesh(mesh: Any) -> FileMesh:
                 data[RENAMED.get(name, name)] = numbers
         blocks.append(Block(kind, nodes[:, : CORNERS[kind]], data))
     points = np.asarray(mesh.points, np.float64)
-    return FileMesh(points, blocks, _names(mesh), ignored, list(dict.fromkeys(notes)))
+    return FileMesh(points, blocks, _names(mesh), ignored, list(dict.fromkeys(notes)), _node_sets(mesh))
+
+
+def _node_sets(mesh: Any) -> dict[str, NDArray[np.int64]]:
+    """Sets of points, point data of few whole numbers, and the points of groups of a dimension below 3."""
+    found: dict[str, NDArray[np.int64]] = {}
+    for name, values in mesh.point_data.items():
+        numbers = whole_numbers(values)
+        if numbers is not None:
+            found |= sets_of_numbers(name, numbers)
+    groups = mesh.cell_data.get("gmsh:physical", [])
+    for name, value in mesh.field_data.items():
+        number, dimension = [*np.asarray(value).ravel().tolist(), -1, -1][:2]
+        of_group = [
+            np.asarray(block.data)[np.asarray(numbers) == number].ravel()
+            for block, numbers in zip(mesh.cells, groups, strict=False)
+            if block.dim == dimension < 3
+        ]
+        if sum(map(len, of_group)):
+            found[str(name)] = np.unique(np.concatenate(of_group)).astype(np.int64)
+    return found | {str(name): np.asarray(nodes, np.int64) for name, nodes in mesh.point_sets.items()}
 
 
 def _names(mesh: Any) -> dict[str, dict[int, str]]:

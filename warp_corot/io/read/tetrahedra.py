@@ -2,10 +2,9 @@
 
 import logging
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +25,8 @@ SURFACE_SUFFIXES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf")
 USUAL = (".msh", ".vtk", ".vtu", ".inp", ".mesh", ".node")
 #: How the note of cells that have been split ends.
 SPLIT = "are split into tetrahedra"
+#: Arrays that number parts of a file that share no nodes.
+OBJECTS = ("block", "instance")
 
 log = logging.getLogger(__name__)
 
@@ -44,6 +45,9 @@ class LoadedMesh:
         regions: Its regions, if the file numbers any.
         says_unit: Whether the file says its unit.
         notes: What the user should know, a line each.
+        node_sets: Nodes that the file gives a name, indices int64 [n].
+        objects: Names of the file's parts that share no nodes (prims, blocks, instances), and how many of the
+            tetrahedra each has, in their order; empty where the file has no parts.
     """
 
     points: NDArray[np.float64]
@@ -55,6 +59,8 @@ class LoadedMesh:
     regions: Regions | None = None
     says_unit: bool = False
     notes: list[str] = field(default_factory=list)
+    node_sets: dict[str, NDArray[np.int64]] = field(default_factory=dict)
+    objects: list[tuple[str, int]] = field(default_factory=list)
 
 
 def load_tets(
@@ -92,19 +98,9 @@ def load_tets(
     asset = find_asset(path)
     source = asset.path if asset else checked_path(path, "path")
     check_file(source, "mesh")
-    says_unit = source.suffix.lower() in USD_SUFFIXES
-    numbered: Regions | None = None
-    notes: list[str] = []
-    tets: NDArray[Any]
-    if says_unit:
-        from warp_corot.io.read.usd.tetrahedra import read_usd_tets
-
-        points, tets, up_axis, metres = read_usd_tets(source)
-        if regions is not None:
-            raise InputError(f"{source}: there is no array {regions!r} that numbers regions; USD stages have none")
-    else:
-        points, tets, numbered, notes = _read(source, regions, found)
-        up_axis, metres = "Z", 1.0
+    is_stage = source.suffix.lower() in USD_SUFFIXES
+    loaded = _of_stage(source, regions) if is_stage else _of_file(source, regions, found)
+    points, tets, metres = loaded.points, loaded.tets, loaded.metres_per_unit
     if len(tets) == 0:
         raise InputError(f"{source}: has no tetrahedra")
     if tets.min() < 0 or tets.max() >= len(points):
@@ -116,12 +112,10 @@ def load_tets(
 
     points = points * (scale if unit is None else scale * metres_per_unit(unit) / metres)
     check_finite(points, source)
-    for note in notes:
+    for note in loaded.notes:
         usual = found is not None or note.endswith(SPLIT)
         log.log(logging.INFO if usual else logging.WARNING, "%s: %s", source, note)
-    # As UTF-8 whatever the locale is; what cannot be shown becomes a question mark.
-    name = asset.name if asset else os.fsencode(source.stem).decode("utf-8", "replace")
-    return LoadedMesh(points, tets.astype(np.int32), up_axis, metres, name, source, numbered, says_unit, notes)
+    return replace(loaded, points=points, name=asset.name if asset else loaded.name)
 
 
 def check_file(source: Path, kind: str) -> None:
@@ -166,9 +160,32 @@ def unknown_format(source: Path) -> InputError:
     )
 
 
-def _read(
-    path: Path, regions: str | None, found: FileMesh | None
-) -> tuple[NDArray[np.float64], NDArray[np.int64], Regions | None, list[str]]:
+def _of_stage(path: Path, regions: str | None) -> LoadedMesh:
+    from warp_corot.io.read.usd.tetrahedra import read_usd_tets
+
+    read = read_usd_tets(path)
+    if regions is not None:
+        raise InputError(f"{path}: there is no array {regions!r} that numbers regions; USD stages have none")
+    objects = read.prims if len(read.prims) > 1 else []
+    return LoadedMesh(
+        read.points,
+        read.tets,
+        read.up_axis,
+        read.metres,
+        _short_name(path),
+        path,
+        says_unit=True,
+        node_sets=read.node_sets,
+        objects=objects,
+    )
+
+
+def _short_name(path: Path) -> str:
+    # As UTF-8 whatever the locale is; what cannot be shown becomes a question mark.
+    return os.fsencode(path.stem).decode("utf-8", "replace")
+
+
+def _of_file(path: Path, regions: str | None, found: FileMesh | None) -> LoadedMesh:
     if path.suffix.lower() in SURFACE_SUFFIXES:
         raise InputError(f"{path}: is not a mesh of tetrahedra but a surface, which Domain.from_surface reads")
     if suffix_of(path) is None:
@@ -191,6 +208,32 @@ def _read(
     if warped:
         notes.append(f"{warped} cells are so warped that their tetrahedra overlap or leave gaps")
     try:
-        return mesh.points, tets, find_regions(mesh, cells, regions), notes
+        numbered = find_regions(mesh, cells, regions)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+    return LoadedMesh(
+        mesh.points,
+        tets.astype(np.int32),
+        "Z",
+        1.0,
+        _short_name(path),
+        path,
+        numbered,
+        notes=notes,
+        node_sets=mesh.node_sets,
+        objects=_objects(mesh, cells),
+    )
+
+
+def _objects(mesh: FileMesh, cells: NDArray[np.int64]) -> list[tuple[str, int]]:
+    """The blocks or instances of a file, and how many of the tetrahedra each has; empty if there are not several."""
+    for array in OBJECTS:
+        if mesh.names.get(array) and all(array in block.data for block in mesh.solids):
+            of_tet = np.concatenate([block.data[array] for block in mesh.solids])[cells]
+            # Readers give the cells of one after those of the other.
+            starts = np.flatnonzero(np.diff(of_tet, prepend=of_tet[:1] - 1))
+            numbers = of_tet[starts].tolist()
+            if len(numbers) == len(set(numbers)) > 1:
+                counts = np.diff([*starts, len(of_tet)]).tolist()
+                return [(mesh.names[array][number], count) for number, count in zip(numbers, counts, strict=True)]
+    return []

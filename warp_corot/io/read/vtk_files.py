@@ -20,7 +20,7 @@ from vtkmodules.vtkCommonDataModel import (
 )
 from vtkmodules.vtkFiltersCore import vtkAppendFilter, vtkTriangleFilter
 
-from .filemesh import CORNERS, Block, FileMesh, Unreadable, as_bytes, corners_note, whole_numbers
+from .filemesh import CORNERS, Block, FileMesh, Unreadable, as_bytes, corners_note, sets_of_numbers, whole_numbers
 from .split import fan, split_polyhedron
 
 #: VTK's numbers of cells by the kind that their corners make; corners come first in cells of any order.
@@ -35,7 +35,10 @@ KINDS = {
 LINEAR = {10, 12, 13, 14, 5, 9}
 VOXEL, PIXEL, STRIP, POLYGON, PENTAPRISM, HEXAPRISM, POLYHEDRON = 11, 8, 6, 7, 15, 16, 42
 #: Arrays that tell nothing of regions.
-INTERNAL = ("vtkGhostType", "vtkOriginalCellIds", "vtkOriginalPointIds", "GlobalCellIds", "GlobalElementId")
+INTERNAL = (
+    *("vtkGhostType", "vtkOriginalCellIds", "vtkOriginalPointIds"),
+    *("GlobalCellIds", "GlobalElementId", "GlobalPointIds", "GlobalNodeId"),
+)
 
 
 def read(path: Path) -> FileMesh | dict[str, NDArray[Any]]:
@@ -134,9 +137,12 @@ def _joined(leaves: list[tuple[str, Any]]) -> FileMesh:
     blocks: list[Block] = []
     ignored: dict[str, int] = {}
     notes: list[str] = []
+    sets: dict[str, list[NDArray[np.int64]]] = {}
     offset = 0
     for number, (_, data) in enumerate(leaves, start=1):
         own = _points(data)
+        for name, nodes in _node_sets(data).items():
+            sets.setdefault(name, []).append(nodes + offset)
         extra = {"block": number} if len(leaves) > 1 else {}
         for block in _cells(data, ignored, notes):
             values = {**block.data, **{name: np.full(len(block.nodes), k) for name, k in extra.items()}}
@@ -144,7 +150,8 @@ def _joined(leaves: list[tuple[str, Any]]) -> FileMesh:
         points.append(own)
         offset += len(own)
     names = {"block": {k: name for k, (name, _) in enumerate(leaves, start=1)}} if len(leaves) > 1 else {}
-    return FileMesh(np.concatenate(points), blocks, names, ignored, list(dict.fromkeys(notes)))
+    joined = {name: np.concatenate(parts) for name, parts in sets.items()}
+    return FileMesh(np.concatenate(points), blocks, names, ignored, list(dict.fromkeys(notes)), joined)
 
 
 def _points(data: Any) -> NDArray[np.float64]:
@@ -224,15 +231,27 @@ def _corners_of(cell: Any) -> list[int]:
 
 def _data(data: Any, cells: NDArray) -> dict[str, NDArray[np.int64]]:
     """The arrays of whole numbers, one a cell."""
+    numbers = _whole_arrays(data.GetCellData(), data.GetNumberOfCells())
+    return {name: values[cells] for name, values in numbers.items()}
+
+
+def _node_sets(data: Any) -> dict[str, NDArray[np.int64]]:
+    """The sets of nodes that point data tell apart."""
+    found: dict[str, NDArray[np.int64]] = {}
+    for name, values in _whole_arrays(data.GetPointData(), data.GetNumberOfPoints()).items():
+        found |= sets_of_numbers(name, values)
+    return found
+
+
+def _whole_arrays(arrays: Any, count: int) -> dict[str, NDArray[np.int64]]:
     found = {}
-    arrays = data.GetCellData()
     for k in range(arrays.GetNumberOfArrays()):
         array, name = arrays.GetArray(k), arrays.GetArrayName(k)
         if array is None or not name or name in INTERNAL:
             continue
         values = whole_numbers(vtk_to_numpy(array))
-        if values is not None and len(values) == data.GetNumberOfCells():
-            found[name] = values[cells]
+        if values is not None and len(values) == count:
+            found[name] = values
     return found
 
 

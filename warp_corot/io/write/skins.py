@@ -39,7 +39,13 @@ class OwnSurface:
     looks: Sequence[Look]
 
     @classmethod
-    def of_domain(cls, path: str | PathLike[str], loaded: LoadedSurface, bounds: npt.ArrayLike) -> OwnSurface | None:
+    def of_domain(
+        cls,
+        path: str | PathLike[str],
+        loaded: LoadedSurface,
+        bounds: npt.ArrayLike,
+        offset: npt.ArrayLike = (0.0, 0.0, 0.0),
+    ) -> OwnSurface | None:
         """The surface that a domain of these bounds [2, 3] [m] was made from; its unit is whatever makes the two
         equally large. None if they are not the same but for that.
 
@@ -47,6 +53,7 @@ class OwnSurface:
             path: Of the file.
             loaded: Its triangles, for files of which more than these is not known.
             bounds: Of the domain.
+            offset: How far the domain was moved [m], [3].
 
         Raises:
             InputError: See `usd_look.read_looks`.
@@ -54,7 +61,8 @@ class OwnSurface:
         from warp_corot.io.read.usd.look import has_looks, look_of_triangles, read_looks
 
         looks = read_looks(path) if has_looks(path) else [look_of_triangles(path, loaded.points, loaded.triangles)]
-        given = np.asarray(bounds, dtype=np.float64)
+        moved = np.asarray(offset, dtype=np.float64)
+        given = np.asarray(bounds, dtype=np.float64) - moved
         length = float(np.ptp(given, axis=0).max())
         # All of the file, or where it has several bodies one part of it.
         for some in (looks, *([look] for look in looks)):
@@ -62,7 +70,7 @@ class OwnSurface:
             own = np.stack([used.min(axis=0), used.max(axis=0)])
             scale = length / max(float(np.ptp(own, axis=0).max()), 1e-300)
             if np.abs(scale * own - given).max() <= SAME * length:
-                return cls([look.placed(scale) for look in some])
+                return cls([look.placed(scale, moved) for look in some])
         return None
 
 

@@ -51,9 +51,9 @@ class Look:
     is_plain: bool
     _stage: Any
 
-    def placed(self, scale: float) -> Look:
-        """The same, its points times a factor."""
-        return replace(self, points=scale * self.points)
+    def placed(self, scale: float, offset: NDArray[np.float64]) -> Look:
+        """The same, its points times a factor and then moved."""
+        return replace(self, points=scale * self.points + offset)
 
     def copy_to(self, layer: Sdf.Layer, target: str, materials: str) -> None:
         """Copy the prim, without points, normals and transform, to a path of a layer, and the materials that it and

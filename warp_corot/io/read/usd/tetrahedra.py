@@ -1,6 +1,10 @@
 """Tetrahedra from USD stages: `UsdGeom.TetMesh` prims, and Mesh prims that carry ``tetraIndices``."""
 
+from __future__ import annotations
+
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,11 +12,33 @@ from pxr import Usd, UsdGeom
 
 from warp_corot.errors import InputError
 from warp_corot.io.files.usd import metres_per_unit, open_stage, reads_stage
+from warp_corot.io.read.filemesh import sets_of_numbers
+
+
+@dataclass(frozen=True)
+class StageTets:
+    """The tetrahedra of a stage, all its prims joined, in world space.
+
+    Attributes:
+        points: At rest [m], float64 [N, 3].
+        tets: int32 [T, 4].
+        up_axis: The stage's.
+        metres: Its metres per unit.
+        prims: Names of the prims, and how many of the tetrahedra each has, in their order.
+        node_sets: Nodes that primvars of whole numbers tell apart, indices int64 [n].
+    """
+
+    points: NDArray[np.float64]
+    tets: NDArray[np.int32]
+    up_axis: str
+    metres: float
+    prims: list[tuple[str, int]]
+    node_sets: dict[str, NDArray[np.int64]]
 
 
 @reads_stage
-def read_usd_tets(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], str, float]:
-    """Reads every tetrahedral prim of a stage, joined into one mesh, in world space.
+def read_usd_tets(path: Path) -> StageTets:
+    """Reads every tetrahedral prim of a stage.
 
     The rest shape is the primvar ``rest`` where there is one (as in files written by `UsdWriter`), else ``points`` at
     the default time, else at the first time sample; so too where the mesh changes over time. Inactive and abstract
@@ -20,9 +46,6 @@ def read_usd_tets(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], s
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
-
-    Returns:
-        ``points`` float64 [N, 3] in metres, ``tets`` int32 [T, 4], the stage's up axis, its metres per unit.
 
     Raises:
         InputError: The file is no USD stage, or has no tetrahedra, or their indices are not four to a tetrahedron.
@@ -34,6 +57,8 @@ def read_usd_tets(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], s
 
     all_points: list[NDArray[np.float64]] = []
     all_tets: list[NDArray[np.int64]] = []
+    prims: list[tuple[str, int]] = []
+    sets: dict[str, list[NDArray[np.int64]]] = {}
     offset = 0
     for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
         indices = _tet_indices(prim, path)
@@ -46,10 +71,35 @@ def read_usd_tets(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], s
         world = np.array(cache.GetLocalToWorldTransform(prim), dtype=np.float64)
         all_points.append(points @ world[:3, :3] + world[3, :3])
         all_tets.append(indices + offset)
+        name = prim.GetName()
+        taken = {known for known, _ in prims}
+        prims.append((name if name not in taken else f"{name}_{len(prims) + 1}", len(indices)))
+        for known, nodes in _node_sets(prim, len(points)).items():
+            sets.setdefault(known, []).append(nodes + offset)
         offset += len(points)
     if not all_tets:
         raise InputError(f"{path}: has no tetrahedra (no TetMesh prim and no Mesh prim with tetraIndices)")
-    return np.concatenate(all_points) * metres, np.concatenate(all_tets).astype(np.int32), up_axis, metres
+    return StageTets(
+        np.concatenate(all_points) * metres,
+        np.concatenate(all_tets).astype(np.int32),
+        up_axis,
+        metres,
+        prims,
+        {known: np.concatenate(parts) for known, parts in sets.items()},
+    )
+
+
+def _node_sets(prim: Any, count: int) -> dict[str, NDArray[np.int64]]:
+    """The sets of a prim's points that its primvars of whole numbers tell apart."""
+    found: dict[str, NDArray[np.int64]] = {}
+    for primvar in UsdGeom.PrimvarsAPI(prim).GetPrimvars():
+        if primvar.GetInterpolation() != UsdGeom.Tokens.vertex or primvar.IsIndexed():
+            continue
+        value = primvar.Get()
+        values = np.asarray(primvar.Get(Usd.TimeCode.EarliestTime()) if value is None else value)
+        if values.shape == (count,) and values.dtype.kind in "iub":
+            found |= sets_of_numbers(primvar.GetPrimvarName().replace(":", "_"), values.astype(np.int64))
+    return found
 
 
 def _tet_indices(prim, path: Path) -> NDArray[np.int64] | None:
