@@ -8,6 +8,7 @@ from warp_corot.materials.anisotropic import Orthotropic, TransverselyIsotropic
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.simulation.energy import Energy, WorldEnergies
+from warp_corot.simulation.progress import show_progress
 from warp_corot.simulation.simulation import Simulation
 
 from . import remesh
@@ -46,4 +47,5 @@ __all__ = [
     "polar_rotation",
     "record",
     "remesh",
+    "show_progress",
 ]

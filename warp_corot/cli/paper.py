@@ -115,6 +115,7 @@ def _with_progress(settings: Settings, device: str | None) -> Results:
 
     from warp_corot.experiments.paper import run_experiment, work
     from warp_corot.inputs.device import checked_device
+    from warp_corot.simulation.progress import hidden
 
     from .compiling import compiling_said
 
@@ -137,5 +138,5 @@ def _with_progress(settings: Settings, device: str | None) -> Results:
             complain(text, kind="")
             bar.refresh()
 
-        with compiling_said(where, say):
+        with compiling_said(where, say), hidden():
             return run_experiment(settings, device=where, progress=tell)

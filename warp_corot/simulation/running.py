@@ -9,15 +9,19 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from warp_corot.elasticity import StVenantKirchhoff
 from warp_corot.errors import StabilityWarning, UnstableError, depth_of_user
 from warp_corot.kernels.stepping.pace import GROWTH
 from warp_corot.solvers.guarding.energy_control import EnergyControl
 from warp_corot.solvers.guarding.guard import Fault
 from warp_corot.solvers.recorded import Segment
+
+from .fault_messages import fault_message
+from .progress import bar_of
 
 if TYPE_CHECKING:
     from .simulation import Simulation
@@ -81,16 +85,25 @@ class Running:
         sim = self._sim
         end = sim.total_steps + count
         self._energies.begin()
-        while (left := end - sim.total_steps) > 0:
-            self._run(left, None)
+        with self._bar(count, "steps") as show:
+            while (left := end - sim.total_steps) > 0:
+                self._run(left, None)
+                show(count - (end - sim.total_steps))
 
     def make_until(self, total_time: float) -> None:
         """Make steps until a time [s], exactly; only if the step is the simulation's to choose."""
         sim = self._sim
         self._energies.begin()
-        while sim.total_time < total_time:
-            if self._run(MOST_INTERVALS * sim.recorded.interval, total_time - sim.time_before_reset):
-                break
+        start = sim.total_time
+        with self._bar(total_time - start, "s") as show:
+            while sim.total_time < total_time:
+                if self._run(MOST_INTERVALS * sim.recorded.interval, total_time - sim.time_before_reset):
+                    break
+                show(sim.total_time - start)
+
+    def _bar(self, total: float, unit: str) -> AbstractContextManager[Callable[[float], None]]:
+        """A bar for long waits; none where hooks may print lines of their own."""
+        return nullcontext(lambda _: None) if self._sim.hook_intervals else bar_of(total, unit)
 
     def look(self) -> None:
         """See that the state is finite, and now and then that nodes are within reach.
@@ -98,12 +111,12 @@ class Running:
         Raises:
             UnstableError: They are not.
         """
-        guard = self._sim.guard
-        fault = guard.not_finite()
-        if fault is None and self._sim.steps % LOOK_STEPS == 0:
-            fault = guard.beyond_reach()
+        sim = self._sim
+        fault = sim.guard.not_finite()
+        if fault is None and sim.steps % LOOK_STEPS == 0:
+            fault = sim.guard.beyond_reach()
         if fault is not None:
-            raise UnstableError(self._message(fault))
+            raise UnstableError(fault_message(sim, fault, MOST_RETURNS))
 
     # --- one run ---------------------------------------------------------------------------------------------------
 
@@ -259,7 +272,7 @@ class Running:
         if sim.safe_step is None or self._returns >= MOST_RETURNS:
             self._returns = 0
             sim.guard.forget()
-            raise UnstableError(self._message(fault))
+            raise UnstableError(fault_message(sim, fault, MOST_RETURNS))
         if not self._returns:
             self._wrong_until = sim.time
         self._returns += 1
@@ -272,27 +285,6 @@ class Running:
                 f"t = {sim.time:.4g} s with half the step, and does the same without a word if that happens again"
             )
             warnings.warn(message, StabilityWarning, stacklevel=depth_of_user())
-
-    def _message(self, fault: Fault) -> str:
-        sim = self._sim
-        more = f" and {len(fault.worlds) - 3} more" if len(fault.worlds) > 3 else ""
-        where = f" in world {', '.join(map(str, fault.worlds[:3]))}{more}" if sim.worlds > 1 else ""
-        if fault.step is None:
-            when = f"at step {sim.steps} (t = {sim.time:.4g} s)"
-        else:
-            when = f"since step {fault.step} (t = {sim.pace.time_at(fault.step):.4g} s)"
-        steps = f"dt is {sim.pace.dt:.3g} s, the largest stable step at rest about {sim.stable_dt:.3g} s"
-        return f"{fault.what} {when}{where}; {steps}{self._advice()}"
-
-    def _advice(self) -> str:
-        sim = self._sim
-        if any(getattr(model, "rotation_level", None) is not None for model in sim.models):
-            return "; shared rotations have no energy, so that strong bending may need rotation_level=None"
-        if any(isinstance(model, StVenantKirchhoff) for model in sim.models):
-            return "; StVenantKirchhoff has no energy barrier against being crushed: take NeoHookean or Corotated"
-        if sim.safe_step is None:
-            return ": take a shorter step, or dt=None, which follows the state"
-        return f"; {MOST_RETURNS} times half the step did not help: look for loads or motions that crush the body"
 
 
 def _steps(seconds: float, dt: float) -> int:

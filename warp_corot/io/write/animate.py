@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_path, shown
+from warp_corot.simulation.progress import hidden, is_shown
 from warp_corot.simulation.simulation import Simulation
 
 from .provenance import provenance, steps_made
@@ -246,8 +247,8 @@ def _bar(count: int, *, wanted: bool) -> Iterator[Progress]:
     from tqdm import tqdm
 
     form = "{desc}  {percentage:3.0f} % |{bar}| frame {n_fmt} of {total_fmt}, {remaining} left"
-    off = None if wanted else True
-    with tqdm(desc="simulating", total=count, delay=2.0, leave=False, disable=off, bar_format=form) as bar:
+    off = not (wanted and is_shown())
+    with tqdm(desc="simulating", total=count, delay=2.0, leave=False, disable=off, bar_format=form) as bar, hidden():
         yield lambda frame, _: bar.update(frame - bar.n)
 
 

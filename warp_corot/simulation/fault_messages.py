@@ -1,0 +1,34 @@
+"""What is said of a state that has gone wrong."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from warp_corot.elasticity import StVenantKirchhoff
+
+if TYPE_CHECKING:
+    from warp_corot.solvers.guarding.guard import Fault
+
+    from .simulation import Simulation
+
+
+def fault_message(sim: Simulation, fault: Fault, returns: int) -> str:
+    """What has gone wrong, since when, and what would help; after so many times with half the step."""
+    more = f" and {len(fault.worlds) - 3} more" if len(fault.worlds) > 3 else ""
+    where = f" in world {', '.join(map(str, fault.worlds[:3]))}{more}" if sim.worlds > 1 else ""
+    if fault.step is None:
+        when = f"at step {sim.steps} (t = {sim.time:.4g} s)"
+    else:
+        when = f"since step {fault.step} (t = {sim.pace.time_at(fault.step):.4g} s)"
+    steps = f"dt is {sim.pace.dt:.3g} s, the largest stable step at rest about {sim.stable_dt:.3g} s"
+    return f"{fault.what} {when}{where}; {steps}{_advice(sim, returns)}"
+
+
+def _advice(sim: Simulation, returns: int) -> str:
+    if any(getattr(model, "rotation_level", None) is not None for model in sim.models):
+        return "; shared rotations have no energy, so that strong bending may need rotation_level=None"
+    if any(isinstance(model, StVenantKirchhoff) for model in sim.models):
+        return "; StVenantKirchhoff has no energy barrier against being crushed: take NeoHookean or Corotated"
+    if sim.safe_step is None:
+        return ": take a shorter step, or dt=None, which follows the state"
+    return f"; {returns} times half the step did not help: look for loads or motions that crush the body"
