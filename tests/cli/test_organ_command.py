@@ -15,6 +15,7 @@ from stages import SURFACE, TETS, drawn, prims
 
 import warp_corot as wc
 import warp_corot.cli.simulate as command
+from warp_corot.cli import bodies
 from warp_corot.cli.organs import DETAIL
 from warp_corot.domain import Domain
 
@@ -187,8 +188,8 @@ def test_compiling_is_said_once_for_mesh_and_body(folder, capsys, monkeypatch):
 
         return compiled
 
-    for name in ("find_organ", "_make_body"):
-        monkeypatch.setattr(command, name, compiled_before(getattr(command, name)))
+    for module, name in ((bodies, "find_organ"), (command, "make_body")):
+        monkeypatch.setattr(module, name, compiled_before(getattr(module, name)))
     write_surface(folder / "organ.glb", False)
     assert simulate("organ.glb", "-o", "a.usd", "--tets", 500, *SHORT) == 0
     assert capsys.readouterr().err.count("compiling kernels for cpu, once") == 1

@@ -253,6 +253,6 @@ def test_an_asset_softer_than_it_is_meant_to_be_is_held_by_what_carries_it():
     mesh = wc.TetForest.box((1, 1, 1), 0.1, 0)
     for young, fix in ((None, "y < 0.01"), (3e4, "y < 0.01"), (3e3, None)):
         subject = Subject(mesh, "bunny")
-        subject.take(find_asset("warp:bunny"), Namespace(young=young, unit=None, scale=None))
+        subject.take(find_asset("warp:bunny"), Namespace(young=young, unit=None, scale=None, offset=None))
         assert subject.fix == fix
         assert subject.young == 3e4

@@ -18,7 +18,7 @@ from warp_corot.errors import InputError, UnstableError
 
 from .parsing import StrictParser
 from .say import EXIT_CODES, complain, interrupt_status, open_streams, silence
-from .signals import terminable
+from .signals import leaving_at_once, terminable
 
 
 def commands() -> dict[str, ModuleType]:
@@ -89,11 +89,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: Sequence[str] | None) -> int:
-    import warp as wp
+    with leaving_at_once():
+        import warp as wp
 
-    wp.config.log_level = wp.LOG_ERROR  # before Warp starts, so that it says nothing about itself
-    logging.basicConfig(format="warp-corot: warning: %(message)s", level=logging.WARNING)
-    args = make_parser().parse_args(argv)
+        wp.config.log_level = wp.LOG_ERROR  # before Warp starts, so that it says nothing about itself
+        logging.basicConfig(format="warp-corot: warning: %(message)s", level=logging.WARNING)
+        parser = make_parser()
+    args = parser.parse_args(argv)
     args.command_line = shlex.join(["warp-corot", *(sys.argv[1:] if argv is None else argv)])
     try:
         _start_warp()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import _thread
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -10,10 +11,13 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
-from .say import Terminated
+from .say import Terminated, complain
 
 #: How long a signal that came during an import waits before it is looked at again [s].
 WAIT = 0.02
+
+#: Whether the process may end in the middle of an import.
+_may_leave = False
 
 
 @contextmanager
@@ -34,10 +38,24 @@ def terminable() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def leaving_at_once() -> Iterator[None]:
+    """Where nothing has begun that could be lost, a signal ends the process without waiting for long imports."""
+    global _may_leave
+    before, _may_leave = _may_leave, True
+    try:
+        yield
+    finally:
+        _may_leave = before
+
+
 def _after_imports(end: Callable[[], NoReturn]) -> Callable[[int, FrameType | None], None]:
     def handle(number: int, frame: FrameType | None) -> None:
         if not _is_importing(frame):
             end()
+        if _may_leave:
+            complain("interrupted", kind="")
+            os._exit(128 + number)
         again = threading.Timer(WAIT, _thread.interrupt_main, [number])
         again.daemon = True
         again.start()
