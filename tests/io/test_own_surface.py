@@ -61,6 +61,19 @@ def test_a_plain_surface_shows_the_stress(folder):
     assert mesh.GetPrim().GetAttribute("primvars:displayColor:indices").GetNumTimeSamples()
 
 
+def test_what_was_written_goes_in_again(folder):
+    """A surface that shows the stress of one run shows that of the next."""
+    trimesh.creation.icosphere(2, 0.03).export(folder / "ball.ply")
+    assert simulate("ball.ply", "-o", "a.usd", "--unit", "m", "--tets", 300, *SHORT) == 0
+    assert simulate("a.usd", "-o", "b.usd", "--tets", 300, "--young", 5e3, *SHORT) == 0
+    stages = [Usd.Stage.Open(str(folder / name)) for name in ("a.usd", "b.usd")]
+    first, again = (stage.GetPrimAtPath("/SoftBody/ball") for stage in stages)
+    for name in ("primvars:vonMises", "primvars:displayColor:indices"):
+        one, other = (np.array(prim.GetAttribute(name).Get(2)) for prim in (first, again))
+        assert one.shape == other.shape
+        assert (one != other).any()
+
+
 def test_remeshed_bodies_carry_it(folder):
     trimesh.creation.box((0.02, 0.02, 0.08)).subdivide().subdivide().export(folder / "bar.stl")
     args = [

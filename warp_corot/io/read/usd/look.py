@@ -20,6 +20,9 @@ from .surfaces import DrawnMesh, drawn_meshes
 
 #: What frames give anew, or what no longer holds of a prim once its points are in the world's coordinates.
 STALE = ("points", "extent", "normals", "velocities", "accelerations", "primvars:normals", "tetraIndices")
+#: Of a prim that a simulation wrote: its stress, which its colours show.
+STRESS = "primvars:vonMises"
+COLORS = (STRESS, "primvars:displayColor", "primvars:displayColor:indices")
 #: Bindings are made anew; where there are several the first of these purposes counts.
 PURPOSES = (UsdShade.Tokens.allPurpose, UsdShade.Tokens.preview, UsdShade.Tokens.full)
 
@@ -171,7 +174,8 @@ def _is_plain(prim: Any) -> bool:
     bound = any(
         UsdShade.MaterialBindingAPI(part).ComputeBoundMaterial(purpose)[0] for part in parts for purpose in PURPOSES
     )
-    return not bound and not UsdGeom.Mesh(prim).GetDisplayColorAttr().HasAuthoredValue()
+    own_colors = UsdGeom.Mesh(prim).GetDisplayColorAttr().HasAuthoredValue() and not prim.HasAttribute(STRESS)
+    return not bound and not own_colors
 
 
 def _flattened(stage: Any) -> Any:
@@ -185,12 +189,13 @@ def _flattened(stage: Any) -> Any:
 
 def _without_stale(spec: Any) -> None:
     """Take from a Mesh prim what frames will give, what moves, and transforms; of the rest keep the first values."""
+    stale = (*STALE, *(COLORS if STRESS in spec.attributes else ()))
     for attribute in list(spec.attributes):
         samples = spec.layer.ListTimeSamplesForPath(attribute.path)
         if samples:
             attribute.default = spec.layer.QueryTimeSample(attribute.path, samples[0])
             for time in samples:
                 spec.layer.EraseTimeSample(attribute.path, time)
-        moved = attribute.name in STALE or attribute.name.startswith("xformOp")
+        moved = attribute.name in stale or attribute.name.startswith("xformOp")
         if moved or not attribute.HasInfo("default"):
             spec.RemoveProperty(attribute)
