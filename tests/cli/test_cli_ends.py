@@ -1,5 +1,6 @@
 """How commands end: what is said, and with which exit status."""
 
+import errno
 import functools
 import importlib
 import re
@@ -65,6 +66,18 @@ def test_failed_write_is_one_line(folder, capsys, monkeypatch):
     monkeypatch.setattr("warp_corot.io.write.usd.writer.UsdWriter.write", fail)
     assert simulate("box", "-o", "a.usd", *SHORT) == 1
     assert capsys.readouterr().err == "warp-corot: error: a.usd: cannot be written: No space left on device\n"
+
+
+@pytest.mark.parametrize("name", ["a.pvd", "a.vtu", "a.xdmf"])
+def test_a_file_for_paraview_that_cannot_be_written_is_named(folder, capsys, monkeypatch, name):
+    def fail(*_):
+        raise OSError(errno.ENOSPC, "a long story of HDF5")
+
+    monkeypatch.setattr("meshio.write", lambda *_, **__: fail())
+    monkeypatch.setattr("warp_corot.io.write.xdmf.XdmfWriter._stored", fail)
+    assert simulate("box", "-o", "a.usd", "--also", name, *SHORT) == 1
+    assert capsys.readouterr().err == f"warp-corot: error: {name}: cannot be written: No space left on device\n"
+    assert len(frames(folder / "a.usd")) >= 1
 
 
 @pytest.mark.parametrize("args", [["--help"], ["simulate", "--help"], ["paper", "--help"]])

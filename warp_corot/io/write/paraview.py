@@ -8,6 +8,8 @@ from __future__ import annotations
 import importlib.util
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
 
@@ -78,8 +80,31 @@ def also_writer(path: Path) -> Writer:
     if suffix == ".xdmf":
         from .xdmf import XdmfWriter
 
-        return XdmfWriter(path)
-    return VtuWriter(path) if suffix == ".vtu" else PvdWriter(path)
+        return _Named(path, XdmfWriter(path))
+    return _Named(path, VtuWriter(path) if suffix == ".vtu" else PvdWriter(path))
+
+
+class _Named:
+    """A writer whose errors name its file."""
+
+    def __init__(self, path: Path, writer: Writer):
+        self._path, self._writer = path, writer
+
+    def write(self, fields: Fields) -> None:
+        with self._named():
+            self._writer.write(fields)
+
+    def close(self) -> None:
+        with self._named():
+            self._writer.close()
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, RuntimeError) as error:  # HDF5 raises both
+            number = getattr(error, "errno", None)
+            raise OSError(f"{self._path}: cannot be written: {os.strerror(number) if number else error}") from None
 
 
 class VtuWriter:
