@@ -79,7 +79,7 @@ def test_a_field_bound_to_a_body_that_has_changed_goes_through_its_present_mesh(
         other = model.bind(body)
         assert other.plan is not sim.fields[0].plan
         alone = wc.SoftBody(changing.forest.to_forest(), MATERIAL, device=device)
-        u = random_displacements(body.node_count, len(body.node_displacements), rng, device)
+        u = random_displacements(body.node_count, len(body.state.displacements), rng, device)
         expected = forces(model.bind(alone), wp.clone(u[: body.node_count]))
         for field in (other, sim.fields[0]):
             found = forces(field, u)[: body.node_count]
