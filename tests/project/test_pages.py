@@ -1,0 +1,129 @@
+"""README and docs: every block of code runs, every command is one, every file that is named is there.
+
+Commands fall under rules by their program: those of this project are parsed by its own parser, and run where they are
+cheap; those that install or check are compared with pyproject.toml. A command under no rule fails.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import command_line
+import pytest
+import warp as wp
+from pages import EXTRAS, PAGES, ROOT, Session, blocks_of, commands_of
+
+import warp_corot as wc
+from warp_corot.cli import make_parser
+
+#: Inputs that run in a second or two.
+CHEAP = ("box", "warp:bear")
+#: Programs of the extra ``dev`` that pages call.
+TOOLS = {"pytest", "ruff", "mypy", "mkdocs"}
+#: Names in backticks that are files of this repository.
+FILE = re.compile(r"`((?:warp_corot|kernels|tests|benchmarks|examples|docs)/[\w./-]*)`")
+
+
+def run_warp_corot(words):
+    """Parse a command of this project, and run it if that is cheap."""
+    options = make_parser().parse_args(words)
+    if options.command != "simulate":
+        return
+    given = str(options.input)
+    if given in CHEAP or Path(given).exists():
+        assert command_line.run(*words, *command_line.SHORT) == 0, words  # of an option given twice the last counts
+
+
+def check_install(words):
+    """Extras that are asked for must be there."""
+    named = re.findall(r"\[([\w,]+)\]", " ".join(words))
+    asked = {extra for names in named for extra in names.split(",")}
+    assert asked <= set(EXTRAS), f"no such extra: {asked - set(EXTRAS)}"
+
+
+def check_tool(words):
+    """The program must come with the extra ``dev``."""
+    assert words[0] in TOOLS, words
+
+
+def check_python(words):
+    """A script or a module must be there; a virtual environment may be made."""
+    if words[1] == "-m":
+        if words[2] == "venv":
+            return
+        path = ROOT / (words[2].replace(".", "/") + ".py")
+    else:
+        path = ROOT / words[1]
+    assert path.is_file(), f"{path} is not there"
+
+
+RULES = {
+    "warp-corot": lambda words: run_warp_corot(words[1:]),
+    "pip": check_install,
+    "python": check_python,
+    "python3": check_python,
+    **dict.fromkeys(TOOLS, check_tool),
+}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_blocks_run(page, folder, tmp_path_factory):
+    session = Session(page, tmp_path_factory.mktemp("source"))
+    with wp.ScopedDevice("cpu"):
+        for block in blocks_of(page):
+            if block.language == "python":
+                session.run(block)
+            elif block.language == "sh":
+                for words in commands_of(block.code):
+                    program = words[0].removeprefix(".venv/bin/")
+                    assert program in RULES, f"{page.name}:{block.line}: no rule knows {' '.join(words)}"
+                    RULES[program]([program, *words[1:]])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_named_files_are_there(page):
+    for name in FILE.findall(page.read_text(encoding="utf-8")):
+        assert (ROOT / name).exists(), f"{page.name} names {name}"
+
+
+def test_a_file_format_is_added_as_the_recipe_says(tmp_path):
+    """To a copy of the package, which another process then runs."""
+    for part in ("warp_corot", "kernels"):
+        ignored = shutil.ignore_patterns("__pycache__", "kernels") if part == "warp_corot" else None
+        place = tmp_path / "warp_corot" / ("" if part == "warp_corot" else part)
+        shutil.copytree(ROOT / part, place, ignore=ignored)
+    blocks = blocks_of(ROOT / "docs" / "recipes" / "file_format.md")
+    (module,) = (block.code for block in blocks if "def read(path" in block.code)
+    (line,) = (block.code for block in blocks if block.language == "text")
+    readers = tmp_path / "warp_corot" / "io" / "read"
+    (readers / "febio.py").write_text(module, encoding="utf-8")
+    listed = (readers / "files.py").read_text(encoding="utf-8")
+    head = "READERS: dict[str, tuple[Reader, ...]] = {\n"
+    assert head in listed
+    (readers / "files.py").write_text(listed.replace(head, head + line), encoding="utf-8")
+    (example,) = (block.code for block in blocks if "write_text" in block.code)
+    (tmp_path / "block.feb").write_text(re.search(r'"""(.*?)"""', example, re.DOTALL)[1], encoding="utf-8")
+    options = ["--materials", "fat=20kPa:0.45,muscle=50kPa:0.45", "--fix", "bottom", "-o", "block.usd"]
+    command = [sys.executable, "-m", "warp_corot", "simulate", "block.feb", "--unit", "mm", *options]
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(
+        [*command, *command_line.SHORT], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "block.usd").exists()
+    assert "muscle" in done.stdout
+
+
+def test_the_reference_has_every_public_name():
+    text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    assert {name for name in wc.__all__ if f"::: warp_corot.{name}\n" not in text} == set()
+    newton = pytest.importorskip("warp_corot.newton")
+    text = (ROOT / "docs" / "api_newton.md").read_text(encoding="utf-8")
+    assert {name for name in newton.__all__ if f"::: warp_corot.newton.{name}\n" not in text} == set()
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
