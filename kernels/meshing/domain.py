@@ -12,7 +12,7 @@ FAR = 1.0e15
 #: quarter on closed surfaces (thin plates and shells among them), at 1.0 a few were; 2.0 takes half as long again.
 ACCURACY = 1.5
 
-#: Two directions in which rays are sent, along which hardly a face lies. After a crossing a ray goes on by this share of
+#: Two directions in which rays are sent, along which hardly a face lies. After a crossing a ray goes on by a share of
 #: its coordinates, and so many crossings are counted.
 RAYS = wp.constant(wp.mat33(0.4573, -0.2689, 0.8477, -0.7346, 0.6211, 0.2729, 0.0, 0.0, 0.0))
 RAY_STEP = wp.constant(2.0e-6)

@@ -218,8 +218,8 @@ def judge_by_edges(
     """Compare the midpoints of the six edges with the linear interpolant: of a quadratic function they tell all.
 
     What would barely pass the closest tolerance that there will be is unsure, and looked at once more, in the middle of
-    its piece of the surface or at its centroid: what the quadratic function has there is ``expected``. An element's need
-    is how far off its piece of the surface is [m].
+    its piece of the surface or at its centroid: what the quadratic function has there is ``expected``. An element's
+    need is how far off its piece of the surface is [m].
     """
     i = wp.tid()
     element = elements[i]

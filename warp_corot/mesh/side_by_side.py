@@ -1,4 +1,4 @@
-"""Warp's kernels run on one core of a CPU; parts of a launch that write apart from one another run side by side here."""
+"""Warp runs a kernel on one core of a CPU; parts of a launch that write to different places run side by side here."""
 
 from __future__ import annotations
 
