@@ -229,6 +229,15 @@ def test_an_output_goes_into_a_scene(bar, folder):
     assert (last - first)[BAR.points[:, 0] == LENGTH, 2].max() < -0.01
 
 
+def test_what_a_user_may_not_have_meant_is_noted(bar, capsys):
+    args = ["--fix", "x == xmin", "--pull", "z == zmax", 0, 0, "1mm", "--ramp", 2, "--density", 1.1, *SHORT]
+    assert simulate("bar.vtk", "-o", "a.usd", *args) == 0
+    said = capsys.readouterr().err
+    assert "3 of its nodes are named by --fix, too, and move" in said
+    assert "--ramp is 2 s, longer than the run: loads reach 2% of their values" in said
+    assert "--density is 1.1 kg/m^3, far less than water; write 1.1g/cm3 for g/cm^3" in said
+
+
 REFUSED = [
     (["--pull", "x == xmax", "0", "0", "up"], "'up' is no number"),
     (["--pull", "x > 9", "0", "0", "1"], "--pull 'x > 9': there are no nodes in it"),
@@ -240,6 +249,14 @@ REFUSED = [
     (["--patch", "tip"], "it must be NAME=EXPR"),
     (["--patch", "x=all"], "x is a name already"),
     (["--fix", "tip"], "'tip' is not known"),
+    (["--fix", "botom"], "'botom' is not known (did you mean bottom?); names are all, bottom, "),
+    (["--fix", "x == xmax", "--pull", "x == xmax", "0", "0", "1"], "all of its nodes are held by --fix"),
+    (["--yuong", "5kPa"], "there is no option --yuong (did you mean --young?)"),
+    (["--young", "5kpa"], "the unit 'kpa' is not known (did you mean kPa?)"),
+    (["--model", "corrotated"], "(did you mean corotated?)"),
+    (["--skin", "marched"], "--skin is for surfaces"),
+    (["--rotation-level", "2"], "--rotation-level is for box, surfaces and scans"),
+    (["more"], "'more' is one word too many"),
     (["--fix", "sphere(x, 0, 0, 1)"], "is not the same at all nodes"),
     (["--fix", "nearest(0, 0, 0, 0.5)"], "nearest takes a number of nodes"),
     (["--fix", "box(0, 0, 1)"], "box takes 6 arguments, not 3"),

@@ -15,9 +15,10 @@ from types import ModuleType
 from typing import NoReturn
 
 from warp_corot.errors import InputError, UnstableError
+from warp_corot.inputs.likely import meant
 
 from .parsing import StrictParser
-from .say import EXIT_CODES, complain, interrupt_status, open_streams, silence
+from .say import EXIT_CODES, as_option, complain, interrupt_status, open_streams, silence
 from .signals import leaving_at_once, terminable
 
 
@@ -37,8 +38,22 @@ class Parser(StrictParser):
         self._negative_number_matcher = re.compile(r"^-(\d|\.\d|inf|nan)")
 
     def error(self, message: str) -> NoReturn:
+        known = re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)$", message)
+        if known:
+            message += meant(known[1], re.findall(r"[\w.-]+", known[2]))
         complain(f"{message} (see {self.prog} --help)")
         sys.exit(2)
+
+    def parse_known_args(self, args=None, namespace=None):
+        """As argparse's; options that are not known are told by the parser of the command, which knows others."""
+        found, unknown = super().parse_known_args(args, namespace)
+        options = [word for word in unknown if word.startswith("-") and len(word) > 1]
+        if options:
+            name = options[0].partition("=")[0]
+            self.error(f"there is no option {name}{meant(name, self._option_string_actions)}")
+        if unknown:
+            self.error(f"{unknown[0]!r} is one word too many; names with spaces need quotation marks")
+        return found, unknown
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -71,7 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stdout.flush()
         return status
     except InputError as error:
-        complain(str(error))
+        complain(as_option(str(error)))
         return 2
     except UnstableError as error:
         complain(str(error))

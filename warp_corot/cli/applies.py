@@ -38,8 +38,13 @@ def _is_file(_: argparse.Namespace, opened: Opened) -> bool:
 
 
 RULES = (
-    Rule(("skin",), lambda args, opened: opened.kind == "surface" or args.skin != "input", "surfaces"),
+    Rule(
+        ("skin",),
+        lambda args, opened: opened.kind == "surface" or (opened.kind == "scan" and args.skin == "marched"),
+        "surfaces",
+    ),
     Rule(("unit", "up"), _is_file, "files"),
+    Rule(("rotation_level",), lambda _, opened: opened.kind != "tets", "box, surfaces and scans"),
     Rule(
         ("join",),
         lambda args, opened: opened.kind == "tets" or len(opened.surface.objects if opened.surface else ()) > 1,

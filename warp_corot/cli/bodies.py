@@ -28,6 +28,9 @@ from .several import bodies_in
 from .subject import Subject, find_subject
 from .summary import pressure
 
+#: A density that is given below this [kg/m^3] is meant in g/cm^3, most likely.
+LIGHT = 5.0
+
 
 @dataclass(eq=False)
 class Body:
@@ -116,7 +119,15 @@ def make_body(body: Body, duration: float) -> None:
         subject.notes.append(f"Young's modulus{rest} is {pressure(chosen)}, chosen for the weight (--young)")
     body.soft = SoftBody(subject.mesh, material, device=args.device)
     body.soft.fix(body.held.nodes)
-    move_patches(body.soft, body.loads, body.patches, ramp_of(args, duration))
+    fixed = None if args.fix is None else body.held.nodes
+    move_patches(body.soft, body.loads, body.patches, ramp_of(args, duration), fixed)
+    if args.ramp is not None and args.ramp > duration:
+        share = duration / args.ramp
+        subject.notes.append(f"--ramp is {args.ramp:g} s, longer than the run: loads reach {share:.0%} of their values")
+    if args.density is not None and args.density < LIGHT:
+        subject.notes.append(
+            f"--density is {args.density:g} kg/m^3, far less than water; write {args.density:g}g/cm3 for g/cm^3"
+        )
 
 
 def gravity_of(args: argparse.Namespace, subject: Subject) -> np.ndarray:
@@ -124,7 +135,7 @@ def gravity_of(args: argparse.Namespace, subject: Subject) -> np.ndarray:
     return np.array(checked_gravity(given, subject.mesh.up_axis))
 
 
-def _model(name: str, rotation_level: int | None) -> Model:
+def _model(name: str, rotation_level: int | float | str | None) -> Model:
     if rotation_level is None:
         return MODELS[name]()
     if name != "corotated":

@@ -80,13 +80,16 @@ def add_load_options(group: argparse._ArgumentGroup) -> None:
             nargs=1 + count,
             metavar=("PATCH", *names.split()),
             help={
-                "pull": "move a patch by so much [m], such as 0 0 3cm",
+                "pull": "move a patch by this much [m], such as 0 0 3cm",
                 "twist": "turn a patch about its mean normal, counter-clockwise seen from outside",
-                "press": "a pressure on the surface of a patch, along the normals at rest; pulls if negative",
+                "press": "press on the surface of a patch, along its normals at rest; a negative pressure pulls",
             }[kind],
         )
     group.add_argument(
-        "--ramp", type=seconds, metavar="T", help="time over which these grow [s] (default: half of the duration)"
+        "--ramp",
+        type=seconds,
+        metavar="T",
+        help="time in which pulls, twists and pressures grow to their full values [s] (default: half of the duration)",
     )
 
 
@@ -128,11 +131,21 @@ def value_of(kind: str, text: str) -> float:
     return value
 
 
-def move_patches(body: SoftBody, loads: Sequence[Load], patches: Patches, ramp: float) -> None:
+def move_patches(
+    body: SoftBody, loads: Sequence[Load], patches: Patches, ramp: float, fixed: npt.NDArray[np.bool_] | None
+) -> None:
     """Have the patches of ``--pull`` and ``--twist`` move as told.
 
+    Args:
+        body: The body.
+        loads: What is done to it.
+        patches: Of the body.
+        ramp: Time over which loads without times grow [s].
+        fixed: Nodes that the user holds, bool [N]; None if nobody said. Those of a patch that moves go along with it.
+
     Raises:
-        InputError: A patch without nodes or, where one is needed, without a direction; a node in two of them.
+        InputError: A patch without nodes or, where one is needed, without a direction; a node in two of them; or a
+            patch all of which is held.
     """
     taken = np.zeros(len(patches.subject.mesh.points), bool)
     for load in loads:
@@ -142,6 +155,11 @@ def move_patches(body: SoftBody, loads: Sequence[Load], patches: Patches, ramp: 
         if (mask & taken).any():
             raise InputError(f"{load}: {int((mask & taken).sum())} of its nodes are moved by another option, too")
         taken |= mask
+        both = 0 if fixed is None else int((mask & fixed).sum())
+        if both == mask.sum():
+            raise InputError(f"{load}: all of its nodes are held by --fix")
+        if both:
+            patches.subject.notes.append(f"{load}: {both} of its nodes are named by --fix, too, and move")
         times, shares = load.curve(ramp)
         if load.kind == "pull":
             moves = shares[:, None] * load.values

@@ -12,7 +12,19 @@ from .label_materials import FORM
 from .loading import add_load_options
 from .organs import MAX_LEVEL_FOR_ERROR, TETS
 from .previews import add_preview_options
-from .quantities import acceleration, density, metres, per_second, pressure, seconds, unit_of_length, value_range
+from .quantities import (
+    acceleration,
+    density,
+    metres,
+    number,
+    per_second,
+    pressure,
+    rotation_level,
+    seconds,
+    unit_of_length,
+    value_range,
+    whole_number,
+)
 from .remesh import add_remesh_options
 from .say import EXIT_CODES
 from .subject import STIFFNESS_PER_WEIGHT
@@ -27,6 +39,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParse
         help="let a soft body move and write it as a USD animation",
         description="Lets a soft body sag and sway under gravity and writes a USD animation, coloured by stress.",
         epilog=f"""examples:
+  warp-corot simulate warp:bunny -o bunny.usd --preview bunny.gif
   warp-corot simulate warp:bear -o bear.usd
   warp-corot simulate liver.msh --unit mm --young 5kPa --fix "z < zmin + 0.01" -o liver.usd --preview liver.png
   warp-corot simulate liver.stl --unit mm --tets 50000 -o liver.usd
@@ -62,12 +75,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "input",
         metavar="INPUT",
-        help="cells with volume, of which others than tetrahedra are split: a USD file with a TetMesh, or a Mesh with "
-        "tetraIndices; .vtk, .vtu, .vtm, .msh of Gmsh, .inp of Abaqus, .mesh, .node, .ele, .vol and others; "
-        "warp:bear, a toy bear; or box, the beam of Tagawa et al. 2013. A closed surface: .obj, .stl, .ply, .off, "
-        ".glb, .vtp, one of the files above with triangles alone, a USD file with Mesh prims alone; or warp:bunny. "
-        "A segmented scan: .nii, .nii.gz, .mgz, .mha, .mhd, .nrrd, .vti, or a folder with a DICOM series. Or a run "
-        "that is written down, .toml",
+        help="what to simulate. A mesh with volume, whose other cells are split into tetrahedra: a USD file with a "
+        "TetMesh, or a Mesh with tetraIndices; .vtk, .vtu, .vtm, .msh of Gmsh, .inp of Abaqus, .mesh, .node, "
+        ".ele, .vol and others; warp:bear, a toy bear; or box, the beam of Tagawa et al. 2013. A closed "
+        "surface: .obj, .stl, .ply, .off, .glb, .vtp, a USD file with Mesh prims alone, one of the other "
+        "files with triangles alone; or warp:bunny. A segmented scan: .nii, .nii.gz, .mgz, .mha, .mhd, .nrrd, "
+        ".vti, or a folder with a DICOM series. Or a run file, .toml",
     )
     parser.add_argument(
         "-o", "--output", type=Path, metavar="OUT.usd", help="animation to write (.usd, .usdc or .usda)"
@@ -77,8 +90,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         action="append",
         metavar="OUT.pvd",
-        help="for ParaView, with displacement, velocity, strain and stress: .pvd or .xdmf of all frames, .vtu of the "
-        "last one; may be given several times",
+        help="also write for ParaView, with displacement, velocity, strain and stress: .pvd or .xdmf with all "
+        "frames, or .vtu with the last; can be given several times",
     )
 
     body = parser.add_argument_group("the body")
@@ -86,75 +99,77 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--unit",
         type=unit_of_length,
         metavar="LENGTH",
-        help="of the coordinates: mm, inch, 3.2cm, ... (default: what the file says; without that mm for what is 50 to "
-        "2500 long, and m)",
+        help="unit of the file's coordinates: mm, inch, 3.2cm, ... (default: the file's own; if it names none, mm "
+        "for what is 50 to 2500 long, else m)",
     )
     body.add_argument(
         "--join",
         action="store_true",
-        help="take all that is in the file as one body, and nodes of tetrahedra in the same place as one node "
-        "(default: closed surfaces, and prims, blocks and instances of tetrahedra, are bodies of their own)",
+        help="take everything in the file as one body, and merge nodes of tetrahedra that are in the same place "
+        "(default: closed surfaces, and prims, blocks and instances of tetrahedra, are separate bodies)",
     )
-    body.add_argument("--scale", type=float, metavar="S", help="factor on the coordinates, after their unit")
+    body.add_argument("--scale", type=number, metavar="S", help="multiply the coordinates by this, after --unit")
     body.add_argument(
         "--offset",
         type=metres,
         nargs=3,
         metavar=("DX", "DY", "DZ"),
-        help="move the body by so much before it begins [m], after --scale: places the bodies of a run file",
+        help="move the body by this much before the run starts [m], after --scale; this places the bodies of a run "
+        "file",
     )
     body.add_argument(
         "--up",
         type=str.upper,
         choices=("Y", "Z"),
         metavar="AXIS",
-        help="axis that points up, y or z (default: what the file says, or the habit of its format)",
+        help="axis that points up, y or z (default: the file's, or the convention of its format)",
     )
     body.add_argument(
         "--young",
         type=pressure,
         metavar="E",
-        help=f"Young's modulus [Pa] (default: {STIFFNESS_PER_WEIGHT:g} times density, gravity and height, with which "
-        "a body visibly sags and stands)",
+        help=f"Young's modulus [Pa] (default: {STIFFNESS_PER_WEIGHT:g} times density, gravity and height, so that a "
+        f"body sags visibly and stands)",
     )
-    body.add_argument("--poisson", type=float, metavar="NU", help="Poisson's ratio (default: 0.45)")
+    body.add_argument("--poisson", type=number, metavar="NU", help="Poisson's ratio (default: 0.45)")
     body.add_argument("--density", type=density, metavar="RHO", help="mass density [kg/m^3] (default: 1000)")
     body.add_argument(
         "--materials",
         metavar="LIST",
-        help="materials of regions, by physical groups, sets or cell data of the file, or by labels of a scan, as in "
-        "liver=3kPa:0.45,vessel@4=30kPa; what it does not name has --young, --poisson and --density",
+        help="materials of the file's regions (physical groups, sets or cell data) or of a scan's labels, as in "
+        "liver=3kPa:0.45,vessel@4=30kPa; everything else has --young, --poisson and --density",
     )
     body.add_argument(
-        "--regions-by", metavar="ARRAY", help="the file's array that numbers regions (default: the likeliest one)"
+        "--regions-by", metavar="ARRAY", help="array of the file that numbers its regions (default: the likeliest one)"
     )
     body.add_argument("--model", choices=MODELS, default="corotated", help="elastic model (default: corotated)")
     body.add_argument(
         "--rotation-level",
-        type=int,
+        type=rotation_level,
         metavar="L",
-        help="corotated box: take rotations from the tree's level L only (default: every element has its own)",
+        help="share rotations among elements, on the mesh of box, a surface or a scan: those of the tree's level "
+        "L; or, with auto or a tolerance in radians, where they are alike (default: each element has its own)",
     )
     body.add_argument(
         "--region",
         nargs=2,
         action="append",
         metavar=("PATCH", "VALUES"),
-        help="another material where a tetrahedron's middle is in a patch: YOUNG[:POISSON[:DENSITY]], such as "
-        "30kPa:0.45; may be given several times, the last one counts",
+        help="another material for the tetrahedra whose centre is in a patch: YOUNG[:POISSON[:DENSITY]], such as "
+        "30kPa:0.45; can be given several times; where patches overlap the last one counts",
     )
     body.add_argument(
         "--patch",
         action="append",
         metavar="NAME=EXPR",
-        help="a name for a patch; later ones may be made of it",
+        help="name a patch, for other options and for later patches",
     )
     body.add_argument(
         "--fix",
         action="append",
         metavar="PATCH",
-        help='nodes that are held, such as bottom or "z < 0.01", or none; may be given several times (default: what '
-        "the body stands on, if that carries it, else its largest flat region or a broad side)",
+        help='hold these nodes, such as bottom or "z < 0.01"; none holds nothing; can be given several times '
+        "(default: what the body stands on, if that carries it, else its largest flat region or a broad side)",
     )
 
     _add_organ_options(parser.add_argument_group("a body from a surface or a scan"))
@@ -165,7 +180,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=acceleration,
         nargs=3,
         metavar=("X", "Y", "Z"),
-        help="[m/s^2] (default: 9.81 down the up axis, z where a file names none)",
+        help="gravity [m/s^2] (default: 9.81 down the up axis, z where a file names none)",
     )
     add_load_options(motion)
     motion.add_argument("--damping", type=per_second, metavar="C", help="mass-proportional damping [1/s] (default: 2)")
@@ -177,12 +192,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "frequency w decays by S w^2 / 2 (default: 0)",
     )
     motion.add_argument("--duration", type=seconds, metavar="T", help="simulated time [s] (default: 4)")
-    motion.add_argument("--fps", type=float, default=FPS, metavar="F", help=f"frames per second (default: {FPS:g})")
+    motion.add_argument("--fps", type=number, default=FPS, metavar="F", help=f"frames per second (default: {FPS:g})")
     motion.add_argument(
         "--dt",
         type=seconds,
-        help="time step [s], shortened so that a whole number makes a frame (default: a safe one, found; with --remesh "
-        "it follows the mesh)",
+        help="time step [s], shortened so that a whole number of them makes a frame (default: the step follows the "
+        "state)",
     )
 
     add_remesh_options(parser.add_argument_group("a mesh that follows the motion, of box, surfaces and scans"))
@@ -193,68 +208,69 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--probe",
         action="append",
         metavar="POINT|PATCH",
-        help='what --csv tells of: "X Y Z" [m], or a patch; may be given several times',
+        help='record this point, "X Y Z" [m], or patch in --csv; can be given several times',
     )
     more.add_argument(
         "--csv",
         type=Path,
         metavar="FILE.csv",
-        help="displacement, velocity and reaction of each probe, and energies, in every frame",
+        help="write displacement, velocity and reaction of each probe, and the energies, of every frame",
     )
-    more.add_argument("--write-run", type=Path, metavar="RUN.toml", help="write down what is asked here")
-    parser.add_argument("--device", help='"cpu", "cuda:0", ... (default: a GPU if there is one)')
+    more.add_argument("--write-run", type=Path, metavar="RUN.toml", help="save what is asked here as a run file")
+    parser.add_argument("--device", help='where to compute: "cpu", "cuda:0", ... (default: a GPU if there is one)')
 
 
 def _add_organ_options(organ: argparse._ArgumentGroup) -> None:
     organ.add_argument(
         "--tets",
-        type=int,
+        type=whole_number,
         metavar="N",
-        help=f"at most so many tetrahedra, and nearly as many (default: {TETS}, unless --max-level or --surface-error "
-        "is given)",
+        help=f"largest number of tetrahedra, which the mesh comes close to (default: {TETS}, unless --max-level or "
+        f"--surface-error is given)",
     )
     organ.add_argument(
         "--min-layers",
-        type=float,
+        type=number,
         metavar="K",
-        help="so many tetrahedra through the thickness of thin parts, where --tets allows (default: 2)",
+        help="tetrahedra through the thickness of thin parts, where --tets allows (default: 2)",
     )
     organ.add_argument(
-        "--cell-size", type=metres, metavar="M", help="edge of the coarsest cubes [m] (default: by --tets)"
+        "--cell-size", type=metres, metavar="M", help="edge of the coarsest cubes [m] (default: chosen to suit --tets)"
     )
     organ.add_argument(
         "--max-level",
-        type=int,
+        type=whole_number,
         metavar="L",
-        help="how often cubes are bisected at most, three times halve the edge (default: as suits --tets; "
+        help=f"how often cubes are bisected at most; three times halve the edge (default: chosen to suit --tets; "
         f"{MAX_LEVEL_FOR_ERROR} with --surface-error)",
     )
     organ.add_argument(
         "--surface-error",
         type=metres,
         metavar="M",
-        help="how far the surface may be from the given one [m] (default: as near as the rest allows)",
+        help="largest distance of the mesh's surface from the input's [m] (default: as small as the other options "
+        "allow)",
     )
     organ.add_argument(
         "--labels",
         metavar="LIST",
-        help="of a scan: the labels that make the body and their materials, as in liver=3kPa:0.45,vessel@4=30kPa:0.45 "
-        "(default: all, of one material)",
+        help="of a scan: the labels that make up the body, and their materials, as in "
+        "liver=3kPa:0.45,vessel@4=30kPa:0.45 (default: all labels, one material)",
     )
     organ.add_argument(
-        "--smoothing", type=metres, metavar="M", help="take the steps of voxels off, over this length [m]"
+        "--smoothing", type=metres, metavar="M", help="smooth away the steps of voxels, over this length [m]"
     )
     organ.add_argument(
         "--threshold",
         type=value_range,
         metavar="LOW[:HIGH]",
-        help="of a scan that is not segmented: voxels of these values make the body, as in 200 or -200:300",
+        help="of a scan without labels: voxels with these values make up the body, as in 200 or -200:300",
     )
     organ.add_argument(
         "--skin",
         choices=("input", "marched"),
-        help="what is drawn of a surface: the given one with its texture coordinates, names and materials, or the one "
-        "that the tetrahedra hold (default: input)",
+        help="surface to draw: the input's own, with its texture coordinates, names and materials, or the one that "
+        "the tetrahedra hold (default: input)",
     )
-    organ.add_argument("--draw-tets", action="store_true", help="write the tetrahedra too, not the surface alone")
+    organ.add_argument("--draw-tets", action="store_true", help="write the tetrahedra as well as the surface")
     organ.add_argument("--draw-labels", action="store_true", help="write a closed surface for each label")

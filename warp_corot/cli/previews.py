@@ -45,12 +45,15 @@ FILM_SIZE, FILM_PIECES = (640, 540), 15_000
 
 def add_preview_options(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
-        "--preview", type=Path, metavar="FILE", help="also draw the last frame (.png), or a film of all (.gif, .mp4)"
+        "--preview",
+        type=Path,
+        metavar="FILE",
+        help="also draw the last frame (.png), or a film of all frames (.gif, .mp4)",
     )
     group.add_argument(
         "--preview-frames",
         metavar="LIST",
-        help="draw these frames of a .png side by side: numbers from 0, or from -1 at the end back, as in 0,12,-1",
+        help="draw these frames side by side into the .png, counted from 0, or back from -1, as in 0,12,-1",
     )
     group.add_argument(
         "--preview-views",

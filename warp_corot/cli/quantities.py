@@ -22,6 +22,35 @@ def quantity(unit: str) -> Callable[[str], float]:
     return parse
 
 
+def number(text: str) -> float:
+    """A number."""
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} must be a number, as in 0.45") from None
+
+
+def whole_number(text: str) -> int:
+    """A whole number, as in 20000 or 2e4."""
+    try:
+        value = float(text)
+        if value == int(value):
+            return int(text) if text.strip().lstrip("+-").isdecimal() else int(value)
+    except (ValueError, OverflowError):
+        pass
+    raise argparse.ArgumentTypeError(f"{text!r} must be a whole number, as in 20000 or 2e4")
+
+
+def rotation_level(text: str) -> int | float | str:
+    """A level of the tree, a tolerance [rad], or "auto"."""
+    if text == "auto":
+        return text
+    try:
+        return int(text)
+    except ValueError:
+        return number(text)
+
+
 pressure = quantity("Pa")
 density = quantity("kg/m^3")
 seconds = quantity("s")

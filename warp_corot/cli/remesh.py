@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 from warp_corot.errors import InputError
 from warp_corot.remesh.online import OnlineRemesh
 
+from .quantities import number, whole_number
+
 if TYPE_CHECKING:
     from warp_corot.io.write.animate import Recording
     from warp_corot.simulation.simulation import Simulation
@@ -37,29 +39,37 @@ def add_remesh_options(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument(
         "--refine-above",
-        type=float,
+        type=number,
         metavar="X",
-        help=f"length of an element's longest edge over its length at rest (default: {OnlineRemesh.refine_above:g})",
+        help=f"bisect elements whose longest edge is more than X times as long as at rest (default: "
+        f"{OnlineRemesh.refine_above:g})",
     )
     group.add_argument(
-        "--simplify-below", type=float, metavar="X", help=f"the same (default: {OnlineRemesh.simplify_below:g})"
+        "--simplify-below",
+        type=number,
+        metavar="X",
+        help=f"merge elements whose longest edge is less than X times as long as at rest (default: "
+        f"{OnlineRemesh.simplify_below:g})",
     )
     group.add_argument(
         "--remesh-levels",
-        type=int,
+        type=whole_number,
         nargs=2,
         metavar=("MIN", "MAX"),
-        help="how often cubes are bisected at least and at most (default: the coarsest level at first, and three more "
-        "than the finest)",
+        help="how often cubes are bisected at least and at most (default: from the coarsest level at the start to "
+        "three more than the finest)",
     )
     group.add_argument(
-        "--remesh-every", type=int, metavar="N", help=f"steps between looks (default: {OnlineRemesh.every})"
+        "--remesh-every",
+        type=whole_number,
+        metavar="N",
+        help=f"steps from one pass of remeshing to the next (default: {OnlineRemesh.every})",
     )
     group.add_argument(
         "--capacity",
-        type=int,
+        type=whole_number,
         metavar="N",
-        help="at most so many tetrahedra (default: four times those at first, or 100000)",
+        help="largest number of tetrahedra (default: four times the number at the start, or 100000)",
     )
 
 

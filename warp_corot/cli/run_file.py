@@ -16,13 +16,13 @@ from warp_corot.io.files.whole import written_whole
 from .loading import FORMS, Load, value_of
 from .parsing import StrictParser
 
-HELP = """a run may be written down: run.toml has the options' names for keys, lists for several values, and true for
-options without any; what the command line says in addition counts for all its bodies, paths are beside the file:
+HELP = """a run file (.toml) has the names of options for keys: several values are a list, and an option without a value is
+true. Options on the command line are added to all its bodies; paths are relative to the file:
   input = "liver.stl"
   unit = "mm"
   fix = ["bottom"]
   pull = [{ patch = "top", by = [0, 0, 0.02], times = [0, 1, 2], shares = [0, 1, 0] }]
-several bodies are tables [[body]], each with an input and options of its own"""
+several bodies are tables [[body]], each with an input and options of its own, such as offset = [0, 0, "5cm"]"""
 
 #: What paths of files are, which a run file has beside it.
 PATHS = ("input", "output", "also", "preview", "csv")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 from contextlib import AbstractContextManager, nullcontext
@@ -14,9 +15,13 @@ if TYPE_CHECKING:
 EXIT_CODES = """exit status:
   0    done
   1    a file could not be written, as when the disk is full
-  2    bad input, said in one line; nothing was simulated, no file touched
-  3    the state became not finite; the frames before are kept
+  2    the input or an option was wrong; nothing was simulated, no file was touched
+  3    the simulation became unstable; the frames before that are kept
   130  interrupted (Ctrl-C), 143 terminated (SIGTERM); the frames written are kept"""
+
+
+#: What Python's arguments are called that options have.
+ARGUMENTS = ("young", "poisson", "density", "dt", "damping", "viscosity", "scale", "duration", "fps", "rotation_level")
 
 
 class Terminated(KeyboardInterrupt):
@@ -26,6 +31,12 @@ class Terminated(KeyboardInterrupt):
 def interrupt_status(signalled: KeyboardInterrupt) -> int:
     """What a shell expects of a program that a signal has ended."""
     return 128 + (signal.SIGTERM if isinstance(signalled, Terminated) else signal.SIGINT)
+
+
+def as_option(message: str) -> str:
+    """A complaint of Python's about an argument, as one about the option of this name."""
+    message = re.sub(rf"^({'|'.join(ARGUMENTS)}) is ", lambda found: f"--{found[1].replace('_', '-')} is ", message)
+    return re.sub(r", or None$", "", message).replace("it must be None, a", "it must be a")
 
 
 def kept_so_far(done: Recording) -> str:

@@ -72,7 +72,7 @@ what is written, on top of OUT's sublayer INPUT, which must stay beside it unles
         metavar="E",
         help="Young's modulus [Pa] (default: 20 times the weight of a column as high as the body, over its area)",
     )
-    said.add_argument("--poisson", type=float, metavar="NU", help="Poisson's ratio (default: 0.45)")
+    said.add_argument("--poisson", type=quantities.number, metavar="NU", help="Poisson's ratio (default: 0.45)")
     said.add_argument("--density", type=quantities.density, metavar="RHO", help="[kg/m^3] (default: 1000)")
     said.add_argument(
         "--ground",
@@ -122,7 +122,10 @@ what is written, on top of OUT's sublayer INPUT, which must stay beside it unles
         help=f"simulated time [s] (default: {DURATION:g})",
     )
     motion.add_argument(
-        "--fps", type=float, metavar="F", help="frames per second (default: the stage's time codes per second, else 24)"
+        "--fps",
+        type=quantities.number,
+        metavar="F",
+        help="frames per second (default: the stage's time codes per second, else 24)",
     )
     motion.add_argument("--dt", type=quantities.seconds, help="longest time step [s] (default: a safe one, found)")
     motion.add_argument(

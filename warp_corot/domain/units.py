@@ -10,7 +10,27 @@ from typing import Any
 import numpy as np
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.likely import meant
 
+#: Units that somebody may have meant.
+USUAL = (
+    "Pa",
+    "kPa",
+    "MPa",
+    "GPa",
+    "mmHg",
+    "kg/m^3",
+    "g/cm^3",
+    "s",
+    "ms",
+    "min",
+    "mm",
+    "cm",
+    "m",
+    "inch",
+    "m/s^2",
+    "1/s",
+)
 #: Metres in a unit.
 UNITS = {"m": 1.0, "cm": 1.0e-2, "mm": 1.0e-3}
 #: What a number looks like at the beginning of a quantity.
@@ -83,7 +103,7 @@ def _factor(words: str, unit: str, given: str) -> float:
     except pint.DimensionalityError:
         raise InputError(f"{given.strip()!r}: {words!r} is no unit like {unit}") from None
     except Exception:
-        raise InputError(f"{given.strip()!r}: the unit {words!r} is not known") from None
+        raise InputError(f"{given.strip()!r}: the unit {words!r} is not known{meant(words, USUAL)}") from None
 
 
 @functools.cache

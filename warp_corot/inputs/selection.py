@@ -15,6 +15,8 @@ import numpy.typing as npt
 
 from warp_corot.errors import InputError
 
+from .likely import meant
+
 CONSTANTS: dict[str, float | bool] = {"pi": math.pi, "all": True, "none": False}
 
 #: Functions by name, with the least and the largest number of arguments (None: any).
@@ -141,8 +143,8 @@ class _Evaluation:
                 return self._constant(node, value)
             case ast.Name(id=name):
                 if name not in names:
-                    known = [*(known for known in names if known != _PLACES), *(self.named.keys() - names.keys())]
-                    raise self._error(f"{name!r} is not known; names are {', '.join(known)}")
+                    known = sorted({*names, *self.named} - {_PLACES})
+                    raise self._error(f"{name!r} is not known{meant(name, known)}; names are {', '.join(known)}")
                 return names[name]
             case ast.UnaryOp(op=ast.Not() | ast.Invert(), operand=operand):
                 return ~self._truth(operand, names, count)

@@ -67,12 +67,23 @@ def _series(folder: Path) -> dict[str, NDArray[Any]] | None:
     return _arrays(image, notes)
 
 
+def _may_be_slice(path: Path) -> bool:
+    """Whether a file may be DICOM, by its mark or its extension. GDCM takes long for files that are something else."""
+    if path.suffix.lower() in ("", ".dcm", ".dicom", ".ima") or path.suffix[1:].isdecimal():
+        return True
+    try:
+        with path.open("rb") as file:
+            return file.read(132)[128:] == b"DICM"
+    except OSError:
+        return False
+
+
 def _all_series(folder: Path) -> list[tuple[str, ...]]:
     found = []
     for count, (below, _, files) in enumerate(os.walk(folder)):
         if count >= MOST_FOLDERS:
             break
-        if not files:
+        if not any(_may_be_slice(Path(below) / name) for name in files):
             continue
         for name in SimpleITK.ImageSeriesReader.GetGDCMSeriesIDs(below):
             found.append(SimpleITK.ImageSeriesReader.GetGDCMSeriesFileNames(below, name))

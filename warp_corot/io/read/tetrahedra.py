@@ -24,7 +24,7 @@ SURFACE_SUFFIXES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf")
 #: The formats of meshes that messages name.
 USUAL = (".msh", ".vtk", ".vtu", ".inp", ".mesh", ".node")
 #: How the note of cells that have been split ends.
-SPLIT = "are split into tetrahedra"
+SPLIT = "split into tetrahedra"
 #: Arrays that number parts of a file that share no nodes.
 OBJECTS = ("block", "instance")
 
@@ -203,8 +203,9 @@ def _of_file(path: Path, regions: str | None, found: FileMesh | None) -> LoadedM
         if block.kind in others:
             others[block.kind] += len(block.nodes)
     if others:
-        said = ", ".join(f"{count} {kind}{'s' if kind != 'hexahedron' else ''}" for kind, count in others.items())
-        notes.append(f"{said.replace('hexahedron', 'hexahedra')} {SPLIT}")
+        plurals = {"hexahedron": "hexahedra", "wedge": "wedges", "pyramid": "pyramids"}
+        said = ", ".join(f"{count} {kind if count == 1 else plurals[kind]}" for kind, count in others.items())
+        notes.append(f"{said} {'are' if sum(others.values()) > 1 else 'is'} {SPLIT}")
     if warped:
         notes.append(f"{warped} cells are so warped that their tetrahedra overlap or leave gaps")
     try:
