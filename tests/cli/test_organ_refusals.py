@@ -64,6 +64,7 @@ REFUSED = [
     (["organ.obj", "--max-level", "99"], "--max-level is 99"),
     (["organ.obj", "--surface-error", "-1"], "--surface-error is -1"),
     (["organ.obj", "--fix", "all", "--tets", "500"], "expression 'all': holds all"),
+    (["organ.obj", "--tets", "10", "--cell-size", "1mm"], "--cell-size is 0.001 m, of which the body's box has"),
     (["organ.obj", "--rotation-level", "-1"], "--rotation-level is -1"),
     (["scan.nii.gz", "--labels", "liver"], "--labels 'liver': it must be NAME"),
     (["scan.nii.gz", "--labels", ""], "--labels '': it must be NAME"),

@@ -36,6 +36,8 @@ TETS_PER_CUBE = 30
 MAX_LEVEL_FOR_ERROR, DETAIL = 12, 6
 #: Root cubes reach beyond the body by this share of its length.
 MARGIN = 1.0e-3
+#: With more root cubes in the body's box for each tetrahedron that is allowed, no body fits.
+CUBES_PER_TET = 1000
 #: What Python's arguments are called on the command line.
 ARGUMENTS = {
     "unit": "--unit",
@@ -152,6 +154,8 @@ def _mesh(args: argparse.Namespace, domain: Domain) -> TetForest:
             size = float(np.ptp(domain.bounds, axis=0).max()) * (1.0 + MARGIN) / cubes
         if level is None:
             level = MAX_LEVEL_FOR_ERROR
+    elif size is not None and size > 0.0:
+        _check_cubes(domain, size, count)
     layers = {} if args.min_layers is None else {"min_layers": args.min_layers}
     try:
         return TetForest.from_domain(
@@ -168,6 +172,20 @@ def _mesh(args: argparse.Namespace, domain: Domain) -> TetForest:
         unsaid = count is not None and count >= 1 and args.surface_error is None and "target_elements" not in str(error)
         with_tets = f"with --tets {count}, " if unsaid else ""
         raise InputError(f"{with_tets}{error}") from None
+
+
+def _check_cubes(domain: Domain, size: float, count: int) -> None:
+    """See that cubes of a size [m] are not hopelessly many for a number of tetrahedra.
+
+    Raises:
+        InputError: They are.
+    """
+    cubes = float(np.prod(np.ceil(np.ptp(domain.bounds, axis=0) / size)))
+    if cubes > CUBES_PER_TET * max(count, 1):
+        raise InputError(
+            f"cell_size is {size:g} m, of which the body's box has {cubes:.3g} cubes; --tets {count} is too few for "
+            "them: take a larger --cell-size or more tetrahedra"
+        )
 
 
 def _own_surface(opened: Opened, args: argparse.Namespace, domain: Domain) -> OwnSurface | None:

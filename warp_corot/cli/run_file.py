@@ -16,7 +16,7 @@ from warp_corot.io.files.whole import written_whole
 from .loading import FORMS, Load, value_of
 from .parsing import StrictParser
 
-HELP = """a run file (.toml) has the names of options for keys: several values are a list, and an option without a value is
+HELP = """a run file (.toml) has the names of options for keys: several values are a list, an option without a value is
 true. Options on the command line are added to all its bodies; paths are relative to the file:
   input = "liver.stl"
   unit = "mm"
