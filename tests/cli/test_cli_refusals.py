@@ -56,7 +56,7 @@ REFUSED = [
     (["box", "--model", "rigid"], "invalid choice: 'rigid'"),
     (["box", "--model", "linear", "--rotation-level", "2"], "--rotation-level is 2"),
     (["box", "--rotation-level", "-1"], "--rotation-level is -1; it must be a whole number"),
-    (["good.vtk", "--rotation-level", "1"], "needs a forest"),
+    (["good.vtk", "--rotation-level", "1"], "--rotation-level is for box, surfaces and scans, and good.vtk is not one"),
     (["box", "--scale", "0"], "scale is 0"),
     (["good.vtk", "--scale", "nan"], "scale is nan"),
     (["box", "--gravity", "0", "nan", "0"], "gravity is"),
