@@ -1,0 +1,95 @@
+"""What damaged files do to other libraries, and numbers in them that do not fit: one line each."""
+
+import json
+
+import numpy as np
+import pytest
+from fuzz_seeds import SEEDS
+
+import warp_corot as wc
+from warp_corot.cli import main
+from warp_corot.domain import Domain
+from warp_corot.domain.closing import close_surface
+from warp_corot.errors import InputError
+from warp_corot.io.files import usd as usd_files
+from warp_corot.io.read.filemesh import FileMesh, Unreadable
+from warp_corot.io.read.volumes import load_volume
+
+
+def test_a_binary_stage_is_tried_elsewhere_first(tmp_path, monkeypatch):
+    """Once for each file as it is; one on which OpenUSD crashes is not opened here. Text is not tried."""
+    path, tried = SEEDS["usdc-tets"](tmp_path), []
+    real = usd_files.read_isolated
+    monkeypatch.setattr(usd_files, "read_isolated", lambda *given: tried.append(given) or real(*given))
+    for _ in range(2):
+        assert len(wc.TetMesh.load(path).tets) == 2
+    assert len(tried) == 1
+    (tmp_path / "text").mkdir()
+    assert len(wc.TetMesh.load(SEEDS["usda-tets"](tmp_path / "text")).tets) == 2
+    assert len(tried) == 1
+    monkeypatch.setattr(usd_files, "read_isolated", lambda *_: (None, "it crashed (SIGSEGV)"))
+    path.write_bytes(path.read_bytes() + b"\0")
+    with pytest.raises(InputError, match=r"seed\.usdc: is not a USD file that OpenUSD can open \(it crashed"):
+        wc.TetMesh.load(path)
+
+
+def test_a_series_without_one_of_its_slices(tmp_path):
+    pytest.importorskip("SimpleITK")
+    folder = SEEDS["dicom"](tmp_path)
+    assert not any("unevenly" in note for note in load_volume(folder).notes)
+    (folder / "4.dcm").unlink()
+    volume = load_volume(folder)
+    assert "slices are missing or unevenly spaced, by up to 4 mm" in volume.notes
+    assert volume.values.shape == (10, 10, 9)
+
+
+def test_a_scan_with_a_unit_that_there_is_not_and_one_without_voxels(tmp_path):
+    nibabel = pytest.importorskip("nibabel")
+    path = SEEDS["nii"](tmp_path)
+    data = bytearray(path.read_bytes())
+    data[123] = 7
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="the file names no unit"):
+        Domain.from_labels(path)
+    nibabel.save(nibabel.Nifti1Image(np.zeros((0, 3, 3), np.uint8), np.eye(4)), tmp_path / "empty.nii")
+    with pytest.raises(InputError, match=r"empty\.nii: has no voxels"):
+        load_volume(tmp_path / "empty.nii")
+
+
+@pytest.mark.parametrize("points", [np.zeros((5, 2)), np.zeros(5), np.array(0.0)])
+def test_points_without_three_coordinates(points):
+    with pytest.raises(Unreadable, match="its points have the shape"):
+        FileMesh(points, [])
+
+
+def test_triangles_whose_areas_are_too_small_for_a_number():
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    with pytest.raises(InputError, match="has an area"):
+        close_surface(1e-200 * corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
+
+
+def test_two_dashes_are_no_value(tmp_path, capsys):
+    for command in (["paper", f"--output={tmp_path}/out", "--device=--"], ["simulate", "box", "--output=--"]):
+        with pytest.raises(SystemExit) as left:
+            main(command)
+        assert left.value.code == 2
+        assert "'--' is not a value" in capsys.readouterr().err
+    (tmp_path / "run.toml").write_text('input = "box"\nyoung = "--"\n')
+    assert main(["simulate", str(tmp_path / "run.toml"), "-o", str(tmp_path / "out.usd")]) == 2
+    assert "'--' is not a value" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("leaf_tets.0", 1 << 30), ("leaves.0", -1), ("code.0", 1 << 30), ("level.0", 99), ("counts", 999)],
+)
+def test_places_beyond_the_ends_of_a_changing_mesh(tmp_path, name, value):
+    """Kernels do not look whether there are such."""
+    path = SEEDS["checkpoint-remesh"](tmp_path)
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    assert json.loads(arrays["header"].tobytes())["bodies"][0]["remesh"]
+    arrays[f"body0.remesh.present.{name}"].reshape(-1)[0] = value
+    np.savez(path, **arrays)
+    with pytest.raises(InputError, match="is not a whole checkpoint"):
+        wc.Simulation.load(path, device="cpu")
