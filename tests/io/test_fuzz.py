@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 SCRIPT = Path(fuzzing.__file__)
-FEW, MANY = 150, 10_000
+FEW, MANY = 100, 10_000
 #: In whose place another format stands in the short run: it has the same reader.
 LONG_ONLY = {
     *("ply-text", "off", "stl-text", "usdz", "usda-tets", "scene", "nii", "mgh", "nrrd-gz", "mhd", "checkpoint"),

@@ -75,7 +75,7 @@ def _ball(suffix: str, level: int = 1, **options) -> Callable[[Path], Path]:
 
 def _objects(folder: Path) -> Path:
     """Two balls, one of them turned and moved, in a file with texture coordinates and a material beside it."""
-    ball = _ball(".obj")(folder)
+    ball = _ball(".obj", 0)(folder)
     lines = [line for line in ball.read_text().splitlines() if line.startswith(("v ", "f "))]
     places = [line for line in lines if line.startswith("v ")]
     faces = [line.split()[1:] for line in lines if line.startswith("f ")]

@@ -329,7 +329,7 @@ class Cases:
             if broken:
                 path.write_bytes(damaged(self.good[path], rng))
         making.clear()
-        if number % MESHED_EVERY == 0 or (self.form in ("options", "run") and number % MADE_EVERY == 0):
+        if number % MESHED_EVERY == MESHED_EVERY - 1 or (self.form in ("options", "run") and number % MADE_EVERY == 0):
             making.add("meshes")
         if number % HELD_EVERY == 0:
             making.add("holds")
