@@ -265,7 +265,7 @@ def wrong_with(command: list[str], folder: Path) -> str | None:
         return None if not errors else f"a body in spite of {errors}"
     if outcome != 2 or len(errors) != 1:
         return f"status {outcome}, {said[:5]}"
-    own = errors[0].replace(LONG_WORD, "")
+    own = errors[0].lower().replace(LONG_WORD, "")
     return None if len(own) < 600 else f"a line of {len(own)} characters, beside what was typed: {errors[0]}"
 
 
