@@ -175,8 +175,8 @@ class _Growing:
         while error > least and (share := judge.holding() / enough.elements) < 1.0:
             error = max(error * min(max(share, STEEPEST), FLATTEST), least)
             self.lower(error)
-        if error > least:
-            self.lower(max(min(enough.finer * share, 1.0) * error, least))
+        if error > least and enough.finer < 1.0:
+            self.lower(max(enough.finer * error, least))
 
     def lower(self, error: float) -> None:
         """Bisect what is off by more than a smaller error than before, and what comes of it."""

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_corot.mesh.surfaces.bound import SurfaceMesh
+from warp_corot.mesh.surfaces.creases import sharpened
 from warp_corot.mesh.surfaces.marching import marched
 from warp_corot.mesh.surfaces.separating import separated
 
 if TYPE_CHECKING:
+    from warp_corot.domain import Domain
     from warp_corot.mesh.forest import TetForest
 
 
@@ -24,12 +26,14 @@ class Detail:
         tets: int32 [k, 4].
         phi: The body's signed function at the points [m], float32 [n].
         labels: Of the points, those outside that of the nearest part, int32 [n]; None: no labels.
+        sharp: The body's surface with its edges and corners, bound to nothing; None: the marched one is drawn.
     """
 
     points: np.ndarray
     tets: np.ndarray
     phi: np.ndarray
     labels: np.ndarray | None = None
+    sharp: SurfaceMesh | None = None
 
     @classmethod
     def of(cls, points: np.ndarray, tets: np.ndarray, phi: np.ndarray, labels: np.ndarray | None) -> Detail:
@@ -40,6 +44,8 @@ class Detail:
 
     def surface(self, forest: TetForest) -> SurfaceMesh:
         """The body's surface, bound to the nodes of a forest."""
+        if self.sharp is not None:
+            return _bound(forest, self.sharp)
         return _bound(forest, marched(self.points, self._across(self.phi < 0), self.phi))
 
     def separating_surface(self, forest: TetForest) -> SurfaceMesh:
@@ -47,8 +53,12 @@ class Detail:
         assert self.labels is not None
         return _bound(forest, separated(self.points, self.tets, self.phi, self.labels))
 
+    def sharpened(self, domain: Domain) -> Detail:
+        """With the edges and corners of the body."""
+        return replace(self, sharp=sharpened(self.points, self._across(self.phi < 0), self.phi, domain))
+
     def within(self, forest: TetForest, kept: np.ndarray) -> Detail:
-        """What of it is in elements, or nearest to them, that are in a mask bool [T]."""
+        """What of it is in elements, or nearest to them, that are in a mask bool [T]; its surface is the marched one."""
         stays = kept[forest.embed(self.points[self.tets].mean(axis=1))[0]]
         return Detail.of(self.points, self.tets[stays], self.phi, self.labels)
 

@@ -183,7 +183,7 @@ def _detail(resolved: Resolved, child: np.ndarray, domain: Domain) -> Detail:
     wanted = (grown.phi[tets] < 0).any(axis=1)
     if not domain.label_names:
         tets = tets[wanted & (grown.phi[tets] >= 0).any(axis=1)]
-        return Detail.of(_points(resolved, slice(None)), tets, grown.phi, None)
+        return Detail.of(_points(resolved, slice(None)), tets, grown.phi, None).sharpened(domain)
     tets = tets[wanted]
     labels = _labels_of_nodes(resolved, tets, domain)
     own = labels[tets]

@@ -97,3 +97,48 @@ def _without_flat(triangles: Array, at_node: Array) -> Array:
         return triangles
     _, which, count = np.unique(np.sort(triangles[whole], axis=1), axis=0, return_inverse=True, return_counts=True)
     return np.delete(triangles, whole[count[which.ravel()] == 2], axis=0)
+
+
+def crossing_polygons(points: Array, tets: Array, values: Array) -> tuple[Array, Array, Array]:
+    """The polygons in which a surface crosses elements, from which `plain_triangles` are made.
+
+    Args:
+        points, tets, values: As for `marched`.
+
+    Returns:
+        The two ends of the edge that each vertex is on, the inner one first, or the same node twice [V, 2]; vertices of
+        the polygons in order, of triangles the last one twice [P, 4]; the element of each polygon [P].
+    """
+    code = codes(values[tets] < 0)
+    cut = np.flatnonzero((code > 0) & (code < 15))
+    code, mirrored = code[cut], signed_volumes(points, tets[cut]) < 0
+    corners, cells = [], []
+    for kind in range(1, 15):
+        chosen = np.flatnonzero(code == kind)
+        faces = TRIANGLES[kind]
+        # The second triangle of a quadrangle adds its last vertex; of one that is turned round, its first.
+        order = [*faces[0], faces[0][2]] if len(faces) == 1 else _quadrangle(faces)
+        ends = tets[cut[chosen]][:, np.array(order)]
+        turned = mirrored[chosen]
+        ends[turned] = ends[turned][:, ::-1]
+        corners.append(ends)
+        cells.append(cut[chosen])
+    pairs = np.concatenate(corners).reshape(-1, 2).astype(np.int64)
+    at_node = values[pairs[:, 1]] == 0
+    pairs[at_node, 0] = pairs[at_node, 1]
+    keys, place = np.unique(pairs[:, 0] << 32 | pairs[:, 1], return_inverse=True)
+    return np.stack([keys >> 32, keys & 0xFFFFFFFF], axis=1), place.reshape(-1, 4), np.concatenate(cells)
+
+
+def _quadrangle(faces: list[list[tuple[int, int]]]) -> list[tuple[int, int]]:
+    """The vertices of two triangles with a common edge, in order."""
+    first, second = faces
+    (alone,) = [vertex for vertex in second if vertex not in first]
+    place = next(n for n in range(3) if first[n] in second and first[(n + 1) % 3] in second)
+    return [*first[: place + 1], alone, *first[place + 1 :]]
+
+
+def plain_triangles(polygons: Array, ends: Array) -> Array:
+    """Two triangles for each polygon [P, 4], without those that have no area [F, 3]."""
+    triangles = np.concatenate([polygons[:, [0, 1, 2]], polygons[:, [0, 2, 3]]])
+    return _without_flat(triangles, ends[:, 0] == ends[:, 1])

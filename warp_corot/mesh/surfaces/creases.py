@@ -1,0 +1,139 @@
+"""Marched surfaces with the body's own edges and corners (Kobbelt, Botsch, Schwanecke and Seidel 2001, *Feature
+sensitive surface extraction from volume data*).
+
+A vertex of marching tetrahedra sits where the body's surface crosses an edge of an element. Where its normals at the
+vertices of one element's polygon differ by more than an angle, a crease goes through the element: a vertex is put where
+the tangent planes meet, and edges between two elements with such vertices are turned so that they follow the crease.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .bound import SurfaceMesh
+from .marching import crossing_polygons, plain_triangles
+
+if TYPE_CHECKING:
+    from warp_corot.domain import Domain
+
+Array = np.ndarray
+
+#: Normals that differ by more than this make a crease [°].
+ANGLE = 30.0
+#: Polygons whose middle is nearer to the surface than this share of their size have no crease.
+NEAR = 5.0e-3
+#: Crossings of edges are sought in so many steps; normals come from differences over this share of a polygon's size.
+STEPS, APART = 6, 0.02
+#: Directions in which planes that meet hardly differ are left alone: singular values below this share of the largest.
+RANK = 0.15
+#: How far outside its element a vertex may be, as a barycentric coordinate, and how much nearer to the surface than the
+#: polygon's middle it must be.
+OUTSIDE, NEARER = -0.2, 0.5
+#: How far along a crease from a polygon's middle a vertex may be, over its size; the middle counts first.
+SLIDES = np.array(sorted(np.linspace(-1.5, 1.5, 31), key=abs))
+#: Four directions whose differences give a gradient.
+_AROUND = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]]) / np.sqrt(3.0)
+
+
+def sharpened(points: Array, tets: Array, values: Array, domain: Domain) -> SurfaceMesh:
+    """The surface of a body in tetrahedra that hold all of it, bound to nothing yet.
+
+    Args:
+        points: Positions of the nodes [m], float64 [n, 3].
+        tets: Nodes of the elements, int32 [T, 4].
+        values: Signed function at the nodes, negative inside [n].
+        domain: The body.
+    """
+    ends, polygons, cells = crossing_polygons(points, tets, values)
+    x = _crossings(points, ends, values, domain)
+    whole = (ends[:, 0] != ends[:, 1])[polygons].all(axis=1)
+    chosen, apexes = _apexes(x, polygons, whole, points[tets[cells]], domain)
+    triangles = plain_triangles(np.delete(polygons, chosen, axis=0), ends)
+    numbers = len(x) + np.arange(len(chosen))
+    x = np.concatenate([x, apexes])
+    triangles = np.concatenate([triangles, _fans(x, polygons[chosen], numbers, domain)])
+    used, corners = np.unique(triangles, return_inverse=True)
+    nothing = np.zeros((len(used), 4))
+    return SurfaceMesh(x[used], nothing.astype(np.int32), nothing, corners.reshape(-1, 3).astype(np.int32))
+
+
+def _phi(domain: Domain, points: Array) -> Array:
+    return np.asarray(domain.phi(points.reshape(-1, 3)), np.float64).reshape(points.shape[:-1])
+
+
+def _crossings(points: Array, ends: Array, values: Array, domain: Domain) -> Array:
+    """Where the surface crosses edges from a node inside to one outside, by false position (Illinois)."""
+    a, along = points[ends[:, 0]], points[ends[:, 1]] - points[ends[:, 0]]
+    low, high = np.zeros(len(ends)), np.ones(len(ends))
+    below, above = values[ends[:, 0]].astype(np.float64), values[ends[:, 1]].astype(np.float64)
+    share = np.zeros(len(ends))
+    going = np.flatnonzero(ends[:, 0] != ends[:, 1])
+    for _ in range(STEPS):
+        b, c = below[going], above[going]
+        share[going] = low[going] + (high[going] - low[going]) * b / np.minimum(b - c, -1e-300)
+        found = _phi(domain, a[going] + share[going, None] * along[going])
+        inside = found < 0.0
+        inner, outer = going[inside], going[~inside]
+        low[inner], below[inner] = share[inner], found[inside]
+        above[inner] *= 0.5
+        high[outer], above[outer] = share[outer], found[~inside]
+        below[outer] *= 0.5
+    return a + share[:, None] * along
+
+
+def _apexes(x: Array, polygons: Array, whole: Array, corners: Array, domain: Domain) -> tuple[Array, Array]:
+    """Polygons through which a crease goes, indices [m], and where the tangent planes at their vertices meet [m, 3]."""
+    at = x[polygons]
+    middle = at.mean(axis=1)
+    size = np.linalg.norm(at - middle[:, None], axis=2).max(axis=1)
+    off = np.abs(_phi(domain, middle))
+    chosen = np.flatnonzero(whole & (off > NEAR * size))
+    if not len(chosen):
+        return chosen, np.empty((0, 3))
+    at, middle, size, off = at[chosen], middle[chosen], size[chosen], off[chosen]
+    around = at[:, :, None] + APART * size[:, None, None, None] * _AROUND
+    normals = _phi(domain, around) @ _AROUND
+    normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-300)
+    cosines = np.einsum("pic,pjc->pij", normals, normals).min(axis=(1, 2))
+    heights = np.einsum("pic,pic->pi", normals, at - middle[:, None])
+    u, s, v = np.linalg.svd(normals, full_matrices=False)
+    inverse = np.where(s > RANK * s[:, :1], 1.0 / np.maximum(s, 1e-300), 0.0)
+    apexes = middle + np.einsum("pkc,pk,pik,pi->pc", v, inverse, u, heights)
+    straight = s[:, 2] <= RANK * s[:, 0]
+    apexes, inside = _slid(apexes, np.where(straight, size, 0.0)[:, None] * v[:, 2], corners[chosen])
+    good = (inside > OUTSIDE) & (cosines < np.cos(np.radians(ANGLE))) & (np.abs(_phi(domain, apexes)) < NEARER * off)
+    return chosen[good], apexes[good]
+
+
+def _slid(points: Array, along: Array, corners: Array) -> tuple[Array, Array]:
+    """Points moved to and fro along lines to where they are farthest inside elements, and how far: the least of their
+    barycentric coordinates there."""
+    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    sides = np.stack([points - corners[:, 0], along], axis=2)
+    later = np.linalg.solve(edges, sides)
+    start, rise = (np.column_stack([k - later[:, :, n].sum(axis=1), later[:, :, n]]) for n, k in ((0, 1.0), (1, 0.0)))
+    inside = (start[:, None] + SLIDES[:, None] * rise[:, None]).min(axis=2)
+    best = np.argmax(inside, axis=1)
+    return points + SLIDES[best, None] * along, inside[np.arange(len(best)), best]
+
+
+def _fans(x: Array, polygons: Array, apexes: Array, domain: Domain) -> Array:
+    """Triangles from apexes to the edges of their polygons; edges between two are turned where that is nearer."""
+    after = np.roll(polygons, -1, axis=1)
+    fans = np.stack([np.repeat(apexes, polygons.shape[1]), polygons.ravel(), after.ravel()], axis=1)
+    fans = fans[fans[:, 1] != fans[:, 2]]
+    if not len(fans):
+        return fans
+    low, high = fans[:, 1:].min(axis=1), fans[:, 1:].max(axis=1)
+    order = np.lexsort((high, low))
+    same = (low[order[1:]] == low[order[:-1]]) & (high[order[1:]] == high[order[:-1]])
+    one, other = order[:-1][same], order[1:][same]
+    now = np.abs(_phi(domain, x[fans[one, 1:]].mean(axis=1)))
+    then = np.abs(_phi(domain, 0.5 * (x[fans[one, 0]] + x[fans[other, 0]])))
+    one, other = one[then < now], other[then < now]
+    apex, apex_other, start, end = fans[one, 0], fans[other, 0], fans[one, 1], fans[one, 2]
+    fans[one] = np.stack([apex, start, apex_other], axis=1)
+    fans[other] = np.stack([apex_other, end, apex], axis=1)
+    return fans
