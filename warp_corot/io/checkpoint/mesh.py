@@ -61,7 +61,7 @@ def unpack_mesh(described: dict[str, Any], prefix: str, arrays: dict[str, np.nda
     a, b, c = described["origin"]
     lattice, ends = arrays[prefix + "lattice"], arrays[prefix + "node_ends"]
     _check_tree(tree, lattice, ends)
-    detail = {name: arrays[key] for name in DETAIL if (key := f"{prefix}detail.{name}") in arrays}
+    detail: dict[str, Any] = {name: arrays[key] for name in DETAIL if (key := f"{prefix}detail.{name}") in arrays}
     of_domain: dict[str, Any] = {name: arrays[f"{prefix}domain.{name}"] for name in described["of_domain"]}
     names = tuple(described["label_names"])
     up_axis = described["up_axis"]

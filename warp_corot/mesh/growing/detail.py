@@ -58,7 +58,7 @@ class Detail:
         return replace(self, sharp=sharpened(self.points, self._across(self.phi < 0), self.phi, domain))
 
     def within(self, forest: TetForest, kept: np.ndarray) -> Detail:
-        """What of it is in elements, or nearest to them, that are in a mask bool [T]; its surface is the marched one."""
+        """The part in elements of a mask bool [T], or nearest to them; its surface is the marched one."""
         stays = kept[forest.embed(self.points[self.tets].mean(axis=1))[0]]
         return Detail.of(self.points, self.tets[stays], self.phi, self.labels)
 
