@@ -13,20 +13,12 @@ from warp_corot.kernels.corotated.anisotropic import (
     vec9,
 )
 from warp_corot.kernels.corotated.definite import definite_law, definite_strain, is_definite, load_axes
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.math.rotation import ITERATIONS, byers_xu, column, identity3, newton_rotation
 
 from .elements import number_of
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.struct
-class IsotropicMaterial:
-    """Lamé's parameters, arrays of one entry (stride 0) or one per element (stride 1)."""
-
-    mu: wp.array[wp.float32]
-    lam: wp.array[wp.float32]
-    stride: int
 
 
 @wp.struct

@@ -13,13 +13,13 @@ import functools
 
 import warp as wp
 
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.elements import ADD_FORCE
 from warp_corot.kernels.stepping.block import LOAD, STORE, number_in, synchronize_block
 from warp_corot.kernels.tables.block_layout import NUMBERS
 from warp_corot.kernels.tables.cluster_layout import DEFAULT_LAYOUT, QUAD_BYTES, ClusterLayout
 
 from .elements import AlignedElements, element_forces, element_gradient, material_scale, number_of, shape_word
-from .laws import IsotropicMaterial
 
 wp.set_module_options({"enable_backward": False})
 

@@ -1,9 +1,11 @@
-"""Constitutive laws, one set of functions each: first Piola-Kirchhoff stress, energy density, a stress to be shown.
+"""Constitutive laws, one set of functions each: first Piola-Kirchhoff stress and its differential, energy density, a
+stress to be shown.
 
 A law takes the displacement gradient A of an element in an orthonormal frame of its own, so that F = I + A there, and
 returns P in the same frame: materials are isotropic, so any frame will do, a left-handed one too. ``elements`` gives
 G = (du/dX) Q, and A = Q^T G. ``cauchy`` functions return a tensor with the invariants of the Cauchy stress, for von
-Mises stress and the like. Stresses in Pa, energy densities in J/m^3.
+Mises stress and the like. ``differential`` functions return dP, the exact directional derivative of P at A in the
+direction dA, which has the digits of dA. Stresses in Pa, energy densities in J/m^3.
 
 No law subtracts numbers near one: each is written in A, so that its stress has float32's digits at any strain.
 """
@@ -12,6 +14,7 @@ import math
 
 import warp as wp
 
+from warp_corot.kernels.math.matrices import cofactor_differential
 from warp_corot.kernels.math.rotation import cofactor, column, identity3, reciprocal
 
 wp.set_module_options({"enable_backward": False})
@@ -22,6 +25,15 @@ _LOG = math.log(CONTINUED_BELOW)
 
 J0 = wp.constant(CONTINUED_BELOW)
 LOG_J0 = wp.constant(_LOG)
+
+
+@wp.struct
+class IsotropicMaterial:
+    """Lamé's parameters, arrays of one entry (stride 0) or one per element (stride 1)."""
+
+    mu: wp.array[wp.float32]
+    lam: wp.array[wp.float32]
+    stride: int
 
 
 @wp.func
@@ -49,6 +61,11 @@ def linear_stress(a: wp.mat33, mu: float, lam: float):
 
 
 @wp.func
+def linear_differential(a: wp.mat33, da: wp.mat33, mu: float, lam: float):
+    return hooke(symmetric(da), mu, lam)
+
+
+@wp.func
 def linear_energy(a: wp.mat33, mu: float, lam: float):
     return hooke_energy(symmetric(a), mu, lam)
 
@@ -70,6 +87,13 @@ def green_strain(a: wp.mat33):
 @wp.func
 def stvk_stress(a: wp.mat33, mu: float, lam: float):
     return (identity3() + a) * hooke(green_strain(a), mu, lam)
+
+
+@wp.func
+def stvk_differential(a: wp.mat33, da: wp.mat33, mu: float, lam: float):
+    """dP = dF S + F dS of P = F S; dS is Hooke's of dE = sym(F^T dF)."""
+    d_strain = symmetric(da + wp.transpose(a) * da)
+    return da * hooke(green_strain(a), mu, lam) + (identity3() + a) * hooke(d_strain, mu, lam)
 
 
 @wp.func
@@ -156,6 +180,14 @@ def volumetric_slope(d: float, mu: float, lam: float):
 
 
 @wp.func
+def volumetric_curvature(d: float, mu: float, lam: float):
+    """V''(J), J = 1 + d; constant below J0."""
+    log, _excess = log_of_dilation(wp.max(d, J0 - 1.0))
+    j = 1.0 + wp.max(d, J0 - 1.0)
+    return (mu + lam * (1.0 - log)) / (j * j)
+
+
+@wp.func
 def volumetric_energy(d: float, mu: float, lam: float):
     """V(J), J = 1 + d; a parabola below J0."""
     energy = float(0.0)
@@ -185,6 +217,17 @@ def neo_hookean_stress(a: wp.mat33, mu: float, lam: float):
     rest = mu - slope
     diagonal = slope - rest * wp.trace(a)
     return mu * a + rest * (wp.transpose(a) - cof) + diagonal * identity3()
+
+
+@wp.func
+def neo_hookean_differential(a: wp.mat33, da: wp.mat33, mu: float, lam: float):
+    """dP = mu (dF - dcof F) + V' dcof F + V'' (cof F : dF) cof F, with cof F = I + tr(A) I - A^T + cof A."""
+    cof_a = cofactor(a)
+    d = dilation(a, cof_a)
+    cof = cof_a - wp.transpose(a) + (1.0 + wp.trace(a)) * identity3()
+    d_cof = cofactor_differential(a, da) - wp.transpose(da) + wp.trace(da) * identity3()
+    volumetric = (volumetric_curvature(d, mu, lam) * wp.ddot(cof, da)) * cof
+    return mu * da + (volumetric_slope(d, mu, lam) - mu) * d_cof + volumetric
 
 
 @wp.func

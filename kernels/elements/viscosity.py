@@ -12,6 +12,7 @@ from typing import Any
 
 import warp as wp
 
+from warp_corot.kernels.math.matrices import axial
 from warp_corot.kernels.math.rotation import byers_xu, identity3
 
 from .constitutive import corotated_strain, hooke, symmetric
@@ -22,12 +23,6 @@ wp.set_module_options({"enable_backward": False})
 #: Below this determinant of tr(U) I - U, which is 8 at rest, the turning of a crushed element is hardly determined: the
 #: symmetric part of A is taken for Udot there, which still takes power out.
 LEAST = wp.constant(0.05)
-
-
-@wp.func
-def axial(a: wp.mat33):
-    """The axial vector of a - a^T."""
-    return wp.vec3(a[2, 1] - a[1, 2], a[0, 2] - a[2, 0], a[1, 0] - a[0, 1])
 
 
 @wp.func

@@ -7,7 +7,12 @@ from typing import TYPE_CHECKING, ClassVar
 
 from warp_corot.discretization.discretization import discretization_of
 from warp_corot.elasticity.paths.laws import law_field
-from warp_corot.kernels.elements.constitutive import linear_cauchy, linear_energy, linear_stress
+from warp_corot.kernels.elements.constitutive import (
+    linear_cauchy,
+    linear_differential,
+    linear_energy,
+    linear_stress,
+)
 
 from .model import ForceField, Model
 
@@ -27,6 +32,7 @@ class Linear(Model):
             "linear",
             discretization,
             stress=linear_stress,
+            differential=linear_differential,
             energy=linear_energy,
             cauchy=linear_cauchy,
             deterministic=deterministic,

@@ -14,6 +14,7 @@ from warp_corot.discretization.plan import Plan
 from warp_corot.discretization.slots import Slots
 from warp_corot.kernels.elements.constitutive import stvk_cauchy
 from warp_corot.kernels.elements.forces import element_von_mises
+from warp_corot.kernels.elements.spring_stiffness import add_mass_spring_diagonal, add_mass_spring_product
 from warp_corot.kernels.elements.springs import mass_spring_energies, scatter_mass_spring
 from warp_corot.kernels.tables.shapes import EDGES
 
@@ -89,6 +90,14 @@ class MassSpringField(ForceField):
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         inputs = [self._edges, self._targets, self._rest, self._stiffness, u]
         self.launch(scatter_mass_spring, len(self._edges), inputs, [f])
+
+    def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None:
+        inputs = [self._edges, self._rest, self._stiffness, u, p]
+        self.launch(add_mass_spring_product, len(self._edges), inputs, [y])
+
+    def add_diagonal(self, u: wp.array, blocks: wp.array) -> None:
+        inputs = [self._edges, self._rest, self._stiffness, u]
+        self.launch(add_mass_spring_diagonal, len(self._edges), inputs, [blocks])
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         inputs = [self._edges, self._rest, self._stiffness, u]

@@ -11,10 +11,14 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.discretization.clusters.single import isotropic_material
 from warp_corot.discretization.discretization import Discretization, Discretized, discretization_of
 from warp_corot.discretization.plan import Plan
 from warp_corot.errors import InputError
 from warp_corot.kernels.elements.forces import element_energies, element_von_mises, scatter_forces
+from warp_corot.kernels.elements.stiffness_products import law_differential
+
+from .stiffness import ElementStiffness
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
@@ -64,6 +68,24 @@ class ForceField(ABC):
     @abstractmethod
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         """Launch the kernels that add the forces to the nodes, or to the slots if there are any."""
+
+    @abstractmethod
+    def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None:
+        """Add K(u) p to y [N], K minus the derivative of the elastic forces at displacements u; all vec4 [worlds * N].
+
+        K is symmetric, and need not be positive semidefinite. A field whose K is not the exact derivative says so. All
+        laws on all meshes go element by element, and sums are atomic: on CUDA rounding differs from call to call, also
+        where forces are deterministic.
+
+        Args:
+            u: Displacements [m].
+            p: Displacements that K is multiplied by [m].
+            y: What the product is added to.
+        """
+
+    @abstractmethod
+    def add_diagonal(self, u: wp.array, blocks: wp.array) -> None:
+        """Add the 3x3 blocks on the diagonal of the same K(u) to those of the nodes [N/m], mat33 [worlds * N]."""
 
     def plan_of(self, discretization: Discretization) -> Plan:
         """The plan that the field goes through; by default the elements one by one."""
@@ -194,7 +216,13 @@ class Model(ABC):
 
 
 class ElementField(ForceField):
-    """Force field of kernels that need nothing but each element's nodal displacements."""
+    """Force field of kernels that need nothing but each element's nodal displacements.
+
+    Args:
+        body, deterministic: As for every field.
+        forces, energies, von_mises: The kernels.
+        differential: The stress's, a device function of ``kernels.elements.stiffness_products``.
+    """
 
     def __init__(
         self,
@@ -203,15 +231,23 @@ class ElementField(ForceField):
         forces: wp.Kernel,
         energies: wp.Kernel,
         von_mises: wp.Kernel,
+        differential: wp.Function,
         deterministic: bool = False,
     ):
         super().__init__(body, deterministic)
         self._forces = forces
+        self._stiffness = ElementStiffness(self.discretization, differential)
         self._energies = energies
         self._von_mises = von_mises
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         self.launch(self._forces, self.element_count, [self.elements, *self.material_inputs, u], [f])
+
+    def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None:
+        self._stiffness.add_product(self.elements, isotropic_material(self.material_inputs), u, p, y)
+
+    def add_diagonal(self, u: wp.array, blocks: wp.array) -> None:
+        self._stiffness.add_diagonal(self.elements, isotropic_material(self.material_inputs), u, blocks)
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         self.launch(self._energies, self.element_count, [self.elements, *self.material_inputs, u], [energies])
@@ -221,13 +257,19 @@ class ElementField(ForceField):
 
 
 class LawField(ElementField):
-    """Force field of a constitutive law in each element's deformation gradient."""
+    """Force field of a constitutive law in each element's deformation gradient.
+
+    Args:
+        body, deterministic: As for every field.
+        stress, differential, energy, cauchy: The law, functions of ``kernels.elements.constitutive``.
+    """
 
     def __init__(
         self,
         body: Discretized | Discretization,
         *,
         stress: wp.Function,
+        differential: wp.Function,
         energy: wp.Function,
         cauchy: wp.Function,
         deterministic: bool = False,
@@ -239,4 +281,5 @@ class LawField(ElementField):
             forces=scatter_forces(kind, stress),
             energies=element_energies(kind, energy),
             von_mises=element_von_mises(kind, cauchy),
+            differential=law_differential(differential),
         )

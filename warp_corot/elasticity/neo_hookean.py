@@ -7,7 +7,12 @@ from typing import TYPE_CHECKING
 
 from warp_corot.discretization.discretization import discretization_of
 from warp_corot.elasticity.paths.laws import law_field
-from warp_corot.kernels.elements.constitutive import neo_hookean_cauchy, neo_hookean_energy, neo_hookean_stress
+from warp_corot.kernels.elements.constitutive import (
+    neo_hookean_cauchy,
+    neo_hookean_differential,
+    neo_hookean_energy,
+    neo_hookean_stress,
+)
 
 from .model import ForceField, Model
 
@@ -34,6 +39,7 @@ class NeoHookean(Model):
             "neo-hookean",
             discretization,
             stress=neo_hookean_stress,
+            differential=neo_hookean_differential,
             energy=neo_hookean_energy,
             cauchy=neo_hookean_cauchy,
             deterministic=deterministic,

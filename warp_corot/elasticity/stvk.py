@@ -7,7 +7,12 @@ from typing import TYPE_CHECKING
 
 from warp_corot.discretization.discretization import discretization_of
 from warp_corot.elasticity.paths.laws import law_field
-from warp_corot.kernels.elements.constitutive import stvk_cauchy, stvk_energy, stvk_stress
+from warp_corot.kernels.elements.constitutive import (
+    stvk_cauchy,
+    stvk_differential,
+    stvk_energy,
+    stvk_stress,
+)
 
 from .model import ForceField, Model
 
@@ -29,6 +34,7 @@ class StVenantKirchhoff(Model):
             "stvk",
             discretization,
             stress=stvk_stress,
+            differential=stvk_differential,
             energy=stvk_energy,
             cauchy=stvk_cauchy,
             deterministic=deterministic,

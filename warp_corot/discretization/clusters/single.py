@@ -9,9 +9,9 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.kernels.clusters.elements import BACKWARDS, SWAPS
-from warp_corot.kernels.clusters.laws import IsotropicMaterial
 from warp_corot.kernels.clusters.single import Clusters, vec2ul
 from warp_corot.kernels.clusters.tables import find_clusters
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.tables.cluster_layout import DEFAULT_LAYOUT, ClusterLayout
 from warp_corot.kernels.tables.shapes import SQRT2
 
@@ -97,7 +97,7 @@ def _node_count(tets: npt.NDArray[np.int32], layout: ClusterLayout) -> int:
 
 
 def isotropic_material(given: list) -> Any:
-    """``kernels.clusters.laws.IsotropicMaterial`` of mu, lambda and their stride."""
+    """``kernels.elements.constitutive.IsotropicMaterial`` of mu, lambda and their stride."""
     material = IsotropicMaterial()
     material.mu, material.lam, material.stride = given
     return material

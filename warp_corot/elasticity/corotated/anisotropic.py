@@ -8,6 +8,7 @@ import warp as wp
 
 from warp_corot.elasticity.model import ForceField
 from warp_corot.elasticity.paths.lanes import Lanes, as_general
+from warp_corot.elasticity.stiffness import ElementStiffness
 from warp_corot.kernels.corotated.anisotropic import anisotropic_energies, anisotropic_von_mises, scatter_anisotropic
 from warp_corot.kernels.corotated.anisotropic_cpu import (
     repair_anisotropic,
@@ -15,6 +16,7 @@ from warp_corot.kernels.corotated.anisotropic_cpu import (
     turn_changed,
     turn_elements,
 )
+from warp_corot.kernels.corotated.anisotropic_tangent import FibreMaterial, anisotropic_differential
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
@@ -31,6 +33,9 @@ class AnisotropicField(ForceField):
     To it comes the active stress of ``SoftBody.activation``, P = s (F d) d^T along the fibres' direction d. It keeps
     both momenta; it puts work in, so that there is no energy of it.
 
+    The stiffness is exact, with the turning of R, at the present active stress; it is bounded where F has hardly a
+    definite rotation (``kernels.corotated.tangent``).
+
     Args:
         discretization: Of an ``Anisotropic`` material.
         rotation: Device function that finds rotations.
@@ -45,10 +50,17 @@ class AnisotropicField(ForceField):
         self._forces = scatter_anisotropic(kind, rotation)
         self._energies = anisotropic_energies(kind, rotation)
         self._von_mises = anisotropic_von_mises(kind, rotation)
+        self._stiffness = ElementStiffness(discretization, anisotropic_differential(rotation), FibreMaterial)
         self.material = discretization.anisotropic_material()
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         self.launch(self._forces, self.element_count, [self.elements, self.material, *self._activation, u], [f])
+
+    def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None:
+        self._stiffness.add_product(self.elements, self._fibres, u, p, y)
+
+    def add_diagonal(self, u: wp.array, blocks: wp.array) -> None:
+        self._stiffness.add_diagonal(self.elements, self._fibres, u, blocks)
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         self.launch(self._energies, self.element_count, [self.elements, self.material, u], [energies])
@@ -56,6 +68,13 @@ class AnisotropicField(ForceField):
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
         inputs = [self.elements, self.material, *self._activation, u]
         self.launch(self._von_mises, self.element_count, inputs, [stress])
+
+    @property
+    def _fibres(self) -> Any:
+        """``kernels.corotated.anisotropic_tangent.FibreMaterial`` with the present active stress."""
+        fibres = FibreMaterial()
+        fibres.passive, (fibres.is_active, fibres.activation) = self.material, self._activation
+        return fibres
 
     @property
     def _activation(self) -> list:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import warp as wp
 
+from warp_corot.discretization.clusters.single import isotropic_material
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.plan import Plan, Units
 from warp_corot.elasticity.model import ForceField
 from warp_corot.elasticity.paths.lanes import Lanes
+from warp_corot.elasticity.stiffness import ElementStiffness
+from warp_corot.errors import InputError
 from warp_corot.kernels.corotated.corotated import (
     corotated_energies,
     corotated_von_mises,
@@ -21,7 +24,14 @@ from warp_corot.kernels.corotated.corotated import (
     scatter_own_rotation,
     scatter_with_rotations,
 )
+from warp_corot.kernels.corotated.tangent import (
+    RotatedMaterial,
+    exact_differential,
+    given_differential,
+    own_differential,
+)
 from warp_corot.kernels.elements.general_cpu import repair_elements, scatter_elements
+from warp_corot.kernels.math.rotation import byers_xu
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
@@ -130,6 +140,49 @@ class CorotatedField(ForceField):
         else:
             self.extract_rotations(u)
             self.add_rotated_forces(u, f)
+
+    def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array, *, exact: bool = False) -> None:
+        """Add K(u) p to y [N], with the paper's K = R K R^T: the rotations that forces at u use, held fixed.
+
+        It is symmetric and positive semidefinite. The exact derivative of the forces has the turning of the rotations
+        besides, which vanishes where the body is not strained.
+
+        Args:
+            u, p, y: As for every field.
+            exact: Whether K is the exact derivative, which can be indefinite; for own rotations alone. It is bounded
+                where F has hardly a definite rotation (``kernels.corotated.tangent``).
+
+        Raises:
+            InputError: ``exact`` with shared rotations.
+        """
+        stiffness, material = self._tangent(u, exact)
+        stiffness.add_product(self.elements, material, u, p, y)
+
+    def add_diagonal(self, u: wp.array, blocks: wp.array, *, exact: bool = False) -> None:
+        """Add the 3x3 blocks on the diagonal of the same K(u) to those of the nodes [N/m]; see ``add_stiffness``."""
+        stiffness, material = self._tangent(u, exact)
+        stiffness.add_diagonal(self.elements, material, u, blocks)
+
+    def used_rotations(self, u: wp.array) -> wp.array:
+        """The rotation of every unit, as forces use it; leaves no trace in the state."""
+        with self.state_kept():
+            return self.extract_rotations(u)
+
+    def _tangent(self, u: wp.array, exact: bool) -> tuple[ElementStiffness, Any]:
+        """The stiffness at displacements u, and the material that it reads."""
+        isotropic, is_warm = isotropic_material(self.material_inputs), self.model.rotation == "warm"
+        if exact:
+            if self.model.rotation_level is not None:
+                level = self.model.rotation_level
+                raise InputError(f"rotation_level is {level!r}; for the exact stiffness it must be None")
+            rotation = byers_xu if is_warm else self.model.own_rotation
+            return ElementStiffness(self.discretization, exact_differential(rotation)), isotropic
+        if self.model.rotation_level is None and not is_warm:
+            return ElementStiffness(self.discretization, own_differential(self.model.own_rotation)), isotropic
+        material = RotatedMaterial()
+        material.isotropic, material.rotations = isotropic, self.used_rotations(u)
+        material.unit = self._sharing().units.unit
+        return ElementStiffness(self.discretization, given_differential, RotatedMaterial), material
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         self.extract_rotations(u)

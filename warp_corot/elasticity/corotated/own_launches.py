@@ -32,6 +32,9 @@ class OwnLaunches:
         material: mu, lambda and their stride.
         tolerance: How near a subtree root's rotation must be to be used in place of own ones [rad]; None: never.
         changing: What adds the forces of all leaves in clusters where the mesh changes.
+
+    Attributes:
+        batches: The subtrees that go as such.
     """
 
     def __init__(
@@ -52,6 +55,7 @@ class OwnLaunches:
         elif changing is not None and 8 * sum(batch.count for batch in batches if batch.grouped) < GROUPED_LEAVES:
             batches, self._clusters = [], changing
         # The structs hold addresses alone: what these stand for must live as long as they do.
+        self.batches = tuple(batches)
         self._rows, self._blocks = _stretches(batches, None if self._clusters is not None else plan.flat)
         self._stretches = wp.array(self._rows, dtype=Stretch, device=self._device) if self._rows else None
         #: How many subtrees and single leaves there are, with gaps, some of which may be left out.

@@ -16,6 +16,8 @@ from warp_corot.elasticity.paths.clusters import ChangingClusterScatter
 from warp_corot.elasticity.paths.lanes import Lanes, as_general
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
+from warp_corot.kernels.corotated.near_rotations import share_near_rotations
+from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.elements.general_cpu import repair_elements, rest_matrices, scatter_elements
 from warp_corot.kernels.elements.lanes import LANES
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
@@ -128,6 +130,17 @@ class SubtreeField(CorotatedField):
                 self.launch(self._own, len(flat), inputs, [f])
         if self._left_out is not None:
             self._left_out.repair(self.elements, self.material_inputs, u, f)
+
+    def used_rotations(self, u: wp.array) -> wp.array:
+        rotations = super().used_rotations(u)
+        if self.model.tolerance is None:
+            return rotations
+        for batch in self.plan.batches if self._own_launches is None else self._own_launches.batches:
+            roots, subtrees = ForestElements(), batch.subtrees
+            roots.code, roots.frames, roots.size = subtrees.code, subtrees.frames, subtrees.size
+            inputs = [roots, subtrees.first, self.elements, self.model.tolerance, u]
+            self.launch(share_near_rotations(batch.shape), batch.count, inputs, [rotations])
+        return rotations
 
     def _kernel(self, shape: int, grouped: bool, sharing: Sharing) -> wp.Kernel:
         given = sharing is Sharing.ABOVE

@@ -14,10 +14,10 @@ from warp_corot.discretization.clusters.single import axis_words, changing_clust
 from warp_corot.discretization.plan import FlatLeaves, LeafCounts, Plan
 from warp_corot.discretization.subtrees import GROUPED_LEAVES, Batch
 from warp_corot.kernels.clusters.elements import AlignedElements, align_elements
-from warp_corot.kernels.clusters.laws import IsotropicMaterial
 from warp_corot.kernels.clusters.pair_elements import GeneralPairs, LatticePairs
 from warp_corot.kernels.clusters.pairs import scatter_pairs
 from warp_corot.kernels.clusters.single import scatter_clusters
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.general_cpu import rest_matrices
 from warp_corot.kernels.tables.cluster_layout import (
     AHEAD,

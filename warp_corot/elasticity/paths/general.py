@@ -34,7 +34,7 @@ class LawGeneralField(LawField):
 
     Args:
         discretization: A general mesh's, or of a forest that has few groups of subtrees.
-        stress, energy, cauchy: The law, functions of ``kernels.elements.constitutive``.
+        stress, functions: The law, as for ``LawField``.
         deterministic: False; slots of elements are not shared, so there is nothing to add up.
     """
 
@@ -43,11 +43,10 @@ class LawGeneralField(LawField):
         discretization: Discretization,
         *,
         stress: wp.Function,
-        energy: wp.Function,
-        cauchy: wp.Function,
         deterministic: bool = False,
+        **functions: wp.Function,
     ):
-        super().__init__(discretization, stress=stress, energy=energy, cauchy=cauchy, deterministic=deterministic)
+        super().__init__(discretization, stress=stress, deterministic=deterministic, **functions)
         self._scatter = ClusterScatter(self.elements, isotropic_law(stress), chosen=clustered(discretization))
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:

@@ -22,6 +22,7 @@ def law_field(
     discretization: Discretization,
     *,
     stress: wp.Function,
+    differential: wp.Function,
     energy: wp.Function,
     cauchy: wp.Function,
     deterministic: bool = False,
@@ -31,10 +32,10 @@ def law_field(
     Args:
         law: Its name among those that run in lanes on the CPU, a key of ``kernels.elements.law_lanes.LAWS``.
         discretization: The mesh and the material.
-        stress, energy, cauchy: The law, functions of ``kernels.elements.constitutive``.
+        stress, differential, energy, cauchy: The law, functions of ``kernels.elements.constitutive``.
         deterministic: As for every field.
     """
-    functions = {"stress": stress, "energy": energy, "cauchy": cauchy}
+    functions = {"stress": stress, "differential": differential, "energy": energy, "cauchy": cauchy}
     if discretization.device.is_cpu:
         return LawLanesField(discretization, law=law, **functions, deterministic=deterministic)
     kind: type[LawField] = LawField

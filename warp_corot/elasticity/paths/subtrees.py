@@ -27,7 +27,7 @@ class LawSubtreeField(LawField):
 
     Args:
         discretization: A forest's, on CUDA.
-        stress, energy, cauchy: The law, functions of ``kernels.elements.constitutive``.
+        stress, functions: The law, as for ``LawField``.
         deterministic: As for every field.
     """
 
@@ -36,11 +36,10 @@ class LawSubtreeField(LawField):
         discretization: Discretization,
         *,
         stress: wp.Function,
-        energy: wp.Function,
-        cauchy: wp.Function,
         deterministic: bool = False,
+        **functions: wp.Function,
     ):
-        super().__init__(discretization, stress=stress, energy=energy, cauchy=cauchy, deterministic=deterministic)
+        super().__init__(discretization, stress=stress, deterministic=deterministic, **functions)
         self._stress = stress
         self._uniform = discretization.material_stride == 0
         self.follow()

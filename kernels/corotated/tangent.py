@@ -1,0 +1,93 @@
+"""Differentials of the isotropic corotated law P = R sigma(e), e = sym(R^T F) - I, for ``elements.stiffness_products``.
+
+With the rotation held fixed dP = R sigma(sym(R^T dF)): the paper's R K R^T, which is positive semidefinite. The exact
+differential has the turning of R too, dR = R [w]x with (tr(S) I - S) w = axial(R^T dF), which needs the rotation to be
+the element's own: dP = R ([w]x sigma(e) + sigma(dS)), dS = sym(R^T dF - [w]x e).
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, corotated_strain, hooke, symmetric
+from warp_corot.kernels.elements.elements import frame, local_gradient
+from warp_corot.kernels.math.matrices import axial, cofactor, column, identity3, largest_entry
+
+wp.set_module_options({"enable_backward": False})
+
+#: det(tr(S) I - S) / |S|^3, which is 1.54 at rest, below which the rotation is taken to turn less than it does, and the
+#: largest entry of S below which it is. Both at zero, F has no definite rotation and the derivative does not exist.
+LEAST_DEFINITENESS = wp.constant(1.0e-3)
+LEAST_STRETCH = wp.constant(1.0e-3)
+
+
+@wp.struct
+class RotatedMaterial:
+    """Lamé's parameters, and rotations with the one that each element uses."""
+
+    isotropic: IsotropicMaterial
+    rotations: wp.array[wp.mat33]  # [units] from rest space to world space
+    unit: wp.array[wp.int32]  # [T]
+
+
+@wp.func
+def stretch_turning(strain: wp.mat33):
+    """tr(S) I - S of S scaled to order one, S = I + ``strain``: its adjugate, its determinant or what is put for one
+    near zero, and the scale."""
+    s = strain + identity3()
+    scale = 1.0 / wp.max(largest_entry(s), LEAST_STRETCH)
+    s = s * scale
+    h = wp.trace(s) * identity3() - s
+    adjugate = cofactor(h)
+    n2 = wp.ddot(s, s)
+    least = wp.max(LEAST_DEFINITENESS * n2 * wp.sqrt(n2), 1.0e-12)
+    return adjugate, wp.max(wp.dot(column(h, 0), column(adjugate, 0)), least), scale
+
+
+@wp.func
+def rotation_differential(strain: wp.mat33, b: wp.mat33):
+    """w of dR = R [w]x, for b = R^T dF."""
+    adjugate, det, scale = stretch_turning(strain)
+    return (scale / det) * (adjugate * axial(b))
+
+
+@functools.cache
+def own_differential(rotation: wp.Function) -> wp.Function:
+    """With the element's own rotation, held fixed."""
+
+    @wp.func
+    def own_differential(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4], dg: wp.mat33):
+        i = t * material.stride
+        r = rotation(frame(elements, t) + local_gradient(elements, t, u))
+        return r * hooke(symmetric(wp.transpose(r) * dg), material.mu[i], material.lam[i])
+
+    return own_differential
+
+
+@wp.func
+def given_differential(elements: Any, t: int, material: RotatedMaterial, u: wp.array[wp.vec4], dg: wp.mat33):
+    """With a given rotation, held fixed."""
+    i = t * material.isotropic.stride
+    r = material.rotations[material.unit[t]] * frame(elements, t)
+    return r * hooke(symmetric(wp.transpose(r) * dg), material.isotropic.mu[i], material.isotropic.lam[i])
+
+
+@functools.cache
+def exact_differential(rotation: wp.Function) -> wp.Function:
+    """With the element's own rotation and its turning."""
+
+    @wp.func
+    def exact_differential(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4], dg: wp.mat33):
+        i = t * material.stride
+        mu = material.mu[i]
+        lam = material.lam[i]
+        q = frame(elements, t)
+        g = local_gradient(elements, t, u)
+        r = rotation(q + g)
+        strain = corotated_strain(g, q, r)
+        b = wp.transpose(r) * dg
+        turning = wp.skew(rotation_differential(strain, b))
+        return r * (turning * hooke(strain, mu, lam) + hooke(symmetric(b - turning * strain), mu, lam))
+
+    return exact_differential

@@ -1,0 +1,98 @@
+"""Products with the tangent stiffness K, minus the derivative of the elastic forces, element by element.
+
+``differential`` is a device function (elements, t, material, u, dg) -> dP: the directional derivative of element t's
+first Piola-Kirchhoff stress, in the local frame as ``elements.scatter_stress`` takes it, at nodal displacements u. Its
+direction dg is the local gradient of another nodal vector (``elements.local_gradient``). ``Material`` is the struct
+that it reads. Every kind of elements and every law has these two kernels; sums are atomic.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from .constitutive import IsotropicMaterial
+from .elements import add_force, frame, gradient_of, local_gradient, nodal_forces
+
+wp.set_module_options({"enable_backward": False})
+
+
+@functools.cache
+def law_differential(law: wp.Function) -> wp.Function:
+    """The differential for these kernels of one of ``constitutive``."""
+
+    @wp.func
+    def law_differential(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4], dg: wp.mat33):
+        i = t * material.stride
+        q = frame(elements, t)
+        a = wp.transpose(q) * local_gradient(elements, t, u)
+        return q * law(a, wp.transpose(q) * dg, material.mu[i], material.lam[i])
+
+    return law_differential
+
+
+@functools.cache
+def add_stiffness_product(Elements: Any, Material: Any, differential: wp.Function) -> wp.Kernel:
+    """y += K(u) p; a thread an element."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add_stiffness_product(
+        # In
+        elements: Elements,
+        material: Material,
+        u: wp.array[wp.vec4],
+        p: wp.array[wp.vec4],
+        # In and out
+        y: wp.array[wp.vec4],
+    ):
+        t = wp.tid()
+        stress = differential(elements, t, material, u, local_gradient(elements, t, p))
+        f0, f1, f2, f3 = nodal_forces(elements, t, -stress)
+        nodes = elements.nodes[t]
+        add_force(y, nodes[0], f0)
+        add_force(y, nodes[1], f1)
+        add_force(y, nodes[2], f2)
+        add_force(y, nodes[3], f3)
+
+    return add_stiffness_product
+
+
+@wp.func
+def where_is(chosen: bool, v: wp.vec3):
+    return wp.where(chosen, v, wp.vec3())
+
+
+@functools.cache
+def add_stiffness_diagonal(Elements: Any, Material: Any, differential: wp.Function) -> wp.Kernel:
+    """Add the 3x3 blocks on K(u)'s diagonal to those of the nodes; a thread a node of an element."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add_stiffness_diagonal(
+        # In
+        elements: Elements,
+        material: Material,
+        u: wp.array[wp.vec4],
+        # In and out
+        blocks: wp.array[wp.mat33],
+    ):
+        t = wp.tid() // 4
+        n = wp.tid() % 4
+        block = wp.mat33()
+        axis = int(0)
+        # Not unrolled: the differential is compiled once.
+        while axis < 3:
+            e = wp.vec3()
+            e[axis] = 1.0
+            u0 = where_is(n == 0, e)
+            u1 = where_is(n == 1, e)
+            u2 = where_is(n == 2, e)
+            u3 = where_is(n == 3, e)
+            stress = differential(elements, t, material, u, gradient_of(elements, t, u0, u1, u2, u3))
+            f0, f1, f2, f3 = nodal_forces(elements, t, -stress)
+            force = where_is(n == 0, f0) + where_is(n == 1, f1) + where_is(n == 2, f2) + where_is(n == 3, f3)
+            for i in range(3):
+                block[i, axis] = force[i]
+            axis += 1
+        wp.atomic_add(blocks, elements.nodes[t][n], block)
+
+    return add_stiffness_diagonal

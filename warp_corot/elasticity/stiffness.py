@@ -1,0 +1,43 @@
+"""Launches of products with the tangent stiffness, element by element; see ``kernels.elements.stiffness_products``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.stiffness_products import add_stiffness_diagonal, add_stiffness_product
+
+if TYPE_CHECKING:
+    from warp_corot.discretization.discretization import Discretization
+
+
+@dataclass(frozen=True)
+class ElementStiffness:
+    """The tangent stiffness of a discretization's elements, one thread an element whatever way forces go.
+
+    Attributes:
+        discretization: The elements' kind, and how many there are.
+        differential: Device function (elements, t, material, u, dg) -> dP.
+        Material: The struct that it reads.
+    """
+
+    discretization: Discretization
+    differential: wp.Function
+    Material: Any = IsotropicMaterial
+
+    def add_product(self, elements: Any, material: Any, u: wp.array, p: wp.array, y: wp.array) -> None:
+        """y += K(u) p."""
+        kernel = add_stiffness_product(self.discretization.element_kind, self.Material, self.differential)
+        self._launch(kernel, 1, [elements, material, u, p], y)
+
+    def add_diagonal(self, elements: Any, material: Any, u: wp.array, blocks: wp.array) -> None:
+        """Add the diagonal blocks of K(u), mat33 a node."""
+        kernel = add_stiffness_diagonal(self.discretization.element_kind, self.Material, self.differential)
+        self._launch(kernel, 4, [elements, material, u], blocks)
+
+    def _launch(self, kernel: wp.Kernel, threads: int, inputs: list, output: wp.array) -> None:
+        count = threads * self.discretization.sizes.launch_elements
+        wp.launch(kernel, dim=count, inputs=inputs, outputs=[output], device=self.discretization.device)
