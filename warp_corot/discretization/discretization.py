@@ -19,6 +19,7 @@ from warp_corot.mesh import TetForest
 
 from .clock import Clock
 from .elements import Mesh, device_elements, element_kind, in_worlds, parts, with_targets
+from .levels import Levels, TreeNodes
 from .plan import ForcePlan, Plan, Units
 from .sizes import Sizes
 from .slots import Slots
@@ -57,6 +58,7 @@ class Discretization(ABC):
     activation: wp.array
     has_activation: bool
     smallest_volume: float
+    _levels: Levels | None = None
 
     @property
     @abstractmethod
@@ -90,6 +92,20 @@ class Discretization(ABC):
             deterministic: Whether every unit has slots of its own for its forces.
         """
 
+    def levels(self) -> Levels:
+        """The nodes by tree level, and transfers between levels: of the present mesh, found when first asked for.
+
+        Raises:
+            InputError: A general mesh, which has no tree.
+        """
+        if self._levels is None or self._levels.version != self.sizes.version:
+            self._levels = Levels(self._tree_nodes(), self.elements, self.sizes)
+        return self._levels
+
+    @abstractmethod
+    def _tree_nodes(self) -> TreeNodes:
+        """The nodes of the tree on the device; see ``levels``."""
+
     @abstractmethod
     def anisotropic_material(self) -> OrthotropicMaterial:
         """The anisotropic material as kernels read it, world after world where it is not uniform."""
@@ -121,11 +137,9 @@ class MeshChanges(Protocol):
 
     def remember(self) -> None:
         """Make the present mesh and state what ``reset`` goes back to."""
-        ...
 
     def reset(self, chosen: wp.array, clock: Clock) -> None:
         """Go back to that, if the world is chosen; int32 [1]."""
-        ...
 
 
 class Discretized(Protocol):
@@ -226,6 +240,9 @@ class FixedMesh(Discretization):
         if isinstance(mesh, TetForest) and rotation_level is not None:
             find_units = partial(Units.of_forest, mesh, rotation_level, device, worlds)
         return ForcePlan.leaf_by_leaf(elements, slots, find_units)
+
+    def _tree_nodes(self) -> TreeNodes:
+        return TreeNodes.of_mesh(self._mesh, self.device)
 
     def anisotropic_material(self) -> OrthotropicMaterial:
         given, fill = self._material, self.fill

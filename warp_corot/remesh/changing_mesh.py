@@ -10,6 +10,7 @@ import numpy.typing as npt
 from warp_corot.discretization.changing.plan import DevicePlan
 from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.levels import TreeNodes
 from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial
 from warp_corot.materials.anisotropic import Anisotropic
 from warp_corot.mesh import TetForest
@@ -84,6 +85,10 @@ class ChangingMesh(Discretization):
             self.activation = plan.values.get(ACTIVATION, self.activation)
             self._carried.serve(plan, self.lame)
         return plan
+
+    def _tree_nodes(self) -> TreeNodes:
+        pools, others = self._forest.pools, self._forest.virtual_count
+        return TreeNodes(pools.lattice, pools.ends, self.sizes.world_nodes, pools.node_limit, others)
 
     def anisotropic_material(self) -> OrthotropicMaterial:
         return self._carried.anisotropic

@@ -1,0 +1,220 @@
+"""Nodes of a forest by tree level, found from their lattice points alone, and the tables that transfers go through.
+
+A node is the midpoint of the refinement edge of a tetrahedron one level up, or a corner of a root. Of the nonzero
+coordinates of its lattice point let t be the smallest number of trailing zero bits. Three levels halve the edges, and
+within three the first midpoints are those of a cube's diagonals, then of its faces' diagonals, then of its edges: on
+these one, two or all three axes the point is odd in units of 2^t. So t and the number of these axes say the level.
+
+Nodes that leaves do not name, corners of ancestors whose descendants there are void, stand elsewhere in the mesh's
+numbering; the others are 0 ... N - 1.
+"""
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import LEVEL_MASK
+
+LOW_HALF = wp.constant(wp.int64((1 << 32) - 1))
+
+
+@wp.func
+def level_of_point(p: wp.vec3i, bits: int):
+    """Level of the node at a lattice point; 0 for a root's corner, ``bits``: log2 of the intervals in a cube's edge."""
+    together = p[0] | p[1] | p[2]
+    lowest = together & -together
+    if lowest == 0 or lowest >= (1 << bits):
+        return 0
+    odd = int(0)
+    for axis in range(3):
+        if (p[axis] & lowest) != 0:
+            odd += 1
+    level = 3 * bits + 1 - odd
+    while lowest > 1:
+        lowest = lowest >> 1
+        level -= 3
+    return level
+
+
+@wp.func
+def number_of(place: int, others: int, mesh_nodes: int, sums: wp.array[wp.int32]):
+    """The number of a node that stands at a place in the mesh's numbering, where the other nodes begin at ``others``;
+    ``sums`` are inclusive sums of flags that say which of these have one."""
+    if place < others:
+        return place
+    return mesh_nodes + sums[place - others] - 1
+
+
+@wp.kernel(enable_backward=False)
+def flag_ends(
+    # In
+    first: int,
+    level: int,
+    bits: int,
+    others: int,
+    lattice: wp.array[wp.vec3i],
+    ends: wp.array[wp.vec2i],
+    # In and out
+    flags: wp.array[wp.int32],
+):
+    """Flag the other nodes that are ends of nodes from place ``first`` on: of flagged ones of a level, or, if the level
+    is negative, of all."""
+    place = first + wp.tid()
+    takes_part = level < 0
+    if level >= 0:
+        takes_part = flags[place - others] != 0 and level_of_point(lattice[place], bits) == level
+    if takes_part:
+        pair = ends[place]
+        for n in range(2):
+            if pair[n] >= others:
+                flags[pair[n] - others] = 1
+
+
+@wp.kernel(enable_backward=False)
+def find_levels(
+    # In
+    mesh_nodes: int,
+    bits: int,
+    lattice: wp.array[wp.vec3i],
+    places: wp.array[wp.int32],
+    # Out
+    level: wp.array[wp.int32],
+    nodes: wp.array[wp.int32],
+):
+    """Level of each node, and its number beside it, for sorting; ``places`` are those of the nodes from N on."""
+    i = wp.tid()
+    place = int(i)
+    if i >= mesh_nodes:
+        place = places[i - mesh_nodes]
+    level[i] = level_of_point(lattice[place], bits)
+    nodes[i] = i
+
+
+@wp.kernel(enable_backward=False)
+def find_starts(
+    # In
+    count: int,
+    level: wp.array[wp.int32],
+    # Out
+    starts: wp.array[wp.int32],
+):
+    """Where the nodes of each level begin among ``count`` that are sorted by level."""
+    wanted = wp.tid()
+    low = int(0)
+    high = int(count)
+    while low < high:
+        middle = low + (high - low) / 2
+        if level[middle] < wanted:
+            low = middle + 1
+        else:
+            high = middle
+    starts[wanted] = low
+
+
+@wp.kernel(enable_backward=False)
+def list_ends(
+    # In
+    mesh_nodes: int,
+    roots: int,
+    others: int,
+    mesh_ends: wp.array[wp.vec2i],
+    sums: wp.array[wp.int32],
+    places: wp.array[wp.int32],
+    level: wp.array[wp.int32],
+    nodes: wp.array[wp.int32],
+    # Out
+    ends: wp.array[wp.vec2i],
+    keys: wp.array[wp.int64],
+    midpoints: wp.array[wp.int32],
+):
+    """Both ends of each node in the order of levels, the first ``roots`` nodes without any; for each end, level and end
+    as a key, and the midpoint."""
+    i = wp.tid()
+    node = nodes[i]
+    if i < roots:
+        ends[i] = wp.vec2i(-1, -1)
+        return
+    place = int(node)
+    if node >= mesh_nodes:
+        place = places[node - mesh_nodes]
+    pair = mesh_ends[place]
+    a = number_of(pair[0], others, mesh_nodes, sums)
+    b = number_of(pair[1], others, mesh_nodes, sums)
+    ends[i] = wp.vec2i(a, b)
+    at = 2 * (i - roots)
+    high = wp.int64(level[i]) << wp.int64(32)
+    keys[at] = high | wp.int64(a)
+    keys[at + 1] = high | wp.int64(b)
+    midpoints[at] = node
+    midpoints[at + 1] = node
+
+
+@wp.kernel(enable_backward=False)
+def flag_first(
+    # In
+    keys: wp.array[wp.int64],
+    # Out
+    flags: wp.array[wp.int32],
+):
+    """Flag the first of equal keys."""
+    i = wp.tid()
+    flags[i] = 1
+    if i > 0 and keys[i - 1] == keys[i]:
+        flags[i] = 0
+
+
+@wp.kernel(enable_backward=False)
+def find_coarse_starts(
+    # In
+    roots: int,
+    starts: wp.array[wp.int32],
+    sums: wp.array[wp.int32],
+    # Out
+    coarse_starts: wp.array[wp.int32],
+):
+    """Where the coarser nodes of each level begin, which stand one for each flag; the last is how many there are."""
+    level = wp.tid()
+    before = 2 * (wp.max(starts[level], roots) - roots)
+    coarse_starts[level] = 0
+    if before > 0:
+        coarse_starts[level] = sums[before - 1]
+
+
+@wp.kernel(enable_backward=False)
+def name_coarse(
+    # In
+    keys: wp.array[wp.int64],
+    midpoint_starts: wp.array[wp.int32],
+    # Out
+    coarse: wp.array[wp.int32],
+):
+    i = wp.tid()
+    coarse[i] = int(keys[midpoint_starts[i]] & LOW_HALF)
+
+
+@wp.kernel(enable_backward=False)
+def finest_of_leaves(
+    # In
+    tets: wp.array[wp.vec4i],
+    code: wp.array[wp.int32],
+    # Out
+    finest: wp.array[wp.int32],
+):
+    """The finest level of the leaves around each node; ``code`` as in ``elements.elements.ForestElements``."""
+    i = wp.tid()
+    level = code[i] & LEVEL_MASK
+    for n in range(4):
+        wp.atomic_max(finest, tets[i][n], level)
+
+
+@wp.kernel(enable_backward=False)
+def finest_of_edges(
+    # In
+    roots: int,
+    level: wp.array[wp.int32],
+    ends: wp.array[wp.vec2i],
+    # Out
+    finest: wp.array[wp.int32],
+):
+    """The finest level of the tetrahedra that were bisected at an edge with the node as an end."""
+    i = roots + wp.tid()
+    for n in range(2):
+        wp.atomic_max(finest, ends[i][n], level[i] - 1)

@@ -1,0 +1,37 @@
+"""Transfers between levels: linear functions on an edge, and the transpose, gathered."""
+
+import warp as wp
+
+
+@wp.kernel(enable_backward=False)
+def average_ends(
+    # In
+    world_nodes: int,
+    nodes: wp.array[wp.int32],
+    ends: wp.array[wp.vec2i],
+    # In and out
+    x: wp.array[wp.vec4],
+):
+    """The mean of both ends at each node of a level."""
+    world, i = wp.tid()
+    first = world * world_nodes
+    x[first + nodes[i]] = 0.5 * (x[first + ends[i][0]] + x[first + ends[i][1]])
+
+
+@wp.kernel(enable_backward=False)
+def gather_midpoints(
+    # In
+    world_nodes: int,
+    coarse: wp.array[wp.int32],
+    starts: wp.array[wp.int32],
+    midpoints: wp.array[wp.int32],
+    # In and out
+    y: wp.array[wp.vec4],
+):
+    """Half of what is at a level's nodes, added to the ends of their edges; ``starts`` has one place more."""
+    world, i = wp.tid()
+    first = world * world_nodes
+    total = wp.vec4(0.0)
+    for at in range(starts[i], starts[i + 1]):
+        total += y[first + midpoints[at]]
+    y[first + coarse[i]] += 0.5 * total
