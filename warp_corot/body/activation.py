@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.indices import checked_indices
 from warp_corot.inputs.keys import checked_times, staying
-
-if TYPE_CHECKING:
-    from .controls import Controls
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +38,13 @@ class Activation:
             raise InputError(f"stress has shape {s.shape}; it must be finite, [{len(t)}] or [{len(t)}, n]")
         object.__setattr__(self, "times", t)
         object.__setattr__(self, "stress", s)
+
+    def repeated(self, worlds: int, count: int) -> Activation:
+        """The same for ``count`` elements in each of the worlds; one that is for all elements alike stays as it is."""
+        stress = np.asarray(self.stress)
+        if stress.ndim == 2 and stress.shape[1] == count:
+            return Activation(self.times, np.tile(stress, (1, worlds)))
+        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,36 +88,8 @@ class ElementActivation:
         return ElementActivation.of_keys(elements, Activation(self.times.numpy(), stress), self.elements.device)
 
 
-def activate(
-    body: Controls,
-    stress: float | npt.ArrayLike | Activation,
-    elements: npt.ArrayLike | None,
-    worlds: npt.ArrayLike | None,
-) -> None:
-    """``SoftBody.activate``."""
-    live, count = body.activation, body.world_element_count
-    own = np.arange(count) if elements is None else checked_indices(np.asarray(elements), count, "element")
-    which = np.arange(body.worlds) if worlds is None else checked_indices(np.asarray(worlds), body.worlds, "world")
-    chosen = (which[:, None] * count + own).ravel()
-    if isinstance(stress, Activation):
-        keys = np.asarray(stress.stress)
-        if keys.ndim == 2 and keys.shape[1] == len(own):
-            stress = Activation(stress.times, np.tile(keys, (1, len(which))))
-        added = [ElementActivation.of_keys(chosen, stress, body.device)] if len(chosen) else []
-    else:
-        values = live.numpy().copy()
-        values[chosen] = _constant(stress, len(which), len(own)).ravel()
-        live.assign(values)
-        added = []
-    before = body.conditions.activations
-    kept = [left for a in before if (left := a.without(chosen))]
-    # Other numbers in the same array are no other launches.
-    if added or kept != before:
-        body.conditions.set_activations(kept + added)
-
-
-def _constant(stress: float | npt.ArrayLike, worlds: int, count: int) -> npt.NDArray[np.float64]:
-    """[worlds, count] of a number or an array that broadcasts to that.
+def constant_stress(stress: float | npt.ArrayLike, worlds: int, count: int) -> npt.NDArray[np.float64]:
+    """Active stress [Pa], float64 [worlds, count], of a number or an array that broadcasts to that.
 
     Raises:
         InputError: It does not, or is not finite.

@@ -14,7 +14,7 @@ from warp_corot.discretization.nodal import same_array
 from warp_corot.kernels.stepping.activation import follow_activation
 from warp_corot.kernels.stepping.conditions import LOAD_NODES, free_nodes, hold_nodes, release_nodes
 
-from .activation import ElementActivation
+from .activation import Activation, ElementActivation
 from .state import State
 from .trajectory import Trajectory
 
@@ -159,6 +159,21 @@ class Conditions:
             inputs += [self.sizes.world_elements, offset]
             outputs = [self.discretization.activation]
             wp.launch(follow_activation, len(each.elements), inputs, outputs, device=self.device)
+
+    def activate(self, elements: npt.NDArray[np.integer], stress: Activation | npt.NDArray[np.float64]) -> None:
+        """Have elements, [k], follow keyframes, or have these stresses [Pa], [k]; in place of former keyframes."""
+        added = []
+        if not isinstance(stress, Activation):
+            live = self.discretization.activation[: self.sizes.elements]
+            values = live.numpy().copy()
+            values[elements] = stress
+            live.assign(values)
+        elif len(elements):
+            added = [ElementActivation.of_keys(elements, stress, self.device)]
+        kept = [left for each in self.activations if (left := each.without(elements))]
+        # Other numbers in the same array are no other launches.
+        if added or kept != self.activations:
+            self.set_activations(kept + added)
 
     def set_activations(self, activations: Sequence[ElementActivation]) -> None:
         """Have active stress follow these keyframes and no others."""

@@ -12,16 +12,16 @@ from warp_corot.discretization.elements import Mesh
 from warp_corot.discretization.nodal import vec3_view
 from warp_corot.discretization.sizes import Sizes
 from warp_corot.errors import InputError
+from warp_corot.inputs.indices import checked_indices
 from warp_corot.materials.anisotropic import Anisotropic
 from warp_corot.materials.isotropic import Material
 
-from .activation import Activation, activate
+from .activation import Activation, constant_stress
 from .conditions import Conditions
-from .places import Nodes, nodes_at
+from .places import ChosenNodes, Nodes, chosen_nodes, nodes_at
 from .state import State
 from .trajectory import Trajectory
 from .views import Views
-from .worlds import ChosenNodes, chosen_nodes
 
 
 class Controls:
@@ -158,14 +158,8 @@ class Controls:
         Raises:
             InputError: The material has no fibres.
         """
-        conditions = self.conditions
-        if not conditions.discretization.has_activation and not isinstance(self.material, Anisotropic):
-            raise InputError(
-                "activation needs a material with a direction, TransverselyIsotropic or Orthotropic; "
-                f"the body's is {type(self.material).__name__}"
-            )
-        conditions.make_activation()
-        return self._views.hand_out(conditions.discretization.activation[: self.element_count])
+        self._make_activation()
+        return self._views.hand_out(self.conditions.discretization.activation[: self.element_count])
 
     def activate(
         self,
@@ -188,7 +182,15 @@ class Controls:
         Raises:
             InputError: The material has no fibres, wrong shapes, or values that are not finite.
         """
-        activate(self, stress, elements, worlds)
+        self._make_activation()
+        count = self.world_element_count
+        own = np.arange(count) if elements is None else checked_indices(np.asarray(elements), count, "element")
+        which = np.arange(self.worlds) if worlds is None else checked_indices(np.asarray(worlds), self.worlds, "world")
+        if isinstance(stress, Activation):
+            given: Activation | npt.NDArray[np.float64] = stress.repeated(len(which), len(own))
+        else:
+            given = constant_stress(stress, len(which), len(own)).ravel()
+        self.conditions.activate((which[:, None] * count + own).ravel(), given)
 
     @property
     def constrained(self) -> npt.NDArray[np.bool_]:
@@ -213,6 +215,16 @@ class Controls:
 
     def _chosen_nodes(self, nodes: Nodes, worlds: npt.ArrayLike | None) -> ChosenNodes:
         return chosen_nodes(nodes_at(nodes, lambda: self.mesh), self.world_node_count, self.worlds, worlds)
+
+    def _make_activation(self) -> None:
+        """See that there is an active stress for every element."""
+        conditions = self.conditions
+        if not conditions.discretization.has_activation and not isinstance(self.material, Anisotropic):
+            raise InputError(
+                "activation needs a material with a direction, TransverselyIsotropic or Orthotropic; "
+                f"the body's is {type(self.material).__name__}"
+            )
+        conditions.make_activation()
 
     def _hold(self, chosen: npt.NDArray[np.intp], velocities: npt.NDArray[np.float64] | wp.array) -> None:
         """Hold nodes that move at these velocities, and follow nothing else."""
