@@ -1,4 +1,9 @@
-"""Which arrays of the pools and of what is carried belong to nodes, and which to tetrahedra."""
+"""Which arrays of the pools and of what is carried belong to nodes, and which to tetrahedra; what unused places hold."""
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.kernels.remesh.pools import SINKS
 
 #: Of ``kernels.remesh.pools.Pools``; what a pass leaves behind for nobody is left out.
 OF_NODES: tuple[str, ...] = ("lattice", "ends", "valence")
@@ -18,3 +23,14 @@ CARRIED_BY_NODES: tuple[str, ...] = (
     "inverse_mass",
 )
 CARRIED_BY_TETRAHEDRA: tuple[str, ...] = ("density", "label", "values", "numbers")
+
+
+def padding(start: int, stop: int, sink: int) -> npt.NDArray[np.int32]:
+    """What ``Pools.leaf_tets`` holds in these places if there are no leaves, int32 [stop - start, 4].
+
+    Args:
+        start, stop: The places.
+        sink: ``Pools.sink``, the first place past the last node.
+    """
+    sinks = sink + np.arange(start, stop, dtype=np.int32) % int(SINKS)
+    return np.repeat(sinks[:, None], 4, axis=1)

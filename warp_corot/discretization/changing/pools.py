@@ -16,6 +16,7 @@ from warp_corot.kernels.remesh import pools as kernels
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.tree import LIVE, VOID, Tree
 
+from .fields import padding
 from .frames import all_frames
 from .snapshot import Snapshot
 from .transfer import Carriage, Column, Numbers
@@ -108,7 +109,7 @@ class DeviceForest:
             raise InputError(f"capacity is {capacity}: that is {self.tree_capacity} tetrahedra; there can be 2**31 - 1")
         self.threads = 1 if self.device.is_cpu else self.device.sm_count * THREADS_PER_PROCESSOR
         self.pools = self._make_pools(tree)
-        self.carriage = Carriage(self, density, values or {})
+        self.carriage = Carriage(forest, self.node_capacity, self.tree_capacity, density, values or {}, self.device)
         self.remember()
 
     def __repr__(self) -> str:
@@ -196,11 +197,11 @@ class DeviceForest:
 
     def remember(self) -> None:
         """Keep the present mesh and all that it carries, for ``restart``; it is done once when this is made."""
-        self.remembered = Snapshot.of(self)
+        self.remembered = Snapshot.of(self.pools, self.carriage.arrays)
 
     def restart(self) -> None:
         """Go back to what was kept last. Arrays stay the same, so that recorded passes and steps stay valid."""
-        self.remembered.restore(self)
+        self.remembered.restore(self.pools, self.carriage.arrays)
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
@@ -236,8 +237,8 @@ class DeviceForest:
         pools.valence = self._filled(valence, self.node_capacity, wp.int32)
         pools.touched = wp.zeros(self.node_capacity, dtype=wp.int32, device=device)
         pools.leaves = self._filled(leaves, self.capacity, wp.int32)
-        padding = self.padding(len(leaves), self.capacity + kernels.LEAF_PADDING)
-        pools.leaf_tets = wp.array(np.concatenate([tets[leaves], padding]), dtype=wp.vec4i, device=device)
+        unused = padding(len(leaves), self.capacity + kernels.LEAF_PADDING, self.node_capacity)
+        pools.leaf_tets = wp.array(np.concatenate([tets[leaves], unused]), dtype=wp.vec4i, device=device)
         pools.new_leaves = wp.empty(self.capacity, dtype=wp.int32, device=device)
         pools.marks = wp.zeros(self.capacity, dtype=wp.int8, device=device)
         counts = np.zeros(kernels.COUNTS, np.int32)
@@ -246,11 +247,6 @@ class DeviceForest:
         counts[kernels.NODE_TOP] = counts[kernels.OLD_TOP] = forest.node_count
         pools.counts = wp.array(counts, dtype=wp.int32, device=device)
         return pools
-
-    def padding(self, start: int, stop: int) -> npt.NDArray[np.int32]:
-        """What ``pools.leaf_tets`` holds in these places if there are no leaves, int32 [stop - start, 4]."""
-        sinks = self.node_capacity + np.arange(start, stop, dtype=np.int32) % int(kernels.SINKS)
-        return np.repeat(sinks[:, None], 4, axis=1)
 
     def _numbers(self) -> npt.NDArray[np.int32]:
         """Places of the source's nodes: those that leaves name first, the others at the end."""

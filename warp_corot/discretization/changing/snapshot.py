@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,10 +15,7 @@ from warp_corot.kernels.remesh import pools as kernels
 from warp_corot.kernels.remesh.state import NO_ROW
 from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 
-from .fields import CARRIED_BY_NODES, CARRIED_BY_TETRAHEDRA, OF_NODES, OF_TETRAHEDRA
-
-if TYPE_CHECKING:
-    from .pools import DeviceForest
+from .fields import CARRIED_BY_NODES, CARRIED_BY_TETRAHEDRA, OF_NODES, OF_TETRAHEDRA, padding
 
 #: What places hold where there is nothing, if it is not zero.
 _UNUSED = {"level": int(kernels.UNUSED), "row": int(NO_ROW)}
@@ -47,45 +44,47 @@ class Snapshot:
     pieces: tuple[Piece, ...]
 
     @classmethod
-    def of(cls, forest: DeviceForest) -> Snapshot:
-        """The present state."""
-        counts = forest.pools.counts.numpy().copy()
-        stretches = ((name, start, count) for name, start, count in _in_use(forest, counts) if count)
+    def of(cls, pools: Any, carried: Any) -> Snapshot:
+        """The present state of ``kernels.remesh.pools.Pools`` and ``kernels.remesh.state.Carried``."""
+        counts = pools.counts.numpy().copy()
+        stretches = ((name, start, count) for name, start, count in _in_use(pools, carried, counts) if count)
         pieces = (
-            Piece(n, start, wp.clone(array_of(forest, n)[start : start + count])) for n, start, count in stretches
+            Piece(n, start, wp.clone(array_of(pools, carried, n)[start : start + count]))
+            for n, start, count in stretches
         )
         return cls(counts, tuple(pieces))
 
-    def restore(self, forest: DeviceForest) -> None:
+    def restore(self, pools: Any, carried: Any) -> None:
         """Write it back into the same arrays."""
-        pools = forest.pools
         present = pools.counts.numpy()
         leaves, known = int(present[kernels.LEAVES]), int(self.counts[kernels.LEAVES])
         if leaves > known:
-            pools.leaf_tets[known:leaves].assign(forest.padding(known, leaves))
+            pools.leaf_tets[known:leaves].assign(padding(known, leaves, pools.sink))
         for name in (*OF_TETRAHEDRA, *OF_NODES, *CARRIED_BY_TETRAHEDRA, *CARRIED_BY_NODES):
-            array_of(forest, name).fill_(_UNUSED.get(name, 0))
+            array_of(pools, carried, name).fill_(_UNUSED.get(name, 0))
         for name, start, values in self.pieces:
-            array_of(forest, name)[start : start + len(values)].assign(values)
+            array_of(pools, carried, name)[start : start + len(values)].assign(values)
         counts = self.counts.copy()
         # Rounds are counted on, so that what was touched in later ones is not taken for new.
         counts[kernels.STAMP] = present[kernels.STAMP]
         pools.counts.assign(counts)
 
 
-def check_places(forest: DeviceForest, counts: npt.NDArray[np.int32], pieces: dict[str, npt.NDArray[Any]]) -> None:
+def check_places(
+    pools: Any, carried: Any, counts: npt.NDArray[np.int32], pieces: dict[str, npt.NDArray[Any]]
+) -> None:
     """See that kernels that are given stretches of arrays stay within these.
 
     Args:
-        forest: Where they are to go.
+        pools, carried: Where they are to go.
         counts: ``Pools.counts``.
         pieces: Values, by the name of their array and, after a dot, where the stretch begins.
 
     Raises:
         ValueError: A place that there is not, in one line.
     """
-    pools, levels = forest.pools, len(forest.carriage.arrays.volume)
-    places, nodes, named = len(pools.level), len(pools.lattice), len(forest.carriage.arrays.rest)
+    levels = len(carried.volume)
+    places, nodes, named = len(pools.level), len(pools.lattice), len(carried.rest)
     bounds = {"tets": (-1, nodes), "ends": (-1, nodes), "leaf_tets": (0, named), "level": (-1, levels)}
     bounds |= {name: (0, places) for name in ("leaves", "free_pairs", "void_leaves")}
     bounds |= {"parent": (-1, places), "first_child": (min(int(LIVE), int(VOID)), places)}
@@ -103,22 +102,22 @@ def check_places(forest: DeviceForest, counts: npt.NDArray[np.int32], pieces: di
         raise ValueError(f"{counts[kernels.NODE_TOP]} nodes are counted, and there are {pools.node_limit}")
 
 
-def array_of(forest: DeviceForest, name: str) -> wp.array:
+def array_of(pools: Any, carried: Any, name: str) -> wp.array:
     """An array of the pools or of what is carried."""
-    return getattr(forest.carriage.arrays if name in _CARRIED else forest.pools, name)
+    return getattr(carried if name in _CARRIED else pools, name)
 
 
-def _in_use(forest: DeviceForest, counts: npt.NDArray[np.int32]) -> Iterator[tuple[str, int, int]]:
+def _in_use(pools: Any, carried: Any, counts: npt.NDArray[np.int32]) -> Iterator[tuple[str, int, int]]:
     """Names of arrays, where stretches of them that are in use begin, and how long these are."""
-    used = int(np.flatnonzero(forest.pools.level.numpy() != kernels.UNUSED)[-1]) + 1
+    used = int(np.flatnonzero(pools.level.numpy() != kernels.UNUSED)[-1]) + 1
     for name in (*OF_TETRAHEDRA, *CARRIED_BY_TETRAHEDRA):
-        if array_of(forest, name).size:
+        if array_of(pools, carried, name).size:
             yield name, 0, used
     for name in (*OF_NODES, *CARRIED_BY_NODES):
         yield name, 0, int(counts[kernels.NODE_TOP])
-        yield name, forest.pools.node_limit, forest.virtual_count
+        yield name, pools.node_limit, pools.sink - pools.node_limit
     yield "free_pairs", 0, int(counts[kernels.FREE_PAIRS])
     for name in ("leaves", "leaf_tets"):
         yield name, 0, int(counts[kernels.LEAVES])
-    yield "void_leaves", 0, forest.pools.void_count
+    yield "void_leaves", 0, pools.void_count
     yield "impulse", 0, 1

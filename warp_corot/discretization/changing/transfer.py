@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,11 +14,9 @@ from warp_corot.discretization.nodal import padded
 from warp_corot.errors import InputError
 from warp_corot.kernels.remesh.pools import SINKS
 from warp_corot.kernels.remesh.state import MEAN, NO_ROW, Carried
+from warp_corot.mesh import TetForest
 from warp_corot.mesh.growing.growth import lattice_spacing
 from warp_corot.mesh.lattice import MAX_LEVEL, volume_shares
-
-if TYPE_CHECKING:
-    from .pools import DeviceForest
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +43,13 @@ class Carriage:
     node goes to both ends by halves. Children have their parent's density and values; a parent has its children's mean,
     or what a ``Column`` says.
 
+    Args:
+        source: The forest to begin with.
+        nodes, elements: Places for nodes and for tetrahedra of all levels.
+        density: Mass per rest volume [kg/m^3], a number or one for each leaf [T].
+        values: Other quantities of leaves by name.
+        device: Where the arrays are.
+
     Attributes:
         arrays: ``kernels.remesh.state.Carried``; nodal arrays by the nodes' places in the pool, with the places that
             padding names behind them, others by those of the tetrahedra. ``rest``, ``u``, ``v``, ``load``,
@@ -53,12 +58,17 @@ class Carriage:
     """
 
     def __init__(
-        self, forest: DeviceForest, density: npt.ArrayLike, values: Mapping[str, npt.ArrayLike | Column | Numbers]
+        self,
+        source: TetForest,
+        nodes: int,
+        elements: int,
+        density: npt.ArrayLike,
+        values: Mapping[str, npt.ArrayLike | Column | Numbers],
+        device: wp.Device,
     ):
-        self.device = forest.device
-        self._nodes = forest.node_capacity + int(SINKS)
-        self._first_nodes = len(forest.source.points)
-        source, elements = forest.source, forest.tree_capacity
+        self.device = device
+        self._nodes = nodes + int(SINKS)
+        self._first_nodes = len(source.points)
         leaves = source.tree.leaves
         fill = 1.0 if source.fill is None else source.fill
         numbers = {name: given.values for name, given in values.items() if isinstance(given, Numbers)}

@@ -23,7 +23,6 @@ from warp_corot.remesh.keyframes import Row
 from warp_corot.remesh.online import OnlineRemesh
 
 if TYPE_CHECKING:
-    from warp_corot.discretization.changing.pools import DeviceForest
     from warp_corot.remesh.changing import Changing
 
 Arrays = dict[str, np.ndarray]
@@ -63,16 +62,17 @@ def pack_changing(changing: Changing, prefix: str, arrays: Arrays) -> dict[str, 
         "at_beginning": conditions.of_present_mesh,
         "survey": asdict(changing.survey.last),
         "initial": _pack_snapshot(forest.remembered, f"{prefix}initial.", arrays),
-        "present": _pack_snapshot(Snapshot.of(forest), f"{prefix}present.", arrays),
+        "present": _pack_snapshot(Snapshot.of(forest.pools, forest.carriage.arrays), f"{prefix}present.", arrays),
     }
 
 
 def unpack_changing(changing: Changing, described: dict[str, Any], prefix: str, arrays: Arrays) -> None:
     """Have a body that was made as it began be remeshed as it was when ``pack_changing`` kept it."""
     forest, keyframes, body = changing.forest, changing.conditions.keyframes, changing.body
-    _unpacked_snapshot(forest, described["initial"], f"{prefix}initial.", arrays).restore(forest)
+    kept_in = forest.pools, forest.carriage.arrays
+    _unpacked_snapshot(kept_in, described["initial"], f"{prefix}initial.", arrays).restore(*kept_in)
     forest.remember()
-    _unpacked_snapshot(forest, described["present"], f"{prefix}present.", arrays).restore(forest)
+    _unpacked_snapshot(kept_in, described["present"], f"{prefix}present.", arrays).restore(*kept_in)
     keyframes.rows = {
         k: Row(arrays[f"{prefix}row{k}.times"], arrays[f"{prefix}row{k}.displacements"]) for k in described["rows"]
     }
@@ -170,10 +170,11 @@ def _pack_snapshot(snapshot: Snapshot, prefix: str, arrays: Arrays) -> list[list
     return [[name, start] for name, start, _ in snapshot.pieces]
 
 
-def _unpacked_snapshot(forest: DeviceForest, pieces: list[list[Any]], prefix: str, arrays: Arrays) -> Snapshot:
-    check_places(forest, arrays[prefix + "counts"], {f"{n}.{k}": arrays[f"{prefix}{n}.{k}"] for n, k in pieces})
-    made = [Piece(n, start, _on_device(arrays[f"{prefix}{n}.{start}"], array_of(forest, n))) for n, start in pieces]
-    return Snapshot(arrays[prefix + "counts"], tuple(made))
+def _unpacked_snapshot(kept_in: tuple[Any, Any], pieces: list[list[Any]], prefix: str, arrays: Arrays) -> Snapshot:
+    counts = arrays[prefix + "counts"]
+    check_places(*kept_in, counts, {f"{n}.{k}": arrays[f"{prefix}{n}.{k}"] for n, k in pieces})
+    made = [Piece(n, start, _on_device(arrays[f"{prefix}{n}.{start}"], array_of(*kept_in, n))) for n, start in pieces]
+    return Snapshot(counts, tuple(made))
 
 
 def _on_device(values: npt.NDArray[Any], like: wp.array) -> wp.array:
