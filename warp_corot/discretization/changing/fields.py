@@ -1,4 +1,4 @@
-"""Which arrays of the pools and of what is carried belong to nodes, and which to tetrahedra; what unused places hold."""
+"""Which arrays of the pools and of what is carried belong to nodes and which to tetrahedra; what unused places hold."""
 
 import numpy as np
 import numpy.typing as npt
