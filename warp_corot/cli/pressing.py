@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.errors import InputError
-from warp_corot.io.write.skins import boundary_surface
+from warp_corot.mesh.surfaces.bodies import boundary_surface
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody

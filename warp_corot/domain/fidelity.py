@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.kernels.meshing import measuring as kernels
+from warp_corot.mesh.surfaces.bodies import boundary_surface
 
 from .domain import Domain
 from .reference import reference_of
@@ -179,11 +180,7 @@ def _labels(mesh: Any) -> tuple[str, ...]:
 
 
 def _own_surface(mesh: Any) -> SurfaceMesh:
-    if hasattr(mesh, "surface"):
-        return mesh.surface()
-    from warp_corot.io.write.skins import boundary_surface
-
-    return boundary_surface(mesh)
+    return mesh.surface() if hasattr(mesh, "surface") else boundary_surface(mesh)
 
 
 def _spread(surface: SurfaceMesh, count: int) -> np.ndarray:

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.errors import InputError
+from warp_corot.mesh.surfaces.bodies import boundary_surface
 from warp_corot.mesh.surfaces.bound import SurfaceMesh
-from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 if TYPE_CHECKING:
     from typing import TypeAlias
@@ -201,15 +201,6 @@ def _skins_of_one(mesh: Any, surface: Any, labels: bool) -> list[Skin]:
     if has_domain(mesh):
         return [Skin("surface", mesh.surface())]
     return [Skin("surface", boundary_surface(mesh), is_boundary=True)]
-
-
-def boundary_surface(mesh: Any, of: npt.NDArray[np.bool_] | None = None) -> SurfaceMesh:
-    """The boundary of any tetrahedral mesh, or of some of its elements, its points bound to the nodes that they are."""
-    faces, _ = boundary_faces(mesh.tets if of is None else mesh.tets[of], mesh.points)
-    used, triangles = np.unique(faces, return_inverse=True)
-    weights = np.tile([1.0, 0.0, 0.0, 0.0], (len(used), 1))
-    nodes = np.repeat(used[:, None], 4, axis=1).astype(np.int32)
-    return SurfaceMesh(mesh.points[used], nodes, weights, triangles.reshape(-1, 3).astype(np.int32))
 
 
 def _rebound(surface: SurfaceMesh, mesh: Any) -> SurfaceMesh:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 def surface(forest: TetForest) -> SurfaceMesh:
     """See `TetForest.surface`."""
     if forest.phi is None:
-        return _boundary(forest)
+        return boundary_surface(forest)
     if forest.detail is not None:
         found = forest.detail.surface(forest)
     else:
         found = _on_nodes(forest, marched(forest.lattice_points, _all_cut(forest), forest.phi))
     # What is thinner than all elements and between their nodes is not met by any.
-    return found if len(found.triangles) else _boundary(forest)
+    return found if len(found.triangles) else boundary_surface(forest)
 
 
 def separating_surface(forest: TetForest) -> SurfaceMesh:
@@ -126,10 +126,10 @@ def _on_nodes(forest: TetForest, found: SurfaceMesh) -> SurfaceMesh:
     return replace(found, nodes=nodes.astype(np.int32), weights=weights)
 
 
-def _boundary(forest: TetForest) -> SurfaceMesh:
-    faces, _ = boundary_faces(forest.tets, forest.points)
+def boundary_surface(mesh: Any, of: npt.NDArray[np.bool_] | None = None) -> SurfaceMesh:
+    """The boundary of any tetrahedral mesh, or of some of its elements, its points bound to the nodes that they are."""
+    faces, _ = boundary_faces(mesh.tets if of is None else mesh.tets[of], mesh.points)
     used, triangles = np.unique(faces, return_inverse=True)
-    weights = np.zeros((len(used), 4))
-    weights[:, 0] = 1.0
+    weights = np.tile([1.0, 0.0, 0.0, 0.0], (len(used), 1))
     nodes = np.repeat(used[:, None], 4, axis=1).astype(np.int32)
-    return SurfaceMesh(forest.points[used], nodes, weights, triangles.reshape(-1, 3).astype(np.int32))
+    return SurfaceMesh(mesh.points[used], nodes, weights, triangles.reshape(-1, 3).astype(np.int32))
