@@ -8,17 +8,19 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.kernels.meshing import domain as kernels
 
-from .domain import Domain
+from .signed import SignedFunction
 
 
-class Pair(Domain):
+class Pair(SignedFunction):
     """Two domains and how they are put together."""
 
     outer: float
     inner: float
     word: str
 
-    def __init__(self, first: Domain, second: Domain, bounds: np.ndarray, second_names: tuple[str, ...]):
+    def __init__(
+        self, first: SignedFunction, second: SignedFunction, bounds: np.ndarray, second_names: tuple[str, ...]
+    ):
         names = first.label_names + tuple(name for name in second_names if name not in first.label_names)
         lipschitz = max(first.lipschitz, second.lipschitz)
         super().__init__(bounds, lipschitz, up_axis=first.up_axis, label_names=names, device=first.device)
@@ -40,7 +42,7 @@ class Union(Pair):
 
     outer, inner, word = -1.0, -1.0, "and also"
 
-    def __init__(self, first: Domain, second: Domain):
+    def __init__(self, first: SignedFunction, second: SignedFunction):
         lows, highs = np.stack([first.bounds, second.bounds], axis=1)
         super().__init__(first, second, np.stack([lows.min(axis=0), highs.max(axis=0)]), second.label_names)
 
@@ -53,7 +55,7 @@ class Union(Pair):
         wp.launch(kernels.choose_labels, points.size, [*phis, *labels, renumbered], [labels[0]], device=points.device)
         return labels[0]
 
-    def part(self, name: str) -> Domain:
+    def part(self, name: str) -> SignedFunction:
         """See `Domain.part`."""
         if name not in self.label_names:
             return super().part(name)
@@ -62,8 +64,8 @@ class Union(Pair):
             return first or self
         rest = self.second.part(name)
         for other in self.first.label_names:
-            rest = rest - self.first.part(other)
-        return first | rest if first else rest
+            rest = Difference(rest, self.first.part(other))
+        return Union(first, rest) if first else rest
 
 
 class Intersection(Pair):
@@ -71,7 +73,7 @@ class Intersection(Pair):
 
     outer, inner, word = 1.0, 1.0, "cut to"
 
-    def __init__(self, first: Domain, second: Domain):
+    def __init__(self, first: SignedFunction, second: SignedFunction):
         lows, highs = np.stack([first.bounds, second.bounds], axis=1)
         bounds = np.stack([lows.max(axis=0), highs.min(axis=0)])
         if not (bounds[0] < bounds[1]).all():
@@ -84,11 +86,12 @@ class Intersection(Pair):
     def _labels(self, points: wp.array) -> wp.array:
         return (self.first if self.first.label_names else self.second)._labels(points)
 
-    def part(self, name: str) -> Domain:
+    def part(self, name: str) -> SignedFunction:
         """See `Domain.part`."""
         if name not in self.label_names:
             return super().part(name)
-        return self.first.part(name) & self.second if self.first.label_names else self.second.part(name) & self.first
+        one, other = (self.first, self.second) if self.first.label_names else (self.second, self.first)
+        return Intersection(one.part(name), other)
 
 
 class Difference(Pair):
@@ -96,21 +99,21 @@ class Difference(Pair):
 
     outer, inner, word = 1.0, -1.0, "without"
 
-    def __init__(self, first: Domain, second: Domain):
+    def __init__(self, first: SignedFunction, second: SignedFunction):
         super().__init__(first, second, first.bounds, ())
 
     def _labels(self, points: wp.array) -> wp.array:
         return self.first._labels(points)
 
-    def part(self, name: str) -> Domain:
+    def part(self, name: str) -> SignedFunction:
         """See `Domain.part`."""
-        return self.first.part(name) - self.second if name in self.label_names else super().part(name)
+        return Difference(self.first.part(name), self.second) if name in self.label_names else super().part(name)
 
 
-class NamedDomain(Domain):
+class NamedDomain(SignedFunction):
     """See `Domain.named`."""
 
-    def __init__(self, body: Domain, name: str):
+    def __init__(self, body: SignedFunction, name: str):
         if not (isinstance(name, str) and name):
             raise InputError(f"the label name is {name!r}; it must be a word")
         super().__init__(body.bounds, body.lipschitz, up_axis=body.up_axis, label_names=(name,), device=body.device)
@@ -122,7 +125,7 @@ class NamedDomain(Domain):
     def _labels(self, points: wp.array) -> wp.array:
         return wp.full(points.size, 1, wp.int32, device=points.device)
 
-    def part(self, name: str) -> Domain:
+    def part(self, name: str) -> SignedFunction:
         """See `Domain.part`."""
         return self if name in self.label_names else super().part(name)
 
@@ -130,6 +133,6 @@ class NamedDomain(Domain):
         return self.body._details()
 
 
-def labels_or_none(domain: Domain, points: wp.array) -> wp.array:
+def labels_or_none(domain: SignedFunction, points: wp.array) -> wp.array:
     """A domain's labels, zeros if it has none."""
     return domain._labels(points) if domain.label_names else wp.zeros(points.size, wp.int32, device=points.device)

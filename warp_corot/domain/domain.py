@@ -1,36 +1,25 @@
-"""Domains: bodies as signed functions, sampled on the device."""
+"""Domains: bodies as users make and combine them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from os import PathLike
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.errors import InputError
-from warp_corot.inputs.device import checked_device
-from warp_corot.kernels.meshing import domain as kernels
-
-from .units import check_float32, length
+from .combined import Difference, Intersection, NamedDomain, Union
+from .function import Function, FunctionDomain
+from .shapes import Box, Capsule, Sphere, Torus
+from .signed import SignedFunction
 
 if TYPE_CHECKING:
-    from warp_corot.io.read.surfaces import LoadedSurface
-    from warp_corot.io.read.volumes import LoadedVolume
-
-    Surface = str | PathLike[str] | LoadedSurface | tuple[npt.ArrayLike, npt.ArrayLike]
-    Volume = str | PathLike[str] | LoadedVolume | npt.ArrayLike
-    # Or a Warp function, which type checkers do not know.
-    Function = Callable[[np.ndarray], npt.ArrayLike]
-
-#: The shortest step inwards when a body's thickness is sought, over how far it is sought, and how many there are.
-SPHERE_STEP = 0.04
-SPHERES = 25
+    from .grid import Volume
+    from .surface import Surface
 
 
-class Domain:
+class Domain(SignedFunction):
     """A body as a signed function phi [m], negative inside.
 
     Made by `from_surface`, `from_labels`, `from_probabilities`, `from_function`, by the shapes `sphere`, `box`, `torus`
@@ -45,165 +34,29 @@ class Domain:
         device: Where points that are given as NumPy arrays are evaluated.
     """
 
-    def __init__(
-        self,
-        bounds: npt.ArrayLike,
-        lipschitz: float,
-        *,
-        up_axis: str = "Y",
-        label_names: Sequence[str] = (),
-        device: str | wp.Device | None = None,
-    ):
-        if up_axis not in ("X", "Y", "Z"):
-            raise InputError(f"up_axis is {up_axis!r}; it must be 'X', 'Y' or 'Z'")
-        self.bounds = np.array(bounds, dtype=np.float64)
-        check_float32(self.bounds)
-        self.lipschitz = float(lipschitz)
-        self.up_axis = up_axis
-        self.label_names = tuple(label_names)
-        self.device = checked_device(device)
-
-    def phi(self, points: Any) -> Any:
-        """The signed function [m], negative inside.
-
-        Args:
-            points: Positions [m]: an array [n, 3], or a Warp array of vec3.
-
-        Returns:
-            float32 [n]: NumPy's for NumPy's, Warp's on the same device for Warp's.
-
-        Raises:
-            InputError: NumPy points of another shape, or not finite.
-        """
-        if isinstance(points, wp.array):
-            return self._phi(points)
-        return self._phi(self._on_device(points)).numpy()
-
-    def labels_at(self, points: Any, *, nearest: bool = False) -> Any:
-        """Which label holds each point.
-
-        Args:
-            points: As for `phi`.
-            nearest: Points outside the body, and in gaps between labels, take the nearest label instead of 0.
-
-        Returns:
-            int32 [n], as for `phi`: the label's place in ``label_names`` plus one; 0 outside any.
-        """
-        given = points if isinstance(points, wp.array) else self._on_device(points)
-        if self.label_names:
-            labels = self._labels(given)
-            if not nearest:
-                wp.launch(kernels.clear_labels_outside, given.size, [self._phi(given)], [labels], device=given.device)
-        else:
-            labels = wp.zeros(given.size, wp.int32, device=given.device)
-        return labels if isinstance(points, wp.array) else labels.numpy()
-
-    #: Whether the body has, or may have, several pieces, which are not to grow together.
-    has_pieces = False
-
-    def thickness(
-        self, points: npt.ArrayLike, inward: npt.ArrayLike, reach: float, *, outside: bool = False
-    ) -> np.ndarray:
-        """How thick the body is at points of its surface: how far it is to where one leaves it again.
-
-        Args:
-            points: On the surface, or nearly [n, 3] [m].
-            inward: Unit vectors [n, 3].
-            reach: What is thicker counts as this thick [m].
-            outside: The same of what is around the body, outwards: how wide gaps are.
-
-        Returns:
-            float64 [n] [m].
-        """
-        side = -1.0 if outside else 1.0
-        given, directions = self._on_device(points), self._on_device(side * np.asarray(inward))
-        return self._thickness(given, directions, float(reach), side).astype(np.float64)
-
     def part(self, name: str) -> Domain:
         """The domain of one label alone.
 
         Raises:
             InputError: No such label; the message lists those there are.
         """
-        there = ", ".join(self.label_names) or "none"
-        raise InputError(f"there is no label {name!r} in this domain; its labels: {there}")
+        return _Made(super().part(name))
 
     def named(self, name: str) -> Domain:
         """The same body, all of it one label of that name.
 
         In a union, the label of the first domain that holds a point counts: ``tumour.named("tumour") | liver``.
         """
-        from .combined import NamedDomain
-
-        return NamedDomain(self, name)
-
-    def report(self) -> list[str]:
-        """What a user should know of it, line by line: size, unit, how closed, pieces, labels."""
-        low, high = self.bounds
-        size = " x ".join(length(side) for side in high - low)
-        lines = [f"bounds {size}, {self.up_axis} up", *self._details()]
-        if self.label_names:
-            lines.append(f"labels: {', '.join(self.label_names)}")
-        return lines
+        return _Made(NamedDomain(self, name))
 
     def __or__(self, other: Domain) -> Domain:
-        from .combined import Union
-
-        return Union(self, other) if isinstance(other, Domain) else NotImplemented
+        return _Made(Union(self, other)) if isinstance(other, Domain) else NotImplemented
 
     def __and__(self, other: Domain) -> Domain:
-        from .combined import Intersection
-
-        return Intersection(self, other) if isinstance(other, Domain) else NotImplemented
+        return _Made(Intersection(self, other)) if isinstance(other, Domain) else NotImplemented
 
     def __sub__(self, other: Domain) -> Domain:
-        from .combined import Difference
-
-        return Difference(self, other) if isinstance(other, Domain) else NotImplemented
-
-    def point_in(self, name: str) -> np.ndarray | None:
-        """A point where a label is [m], float64 [3]; None where none is known without looking for it."""
-        return None
-
-    # What a kind of domain defines.
-
-    def _phi(self, points: wp.array) -> wp.array:
-        """float32 [n] on the points' device."""
-        raise NotImplementedError
-
-    def _labels(self, points: wp.array) -> wp.array:
-        """Labels int32 [n] on the points' device; outside the body those of the nearest part."""
-        raise NotImplementedError
-
-    def _thickness(self, points: wp.array, along: wp.array, reach: float, side: float) -> np.ndarray:
-        """float32 [n]; of the body for a ``side`` of 1, of what is around it for -1.
-
-        Here by spheres: as far on as no surface can be, again and again.
-        """
-        start, along = points.numpy(), along.numpy()
-        gone = np.full(len(start), SPHERE_STEP * reach, np.float32)
-        going = np.arange(len(start))
-        for _ in range(SPHERES):
-            phi = side * self.phi(start[going] + gone[going, None] * along[going])
-            inside = phi < 0.0
-            going, step = going[inside], np.abs(phi[inside]) / self.lipschitz
-            gone[going] += np.maximum(step, SPHERE_STEP * reach)
-            going = going[gone[going] < reach]
-            if not len(going):
-                break
-        return np.minimum(gone, reach)
-
-    def _details(self) -> list[str]:
-        return []
-
-    def _on_device(self, points: npt.ArrayLike) -> wp.array:
-        given = np.asarray(points)
-        if given.ndim != 2 or given.shape[1] != 3 or given.dtype.kind not in "fiu":
-            raise InputError(f"points have shape {given.shape} and dtype {given.dtype}; they must be numbers [n, 3]")
-        bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
-        if len(bad):
-            raise InputError(f"point {bad[0]} is {given[bad[0]].tolist()}; its coordinates must be finite")
-        return wp.array(np.ascontiguousarray(given, dtype=np.float32), dtype=wp.vec3, device=self.device)
+        return _Made(Difference(self, other)) if isinstance(other, Domain) else NotImplemented
 
     # Ways to make one.
 
@@ -242,7 +95,7 @@ class Domain:
         """
         from .surface import surface_domain
 
-        return surface_domain(surface, unit, up_axis, device)
+        return _Made(surface_domain(surface, unit, up_axis, device))
 
     @classmethod
     def from_labels(
@@ -289,7 +142,7 @@ class Domain:
         """
         from .labels import label_domain
 
-        return label_domain(volume, spacing, origin, affine, labels, unit, smoothing, up_axis, device)
+        return _Made(label_domain(volume, spacing, origin, affine, labels, unit, smoothing, up_axis, device))
 
     @classmethod
     def from_probabilities(
@@ -317,7 +170,7 @@ class Domain:
         """
         from .labels import probability_domain
 
-        return probability_domain(maps, certain, spacing, origin, affine, unit, smoothing, up_axis, device)
+        return _Made(probability_domain(maps, certain, spacing, origin, affine, unit, smoothing, up_axis, device))
 
     @classmethod
     def from_function(
@@ -343,36 +196,61 @@ class Domain:
             InputError: An empty box, a function of another form or not finite in the box, or one that was seen to
                 change faster than ``lipschitz`` says.
         """
-        from .function import FunctionDomain
-
-        return FunctionDomain(function, bounds, lipschitz, up_axis=up_axis, device=device)
+        return _Made(FunctionDomain(function, bounds, lipschitz, up_axis=up_axis, device=device))
 
     @classmethod
     def sphere(cls, radius: float, centre: Sequence[float] = (0.0, 0.0, 0.0), **options: Any) -> Domain:
         """A ball [m]. Options here and below: ``up_axis``, ``device``."""
-        from .shapes import Sphere
-
-        return Sphere(radius, centre, **options)
+        return _Made(Sphere(radius, centre, **options))
 
     @classmethod
     def box(cls, lower: Sequence[float], upper: Sequence[float], **options: Any) -> Domain:
         """An axis-aligned box between two corners [m]."""
-        from .shapes import Box
-
-        return Box(lower, upper, **options)
+        return _Made(Box(lower, upper, **options))
 
     @classmethod
     def torus(
         cls, major: float, minor: float, centre: Sequence[float] = (0.0, 0.0, 0.0), axis: str = "Z", **options: Any
     ) -> Domain:
         """A ring: a tube of radius ``minor`` around a circle of radius ``major`` [m] about an axis."""
-        from .shapes import Torus
-
-        return Torus(major, minor, centre, axis, **options)
+        return _Made(Torus(major, minor, centre, axis, **options))
 
     @classmethod
     def capsule(cls, start: Sequence[float], end: Sequence[float], radius: float, **options: Any) -> Domain:
         """All points within ``radius`` of the segment between two points [m]."""
-        from .shapes import Capsule
+        return _Made(Capsule(start, end, radius, **options))
 
-        return Capsule(start, end, radius, **options)
+
+class _Made(Domain):
+    """A signed function of any kind, as users hold it."""
+
+    def __init__(self, kind: SignedFunction):
+        options: dict[str, Any] = {"up_axis": kind.up_axis, "label_names": kind.label_names, "device": kind.device}
+        super().__init__(kind.bounds, kind.lipschitz, **options)
+        self._kind = kind
+
+    @property
+    def kind(self) -> SignedFunction:
+        return self._kind
+
+    @property
+    def has_pieces(self) -> bool:
+        return self._kind.has_pieces
+
+    def part(self, name: str) -> Domain:
+        return _Made(self._kind.part(name))
+
+    def point_in(self, name: str) -> np.ndarray | None:
+        return self._kind.point_in(name)
+
+    def _phi(self, points: wp.array) -> wp.array:
+        return self._kind._phi(points)
+
+    def _labels(self, points: wp.array) -> wp.array:
+        return self._kind._labels(points)
+
+    def _thickness(self, points: wp.array, along: wp.array, reach: float, side: float) -> np.ndarray:
+        return self._kind._thickness(points, along, reach, side)
+
+    def _details(self) -> list[str]:
+        return self._kind._details()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,11 +12,11 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.kernels.meshing import domain as kernels
 
-from .domain import Domain
+from .signed import SignedFunction
 from .units import length
 
-if TYPE_CHECKING:
-    from .domain import Function
+#: What users write, or a Warp function, which type checkers do not know.
+Function = Callable[[np.ndarray], npt.ArrayLike]
 
 #: Pairs of points at which the slope is looked at.
 PAIRS = 4096
@@ -23,7 +24,7 @@ PAIRS = 4096
 SLACK = 1.0e-2
 
 
-class FunctionDomain(Domain):
+class FunctionDomain(SignedFunction):
     """See `Domain.from_function`."""
 
     def __init__(self, function: Function, bounds: npt.ArrayLike, lipschitz: float, **options: Any):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,8 +15,8 @@ from warp_corot.io.read.volumes import LoadedVolume, affine_of, load_volume
 
 from .units import metres_per_unit
 
-if TYPE_CHECKING:
-    from .domain import Volume
+#: A file, what ``load_volume`` gives, or an array.
+Volume = str | PathLike[str] | LoadedVolume | npt.ArrayLike
 
 #: Voxel axes whose directions' inner products are below this are at right angles.
 SQUARE = 1.0e-4

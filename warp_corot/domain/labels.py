@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,13 +13,10 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.kernels.meshing import domain as kernels
 
-from .domain import Domain
-from .grid import Grid, labels_from_probabilities, numbered_labels, placed_grid
+from .grid import Grid, Volume, labels_from_probabilities, numbered_labels, placed_grid
+from .signed import SignedFunction
 from .units import length, unlikely_size, volume
 from .voxels import gaussian, pieces, signed_distance, steepest_slope
-
-if TYPE_CHECKING:
-    from .domain import Volume
 
 #: Voxels of background around the body: the interpolant is positive beyond.
 MARGIN = 2
@@ -27,7 +24,7 @@ MARGIN = 2
 LARGEST_SMOOTHING = 0.1
 
 
-class LabelDomain(Domain):
+class LabelDomain(SignedFunction):
     """See `Domain.from_labels`.
 
     Args:
@@ -119,7 +116,7 @@ class LabelDomain(Domain):
         chosen = voxels[np.argmin(((voxels - voxels.mean(axis=0)) ** 2).sum(axis=1))]
         return self.affine[:3, :3] @ chosen + self.affine[:3, 3]
 
-    def part(self, name: str) -> Domain:
+    def part(self, name: str) -> SignedFunction:
         """See `Domain.part`."""
         if name not in self.label_names:
             return super().part(name)
@@ -151,7 +148,7 @@ def label_domain(
     smoothing: float,
     up_axis: str,
     device: Any,
-) -> Domain:
+) -> SignedFunction:
     """See `Domain.from_labels`."""
     grid = placed_grid(given, spacing, origin, affine, unit)
     numbers, names = numbered_labels(grid.values, labels)
@@ -168,7 +165,7 @@ def probability_domain(
     smoothing: float,
     up_axis: str,
     device: Any,
-) -> Domain:
+) -> SignedFunction:
     """See `Domain.from_probabilities`."""
     if not (isinstance(maps, Mapping) and maps):
         raise InputError("maps is empty; it must give at least one volume by label name")
@@ -185,7 +182,7 @@ def probability_domain(
 
 def _domain(
     grid: Grid, numbers: np.ndarray, names: Sequence[str], smoothing: float, up_axis: str, device: Any
-) -> Domain:
+) -> SignedFunction:
     if not (np.isfinite(smoothing) and smoothing >= 0.0):
         raise InputError(f"smoothing is {smoothing!r}; it must be a length [m], 0 for none")
     domain = LabelDomain(numbers, grid.affine, names, smoothing, grid.notes, up_axis=up_axis, device=device)

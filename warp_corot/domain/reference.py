@@ -10,8 +10,8 @@ import warp as wp
 
 from warp_corot.kernels.meshing import measuring as kernels
 
-from .domain import Domain
 from .labels import LabelDomain
+from .signed import SignedFunction
 from .surface import SurfaceDomain
 from .voxels import piece_of_voxels
 from .winding import Parts, edge_parts, linked, part_volumes
@@ -39,17 +39,18 @@ class Reference:
     pieces: int
 
 
-def reference_of(domain: Domain, count: int) -> Reference:
+def reference_of(domain: SignedFunction, count: int) -> Reference:
     """What is known of a domain, without meshing it.
 
     Args:
         domain: Any. Of a surface and of voxels all is exact; of others volume and pieces come from samples.
         count: About how many points.
     """
-    if isinstance(domain, SurfaceDomain):
-        return _of_surface(domain, count)
-    if isinstance(domain, LabelDomain):
-        return _of_voxels(domain, count)
+    kind = domain.kind
+    if isinstance(kind, SurfaceDomain):
+        return _of_surface(kind, count)
+    if isinstance(kind, LabelDomain):
+        return _of_voxels(kind, count)
     return _of_samples(domain, count)
 
 
@@ -159,7 +160,7 @@ def _of_voxels(domain: LabelDomain, count: int) -> Reference:
     return Reference(float(inside.sum()) * voxel, spread, owner[chosen].astype(np.int32), int(numbers.max()))
 
 
-def _of_samples(domain: Domain, count: int) -> Reference:
+def _of_samples(domain: SignedFunction, count: int) -> Reference:
     volume, points, pieces = _sampled(domain)
     points = _projected(domain, points)
     if len(points) > count:
@@ -167,7 +168,7 @@ def _of_samples(domain: Domain, count: int) -> Reference:
     return Reference(volume, points, np.zeros(len(points), np.int32), pieces)
 
 
-def _sampled(domain: Domain) -> tuple[float, np.ndarray, int]:
+def _sampled(domain: SignedFunction) -> tuple[float, np.ndarray, int]:
     """Volume, points near the surface, and pieces, of cells that are halved where the surface may be."""
     low, size = domain.bounds[0], np.ptp(domain.bounds, axis=0)
     h = float(size.max()) / CELLS
@@ -195,7 +196,7 @@ def _sampled(domain: Domain) -> tuple[float, np.ndarray, int]:
     raise AssertionError
 
 
-def _projected(domain: Domain, points: np.ndarray) -> np.ndarray:
+def _projected(domain: SignedFunction, points: np.ndarray) -> np.ndarray:
     """Points near the surface, moved onto it."""
     size = float(np.ptp(domain.bounds, axis=0).max())
     step = 1.0e-4 * size
@@ -207,19 +208,20 @@ def _projected(domain: Domain, points: np.ndarray) -> np.ndarray:
     return points[np.abs(domain.phi(points)) < 1.0e-3 * size / CELLS]
 
 
-def extent_of(domain: Domain) -> tuple[float, float]:
+def extent_of(domain: SignedFunction) -> tuple[float, float]:
     """About the volume [m^3] and the area of the surface [m^2] of a domain."""
-    if isinstance(domain, SurfaceDomain):
-        corners = domain.closed.points[domain.closed.triangles]
+    kind = domain.kind
+    if isinstance(kind, SurfaceDomain):
+        corners = kind.closed.points[kind.closed.triangles]
         crossed = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        return domain.closed.volume, 0.5 * float(np.linalg.norm(crossed, axis=1).sum())
-    if isinstance(domain, LabelDomain):
-        inside = domain.numbers > 0
-        voxel = abs(float(np.linalg.det(domain.affine[:3, :3])))
+        return kind.closed.volume, 0.5 * float(np.linalg.norm(crossed, axis=1).sum())
+    if isinstance(kind, LabelDomain):
+        inside = kind.numbers > 0
+        voxel = abs(float(np.linalg.det(kind.affine[:3, :3])))
         area = 0.0
         for axis in range(3):
             faces = np.count_nonzero(np.diff(inside, axis=axis))
-            area += faces * voxel / float(np.linalg.norm(domain.affine[:3, axis]))
+            area += faces * voxel / float(np.linalg.norm(kind.affine[:3, axis]))
         # A staircase has half as much again as the slope that it stands for, about.
         return float(inside.sum()) * voxel, area / 1.5
     volume, points, _ = _sampled(domain)

@@ -11,11 +11,11 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.kernels.meshing import domain as kernels
 
-from .domain import Domain
+from .signed import SignedFunction
 from .units import length
 
 
-class Shape(Domain):
+class Shape(SignedFunction):
     """A shape that one kernel evaluates; its distance is exact."""
 
     def __init__(self, kernel: wp.Kernel, numbers: Sequence[Any], bounds: Any, **options: Any):

@@ -16,13 +16,15 @@ from warp_corot.io.read.surfaces import UP_AXES, LoadedSurface, load_surface
 from warp_corot.kernels.meshing import domain as kernels
 from warp_corot.mesh.side_by_side import in_parts
 
-from .domain import Domain
 from .sides import sides_of
+from .signed import SignedFunction
 from .units import length, metres_per_unit, unlikely_size, volume
 
 if TYPE_CHECKING:
     from .closing import ClosedSurface
-    from .domain import Surface
+
+#: A file, what ``load_surface`` gives, or points and triangles.
+Surface = str | PathLike[str] | LoadedSurface | tuple[npt.ArrayLike, npt.ArrayLike]
 
 #: Points along each side of the box at which winding numbers are looked at.
 SAMPLES = 16
@@ -34,7 +36,7 @@ START = 0.01
 LARGE_HOLES = 0.01
 
 
-class SurfaceDomain(Domain):
+class SurfaceDomain(SignedFunction):
     """See `Domain.from_surface`.
 
     Args:
@@ -75,7 +77,7 @@ class SurfaceDomain(Domain):
         return phi
 
     @property
-    def has_pieces(self) -> bool:  # type: ignore[override]
+    def has_pieces(self) -> bool:
         return self.closed.pieces > 1
 
     def _thickness(self, points: wp.array, along: wp.array, reach: float, side: float) -> np.ndarray:
@@ -135,7 +137,7 @@ class SurfaceDomain(Domain):
         return [*lines, *(line for happened, line in said if happened)]
 
 
-def surface_domain(surface: Surface, unit: str | float | None, up_axis: str | None, device: Any) -> Domain:
+def surface_domain(surface: Surface, unit: str | float | None, up_axis: str | None, device: Any) -> SignedFunction:
     """See `Domain.from_surface`."""
     from .closing import close_surface
 

@@ -1,0 +1,176 @@
+"""Bodies as signed functions, sampled on the device: what all kinds of domains have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.errors import InputError
+from warp_corot.inputs.device import checked_device
+from warp_corot.kernels.meshing import domain as kernels
+
+from .units import check_float32, length
+
+#: The shortest step inwards when a body's thickness is sought, over how far it is sought, and how many there are.
+SPHERE_STEP = 0.04
+SPHERES = 25
+
+
+class SignedFunction:
+    """A body as a signed function phi [m], negative inside: what all kinds of domains are.
+
+    Attributes:
+        bounds: Axis-aligned box that holds the inside [m], float64 [2, 3].
+        lipschitz: |phi(a) - phi(b)| <= lipschitz * |a - b| for all points a and b, up to float32's rounding: where
+            |phi| > lipschitz * r no surface is nearer than r.
+        up_axis: "X", "Y" or "Z".
+        label_names: Names of the labels, () without any.
+        device: Where points that are given as NumPy arrays are evaluated.
+    """
+
+    def __init__(
+        self,
+        bounds: npt.ArrayLike,
+        lipschitz: float,
+        *,
+        up_axis: str = "Y",
+        label_names: Sequence[str] = (),
+        device: str | wp.Device | None = None,
+    ):
+        if up_axis not in ("X", "Y", "Z"):
+            raise InputError(f"up_axis is {up_axis!r}; it must be 'X', 'Y' or 'Z'")
+        self.bounds = np.array(bounds, dtype=np.float64)
+        check_float32(self.bounds)
+        self.lipschitz = float(lipschitz)
+        self.up_axis = up_axis
+        self.label_names = tuple(label_names)
+        self.device = checked_device(device)
+
+    def phi(self, points: Any) -> Any:
+        """The signed function [m], negative inside.
+
+        Args:
+            points: Positions [m]: an array [n, 3], or a Warp array of vec3.
+
+        Returns:
+            float32 [n]: NumPy's for NumPy's, Warp's on the same device for Warp's.
+
+        Raises:
+            InputError: NumPy points of another shape, or not finite.
+        """
+        if isinstance(points, wp.array):
+            return self._phi(points)
+        return self._phi(self._on_device(points)).numpy()
+
+    def labels_at(self, points: Any, *, nearest: bool = False) -> Any:
+        """Which label holds each point.
+
+        Args:
+            points: As for `phi`.
+            nearest: Points outside the body, and in gaps between labels, take the nearest label instead of 0.
+
+        Returns:
+            int32 [n], as for `phi`: the label's place in ``label_names`` plus one; 0 outside any.
+        """
+        given = points if isinstance(points, wp.array) else self._on_device(points)
+        if self.label_names:
+            labels = self._labels(given)
+            if not nearest:
+                wp.launch(kernels.clear_labels_outside, given.size, [self._phi(given)], [labels], device=given.device)
+        else:
+            labels = wp.zeros(given.size, wp.int32, device=given.device)
+        return labels if isinstance(points, wp.array) else labels.numpy()
+
+    @property
+    def kind(self) -> SignedFunction:
+        """The function itself, whose class says of what kind it is; of a ``Domain`` what it was made as."""
+        return self
+
+    @property
+    def has_pieces(self) -> bool:
+        """Whether the body has, or may have, several pieces, which are not to grow together."""
+        return False
+
+    def thickness(
+        self, points: npt.ArrayLike, inward: npt.ArrayLike, reach: float, *, outside: bool = False
+    ) -> np.ndarray:
+        """How thick the body is at points of its surface: how far it is to where one leaves it again.
+
+        Args:
+            points: On the surface, or nearly [n, 3] [m].
+            inward: Unit vectors [n, 3].
+            reach: What is thicker counts as this thick [m].
+            outside: The same of what is around the body, outwards: how wide gaps are.
+
+        Returns:
+            float64 [n] [m].
+        """
+        side = -1.0 if outside else 1.0
+        given, directions = self._on_device(points), self._on_device(side * np.asarray(inward))
+        return self._thickness(given, directions, float(reach), side).astype(np.float64)
+
+    def part(self, name: str) -> SignedFunction:
+        """The domain of one label alone.
+
+        Raises:
+            InputError: No such label; the message lists those there are.
+        """
+        there = ", ".join(self.label_names) or "none"
+        raise InputError(f"there is no label {name!r} in this domain; its labels: {there}")
+
+    def report(self) -> list[str]:
+        """What a user should know of it, line by line: size, unit, how closed, pieces, labels."""
+        low, high = self.bounds
+        size = " x ".join(length(side) for side in high - low)
+        lines = [f"bounds {size}, {self.up_axis} up", *self._details()]
+        if self.label_names:
+            lines.append(f"labels: {', '.join(self.label_names)}")
+        return lines
+
+    def point_in(self, name: str) -> np.ndarray | None:
+        """A point where a label is [m], float64 [3]; None where none is known without looking for it."""
+        return None
+
+    # What a kind of body defines.
+
+    def _phi(self, points: wp.array) -> wp.array:
+        """float32 [n] on the points' device."""
+        raise NotImplementedError
+
+    def _labels(self, points: wp.array) -> wp.array:
+        """Labels int32 [n] on the points' device; outside the body those of the nearest part."""
+        raise NotImplementedError
+
+    def _thickness(self, points: wp.array, along: wp.array, reach: float, side: float) -> np.ndarray:
+        """float32 [n]; of the body for a ``side`` of 1, of what is around it for -1.
+
+        Here by spheres: as far on as no surface can be, again and again.
+        """
+        start, along = points.numpy(), along.numpy()
+        gone = np.full(len(start), SPHERE_STEP * reach, np.float32)
+        going = np.arange(len(start))
+        for _ in range(SPHERES):
+            phi = side * self.phi(start[going] + gone[going, None] * along[going])
+            inside = phi < 0.0
+            going, step = going[inside], np.abs(phi[inside]) / self.lipschitz
+            gone[going] += np.maximum(step, SPHERE_STEP * reach)
+            going = going[gone[going] < reach]
+            if not len(going):
+                break
+        return np.minimum(gone, reach)
+
+    def _details(self) -> list[str]:
+        return []
+
+    def _on_device(self, points: npt.ArrayLike) -> wp.array:
+        given = np.asarray(points)
+        if given.ndim != 2 or given.shape[1] != 3 or given.dtype.kind not in "fiu":
+            raise InputError(f"points have shape {given.shape} and dtype {given.dtype}; they must be numbers [n, 3]")
+        bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
+        if len(bad):
+            raise InputError(f"point {bad[0]} is {given[bad[0]].tolist()}; its coordinates must be finite")
+        return wp.array(np.ascontiguousarray(given, dtype=np.float32), dtype=wp.vec3, device=self.device)
