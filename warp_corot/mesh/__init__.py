@@ -2,7 +2,8 @@
 
 from warp_corot.mesh.surfaces.bound import BoundPoints, SurfaceMesh
 
-from .forest import TetForest, Tree
+from .forest import TetForest
 from .tetmesh import TetMesh
+from .tree import Tree
 
 __all__ = ["BoundPoints", "SurfaceMesh", "TetForest", "TetMesh", "Tree"]

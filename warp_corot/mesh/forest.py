@@ -7,9 +7,6 @@ lattice. The tree knows every ancestor; the leaves are the mesh. All is built wi
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING
 
@@ -20,27 +17,28 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_numbers, shown
 from warp_corot.inputs.indices import checked_indices
-from warp_corot.mesh.growing.refined import refined
 
-from .lattice import LATTICE_BITS, checked_cell_size, checked_cells, checked_level, volume_shares
+from .forest_arrays import ForestArrays
+from .growing.refined import refined
+from .lattice import LATTICE_BITS, checked_cell_size, checked_cells, checked_level
 from .lattice import MAX_LEVEL as MAX_LEVEL
-from .tree import Tree, UniformTree
+from .pieces import pieces_of
+from .surfaces.bodies import largest_piece, separating_surface, summary, surface
+from .surfaces.bound import BoundPoints, SurfaceMesh, bound
+from .surfaces.embedding import embed
+from .tree import UniformTree
 from .uniform import halvings, uniform_leaves
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
-    from warp_corot.mesh.growing.detail import Detail
-    from warp_corot.mesh.surfaces.bound import BoundPoints, SurfaceMesh
 
-#: A user's function of points [n, 3] -> [n].
-Field = Callable[[np.ndarray], np.ndarray]
+    from .growing.judging import Field
 
 #: Leaves are numbered in 32 bits.
 MAX_LEAVES = 2**31 - 1
 
 
-@dataclass(frozen=True, eq=False)
-class TetForest:
+class TetForest(ForestArrays):
     """A conforming mesh of right-angled tetrahedra of three shapes, the leaves of a forest of binary trees.
 
     Attributes:
@@ -61,20 +59,6 @@ class TetForest:
         label_names: Names of the labels.
         detail: The body's surface where it was looked at more closely than the mesh follows it; None: nowhere.
     """
-
-    cells: tuple[int, int, int]
-    cell_size: float
-    origin: tuple[float, float, float]
-    lattice: np.ndarray
-    node_ends: np.ndarray
-    tree: Tree
-    up_axis: str = "Y"
-    phi: np.ndarray | None = None
-    fill: np.ndarray | None = None
-    labels: np.ndarray | None = None
-    node_labels: np.ndarray | None = None
-    label_names: tuple[str, ...] = ()
-    detail: Detail | None = None
 
     @classmethod
     def box(
@@ -183,55 +167,6 @@ class TetForest:
             device,
         )
 
-    @cached_property
-    def points(self) -> np.ndarray:
-        """Rest positions of the nodes [m], float64 [N, 3]."""
-        return self.lattice_points[: self.node_count]
-
-    @cached_property
-    def lattice_points(self) -> np.ndarray:
-        """Rest positions of all lattice points [m], the N nodes first, float64."""
-        return np.asarray(self.origin) + self.lattice * (self.cell_size / 2**LATTICE_BITS)
-
-    @cached_property
-    def node_count(self) -> int:
-        """Number of nodes N, those that leaves name."""
-        return len(self.lattice) if isinstance(self.tree, UniformTree) else int(self.tets.max()) + 1
-
-    @cached_property
-    def tets(self) -> np.ndarray:
-        """The leaves' nodes in Maubach order, in tree order, int32 [T, 4]."""
-        return self.tree.leaf_tets
-
-    @cached_property
-    def levels(self) -> np.ndarray:
-        """Level of each leaf, int32 [T]; of uniform leaves one number seen T times, which takes no memory."""
-        return self.tree.leaf_levels
-
-    @cached_property
-    def volumes(self) -> np.ndarray:
-        """Rest volume of each leaf [m^3], float64 [T], of uniform leaves as ``levels``."""
-        if isinstance(self.tree, UniformTree):
-            return np.broadcast_to(volume_shares(self.tree.depth) * self.cell_size**3, self.levels.shape)
-        return volume_shares(self.levels) * self.cell_size**3
-
-    def ancestors(self, level: int) -> np.ndarray:
-        """For each leaf the highest tetrahedron above it, or the leaf itself, that is not above ``level`` and whose
-        corners are nodes; indices into the tree, int32 [T]. But for the rim of a body it is the one at ``level``."""
-        if self.node_count == len(self.lattice):
-            return self.tree.ancestors(self.tree.leaves, level)
-        tree, found = self.tree, self.tree.leaves.copy()
-        on_nodes = np.less(tree.tets.max(axis=1), self.node_count)
-        below = np.flatnonzero(tree.level[found] > level)
-        climbed = found[below]
-        while len(below):
-            climbed = tree.parent[climbed]
-            real = on_nodes[climbed]
-            found[below[real]] = climbed[real]
-            further = tree.level[climbed] > level
-            below, climbed = below[further], climbed[further]
-        return found
-
     def refine(self, leaves: npt.ArrayLike) -> TetForest:
         """A forest in which the chosen leaves are bisected, and as many others as conformity asks for.
 
@@ -261,8 +196,6 @@ class TetForest:
         Raises:
             InputError: Not [n, 3], or not finite.
         """
-        from warp_corot.mesh.surfaces.embedding import embed
-
         return embed(self, np.asarray(points))
 
     def bind(self, points: npt.ArrayLike, triangles: npt.ArrayLike | None = None) -> BoundPoints:
@@ -271,9 +204,8 @@ class TetForest:
         Raises:
             InputError: As `embed`, or triangles of points that are not there.
         """
-        from warp_corot.mesh.surfaces.bodies import bind
-
-        return bind(self, np.asarray(points), triangles)
+        elements, weights = self.embed(points)
+        return bound(np.asarray(points), self.tets[elements], weights, triangles)
 
     def surface(self) -> SurfaceMesh:
         """The marched surface of a mesh made from a domain, closed; of any other its boundary.
@@ -281,8 +213,6 @@ class TetForest:
         Points sit on edges between nodes inside and outside. Where the outer end went with an element that holds too
         little, the point is bound to the nodes of the nearest element.
         """
-        from warp_corot.mesh.surfaces.bodies import surface
-
         return surface(self)
 
     def separating_surface(self) -> SurfaceMesh:
@@ -291,44 +221,16 @@ class TetForest:
         Raises:
             InputError: The mesh has no labels.
         """
-        from warp_corot.mesh.surfaces.bodies import separating_surface
-
         return separating_surface(self)
-
-    def elements_of(self, label: str) -> np.ndarray:
-        """Leaves whose label this is, bool [T].
-
-        Raises:
-            InputError: No such label.
-        """
-        if label not in self.label_names or self.labels is None:
-            raise InputError(f"there is no label {label!r}; there are: {', '.join(self.label_names) or 'none'}")
-        return np.equal(self.labels, self.label_names.index(label) + 1)
-
-    def nodes_of(self, label: str) -> np.ndarray:
-        """Nodes of the leaves whose label this is, bool [N]; nodes on a border belong to both sides.
-
-        Raises:
-            InputError: No such label.
-        """
-        found = np.zeros(self.node_count, bool)
-        found[self.tets[self.elements_of(label)]] = True
-        return found
 
     def pieces(self) -> np.ndarray:
         """Which piece each leaf is in, int32 [T]: leaves that hang together by faces; the largest piece is 0."""
-        from .pieces import pieces_of
-
         return pieces_of(self.tets)
 
     def largest_piece(self) -> TetForest:
         """The mesh without what hangs together with its largest piece by no face, surface and all."""
-        from warp_corot.mesh.surfaces.bodies import largest_piece
-
         return largest_piece(self)
 
     def summary(self) -> list[str]:
         """What a user should know of the mesh, line by line: counts by level and type, volume, labels, pieces."""
-        from warp_corot.mesh.surfaces.bodies import summary
-
         return summary(self)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from os import PathLike
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -14,10 +13,10 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_numbers
 from warp_corot.inputs.indices import checked_indices
 from warp_corot.kernels.tables.shapes import EDGES
-from warp_corot.mesh.surfaces.boundary import signed_volumes
 
-if TYPE_CHECKING:
-    from warp_corot.mesh.surfaces.bound import BoundPoints
+from .surfaces.bound import BoundPoints, bound
+from .surfaces.boundary import signed_volumes
+from .surfaces.locating import embed_in_tets
 
 #: A tetrahedron of less volume than this times its longest edge cubed cannot be told from a flat one in float32.
 FLAT = 1e-7
@@ -180,8 +179,6 @@ class TetMesh:
         Raises:
             InputError: Not [n, 3], or not finite.
         """
-        from warp_corot.mesh.surfaces.locating import embed_in_tets
-
         return embed_in_tets(self.points, self.tets, np.asarray(points))
 
     def bind(self, points: npt.ArrayLike, triangles: npt.ArrayLike | None = None) -> BoundPoints:
@@ -190,9 +187,8 @@ class TetMesh:
         Raises:
             InputError: As `embed`, or triangles of points that are not there.
         """
-        from warp_corot.mesh.surfaces.bodies import bind
-
-        return bind(self, np.asarray(points), triangles)
+        elements, weights = self.embed(points)
+        return bound(np.asarray(points), self.tets[elements], weights, triangles)
 
 
 def _mask(nodes: npt.ArrayLike, count: int) -> npt.NDArray[np.bool_]:

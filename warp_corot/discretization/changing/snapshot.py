@@ -70,9 +70,7 @@ class Snapshot:
         pools.counts.assign(counts)
 
 
-def check_places(
-    pools: Any, carried: Any, counts: npt.NDArray[np.int32], pieces: dict[str, npt.NDArray[Any]]
-) -> None:
+def check_places(pools: Any, carried: Any, counts: npt.NDArray[np.int32], pieces: dict[str, npt.NDArray[Any]]) -> None:
     """See that kernels that are given stretches of arrays stay within these.
 
     Args:

@@ -14,7 +14,6 @@ from warp_corot.mesh.surfaces.separating import separated
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
-    from warp_corot.mesh.forest import TetForest
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,31 +41,19 @@ class Detail:
         named = None if labels is None else labels[used]
         return cls(points[used], corners.reshape(-1, 4).astype(np.int32), phi[used], named)
 
-    def surface(self, forest: TetForest) -> SurfaceMesh:
-        """The body's surface, bound to the nodes of a forest."""
-        if self.sharp is not None:
-            return _bound(forest, self.sharp)
-        return _bound(forest, marched(self.points, self._across(self.phi < 0), self.phi))
+    def surface(self) -> SurfaceMesh:
+        """The body's surface, with its edges and corners if these are known; bound to these points, or to nothing."""
+        return marched(self.points, self._across(self.phi < 0), self.phi) if self.sharp is None else self.sharp
 
-    def separating_surface(self, forest: TetForest) -> SurfaceMesh:
-        """The surfaces between labels and around them, bound to the nodes of a forest."""
+    def separating_surface(self) -> SurfaceMesh:
+        """The surfaces between labels and around them, bound to these points."""
         assert self.labels is not None
-        return _bound(forest, separated(self.points, self.tets, self.phi, self.labels))
+        return separated(self.points, self.tets, self.phi, self.labels)
 
     def sharpened(self, domain: Domain) -> Detail:
         """With the edges and corners of the body."""
         return replace(self, sharp=sharpened(self.points, self._across(self.phi < 0), self.phi, domain))
 
-    def within(self, forest: TetForest, kept: np.ndarray) -> Detail:
-        """The part in elements of a mask bool [T], or nearest to them; its surface is the marched one."""
-        stays = kept[forest.embed(self.points[self.tets].mean(axis=1))[0]]
-        return Detail.of(self.points, self.tets[stays], self.phi, self.labels)
-
     def _across(self, inside: np.ndarray) -> np.ndarray:
         own = inside[self.tets]
         return self.tets[own.any(axis=1) & ~own.all(axis=1)]
-
-
-def _bound(forest: TetForest, found: SurfaceMesh) -> SurfaceMesh:
-    elements, weights = forest.embed(found.points)
-    return replace(found, nodes=forest.tets[elements], weights=weights)

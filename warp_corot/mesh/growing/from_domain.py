@@ -11,7 +11,7 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count
 from warp_corot.inputs.device import checked_device
-from warp_corot.mesh.forest import Field, TetForest
+from warp_corot.mesh.forest import TetForest
 from warp_corot.mesh.lattice import MAX_LEVEL, check_levels, checked_cell_size, checked_level
 from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, pruned, renumbered, with_virtual
 from warp_corot.mesh.tree import LIVE
@@ -21,7 +21,7 @@ from .budget import NEAR, NEAR_ENOUGH, Budget, chosen_meshes
 from .cut import label_shares, without_slivers
 from .detail import Detail
 from .growth import lattice_spacing
-from .judging import Wishes
+from .judging import Field, Wishes
 from .resolved import LEAST, MOST_POINTS, Resolved, points_within
 
 if TYPE_CHECKING:

@@ -20,7 +20,9 @@ from .growth import Growth, lattice_spacing, with_room
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
-    from warp_corot.mesh.forest import Field
+
+#: A user's function of points [n, 3] -> [n].
+Field = Callable[[np.ndarray], np.ndarray]
 
 #: What an element counts as being off by where the body is thinner than its layers, as a share of its edge, and so many
 #: elements have room between pieces of the body that are not to grow together.

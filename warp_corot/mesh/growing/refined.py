@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TypeVar
 
 import numpy as np
 import warp as wp
 
+from warp_corot.mesh.forest_arrays import ForestArrays
 from warp_corot.mesh.numbering import renumbered, with_virtual
 from warp_corot.mesh.tree import VOID, Tree
 
 from .growth import Growth
 
-if TYPE_CHECKING:
-    from warp_corot.mesh.forest import TetForest
+Forest = TypeVar("Forest", bound=ForestArrays)
 
 
-def refined(forest: TetForest, leaves: np.ndarray) -> TetForest:
+def refined(forest: Forest, leaves: np.ndarray) -> Forest:
     """See `TetForest.refine`; leaves by their indices."""
     tree = forest.tree
     growth = Growth(forest.lattice, forest.node_ends, tree, wp.get_device("cpu"))

@@ -1,64 +1,50 @@
-"""What a forest made from a domain is as a body: its surfaces, what is bound to it, its pieces."""
+"""What a forest made from a domain is as a body: its surfaces, and its pieces."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.indices import checked_indices
+from warp_corot.mesh.forest_arrays import ForestArrays
+from warp_corot.mesh.growing.detail import Detail
 from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, renumbered, with_virtual
 from warp_corot.mesh.pieces import pieces_of
 
-from .bound import BoundPoints, SurfaceMesh
+from .bound import SurfaceMesh
 from .boundary import boundary_faces
+from .embedding import embed
 from .marching import marched
 from .separating import separated
 
-if TYPE_CHECKING:
-    from warp_corot.mesh.forest import TetForest
-    from warp_corot.mesh.tetmesh import TetMesh
+Forest = TypeVar("Forest", bound=ForestArrays)
 
 
-def surface(forest: TetForest) -> SurfaceMesh:
+def surface(forest: ForestArrays) -> SurfaceMesh:
     """See `TetForest.surface`."""
     if forest.phi is None:
         return boundary_surface(forest)
     if forest.detail is not None:
-        found = forest.detail.surface(forest)
+        found = _embedded(forest, forest.detail.surface())
     else:
         found = _on_nodes(forest, marched(forest.lattice_points, _all_cut(forest), forest.phi))
     # What is thinner than all elements and between their nodes is not met by any.
     return found if len(found.triangles) else boundary_surface(forest)
 
 
-def separating_surface(forest: TetForest) -> SurfaceMesh:
+def separating_surface(forest: ForestArrays) -> SurfaceMesh:
     """See `TetForest.separating_surface`."""
     if forest.phi is None or forest.node_labels is None:
         raise InputError("this mesh has no labels; they come from a domain that has")
     if forest.detail is not None:
-        return forest.detail.separating_surface(forest)
+        return _embedded(forest, forest.detail.separating_surface())
     return _on_nodes(forest, separated(forest.lattice_points, _all_cut(forest), forest.phi, forest.node_labels))
 
 
-def bind(mesh: TetForest | TetMesh, points: np.ndarray, triangles: npt.ArrayLike | None) -> BoundPoints:
-    """See `TetForest.bind`."""
-    elements, weights = mesh.embed(points)
-    nodes = mesh.tets[elements]
-    rest = np.array(points, dtype=np.float64)
-    if triangles is None:
-        return BoundPoints(rest, nodes, weights)
-    faces = np.asarray(triangles)
-    if faces.ndim != 2 or faces.shape[1] != 3:
-        raise InputError(f"triangles has shape {faces.shape}; it must be [F, 3]")
-    checked_indices(faces.ravel(), len(rest), "point")
-    return SurfaceMesh(rest, nodes, weights, faces.astype(np.int32))
-
-
-def largest_piece(forest: TetForest) -> TetForest:
+def largest_piece(forest: Forest) -> Forest:
     """See `TetForest.largest_piece`."""
     kept = pieces_of(forest.tets) == 0
     if kept.all():
@@ -82,11 +68,11 @@ def largest_piece(forest: TetForest) -> TetForest:
         node_labels=None if forest.node_labels is None else forest.node_labels[order],
         fill=None if forest.fill is None else forest.fill[kept],
         labels=None if forest.labels is None else forest.labels[kept],
-        detail=None if forest.detail is None else forest.detail.within(forest, kept),
+        detail=None if forest.detail is None else _within(forest, forest.detail, kept),
     )
 
 
-def summary(forest: TetForest) -> list[str]:
+def summary(forest: ForestArrays) -> list[str]:
     """See `TetForest.summary`."""
     x, y, z = forest.cells
     count = len(forest.tets)
@@ -107,21 +93,33 @@ def summary(forest: TetForest) -> list[str]:
     return lines
 
 
-def _all_cut(forest: TetForest) -> np.ndarray:
+def _all_cut(forest: ForestArrays) -> np.ndarray:
     """Nodes of all leaves that hold something, also of those given up for holding too little, int32 [n, 4]."""
     assert forest.phi is not None
     tets = forest.tree.tets[forest.tree.first_child < 0]
     return tets[(forest.phi[tets] < 0).any(axis=1)]
 
 
-def _on_nodes(forest: TetForest, found: SurfaceMesh) -> SurfaceMesh:
+def _embedded(forest: ForestArrays, found: SurfaceMesh) -> SurfaceMesh:
+    """The surface, bound to the nodes of a forest."""
+    elements, weights = embed(forest, found.points)
+    return replace(found, nodes=forest.tets[elements], weights=weights)
+
+
+def _within(forest: ForestArrays, detail: Detail, kept: np.ndarray) -> Detail:
+    """What of a detail is in elements, or nearest to them, that are in a mask bool [T]."""
+    elements, _ = embed(forest, detail.points[detail.tets].mean(axis=1))
+    return Detail.of(detail.points, detail.tets[kept[elements]], detail.phi, detail.labels)
+
+
+def _on_nodes(forest: ForestArrays, found: SurfaceMesh) -> SurfaceMesh:
     """The surface with points that are bound to no nodes of the mesh bound to the nearest element's."""
     lost = np.flatnonzero(((found.nodes >= forest.node_count) & (found.weights != 0)).any(axis=1))
     unused = found.nodes >= forest.node_count
     nodes = np.where(unused, found.nodes.min(axis=1, keepdims=True), found.nodes)
     weights = found.weights.copy()
     if len(lost):
-        elements, weights[lost] = forest.embed(found.points[lost])
+        elements, weights[lost] = embed(forest, found.points[lost])
         nodes[lost] = forest.tets[elements]
     return replace(found, nodes=nodes.astype(np.int32), weights=weights)
 

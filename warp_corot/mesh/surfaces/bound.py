@@ -11,6 +11,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.indices import checked_indices
 from warp_corot.kernels.meshing import embedding as kernels
 
 
@@ -147,3 +148,23 @@ def vertex_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     )
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+
+
+def bound(points: np.ndarray, nodes: np.ndarray, weights: np.ndarray, triangles: npt.ArrayLike | None) -> BoundPoints:
+    """Points, or with triangles [F, 3] a surface, of a user's own.
+
+    Args:
+        points: Rest positions [m], [V, 3].
+        nodes, weights: See ``BoundPoints``.
+
+    Raises:
+        InputError: Triangles of another shape, or of points that are not there.
+    """
+    rest = np.array(points, dtype=np.float64)
+    if triangles is None:
+        return BoundPoints(rest, nodes, weights)
+    faces = np.asarray(triangles)
+    if faces.ndim != 2 or faces.shape[1] != 3:
+        raise InputError(f"triangles has shape {faces.shape}; it must be [F, 3]")
+    checked_indices(faces.ravel(), len(rest), "point")
+    return SurfaceMesh(rest, nodes, weights, faces.astype(np.int32))

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import warp as wp
 
 from warp_corot.kernels.meshing import embedding as kernels
+from warp_corot.mesh.forest_arrays import ForestArrays
 from warp_corot.mesh.lattice import LATTICE_BITS
 from warp_corot.mesh.tree import VOID
 
 from .boundary import boundary_faces
 from .locating import FARTHEST, checked_points, nearest_faces
 
-if TYPE_CHECKING:
-    from warp_corot.mesh.forest import TetForest
-
 #: The walk from one corner of a cube to the opposite one, by the axes in descending order of a point's coordinates.
 _WALKS = np.array([[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]])
 
 
-def embed(forest: TetForest, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def embed(forest: ForestArrays, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """See `TetForest.embed`."""
     points = checked_points(points)
     elements = _descended(forest, points)
@@ -31,7 +27,7 @@ def embed(forest: TetForest, points: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return elements, barycentric(forest, elements, points)
 
 
-def barycentric(forest: TetForest, elements: np.ndarray, points: np.ndarray) -> np.ndarray:
+def barycentric(forest: ForestArrays, elements: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Barycentric coordinates of points in leaves, float64 [n, 4]; outside of them some are negative."""
     x = forest.points[forest.tets[elements]]
     edges = np.swapaxes(x[:, 1:] - x[:, :1], 1, 2)
@@ -39,7 +35,7 @@ def barycentric(forest: TetForest, elements: np.ndarray, points: np.ndarray) -> 
     return np.column_stack([1 - later.sum(axis=1), later])
 
 
-def _descended(forest: TetForest, points: np.ndarray) -> np.ndarray:
+def _descended(forest: ForestArrays, points: np.ndarray) -> np.ndarray:
     """The live leaf that holds each point, int32 [n], -1 where none does."""
     cells = np.array(forest.cells)
     scaled = (points - np.asarray(forest.origin)) / forest.cell_size
@@ -70,7 +66,7 @@ def _descended(forest: TetForest, points: np.ndarray) -> np.ndarray:
     return found
 
 
-def _nearest(forest: TetForest, points: np.ndarray) -> np.ndarray:
+def _nearest(forest: ForestArrays, points: np.ndarray) -> np.ndarray:
     """The element behind the boundary face that is closest to each point, int32 [n]."""
     faces, parents = _boundary_faces(forest)
     # About the middle of the mesh, as float32 keeps few digits far from zero.
@@ -81,7 +77,7 @@ def _nearest(forest: TetForest, points: np.ndarray) -> np.ndarray:
     return parents[nearest_faces(forest.points - middle, faces, moved, 10.0 * limit)]
 
 
-def _boundary_faces(forest: TetForest) -> tuple[np.ndarray, np.ndarray]:
+def _boundary_faces(forest: ForestArrays) -> tuple[np.ndarray, np.ndarray]:
     """Boundary faces and the leaves they belong to, sought where all nodes are on void or on the grid's end."""
     tree = forest.tree
     lattice = forest.lattice[: forest.node_count]

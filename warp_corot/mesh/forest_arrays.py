@@ -1,0 +1,105 @@
+"""The arrays that a forest of bisected tetrahedra is made of, and what follows from them without a search."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from warp_corot.errors import InputError
+
+from .lattice import LATTICE_BITS, volume_shares
+from .tree import Tree, UniformTree
+
+if TYPE_CHECKING:
+    from .growing.detail import Detail
+
+
+@dataclass(frozen=True, eq=False)
+class ForestArrays:
+    """What refining, embedding and drawing a forest work on; ``TetForest``, which users hold, says what each is."""
+
+    cells: tuple[int, int, int]
+    cell_size: float
+    origin: tuple[float, float, float]
+    lattice: np.ndarray
+    node_ends: np.ndarray
+    tree: Tree
+    up_axis: str = "Y"
+    phi: np.ndarray | None = None
+    fill: np.ndarray | None = None
+    labels: np.ndarray | None = None
+    node_labels: np.ndarray | None = None
+    label_names: tuple[str, ...] = ()
+    detail: Detail | None = None
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """Rest positions of the nodes [m], float64 [N, 3]."""
+        return self.lattice_points[: self.node_count]
+
+    @cached_property
+    def lattice_points(self) -> np.ndarray:
+        """Rest positions of all lattice points [m], the N nodes first, float64."""
+        return np.asarray(self.origin) + self.lattice * (self.cell_size / 2**LATTICE_BITS)
+
+    @cached_property
+    def node_count(self) -> int:
+        """Number of nodes N, those that leaves name."""
+        return len(self.lattice) if isinstance(self.tree, UniformTree) else int(self.tets.max()) + 1
+
+    @cached_property
+    def tets(self) -> np.ndarray:
+        """The leaves' nodes in Maubach order, in tree order, int32 [T, 4]."""
+        return self.tree.leaf_tets
+
+    @cached_property
+    def levels(self) -> np.ndarray:
+        """Level of each leaf, int32 [T]; of uniform leaves one number seen T times, which takes no memory."""
+        return self.tree.leaf_levels
+
+    @cached_property
+    def volumes(self) -> np.ndarray:
+        """Rest volume of each leaf [m^3], float64 [T], of uniform leaves as ``levels``."""
+        if isinstance(self.tree, UniformTree):
+            return np.broadcast_to(volume_shares(self.tree.depth) * self.cell_size**3, self.levels.shape)
+        return volume_shares(self.levels) * self.cell_size**3
+
+    def ancestors(self, level: int) -> np.ndarray:
+        """For each leaf the highest tetrahedron above it, or the leaf itself, that is not above ``level`` and whose
+        corners are nodes; indices into the tree, int32 [T]. But for the rim of a body it is the one at ``level``."""
+        if self.node_count == len(self.lattice):
+            return self.tree.ancestors(self.tree.leaves, level)
+        tree, found = self.tree, self.tree.leaves.copy()
+        on_nodes = np.less(tree.tets.max(axis=1), self.node_count)
+        below = np.flatnonzero(tree.level[found] > level)
+        climbed = found[below]
+        while len(below):
+            climbed = tree.parent[climbed]
+            real = on_nodes[climbed]
+            found[below[real]] = climbed[real]
+            further = tree.level[climbed] > level
+            below, climbed = below[further], climbed[further]
+        return found
+
+    def elements_of(self, label: str) -> np.ndarray:
+        """Leaves whose label this is, bool [T].
+
+        Raises:
+            InputError: No such label.
+        """
+        if label not in self.label_names or self.labels is None:
+            raise InputError(f"there is no label {label!r}; there are: {', '.join(self.label_names) or 'none'}")
+        return np.equal(self.labels, self.label_names.index(label) + 1)
+
+    def nodes_of(self, label: str) -> np.ndarray:
+        """Nodes of the leaves whose label this is, bool [N]; nodes on a border belong to both sides.
+
+        Raises:
+            InputError: No such label.
+        """
+        found = np.zeros(self.node_count, bool)
+        found[self.tets[self.elements_of(label)]] = True
+        return found
