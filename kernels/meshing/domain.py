@@ -157,13 +157,17 @@ def pseudo_normal(
 
 @wp.func
 def crossings(mesh: wp.uint64, p: wp.vec3, direction: wp.vec3):
-    """How often more a ray leaves what a closed surface encloses than it enters it: the winding number at its start."""
+    """How often more a ray leaves what a closed surface encloses than it enters it: the winding number at its start.
+
+    -MOST_CROSSINGS where triangles that lie on one another, or too near, were taken for one.
+    """
+    total = wp.mesh_query_ray_count_intersections(mesh, p, direction)
     count = int(0)
     at = float(0.0)
-    for _ in range(MOST_CROSSINGS):
+    for n in range(MOST_CROSSINGS):
         found = wp.mesh_query_ray(mesh, p + at * direction, direction, FAR)
         if not found.result:
-            return count
+            return wp.where(n == total, count, -MOST_CROSSINGS)
         leaves = wp.dot(wp.mesh_eval_face_normal(mesh, found.face), direction) > 0.0
         count += wp.where(leaves, 1, -1)
         at += found.t

@@ -9,6 +9,7 @@ import trimesh
 import warp_corot as wc
 from warp_corot.domain.fidelity import fidelity
 from warp_corot.domain.winding import net_edges
+from warp_corot.io.checkpoint.mesh import pack_mesh, unpack_mesh
 
 TURN = trimesh.transformations.euler_matrix(np.radians(20.0), np.radians(30.0), 0.0)
 
@@ -30,7 +31,7 @@ BODIES = {
 def test_edges_are_followed_and_smooth_bodies_lose_nothing(name, nearer):
     domain = BODIES[name]()
     forest = wc.TetForest.from_domain(domain, target_elements=3000)
-    plain = replace(forest, detail=replace(forest.detail, sharp=None)).surface()
+    plain = replace(forest, detail=replace(forest.detail, sharp_points=None)).surface()
     sharp = forest.surface()
     assert not len(net_edges(sharp.triangles.astype(np.int64))[0])
     assert sharp.euler_characteristic == plain.euler_characteristic == 2
@@ -49,3 +50,12 @@ def test_the_surface_is_bound_to_the_elements():
     matrix = np.array([[0.1, 0.2, 0.0], [0.0, -0.1, 0.3], [0.05, 0.0, 0.2]])
     moved = surface.moved(forest.points @ matrix.T)
     assert moved == pytest.approx(surface.points + surface.points @ matrix.T, abs=1e-9)
+
+
+def test_a_checkpoint_keeps_the_surface():
+    forest = wc.TetForest.from_domain(BODIES["cube"](), target_elements=500)
+    arrays: dict[str, np.ndarray] = {}
+    described = pack_mesh(forest, "mesh.", arrays)
+    again = unpack_mesh(described, "mesh.", arrays).surface()
+    assert np.array_equal(again.points, forest.surface().points)
+    assert np.array_equal(again.triangles, forest.surface().triangles)

@@ -1,4 +1,4 @@
-"""Warp runs a kernel on one core of a CPU; parts of a launch that write to different places run side by side here."""
+"""Launches on all cores of a CPU: Warp's kernels run on one, but parts of a launch may run side by side."""
 
 from __future__ import annotations
 
@@ -23,6 +23,8 @@ def in_parts(device: wp.Device, count: int, work: Callable[[int, int], None]) ->
         count: Of threads of a kernel.
         work: Called with where a part starts and where it ends; parts must not depend on one another.
     """
+    if not count:
+        return
     cores = core_count()
     if not device.is_cpu or count < LEAST or cores == 1:
         work(0, count)

@@ -11,7 +11,7 @@ from warp_corot.mesh import TetForest, TetMesh, Tree
 from warp_corot.mesh.growing.detail import Detail
 
 #: What surfaces that are finer than their mesh have.
-DETAIL = ("points", "tets", "phi", "labels")
+DETAIL = ("points", "tets", "phi", "labels", "sharp_points", "sharp_triangles")
 #: What forests have that were made from a domain.
 OF_DOMAIN = ("phi", "fill", "labels", "node_labels")
 

@@ -38,8 +38,8 @@ UNBISECTED = 1.0 / 6.0
 #: finer ones would bring the rest of the surface little, and make the time step smaller. From so many elements on
 #: there are too few at the surface for that. Thin parts may have finer ones.
 MAX_LEVEL, MANY, MAX_LEVEL_THIN = 7, 300_000, 13
-#: How closely the body is looked at: from which surface error over a cube's edge to which, and to how many tetrahedra
-#: of all levels for each one asked for, or a fixed number if that is more.
+#: How closely the body is looked at: from which surface error over a cube's edge to which, and to how many
+#: tetrahedra of all levels for each one asked for, or a fixed number if that is more.
 FIRST_ERROR, CLOSE_ERROR, CLOSE_LEVEL = 0.1, 0.01, 8
 CLOSER_LEVELS, CLOSER_ERROR = 6, 0.2
 CLOSE_ELEMENTS, CLOSE_ELEMENTS_OF_MANY = 5, 2

@@ -25,14 +25,16 @@ class Detail:
         tets: int32 [k, 4].
         phi: The body's signed function at the points [m], float32 [n].
         labels: Of the points, those outside that of the nearest part, int32 [n]; None: no labels.
-        sharp: The body's surface with its edges and corners, bound to nothing; None: the marched one is drawn.
+        sharp_points, sharp_triangles: The body's surface with its edges, float64 [V, 3] [m] and int32 [F, 3]; None: the
+            marched one is drawn.
     """
 
     points: np.ndarray
     tets: np.ndarray
     phi: np.ndarray
     labels: np.ndarray | None = None
-    sharp: SurfaceMesh | None = None
+    sharp_points: np.ndarray | None = None
+    sharp_triangles: np.ndarray | None = None
 
     @classmethod
     def of(cls, points: np.ndarray, tets: np.ndarray, phi: np.ndarray, labels: np.ndarray | None) -> Detail:
@@ -42,8 +44,11 @@ class Detail:
         return cls(points[used], corners.reshape(-1, 4).astype(np.int32), phi[used], named)
 
     def surface(self) -> SurfaceMesh:
-        """The body's surface, with its edges and corners if these are known; bound to these points, or to nothing."""
-        return marched(self.points, self._across(self.phi < 0), self.phi) if self.sharp is None else self.sharp
+        """The body's surface: with its edges if these are known, bound to nothing yet; else bound to these points."""
+        if self.sharp_points is None or self.sharp_triangles is None:
+            return marched(self.points, self._across(self.phi < 0), self.phi)
+        unbound = np.zeros((len(self.sharp_points), 4))
+        return SurfaceMesh(self.sharp_points, unbound.astype(np.int32), unbound, self.sharp_triangles)
 
     def separating_surface(self) -> SurfaceMesh:
         """The surfaces between labels and around them, bound to these points."""
@@ -51,8 +56,9 @@ class Detail:
         return separated(self.points, self.tets, self.phi, self.labels)
 
     def sharpened(self, domain: Domain) -> Detail:
-        """With the edges and corners of the body."""
-        return replace(self, sharp=sharpened(self.points, self._across(self.phi < 0), self.phi, domain))
+        """With the edges of the body."""
+        points, triangles = sharpened(self.points, self._across(self.phi < 0), self.phi, domain)
+        return replace(self, sharp_points=points, sharp_triangles=triangles)
 
     def _across(self, inside: np.ndarray) -> np.ndarray:
         own = inside[self.tets]

@@ -209,19 +209,21 @@ class Judge:
         # Without a limit to their number elements are no finer for it than the rest.
         deepest = wishes.thin_level if self.closer else wishes.max_level
         chosen = np.flatnonzero((state == kernels.DONE) & (leaf == LIVE) & (level < deepest))
-        # Rays start well where the surface is known well.
-        chosen = chosen[self.need[first : growth.element_count].numpy()[chosen] <= self.closest[level[chosen]]]
+        # Thickness is known well where the surface is; gaps are only looked at, so any ray will do.
+        known = self.need[first : growth.element_count].numpy()[chosen] <= self.closest[level[chosen]]
+        if not domain.has_pieces:
+            chosen, known = chosen[known], known[known]
         tets = growth.tets[first : growth.element_count].numpy()[chosen]
         phi = self.phi.numpy()[tets]
         crossed = (phi < 0).any(axis=1) & (phi >= 0).any(axis=1)
-        chosen, tets = chosen[crossed], tets[crossed]
+        chosen, tets, known = chosen[crossed], tets[crossed], known[crossed]
         if not len(chosen):
             return
         x, inward = surface_points(growth.lattice.numpy(), self.phi.numpy(), tets, self.origin, self.spacing)
         # By volume: a cube's edge halves in three levels.
         length = self.lengths[0] * 0.5 ** (level[chosen] / 3.0)
         reach = FARTHER * wishes.layers * float(length.max())
-        thin = wishes.layers * length > domain.thickness(x, inward, reach)
+        thin = known & (wishes.layers * length > domain.thickness(x, inward, reach))
         need = np.where(thin, THIN_NEED * length, 0.0)
         wanted = THIN_NEED * length > (self.tolerances[level[chosen]] if self.limited else 0.0)
         split = thin & wanted

@@ -1,4 +1,4 @@
-"""Marched surfaces with the body's own edges and corners (Kobbelt, Botsch, Schwanecke and Seidel 2001, *Feature
+"""Marched surfaces with the body's own edges (Kobbelt, Botsch, Schwanecke and Seidel 2001, *Feature
 sensitive surface extraction from volume data*).
 
 A vertex of marching tetrahedra sits where the body's surface crosses an edge of an element. Where its normals at the
@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .bound import SurfaceMesh
 from .marching import crossing_polygons, plain_triangles
 
 if TYPE_CHECKING:
@@ -37,8 +36,8 @@ SLIDES = np.array(sorted(np.linspace(-1.5, 1.5, 31), key=abs))
 _AROUND = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]]) / np.sqrt(3.0)
 
 
-def sharpened(points: Array, tets: Array, values: Array, domain: Domain) -> SurfaceMesh:
-    """The surface of a body in tetrahedra that hold all of it, bound to nothing yet.
+def sharpened(points: Array, tets: Array, values: Array, domain: Domain) -> tuple[Array, Array]:
+    """The surface of a body in tetrahedra that hold all of it: points [m], float64 [V, 3], and triangles int32 [F, 3].
 
     Args:
         points: Positions of the nodes [m], float64 [n, 3].
@@ -55,8 +54,7 @@ def sharpened(points: Array, tets: Array, values: Array, domain: Domain) -> Surf
     x = np.concatenate([x, apexes])
     triangles = np.concatenate([triangles, _fans(x, polygons[chosen], numbers, domain)])
     used, corners = np.unique(triangles, return_inverse=True)
-    nothing = np.zeros((len(used), 4))
-    return SurfaceMesh(x[used], nothing.astype(np.int32), nothing, corners.reshape(-1, 3).astype(np.int32))
+    return x[used], corners.reshape(-1, 3).astype(np.int32)
 
 
 def _phi(domain: Domain, points: Array) -> Array:
