@@ -30,6 +30,12 @@ def sphere():
     return wc.TetForest.from_domain(domain, 0.5, max_level=8, surface_error=0.01)
 
 
+def speck():
+    """A ball much smaller than its cube: most of what its leaves come from is void."""
+    domain = wc.Domain.sphere(0.06, (0.12, 0.07, -0.11), device="cpu")
+    return wc.TetForest.from_domain(domain, 0.5, max_level=10, surface_error=0.003)
+
+
 def refined_sphere():
     forest = sphere()
     return forest.refine(np.flatnonzero(forest.points[forest.tets].mean(axis=1)[:, 0] > 0.25))
@@ -46,6 +52,7 @@ FORESTS = {
     "uniform": uniform,
     "mixed": mixed,
     "sphere": sphere,
+    "speck": speck,
     "refined sphere": refined_sphere,
     "labels": labelled,
 }
