@@ -163,5 +163,5 @@ def _material(
     else:
         material = Isotropic(young, poisson, density)
     if args.region:
-        material = region_material(subject.mesh, patches, args.region, material)
+        material = region_material(subject.mesh, patches.tetrahedra, args.region, material)
     return material, chosen

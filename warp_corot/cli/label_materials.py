@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from warp_corot.io.read.regions import Regions
     from warp_corot.io.read.volumes import LoadedVolume
     from warp_corot.mesh import TetForest, TetMesh
-
-    from .patches import Patches
 
 FORM = "NAME[@NUMBER[+NUMBER...]]=YOUNG[:POISSON[:DENSITY]]"
 _ENTRY = re.compile(r"\s*(?P<name>[^@=:]+?)\s*(?:@\s*(?P<numbers>\d+(?:\s*\+\s*\d+)*)\s*)?=(?P<values>.*)")
@@ -190,12 +188,14 @@ def covers_all(mesh: TetForest | TetMesh, entries: Sequence[LabelMaterial]) -> b
     return all(number and mesh.label_names[number - 1] in named for number in np.unique(mesh.labels).tolist())
 
 
-def region_material(mesh: Mesh, patches: Patches, regions: Sequence[Sequence[str]], base: Isotropic) -> Isotropic:
+def region_material(
+    mesh: Mesh, inside: Callable[[str], np.ndarray], regions: Sequence[Sequence[str]], base: Isotropic
+) -> Isotropic:
     """The material where ``--region`` gives tetrahedra one of their own.
 
     Args:
         mesh: The body's.
-        patches: Of the body.
+        inside: Which tetrahedra are in a patch, bool [T].
         regions: Pairs of a patch and ``YOUNG[:POISSON[:DENSITY]]``; the last one that holds a tetrahedron counts.
         base: What the others are made of, and what values that are left out come from.
 
@@ -207,10 +207,10 @@ def region_material(mesh: Mesh, patches: Patches, regions: Sequence[Sequence[str
     for expression, text in regions:
         option = f"--region {expression!r} {text!r}"
         entry = _entry(f"region={text}", "--region", f"{option}: it must be PATCH YOUNG[:POISSON[:DENSITY]]")
-        inside = patches.tetrahedra(expression)
-        if not inside.any():
+        chosen = inside(expression)
+        if not chosen.any():
             raise InputError(f"--region {expression!r}: there is no tetrahedron in it")
         for array, value in zip(values, (entry.young, entry.poisson, entry.density), strict=True):
             if value is not None:
-                array[inside] = value
+                array[chosen] = value
     return Isotropic(*values)

@@ -10,7 +10,7 @@ from warp_corot.elasticity import MODELS
 from . import patches, run_file
 from .label_materials import FORM
 from .loading import add_load_options
-from .organs import MAX_LEVEL_FOR_ERROR, TETS
+from .organs import MAX_LEVEL_FOR_ERROR
 from .previews import add_preview_options
 from .quantities import (
     acceleration,
@@ -27,6 +27,7 @@ from .quantities import (
 )
 from .remesh import add_remesh_options
 from .say import EXIT_CODES
+from .several import TETS
 from .subject import STIFFNESS_PER_WEIGHT
 
 FPS = 24.0

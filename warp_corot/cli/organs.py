@@ -18,6 +18,7 @@ from warp_corot.mesh import TetForest
 
 from .label_materials import LabelMaterial, numbers_by_name, parse_labels
 from .opened import Opened, offset_of, placed_surface, placed_volume
+from .several import TETS
 from .subject import Subject
 
 if TYPE_CHECKING:
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
     from warp_corot.io.write.skins import OwnSurface
     from warp_corot.mesh import SurfaceMesh
 
-#: Tetrahedra, about, where nothing is said of their size.
-TETS = 20_000
 #: Where a surface error or a level is asked for in place of a number: so many of these tetrahedra make a root cube of a
 #: length's cube worthwhile.
 TETS_PER_CUBE = 30

@@ -13,8 +13,9 @@ from warp_corot.io.read.surfaces import LoadedSurface
 from warp_corot.io.read.tetrahedra import LoadedMesh
 
 from .opened import Opened, loaded_tets, longest_side
-from .organs import TETS
 
+#: Tetrahedra, about, where nothing is said of their size.
+TETS = 20_000
 #: More objects than these are taken as one: each would be a body, with a mesh of its own.
 MOST_BODIES = 32
 #: Tetrahedra that each of several bodies has at least, where they share a number.

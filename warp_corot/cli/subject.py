@@ -18,6 +18,7 @@ from warp_corot.mesh import TetForest, TetMesh
 
 from .label_materials import of_regions, parse_labels
 from .opened import Opened, offset_of, placed_tets
+from .several import merged_nodes
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
@@ -157,8 +158,6 @@ def _joined(
     Raises:
         InputError: There is nothing to join.
     """
-    from .several import merged_nodes
-
     points, tets, place = merged_nodes(loaded.points, loaded.tets)
     merged = len(place) - len(points)
     if not merged and not loaded.objects:
