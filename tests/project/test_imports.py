@@ -3,12 +3,20 @@
 import ast
 
 import pytest
-from imports import circles, floor_of, imports, modules
+from imports import Import, against_the_floors, circles, floor_of, imports, modules
 
 #: Kernels of passes over a mesh that changes.
 REMESHING = ("kernels.remesh",)
 #: Kernels that may know them: their own, and those that derive the plan of a mesh that has changed.
 PASSES = (*REMESHING, "kernels.plan")
+#: The modules that lie in no room: the public face.
+ROOT_MODULES = {"__init__", "__main__", "api", "errors"}
+#: So many modules at most may import one another, lazily or for type checkers.
+LARGEST_CIRCLE = 3
+#: So many imports at most may go from a lower floor to a higher one, and these do: a simulation saves and loads itself,
+#: and a report names the package's version.
+MOST_UPWARDS = 6
+UPWARDS = {("simulation.simulation", "io.checkpoint.archive"), ("experiments.report", "__init__")}
 
 
 def test_no_force_law_knows_remeshing():
@@ -28,9 +36,28 @@ def test_every_module_loads_without_a_circle():
     assert circles(edge for edge in imports() if edge.kind == "load") == []
 
 
+def test_no_circle_is_larger_than_three_modules():
+    """Lazy imports and those for type checkers count."""
+    assert [circle for circle in circles(imports()) if len(circle) > LARGEST_CIRCLE] == []
+
+
 def test_every_module_has_a_floor():
     assert {"api", "body.soft_body", "kernels.stepping.pace"} <= set(modules())
     assert all(floor_of(name) >= 0 for name in modules())
+
+
+def test_imports_go_down_the_floors():
+    assert {(edge.source, edge.target) for edge in against_the_floors(imports())} == UPWARDS
+    assert len(UPWARDS) <= MOST_UPWARDS
+
+
+def test_an_import_of_a_higher_floor_is_seen():
+    up, down = Import("mesh.forest", "cli.say", "lazy", 1), Import("cli.say", "mesh.forest", "load", 1)
+    assert against_the_floors([up, down]) == [up]
+
+
+def test_no_module_lies_outside_the_rooms():
+    assert {name for name in modules() if "." not in name} == ROOT_MODULES
 
 
 @pytest.mark.parametrize("kind", ["load", "lazy", "type"])

@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import ast
 import sys
-from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = "warp_corot"
@@ -58,18 +61,26 @@ def modules(root: Path = ROOT) -> dict[str, Path]:
     return dict(sorted(found.items()))
 
 
-def imports(root: Path = ROOT) -> list[Import]:
+@cache
+def imports(root: Path = ROOT) -> tuple[Import, ...]:
     """All imports of one module of the package by another."""
     files = modules(root)
-    return [each for name, path in files.items() for each in _imports_of(name, path, files)]
+    return tuple(each for name, path in files.items() for each in _imports_of(name, path, files))
 
 
 def circles(edges: Iterable[Import]) -> list[list[str]]:
     """Modules that import one another, directly or by way of others: strongly connected components, largest first."""
-    graph: dict[str, set[str]] = defaultdict(set)
-    for edge in edges:
-        graph[edge.source].add(edge.target)
-    return sorted((sorted(each) for each in _components(graph) if len(each) > 1), key=len, reverse=True)
+    pairs = {(edge.source, edge.target) for edge in edges}
+    names = sorted({name for pair in pairs for name in pair})
+    if not names:
+        return []
+    place = {name: number for number, name in enumerate(names)}
+    graph = np.zeros((len(names), len(names)), bool)
+    for source, target in pairs:
+        graph[place[source], place[target]] = True
+    count, component = connected_components(graph, connection="strong")
+    found = [[name for name in names if component[place[name]] == number] for number in range(count)]
+    return sorted((each for each in found if len(each) > 1), key=len, reverse=True)
 
 
 def floor_of(module: str) -> int:
@@ -135,41 +146,6 @@ def _targets(node: ast.Import | ast.ImportFrom, package: list[str], files: dict[
                 if ".".join(candidate) in files:
                     yield ".".join(candidate)
                     break
-
-
-def _components(graph: dict[str, set[str]]) -> list[set[str]]:
-    """Strongly connected components (Tarjan 1972), without recursion."""
-    index: dict[str, int] = {}
-    low: dict[str, int] = {}
-    path: list[str] = []
-    on_path: set[str] = set()
-    found = []
-    for root in list(graph):
-        work = [] if root in index else [(root, iter(sorted(graph[root])))]
-        if work:
-            index[root] = low[root] = len(index)
-            path.append(root)
-            on_path.add(root)
-        while work:
-            node, targets = work[-1]
-            target = next(targets, None)
-            if target is None:
-                work.pop()
-                if work:
-                    low[work[-1][0]] = min(low[work[-1][0]], low[node])
-                if low[node] == index[node]:
-                    at = path.index(node)
-                    found.append(set(path[at:]))
-                    on_path.difference_update(path[at:])
-                    del path[at:]
-            elif target not in index:
-                index[target] = low[target] = len(index)
-                path.append(target)
-                on_path.add(target)
-                work.append((target, iter(sorted(graph.get(target, ())))))
-            elif target in on_path:
-                low[node] = min(low[node], index[target])
-    return found
 
 
 def main() -> None:
