@@ -21,16 +21,7 @@ SPHERES = 25
 
 
 class SignedFunction:
-    """A body as a signed function phi [m], negative inside: what all kinds of domains are.
-
-    Attributes:
-        bounds: Axis-aligned box that holds the inside [m], float64 [2, 3].
-        lipschitz: |phi(a) - phi(b)| <= lipschitz * |a - b| for all points a and b, up to float32's rounding: where
-            |phi| > lipschitz * r no surface is nearer than r.
-        up_axis: "X", "Y" or "Z".
-        label_names: Names of the labels, () without any.
-        device: Where points that are given as NumPy arrays are evaluated.
-    """
+    """What all kinds of bodies are; ``Domain``, which users hold, says what the attributes mean."""
 
     def __init__(
         self,
