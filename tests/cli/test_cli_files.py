@@ -239,4 +239,4 @@ def test_scenes_are_placed_by_their_transforms(folder):
     surface = open_input("scene.glb").surface
     assert surface.points.min(axis=0) == pytest.approx([-0.05, -0.1, -0.1], abs=1e-3)
     assert surface.points.max(axis=0) == pytest.approx([0.6, 0.1, 0.1], abs=1e-3)
-    assert wc.Domain.from_surface("scene.glb").kind.closed.pieces == 2
+    assert wc.Domain.from_surface("scene.glb").closed.pieces == 2

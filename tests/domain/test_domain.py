@@ -162,3 +162,16 @@ def test_bad_arguments_are_refused_in_one_line(tmp_path):
         with pytest.raises(InputError, match=message) as raised:
             make()
         assert "\n" not in str(raised.value)
+
+
+def test_a_domain_has_what_its_kind_has():
+    """A domain of voxels has their numbers and where they lie, one of a surface the surface as it was closed."""
+    voxels = Domain.from_labels(np.ones((2, 3, 4), np.int16), (0.01, 0.01, 0.01), device="cpu")
+    assert np.count_nonzero(voxels.numbers) == 24
+    assert np.allclose(voxels.affine[:3, :3], 0.01 * np.eye(3))
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
+    tetrahedron = Domain.from_surface((corners, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]), device="cpu")
+    assert tetrahedron.closed.volume == pytest.approx(1 / 6)
+    assert all(isinstance(each, Domain) for each in (voxels, tetrahedron, voxels | tetrahedron, voxels.part("1")))
+    with pytest.raises(AttributeError, match="numbers"):
+        _ = tetrahedron.numbers

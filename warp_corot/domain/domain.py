@@ -229,6 +229,12 @@ class _Made(Domain):
         super().__init__(kind.bounds, kind.lipschitz, **options)
         self._kind = kind
 
+    def __getattr__(self, name: str) -> Any:
+        """What its kind alone has, as ``numbers`` and ``affine`` of voxels and ``closed`` of a surface."""
+        if name.startswith("_"):
+            raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
+        return getattr(self._kind, name)
+
     @property
     def kind(self) -> SignedFunction:
         return self._kind
