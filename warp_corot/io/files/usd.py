@@ -12,8 +12,8 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 from pxr import Tf, Usd, UsdGeom
 
 from warp_corot.errors import InputError
-from warp_corot.io.read.isolated import read_isolated
 
+from .isolated import read_isolated
 from .quiet import USD_MEMORY, bounded, quietly
 
 try:
@@ -65,7 +65,7 @@ def _is_binary(path: Path) -> bool:
 @functools.lru_cache(maxsize=64)
 def _trial(path: Path, size: int, written: int) -> str | None:
     """Why a stage is not to be opened in this process, if so; files are told apart by size and time, too."""
-    return read_isolated("warp_corot.io.read.usd_trial", path)[1]
+    return read_isolated(f"{__package__}.usd_trial", path)[1]
 
 
 P = ParamSpec("P")

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_corot.errors import InputError
+from warp_corot.io.files.isolated import read_isolated
 
 from .filemesh import FileMesh
-from .isolated import read_isolated
 
 
 @dataclass(frozen=True)

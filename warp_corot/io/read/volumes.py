@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_corot.errors import InputError
+from warp_corot.io.files.isolated import read_isolated
 from warp_corot.io.files.quiet import bounded, quietly
 
 from .filemesh import from_bytes
-from .isolated import read_isolated
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any
 from numpy.typing import NDArray
 from pxr import Tf, Usd
 
-from warp_corot.io.files.quiet import USD_MEMORY, bounded
+from .quiet import USD_MEMORY, bounded
 
 #: Where memory is overwritten a first reading may end well, and the next one not.
 READINGS = 2

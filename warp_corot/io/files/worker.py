@@ -1,4 +1,4 @@
-"""What runs in the process of a reader; see `warp_corot.io.read.isolated`."""
+"""What runs in the process of a reader; see `warp_corot.io.files.isolated`."""
 
 from __future__ import annotations
 
