@@ -2,17 +2,32 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 from warp_corot.elasticity import StVenantKirchhoff
 
 if TYPE_CHECKING:
     from warp_corot.solvers.guarding.guard import Fault
+    from warp_corot.solvers.steps.pace import Pace
 
-    from .simulation import Simulation
+
+class Stepped(Protocol):
+    """What a message names of a simulation."""
+
+    worlds: int
+    models: tuple[Any, ...]
+    pace: Pace
+    stable_dt: float
+    safe_step: Any
+
+    @property
+    def steps(self) -> int: ...
+
+    @property
+    def time(self) -> float: ...
 
 
-def fault_message(sim: Simulation, fault: Fault, returns: int) -> str:
+def fault_message(sim: Stepped, fault: Fault, returns: int) -> str:
     """What has gone wrong, since when, and what would help; after so many times with half the step."""
     more = f" and {len(fault.worlds) - 3} more" if len(fault.worlds) > 3 else ""
     where = f" in world {', '.join(map(str, fault.worlds[:3]))}{more}" if sim.worlds > 1 else ""
@@ -24,7 +39,7 @@ def fault_message(sim: Simulation, fault: Fault, returns: int) -> str:
     return f"{fault.what} {when}{where}; {steps}{_advice(sim, returns)}"
 
 
-def _advice(sim: Simulation, returns: int) -> str:
+def _advice(sim: Stepped, returns: int) -> str:
     if any(getattr(model, "rotation_level", None) is not None for model in sim.models):
         return "; shared rotations have no energy, so that strong bending may need rotation_level=None"
     if any(isinstance(model, StVenantKirchhoff) for model in sim.models):
