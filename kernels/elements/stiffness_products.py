@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from .constitutive import IsotropicMaterial
-from .elements import add_force, frame, gradient_of, local_gradient, nodal_forces
+from .elements import add_force, frame, gradient_of, local_gradient, nodal_forces, rest_volume
 
 wp.set_module_options({"enable_backward": False})
 
@@ -77,21 +77,19 @@ def add_stiffness_diagonal(Elements: Any, Material: Any, differential: wp.Functi
     ):
         t = wp.tid() // 4
         n = wp.tid() % 4
+        # The gradient of the node's hat function: of its displacements alone, G = u (grad N)^T.
+        x = wp.vec3(1.0, 0.0, 0.0)
+        unit = gradient_of(
+            elements, t, where_is(n == 0, x), where_is(n == 1, x), where_is(n == 2, x), where_is(n == 3, x)
+        )
+        hat = wp.vec3(unit[0, 0], unit[0, 1], unit[0, 2])
+        scaled = rest_volume(elements, t) * hat
         block = wp.mat33()
         axis = int(0)
         # Not unrolled: the differential is compiled once.
         while axis < 3:
-            e = wp.vec3()
-            e[axis] = 1.0
-            u0 = where_is(n == 0, e)
-            u1 = where_is(n == 1, e)
-            u2 = where_is(n == 2, e)
-            u3 = where_is(n == 3, e)
-            stress = differential(elements, t, material, u, gradient_of(elements, t, u0, u1, u2, u3))
-            f0, f1, f2, f3 = nodal_forces(elements, t, -stress)
-            force = where_is(n == 0, f0) + where_is(n == 1, f1) + where_is(n == 2, f2) + where_is(n == 3, f3)
-            for i in range(3):
-                block[i, axis] = force[i]
+            e = wp.vec3(float(axis == 0), float(axis == 1), float(axis == 2))
+            block += wp.outer(differential(elements, t, material, u, wp.outer(e, hat)) * scaled, e)
             axis += 1
         wp.atomic_add(blocks, elements.nodes[t][n], block)
 
