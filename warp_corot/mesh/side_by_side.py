@@ -30,7 +30,8 @@ def in_parts(device: wp.Device, count: int, work: Callable[[int, int], None]) ->
         work(0, count)
         return
     bounds = [count * part // (PARTS * cores) for part in range(PARTS * cores + 1)]
-    for _ in _pool().map(work, bounds[:-1], bounds[1:]):
+    work(bounds[0], bounds[1])  # by itself, since it may compile and load kernels
+    for _ in _pool().map(work, bounds[1:-1], bounds[2:]):
         pass
 
 
@@ -45,3 +46,7 @@ def core_count() -> int:
 @functools.cache
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(core_count(), thread_name_prefix="warp_corot")
+
+
+if hasattr(os, "register_at_fork"):  # a forked process has the pool without its threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)
