@@ -82,7 +82,7 @@ def test_nothing_is_shown_without_a_terminal(tmp_path):
 ADVANCE = """
 import time
 import warp_corot as wc
-from warp_corot import progress
+from warp_corot.simulation import progress
 progress.SILENT = 0.0
 body = wc.SoftBody(wc.TetForest.box((1, 1, 1), 0.1, 3), wc.Isotropic(1e4, 0.4, 1e3), device="cpu")
 body.fix("z < 0.01")

@@ -126,7 +126,7 @@ def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
     material = anisotropic(kind, mesh, rng)
     body = wc.SoftBody(mesh, material, device=device)
     on_device, active = strained(mesh, rng, device)
-    whole = AnisotropicField(body, byers_xu, False)
+    whole = AnisotropicField(body.discretization, byers_xu, False)
     axes = wp.empty(len(whole.material.axes), dtype=wp.quat, device=device)
     wp.launch(quaternions_of, len(axes), inputs=[whole.material.axes], outputs=[axes], device=device)
     options = ("muscle" in kind, whole.material.axes_stride == 0, whole.material.stride == 0)
@@ -157,7 +157,7 @@ def test_anisotropic_general_elements(kind, device, rng):
     body = wc.SoftBody(mesh, material, device=device)
     on_device, active = strained(mesh, rng, device)
     f = wp.zeros_like(on_device)
-    field = GeneralAnisotropicField(body)
+    field = GeneralAnisotropicField(body.discretization)
     body.discretization.has_activation = True
     body.discretization.activation = active
     add_forces(field.scatter, field.active_material, on_device, f)

@@ -18,6 +18,8 @@ from scene_stages import (
 )
 from scipy.linalg import polar
 
+from warp_corot.mesh.surfaces.boundary import signed_volumes
+
 G = 9.81
 HEIGHT, AREA = 3 * CELL, (2 * CELL) ** 2
 
@@ -225,7 +227,7 @@ def test_wrongly_wound_tetrahedra_are_turned_round(tmp_path):
     stage = Usd.Stage.Open(str(tmp_path / "out.usda"))
     drawn = UsdGeom.TetMesh.Get(stage, SIM)
     points, tets = (np.array(a.Get()) for a in (drawn.GetPointsAttr(), drawn.GetTetVertexIndicesAttr()))
-    assert wc.mesh.surface.signed_volumes(points, tets).min() > 0
+    assert signed_volumes(points, tets).min() > 0
 
 
 @pytest.mark.parametrize("mirror", ["orientation", "transform"])

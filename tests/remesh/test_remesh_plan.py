@@ -61,7 +61,7 @@ class Comparison:
         self.mesh_units = None
         if rotation_level is not None:
             self.mesh_units = Units.of_forest(mesh, rotation_level, forest.device)
-        self.mesh_elements = wc.SoftBody(mesh, MATERIAL, device=forest.device).elements
+        self.mesh_elements = wc.SoftBody(mesh, MATERIAL, device=forest.device).discretization.elements
 
     def check(self):
         plan, expected = self.plan, self.expected

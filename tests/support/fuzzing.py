@@ -133,7 +133,7 @@ def prepared() -> None:
 
     from warp_corot import cli
     from warp_corot.body.soft_body import SoftBody
-    from warp_corot.cli import scene, simulate  # noqa: F401 (all that reads files)
+    from warp_corot.cli import bodies, scene, simulate  # noqa: F401 (all that reads files)
     from warp_corot.experiments import paper
     from warp_corot.io.write import animate
     from warp_corot.mesh import TetForest
@@ -149,7 +149,7 @@ def prepared() -> None:
             raise Reached
         made(self, mesh, *arguments, **options)
 
-    held = simulate.held_by_default
+    held = bodies.held_by_default
 
     def holds(subject, *arguments, **options):
         _see(subject.mesh)
@@ -164,7 +164,7 @@ def prepared() -> None:
             raise Reached
         return meshed(*arguments, **options)
 
-    simulate.held_by_default = holds
+    bodies.held_by_default = holds
     SoftBody.__init__ = body  # type: ignore[method-assign]
     TetForest.from_domain = mesh  # type: ignore[method-assign]
     animate.record = stop

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pxr import Tf, Usd
 
 from .quiet import USD_MEMORY, bounded
+from .usd import usd_name
 
 #: Where memory is overwritten a first reading may end well, and the next one not.
 READINGS = 2
@@ -20,7 +21,7 @@ def read(path: Path) -> dict[str, NDArray[Any]]:
     of again to the process that asked."""
     with bounded(path, USD_MEMORY), suppress(Tf.ErrorException, UnicodeDecodeError):
         for _ in range(READINGS):
-            stage = Usd.Stage.Open(str(path))
+            stage = Usd.Stage.Open(usd_name(path))
             for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
                 for attribute in prim.GetAttributes():
                     attribute.Get()
