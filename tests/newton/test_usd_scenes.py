@@ -13,7 +13,6 @@ from scene_stages import (
     StageSimulation,
     simulated,
     standing,
-    wc,
     written,
 )
 from scipy.linalg import polar
