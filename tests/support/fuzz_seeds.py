@@ -53,7 +53,7 @@ unit = "m"
 fix = ["bottom", "z < zmin + 0.01"]
 patch = ["upper=z > zmax - 0.004"]
 pull = [{ patch = "upper", by = [0, 0, 0.02], times = [0, 0.2, 0.5], shares = [0, 1, 0.5] }]
-twist = [{ patch = "x > xmax - 0.004", degrees = 30, axis = [0, 0, 1], times = [0, 0.5], shares = [0, 1] }]
+twist = [{ patch = "x > xmax - 0.004 and z < 0.02", degrees = 30, axis = [0, 0, 1], times = [0, 0.5], shares = [0, 1] }]
 press = [["top", 100.0]]
 probe = ["0 0 0", "top"]
 [[body]]
