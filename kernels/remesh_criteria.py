@@ -1,0 +1,19 @@
+"""The former place of criteria of remeshing, which are in ``warp_corot.remesh``; kept for one version.
+
+Checkpoints name criteria by the place that they had.
+"""
+
+import warnings
+
+from warp_corot.kernels.remesh.criteria import (
+    displacement_gradient,
+    green_strain,
+    longest_edge,
+    nearness,
+    strain,
+    von_mises_stress,
+)
+
+__all__ = ["displacement_gradient", "green_strain", "longest_edge", "nearness", "strain", "von_mises_stress"]
+
+warnings.warn("warp_corot.kernels.remesh_criteria has moved: use warp_corot.remesh", DeprecationWarning, stacklevel=2)
