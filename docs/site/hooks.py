@@ -19,6 +19,7 @@ PAGES = {
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
     "benchmarks/README.md": "figures.md",
+    "benchmarks/bodies.md": "bodies.md",
 }
 #: Files that pages link to and a browser can show.
 FILES = [
