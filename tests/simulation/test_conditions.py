@@ -28,12 +28,16 @@ def in_rows(values, device):
     return wp.array(values, dtype=wp.float32, device=device)
 
 
+def in_doubles(values, device):
+    return wp.array(np.squeeze(values), dtype=wp.float64, device=device)
+
+
 def in_torch(values, device):
     torch = pytest.importorskip("torch")
     return torch.tensor(values, dtype=torch.float32, device=str(device))
 
 
-@pytest.mark.parametrize("made", [in_warp, in_rows, in_torch])
+@pytest.mark.parametrize("made", [in_warp, in_rows, in_doubles, in_torch])
 @pytest.mark.parametrize("each", [False, True], ids=["one for all", "one each"])
 def test_forces_and_velocities_on_the_device_are_those_of_numpy(made, each, device, rng):
     force, velocity = 1e-2 * rng.standard_normal((2, 3))

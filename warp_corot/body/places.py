@@ -103,6 +103,8 @@ class ChosenNodes:
         there = vectors_on_device(given, name, (len(self.indices), self.each or len(self.indices)), device)
         if there is not None:
             return there
+        if isinstance(given, wp.array):  # of other numbers, as float64
+            given = given.numpy()
         try:
             values = np.asarray(given, dtype=np.float64)
         except (TypeError, ValueError):

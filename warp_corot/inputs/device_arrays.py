@@ -47,7 +47,7 @@ def vectors_on_device(given: Any, name: str, counts: tuple[int, ...], device: wp
 
 def _as_warp(given: Any) -> wp.array | None:
     if isinstance(given, wp.array):
-        return given
+        return given if given.dtype in (wp.float32, wp.vec3) else None
     if isinstance(given, np.ndarray | np.generic) or not hasattr(given, "__dlpack__"):
         return None
     try:
