@@ -1,6 +1,6 @@
-"""The former place of criteria of remeshing, which are in ``warp_corot.remesh``; kept for one version.
+"""The former place of remeshing criteria, which are now in ``warp_corot.remesh``; kept for one version.
 
-Checkpoints name criteria by the place that they had.
+Checkpoints name criteria by this former place.
 """
 
 import warnings

@@ -1,4 +1,4 @@
-"""The former place of ``ElementState`` and ``elongation``, which are in ``warp_corot.remesh``; kept for one version."""
+"""The former place of ``ElementState`` and ``elongation``, now in ``warp_corot.remesh``; kept for one version."""
 
 import warnings
 

@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import LEVEL_MASK
 from warp_corot.kernels.math.matrices import column
-from warp_corot.kernels.tables.shapes import MIRROR_BIT
+from warp_corot.kernels.tables.shapes import MIRROR_BIT, VOLUME
 
 wp.set_module_options({"enable_backward": False})
 
@@ -114,8 +114,8 @@ def element_gradient(elements: AlignedElements, t: int, shape: int, u0: wp.vec3,
 def material_scale(elements: AlignedElements, t: int, shape: int):
     """What stresses are multiplied by before ``element_forces``: V / h."""
     h = elements.cell * power_of_two(-(shape >> HALVINGS_SHIFT))
-    volume = wp.where((shape & IS_TYPE1) != 0, wp.static(1.0 / 12.0), wp.static(1.0 / 6.0))
-    return wp.where((shape & IS_TYPE2) != 0, wp.static(1.0 / 24.0), volume) * (h * h)
+    volume = wp.where((shape & IS_TYPE1) != 0, wp.static(VOLUME[1]), wp.static(VOLUME[0]))
+    return wp.where((shape & IS_TYPE2) != 0, wp.static(VOLUME[2]), volume) * (h * h)
 
 
 @wp.func

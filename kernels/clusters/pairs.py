@@ -6,7 +6,6 @@ begin. A cluster has no more pairs or tasks than threads. Nodes of more slots ha
 """
 
 import functools
-from typing import Any
 
 import warp as wp
 
@@ -85,7 +84,7 @@ def fetch_number(numbers: wp.array[wp.int32], i: int): ...
 
 
 @functools.cache
-def scatter_pairs(Pairs: Any, Material: Any, law: wp.Function, layout: PairLayout) -> wp.Kernel:
+def scatter_pairs(Pairs: type, Material: type, law: wp.Function, layout: PairLayout) -> wp.Kernel:
     """Add the nodal forces of a law to f; launch with block_dim ``layout.threads`` and whole blocks.
 
     Args:

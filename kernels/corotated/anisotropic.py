@@ -16,8 +16,7 @@ from typing import Any
 import warp as wp
 
 from warp_corot.kernels.elements.constitutive import corotated_strain, hooke, stretch_strain
-from warp_corot.kernels.elements.elements import frame, local_gradient, rest_volume, scatter_stress
-from warp_corot.kernels.elements.forces import von_mises
+from warp_corot.kernels.elements.elements import frame, local_gradient
 from warp_corot.kernels.math.rotation import cofactor, column, identity3, largest_entry
 
 wp.set_module_options({"enable_backward": False})
@@ -42,6 +41,15 @@ class OrthotropicMaterial:
     stride: int  # of the last three
     fill: wp.array[wp.float32]  # share of an element's volume that the body takes
     fill_stride: int
+
+
+@wp.struct
+class FibreMaterial:
+    """An orthotropic material, and the active stress of each element."""
+
+    passive: OrthotropicMaterial
+    is_active: int
+    activation: wp.array[wp.float32]
 
 
 @wp.func
@@ -145,120 +153,77 @@ def material_strain(g: wp.mat33, m: wp.mat33, r: wp.mat33):
 
 
 @functools.cache
-def element_forces(rotation: wp.Function) -> wp.Function:
-    """What adds the forces of element t."""
-    forces = listed_forces(rotation)
+def listed_stress(rotation: wp.Function) -> wp.Function:
+    """Stress of element k of a list that has the material and activation of the mesh's element t, each with its own
+    rotation; elastic and active stress together."""
 
     @wp.func
-    def element_forces(
-        elements: Any,
-        material: OrthotropicMaterial,
-        is_active: int,
-        activation: wp.array[wp.float32],
-        t: int,
-        u: wp.array[wp.vec4],
-        f: wp.array[wp.vec4],
-    ):
-        forces(elements, t, material, is_active, activation, t, u, f)
-
-    return element_forces
-
-
-@functools.cache
-def listed_forces(rotation: wp.Function) -> wp.Function:
-    """What adds the forces of element k of a list that has the material and activation of the mesh's element t."""
-
-    @wp.func
-    def listed_forces(
-        elements: Any,
-        k: int,
-        material: OrthotropicMaterial,
-        is_active: int,
-        activation: wp.array[wp.float32],
-        t: int,
-        u: wp.array[wp.vec4],
-        f: wp.array[wp.vec4],
-    ):
-        m = axes_of(material, t)
+    def listed_stress(elements: Any, k: int, material: FibreMaterial, t: int, u: wp.array[wp.vec4]):
+        m = axes_of(material.passive, t)
         g, turn = material_gradient(elements, k, m, u)
         r = rotation(m + g)
-        stress, a = turned_stress(material_strain(g, m, r), material, t)
+        stress, a = turned_stress(material_strain(g, m, r), material.passive, t)
         p = r * (stress + wp.skew(a))
-        if is_active != 0:
+        if material.is_active != 0:
             # s (F d) d^T, and d is the first axis.
-            pull = activation[t] * column(m + g, 0)
+            pull = material.activation[t] * column(m + g, 0)
             p += wp.outer(pull, wp.vec3(1.0, 0.0, 0.0))
-        scatter_stress(elements, k, (filled(material, t) * p) * wp.transpose(turn), f)
+        return (filled(material.passive, t) * p) * wp.transpose(turn)
 
-    return listed_forces
+    return listed_stress
 
 
-@functools.cache
-def scatter_anisotropic(Elements: Any, rotation: wp.Function) -> wp.Kernel:
-    """Corotated forces of orthotropic elements, each with its own rotation, and of their active stress."""
-    forces = element_forces(rotation)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def scatter_anisotropic(
-        # In
-        elements: Elements,
-        material: OrthotropicMaterial,
-        is_active: int,
-        activation: wp.array[wp.float32],
-        u: wp.array[wp.vec4],
-        # Out
-        f: wp.array[wp.vec4],
-    ):
-        forces(elements, material, is_active, activation, wp.tid(), u, f)
-
-    return scatter_anisotropic
+# --- the law, for the kernels of ``elements.forces`` ------------------------------------------------------------------
 
 
 @functools.cache
-def anisotropic_energies(Elements: Any, rotation: wp.Function) -> wp.Kernel:
-    """Strain energy of each element [J]; active stress has none."""
+def fibre_stress(rotation: wp.Function) -> wp.Function:
+    """Elastic and active stress, with the element's own rotation."""
+    stress = listed_stress(rotation)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def anisotropic_energies(
-        # In
-        elements: Elements,
-        material: OrthotropicMaterial,
-        u: wp.array[wp.vec4],
-        # Out
-        energies: wp.array[wp.float64],
-    ):
-        t = wp.tid()
-        m = axes_of(material, t)
+    @wp.func
+    def fibre_stress(elements: Any, t: int, material: FibreMaterial, u: wp.array[wp.vec4]):
+        return stress(elements, t, material, t, u)
+
+    return fibre_stress
+
+
+@functools.cache
+def own_strain(rotation: wp.Function) -> wp.Function:
+    """The strain in the material's axes."""
+
+    @wp.func
+    def own_strain(elements: Any, t: int, material: FibreMaterial, u: wp.array[wp.vec4]):
+        m = axes_of(material.passive, t)
         g, _turn = material_gradient(elements, t, m, u)
-        strain = material_strain(g, m, rotation(m + g))
-        density = filled(material, t) * energy_density(strain, material, t)
-        energies[t] = wp.float64(density) * wp.float64(rest_volume(elements, t))
+        return material_strain(g, m, rotation(m + g))
 
-    return anisotropic_energies
+    return own_strain
 
 
 @functools.cache
-def anisotropic_von_mises(Elements: Any, rotation: wp.Function) -> wp.Kernel:
-    """Von Mises stress of each element [Pa], of elastic and active stress together, in the frame that turns with it."""
+def fibre_density(rotation: wp.Function) -> wp.Function:
+    """Energy density; active stress has none."""
+    strain = own_strain(rotation)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def anisotropic_von_mises(
-        # In
-        elements: Elements,
-        material: OrthotropicMaterial,
-        is_active: int,
-        activation: wp.array[wp.float32],
-        u: wp.array[wp.vec4],
-        # Out
-        equivalent: wp.array[wp.float32],
-    ):
-        t = wp.tid()
-        m = axes_of(material, t)
-        g, _turn = material_gradient(elements, t, m, u)
-        strain = material_strain(g, m, rotation(m + g))
-        stress, _a = turned_stress(strain, material, t)
-        if is_active != 0:
-            stress[0, 0] += activation[t]
-        equivalent[t] = von_mises(stress)
+    @wp.func
+    def fibre_density(elements: Any, t: int, material: FibreMaterial, u: wp.array[wp.vec4]):
+        passive = material.passive
+        return filled(passive, t) * energy_density(strain(elements, t, material, u), passive, t)
 
-    return anisotropic_von_mises
+    return fibre_density
+
+
+@functools.cache
+def fibre_cauchy(rotation: wp.Function) -> wp.Function:
+    """Elastic and active stress together, in the frame that turns with the element."""
+    strain = own_strain(rotation)
+
+    @wp.func
+    def fibre_cauchy(elements: Any, t: int, material: FibreMaterial, u: wp.array[wp.vec4]):
+        stress, _a = turned_stress(strain(elements, t, material, u), material.passive, t)
+        if material.is_active != 0:
+            stress[0, 0] += material.activation[t]
+        return stress
+
+    return fibre_cauchy

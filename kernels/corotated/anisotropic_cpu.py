@@ -1,8 +1,8 @@
 """Corotated forces of orthotropic elements on the CPU, eight to the lanes of vector registers; see ``elements.lanes``.
 
 Both kinds of elements come as general ones, with M multiplied into their rest matrix: F M = M + (d1 d2 d3) B. An
-element of which no rotation is found adds nothing and is put on a list, which ``repair_anisotropic`` goes through. Left
-out are also all that are near having no definite rotation (see ``anisotropic``): det(tr(S) I - S) = q / 2 below
+element of which no rotation is found adds nothing and is put on a list, which ``forces.repair_forces`` goes through.
+Left out are also all that are near having no definite rotation (see ``anisotropic``): det(tr(S) I - S) = q / 2 below
 ``NEARLY_INDEFINITE`` |S|^3.
 """
 
@@ -13,56 +13,26 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements, frame, rest_volume
 from warp_corot.kernels.elements.general_cpu import rest_inverse_of
-from warp_corot.kernels.elements.lanes import COMPILER_FLAGS, constants, native, on_cpu
+from warp_corot.kernels.elements.lanes import constants, native, scatter_lanes
 from warp_corot.kernels.elements.law_lanes import ROTATION
-from warp_corot.kernels.math.rotation import byers_xu
 
-from .anisotropic import OrthotropicMaterial, axes_of, element_forces, filled
+from .anisotropic import FibreMaterial, OrthotropicMaterial, axes_of, filled
 
 wp.set_module_options({"enable_backward": False})
 
 #: Of det(tr(S) I - S) over |S|^3, where leaves of no definite rotation begin.
 NEARLY_INDEFINITE = 0.41
 
-_FORCES = on_cpu(
-    constants(NEARLY_INDEFINITE=(2 * NEARLY_INDEFINITE) ** 2),
-    ROTATION,
-    native("elements", "orthotropic", "element_forces", "left_out_elements"),
+#: Corotated forces of orthotropic elements, which have Dm^-1 M for the inverse of their rest matrix, and of their
+#: active stress.
+scatter_anisotropic_lanes = scatter_lanes(
+    constants(NEARLY_INDEFINITE=(2 * NEARLY_INDEFINITE) ** 2)
+    + ROTATION
+    + native("elements", "orthotropic", "element_forces", "left_out_elements"),
+    GeneralElements,
+    FibreMaterial,
+    wp.int32,
 )
-
-
-@wp.func_native(_FORCES)
-def eight_anisotropic(
-    elements: GeneralElements,
-    material: OrthotropicMaterial,
-    is_active: int,
-    activation: wp.array[wp.float32],
-    block: int,
-    count: int,
-    u: wp.array[wp.vec4],
-    f: wp.array[wp.vec4],
-    left_out: wp.array[wp.int32],
-): ...
-
-
-@wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": COMPILER_FLAGS})
-def scatter_anisotropic_lanes(
-    # In
-    elements: GeneralElements,
-    material: OrthotropicMaterial,
-    is_active: int,
-    activation: wp.array[wp.float32],
-    count: int,
-    u: wp.array[wp.vec4],
-    # Out
-    f: wp.array[wp.vec4],
-    left_out: wp.array[wp.int32],
-):
-    """Corotated forces of orthotropic elements and of their active stress; a thread is eight elements.
-
-    ``elements.elements`` have Dm^-1 M in place of their rest matrix' inverse.
-    """
-    eight_anisotropic(elements, material, is_active, activation, wp.tid(), count, u, f, left_out)
 
 
 @wp.func
@@ -78,7 +48,7 @@ def turn_element(
 
 
 @functools.cache
-def turn_elements(Elements: Any) -> wp.Kernel:
+def turn_elements(Elements: type) -> wp.Kernel:
     """Elements of either kind as ``scatter_anisotropic_lanes`` wants them: Dm^-1 M, and the filled volume."""
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -114,28 +84,3 @@ def turn_changed(
         count = 0
     for t in range(wp.tid(), count, threads):
         turn_element(elements, material, t, rest_inverse, volume)
-
-
-@functools.cache
-def repair_anisotropic(Elements: Any) -> wp.Kernel:
-    """Forces of the elements on the list, in a way that is right for every F, by one thread; empties it."""
-    forces = element_forces(byers_xu)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def repair_anisotropic(
-        # In
-        elements: Elements,
-        material: OrthotropicMaterial,
-        is_active: int,
-        activation: wp.array[wp.float32],
-        u: wp.array[wp.vec4],
-        # In and out
-        left_out: wp.array[wp.int32],
-        # Out
-        f: wp.array[wp.vec4],
-    ):
-        for i in range(left_out[0]):
-            forces(elements, material, is_active, activation, left_out[i + 1], u, f)
-        left_out[0] = 0
-
-    return repair_anisotropic

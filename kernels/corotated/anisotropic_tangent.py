@@ -18,7 +18,7 @@ from warp_corot.kernels.math.matrices import axial, cofactor, cofactor_different
 
 from .anisotropic import (
     INDEFINITE,
-    OrthotropicMaterial,
+    FibreMaterial,
     axes_of,
     filled,
     material_gradient,
@@ -30,15 +30,6 @@ from .anisotropic import (
 from .tangent import rotation_differential, stretch_turning
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.struct
-class FibreMaterial:
-    """An orthotropic material, and the active stress of each element."""
-
-    passive: OrthotropicMaterial
-    is_active: int
-    activation: wp.array[wp.float32]
 
 
 @wp.func

@@ -10,7 +10,13 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, corotated_strain, hooke, symmetric
+from warp_corot.kernels.elements.constitutive import (
+    IsotropicMaterial,
+    RotatedMaterial,
+    corotated_strain,
+    hooke,
+    symmetric,
+)
 from warp_corot.kernels.elements.elements import frame, local_gradient
 from warp_corot.kernels.math.matrices import axial, cofactor, column, identity3, largest_entry
 
@@ -20,15 +26,6 @@ wp.set_module_options({"enable_backward": False})
 #: largest entry of S below which it is. Both at zero, F has no definite rotation and the derivative does not exist.
 LEAST_DEFINITENESS = wp.constant(1.0e-3)
 LEAST_STRETCH = wp.constant(1.0e-3)
-
-
-@wp.struct
-class RotatedMaterial:
-    """Lamé's parameters, and rotations with the one that each element uses."""
-
-    isotropic: IsotropicMaterial
-    rotations: wp.array[wp.mat33]  # [units] from rest space to world space
-    unit: wp.array[wp.int32]  # [T]
 
 
 @wp.func

@@ -36,6 +36,15 @@ class IsotropicMaterial:
     stride: int
 
 
+@wp.struct
+class RotatedMaterial:
+    """Lamé's parameters, and rotations with the one that each element uses."""
+
+    isotropic: IsotropicMaterial
+    rotations: wp.array[wp.mat33]  # [units] from rest space to world space
+    unit: wp.array[wp.int32]  # [T]
+
+
 @wp.func
 def hooke(strain: wp.mat33, mu: float, lam: float):
     return (2.0 * mu) * strain + (lam * wp.trace(strain)) * identity3()
@@ -124,6 +133,12 @@ def corotated_strain(g: wp.mat33, q: wp.mat33, r: wp.mat33):
     """
     d = r - q
     return symmetric(wp.transpose(r) * g) - 0.5 * (wp.transpose(d) * d)
+
+
+@wp.func
+def rotated_stress(g: wp.mat33, q: wp.mat33, r: wp.mat33, mu: float, lam: float):
+    """The corotated stress times Q, of G, the frame Q and the rotation of F Q."""
+    return r * hooke(corotated_strain(g, q, r), mu, lam)
 
 
 @wp.func

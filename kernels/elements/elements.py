@@ -10,12 +10,16 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.tables.shapes import FRAME_SHIFT, LEVEL_BITS, MIRROR_BIT, SQRT2
+from warp_corot.kernels.tables.shapes import FRAME_SHIFT, LEVEL_BITS, MIRROR_BIT, VOLUME
+
+from .shapes import columns_of, leaf_forces_of
 
 wp.set_module_options({"enable_backward": False})
 
 LEVEL_MASK = wp.constant((1 << LEVEL_BITS) - 1)
-ROOT2 = wp.constant(SQRT2)
+
+columns0, columns1, columns2 = (columns_of(shape) for shape in range(3))
+leaf_forces0, leaf_forces1, leaf_forces2 = (leaf_forces_of(shape) for shape in range(3))
 
 
 @wp.struct
@@ -107,13 +111,9 @@ def frame(elements: GeneralElements, t: int):
 @wp.func
 def rest_volume(elements: ForestElements, t: int):
     h = edge_length(elements, t)
-    volume = h * h * h / 6.0
     shape = shape_of(elements.code[t])
-    if shape == 1:
-        volume *= 0.5
-    elif shape == 2:
-        volume *= 0.25
-    return volume
+    volume = wp.where(shape == 1, wp.static(VOLUME[1]), wp.static(VOLUME[0]))
+    return h * h * h * wp.where(shape == 2, wp.static(VOLUME[2]), volume)
 
 
 @wp.func
@@ -131,15 +131,11 @@ def gradient_of(elements: ForestElements, t: int, u0: wp.vec3, u1: wp.vec3, u2: 
     """G = (du/dX) Q [3, 3] of nodal displacements: sums and differences by type, divided by the edge length."""
     code = elements.code[t]
     shape = shape_of(code)
-    c0 = u1 - u0
-    c1 = u2 - u1
-    c2 = u3 - u2
+    c0, c1, c2 = columns0(u0, u1, u2, u3)
     if shape == 1:
-        c2 = c2 + (u3 - u0)
+        c0, c1, c2 = columns1(u0, u1, u2, u3)
     elif shape == 2:
-        c0 = ROOT2 * (u0 - u2)
-        c1 = ROOT2 * (u1 - u2)
-        c2 = 2.0 * c2
+        c0, c1, c2 = columns2(u0, u1, u2, u3)
     inv_h = 1.0 / edge_length(elements, t)
     return wp.matrix_from_cols(c0 * inv_h, c1 * inv_h, c2 * (inv_h * mirror_sign(code)))
 
@@ -187,18 +183,11 @@ def nodal_forces(elements: ForestElements, t: int, p: wp.mat33):
     p0 = wp.vec3(p[0, 0], p[1, 0], p[2, 0]) * area
     p1 = wp.vec3(p[0, 1], p[1, 1], p[2, 1]) * area
     p2 = wp.vec3(p[0, 2], p[1, 2], p[2, 2]) * (area * mirror_sign(code))
-    f0 = p0
-    f1 = p1 - p0
-    f2 = p2 - p1
-    f3 = -p2
+    f0, f1, f2, f3 = leaf_forces0(p0, p1, p2)
     if shape == 1:
-        f0 = p0 + p2
-        f3 = -2.0 * p2
+        f0, f1, f2, f3 = leaf_forces1(p0, p1, p2)
     elif shape == 2:
-        f0 = -ROOT2 * p0
-        f1 = -ROOT2 * p1
-        f2 = ROOT2 * (p0 + p1) + 2.0 * p2
-        f3 = -2.0 * p2
+        f0, f1, f2, f3 = leaf_forces2(p0, p1, p2)
     return f0, f1, f2, f3
 
 

@@ -1,7 +1,9 @@
 """Kernel factories of the element loop: forces, energies and stresses of a law on a kind of elements.
 
-``stress``, ``energy`` and ``cauchy`` are functions of ``constitutive``; ``Elements`` is a struct of ``elements``.
-Material parameters are arrays of one entry (uniform) or one per element; ``stride`` is 0 or 1 accordingly.
+A law is device functions (elements, t, material, u) of element t at nodal displacements u: ``stress``, the first
+Piola-Kirchhoff stress as ``elements.scatter_stress`` takes it; ``density``, the energy density; and ``cauchy``, a
+tensor with the invariants of the Cauchy stress. ``Elements`` is a struct of ``elements``, ``Material`` the struct that
+the law reads.
 """
 
 import functools
@@ -9,6 +11,7 @@ from typing import Any
 
 import warp as wp
 
+from .constitutive import IsotropicMaterial
 from .elements import ForestElements, GeneralElements, frame, local_gradient, rest_volume, scatter_stress
 
 wp.set_module_options({"enable_backward": False})
@@ -36,76 +39,121 @@ def own_gradient(elements: GeneralElements, t: int, u: wp.array[wp.vec4]):
 
 
 @wp.func
-def scatter_own_stress(elements: ForestElements, t: int, p: wp.mat33, f: wp.array[wp.vec4]):
-    """Add the nodal forces of a first Piola-Kirchhoff stress in the frame of ``own_gradient``."""
-    scatter_stress(elements, t, frame(elements, t) * p, f)
+def in_local_frame(elements: ForestElements, t: int, p: wp.mat33):
+    """P Q of a first Piola-Kirchhoff stress P in the frame of ``own_gradient``, rows and columns."""
+    return frame(elements, t) * p
 
 
 @wp.func
-def scatter_own_stress(elements: GeneralElements, t: int, p: wp.mat33, f: wp.array[wp.vec4]):
-    scatter_stress(elements, t, p, f)
+def in_local_frame(elements: GeneralElements, t: int, p: wp.mat33):
+    return p
+
+
+# --- laws of ``constitutive``, of materials that are the same in all directions ---------------------------------------
 
 
 @functools.cache
-def scatter_forces(Elements: Any, stress: wp.Function) -> wp.Kernel:
-    """Add the elastic nodal forces of a law to f."""
+def law_stress(stress: wp.Function) -> wp.Function:
+    """A law's stress for the kernels below."""
+
+    @wp.func
+    def law_stress(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4]):
+        i = t * material.stride
+        return in_local_frame(elements, t, stress(own_gradient(elements, t, u), material.mu[i], material.lam[i]))
+
+    return law_stress
+
+
+@functools.cache
+def law_value(function: wp.Function) -> wp.Function:
+    """A law's energy density or Cauchy stress for the kernels below."""
+
+    @wp.func
+    def law_value(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4]):
+        i = t * material.stride
+        return function(own_gradient(elements, t, u), material.mu[i], material.lam[i])
+
+    return law_value
+
+
+# --- kernels of any law on any kind of elements -----------------------------------------------------------------------
+
+
+@functools.cache
+def scatter_forces(Elements: type, Material: type, stress: wp.Function) -> wp.Kernel:
+    """Add the elastic nodal forces of a law to f; a thread an element."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def scatter_forces(
         # In
         elements: Elements,
-        mu: wp.array[wp.float32],
-        lam: wp.array[wp.float32],
-        stride: int,
+        material: Material,
         u: wp.array[wp.vec4],
         # Out
         f: wp.array[wp.vec4],
     ):
         t = wp.tid()
-        p = stress(own_gradient(elements, t, u), mu[t * stride], lam[t * stride])
-        scatter_own_stress(elements, t, p, f)
+        scatter_stress(elements, t, stress(elements, t, material, u), f)
 
     return scatter_forces
 
 
 @functools.cache
-def element_energies(Elements: Any, energy: wp.Function) -> wp.Kernel:
+def repair_forces(Elements: type, Material: type, stress: wp.Function) -> wp.Kernel:
+    """The same of the elements on a list, by one thread, which empties the list: how many, then which."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def repair_forces(
+        # In
+        elements: Elements,
+        material: Material,
+        u: wp.array[wp.vec4],
+        # In and out
+        listed: wp.array[wp.int32],
+        # Out
+        f: wp.array[wp.vec4],
+    ):
+        for i in range(listed[0]):
+            t = listed[i + 1]
+            scatter_stress(elements, t, stress(elements, t, material, u), f)
+        listed[0] = 0
+
+    return repair_forces
+
+
+@functools.cache
+def element_energies(Elements: type, Material: type, density: wp.Function) -> wp.Kernel:
     """Strain energy of each element [J], in float64 so that sums over millions keep their digits."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def element_energies(
         # In
         elements: Elements,
-        mu: wp.array[wp.float32],
-        lam: wp.array[wp.float32],
-        stride: int,
+        material: Material,
         u: wp.array[wp.vec4],
         # Out
         energies: wp.array[wp.float64],
     ):
         t = wp.tid()
-        density = energy(own_gradient(elements, t, u), mu[t * stride], lam[t * stride])
-        energies[t] = wp.float64(density) * wp.float64(rest_volume(elements, t))
+        energies[t] = wp.float64(density(elements, t, material, u)) * wp.float64(rest_volume(elements, t))
 
     return element_energies
 
 
 @functools.cache
-def element_von_mises(Elements: Any, cauchy: wp.Function) -> wp.Kernel:
+def element_von_mises(Elements: type, Material: type, cauchy: wp.Function) -> wp.Kernel:
     """Von Mises stress of each element [Pa]."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def element_von_mises(
         # In
         elements: Elements,
-        mu: wp.array[wp.float32],
-        lam: wp.array[wp.float32],
-        stride: int,
+        material: Material,
         u: wp.array[wp.vec4],
         # Out
         stress: wp.array[wp.float32],
     ):
         t = wp.tid()
-        stress[t] = von_mises(cauchy(own_gradient(elements, t, u), mu[t * stride], lam[t * stride]))
+        stress[t] = von_mises(cauchy(elements, t, material, u))
 
     return element_von_mises

@@ -14,6 +14,8 @@ registers do what each would do alone.
 import functools
 from pathlib import Path
 
+import warp as wp
+
 #: The vectors are as wide as the machine at hand has them.
 COMPILER_FLAGS = "-march=native -ffp-contract=fast"
 
@@ -36,6 +38,49 @@ def constants(**values: float) -> str:
     return "".join(f"const {kinds[name]} {name} = {value!r};\n" for name, value in values.items())
 
 
+#: Where native code finds Lamé's parameters: in ``IsotropicMaterial``, or in a material of which that is a part.
+ISOTROPIC = "const auto& isotropic = material;\n"
+ISOTROPIC_PART = "const auto& isotropic = material.isotropic;\n"
+
+
 def on_cpu(*code: str) -> str:
     """A native snippet on lanes, which is nothing where Warp compiles it for a GPU."""
     return f"#if !defined(__CUDA_ARCH__)\n{native('lanes')}{''.join(code)}#endif\n"
+
+
+@functools.cache
+def scatter_lanes(code: str, Units: type, Material: type, missed_type: type) -> wp.Kernel:
+    """The kernel that adds forces on the CPU; a thread is eight units.
+
+    Args:
+        code: What it does with them. In: units, the number ``block`` of the eight, the ``count`` of all, material, u.
+            Out: f, and ``missed``, what is left out.
+        Units, Material: Structs of what forces are found of, and of what these are made of.
+        missed_type: uint8: flags of a subtree's leaves; int32: a list of elements, how many and then which.
+    """
+
+    @wp.func_native(on_cpu(code))
+    def eight_units(
+        units: Units,
+        block: int,
+        count: int,
+        material: Material,
+        u: wp.array[wp.vec4],
+        f: wp.array[wp.vec4],
+        missed: wp.array[missed_type],
+    ): ...
+
+    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": COMPILER_FLAGS})
+    def scatter_lanes(
+        # In
+        units: Units,
+        count: int,
+        material: Material,
+        u: wp.array[wp.vec4],
+        # Out
+        f: wp.array[wp.vec4],
+        missed: wp.array[missed_type],
+    ):
+        eight_units(units, wp.tid(), count, material, u, f, missed)
+
+    return scatter_lanes

@@ -7,18 +7,18 @@ small-strain form. ``scatter_mass_spring``: one independent linear spring for ea
 """
 
 import functools
-from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.tables.shapes import FIRST_NODE, REST, SECOND_NODE, edge_stiffness, fingerprint
+from warp_corot.kernels.tables.shapes import FIRST_NODE, SECOND_NODE, edge_stiffness, fingerprint
 
+from .constitutive import IsotropicMaterial
 from .elements import ForestElements, GeneralElements, add_force, edge_length, frame, load_node, mirror_sign, shape_of
+from .shapes import mat43, rest_shape
 
 wp.set_module_options({"enable_backward": False})
 
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
-mat43 = wp.types.matrix(shape=(4, 3), dtype=wp.float32)
 
 _EDGE_STIFFNESS = tuple(edge_stiffness(shape) for shape in range(3))
 
@@ -27,12 +27,7 @@ _EDGE_STIFFNESS = tuple(edge_stiffness(shape) for shape in range(3))
 def rest_nodes(elements: ForestElements, t: int):
     """Rest positions of the four nodes in the local frame, up to a translation [m], a row a node."""
     code = elements.code[t]
-    shape = shape_of(code)
-    x = wp.static(mat43(*(c for node in REST[0] for c in node)))
-    if shape == 1:
-        x = wp.static(mat43(*(c for node in REST[1] for c in node)))
-    elif shape == 2:
-        x = wp.static(mat43(*(c for node in REST[2] for c in node)))
+    x = rest_shape(shape_of(code))
     h = edge_length(elements, t)
     s = mirror_sign(code)
     for n in range(4):
@@ -128,16 +123,35 @@ def edge_stretch(rest: wp.vec3, stretch: wp.vec3, biquadratic: bool):
 
 
 @functools.cache
-def scatter_edge_stvk(Elements: Any, biquadratic: bool) -> wp.Kernel:
+def edge_measures(biquadratic: bool) -> wp.Function:
+    """D of the six edges, and their factors (``edge_stretch``), from the frame and the nodes at rest in it."""
+
+    @wp.func
+    def edge_measures(nodes: wp.vec4i, q: wp.mat33, x: mat43, u: wp.array[wp.vec4]):
+        d = vec6()
+        pull = vec6()
+        for e in range(6):
+            i = FIRST_NODE[e]
+            j = SECOND_NODE[e]
+            stretch = load_node(u, nodes[j]) - load_node(u, nodes[i])
+            measure, factor = edge_stretch(q * (x[j] - x[i]), stretch, wp.static(biquadratic))
+            d[e] = measure
+            pull[e] = factor
+        return d, pull
+
+    return edge_measures
+
+
+@functools.cache
+def scatter_edge_stvk(Elements: type, biquadratic: bool) -> wp.Kernel:
     """Add the nodal forces of the six coupled springs of each element to f."""
+    measures = edge_measures(biquadratic)
 
     @wp.kernel(module="unique", enable_backward=False)
     def scatter_edge_stvk(
         # In
         elements: Elements,
-        mu: wp.array[wp.float32],
-        lam: wp.array[wp.float32],
-        stride: int,
+        material: IsotropicMaterial,
         u: wp.array[wp.vec4],
         # Out
         f: wp.array[wp.vec4],
@@ -147,18 +161,8 @@ def scatter_edge_stvk(Elements: Any, biquadratic: bool) -> wp.Kernel:
         targets = elements.targets[t]
         q = frame(elements, t)
         x = rest_nodes(elements, t)
-        d = vec6()
-        pull = vec6()
-        for e in range(6):
-            i = FIRST_NODE[e]
-            j = SECOND_NODE[e]
-            rest = q * (x[j] - x[i])
-            measure, factor = edge_stretch(
-                rest, load_node(u, nodes[j]) - load_node(u, nodes[i]), wp.static(biquadratic)
-            )
-            d[e] = measure
-            pull[e] = factor
-        tension = edge_tensions(elements, t, d, mu[t * stride], lam[t * stride])
+        d, pull = measures(nodes, q, x, u)
+        tension = edge_tensions(elements, t, d, material.mu[t * material.stride], material.lam[t * material.stride])
         for e in range(6):
             i = FIRST_NODE[e]
             j = SECOND_NODE[e]
@@ -171,34 +175,22 @@ def scatter_edge_stvk(Elements: Any, biquadratic: bool) -> wp.Kernel:
 
 
 @functools.cache
-def edge_stvk_energies(Elements: Any, biquadratic: bool) -> wp.Kernel:
+def edge_stvk_energies(Elements: type, biquadratic: bool) -> wp.Kernel:
     """D^T K D / 2 of each element [J]."""
+    measures = edge_measures(biquadratic)
 
     @wp.kernel(module="unique", enable_backward=False)
     def edge_stvk_energies(
         # In
         elements: Elements,
-        mu: wp.array[wp.float32],
-        lam: wp.array[wp.float32],
-        stride: int,
+        material: IsotropicMaterial,
         u: wp.array[wp.vec4],
         # Out
         energies: wp.array[wp.float64],
     ):
         t = wp.tid()
-        nodes = elements.nodes[t]
-        q = frame(elements, t)
-        x = rest_nodes(elements, t)
-        d = vec6()
-        for e in range(6):
-            i = FIRST_NODE[e]
-            j = SECOND_NODE[e]
-            rest = q * (x[j] - x[i])
-            measure, _factor = edge_stretch(
-                rest, load_node(u, nodes[j]) - load_node(u, nodes[i]), wp.static(biquadratic)
-            )
-            d[e] = measure
-        tension = edge_tensions(elements, t, d, mu[t * stride], lam[t * stride])
+        d, _pull = measures(elements.nodes[t], frame(elements, t), rest_nodes(elements, t), u)
+        tension = edge_tensions(elements, t, d, material.mu[t * material.stride], material.lam[t * material.stride])
         energies[t] = wp.float64(0.5 * wp.dot(d, tension))
 
     return edge_stvk_energies

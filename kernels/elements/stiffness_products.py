@@ -32,7 +32,7 @@ def law_differential(law: wp.Function) -> wp.Function:
 
 
 @functools.cache
-def add_stiffness_product(Elements: Any, Material: Any, differential: wp.Function) -> wp.Kernel:
+def add_stiffness_product(Elements: type, Material: type, differential: wp.Function) -> wp.Kernel:
     """y += K(u) p; a thread an element."""
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -63,7 +63,7 @@ def where_is(chosen: bool, v: wp.vec3):
 
 
 @functools.cache
-def add_stiffness_diagonal(Elements: Any, Material: Any, differential: wp.Function) -> wp.Kernel:
+def add_stiffness_diagonal(Elements: type, Material: type, differential: wp.Function) -> wp.Kernel:
     """Add the 3x3 blocks on K(u)'s diagonal to those of the nodes; a thread a node of an element."""
 
     @wp.kernel(module="unique", enable_backward=False)

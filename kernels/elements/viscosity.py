@@ -8,14 +8,13 @@ s : Udot >= 0 of power and has no torque.
 """
 
 import functools
-from typing import Any
 
 import warp as wp
 
 from warp_corot.kernels.math.matrices import axial
 from warp_corot.kernels.math.rotation import byers_xu, identity3
 
-from .constitutive import corotated_strain, hooke, symmetric
+from .constitutive import IsotropicMaterial, corotated_strain, hooke, symmetric
 from .elements import frame, local_gradient, scatter_stress
 
 wp.set_module_options({"enable_backward": False})
@@ -38,7 +37,7 @@ def viscous_stress(u: wp.mat33, a: wp.mat33, mu: float, lam: float):
 
 
 @functools.cache
-def scatter_viscous(Elements: Any) -> wp.Kernel:
+def scatter_viscous(Elements: type) -> wp.Kernel:
     """Add viscous nodal forces to f: eta times the stiffness, for small motions."""
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -46,9 +45,7 @@ def scatter_viscous(Elements: Any) -> wp.Kernel:
         # In
         elements: Elements,
         eta: float,
-        mu: wp.array[wp.float32],
-        lam: wp.array[wp.float32],
-        stride: int,
+        material: IsotropicMaterial,
         u: wp.array[wp.vec4],
         v: wp.array[wp.vec4],
         # Out
@@ -60,7 +57,8 @@ def scatter_viscous(Elements: Any) -> wp.Kernel:
         r = byers_xu(q + g)
         stretch = identity3() + corotated_strain(g, q, r)
         rate = wp.transpose(r) * local_gradient(elements, t, v)
-        p = r * viscous_stress(stretch, rate, eta * mu[t * stride], eta * lam[t * stride])
+        i = t * material.stride
+        p = r * viscous_stress(stretch, rate, eta * material.mu[i], eta * material.lam[i])
         scatter_stress(elements, t, p, f)
 
     return scatter_viscous

@@ -1,1 +1,1 @@
-"""Small matrices, and the rotations in them."""
+"""Small matrices and their rotations."""

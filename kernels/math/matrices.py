@@ -1,4 +1,4 @@
-"""Small matrices: what rotations and constitutive laws are made of."""
+"""Small matrices for rotations and constitutive laws."""
 
 import warp as wp
 
@@ -17,7 +17,7 @@ MAX_FLOAT = wp.constant(3.4028234e38)
 #endif
 """)
 def reciprocal(x: float) -> float:
-    """1 / x to the last digit but one, in one instruction."""
+    """1 / x, accurate to the last digit but one, in one instruction."""
     ...
 
 
@@ -31,7 +31,7 @@ def reciprocal(x: float) -> float:
 #endif
 """)
 def square_root(x: float) -> float:
-    """The root of x >= 0 to the last digit but one."""
+    """The root of x >= 0, accurate to the last digit but one."""
     ...
 
 
@@ -45,7 +45,7 @@ def square_root(x: float) -> float:
 #endif
 """)
 def reciprocal_root(x: float) -> float:
-    """1 / sqrt(x) to the last digit but one."""
+    """1 / sqrt(x), accurate to the last digit but one."""
     ...
 
 

@@ -1,7 +1,7 @@
 """Rotations of any F, inverted and singular ones too, as quaternions: the maximiser of tr(R^T F), det R = +1.
 
 ``robust_rotation``: tr(R^T F) = q^T K q for the quaternion q of R and a symmetric 4x4 matrix K of F's entries
-(Davenport; Horn 1987; Higham and Noferini 2016), so the quaternion sought is K's dominant eigenvector for every F. It
+(Davenport; Horn 1987; Higham and Noferini 2016), so this quaternion is K's dominant eigenvector for every F. It
 takes some four hundred operations without a branch, the same for every F, and no SVD.
 ``turn_quaternion`` iterates on a quaternion that the caller keeps (Müller et al. 2016), with the exact Hessian where it
 is positive definite (Kugelstadt, Koschier and Bender 2018).
@@ -15,14 +15,14 @@ wp.set_module_options({"enable_backward": False})
 
 MAX_TURNS = wp.constant(40)
 
-# Of the largest eigenvalue of K for |F| = 1: steps of Laguerre's method, and the least denominator of one. What is used
-# in the eigenvalue's place stands so far above it that the characteristic polynomial has the least slope there, and at
-# most so far.
+# The largest eigenvalue of K for |F| = 1: number of steps of Laguerre's method, and the smallest denominator of a step.
+# The value used in place of the eigenvalue is so far above it that the characteristic polynomial has the minimum slope
+# there, and at most this far.
 ROOT_STEPS = wp.constant(3)
 LEAST_DENOMINATOR = wp.constant(0.01)
 LEAST_SLOPE = wp.constant(3.0e-3)
 MOST_SHIFT = wp.constant(0.02)
-# |F|^2 of which the square and the inverse root are in range.
+# Range of |F|^2 in which its square and inverse root are representable.
 SMALL = wp.constant(1.0e-20)
 LARGE = wp.constant(1.0e20)
 POWER_OF_TWO = wp.constant(2.0**100)
@@ -30,7 +30,7 @@ POWER_OF_TWO = wp.constant(2.0**100)
 
 @wp.func
 def leading_eigenvector(s: wp.mat33, scale: float):
-    """About the eigenvector of the largest eigenvalue of a symmetric matrix of entries up to ``scale``."""
+    """Approximate eigenvector of the largest eigenvalue of a symmetric matrix with entries up to ``scale``."""
     m = s / scale + 3.0 * identity3()
     for _ in range(5):
         m = m * m
@@ -44,7 +44,8 @@ def leading_eigenvector(s: wp.mat33, scale: float):
 
 @wp.func
 def slope_and_hessian(f: wp.mat33, q: wp.quat):
-    """b = R^T F, the slope of tr(R^T F) against a rotation vector in the rotated frame, and minus its Hessian."""
+    """b = R^T F, the slope of tr(R^T F) with respect to a rotation vector in the rotated frame, and minus its
+    Hessian."""
     b = wp.transpose(wp.quat_to_matrix(q)) * f
     axial = wp.vec3(b[2, 1] - b[1, 2], b[0, 2] - b[2, 0], b[1, 0] - b[0, 1])
     return b, axial, wp.trace(b) * identity3() - 0.5 * (b + wp.transpose(b))
@@ -52,7 +53,7 @@ def slope_and_hessian(f: wp.mat33, q: wp.quat):
 
 @wp.func
 def newton_turn(axial: wp.vec3, h: wp.mat33, scale: float):
-    """Newton's step towards the maximum, and whether it is one: h well above singular."""
+    """Newton's step towards the maximum, and whether h is well above singular, so that it is one."""
     minor = h[0, 0] * h[1, 1] - h[0, 1] * h[0, 1]
     det = wp.determinant(h)
     sound = h[0, 0] > 1.0e-3 * scale and minor > 1.0e-4 * scale * scale and det > 1.0e-6 * scale * scale * scale
@@ -74,7 +75,7 @@ def turn(f: wp.mat33, q: wp.quat):
     scale = wp.max(largest_entry(b), 1.0e-30)
     w, sound = newton_turn(axial, h, scale)
     if not sound:
-        # Past the reach of Newton's step: where the slope is small it would creep along a saddle, so leave about the
+        # Beyond the reach of Newton's step: where the slope is small it would creep along a saddle, so leave about the
         # axis of upward curvature.
         trace = wp.trace(b)
         w = axial / (wp.abs(trace) + scale)
@@ -98,11 +99,11 @@ def turn_quaternion(f: wp.mat33, guess: wp.quat, iterations: int, tolerance: flo
 
 @wp.func
 def warm_rotation(f: wp.mat33, guess: wp.quat):
-    """The rotation of any F as a quaternion, started from ``guess``; a non-finite or zero F returns the guess."""
+    """The rotation of any F as a quaternion, starting from ``guess``; a non-finite or zero F returns the guess."""
     m = largest_entry(f)
     q = guess
     if all_finite(f) and m > 0.0:
-        # The step after one of 1e-4 would be of order 1e-8: quadratic convergence has done the rest already.
+        # After a step of 1e-4 the next would be of order 1e-8: quadratic convergence is complete.
         q = turn_quaternion(f / m, guess, MAX_TURNS, 1.0e-4)
     return q
 
@@ -122,8 +123,8 @@ def sum_of_squares(a: wp.mat33):
 def largest_root(n2: float, c2: float, det: float):
     """The largest eigenvalue of K, sigma_1 + sigma_2 + sign(det F) sigma_3, of |F|^2 = n2 = 1, |cof F|^2 and det F.
 
-    It is the largest root of x^4 - 2 n2 x^2 - 8 det x + n2^2 - 4 c2, whose roots are all real: from the bound above it
-    Laguerre's method descends to it. Where it meets another root the slope vanishes, and the result is a little too
+    It is the largest root of x^4 - 2 n2 x^2 - 8 det x + n2^2 - 4 c2, whose roots are all real: Laguerre's method
+    descends to it from the bound above it. At a multiple root the slope vanishes, and the result is slightly too
     large.
     """
     # x^2 = n2 + 2 y, y^2 = c2 + 2 det x, with x from 1 / sqrt(3) to sqrt(3).
@@ -144,10 +145,10 @@ def largest_root(n2: float, c2: float, det: float):
 
 @wp.func
 def dominant_quaternion(f: wp.mat33):
-    """About the quaternion of the rotation of F, for |F| = 1.
+    """Approximate quaternion of the rotation of F, for |F| = 1.
 
-    The adjugate of (root I - K) is its inverse but for a factor, and exists where eigenvalues meet. In its powers the
-    dominant eigenvector outgrows the others: this is a column of the sixth, the one that has most of it.
+    The adjugate of (root I - K) is its inverse up to a factor, and exists for multiple eigenvalues. In its powers the
+    dominant eigenvector outgrows the others: this is the largest column of the sixth power.
     """
     c = cofactor(f)
     root = largest_root(sum_of_squares(f), sum_of_squares(c), wp.dot(column(f, 0), column(c, 0)))
@@ -193,7 +194,7 @@ def dominant_quaternion(f: wp.mat33):
     b22 = a02 * a02 + a12 * a12 + a22 * a22 + a23 * a23
     b23 = a02 * a03 + a12 * a13 + a22 * a23 + a23 * a33
     b33 = a03 * a03 + a13 * a13 + a23 * a23 + a33 * a33
-    # By selections: an index that is not known would put the matrix into memory.
+    # By selections: a variable index would put the matrix into memory.
     q = wp.where(b11 > b00, wp.vec4(b01, b11, b12, b13), wp.vec4(b00, b01, b02, b03))
     other = wp.where(b33 > b22, wp.vec4(b03, b13, b23, b33), wp.vec4(b02, b12, b22, b23))
     q = wp.where(wp.max(b22, b33) > wp.max(b00, b11), other, q)
@@ -232,9 +233,9 @@ def matrix_of(q: wp.quat):
 
 @wp.func
 def polished(f: wp.mat33, q: wp.quat):
-    """q after one of Newton's steps towards the maximum of tr(R^T F), |F| = 1; an error becomes its third power.
+    """q after one Newton step towards the maximum of tr(R^T F), |F| = 1; it cubes the error.
 
-    The Hessian is tr(B) I - (B + B^T) / 2 of B = R^T F, turned round. Where it is not well above singular q stays.
+    The Hessian is tr(B) I - (B + B^T) / 2 of B = R^T F, negated. If it is not well above singular, q does not change.
     """
     b = wp.transpose(matrix_of(q)) * f
     h00 = b[1, 1] + b[2, 2]
@@ -255,7 +256,7 @@ def polished(f: wp.mat33, q: wp.quat):
     det = h00 * c00 + h01 * c01 + h02 * c02
     sound = h00 > 1.0e-3 and c22 > 1.0e-4 and det > 1.0e-6
     s = wp.where(sound, 0.5 * reciprocal(det), 0.0)
-    # Half of the turn, in the frame that is turned along.
+    # Half of the rotation vector, in the rotated frame.
     t0 = s * (c00 * x + c01 * y + c02 * z)
     t1 = s * (c01 * x + c11 * y + c12 * z)
     t2 = s * (c02 * x + c12 * y + c22 * z)

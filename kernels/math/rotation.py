@@ -2,18 +2,18 @@
 
 ``byers_xu`` is the paper's method: Newton's iteration with the scaling of Byers and Xu (2008),
     X <- (zeta X + X^-T / zeta) / 2.
-Its stopping test as printed (eq. 6) measures ||X - X*||, which does not vanish at a rotation; what tends to zero is the
-step, and that is what is tested here against the paper's 3.85e-5.
+Its stopping test as printed (eq. 6) measures ||X - X*||, which does not vanish at a rotation; the step tends to zero,
+and is tested here against the paper's 3.85e-5.
 ``mcadams_svd`` is the baseline, U V^T of Warp's 3x3 SVD (McAdams et al. 2011).
 
-Newton's iteration has no answer for a singular F and gives a reflection for an inverted one. Both are left to
-``quaternion.robust_rotation``.
+Newton's iteration has no result for a singular F and gives a reflection for an inverted one. For both,
+``quaternion.robust_rotation`` is used.
 """
 
 import warp as wp
 
 from .matrices import all_finite, cofactor, column, frobenius, identity3, largest_entry, reciprocal
-from .quaternion import robust_rotation, warm_rotation  # noqa: F401 (others find it here)
+from .quaternion import robust_rotation, warm_rotation  # noqa: F401 (other modules import them from here)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -27,11 +27,11 @@ MAX_NEWTON = wp.constant(16)
 
 ITERATIONS = 4
 
-# Of the unscaled iteration: how many, det F below which it is not tried, and det X - 1 before the last iteration beyond
-# which it has not converged (the rotation's error is at most half the square of that).
+# The unscaled iteration: its number of steps, det F below which it is not tried, and det X - 1 before the last step
+# above which it has not converged (the rotation's error is at most half the square of that).
 FLAT = wp.constant(0.03)
 UNCONVERGED = wp.constant(1.0e-3)
-# Iterations that may follow them: enough for principal stretches of 1e4 or 1e-4, each halves what is far from one.
+# Further iterations: enough for principal stretches of 1e4 or 1e-4, each halves values far from one.
 MORE_ITERATIONS = wp.constant(12)
 
 
@@ -104,11 +104,11 @@ def byers_xu(f: wp.mat33):
 
 @wp.func
 def newton_rotation(c0: wp.vec3, c1: wp.vec3, c2: wp.vec3, handedness: float):
-    """Z = 2^ITERATIONS R of the columns of F, and whether it may be trusted: F neither flat, inverted nor far from one.
+    """Z = 2^ITERATIONS R of the columns of F, and whether it is reliable: F neither flat, inverted nor far from one.
 
     Newton's iteration unscaled, X <- (X + X^-T)/2, for F of order one: four steps are enough for principal stretches
     between 0.45 and 2.2. It runs on Z = s X with s doubling in every step, Z <- Z + (s^2 / det Z) cof Z, one
-    multiply-add a component. Where four are not enough it goes on with s kept.
+    multiply-add a component. If four are not enough, it continues with constant s.
     """
     z0 = c0
     z1 = c1
@@ -150,7 +150,7 @@ def rotation_out_of_line(f: wp.mat33):
 
 @wp.func
 def quick_rotation(f: wp.mat33):
-    """As ``byers_xu`` and at least as near: unscaled where that converges, which nearly all elements let it."""
+    """The same as ``byers_xu`` and at least as accurate: unscaled if that converges, as for nearly all elements."""
     z0, z1, z2, trusted = newton_rotation(column(f, 0), column(f, 1), column(f, 2), 1.0)
     r = wp.static(0.5**ITERATIONS) * wp.matrix_from_cols(z0, z1, z2)
     if not trusted:

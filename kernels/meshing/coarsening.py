@@ -1,9 +1,9 @@
-"""A coarser mesh out of a forest: bisected again from the roots, where it is wished and conformity asks for it.
+"""A coarser mesh from a forest: bisected again from the roots, where requested and where conformity requires it.
 
-All that could be asked for is in the forest: a conforming mesh that is wished for in part of its tetrahedra needs no
-other bisections than those that the forest has. A tetrahedron must be bisected where it needs it, where a child of its
-is, and where another that shares its refinement edge is; all its other edges are edges of its children. So one sweep
-from the deepest level up tells for every tetrahedron up to which threshold it is bisected.
+Everything that can be requested is in the forest: a conforming mesh that needs part of its tetrahedra needs no
+bisections that the forest does not have. A tetrahedron must be bisected if it is requested, if a child of it
+is bisected, and if another with the same refinement edge is; all its other edges are edges of its children. So one
+sweep from the deepest level up gives for every tetrahedron the threshold up to which it is bisected.
 """
 
 import warp as wp
@@ -11,13 +11,13 @@ import warp as wp
 from .bisection import refinement_end
 from .growth import LIVE, VOID
 
-#: In place of a first child: below the mesh.
+#: Value in place of a first child: below the mesh.
 BELOW = wp.constant(-3)
 
 
 @wp.func
 def newest_node(element: int, tets: wp.array[wp.vec4i], level: wp.array[wp.int32], first_child: wp.array[wp.int32]):
-    """The node at which an element is bisected."""
+    """The node at which an element was bisected."""
     return tets[first_child[element]][refinement_end(level[element])]
 
 
@@ -33,7 +33,7 @@ def gather_needs(
     needs: wp.array[wp.float32],
     of_node: wp.array[wp.float32],
 ):
-    """What the bisected elements of one level need, and with each the others around the edge."""
+    """Gather the needs of the bisected elements of one level, and pass them to the others around the edge."""
     element = elements[wp.tid()]
     below = first_child[element]
     need = wp.max(needs[element], wp.max(needs[below], needs[below + 1]))
@@ -53,7 +53,7 @@ def take_needs(
     # In and out
     needs: wp.array[wp.float32],
 ):
-    """An element is bisected where another around its refinement edge is."""
+    """Bisect an element if another around its refinement edge is bisected."""
     element = elements[wp.tid()]
     node = newest_node(element, tets, level, first_child)
     needs[element] = wp.max(needs[element], of_node[node])
@@ -70,7 +70,7 @@ def cut_off(
     # Out
     child: wp.array[wp.int32],
 ):
-    """The mesh of a threshold. What holds nothing of the body is not bisected."""
+    """The mesh of a threshold. An element outside the body is not bisected."""
     i = wp.tid()
     above = parent[i]
     found = BELOW

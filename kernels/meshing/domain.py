@@ -1,27 +1,24 @@
 """Signed functions of bodies at many points: negative inside, in metres.
 
-Each kernel evaluates one kind of domain, one thread a point; sets of domains combine what these have written.
+Each kernel evaluates one kind of domain, with one thread for each point; sets of domains combine the results.
 """
 
 import warp as wp
 
-#: How far a closest triangle is looked for [m]: everywhere.
+from .windings import Lines, winding_number
+
+#: Search radius for the closest triangle [m]: unlimited.
 FAR = 1.0e15
 
-#: How many radii away a group of triangles counts as one dipole in a winding number. At 1.5 no number was off by a
-#: quarter on closed surfaces (thin plates and shells among them), at 1.0 a few were; 2.0 takes half as long again.
+#: A group of triangles farther away than this many radii counts as one dipole in a winding number. At 1.5 no number was
+#: off by a quarter on closed surfaces (thin plates and shells included), at 1.0 a few were; 2.0 takes 1.5 times as
+#: long.
 ACCURACY = 1.5
 
-#: Two directions in which rays are sent, along which hardly a face lies. After a crossing a ray goes on by a share of
-#: its coordinates, and so many crossings are counted.
-RAYS = wp.constant(wp.mat33(0.4573, -0.2689, 0.8477, -0.7346, 0.6211, 0.2729, 0.0, 0.0, 0.0))
-RAY_STEP = wp.constant(2.0e-6)
-MOST_CROSSINGS = wp.constant(64)
-
-#: A closest point whose barycentric coordinate at a corner is below this lies on the edge across from it.
+#: A closest point whose barycentric coordinate at a corner is below this is on the opposite edge.
 AT_EDGE = wp.constant(1.0e-4)
 
-# What is on the sides of a triangle: the body behind it alone, or on both, or it must be found out for each point.
+# The sides of a triangle: the body is only behind it, or on both sides, or each point must be tested.
 UNSURE = wp.constant(0)
 BOUNDARY = wp.constant(1)
 BURIED = wp.constant(2)
@@ -103,7 +100,7 @@ def clip_to_box(
     # In and out
     phi: wp.array[wp.float32],
 ):
-    """Cut off what lies outside a box, with a wall of the given slope."""
+    """Cut off everything outside a box, with a wall of the given slope."""
     i = wp.tid()
     phi[i] = wp.max(phi[i], slope * box_distance(points[i], lower, upper))
 
@@ -134,8 +131,8 @@ def pseudo_normal(
     corner_normals: wp.array[wp.vec3],
     normal: wp.vec3,
 ):
-    """The normal at a closest point that tells inside from outside: the triangle's own within it, at an edge the sum of
-    its two triangles', at a corner that of all around it weighted by their angles (Baerentzen and Aanaes 2005)."""
+    """The normal at a closest point that separates inside from outside: the triangle's own in its interior, on an edge
+    the sum of both triangles' normals, at a corner the angle-weighted sum (Baerentzen and Aanaes 2005)."""
     w = 1.0 - u - v
     near = wp.vec3(u, v, w)
     count = int(0)
@@ -155,49 +152,21 @@ def pseudo_normal(
     return found
 
 
-@wp.func
-def crossings(mesh: wp.uint64, p: wp.vec3, direction: wp.vec3):
-    """How often more a ray leaves what a closed surface encloses than it enters it: the winding number at its start.
-
-    -MOST_CROSSINGS where triangles that lie on one another, or too near, were taken for one.
-    """
-    total = wp.mesh_query_ray_count_intersections(mesh, p, direction)
-    count = int(0)
-    at = float(0.0)
-    for n in range(MOST_CROSSINGS):
-        found = wp.mesh_query_ray(mesh, p + at * direction, direction, FAR)
-        if not found.result:
-            return wp.where(n == total, count, -MOST_CROSSINGS)
-        leaves = wp.dot(wp.mesh_eval_face_normal(mesh, found.face), direction) > 0.0
-        count += wp.where(leaves, 1, -1)
-        at += found.t
-        at += RAY_STEP * (wp.length(p) + at)
-    return -MOST_CROSSINGS
-
-
-@wp.func
-def is_inside(mesh: wp.uint64, p: wp.vec3):
-    """Whether the winding number at a point is above one half: by two rays, and by solid angles where these differ."""
-    first = crossings(mesh, p, wp.normalize(RAYS[0]))
-    if first == crossings(mesh, p, wp.normalize(RAYS[1])) and first > -MOST_CROSSINGS:
-        return first > 0
-    return wp.mesh_query_point_sign_winding_number(mesh, p, FAR, ACCURACY).sign < 0.0
-
-
 @wp.kernel(enable_backward=False)
 def evaluate_surface(
     # In
     points: wp.array[wp.vec3],
     mesh: wp.uint64,
     indices: wp.array[wp.int32],
+    lines: Lines,
     sides: wp.array[wp.uint8],
     edge_normals: wp.array2d[wp.vec3],
     corner_normals: wp.array[wp.vec3],
     # Out
     phi: wp.array[wp.float32],
 ):
-    """Distance to the closest triangle, negative where the winding number is above one half. Where that triangle is
-    known to have the outside in front of it and the inside behind, its normal tells the same, ten times as fast."""
+    """Distance to the closest triangle, negative where the winding number is above one half. For a triangle with the
+    outside in front of it and the inside behind, its normal gives the sign twice as fast."""
     i = wp.tid()
     p = points[i]
     found = wp.mesh_query_point_no_sign(mesh, p, FAR)
@@ -205,7 +174,7 @@ def evaluate_surface(
     side = int(sides[found.face])
     sign = float(-1.0)
     if side == UNSURE:
-        sign = wp.where(is_inside(mesh, p), -1.0, 1.0)
+        sign = wp.where(winding_number(mesh, indices, lines, p) > 0, -1.0, 1.0)
     elif side == BOUNDARY:
         normal = wp.mesh_eval_face_normal(mesh, found.face)
         normal = pseudo_normal(found.face, found.u, found.v, indices, edge_normals, corner_normals, normal)
@@ -222,7 +191,7 @@ def count_windings(
     # Out
     above: wp.array[wp.int32],
 ):
-    """How many of the thresholds, which ascend, the winding number at a point exceeds."""
+    """How many of the ascending thresholds the winding number at a point exceeds."""
     i = wp.tid()
     count = int(0)
     for k in range(thresholds.shape[0]):
@@ -244,8 +213,8 @@ def evaluate_voxels(
     phi: wp.array[wp.float32],
 ):
     """Trilinear between voxel centres; outside the volume sqrt(v^2 + d^2), with the distance d to its closest point c
-    and the value v > 0 there. v changes only along the directions in which d does not, so this is no steeper than v
-    and d are; and it is no more than the distance to any point q of the body, since c - q leads away from p."""
+    and the value v > 0 there. v changes only along directions in which d does not, so the function is no steeper than v
+    and d; and it does not exceed the distance to any point q of the body, since c - q points away from p."""
     i = wp.tid()
     x = to_voxel * points[i] + shift
     top = wp.vec3(float(values.shape[0] - 1), float(values.shape[1] - 1), float(values.shape[2] - 1))
@@ -300,7 +269,7 @@ def combine(
     # Out
     phi: wp.array[wp.float32],
 ):
-    """The larger of two functions, times signs: union (-1, -1), intersection (1, 1), difference (1, -1)."""
+    """The maximum of two functions with signs: union (-1, -1), intersection (1, 1), difference (1, -1)."""
     i = wp.tid()
     phi[i] = outer * wp.max(outer * first[i], inner * second[i])
 
@@ -316,7 +285,7 @@ def choose_labels(
     # Out
     labels: wp.array[wp.int32],
 ):
-    """The label of the first domain that holds the point and has a label there; of the nearer one where none does."""
+    """The label of the first domain that contains the point and has a label there; otherwise that of the nearer one."""
     i = wp.tid()
     a = first_labels[i]
     b = renumbered[second_labels[i]]
@@ -351,9 +320,9 @@ def evaluate_thickness(
     # Out
     thickness: wp.array[wp.float32],
 ):
-    """How far it is along a direction to where a ray leaves the body (``side`` 1) or what is around it (-1).
+    """The distance along a direction to where a ray leaves the body (``side`` 1) or its surroundings (-1).
 
-    ``reach`` if it is farther. A triangle that looks the other way is where one enters: a part that overlaps this one.
+    ``reach`` if it is farther. A triangle with the opposite orientation is an entry: an overlapping part.
     """
     i = wp.tid()
     direction = inward[i]

@@ -1,6 +1,6 @@
-"""What an element holds of a body: nothing, part of its surface and how flat, or neither.
+"""The part of the body in an element: none, a part of its surface with its flatness, or the interior.
 
-The body's signed function is known at the nodes; between them it changes by no more than its Lipschitz constant says.
+The body's signed function is known at the nodes; between them its Lipschitz constant bounds its change.
 """
 
 import warp as wp
@@ -9,16 +9,16 @@ from warp_corot.kernels.tables.shapes import FIRST_NODE, SECOND_NODE
 
 from .growth import LIVE, VOID
 
-# What is known of a new element.
+# State of a new element.
 DONE = wp.constant(0)
 SPLIT = wp.constant(1)
 OPEN = wp.constant(2)
-LEFT = wp.constant(3)  # not looked at again
+LEFT = wp.constant(3)  # not evaluated again
 
-#: The need of an element that must be bisected, whatever is wished [m].
+#: The need of an element that must be bisected in any case [m].
 MUST = wp.constant(1.0e30)
 
-#: A gradient below this share of the steepest possible is taken for that much.
+#: A gradient below this fraction of the steepest possible one is raised to it.
 FLATTEST = wp.constant(0.1)
 
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
@@ -46,7 +46,7 @@ def node_points(
     # Out
     points: wp.array[wp.vec3],
 ):
-    """Positions in float64, rounded once."""
+    """Positions in float64, with a single rounding."""
     i = wp.tid()
     p = lattice[first + i]
     points[i] = wp.vec3(
@@ -67,7 +67,7 @@ def take_values(
     # Out
     phi: wp.array[wp.float32],
 ):
-    """Values of new nodes: nothing is inside on the outermost faces of the grid, and rounding noise counts as zero."""
+    """Values of new nodes: the outermost faces of the grid are outside, and rounding noise counts as zero."""
     i = wp.tid()
     p = lattice[first + i]
     value = found[i]
@@ -96,11 +96,11 @@ def judge_by_corners(
     states: wp.array[wp.int32],
     needs: wp.array[wp.float32],
 ):
-    """No surface is where values are beyond what the function can change over the distance from them.
+    """Elements have no surface if values exceed the function's possible change over the distance from them.
 
     Every point of an element is within its circumradius of some corner, within the longest edge of each, and within
     half the circumradius of some corner or midpoint of an edge: these ten are the nodes of the eight elements three
-    levels below, of half the size. Midpoints' values are bounded from those of the ends.
+    levels below, which have half the size. Values at midpoints are bounded by those at the ends.
     """
     i = wp.tid()
     tet = tets[first + i]
@@ -137,7 +137,7 @@ def judge_by_corners(
 def gradient_size(
     tet: wp.vec4i, phi: wp.array[wp.float32], lattice: wp.array[wp.vec3i], spacing: float, lipschitz: float
 ):
-    """Length of the interpolant's gradient, from below bounded by a share of the steepest."""
+    """Length of the interpolant's gradient, bounded from below by a fraction of the steepest one."""
     p = lattice[tet[0]]
     rows = wp.mat33()
     rise = wp.vec3()
@@ -145,7 +145,7 @@ def gradient_size(
         q = lattice[tet[n + 1]]
         rows[n] = spacing * wp.vec3(float(q[0] - p[0]), float(q[1] - p[1]), float(q[2] - p[2]))
         rise[n] = phi[tet[n + 1]] - phi[tet[0]]
-    # Scaled, so that no determinant is below float32's range.
+    # Scaled, so that determinants do not underflow in float32.
     size = wp.length(rows[0])
     gradient = wp.inverse(rows / size) * rise / size
     return wp.max(wp.length(gradient), FLATTEST * lipschitz)
@@ -153,10 +153,10 @@ def gradient_size(
 
 @wp.func
 def worst_deviation(deviation: vec6):
-    """The largest deviation of a quadratic function from the linear interpolant, from those at the midpoints.
+    """The largest deviation of a quadratic function from the linear interpolant, given the deviations at the midpoints.
 
-    At barycentric coordinates l it is the sum of 4 l_i l_j e_ij: the mean of the e times 4/3 at a face's centre, times
-    3/2 at the centroid.
+    At barycentric coordinates l it is the sum of 4 l_i l_j e_ij: 4/3 of the mean of the e at a face's centre, 3/2 of it
+    at the centroid.
     """
     faces = wp.static(4.0 / 9.0) * wp.vec4(
         deviation[0] + deviation[1] + deviation[3],
@@ -174,7 +174,7 @@ def worst_deviation(deviation: vec6):
 
 @wp.func
 def middle_of_piece(tet: wp.vec4i, phi: wp.array[wp.float32]):
-    """Barycentric coordinates of the mean of the points at which the surface cuts a crossed element's edges."""
+    """Barycentric coordinates of the mean of the points where the surface cuts the edges of a crossed element."""
     place = wp.vec4(0.0)
     count = float(0.0)
     for e in range(6):
@@ -215,11 +215,11 @@ def judge_by_edges(
     expected: wp.array[wp.float32],
     deviations: wp.array[wp.float32],
 ):
-    """Compare the midpoints of the six edges with the linear interpolant: of a quadratic function they tell all.
+    """Compare the midpoints of the six edges with the linear interpolant: they determine a quadratic function.
 
-    What would barely pass the closest tolerance that there will be is unsure, and looked at once more, in the middle of
-    its piece of the surface or at its centroid: what the quadratic function has there is ``expected``. An element's
-    need is how far off its piece of the surface is [m].
+    An element that would barely pass the finest tolerance is unsure and is evaluated once more, in the middle of
+    its piece of the surface or at its centroid; ``expected`` is the quadratic function's value there. An element's
+    need is the error of its piece of the surface [m].
     """
     i = wp.tid()
     element = elements[i]
@@ -302,8 +302,8 @@ def judge_by_probes(
     states: wp.array[wp.int32],
     needs: wp.array[wp.float32],
 ):
-    """The last look. Where the function is not the quadratic one of its ten values, as at a crease, it deviates between
-    the points looked at by more than at them: by half as much again where three faces meet."""
+    """The last evaluation. Where the function is not the quadratic one of its ten values, for example at a crease, it
+    deviates more between the samples than at them: by half as much again where three faces meet."""
     i = wp.tid()
     element = elements[chosen[i]]
     tet = tets[element]
@@ -352,7 +352,7 @@ def flag_off(
     # Out
     flags: wp.array[wp.int32],
 ):
-    """Leaves that need to be bisected by more than they may."""
+    """Flag leaves whose error exceeds the tolerance."""
     i = wp.tid()
     flag = int(0)
     if first_child[i] == LIVE and level[i] < max_level and needs[i] > tolerances[level[i]]:
@@ -376,7 +376,7 @@ def open_leaves(
     # Out
     states: wp.array[wp.int32],
 ):
-    """Leaves of the deepest level, or below it, that the surface may cut and whose parents were off by a share of their
+    """Leaves at or below the deepest level that the surface may cut and whose parents' error was a fraction of their
     size."""
     i = wp.tid()
     state = LEFT
@@ -400,7 +400,7 @@ def count_holding(
     # Out
     count: wp.array[wp.int32],
 ):
-    """How many leaves have a corner inside."""
+    """Number of leaves with a corner inside."""
     i = wp.tid()
     if first_child[i] == LIVE:
         tet = tets[i]

@@ -1,4 +1,4 @@
-"""Points bound to the nodes of a mesh: where they go, what normals they have, and which element holds them."""
+"""Points bound to the nodes of a mesh: their motion, their normals, and the elements that contain them."""
 
 import warp as wp
 
@@ -16,7 +16,7 @@ def move_points(
     # Out
     positions: wp.array[wp.vec3],
 ):
-    """Rest position and the weighted displacements of four nodes: at rest not a digit is lost."""
+    """Rest position plus the weighted displacements of four nodes: exact at rest."""
     i = wp.tid()
     u = wp.vec3(0.0)
     for n in range(4):
@@ -32,7 +32,7 @@ def add_triangle_normals(
     # Out
     normals: wp.array[wp.vec3],
 ):
-    """Each triangle's normal times twice its area, added at its corners."""
+    """Add each triangle's normal, times twice its area, at its corners."""
     tri = triangles[wp.tid()]
     p = positions[tri[0]]
     normal = wp.cross(positions[tri[1]] - p, positions[tri[2]] - p)
@@ -60,10 +60,10 @@ def descend(
     # Out
     leaves: wp.array[wp.int32],
 ):
-    """The live leaf that holds a point, -1 for none, from the root that does, by barycentric coordinates alone.
+    """The live leaf that contains a point, -1 for none, found from the root that does, by barycentric coordinates.
 
-    With z halfway between x0 and xk, the point is in the first child if its coordinate at x0 is the larger one: there
-    z takes twice that at xk, and x0 what is left; in the second child the other way round.
+    With z halfway between x0 and xk, the point is in the first child if its coordinate at x0 is the larger one: then
+    z gets twice that at xk, and x0 the rest; in the second child the other way round.
     """
     i = wp.tid()
     element = roots[i]
@@ -96,7 +96,7 @@ def nearest_faces(
     # Out
     faces: wp.array[wp.int32],
 ):
-    """The triangle closest to each point, -1 where none is within ``far``."""
+    """The triangle closest to each point, -1 if none is within ``far``."""
     i = wp.tid()
     found = wp.mesh_query_point_no_sign(mesh, points[i], far)
     faces[i] = wp.where(found.result, found.face, -1)
@@ -112,7 +112,7 @@ def find_holders(
     # Out
     holders: wp.array[wp.int32],
 ):
-    """The tetrahedron that holds a point, -1 where none does; of several the one in whose middle it is the most."""
+    """The tetrahedron that contains a point, -1 for none; of several, the one in which it is deepest."""
     i = wp.tid()
     p = points[i]
     at = wp.vec3(float(p[0]), float(p[1]), float(p[2]))

@@ -1,8 +1,8 @@
 """Growing a forest: bisection without neighbour pointers.
 
-The midpoint of an edge is found in a hash table by the edge's two nodes (linear probing, filled by compare-and-swap).
-A midpoint is active once a tetrahedron has been bisected at it; an element with an active midpoint on any edge hangs
-and must be bisected too. Midpoints that are not active are places at which the body was looked at.
+A hash table gives the midpoint of an edge from the edge's two nodes (linear probing, filled by compare-and-swap).
+A midpoint is active once a tetrahedron has been bisected at it; an element with an active midpoint on any edge has a
+hanging node and must be bisected too. Midpoints that are not active are places where the body was evaluated.
 """
 
 import warp as wp
@@ -17,7 +17,7 @@ VOID = wp.constant(-2)
 
 # Places in ``counts``.
 NODES = wp.constant(0)
-DEEPEST = wp.constant(1)  # the deepest level that was to be bisected
+DEEPEST = wp.constant(1)  # the deepest level that had to be bisected
 
 
 @wp.func
@@ -33,7 +33,7 @@ def home_slot(key: wp.int64, mask: int):
 
 @wp.func
 def find_slot(a: int, b: int, keys: wp.array[wp.int64]):
-    """Where an edge stands in a table, or -1."""
+    """The slot of an edge in a table, or -1."""
     key = edge_key(a, b)
     mask = keys.shape[0] - 1
     slot = home_slot(key, mask)
@@ -46,7 +46,7 @@ def find_slot(a: int, b: int, keys: wp.array[wp.int64]):
 
 @wp.func
 def find_midpoint(a: int, b: int, keys: wp.array[wp.int64], values: wp.array[wp.int32]):
-    """The node at the middle of an edge, -1 where there is none."""
+    """The node at the middle of an edge, -1 if there is none."""
     slot = find_slot(a, b, keys)
     if slot >= 0:
         return values[slot]
@@ -55,7 +55,7 @@ def find_midpoint(a: int, b: int, keys: wp.array[wp.int64], values: wp.array[wp.
 
 @wp.func
 def claim_slot(key: wp.int64, keys: wp.array[wp.int64]):
-    """The key's slot, and whether it was put there now: a negative slot - 1 says so."""
+    """The key's slot; if it was inserted now, its negative minus 1."""
     mask = keys.shape[0] - 1
     slot = home_slot(key, mask)
     while True:
@@ -76,7 +76,7 @@ def fill_table(
     keys: wp.array[wp.int64],
     values: wp.array[wp.int32],
 ):
-    """Enter all midpoints that there are into an empty table."""
+    """Enter all existing midpoints into an empty table."""
     node = wp.tid()
     pair = ends[node]
     if pair[0] >= 0:
@@ -97,7 +97,7 @@ def insert_midpoints(
     # Out
     slots: wp.array[wp.int32],
 ):
-    """Make the midpoints that are not there yet; the slot of each."""
+    """Insert the midpoints that do not exist yet; returns the slot of each."""
     i = wp.tid()
     a = pairs[i][0]
     b = pairs[i][1]
@@ -154,7 +154,7 @@ def activate(
     active: wp.array[wp.uint8],
     touched: wp.array[wp.uint8],
 ):
-    """Make midpoints active, and touch both ends of the edges of which they are."""
+    """Make midpoints active, and mark both ends of their edges as touched."""
     node = values[slots[wp.tid()]]
     active[node] = wp.uint8(1)
     touched[ends[node][0]] = wp.uint8(1)
@@ -175,7 +175,7 @@ def bisect(
     first_child: wp.array[wp.int32],
     bound: wp.array[wp.uint8],
 ):
-    """Children stand behind one another from ``base`` on and are live or void as their parent was."""
+    """Bisect elements. Children are stored consecutively from ``base`` on and are live or void like their parent."""
     i = wp.tid()
     element = elements[i]
     tet = tets[element]
@@ -206,10 +206,10 @@ def flag_hanging(
     # Out
     flags: wp.array[wp.int32],
 ):
-    """Leaves that are wished to be bisected or have an active midpoint on an edge. Void ones only where bound to.
+    """Flag leaves that must be bisected or have an active midpoint on an edge; void ones only if conformity requires.
 
-    Only elements from ``first_new`` on, and those that share an edge that was bisected of late, of which both ends are
-    touched, need to be looked at closely.
+    Only elements from ``first_new`` on, and those with a recently bisected edge, both ends of which are
+    touched, need a closer check.
     """
     i = wp.tid()
     flag = int(0)
@@ -218,13 +218,15 @@ def flag_hanging(
             flag = 1
         else:
             tet = tets[i]
-            for e in range(6):
-                a = tet[FIRST_NODE[e]]
-                b = tet[SECOND_NODE[e]]
-                if flag == 0 and (i >= first_new or int(touched[a]) * int(touched[b]) == 1):
-                    node = find_midpoint(a, b, keys, values)
-                    if node >= 0:
-                        flag = int(active[node])
+            ends = int(touched[tet[0]]) + int(touched[tet[1]]) + int(touched[tet[2]]) + int(touched[tet[3]])
+            if i >= first_new or ends > 1:
+                for e in range(6):
+                    a = tet[FIRST_NODE[e]]
+                    b = tet[SECOND_NODE[e]]
+                    if flag == 0 and (i >= first_new or int(touched[a]) * int(touched[b]) == 1):
+                        node = find_midpoint(a, b, keys, values)
+                        if node >= 0:
+                            flag = int(active[node])
     flags[i] = flag
 
 
@@ -237,7 +239,7 @@ def gather_flagged(
     # Out
     chosen: wp.array[wp.int32],
 ):
-    """Numbers, from ``first`` on, of what is flagged, in order; ``places`` is the inclusive sum of the flags."""
+    """Indices, from ``first`` on, of flagged entries, in order; ``places`` is the inclusive sum of the flags."""
     i = wp.tid()
     if flags[i] != 0:
         chosen[places[i] - 1] = first + i

@@ -1,13 +1,13 @@
-"""Measuring surfaces: how far points are from one, and which of its parts cross each other."""
+"""Measurements of surfaces: distances of points to one, and parts of it that cross each other."""
 
 import warp as wp
 
-#: Along an edge so many triangles of its own part are passed by at most.
+#: Maximum number of triangles of its own part that an edge can pass.
 MOST_OWN_HITS = wp.constant(8)
-#: The same of triangles around its points, and how far beyond its ends it is looked, over its length.
+#: The same for triangles around its points, and how far beyond its ends to search, relative to its length.
 MOST_OWN_TRIANGLES = wp.constant(64)
 BEYOND = wp.constant(1.0e-3)
-#: What of an edge's length is left out at its ends, where its own triangles begin.
+#: Fraction of an edge's length that is left out at its ends, where its own triangles begin.
 ENDS = wp.constant(1.0e-4)
 
 
@@ -20,7 +20,7 @@ def measure_distances(
     # Out
     distances: wp.array[wp.float32],
 ):
-    """How far each point is from the closest triangle, ``far`` where none is nearer."""
+    """Distance of each point to the closest triangle, ``far`` if none is closer."""
     i = wp.tid()
     found = wp.mesh_query_point_no_sign(mesh, points[i], far)
     distance = far
@@ -40,7 +40,7 @@ def find_crossed_parts(
     # Out
     crossed: wp.array[wp.int32],
 ):
-    """Another part whose triangle an edge goes through, -1 for none."""
+    """Another part with a triangle that an edge crosses, -1 for none."""
     i = wp.tid()
     start = points[edges[i][0]]
     along = points[edges[i][1]] - start
@@ -72,7 +72,7 @@ def find_touched_triangles(
     # Out
     touched: wp.array[wp.int32],
 ):
-    """A triangle that an edge goes through or ends at, but for those around its two points; -1 for none."""
+    """A triangle that an edge crosses or ends at, except those around its two points; -1 for none."""
     i = wp.tid()
     a = edges[i][0]
     b = edges[i][1]
@@ -98,5 +98,5 @@ def find_touched_triangles(
                 touched[i] = found.face
                 return
             at += found.t + ENDS * length
-    # More triangles than can be passed: none of them is sure.
+    # More triangles than can be passed: no result is certain.
     touched[i] = -2

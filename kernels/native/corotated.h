@@ -1,4 +1,4 @@
-// The corotated law; see law_lanes.py. P is nothing where it is not to be trusted.
+// The corotated law: ``stress``, see law_lanes.py. In: INDEFINITE; ``stretch_of``. P is zero where it is not trusted.
 const auto stress = [&](const triple* f, const lanes8* e, const lanes8& handedness, const lanes8& m,
         const lanes8& k, triple* p) {
     const triple last = cross(f[0], f[1]);

@@ -1,4 +1,4 @@
-// Adjugate and invariants of E, and J - 1 by these where E is small: |E|^2 < 0.4.
+// Adjugate and invariants, and J - 1 from these where E is small: |E|^2 < 0.4. In: E and det F. Out: ``invariants``.
 struct invariants { lanes8 adjugate[6], a, b, c, squared, j; masks8 small; };
 const auto invariants_of = [&](const lanes8* e, const lanes8& det) {
     invariants i;

@@ -3,10 +3,14 @@
 typedef float lanes8 __attribute__((vector_size(32), aligned(4)));
 typedef int masks8 __attribute__((vector_size(32)));
 typedef float four __attribute__((vector_size(16), aligned(4)));
-struct triple { lanes8 x, y, z; };
-const auto plus = [](const triple& a, const triple& b) { return triple{a.x + b.x, a.y + b.y, a.z + b.z}; };
-const auto minus = [](const triple& a, const triple& b) { return triple{a.x - b.x, a.y - b.y, a.z - b.z}; };
-const auto scaled = [](const lanes8& w, const triple& a) { return triple{w * a.x, w * a.y, w * a.z}; };
+struct triple {
+    lanes8 x, y, z;
+    triple operator+(const triple& b) const { return {x + b.x, y + b.y, z + b.z}; }
+    triple operator-(const triple& b) const { return {x - b.x, y - b.y, z - b.z}; }
+    triple operator-() const { return {-x, -y, -z}; }
+    triple operator*(const lanes8& w) const { return {w * x, w * y, w * z}; }
+    triple operator*(float w) const { return {w * x, w * y, w * z}; }
+};
 // a + w b
 const auto added = [](const triple& a, const lanes8& w, const triple& b) {
     return triple{a.x + w * b.x, a.y + w * b.y, a.z + w * b.z};

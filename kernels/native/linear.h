@@ -1,4 +1,4 @@
-// Linear elasticity, of the small strain.
+// Linear elasticity: ``stress`` of the small strain, see law_lanes.py.
 const auto stress = [&](const triple* frame, const lanes8* e, const lanes8&, const lanes8& m, const lanes8& k,
         triple* p) {
     lanes8 sigma[6];

@@ -1,4 +1,4 @@
-// Forces with the root's rotation, for subtrees in which it is near that of every leaf. In: tolerance. Out: g, and
+// Forces with the root's rotation, for subtrees in which it is near that of every leaf. Out: g, and
 // where subtrees are ``done``.
 masks8 done;
 {

@@ -1,5 +1,5 @@
-// Neo-Hookean: P = cof F (mu E + lambda ln J) / J; below J0 = CONTINUED_BELOW mu F + U'(J) cof F, with U' continued
-// linearly.
+// Neo-Hookean: ``stress``, see law_lanes.py. In: CONTINUED_BELOW; ``invariants_of``.
+// P = cof F (mu E + lambda ln J) / J; below J0 = CONTINUED_BELOW mu F + U'(J) cof F, with U' continued linearly.
 
 // ln(1 + j) of positive 1 + j: twice the artanh of j / (2 + j), of what powers of two leave within sqrt(2).
 const auto log_of = [&](const lanes8& j) {
@@ -29,7 +29,7 @@ const auto stress = [&](const triple* f, const lanes8* e, const lanes8& handedne
         const lanes8 slope = handedness * ((k * log0 - m) / j0
             + (m + k * (1.0f - log0)) / (j0 * j0) * (j + (1.0f - j0)));
         for (int i = 0; i < 3; ++i) {
-            p[i] = chosen(crushed, added(scaled(m, f[i]), slope, cofactor[i]), p[i]);
+            p[i] = chosen(crushed, added(f[i] * m, slope, cofactor[i]), p[i]);
         }
     }
     return every;

@@ -1,10 +1,11 @@
 // Corotated stress of orthotropic elements, and active stress. In: what elements.h has gathered, of rest matrices
-// times M; material, activation; NEARLY_INDEFINITE. Out: columns p of the stress times -V, nothing where not
+// times M; material (``FibreMaterial``); NEARLY_INDEFINITE. Out: columns p of the stress times -V, nothing where not
 // ``sound``.
+const auto& passive = material.passive;
 lanes8 m[9], k[9];
-gather_matrix([&](int lane) { return material.axes.data[material.axes_stride * element(lane)].data[0]; }, m);
-gather_matrix([&](int lane) { return &material.stiffness.data[material.stride * element(lane)][0]; }, k);
-const lanes8 active = is_active ? values_of(activation.data) : spread(0.0f);
+gather_matrix([&](int lane) { return passive.axes.data[passive.axes_stride * element(lane)].data[0]; }, m);
+gather_matrix([&](int lane) { return &passive.stiffness.data[passive.stride * element(lane)][0]; }, k);
+const lanes8 active = material.is_active ? values_of(material.activation.data) : spread(0.0f);
 // Columns of M, G M and F M, and E in the material's axes.
 triple axis[3], a[3], c[3], r[3];
 for (int j = 0; j < 3; ++j) {
@@ -59,8 +60,8 @@ const lanes8 t0 = over * (a0 * w0 + a01 * w1 + a02 * w2);
 const lanes8 t1 = over * (a01 * w0 + a1 * w1 + a12 * w2);
 const lanes8 t2 = over * (a02 * w0 + a12 * w1 + a2 * w2);
 triple p[3];
-p[0] = plus(scaled(s0, r[0]), plus(scaled(s01 + t2, r[1]), scaled(s02 - t1, r[2])));
-p[1] = plus(scaled(s01 - t2, r[0]), plus(scaled(s1, r[1]), scaled(s12 + t0, r[2])));
-p[2] = plus(scaled(s02 + t1, r[0]), plus(scaled(s12 - t0, r[1]), scaled(s2, r[2])));
-p[0] = plus(p[0], scaled(active, c[0]));
-for (int j = 0; j < 3; ++j) p[j] = chosen(sound, scaled(-volume, p[j]), nothing);
+p[0] = r[0] * s0 + (r[1] * (s01 + t2) + r[2] * (s02 - t1));
+p[1] = r[0] * (s01 - t2) + (r[1] * s1 + r[2] * (s12 + t0));
+p[2] = r[0] * (s02 + t1) + (r[1] * (s12 - t0) + r[2] * s2);
+p[0] = p[0] + c[0] * active;
+for (int j = 0; j < 3; ++j) p[j] = chosen(sound, p[j] * -volume, nothing);

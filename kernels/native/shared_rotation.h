@@ -1,4 +1,5 @@
-// Forces of all leaves with one rotation. ``turn`` are the columns of R times the frame.
+// Functions for forces of all leaves with one rotation; ``turn`` are the columns of R times the frame. In: what
+// subtrees.h has gathered; ``columns``, ``add_leaf`` and ``multiply`` of the type.
 
 // Columns f of F of the subtree as one element, times the frame, and E there.
 const auto root_strain = [&](lanes8* e, triple* f) {
@@ -6,7 +7,7 @@ const auto root_strain = [&](lanes8* e, triple* f) {
     triple a[3];
     columns(x, corners, a);
     // The subtree's edge is two of a leaf's.
-    for (int j = 0; j < 3; ++j) a[j] = scaled(spread(0.5f), a[j]);
+    for (int j = 0; j < 3; ++j) a[j] = a[j] * 0.5f;
     find_strain(a, frame, e, f);
 };
 
@@ -32,7 +33,7 @@ const auto turn_back = [&](triple* turn, lanes8* y) {
     turned[2].y = acute ? yz_ - x_ : r[1][2];
     turned[2].z = acute ? -xx_ - yy_ : r[2][2] - 1.0f;
     for (int j = 0; j < 3; ++j)
-        turn[j] = plus(frame[j], combined(turned[j].x, frame[0], turned[j].y, frame[1], turned[j].z, frame[2]));
+        turn[j] = frame[j] + combined(turned[j].x, frame[0], turned[j].y, frame[1], turned[j].z, frame[2]);
     for (int node = 0; node < 10; ++node) {
         const triple d = get(x, node);
         for (int axis = 0; axis < 3; ++axis) {
@@ -45,7 +46,7 @@ const auto turn_back = [&](triple* turn, lanes8* y) {
 // Forces g of displacements y, in the subtree's frame: by its stiffness as a whole, or leaf by leaf where these
 // differ.
 const auto add_linear = [&](const lanes8* y, lanes8* g) {
-    if (!stride) return multiply(y, g);
+    if (!isotropic.stride) return multiply(y, g);
     #pragma clang loop unroll(disable)
     for (int leaf = 0; leaf < 8; ++leaf) {
         material_of(leaf);

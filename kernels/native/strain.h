@@ -8,7 +8,7 @@ const auto find_strain = [&](const triple* a, const triple* frame, lanes8* e, tr
     e[3] = dot(a[0], h[1]) + dot(a[1], h[0]);
     e[4] = dot(a[0], h[2]) + dot(a[2], h[0]);
     e[5] = dot(a[1], h[2]) + dot(a[2], h[1]);
-    for (int j = 0; j < 3; ++j) f[j] = plus(frame[j], a[j]);
+    for (int j = 0; j < 3; ++j) f[j] = frame[j] + a[j];
 };
 
 // The same where the frame is the identity.

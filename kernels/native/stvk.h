@@ -1,4 +1,4 @@
-// St. Venant-Kirchhoff: P = F (mu E + lambda / 2 tr E).
+// St. Venant-Kirchhoff: ``stress``, see law_lanes.py. P = F (mu E + lambda / 2 tr E).
 const auto stress = [&](const triple* f, const lanes8* e, const lanes8&, const lanes8& m, const lanes8& k,
         triple* p) {
     lanes8 sigma[6];

@@ -1,7 +1,7 @@
-"""What launches read of a derived plan (``plan``): nodes and codes of subtrees and of the leaves in none.
+"""The arrays that launches read of a derived plan (``plan``): nodes and codes of subtrees and of single leaves.
 
-All is written as far as there is something, and as padding as far as there was something before. Padding stands on
-sinks, which do not move.
+Everything is written up to the current size, and as padding up to the former size. Padding refers to
+sinks, nodes that do not move.
 """
 
 import warp as wp
@@ -16,9 +16,9 @@ from .plan import Plan, above, extent, flat_row, padding_code
 
 @wp.struct
 class Batches:
-    """By class, or by kind (shape and sharing) where only groups or only single subtrees have it."""
+    """Arrays by class, or by kind (shape and sharing) if only groups or only single subtrees have them."""
 
-    # Which leaf of the subtree, or of the group, and which of its nodes a node is, by shape; negative past the last.
+    # The leaf of the subtree, or of the group, and its node for each place, by shape; negative past the last.
     places: wp.array2d[wp.vec2i]  # [3, 10]
     group_places: wp.array2d[wp.vec2i]  # [3, 40]
     by_node: int  # 1: nodes of single subtrees are [10, subtrees], else [subtrees, 10]
@@ -26,22 +26,22 @@ class Batches:
     group_nodes: wp.array3d[wp.int32]  # [kinds, groups, 40]
     code: wp.array2d[wp.int32]  # [classes, subtrees] of the root
     root_nodes: wp.array2d[wp.vec4i]  # [members, subtrees] of those that share their root's rotation
-    unit: wp.array2d[wp.int32]  # [classes, subtrees] that their leaves use, where one further up is shared
+    unit: wp.array2d[wp.int32]  # [classes, subtrees] used by the leaves, if a rotation further up is shared
 
 
 @wp.struct
 class FlatLeaves:
-    """Leaves in no subtree, as elements of their own."""
+    """Leaves in no subtree, as single elements."""
 
     nodes: wp.array[wp.vec4i]
     code: wp.array[wp.int32]
     unit: wp.array[wp.int32]
-    # Their Lamé parameters where these vary, and the rows that they stand in in ``Plan.values``; else -1.
+    # Their Lamé parameters if these vary, and their rows in ``Plan.values``; else -1.
     mu: wp.array[wp.float32]
     lam: wp.array[wp.float32]
     mu_row: int
     lam_row: int
-    # What general elements have, on the CPU; and from what it is looked up.
+    # Data of general elements, on the CPU, and the tables from which they come.
     rest_inverse: wp.array[wp.mat33]
     volume: wp.array[wp.float32]
     inverse_of: wp.array[wp.mat33]  # [3 * n] by type and frame, of level 0 to 2
@@ -69,7 +69,7 @@ def fill_single(kind: int, shape: int, k: int, first: int, pools: Pools, batches
 
 @wp.func
 def fill_share(kind: int, shape: int, k: int, first: int, pools: Pools, batches: Batches):
-    """Five nodes of the group that the k-th subtree of a kind is in; ``first`` is the group's first leaf, or -1."""
+    """Five nodes of the group with the k-th subtree of a kind; ``first`` is the group's first leaf, or -1."""
     for n in range(5):
         m = 5 * (k % 8) + n
         node = sink(k, pools)
@@ -93,7 +93,7 @@ def fill_batches(
     # Out
     batches: Batches,
 ):
-    """One row of threads for each class."""
+    """Fill one class with each row of threads."""
     c, t = wp.tid()
     kind = c / plan.members
     grouped = plan.members == 2 and c % 2 == 0
@@ -138,7 +138,7 @@ def fill_flat(
     # Out
     leaves: FlatLeaves,
 ):
-    """The leaves in no subtree."""
+    """Fill the leaves in no subtree."""
     row = flat_row(plan)
     for k in range(wp.tid(), extent(row, plan), threads):
         nodes = padding(k, pools)
@@ -166,7 +166,7 @@ def fill_flat(
             leaves.lam[k] = lam
         if leaves.volume.shape[0] > 0:
             level = code & LEVEL_MASK
-            # An edge is halved every three levels: exact, and much less work than to find it anew.
+            # An edge is halved every three levels: exact, and much less work than to compute it again.
             halved = float(1 << (level / 3))
             leaves.rest_inverse[k] = halved * leaves.inverse_of[3 * (code >> MIRROR_BIT) + level % 3]
             leaves.volume[k] = leaves.volume_of[level]

@@ -1,12 +1,12 @@
-"""Nodes of a forest by tree level, found from their lattice points alone, and the tables that transfers go through.
+"""Nodes of a forest by tree level, found from their lattice points alone, and the tables for transfers.
 
-A node is the midpoint of the refinement edge of a tetrahedron one level up, or a corner of a root. Of the nonzero
-coordinates of its lattice point let t be the smallest number of trailing zero bits. Three levels halve the edges, and
-within three the first midpoints are those of a cube's diagonals, then of its faces' diagonals, then of its edges: on
-these one, two or all three axes the point is odd in units of 2^t. So t and the number of these axes say the level.
+A node is the midpoint of the refinement edge of a tetrahedron one level up, or a corner of a root. Let t be the
+smallest number of trailing zero bits of the nonzero coordinates of its lattice point. Three levels halve the edges, and
+within three the first midpoints are those of a cube's diagonals, then of its faces' diagonals, then of its edges:
+on one, two or all three axes the point is odd in units of 2^t. So t and the number of these axes give the level.
 
-Nodes that leaves do not name, corners of ancestors whose descendants there are void, stand elsewhere in the mesh's
-numbering; the others are 0 ... N - 1.
+Nodes of no leaf, corners of ancestors whose descendants there are void, have other places in the mesh's
+numbering; the nodes of leaves are 0 ... N - 1.
 """
 
 import warp as wp
@@ -36,8 +36,8 @@ def level_of_point(p: wp.vec3i, bits: int):
 
 @wp.func
 def number_of(place: int, others: int, mesh_nodes: int, sums: wp.array[wp.int32]):
-    """The number of a node that stands at a place in the mesh's numbering, where the other nodes begin at ``others``;
-    ``sums`` are inclusive sums of flags that say which of these have one."""
+    """The number of a node at a place in the mesh's numbering, where the other nodes begin at ``others``;
+    ``sums`` are inclusive sums of the flags of those that have a number."""
     if place < others:
         return place
     return mesh_nodes + sums[place - others] - 1
@@ -55,8 +55,8 @@ def flag_ends(
     # In and out
     flags: wp.array[wp.int32],
 ):
-    """Flag the other nodes that are ends of nodes from place ``first`` on: of flagged ones of a level, or, if the level
-    is negative, of all."""
+    """Flag the other nodes that are ends of nodes from place ``first`` on: of flagged ones of a level, or of all, if
+    the level is negative."""
     place = first + wp.tid()
     takes_part = level < 0
     if level >= 0:
@@ -79,7 +79,7 @@ def find_levels(
     level: wp.array[wp.int32],
     nodes: wp.array[wp.int32],
 ):
-    """Level of each node, and its number beside it, for sorting; ``places`` are those of the nodes from N on."""
+    """Level of each node, and its number, for sorting; ``places`` are those of the nodes from N on."""
     i = wp.tid()
     place = int(i)
     if i >= mesh_nodes:
@@ -96,7 +96,7 @@ def find_starts(
     # Out
     starts: wp.array[wp.int32],
 ):
-    """Where the nodes of each level begin among ``count`` that are sorted by level."""
+    """The start of each level among ``count`` nodes sorted by level."""
     wanted = wp.tid()
     low = int(0)
     high = int(count)
@@ -170,7 +170,7 @@ def find_coarse_starts(
     # Out
     coarse_starts: wp.array[wp.int32],
 ):
-    """Where the coarser nodes of each level begin, which stand one for each flag; the last is how many there are."""
+    """The start of each level's coarser nodes, one for each flag; the last entry is their number."""
     level = wp.tid()
     before = 2 * (wp.max(starts[level], roots) - roots)
     coarse_starts[level] = 0

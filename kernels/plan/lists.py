@@ -1,12 +1,12 @@
-"""Which leaves are in complete subtrees, and which are not: the lists of a derived plan (``plan``).
+"""The leaves in complete subtrees, and the others: the lists of a derived plan (``plan``).
 
-Leaves are in tree order, so that those of a subtree follow one another: eight leaves of one level of which the first
-and the last have the same ancestor three levels up are all of its leaves. Likewise 64 under an ancestor six levels up,
-which are a group (see ``tables.subtree``). Subtrees are put into classes, those that one launch may go through
-together.
+Leaves are in tree order, so the leaves of a subtree are contiguous: eight leaves of one level are a subtree if the
+first and the last have the same ancestor three levels up. Likewise 64 leaves under an ancestor six levels up
+are a group (see ``tables.subtree``). Subtrees are divided into classes; one launch can compute a
+class.
 
-Each thread goes through one stretch of the leaves, says of each what it begins and counts; sums over the threads tell
-it where its lists begin, which so are in tree order whatever the threads.
+Each thread processes one stretch of the leaves, marks what each leaf begins and counts; sums over the threads give
+the start of its lists, which are thus in tree order for any number of threads.
 """
 
 import warp as wp
@@ -16,10 +16,10 @@ from warp_corot.kernels.remesh.pools import LEAVES, Pools
 from .plan import Plan, above, flat_row, level_of
 from .units import begins_unit, unit_of
 
-#: Classes there may be: three shapes with own rotations, one with its root's, three with one from further up; on CUDA
-#: each in groups, then one by one.
+#: Maximum number of classes: three shapes with own rotations, one with its root's, three with one from further up; on
+#: CUDA each in groups, then one by one.
 CLASSES = wp.constant(14)
-# What a leaf's mark says in its lower bits if not the class of the subtree that it is the first leaf of.
+# Lower bits of a leaf's mark, if they are not the class of the subtree that it begins.
 FLAT = wp.constant(14)
 COVERED = wp.constant(15)
 MARK_BITS = wp.constant(15)
@@ -33,7 +33,7 @@ places_t = wp.types.vector(length=16, dtype=wp.int32)
 
 @wp.func
 def place_in_subtree(e: int, pools: Pools):
-    """Which of the eight descendants three levels below its ancestor a tetrahedron is, in tree order."""
+    """The index, in tree order, of a tetrahedron among the eight descendants three levels below its ancestor."""
     p = pools.parent[e]
     q = pools.parent[p]
     return (e - pools.roots) % 2 + 2 * ((p - pools.roots) % 2) + 4 * ((q - pools.roots) % 2)
@@ -41,7 +41,7 @@ def place_in_subtree(e: int, pools: Pools):
 
 @wp.func
 def kind_of(level: int, plan: Plan):
-    """Shape and sharing of subtrees with leaves of a level; -1 where leaves use rotations of different elements."""
+    """Shape and sharing of subtrees with leaves of a level; -1 if leaves use rotations of different elements."""
     shape = level % 3
     if plan.rotation_level < 0 or level <= plan.rotation_level:
         return shape
@@ -54,8 +54,8 @@ def kind_of(level: int, plan: Plan):
 
 @wp.func
 def complete(i: int, size: int, depth: int, pools: Pools, plan: Plan):
-    """The tetrahedron ``depth`` levels up of which leaf i and the next ones, ``size`` in all, are all descendants of
-    their level; -1 if they are not."""
+    """The tetrahedron ``depth`` levels up whose descendants at their level are leaf i and the next ones, ``size`` in
+    all; -1 if they are not."""
     if i < 0 or i + size > pools.counts[LEAVES]:
         return -1
     level = level_of(i, plan)
@@ -94,7 +94,7 @@ def class_at(i: int, pools: Pools, plan: Plan):
 
 @wp.func
 def covered_from(i: int, pools: Pools, plan: Plan):
-    """How many leaves from the i-th on are in a subtree that begins before it."""
+    """Number of leaves from the i-th on that belong to a subtree that begins before it."""
     if level_of(i, plan) < 3:
         return 0
     place = place_in_subtree(pools.leaves[i], pools)
@@ -115,7 +115,7 @@ def mark_leaves(
     # Out
     sums: wp.array[wp.int32],
 ):
-    """What each leaf begins, and how much of everything there is in each thread's stretch, [classes + 2, threads]."""
+    """Mark what each leaf begins, and count everything in each thread's stretch, [classes + 2, threads]."""
     t = wp.tid()
     totals = places_t()
     if plan.goes[0] != 0:
@@ -145,7 +145,7 @@ def mark_leaves(
                     mark = int(at)
                     if n > 0:
                         mark = int(COVERED)
-                    # A subtree that shares its rotation is in one unit.
+                    # A subtree that shares its rotation belongs to one unit.
                     new = bool(False)
                     if not shared or (n == 0 and at != COVERED):
                         new = begins_unit(i + n, pools, plan)
@@ -193,7 +193,7 @@ def list_leaves(
                 places[flat_row(plan)] += 1
             if plan.rotation_level >= 0:
                 if mark >= FIRST_OF_UNIT:
-                    # One further on: the first place is padding.
+                    # Offset by one: the first place is padding.
                     places[unit_row] += 1
                     e = unit_of(pools.leaves[i], pools, plan)
                     plan.unit_nodes[places[unit_row]] = pools.tets[e]

@@ -1,7 +1,7 @@
-"""The force plan of a forest that changes: the arrays that it stands in, and what leaves are by their places in them.
+"""The force plan of a forest that changes: its arrays, and the data of leaves by their places in them.
 
-``lists`` says which leaves are in complete subtrees, and which are not; ``units`` whose rotations are
-found; ``batches`` writes what launches read.
+``lists`` finds the leaves in complete subtrees and the others; ``units`` the elements whose rotations are
+found; ``batches`` writes the arrays that launches read.
 """
 
 import warp as wp
@@ -12,16 +12,16 @@ from warp_corot.kernels.remesh.pools import ADDED, LEAVES, REMOVED, Pools
 
 @wp.struct
 class Plan:
-    """What is derived, with as many places as there may ever be, and padding beyond what there is."""
+    """The derived arrays, sized for the capacity, with padding beyond the current size."""
 
     rotation_level: int  # -1: rotations are not shared
-    with_subtrees: int  # 0: all leaves go one by one
+    with_subtrees: int  # 0: all leaves are computed one by one
     members: int  # 2: groups and single subtrees; 1: there are no groups
     classes: int
-    # How many there are of each class, of leaves in none, of units and of leaves; and how many there were.
+    # Numbers for each class, for leaves in none, for units and for leaves; and the former numbers.
     counts: wp.array[wp.int32]
     before: wp.array[wp.int32]
-    stale: wp.array[wp.int32]  # [1] not 0: derive it also if the last pass has changed nothing
+    stale: wp.array[wp.int32]  # [1] nonzero: derive it even if the last pass changed nothing
     goes: wp.array[wp.int32]  # [1] whether it is derived at all
     # Leaves.
     code: wp.array[wp.int32]
@@ -31,26 +31,26 @@ class Plan:
     # Subtrees by class, and the leaves in none.
     first: wp.array2d[wp.int32]  # [classes, subtrees]
     flat: wp.array[wp.int32]
-    # Units; the first place is padding always, for leaves that are padding.
+    # Units; the first place is always padding, for leaves that are padding.
     unit_nodes: wp.array[wp.vec4i]
     unit_code: wp.array[wp.int32]
 
 
 @wp.func
 def flat_row(plan: Plan):
-    """Where leaves that are in no subtree are counted; next to it units, then all leaves."""
+    """The row that counts leaves in no subtree; the next one counts units, then all leaves."""
     return plan.classes
 
 
 @wp.func
 def leaf_row(plan: Plan):
-    """Where all leaves are counted."""
+    """The row that counts all leaves."""
     return plan.classes + 2
 
 
 @wp.func
 def extent(row: int, plan: Plan):
-    """How many places of something are written, padding included."""
+    """Number of written places in a row, padding included."""
     if plan.goes[0] == 0:
         return 0
     return wp.max(plan.counts[row], plan.before[row])
@@ -58,7 +58,7 @@ def extent(row: int, plan: Plan):
 
 @wp.func
 def padding_code(pools: Pools):
-    """That of a root, whose frame is along the axes: deformation gradients of padding are exact, energies zero."""
+    """The code of a root, whose frame is along the axes: deformation gradients of padding are exact, energies zero."""
     return pools.code[0]
 
 
@@ -85,7 +85,7 @@ def begin_counts(
     # Out
     found: wp.array[wp.int32],
 ):
-    """Forget what was counted of the mesh before, if there is to be another count."""
+    """Reset the counts if they will be counted again."""
     if goes[0] != 0:
         found[wp.tid()] = 0
 
@@ -99,7 +99,7 @@ def gather_leaves(
     # In and out
     plan: Plan,
 ):
-    """What leaves are by their places in the list; values of padding are zero."""
+    """Data of leaves by their places in the list; values of padding are zero."""
     for i in range(wp.tid(), extent(leaf_row(plan), plan), threads):
         if i < pools.counts[LEAVES]:
             e = pools.leaves[i]

@@ -1,4 +1,4 @@
-"""Transfers between levels: linear functions on an edge, and the transpose, gathered."""
+"""Transfers between levels: linear interpolation on an edge, and its transpose, gathered."""
 
 import warp as wp
 
@@ -28,7 +28,7 @@ def gather_midpoints(
     # In and out
     y: wp.array[wp.vec4],
 ):
-    """Half of what is at a level's nodes, added to the ends of their edges; ``starts`` has one place more."""
+    """Add half of the values at a level's nodes to the ends of their edges; ``starts`` has one more entry."""
     world, i = wp.tid()
     first = world * world_nodes
     total = wp.vec4(0.0)

@@ -1,7 +1,7 @@
-"""Whose rotations are found where leaves share them: the units of a derived plan (``plan``), in tree order.
+"""The elements whose rotations are found if leaves share them: the units of a derived plan (``plan``), in tree order.
 
-A unit is the highest tetrahedron above a leaf that is not above the rotation level and stands on nodes. The leaves of
-one follow one another.
+A unit is the highest tetrahedron above a leaf that is not above the rotation level and whose corners are nodes. The
+leaves of a unit are contiguous.
 """
 
 import warp as wp
@@ -13,7 +13,7 @@ from .plan import Plan, extent, flat_row, level_of, padding_code
 
 @wp.func
 def on_nodes(e: int, pools: Pools):
-    """Whether all corners are nodes of leaves, as they may not be on the rim of a domain's mesh."""
+    """Whether all corners are nodes of leaves; on the rim of a domain's mesh they may not be."""
     if pools.node_limit == pools.sink:
         return True
     tet = pools.tets[e]
@@ -22,7 +22,7 @@ def on_nodes(e: int, pools: Pools):
 
 @wp.func
 def unit_of(e: int, pools: Pools, plan: Plan):
-    """The highest tetrahedron above a leaf, or itself, that is not above the rotation level and stands on nodes."""
+    """The highest tetrahedron above a leaf, or the leaf, that is not above the rotation level and stands on nodes."""
     found = int(e)
     climbed = int(e)
     while pools.level[climbed] > plan.rotation_level:
@@ -34,9 +34,9 @@ def unit_of(e: int, pools: Pools, plan: Plan):
 
 @wp.func
 def begins_unit(i: int, pools: Pools, plan: Plan):
-    """Whether leaf i has another unit than the one before it.
+    """Whether leaf i has a different unit from the one before it.
 
-    They share one if an ancestor of both that is not above the level stands on nodes.
+    They share one if a common ancestor that is not above the level stands on nodes.
     """
     limit = plan.rotation_level
     if plan.rotation_level < 0:
@@ -70,7 +70,7 @@ def pad_units(
     # In and out
     plan: Plan,
 ):
-    """Units are counted without the first place, which is padding."""
+    """Number units after the first place, which is padding."""
     row = flat_row(plan) + 1
     for k in range(plan.counts[row] + 1 + wp.tid(), extent(row, plan) + 1, threads):
         plan.unit_nodes[k] = padding(k, pools)

@@ -1,4 +1,4 @@
-"""Anisotropic materials and active stress of elements that change: between what they carry and what forces read."""
+"""Anisotropic materials and active stress of changing elements: conversion between carried data and kernel input."""
 
 from typing import Any
 
@@ -34,9 +34,9 @@ def assemble_materials(
     axes: wp.array[wp.mat33],
     stiffness: wp.array[vec9],
 ):
-    """Axes and stiffness of each leaf from the nine rows of values from which each is read, none if that is negative.
+    """Axes and stiffness of each leaf, each from nine rows of values from a first row on; a negative row: none.
 
-    Those of padding are the identity and zero.
+    Padding has the identity and zero.
     """
     for i in range(wp.tid(), extent(leaf_row(plan), plan), threads):
         is_leaf = i < pools.counts[LEAVES]
@@ -61,7 +61,7 @@ def write_leaves(
     # Out
     columns: wp.array2d[Any],
 ):
-    """Let leaves carry what is given by their places in the list."""
+    """Write values given by places in the list into the leaves' data."""
     i = wp.tid()
     columns[leaves[i], column] = given[i]
 
@@ -80,7 +80,7 @@ def read_leaves(
 
 
 def _by_type(kernel: wp.Kernel, of_leaves: str) -> dict[type, wp.Kernel]:
-    """The kernel for values and for whole numbers, chosen here and not anew at every launch."""
+    """The kernel for values and for whole numbers, chosen once and not at every launch."""
     return {
         kind: wp.overload(kernel, {of_leaves: wp.array(dtype=kind), "columns": wp.array2d(dtype=kind)})
         for kind in (wp.float32, wp.int32)

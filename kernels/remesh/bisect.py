@@ -1,4 +1,4 @@
-"""Bisection of the edges around which all leaves agree, as far as there is room."""
+"""Bisection of the edges that are the refinement edges of all leaves around them, as far as the pools allow."""
 
 import warp as wp
 
@@ -23,7 +23,7 @@ from .pools import (
 )
 from .state import Carried, copy_to_children, make_node, quarter_mass
 
-# Nodes are counted in the upper half of ``demand``, pairs in the lower.
+# The upper half of ``demand`` counts nodes, the lower half pairs.
 ONE_NODE = wp.constant(wp.int64(1 << 32))
 
 
@@ -36,10 +36,10 @@ def admit_edges(
     edges: WantedEdges,
     demand: wp.array[wp.int64],
 ):
-    """Take a node and pairs for each edge that can be bisected.
+    """Reserve a node and pairs for each edge that can be bisected.
 
-    One atomic sum of nodes and pairs gives every edge its places; those whose places do not exist are refused, and as
-    the sum only grows, all that come after them.
+    One atomic sum of nodes and pairs gives every edge its places; edges whose places do not exist are refused, and
+    since the sum only grows, so are all later ones.
     """
     for i in range(wp.tid(), pools.counts[WANTED], threads):
         slot = edges.wanted[i]
@@ -59,7 +59,7 @@ def admit_edges(
 
 @wp.func
 def leave_edges(tet: wp.vec4i, end: int, pools: Pools, edges: WantedEdges):
-    """A leaf that is bisected counts no more at its other wanted edges."""
+    """Remove a bisected leaf from the counts of its other wanted edges."""
     since = pools.counts[PASS_STAMP]
     for n in range(6):
         a = tet[FIRST_NODE[n]]
@@ -92,7 +92,7 @@ def bisect_leaf(e: int, child: int, z: int, pools: Pools, edges: WantedEdges):
 
 @wp.func
 def bisect_edge(slot: int, pools: Pools, edges: WantedEdges, carried: Carried):
-    """Bisect the leaves around an edge and hand on what they and its ends carry."""
+    """Bisect the leaves around an edge and pass on what they and its ends carry."""
     z = edges.node[slot]
     first = edges.head[slot]
     ring = edges.ring[slot]
@@ -124,7 +124,7 @@ def bisect_edge(slot: int, pools: Pools, edges: WantedEdges, carried: Carried):
     pools.lattice[z] = halfway(pools.lattice[a], pools.lattice[b])
     pools.valence[z] = 2 * ring
     make_node(z, a, b, pools.lattice[z], loss_a, loss_b, carried)
-    # Its ring is bisected: nobody counts at it any more.
+    # Its ring is bisected: no leaf counts at it any more.
     edges.ring[slot] = 0
     edges.agreed[slot] = 0
 

@@ -1,16 +1,16 @@
-"""Which stretches of the list of leaves have an edge, so that a round looks at few of them.
+"""The blocks of the list of leaves that contain an edge, so that a round visits few of them.
 
-Leaves that follow one another in tree order lie close together: a node is named in a handful of blocks of the list.
+Consecutive leaves in tree order are close in space, so a node is named in only a few blocks of the list.
 """
 
 import warp as wp
 
 from .pools import BIRTHS, LEAVES, NODE_TOP, STAMP, Pools
 
-#: Leaves of a block, and those of it that one thread looks at.
+#: Leaves in a block, and those that one thread visits.
 BLOCK = wp.constant(512)
 STRETCH = wp.constant(16)
-#: Blocks that are kept of a node. Of one in more the last says so.
+#: Number of blocks that are kept for a node. For a node in more blocks, the last entry says so.
 KEPT = 8
 LAST = wp.constant(KEPT - 1)
 NONE = wp.constant(-1)
@@ -19,17 +19,17 @@ MORE = wp.constant(-2)
 
 @wp.struct
 class Blocks:
-    """The blocks in which nodes are named, in the list as it was when the pass began."""
+    """The blocks that name each node, in the list at the beginning of the pass."""
 
     of_node: wp.array2d[wp.int32]  # [nodes, KEPT]
     latest: wp.array[wp.int32]
-    hot: wp.array[wp.int32]  # the last round in which an edge in the block came to be wanted
-    all_hot: wp.array[wp.int32]  # [1] the same of an edge whose blocks are not known
+    hot: wp.array[wp.int32]  # the last round in which an edge in the block became wanted
+    all_hot: wp.array[wp.int32]  # [1] the same for an edge whose blocks are not known
 
 
 @wp.func
 def add_block(node: int, block: int, blocks: Blocks):
-    # Mostly it is the one that was added last.
+    # Usually it is the one that was added last.
     if blocks.latest[node] == block:
         return
     blocks.latest[node] = block
@@ -65,7 +65,7 @@ def list_blocks(
     # In and out
     blocks: Blocks,
 ):
-    """If anything is wanted at all."""
+    """List the blocks of nodes, if any edge is wanted."""
     count = pools.counts[LEAVES]
     if pools.counts[BIRTHS] == 0:
         count = 0
@@ -77,7 +77,7 @@ def list_blocks(
 
 @wp.func
 def heat_blocks(a: int, b: int, stamp: int, first_new: int, blocks: Blocks):
-    """Mark the blocks that name both ends of an edge; nodes that are new in this pass are in none."""
+    """Mark the blocks that name both ends of an edge; nodes made in this pass are in none."""
     if a >= first_new or b >= first_new:
         return
     more_a = blocks.of_node[a, LAST] == MORE
@@ -103,6 +103,6 @@ def heat_blocks(a: int, b: int, stamp: int, first_new: int, blocks: Blocks):
 
 @wp.func
 def is_hot(i: int, pools: Pools, blocks: Blocks):
-    """Whether an edge in the i-th leaf's block came to be wanted in the last round, or in this one."""
+    """Whether an edge in the i-th leaf's block became wanted in the last round, or in this one."""
     since = pools.counts[STAMP] - 1
     return blocks.hot[i // BLOCK] >= since or blocks.all_hot[0] >= since

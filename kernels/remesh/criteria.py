@@ -27,7 +27,7 @@ def displacement_gradient(element: ElementState):
 
 @wp.func
 def green_strain(element: ElementState):
-    """Green strain E = (F^T F - I) / 2, which is free of rotations."""
+    """Green strain E = (F^T F - I) / 2, which does not depend on rotations."""
     gradient = displacement_gradient(element)
     return 0.5 * (gradient + wp.transpose(gradient) + wp.transpose(gradient) * gradient)
 
@@ -36,7 +36,7 @@ def green_strain(element: ElementState):
 def von_mises_stress(element: ElementState, parameters: wp.array[wp.float32]):
     """Von Mises stress of the corotated law [Pa], times the longest edge over ``parameters[0]`` [m] as in ``strain``.
 
-    A parent's material is known once it has been an element; one that never was counts as free of stress.
+    The material of a parent is known if it has been an element; otherwise the stress counts as zero.
     """
     gradient = displacement_gradient(element)
     r = byers_xu(identity3() + gradient)
@@ -48,9 +48,9 @@ def von_mises_stress(element: ElementState, parameters: wp.array[wp.float32]):
 def strain(element: ElementState, parameters: wp.array[wp.float32]):
     """Norm of the Green strain, times the longest edge over ``parameters[0]`` [m].
 
-    It does not depend on how the edges lie to the direction of stretch, as the elongation does. What asks for small
-    elements is not strain but how it varies within them; next to a notch or a tool it falls off with the distance, so
-    that strain times size says about that, and the mesh grows coarser with the distance.
+    Unlike the elongation, it does not depend on the directions of the edges. Small elements are needed
+    where strain varies within an element, not where it is large; near a notch or a tool strain decays with the
+    distance, so strain times size measures that, and the mesh becomes coarser with the distance.
     """
     e = green_strain(element)
     return wp.sqrt(wp.ddot(e, e)) * longest_edge(element) / parameters[0]
@@ -58,11 +58,11 @@ def strain(element: ElementState, parameters: wp.array[wp.float32]):
 
 @wp.func
 def nearness(element: ElementState, parameters: wp.array[wp.float32]):
-    """Longest edge over the distance of the moved centroid from a tool, a box that may be rounded off.
+    """Longest edge over the distance of the moved centroid from a tool, a box with optional rounding.
 
-    Parameters, all in metres: the box's centre, half its size along each axis, the radius that it is rounded off with
-    (of a ball alone, the half sizes being zero), and a length added to the distance, so that elements are not refined
-    without end where they touch.
+    Parameters, all in metres: the box's centre, half its size along each axis, the radius of its rounding
+    (for a ball the half sizes are zero), and a length added to the distance, which limits refinement
+    at contact.
     """
     x = element.corner
     for n in range(4):
@@ -73,5 +73,5 @@ def nearness(element: ElementState, parameters: wp.array[wp.float32]):
     return longest_edge(element) / (wp.max(outside, 0.0) + parameters[7])
 
 
-#: How many parameters each of these reads.
+#: Number of parameters of each criterion.
 PARAMETER_COUNTS = {von_mises_stress: 1, strain: 1, nearness: 8}

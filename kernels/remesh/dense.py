@@ -1,8 +1,8 @@
-"""Nodes without gaps again after a removal: the last ones move into the places of those that went.
+"""Renumbers nodes without gaps after a removal: the last ones move into the places of removed ones.
 
-With N' nodes left, the holes are the places below N' of which the node was removed, and the movers are the nodes from
-N' on: as many of one as of the other. The k-th mover moves into the k-th hole, whatever the threads. Its name is
-changed wherever it stands: in leaves and, upwards from these, in their ancestors, and in the ends of other nodes.
+With N' nodes left, the holes are the places of removed nodes below N', and the movers are the nodes from
+N' on; their numbers are equal. The k-th mover moves into the k-th hole, independently of the threads. Its number is
+changed in leaves and, upwards from these, in their ancestors, and in the ends of other nodes.
 """
 
 import warp as wp
@@ -13,7 +13,7 @@ from .state import Carried, move_node
 
 @wp.struct
 class Moves:
-    """Who moves where in the present pass."""
+    """The moves in the current pass."""
 
     sums: wp.array[wp.int32]  # [2 * threads] holes in each thread's stretch of the nodes, then movers
     ends: wp.array[wp.int32]  # inclusive sums of these
@@ -104,7 +104,7 @@ def move_nodes(
 
 @wp.func
 def present_name(node: int, top: int, old_top: int, moves: Moves):
-    """A node's number now; movers had numbers from ``top`` up to ``old_top``."""
+    """A node's current number; movers had numbers from ``top`` up to ``old_top``."""
     if node >= top and node < old_top:
         return moves.forward[node]
     return node
@@ -128,7 +128,7 @@ def rename_ends(
     # In and out
     pools: Pools,
 ):
-    """If anyone has moved; nodes that only void tetrahedra name may have ends that did."""
+    """Rename ends if a node has moved; nodes that only void tetrahedra name may have ends that moved."""
     top = pools.counts[NODE_TOP]
     old_top = pools.counts[OLD_TOP]
     count = top + pools.sink - pools.node_limit
@@ -145,9 +145,9 @@ def rename_ends(
 
 @wp.func
 def rename_upwards(e: int, top: int, old_top: int, pools: Pools, moves: Moves):
-    """Put present names into a leaf, and into its ancestors as far as they name a mover that it names.
+    """Write current numbers into a leaf, and into its ancestors as far as they share a mover with it.
 
-    Threads that meet in an ancestor write the same, and each goes on for its own movers.
+    Threads that meet in an ancestor write the same value, and each continues for its own movers.
     """
     before = pools.tets[e]
     tet = with_present_names(before, top, old_top, moves)

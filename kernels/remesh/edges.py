@@ -1,8 +1,9 @@
-"""Edges that are wanted to be bisected: a hash table that is filled anew in each pass, keyed by the edges' nodes.
+"""Edges that must be bisected, "wanted" edges: a hash table, filled again in each pass, keyed by the edges' nodes.
 
-An edge is bisected once all leaves around it have it as their refinement edge. A leaf that has a wanted edge which is
-not its refinement edge wants that one too. So wishes travel outwards to ever larger leaves, bisection comes back
-inwards, and each single bisection leaves the mesh conforming: it may stop at any time, as when the pools are full.
+An edge is bisected once it is the refinement edge of all leaves around it. If a leaf has a wanted edge that is
+not its refinement edge, its refinement edge becomes wanted, too. So requests spread outwards to ever larger leaves,
+bisection comes back inwards, and each bisection leaves the mesh conforming: it may stop at any time, for example when
+the pools are full.
 """
 
 import warp as wp
@@ -36,22 +37,23 @@ LOW_HALF = wp.constant(wp.int64((1 << 32) - 1))
 
 @wp.struct
 class WantedEdges:
-    """The table: of each edge the leaves around it, counted as the rounds find them."""
+    """The table: for each edge the leaves around it, counted in rounds."""
 
     keys: wp.array[wp.int64]
-    born: wp.array[wp.int32]  # the round in which the edge came to be wanted; NEVER
-    ring: wp.array[wp.int32]  # leaves around it
-    agreed: wp.array[wp.int32]  # of them those whose refinement edge it is, and
-    head: wp.array[wp.int32]  # the first of these, or -1
-    node: wp.array[wp.int32]  # its midpoint once it is bisected, or -1
-    pairs: wp.array[wp.int32]  # where its pairs begin among those that are taken in a round
+    born: wp.array[wp.int32]  # the round in which the edge became wanted; NEVER
+    ring: wp.array[wp.int32]  # number of leaves around it
+    agreed: wp.array[wp.int32]  # number of these whose refinement edge it is
+    head: wp.array[wp.int32]  # the first of the latter, or -1
+    node: wp.array[wp.int32]  # its midpoint after bisection, or -1
+    pairs: wp.array[wp.int32]  # start of its pairs among those taken in a round
     wanted: wp.array[wp.int32]  # slots of all wanted edges
-    most: int  # so many edges can be wanted in a pass
+    most: int  # maximum number of wanted edges in a pass
 
 
 @wp.func
 def want_edge(a: int, b: int, pools: Pools, edges: WantedEdges):
-    """Want an edge; whether it is new. One too many is left out, which costs a refinement but never conformity."""
+    """Want an edge; returns whether it is new. Beyond the maximum it is left out: that loses a refinement, never
+    conformity."""
     if pools.counts[WANTED] >= edges.most:
         wp.atomic_max(pools.counts, FULL, 1)
         return False
@@ -76,7 +78,7 @@ def want_marked(
     pools: Pools,
     edges: WantedEdges,
 ):
-    """Want the refinement edges of the leaves that are marked."""
+    """Want the refinement edges of marked leaves."""
     for i in range(wp.tid(), pools.counts[LEAVES], threads):
         if pools.marks[i] == REFINE:
             level = pools.level[pools.leaves[i]]
@@ -94,7 +96,7 @@ def heat_wanted(
     # In and out
     blocks: Blocks,
 ):
-    """Look for what is wanted at first, once it is known which blocks name which nodes."""
+    """Mark blocks with the first wanted edges, once it is known which blocks name which nodes."""
     for i in range(wp.tid(), pools.counts[WANTED], threads):
         key = edges.keys[edges.wanted[i]]
         a = int(key >> wp.int64(32))
@@ -121,7 +123,7 @@ def begin_round(
 
 @wp.func
 def count_at_edges(e: int, tet: wp.vec4i, is_new: bool, pools: Pools, edges: WantedEdges, blocks: Blocks):
-    """Count a leaf at its wanted edges, each once: an old one at those of the last round, a new one at all."""
+    """Count a leaf at its wanted edges, each once: an old leaf at those of the last round, a new one at all."""
     stamp = pools.counts[STAMP]
     since = stamp - 1
     if is_new:
@@ -148,7 +150,7 @@ def count_at_edges(e: int, tet: wp.vec4i, is_new: bool, pools: Pools, edges: Wan
 
 @wp.func
 def visit_leaf(i: int, pools: Pools, edges: WantedEdges, blocks: Blocks):
-    """Few leaves are near a wanted edge, with two nodes touched of late: three others tell that one is not."""
+    """Count a leaf at new wanted edges, if it has two recently touched nodes: often three nodes rule it out."""
     tet = pools.leaf_tets[i]
     since = pools.counts[STAMP] - 1
     near = int(0)
@@ -172,7 +174,7 @@ def visit_leaves(
     edges: WantedEdges,
     blocks: Blocks,
 ):
-    """The leaves there were before the pass, if there is anything new to be counted at."""
+    """Visit the leaves from before the pass, if there is a new edge to count at."""
     count = (pools.counts[LEAVES] + STRETCH - 1) // STRETCH
     if pools.counts[LAST_BIRTHS] == 0:
         count = 0
@@ -192,7 +194,7 @@ def visit_fresh(
     edges: WantedEdges,
     blocks: Blocks,
 ):
-    """The leaves that this pass made."""
+    """Visit the leaves that this pass made."""
     for i in range(wp.tid(), 2 * pools.counts[FRESH_NEW], threads):
         e = pools.fresh[i // 2] + i % 2
         if pools.first_child[e] == LIVE:

@@ -1,4 +1,4 @@
-"""Points that go along with a mesh while its elements change."""
+"""Points that follow a mesh while its elements change."""
 
 import warp as wp
 
@@ -36,9 +36,9 @@ def bind_points(
     nodes: wp.array[wp.vec4i],
     weights: wp.array[wp.vec4],
 ):
-    """The leaf below each root that holds the place ``inside``, and the coordinates of ``points`` in it.
+    """The leaf below each root that contains the point ``inside``, and the coordinates of ``points`` in it.
 
-    Both are barycentric in the root. A point outside of the mesh goes along with the leaf that is nearest.
+    Both are barycentric in the root. A point outside the mesh follows the nearest leaf.
     """
     i = wp.tid()
     element = roots[i]

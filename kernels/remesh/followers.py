@@ -1,11 +1,11 @@
-"""Which nodes of a changing mesh follow keyframes."""
+"""The nodes of a changing mesh that follow keyframes."""
 
 import warp as wp
 
 from .pools import NODE_TOP, Pools
 from .state import MIXED_ROWS, NO_ROW, Carried
 
-#: What is counted: nodes that follow some, and those among them whose row is not known yet.
+#: Counts: nodes that follow keyframes, and those among them whose row is not known yet.
 FOLLOWERS = wp.constant(0)
 MIXED = wp.constant(1)
 PLACES = 2
@@ -23,7 +23,7 @@ def list_followers(
     rows: wp.array[wp.int32],
     found: wp.array[wp.int32],
 ):
-    """Nodes with their rows, in any order, if ``goes`` [1] is not zero."""
+    """List nodes with their rows, in any order, if ``goes`` [1] is not zero."""
     count = pools.counts[NODE_TOP]
     if goes[0] == 0:
         count = 0

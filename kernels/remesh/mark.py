@@ -1,4 +1,4 @@
-"""Which leaves are to be refined or simplified: a criterion of the element's state against two thresholds."""
+"""Marking of leaves for refinement or simplification: a criterion of the element's state against two thresholds."""
 
 import functools
 from typing import Any
@@ -10,8 +10,8 @@ from warp_corot.kernels.meshing.bisection import refinement_end
 
 from .pools import LEAVES, REFINE, SIMPLIFY, Pools
 
-#: Share of its volume below which an element is not refined for its own sake: what is stretched there is mostly no
-#: tissue, and halves of it would hold next to no mass.
+#: Fraction of its volume inside the body below which an element is refined only for conformity: most of what is
+#: stretched there is not tissue, and its halves would hold almost no mass.
 LEAST_FILL = 0.5
 
 mat43 = wp.types.matrix(shape=(4, 3), dtype=wp.float32)
@@ -19,22 +19,22 @@ mat43 = wp.types.matrix(shape=(4, 3), dtype=wp.float32)
 
 @wp.struct
 class ElementState:
-    """What a criterion sees of an element, its nodes in Maubach order."""
+    """The state of an element for a criterion, with its nodes in Maubach order."""
 
     level: int
     corner: wp.vec3  # rest position of node 0 [m]
-    rest: mat43  # rest positions from there, a row a node [m]
-    moved: mat43  # displacements, a row a node [m]
-    mu: float  # Lamé's parameters [Pa], of the nearest isotropic material
+    rest: mat43  # rest positions relative to node 0, a row for each node [m]
+    moved: mat43  # displacements, a row for each node [m]
+    mu: float  # Lamé's parameters [Pa] of the nearest isotropic material
     lam: float
 
 
 @wp.struct
 class Contents:
-    """What tetrahedra are made of, as far as marking looks at it; columns of ``Carried.values``, or -1."""
+    """Material data of tetrahedra for marking; columns of ``Carried.values``, or -1."""
 
     values: wp.array2d[wp.float32]
-    mu: float  # Lamé's parameters of all if they are alike, where there are no columns of them
+    mu: float  # Lamé's parameters of all elements if they are equal and have no columns
     lam: float
     mu_column: int
     lam_column: int
@@ -59,7 +59,7 @@ def load_state(
     contents: Contents,
     u: wp.array[wp.vec4],
 ):
-    """What a criterion sees of a tetrahedron, a leaf or one above leaves."""
+    """The state of a tetrahedron, a leaf or an ancestor, for a criterion."""
     state = ElementState()
     tet = pools.tets[e]
     p = pools.lattice[tet[0]]
@@ -88,7 +88,7 @@ def load_state(
 
 @wp.func
 def holds_enough(e: int, contents: Contents):
-    """Whether an element may be refined for its own sake."""
+    """Whether an element may be refined if conformity does not require it."""
     if contents.fill_column < 0:
         return True
     return contents.values[e, contents.fill_column] >= wp.static(LEAST_FILL)
@@ -98,8 +98,8 @@ def holds_enough(e: int, contents: Contents):
 def marking_kernel(criterion: Any) -> wp.Kernel:
     """The kernel that marks leaves by a criterion: a Warp function of an ``ElementState`` and an array of numbers.
 
-    A leaf is not given up if its parent would be refined at once: edges of an element and of its halves point
-    elsewhere, so that what is stretched in one may not be in the other.
+    A leaf is not merged if its parent would be refined at once: edges of an element and of its halves have different
+    directions, so that one may be stretched and the other not.
     """
 
     @wp.kernel(enable_backward=False, module="unique")

@@ -1,7 +1,7 @@
-"""The leaves in tree order again after a pass.
+"""Restores the tree order of the leaves after a pass.
 
-Each thread goes through one stretch of the list as it was: where a leaf was bisected its descendants stand, where it
-was merged its parent does. A sum over the threads tells each where to begin.
+Each thread processes one stretch of the former list: a bisected leaf is replaced by its descendants, a merged one by
+its parent. A sum over the threads gives the start of each.
 """
 
 import warp as wp
@@ -26,7 +26,7 @@ def next_leaf(e: int, top: int, pools: Pools):
 
 @wp.func
 def first_leaf(i: int, pools: Pools):
-    """The first leaf that stands where the i-th did, -1 if none does."""
+    """The first leaf in place of the i-th, -1 if there is none."""
     found = pools.leaves[i]
     if pools.level[found] == UNUSED:
         if (found - pools.roots) % 2 == 1:
@@ -45,7 +45,7 @@ def count_leaves(
     # Out
     sums: wp.array[wp.int32],
 ):
-    """How many leaves each thread's stretch comes to; nothing where no leaf has changed."""
+    """The number of leaves from each thread's stretch; nothing if no leaf has changed."""
     t = wp.tid()
     total = int(0)
     if pools.counts[ADDED] + pools.counts[REMOVED] > 0:
@@ -100,7 +100,7 @@ def adopt_list(
     # In and out
     pools: Pools,
 ):
-    """The new list takes the old one's place; nodes that have moved are named anew on the way."""
+    """Replace the old list by the new one, with new numbers for nodes that have moved."""
     new = pools.counts[NEW_LEAVES]
     top = pools.counts[NODE_TOP]
     old_top = pools.counts[OLD_TOP]

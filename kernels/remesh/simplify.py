@@ -1,7 +1,7 @@
 """Removal of nodes, the reverse of bisection.
 
-A node can go when all leaves that name it, live or void, are children that were made with it, and all are to be
-simplified: then their parents become leaves. Two children of which only one is live, or whose labels differ, stay.
+A node can be removed if all leaves that name it, live or void, are children that were made with it, and all are
+marked: then their parents become leaves. Two children stay if only one is live, or if their labels differ.
 """
 
 import warp as wp
@@ -15,16 +15,16 @@ from .state import Carried, average_children, quarter_mass, unmake_node
 
 @wp.struct
 class Removal:
-    """Nodes that some leaves would give up."""
+    """Nodes that some leaves could give up."""
 
-    willing: wp.array[wp.int32]  # how many leaves would
+    willing: wp.array[wp.int32]  # number of these leaves
     head: wp.array[wp.int32]  # their first parent, or -1
     candidates: wp.array[wp.int32]
 
 
 @wp.func
 def offer_node(i: int, min_level: int, pools: Pools, carried: Carried, removal: Removal):
-    """If this and the next leaf are a pair that is to be merged, count them at the node that would go."""
+    """If this and the next leaf are a pair that may be merged, count them at the node that would be removed."""
     e = pools.leaves[i]
     if e < pools.roots or (e - pools.roots) % 2 == 1 or pools.leaves[i + 1] != e + 1:
         return
@@ -59,7 +59,7 @@ def offer_nodes(
 
 @wp.func
 def remove_node(z: int, pools: Pools, carried: Carried, removal: Removal):
-    """Merge the pairs around a node, and hand on what they and the node carry."""
+    """Merge the pairs around a node, and pass on what they and the node carry."""
     ends = pools.ends[z]
     gain_a = wp.float64(0.0)
     gain_b = wp.float64(0.0)
@@ -84,7 +84,7 @@ def remove_node(z: int, pools: Pools, carried: Carried, removal: Removal):
             if n != end:
                 wp.atomic_add(pools.valence, tet[n], -1)
         pools.first_child[e] = LIVE
-        # The parent's number stays, for those who put the leaves in order.
+        # The parent's number stays, for the kernels that order the leaves.
         pools.level[child] = UNUSED
         pools.level[child + 1] = UNUSED
         pools.free_pairs[place] = child

@@ -1,12 +1,12 @@
-"""What nodes and tetrahedra carry, handed on when the mesh changes.
+"""Data of nodes and tetrahedra, passed on when the mesh changes.
 
-A new node takes from each end of its edge the mass that this end loses, with the momentum of that mass; a node that is
-removed gives back to each end what it then gains, moving as the end does and, on top, as the node moved against both
-together. So mass and linear momentum stay, and bisection and removal undo each other. Children have their parent's
-density. What ends lose and gain is summed leaf by leaf, so that densities around an edge may differ by any factor, and
-children that are merged may, too.
+A new node takes from each end of its edge the mass that this end loses, with the momentum of that mass. A removed
+node returns to each end the mass that it gains, at the end's velocity plus the node's velocity relative to both
+together. So mass and linear momentum are conserved, and bisection and removal undo each other. Children have their
+parent's density. Losses and gains of the ends are summed leaf by leaf, so that densities around an edge, and of merged
+children, may differ by any factor.
 
-Tetrahedra carry columns of numbers. Children have their parent's; what a parent has of its children's each column says.
+Tetrahedra carry columns of numbers. Children have their parent's values; each column defines the parent's value.
 """
 
 import warp as wp
@@ -15,25 +15,25 @@ from warp_corot.kernels.elements.elements import load_node, store_node
 
 from .pools import ADDED, GAINERS, NODE_TOP, REMOVED, Pools
 
-# Rows of keyframes for nodes that follow none, and for held nodes between such as follow different ones.
+# Rows of keyframes for nodes that follow none, and for held nodes between nodes with different rows.
 NO_ROW = wp.constant(-1)
 MIXED_ROWS = wp.constant(-2)
 
-# What a parent has in a column of values. Children are of one volume, so that means keep what values are densities of.
+# A parent's value in a column. Children have equal volumes, so means conserve quantities whose densities are stored.
 MEAN = wp.constant(0)  # of both children
-MEAN_OF_CONTENTS = wp.constant(1)  # weighted by what each child holds of its volume
+MEAN_OF_CONTENTS = wp.constant(1)  # weighted by the filled volume of each child
 FIRST = wp.constant(2)  # the first child's
-MEAN_IF_ALIKE = wp.constant(3)  # MEAN_OF_CONTENTS if all whole numbers of both are the same, else FIRST
+MEAN_IF_ALIKE = wp.constant(3)  # MEAN_OF_CONTENTS if all whole numbers of both are equal, else FIRST
 
 
 @wp.struct
 class Carried:
-    """Of nodes: displacement, velocity, mass and load. Of tetrahedra: density and other values per full volume."""
+    """Nodes: displacement, velocity, mass and load. Tetrahedra: density and other values per full volume."""
 
     origin: wp.vec3d  # of the lattice [m]
     spacing: wp.float64  # of its points [m]
     volume: wp.array[wp.float64]  # rest volume by level [m^3]
-    # Nodes; these arrays have places for padding, too.
+    # Nodes; these arrays include padding.
     rest: wp.array[wp.vec4]  # rest position [m]
     u: wp.array[wp.vec4]
     v: wp.array[wp.vec4]
@@ -41,22 +41,22 @@ class Carried:
     reaction: wp.array[wp.vec4]  # force of the support on a held node [N]
     mass: wp.array[wp.float64]
     held: wp.array[wp.uint8]
-    row: wp.array[wp.int32]  # which row of keyframes a held node follows, NO_ROW, or MIXED_ROWS
-    mass32: wp.array[wp.float32]  # what stepping reads
+    row: wp.array[wp.int32]  # the row of keyframes that a held node follows, NO_ROW, or MIXED_ROWS
+    mass32: wp.array[wp.float32]  # the mass for stepping
     inverse_mass: wp.array[wp.float32]
     # Tetrahedra, by their places in the pool.
-    density: wp.array[wp.float64]  # mass per rest volume, what is not filled counted in
+    density: wp.array[wp.float64]  # mass per rest volume, averaged over the unfilled part, too
     label: wp.array[wp.int32]
     values: wp.array2d[wp.float32]
     merging: wp.array[wp.int32]  # MEAN, MEAN_OF_CONTENTS, … of each column of values
-    fill_column: int  # that of the filled share, -1 if all is full
-    numbers: wp.array2d[wp.int32]  # whole ones; a parent has its first child's
-    # While nodes are removed.
+    fill_column: int  # column of the filled fraction, -1 if all elements are full
+    numbers: wp.array2d[wp.int32]  # whole numbers; a parent has its first child's
+    # During removal of nodes.
     gained_mass: wp.array[wp.float64]
-    gained_momentum: wp.array[wp.vec3d]  # beyond what the mass has that moves as the end does
+    gained_momentum: wp.array[wp.vec3d]  # beyond that of the gained mass at the end's velocity
     gain_count: wp.array[wp.int32]
     gainers: wp.array[wp.int32]
-    impulse: wp.array[wp.vec3d]  # [1] that supports have given, in all passes [N s]
+    impulse: wp.array[wp.vec3d]  # [1] total impulse of supports in all passes [N s]
 
 
 @wp.func
@@ -82,7 +82,7 @@ def copy_to_children(e: int, child: int, carried: Carried):
 
 @wp.func
 def share_of_first(child: int, carried: Carried):
-    """How much of what both children hold the first one does."""
+    """The first child's fraction of what both children hold."""
     share = float(0.5)
     if carried.fill_column >= 0:
         first = carried.values[child, carried.fill_column]
@@ -124,7 +124,7 @@ def rest_position(point: wp.vec3i, carried: Carried):
 
 @wp.func
 def row_between(a: int, b: int):
-    """The row of a node between two held ones that follow rows a and b."""
+    """The row of a node between two held nodes with rows a and b."""
     row = wp.where(a == b, a, NO_ROW)
     if a != b and (a != NO_ROW or b != NO_ROW):
         row = MIXED_ROWS
@@ -141,7 +141,7 @@ def make_node(
     loss_b: wp.float64,
     carried: Carried,
 ):
-    """The midpoint of the deformed edge a-b, with what both ends lose."""
+    """Make the midpoint of the deformed edge a-b from what both ends lose."""
     store_node(carried.rest, z, rest_position(point, carried))
     store_node(carried.reaction, z, wp.vec3())
     store_node(carried.u, z, 0.5 * (load_node(carried.u, a) + load_node(carried.u, b)))
@@ -184,7 +184,7 @@ def give_to_end(
 
 @wp.func
 def wipe_node(z: int, carried: Carried):
-    """Leave nothing behind where there is no node any more."""
+    """Clear the data of a removed node."""
     carried.mass[z] = wp.float64(0.0)
     carried.mass32[z] = 0.0
     carried.inverse_mass[z] = 0.0
@@ -199,7 +199,7 @@ def wipe_node(z: int, carried: Carried):
 
 @wp.func
 def move_node(z: int, place: int, carried: Carried):
-    """Put all that a node has at another place, where there was none."""
+    """Move the data of a node to a free place."""
     carried.mass[place] = carried.mass[z]
     carried.mass32[place] = carried.mass32[z]
     carried.inverse_mass[place] = carried.inverse_mass[z]
@@ -215,7 +215,7 @@ def move_node(z: int, place: int, carried: Carried):
 
 @wp.func
 def unmake_node(z: int, a: int, b: int, gain_a: wp.float64, gain_b: wp.float64, pools: Pools, carried: Carried):
-    """Give back to both ends; ``settle_ends`` puts it to account."""
+    """Return mass and momentum to both ends; ``settle_ends`` applies them."""
     mass = gain_a + gain_b
     deviation = wp.vec3d()
     if mass > wp.float64(0.0):
@@ -235,7 +235,7 @@ def settle_ends(
     # In and out
     carried: Carried,
 ):
-    """Velocities of nodes that got mass back. What a held one cannot take up its support does."""
+    """Update velocities of nodes that gained mass. For held nodes, the supports take the impulse."""
     for i in range(wp.tid(), pools.counts[GAINERS], threads):
         end = carried.gainers[i]
         momentum = carried.gained_momentum[end]
@@ -259,7 +259,7 @@ def refresh_masses(
     # In and out
     carried: Carried,
 ):
-    """What stepping reads, if anything has changed."""
+    """Update the masses for stepping, if anything has changed."""
     count = pools.counts[NODE_TOP]
     if pools.counts[ADDED] + pools.counts[REMOVED] == 0:
         count = 0

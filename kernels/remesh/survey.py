@@ -1,6 +1,7 @@
-"""What limits the time step of a mesh that has changed: its stiffest elements for their size and mass, and how many.
+"""Limits of the time step of a changed mesh: its stiffest elements for their size and mass, and their number.
 
-An element in a patch of its like vibrates faster than one among larger ones, so that not only the finest level counts.
+An element among elements of its size vibrates faster than one among larger ones, so the finest level alone is not
+enough.
 """
 
 import warp as wp
@@ -8,7 +9,7 @@ import warp as wp
 from .pools import LEAVES, Pools
 from .state import Carried
 
-# Places in what is found; from FINEST_COUNTS on there are partial sums.
+# Places in the result; from FINEST_COUNTS on there are partial sums.
 STIFFEST = wp.constant(0)
 FINEST_LEVEL = wp.constant(1)
 FINEST_COUNTS = wp.constant(2)
@@ -31,7 +32,7 @@ def find_stiffest(
 ):
     """Largest (2 mu + lambda) / (density volume^(2/3)) [1/s^2] of the leaves, as a float's bits, and the finest level.
 
-    ``modulus`` is 2 mu + lambda [Pa] where all elements have the same, and columns of ``values`` are negative.
+    ``modulus`` is 2 mu + lambda [Pa] if all elements have the same, and columns of ``values`` are negative.
     """
     count = wp.where(goes[0] != 0, pools.counts[LEAVES], 0)
     most = float(0.0)
@@ -45,7 +46,7 @@ def find_stiffest(
         size = wp.pow(float(carried.volume[level]), 2.0 / 3.0)
         most = wp.max(most, stiffness / (float(carried.density[e]) * size))
         finest = wp.max(finest, level)
-    # Positive floats are in the order of their bits. Few threads get so far as to write.
+    # Positive floats have the order of their bits. Few threads reach the write.
     bits = wp.cast(most, wp.int32)
     if bits > found[STIFFEST]:
         wp.atomic_max(found, STIFFEST, bits)
@@ -62,7 +63,7 @@ def count_finest(
     # In and out
     found: wp.array[wp.int32],
 ):
-    """How many leaves are of the finest level, in partial sums."""
+    """Number of leaves at the finest level, in partial sums."""
     count = wp.where(goes[0] != 0, pools.counts[LEAVES], 0)
     own = int(0)
     for i in range(wp.tid(), count, threads):

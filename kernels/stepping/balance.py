@@ -18,8 +18,10 @@ from .pace import BEFORE, CONTROLS, DONE, DONE_THEN, DT, END, SLOT, THEN, Pace, 
 wp.set_module_options({"enable_backward": False})
 
 #: Columns of ``sums``.
-KINETIC, AHEAD, GRAVITATIONAL, LOADS, SUPPORTS, REACH, ELASTIC, UNTIMELY = (wp.constant(k) for k in range(8))
-COLUMNS = 8
+KINETIC, AHEAD, GRAVITATIONAL, LOADS, SUPPORTS, REACH, ELASTIC, UNTIMELY, WORKED, WORKED_ABSOLUTE = (
+    wp.constant(k) for k in range(10)
+)
+COLUMNS = 10
 
 #: Places in what is reported besides sums: the clock's numbers, what moving supports have put in and the sum of its
 #: absolute values [J], the first step that was not finite, whether somebody has written to the state, and from CONTROL
@@ -121,6 +123,8 @@ def sum_nodes(
     f: wp.array[wp.vec4],
     u: wp.array[wp.vec4],
     v: wp.array[wp.vec4],
+    touched: int,
+    contact: wp.array[wp.vec4],
     orders: wp.array[wp.float64],
     keeps: int,
     # In and out
@@ -137,6 +141,7 @@ def sum_nodes(
     beyond the stable step, where it need not be positive.
     The work of supports that ``add_support_work`` has added up counts half of f's share too early; that half is
     ``SUPPORTS``. Velocities at the time of the displacements, halfway, have ``UNTIMELY`` more than that product.
+    Contact forces of the last step, if any, are part of what accelerates nodes; their work is counted elsewhere.
     """
     world, thread = wp.tid()
     slot = int(orders[SLOT])
@@ -168,6 +173,8 @@ def sum_nodes(
                 pull += wp.vec3d(external)
                 power += dot64(external, velocity)
                 work += dot64(external, x) - dot64(external, load_node(kept_u[slot], i))
+            if touched != 0:
+                pull += wp.vec3d(load_node(contact, i))
             square = wp.dot(pull, pull) / m
             ahead += wp.float64(0.5) * (before * power + both * square)
             untimely += square
@@ -208,6 +215,25 @@ def sum_elements(energies: wp.array[wp.float64], count: int, threads: int, lanes
     if thread % lanes == 0:
         part = thread / lanes
         sums[world, part, ELASTIC] = sums[world, part, ELASTIC] + total
+
+
+@wp.kernel(enable_backward=False)
+def sum_work(account: wp.array2d[wp.float64], count: int, threads: int, lanes: int, sums: wp.array3d[wp.float64]):
+    """Add the work of constraints and its absolute value, of ``count`` places in each world."""
+    world, thread = wp.tid()
+    work = wp.float64(0.0)
+    absolute = wp.float64(0.0)
+    k = thread
+    while k < count:
+        work += account[0, world * count + k]
+        absolute += account[1, world * count + k]
+        k += threads
+    work = sum_of_lanes(work)
+    absolute = sum_of_lanes(absolute)
+    if thread % lanes == 0:
+        part = thread / lanes
+        sums[world, part, WORKED] = sums[world, part, WORKED] + work
+        sums[world, part, WORKED_ABSOLUTE] = sums[world, part, WORKED_ABSOLUTE] + absolute
 
 
 @wp.kernel(enable_backward=False)

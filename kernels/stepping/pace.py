@@ -32,6 +32,8 @@ STABLE, REST_CURVATURE, SAFE, SAFE_STRAINED = (wp.constant(k) for k in range(4))
 SMALL, LARGE = wp.constant(wp.float64(0.1)), wp.constant(wp.float64(0.4))
 #: Growth of the step from one measurement to the next at most: what was stiff a moment ago may soon be so again.
 GROWTH = wp.constant(wp.float64(1.05))
+#: Share of the thinnest thing in the way that may be passed in a step.
+PASSED = wp.constant(wp.float64(0.2))
 #: No step is shorter than this share of that at rest.
 LEAST = wp.constant(wp.float64(0.002))
 
@@ -116,16 +118,24 @@ def take_safe_step(
     at_rest: wp.array2d[wp.float64],
     # In and out
     found: wp.array2d[wp.float32],
+    motion_rates: wp.array[wp.float32],
     control: wp.array[wp.float64],
     pace: Pace,
 ):
-    """Take the smallest of the bodies' safe steps: at once where it is shorter than before, slowly where longer."""
+    """Take the smallest of the bodies' safe steps: at once where it is shorter than before, slowly where longer.
+
+    No step is so long that things pass one another within it; ``System.motion_rates`` says how fast they are.
+    """
     longest = control[AT_REST]
     safe = longest
     for body in range(at_rest.shape[0]):
         safe = wp.min(safe, safe_step(at_rest, found, body))
         found[body, CURVATURE] = 0.0
         found[body, STRAIN] = 0.0
+    rate = wp.float64(motion_rates[0]) + wp.float64(motion_rates[1])
+    motion_rates[1] = 0.0
+    if rate > wp.float64(0.0):
+        safe = wp.min(safe, PASSED / rate)
     control[ALLOWED] = wp.min(wp.max(safe, LEAST * longest), GROWTH * control[ALLOWED])
     take_allowed_step(control, pace)
 

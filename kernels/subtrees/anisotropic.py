@@ -10,15 +10,22 @@ import functools
 
 import warp as wp
 
-from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial, element_forces, filled, listed_forces
+from warp_corot.kernels.corotated.anisotropic import FibreMaterial, OrthotropicMaterial, filled, listed_stress
 from warp_corot.kernels.corotated.definite import definite_law, definite_strain, is_definite, load_axes
-from warp_corot.kernels.elements.elements import FRAME_SHIFT, LEVEL_MASK, ForestElements, Subtrees, mirror_sign
+from warp_corot.kernels.elements.elements import (
+    FRAME_SHIFT,
+    LEVEL_MASK,
+    ForestElements,
+    Subtrees,
+    mirror_sign,
+    scatter_stress,
+)
 from warp_corot.kernels.math.rotation import ITERATIONS, byers_xu, column, newton_rotation, quick_rotation
 from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
 from warp_corot.kernels.tables.subtree import FRAMES, HANDEDNESS, LEAVES
 
 from .cuda import BLOCK, memory_of
-from .forces import columns_of, first_of, leaf_forces_of, mat10
+from .forces import columns_of, leaf_forces_of, mat10, turns_of
 from .laws import turn_in, turn_out
 
 wp.set_module_options({"enable_backward": False})
@@ -32,7 +39,7 @@ def anisotropic_forces(shape: int, transverse: bool, one_axes: bool, one_stiffne
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
     leaves, frames, handed, volume = LEAVES[shape], FRAMES[shape], HANDEDNESS[shape], VOLUME[shape]
-    rows = [[first_of(axis) for axis in frame] for frame in frames]
+    into_leaf, _out_of_leaf = turns_of(shape)
     law = definite_law(transverse)
 
     @wp.func
@@ -66,19 +73,9 @@ def anisotropic_forces(shape: int, transverse: bool, one_axes: bool, one_stiffne
                 y[wp.static(leaves[leaf][3])],
             )
             gradient = wp.matrix_from_cols(c0, c1, c2)
-            # A = B^T G and the axes in the leaf's frame B, zeros of B left out.
-            a = wp.mat33()
-            n = wp.mat33()
-            for i in range(3):
-                for axis in range(3):
-                    if wp.static(axis == rows[leaf][i]):
-                        for j in range(3):
-                            a[i, j] = wp.static(frames[leaf][i][axis]) * gradient[axis, j]
-                            n[i, j] = wp.static(frames[leaf][i][axis]) * m[axis, j]
-                    elif wp.static(abs(frames[leaf][i][axis]) > 1e-9):
-                        for j in range(3):
-                            a[i, j] += wp.static(frames[leaf][i][axis]) * gradient[axis, j]
-                            n[i, j] += wp.static(frames[leaf][i][axis]) * m[axis, j]
+            # A = B^T G, and the axes, in the leaf's frame B.
+            a = into_leaf(leaf, gradient)
+            n = into_leaf(leaf, m)
             f0 = c0 + wp.static(wp.vec3(*frames[leaf][0]))
             f1 = c1 + wp.static(wp.vec3(*frames[leaf][1]))
             f2 = c2 + wp.static(wp.vec3(*frames[leaf][2]))
@@ -152,7 +149,7 @@ def scatter_anisotropic_subtrees(
     return scatter_anisotropic_subtrees
 
 
-_robust_forces = element_forces(byers_xu)
+_robust_stress = listed_stress(byers_xu)
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -161,9 +158,7 @@ def repair_leaves(
     flagged: wp.array[wp.uint64],
     first: wp.array[wp.int32],
     elements: ForestElements,
-    material: OrthotropicMaterial,
-    is_active: int,
-    activation: wp.array[wp.float32],
+    material: FibreMaterial,
     u: wp.array[wp.vec4],
     # Out
     f: wp.array[wp.vec4],
@@ -177,12 +172,13 @@ def repair_leaves(
     member = int(0)
     while flags != wp.uint64(0) and member < 8:
         if (flags & wp.uint64(1)) != wp.uint64(0):
-            _robust_forces(elements, material, is_active, activation, first[8 * (i // 8) + member] + i % 8, u, f)
+            t = first[8 * (i // 8) + member] + i % 8
+            scatter_stress(elements, t, _robust_stress(elements, t, material, t, u), f)
         flags = flags >> wp.uint64(8)
         member += 1
 
 
-_quick_forces = listed_forces(quick_rotation)
+_quick_stress = listed_stress(quick_rotation)
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -190,13 +186,11 @@ def scatter_flat(
     # In
     elements: ForestElements,
     leaves: wp.array[wp.int32],
-    material: OrthotropicMaterial,
-    is_active: int,
-    activation: wp.array[wp.float32],
+    material: FibreMaterial,
     u: wp.array[wp.vec4],
     # Out
     f: wp.array[wp.vec4],
 ):
     """Add the forces of leaves that are in no subtree; ``leaves`` are their places among the mesh's elements."""
     k = wp.tid()
-    _quick_forces(elements, k, material, is_active, activation, leaves[k], u, f)
+    scatter_stress(elements, k, _quick_stress(elements, k, material, leaves[k], u), f)

@@ -6,8 +6,8 @@ leaves for global memory are 16-byte vector reductions where the card has them. 
 polynomial (``corotated.algebraic``), the same way for small strains and large ones.
 
 A leaf that is flat, turned over or far from order one adds nothing. Its bit is set in its subtree's byte, and the
-subtree is put on a list; ``repair`` does those leaves. A warp most of whose leaves were left out before puts all of
-them on the list untried, but for now and then. Bodies of one type of subtree alone have a kernel of their own; all
+subtree is put on a list; ``repair`` does those leaves. A warp most of whose leaves were left out before takes all of
+them one by one instead, and sets their bits anew. Bodies of one type of subtree alone have a kernel of their own; all
 others are one launch, in which each thread block looks up what it is to do.
 """
 
@@ -15,6 +15,7 @@ import functools
 
 import warp as wp
 
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.elements import (
     ADD_FORCE,
     FRAME_SHIFT,
@@ -32,8 +33,8 @@ from warp_corot.kernels.elements.elements import (
 from warp_corot.kernels.elements.merging import add_four_forces
 from warp_corot.kernels.tables.subtree import GROUP_NODES, SLOT_STRIDE, group_slots, group_sources
 
-from .forces import ALL_LEAVES, leaf_stress, mat10, near_forces, shared_forces
-from .repair import LeftOut, append, is_hopeless, list_of, reserve
+from .forces import leaf_stress, mat10, near_forces, shared_forces
+from .repair import WARP, LeftOut, append, is_mostly_left_out, list_of, reserve, scatter_one_by_one
 
 wp.set_module_options({"enable_backward": False})
 
@@ -199,9 +200,9 @@ def scatter_subtrees_own(
     )
     def scatter_subtrees_own(
         # In
+        elements: ForestElements,
         subtrees: Subtrees,
-        mu: wp.array[wp.float32],
-        lam: wp.array[wp.float32],
+        material: IsotropicMaterial,
         u: wp.array[wp.vec4],
         # In and out
         f: wp.array[wp.vec4],
@@ -217,15 +218,14 @@ def scatter_subtrees_own(
         mirror = mirror_sign(code)
         q = subtrees.frames[code >> FRAME_SHIFT]
         x = load(subtrees, s, u)
-        hopeless = bool(False)
-        if wp.static(listed):
-            hopeless = is_hopeless(left_out, s, before)
-        if hopeless:
-            to_come = subtrees.code.shape[0] - s
-            place = reserve(left_out, list_of(s // BLOCK), True, to_come)
-            append(left_out, list_of(s // BLOCK), place, subtrees.first[s], ALL_LEAVES, to_come)
-            return
-        g, mask = forces(x, q, h, mirror, mu, lam, wp.where(wp.static(uniform), 0, subtrees.first[s]))
+        # Asked only now: the bits and the displacements are on their way at once.
+        if wp.static(listed):  # noqa: SIM102 (what is static decides what is generated)
+            if is_mostly_left_out(before):
+                mask = scatter_one_by_one(elements, subtrees.first[s], s % WARP, material, u, f)
+                flagged[s] = wp.uint8(mask)
+                return
+        leaf = wp.where(wp.static(uniform), 0, subtrees.first[s])
+        g, mask = forces(x, q, h, mirror, material.mu, material.lam, leaf)
         flagged[s] = wp.uint8(mask)
         reserved = int(0)
         if wp.static(listed):

@@ -7,12 +7,13 @@ reported: bit k stands for leaf k in tree order.
 """
 
 import functools
+import itertools
 from collections.abc import Sequence
 
 import warp as wp
 
 from warp_corot.kernels.corotated.algebraic import stretch_stress
-from warp_corot.kernels.elements.elements import ROOT2
+from warp_corot.kernels.elements.shapes import columns_of, leaf_forces_of
 from warp_corot.kernels.math.rotation import ITERATIONS, column, newton_rotation
 from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
 from warp_corot.kernels.tables.subtree import FRAMES, LEAVES, POSITIONS
@@ -21,56 +22,29 @@ wp.set_module_options({"enable_backward": False})
 
 mat10 = wp.types.matrix(shape=(10, 3), dtype=wp.float32)
 
-#: What a mask of left-out leaves is where the whole subtree is.
-ALL_LEAVES = wp.constant(255)
-
-
-def first_of(weights: Sequence[float]) -> int:
-    """The first of a list that is not zero."""
-    return next(i for i, weight in enumerate(weights) if abs(weight) > 1e-9)
-
 
 @functools.cache
-def columns_of(shape: int) -> wp.Function:
-    """Differences of four nodes, the columns of F in the Maubach frame where lengths are in edge lengths."""
-
-    @wp.func
-    def columns(x0: wp.vec3, x1: wp.vec3, x2: wp.vec3, x3: wp.vec3):
-        c0 = x1 - x0
-        c1 = x2 - x1
-        c2 = x3 - x2
-        if wp.static(shape == 1):
-            c2 = c2 + (x3 - x0)
-        if wp.static(shape == 2):
-            c0 = ROOT2 * (x0 - x2)
-            c1 = ROOT2 * (x1 - x2)
-            c2 = 2.0 * c2
-        return c0, c1, c2
-
-    return columns
+def turns_of(shape: int) -> tuple[wp.Function, wp.Function]:
+    """B^T C and B C for the frame B of a leaf and a matrix C; the leaf's number is one that the compiler knows."""
+    columns = FRAMES[shape]
+    rows = [list(zip(*frame, strict=True)) for frame in columns]
+    return _products(columns), _products(rows)
 
 
-@functools.cache
-def leaf_forces_of(shape: int) -> wp.Function:
-    """Forces on the four nodes from the columns of the stress times V / h."""
+def _products(matrices: Sequence[Sequence[Sequence[float]]]) -> wp.Function:
+    """What multiplies by one of these matrices, zeros left out."""
+    cases = ""
+    for number, matrix in enumerate(matrices):
+        entries = []
+        for row, j in itertools.product(matrix, range(3)):
+            terms = [f"{weight!r}f * c.data[{k}][{j}]" for k, weight in enumerate(row) if abs(weight) > 1e-9]
+            entries.append(" + ".join(terms))
+        cases += f"case {number}: return wp::mat_t<3, 3, wp::float32>({', '.join(entries)});\n"
 
-    @wp.func
-    def leaf_forces(p0: wp.vec3, p1: wp.vec3, p2: wp.vec3):
-        f0 = p0
-        f1 = p1 - p0
-        f2 = p2 - p1
-        f3 = -p2
-        if wp.static(shape == 1):
-            f0 = p0 + p2
-            f3 = -2.0 * p2
-        if wp.static(shape == 2):
-            f0 = -ROOT2 * p0
-            f1 = -ROOT2 * p1
-            f2 = ROOT2 * (p0 + p1) + 2.0 * p2
-            f3 = -2.0 * p2
-        return f0, f1, f2, f3
+    @wp.func_native(f"switch (leaf) {{\n{cases}default: return c;\n}}")
+    def product(leaf: int, c: wp.mat33) -> wp.mat33: ...
 
-    return leaf_forces
+    return product
 
 
 @wp.func
@@ -81,16 +55,16 @@ def leaf_stress(g: wp.mat33, q: wp.mat33, mu: float, lam: float):
 
 
 @functools.cache
-def turned_forces_of(shape: int, uniform: bool, chosen: range) -> wp.Function:
-    """Forces of the chosen leaves, each with its own rotation, and which are left out: in the subtree's Maubach frame,
-    or in one that is turned along with the subtree.
+def turned_forces_of(shape: int, uniform: bool, chosen: range, stress: wp.Function = stretch_stress) -> wp.Function:
+    """Forces of the chosen leaves, each by itself, and which are left out: in the subtree's Maubach frame, or in one
+    that is turned along with the subtree.
 
-    ``y`` are ten displacements there, in edge lengths h of a leaf; leaves' frames B are tables.
+    ``y`` are ten displacements there, in edge lengths h of a leaf; leaves' frames B are tables. ``stress`` is a law of
+    the displacement gradient and Lamé's parameters, and says whether it may be trusted.
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
     leaves, frames = LEAVES[shape], FRAMES[shape]
-    rows = [[first_of(axis) for axis in frame] for frame in frames]
-    backs = [[first_of([frame[i][axis] for i in range(3)]) for axis in range(3)] for frame in frames]
+    into_leaf, out_of_leaf = turns_of(shape)
     begin, end = chosen.start, chosen.stop
     volume = VOLUME[shape]
 
@@ -113,28 +87,10 @@ def turned_forces_of(shape: int, uniform: bool, chosen: range) -> wp.Function:
                 y[wp.static(leaves[leaf][2])],
                 y[wp.static(leaves[leaf][3])],
             )
-            c = wp.matrix_from_cols(b0, b1, b2)
-            # The displacement gradient in the leaf's frame: B^T C, zeros of B left out.
-            w = wp.mat33()
-            for i in range(3):
-                for axis in range(3):
-                    if wp.static(axis == rows[leaf][i]):
-                        for j in range(3):
-                            w[i, j] = wp.static(frames[leaf][i][axis]) * c[axis, j]
-                    elif wp.static(abs(frames[leaf][i][axis]) > 1e-9):
-                        for j in range(3):
-                            w[i, j] += wp.static(frames[leaf][i][axis]) * c[axis, j]
-            sigma, trusted = stretch_stress(w, m, k)
+            # Of the displacement gradient in the leaf's frame.
+            sigma, trusted = stress(into_leaf(leaf, wp.matrix_from_cols(b0, b1, b2)), m, k)
             if trusted:
-                p = wp.mat33()
-                for axis in range(3):
-                    for i in range(3):
-                        if wp.static(i == backs[leaf][axis]):
-                            for j in range(3):
-                                p[axis, j] = wp.static(frames[leaf][i][axis]) * sigma[i, j]
-                        elif wp.static(abs(frames[leaf][i][axis]) > 1e-9):
-                            for j in range(3):
-                                p[axis, j] += wp.static(frames[leaf][i][axis]) * sigma[i, j]
+                p = out_of_leaf(leaf, sigma)
                 f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
                 g[wp.static(leaves[leaf][0])] += f0
                 g[wp.static(leaves[leaf][1])] += f1
@@ -236,6 +192,7 @@ def shared_forces(
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
     leaves, frames, at = LEAVES[shape], FRAMES[shape], POSITIONS[shape]
+    into_leaf, out_of_leaf = turns_of(shape)
     turned_back = turned_back_of(shape)
     turned_forces = turned_forces_of(shape, uniform, chosen)
     adaptive = tolerance is not None
@@ -297,15 +254,10 @@ def shared_forces(
                 y[wp.static(leaves[leaf][2])],
                 y[wp.static(leaves[leaf][3])],
             )
-            c = wp.matrix_from_cols(b0, b1, b2)
-            # B^T C in the leaf's frame B, zeros of B left out.
-            e = wp.mat33()
-            for i in range(3):
-                for j in range(3):
-                    for axis in range(3):
-                        if wp.static(abs(frames[leaf][i][axis]) > 1e-9):
-                            e[i, j] += wp.static(frames[leaf][i][axis]) * c[axis, j]
+            e = into_leaf(leaf, wp.matrix_from_cols(b0, b1, b2))
             if wp.static(adaptive):
+                # Sums with zero: with plain copies the compiler keeps more leaves at once than there are registers for.
+                e = wp.mat33() + e
                 axial = wp.vec3(e[0, 1] - e[1, 0], e[0, 2] - e[2, 0], e[1, 2] - e[2, 1])
                 # Of the Frobenius norm, |E|^2 = |sym E|^2 + |skew E|^2.
                 skew = 0.5 * wp.dot(axial, axial)
@@ -326,12 +278,7 @@ def shared_forces(
                 s12,
                 double_mu * e[2, 2] + pressure,
             )
-            p = wp.mat33()
-            for axis in range(3):
-                for j in range(3):
-                    for i in range(3):
-                        if wp.static(abs(frames[leaf][i][axis]) > 1e-9):
-                            p[axis, j] += wp.static(frames[leaf][i][axis]) * sigma[i, j]
+            p = out_of_leaf(leaf, sigma)
             f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
             g[wp.static(leaves[leaf][0])] += f0
             g[wp.static(leaves[leaf][1])] += f1

@@ -8,31 +8,8 @@ import functools
 from warp_corot.kernels.elements.elements import FRAME_SHIFT, LEVEL_MASK, MIRROR_BIT
 from warp_corot.kernels.elements.lanes import constants, native
 from warp_corot.kernels.elements.stiffness import Coefficients
-from warp_corot.kernels.tables.shapes import SQRT2, VOLUME
+from warp_corot.kernels.tables.shapes import VOLUME, column_sums, force_sums
 from warp_corot.kernels.tables.subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS, stiffness
-
-#: Columns of the displacement gradient from displacements x0 to x3 over the edge length, by type.
-COLUMNS = (
-    ("minus(x1, x0)", "minus(x2, x1)", "minus(x3, x2)"),
-    ("minus(x1, x0)", "minus(x2, x1)", "plus(minus(x3, x2), minus(x3, x0))"),
-    (
-        f"scaled(spread({SQRT2!r}f), minus(x0, x2))",
-        f"scaled(spread({SQRT2!r}f), minus(x1, x2))",
-        "scaled(spread(2.0f), minus(x3, x2))",
-    ),
-)
-
-#: Forces on the four nodes from the columns p of P V / h, by type.
-FORCES = (
-    ("p[0]", "minus(p[1], p[0])", "minus(p[2], p[1])", "minus(nothing, p[2])"),
-    ("plus(p[0], p[2])", "minus(p[1], p[0])", "minus(p[2], p[1])", "scaled(spread(-2.0f), p[2])"),
-    (
-        f"scaled(spread({-SQRT2!r}f), p[0])",
-        f"scaled(spread({-SQRT2!r}f), p[1])",
-        f"plus(scaled(spread({SQRT2!r}f), plus(p[0], p[1])), scaled(spread(2.0f), p[2]))",
-        "scaled(spread(-2.0f), p[2])",
-    ),
-)
 
 
 @functools.cache
@@ -44,14 +21,16 @@ def begin(shape: int) -> str:
     which three are the frame of each leaf, by ``axes_of``; and the functions ``columns`` and ``add_leaf`` of ten
     displacements or forces and four of their numbers.
     """
-    c, f = COLUMNS[shape], FORCES[shape]
+    columns = "".join(f" a[{c}] = {expression};" for c, expression in enumerate(column_sums(shape)))
+    forces = "".join(f" add(g, n[{n}], {expression});" for n, expression in enumerate(force_sums(shape)))
     functions = f"""
 const auto columns = [&](const lanes8* x, const int* n, triple* a) {{
     const triple x0 = get(x, n[0]), x1 = get(x, n[1]), x2 = get(x, n[2]), x3 = get(x, n[3]);
-    a[0] = {c[0]}, a[1] = {c[1]}, a[2] = {c[2]};
+   {columns}
 }};
 const auto add_leaf = [&](lanes8* g, const int* n, const triple* p) {{
-    add(g, n[0], {f[0]}); add(g, n[1], {f[1]}); add(g, n[2], {f[2]}); add(g, n[3], {f[3]});
+    const triple &p0 = p[0], &p1 = p[1], &p2 = p[2];
+   {forces}
 }};
 """
     names = {"FRAME_SHIFT": FRAME_SHIFT, "MIRROR_BIT": MIRROR_BIT, "LEVEL_MASK": LEVEL_MASK}
@@ -64,7 +43,7 @@ def product(shape: int) -> str:
     """``multiply``: g = -h^2 K y with the stiffness of a whole subtree, straight-line code without its zeros."""
     entries = Coefficients(*stiffness(shape))
     values = "".join(
-        f"    const float c{k} = {a!r}f * lam.data[0] + {b!r}f * mu.data[0];\n"
+        f"    const float c{k} = {a!r}f * isotropic.lam.data[0] + {b!r}f * isotropic.mu.data[0];\n"
         for k, (a, b) in enumerate(entries.distinct)
     )
     rows = ""
@@ -104,7 +83,7 @@ def near_test(shape: int) -> str:
         near &= (skew <= bound) & (whole - skew <= 0.25f);
     }}"""
     return f"""const auto are_near = [&](const lanes8* y) {{
-    const lanes8 bound = spread(tolerance * tolerance);
+    const lanes8 bound = spread(material.tolerance * material.tolerance);
     masks8 near = every;{code}
     return near;
 }};

@@ -9,7 +9,7 @@ the bytes of eight subtrees at a time, nearly always all zero, and goes through 
 import warp as wp
 
 from warp_corot.kernels.corotated.algebraic import FLAT, stretch_stress, turned_stress
-from warp_corot.kernels.elements.constitutive import corotated_strain, hooke
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, rotated_stress
 from warp_corot.kernels.elements.elements import ForestElements, frame, local_gradient, nodal_forces, scatter_stress
 from warp_corot.kernels.elements.merging import add_four_forces
 from warp_corot.kernels.math.matrices import identity3
@@ -26,9 +26,6 @@ WARP = 32
 #: Lists that a body's thread blocks take in turn.
 LISTS = 32
 COUNT_STRIDE = 32
-EVALUATIONS = COUNT_STRIDE * LISTS + 1
-#: How seldom subtrees of which most leaves were left out are tried again.
-TRIED_EVERY = 16
 
 
 # More rounds would cost more arithmetic than they save sums.
@@ -42,25 +39,10 @@ class LeftOut:
     One list would not do: additions to one number, each of which returns what was there, take 5 ns each.
     """
 
-    # Entries of each list, a cache line apart, then blocks that are done, all zero between evaluations; then how many
-    # evaluations have left out any.
+    # Entries of each list, a cache line apart, then blocks that are done; all zero between evaluations.
     counts: wp.array[wp.int32]  # [(LISTS + 1) COUNT_STRIDE]
     room: int  # of a list
     entries: wp.array[wp.vec2i]  # [LISTS room] where its first leaf (own rotations) or it itself stands, and the mask
-
-
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-    // Half of the leaves of half of the subtrees of a whole warp.
-    if (__activemask() != 0xffffffffu || __popc(__ballot_sync(0xffffffffu, __popc(mask) >= 4)) < 16) return false;
-    return (wp::index(lists.counts, {EVALUATIONS}) + s / {WARP}) % {TRIED_EVERY} != 0;
-#else
-    return false;
-#endif
-""")
-def is_hopeless(lists: LeftOut, s: int, mask: int) -> bool:
-    """Whether so many of a warp's leaves were left out before, by their masks, that all go on a list untried."""
-    ...
 
 
 @wp.func_native(f"""
@@ -135,10 +117,7 @@ def entry_count(lists: LeftOut, list: int):
         __threadfence();
         int* const counts = &wp::index(lists.counts, 0);
         if (atomicAdd(counts + {COUNT_STRIDE * LISTS}, 1) == blocks - 1)
-        {{
             for (int list = 0; list <= {LISTS}; ++list) counts[{COUNT_STRIDE} * list] = 0;
-            counts[{EVALUATIONS}] += 1;
-        }}
     }}
 #else
     for (int list = 0; list < {LISTS}; ++list) wp::index(lists.counts, {COUNT_STRIDE} * list) = 0;
@@ -157,54 +136,118 @@ def is_left_out(flags: wp.uint64, leaf: int):
 
 @wp.func
 def scatter_turned(
-    elements: ForestElements, t: int, r: wp.mat33, mu: float, lam: float, u: wp.array[wp.vec4], f: wp.array[wp.vec4]
+    elements: ForestElements,
+    t: int,
+    r: wp.mat33,
+    material: IsotropicMaterial,
+    u: wp.array[wp.vec4],
+    f: wp.array[wp.vec4],
 ):
-    """Add the forces of element t with r, the rotation of its F Q."""
-    strain = corotated_strain(local_gradient(elements, t, u), frame(elements, t), r)
-    scatter_stress(elements, t, r * hooke(strain, mu, lam), f)
+    """Add the forces of element t with r, a rotation from rest space."""
+    q = frame(elements, t)
+    m = material.mu[t * material.stride]
+    k = material.lam[t * material.stride]
+    scatter_stress(elements, t, rotated_stress(local_gradient(elements, t, u), q, r * q, m, k), f)
 
 
 @wp.func
-def own_stress(
-    elements: ForestElements,
-    t: int,
-    mu: wp.array[wp.float32],
-    lam: wp.array[wp.float32],
-    stride: int,
-    u: wp.array[wp.vec4],
-):
-    """First Piola-Kirchhoff stress times Q of element t with its own rotation, whatever its F."""
+def own_stress(elements: ForestElements, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4]):
+    """First Piola-Kirchhoff stress times Q of element t with its own rotation, whatever its F, and whether the subtree
+    kernels could have found it."""
     q = frame(elements, t)
     w = wp.transpose(q) * local_gradient(elements, t, u)
-    m = mu[t * stride]
-    k = lam[t * stride]
+    m = material.mu[t * material.stride]
+    k = material.lam[t * material.stride]
     p = wp.mat33()
     trusted = wp.determinant(identity3() + w) > FLAT
     if trusted:
         p, trusted = stretch_stress(w, m, k)
     if not trusted:
         p = turned_stress(identity3() + w, m, k)
-    return q * p
-
-
-@wp.func
-def scatter_own(
-    elements: ForestElements,
-    t: int,
-    mu: wp.array[wp.float32],
-    lam: wp.array[wp.float32],
-    stride: int,
-    u: wp.array[wp.vec4],
-    f: wp.array[wp.vec4],
-):
-    """Add the forces of element t with its own rotation."""
-    scatter_stress(elements, t, own_stress(elements, t, mu, lam, stride, u), f)
+    return q * p, trusted
 
 
 @wp.func
 def root_rotation(roots: ForestElements, s: int, u: wp.array[wp.vec4]):
     q = frame(roots, s)
     return robust_rotation(q + local_gradient(roots, s, u)) * wp.transpose(q)
+
+
+# --- in place -------------------------------------------------------------------------------------------------------
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    // Half of the leaves of half of the subtrees of a whole warp.
+    if (__activemask() != 0xffffffffu) return false;
+    return __popc(__ballot_sync(0xffffffffu, __popc(mask) >= {LEAVES // 2})) >= {WARP // 2};
+#else
+    return false;
+#endif
+""")
+def is_mostly_left_out(mask: int) -> bool:
+    """Whether most leaves of a warp were left out before, by their masks: then it takes its leaves one by one."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __shfl_sync(0xffffffffu, value, lane);
+#else
+    return value;
+#endif
+""")
+def of_lane(value: int, lane: int) -> int:
+    """The value that another thread of a whole warp has."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return static_cast<int>(__ballot_sync(0xffffffffu, flag));
+#else
+    return flag ? 1 : 0;
+#endif
+""")
+def flags_of_warp(flag: bool) -> int:
+    """A bit for each thread of a whole warp."""
+    ...
+
+
+@wp.func
+def scatter_one_by_one(
+    elements: ForestElements,
+    first: int,
+    lane: int,
+    material: IsotropicMaterial,
+    u: wp.array[wp.vec4],
+    f: wp.array[wp.vec4],
+):
+    """Add the forces of all leaves of a warp's subtrees, a thread a leaf at a time.
+
+    Args:
+        elements: All leaves.
+        first: First leaf of this thread's subtree.
+        lane: Place of the thread in its warp.
+        material, u: As in ``own_stress``.
+        f: Forces [N].
+
+    Returns:
+        The leaves of this thread's subtree that the subtree kernels would leave out, a bit each.
+    """
+    mask = int(0)
+    each = wp.static(WARP // LEAVES)
+    j = int(0)
+    while j < LEAVES:
+        t = of_lane(first, each * j + lane // LEAVES) + lane % LEAVES
+        p, trusted = own_stress(elements, t, material, u)
+        f0, f1, f2, f3 = nodal_forces(elements, t, p)
+        add_pairs(f, elements.targets[t], f0, f1, f2, f3)
+        flags = flags_of_warp(not trusted)
+        if lane // each == j:
+            mask = (flags >> (LEAVES * (lane % each))) & 255
+        j += 1
+    return mask
 
 
 # --- by a list ------------------------------------------------------------------------------------------------------
@@ -257,9 +300,7 @@ def repair_listed_own(
     # In
     threads: int,
     elements: ForestElements,
-    mu: wp.array[wp.float32],
-    lam: wp.array[wp.float32],
-    stride: int,
+    material: IsotropicMaterial,
     u: wp.array[wp.vec4],
     # In and out
     listed: LeftOut,
@@ -295,7 +336,7 @@ def repair_listed_own(
                 if k < total:
                     t = leaves_of_entries(listed, 0, 0, k)
                     targets = elements.targets[t]
-                    p = own_stress(elements, t, mu, lam, stride, u)
+                    p, _trusted = own_stress(elements, t, material, u)
                 f0, f1, f2, f3 = nodal_forces(elements, t, p)
                 add_pairs(f, targets, f0, f1, f2, f3)
                 k += lanes
@@ -311,9 +352,7 @@ def repair_listed_shared(
     first: wp.array[wp.int32],
     roots: ForestElements,
     elements: ForestElements,
-    mu: wp.array[wp.float32],
-    lam: wp.array[wp.float32],
-    stride: int,
+    material: IsotropicMaterial,
     u: wp.array[wp.vec4],
     # In and out
     listed: LeftOut,
@@ -331,8 +370,7 @@ def repair_listed_shared(
         while i < entry_count(listed, list) * LEAVES:
             s = listed.entries[listed.room * list + i // LEAVES][0]
             t = first[s] + i % LEAVES
-            r = root_rotation(roots, s, u) * frame(elements, t)
-            scatter_turned(elements, t, r, mu[t * stride], lam[t * stride], u, f)
+            scatter_turned(elements, t, root_rotation(roots, s, u), material, u, f)
             i += each_list
         list += at_a_time
     leave(listed, threads // LIST_BLOCK)
@@ -347,9 +385,7 @@ def repair_own(
     flagged: wp.array[wp.uint64],
     first: wp.array[wp.int32],
     elements: ForestElements,
-    mu: wp.array[wp.float32],
-    lam: wp.array[wp.float32],
-    stride: int,
+    material: IsotropicMaterial,
     u: wp.array[wp.vec4],
     # Out
     f: wp.array[wp.vec4],
@@ -363,7 +399,8 @@ def repair_own(
     while leaf < SUBTREES * LEAVES:
         if is_left_out(flags, leaf):
             t = first[SUBTREES * i + leaf // LEAVES] + leaf % LEAVES
-            scatter_own(elements, t, mu, lam, stride, u, f)
+            p, _trusted = own_stress(elements, t, material, u)
+            scatter_stress(elements, t, p, f)
         leaf += 1
 
 
@@ -374,9 +411,7 @@ def repair_shared(
     first: wp.array[wp.int32],
     roots: ForestElements,
     elements: ForestElements,
-    mu: wp.array[wp.float32],
-    lam: wp.array[wp.float32],
-    stride: int,
+    material: IsotropicMaterial,
     u: wp.array[wp.vec4],
     # Out
     f: wp.array[wp.vec4],
@@ -394,6 +429,6 @@ def repair_shared(
             leaf = int(0)
             while leaf < LEAVES:
                 t = first[s] + leaf
-                scatter_turned(elements, t, rotation * frame(elements, t), mu[t * stride], lam[t * stride], u, f)
+                scatter_turned(elements, t, rotation, material, u, f)
                 leaf += 1
         member += 1

@@ -15,11 +15,21 @@ import warp as wp
 
 SQRT2 = math.sqrt(2.0)
 
+#: Columns of the local displacement gradient times h, by type: a weight, and the differences of nodal values that it
+#: multiplies, each as (node, node taken off). All else about gradients and forces comes from this table.
+DIFFERENCES: tuple[tuple[tuple[float, tuple[tuple[int, int], ...]], ...], ...] = (
+    ((1.0, ((1, 0),)), (1.0, ((2, 1),)), (1.0, ((3, 2),))),
+    ((1.0, ((1, 0),)), (1.0, ((2, 1),)), (1.0, ((3, 2), (3, 0)))),
+    ((SQRT2, ((0, 2),)), (SQRT2, ((1, 2),)), (2.0, ((3, 2),))),
+)
+
 #: Frame columns by node: column c of the local gradient is sum_n GRADIENT[type][c][n] * x_n / h.
-GRADIENT: tuple[tuple[tuple[float, ...], ...], ...] = (
-    ((-1.0, 1.0, 0.0, 0.0), (0.0, -1.0, 1.0, 0.0), (0.0, 0.0, -1.0, 1.0)),
-    ((-1.0, 1.0, 0.0, 0.0), (0.0, -1.0, 1.0, 0.0), (-1.0, 0.0, -1.0, 2.0)),
-    ((SQRT2, 0.0, -SQRT2, 0.0), (0.0, SQRT2, -SQRT2, 0.0), (0.0, 0.0, -2.0, 2.0)),
+GRADIENT: tuple[tuple[tuple[float, ...], ...], ...] = tuple(
+    tuple(
+        tuple(weight * sum((n == node) - (n == other) for node, other in pairs) for n in range(4))
+        for weight, pairs in columns
+    )
+    for columns in DIFFERENCES
 )
 
 #: Rest volume over h^3.
@@ -80,3 +90,31 @@ def edge_stiffness(shape: int) -> tuple[list[list[float]], list[list[float]]]:
             ]
         )
     return first, second
+
+
+def _scaled(expression: str, weight: float) -> str:
+    return expression if weight == 1.0 else f"-({expression})" if weight == -1.0 else f"({expression}) * {weight!r}f"
+
+
+def column_sums(shape: int) -> list[str]:
+    """The columns of ``DIFFERENCES`` as expressions in C++, of vectors x0 to x3."""
+    return [_scaled(" + ".join(f"(x{i} - x{j})" for i, j in pairs), weight) for weight, pairs in DIFFERENCES[shape]]
+
+
+def force_sums(shape: int) -> list[str]:
+    """The forces on the four nodes, -V P grad N, as expressions in C++ of the columns p0 to p2 of P V / h."""
+    sums = []
+    for node in range(4):
+        by_weight: dict[float, list[tuple[bool, str]]] = {}
+        for c in range(3):
+            weight = -GRADIENT[shape][c][node]
+            if weight:
+                by_weight.setdefault(abs(weight), []).append((weight < 0, f"p{c}"))
+        terms = []
+        for weight, columns in by_weight.items():
+            sign = min(is_taken_off for is_taken_off, _ in columns)
+            added = [name for is_taken_off, name in columns if is_taken_off == sign]
+            taken_off = [f" - {name}" for is_taken_off, name in columns if is_taken_off != sign]
+            terms.append(_scaled(" + ".join(added) + "".join(taken_off), -weight if sign else weight))
+        sums.append(" + ".join(terms))
+    return sums
