@@ -1,0 +1,123 @@
+"""Nodes that a tool holds: each at its place in the tool's frame, rigidly or by a spring."""
+
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.stepping.integrate import by_vectors, symplectic_euler_velocity, vector_at
+from warp_corot.kernels.stepping.pace import DT, Pace, length_before
+
+from .law import SETTLING
+from .motion import Motions
+from .shapes import carried
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel(enable_backward=False)
+def take_hold(
+    # In
+    nodes: wp.array[wp.int32],
+    per_world: int,
+    o: int,
+    motions: Motions,
+    rest: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    # Out
+    places: wp.array[wp.vec3],
+):
+    """Where nodes are in the tool's frame."""
+    k = wp.tid()
+    i = nodes[k]
+    pose = motions.later[k / per_world, o]
+    x = load_node(rest, i) + load_node(u, i)
+    places[k] = wp.quat_rotate_inv(wp.transform_get_rotation(pose), x - wp.transform_get_translation(pose))
+
+
+@wp.kernel(enable_backward=False)
+def hold_in_tool(
+    # In
+    nodes: wp.array[wp.int32],
+    per_world: int,
+    o: int,
+    motions: Motions,
+    places: wp.array[wp.vec3],
+    stiffness: float,
+    damping: float,
+    gravity: wp.vec3,
+    inverse_mass: wp.array[wp.float32],
+    has_load: int,
+    load: wp.array[Any],
+    pace: Pace,
+    offset: int,
+    rest: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    v: wp.array[wp.vec4],
+    # In and out
+    f: wp.array[wp.vec4],
+    contact_forces: wp.array[wp.vec4],
+    account: wp.array2d[wp.float64],
+    # Out
+    forces: wp.array[wp.vec3],
+):
+    """What takes nodes along with the tool by the end of the step; or pulls them there by so many newtons a metre,
+    implicitly, if ``stiffness`` is positive."""
+    k = wp.tid()
+    i = nodes[k]
+    forces[k] = wp.vec3()
+    w = inverse_mass[i]
+    if w == 0.0:
+        return
+    world = k / per_world
+    dt = float(pace.seconds[DT])
+    before = dt
+    if offset == 0:
+        before = float(length_before(pace))
+    kick = 0.5 * (before + dt)
+    damped = 1.0 / (1.0 + dt * damping)
+    pull = load_node(f, i)
+    others = pull
+    if has_load != 0:
+        others += vector_at(load, i)
+    velocity = load_node(v, i)
+    d = dt * symplectic_euler_velocity(velocity, others, w, gravity, kick, damped)
+    yielding = dt * kick * w * damped
+    now = motions.now[world, o]
+    x = load_node(rest, i) + load_node(u, i)
+    way = carried(now, motions.later[world, o], x) - d
+    off = wp.transform_point(now, places[k]) - x
+    force = (way + SETTLING * off) / yielding
+    if stiffness > 0.0:
+        force = (stiffness / (1.0 + stiffness * yielding)) * (way + off)
+    forces[k] = force
+    store_node(f, i, pull + force)
+    store_node(contact_forces, i, load_node(contact_forces, i) + force)
+    work = wp.float64(wp.dot(force, 0.5 * (before * velocity + d + yielding * force)))
+    account[0, k] = account[0, k] + work
+    account[1, k] = account[1, k] + wp.abs(work)
+
+
+@wp.kernel(enable_backward=False)
+def sum_held(
+    # In
+    per_world: int,
+    o: int,
+    motions: Motions,
+    places: wp.array[wp.vec3],
+    forces: wp.array[wp.vec3],
+    # Out
+    wrenches: wp.array[wp.spatial_vector],
+):
+    """What the nodes do to the tool about its origin, in one order."""
+    world = wp.tid()
+    force = wp.vec3d()
+    torque = wp.vec3d()
+    turn = wp.transform_get_rotation(motions.later[world, o])
+    for k in range(world * per_world, (world + 1) * per_world):
+        force -= wp.vec3d(forces[k])
+        torque -= wp.vec3d(wp.cross(wp.quat_rotate(turn, places[k]), forces[k]))
+    wrenches[world] = wp.spatial_vector(wp.vec3(force), wp.vec3(torque))
+
+
+HOLD_IN_TOOL = by_vectors(hold_in_tool, "load")

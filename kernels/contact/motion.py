@@ -1,0 +1,200 @@
+"""What contact needs of a step before it is made: where nodes would go without it, and where obstacles go."""
+
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.stepping.integrate import by_vectors, symplectic_euler_velocity, vector_at
+from warp_corot.kernels.stepping.pace import DT, Pace, length_before, time_after
+
+wp.set_module_options({"enable_backward": False})
+
+#: How an obstacle moves: not at all, along keyframes, or towards a place at no more than some speed.
+FIXED, KEYED, SENT = (wp.constant(k) for k in range(3))
+
+
+@wp.struct
+class Surface:
+    """The surface nodes of all bodies in all worlds, a place each; places that are not in use have node -1."""
+
+    node: wp.array[wp.int32]  # [S] among the nodes of all worlds of its body
+    world: wp.array[wp.int32]  # [S]
+    rest: wp.array[wp.vec3]  # [S] where it is at rest [m]
+    x: wp.array[wp.vec3]  # [S] where it is [m]
+    d: wp.array[wp.vec3]  # [S] how far it goes in this step [m]
+    yielding: wp.array[wp.float32]  # [S] how much farther for each newton [m/N]; zero for held nodes
+    f: wp.array[wp.vec3]  # [S] forces of contact [N]
+
+
+@wp.struct
+class Motions:
+    """How obstacles move, [O], or [W, O] for each world."""
+
+    mode: wp.array[wp.int32]
+    speed: wp.array[wp.float32]  # SENT: at most [m/s]
+    reach: wp.array[wp.float32]  # how far its points are from its origin [m], for turning
+    first: wp.array[wp.int32]  # KEYED: the first key
+    keys: wp.array[wp.int32]  # how many
+    times: wp.array[wp.float64]
+    poses: wp.array[wp.transform]
+    target: wp.array2d[wp.transform]
+    now: wp.array2d[wp.transform]
+    later: wp.array2d[wp.transform]  # at the end of the step
+
+
+@wp.kernel(enable_backward=False)
+def predict_motion(
+    # In
+    start: int,
+    damping: float,
+    gravity: wp.vec3,
+    inverse_mass: wp.array[wp.float32],
+    has_load: int,
+    load: wp.array[Any],
+    pace: Pace,
+    offset: int,
+    rest: wp.array[wp.vec4],
+    f: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    v: wp.array[wp.vec4],
+    # Out
+    surface: Surface,
+):
+    """Where a body's surface nodes are, and how far they go in this step without contact; as the step itself has it."""
+    s = start + wp.tid()
+    i = surface.node[s]
+    surface.f[s] = wp.vec3()
+    if i < 0:
+        surface.yielding[s] = 0.0
+        return
+    dt = float(pace.seconds[DT])
+    kick = dt
+    if offset == 0:
+        kick = 0.5 * (float(length_before(pace)) + dt)
+    damped = 1.0 / (1.0 + dt * damping)
+    force = load_node(f, i)
+    if has_load != 0:
+        force += vector_at(load, i)
+    w = inverse_mass[i]
+    velocity = load_node(v, i)
+    if w > 0.0:
+        velocity = symplectic_euler_velocity(velocity, force, w, gravity, kick, damped)
+    home = load_node(rest, i)
+    surface.rest[s] = home
+    surface.x[s] = home + load_node(u, i)
+    surface.d[s] = dt * velocity
+    surface.yielding[s] = dt * kick * w * damped
+
+
+@wp.kernel(enable_backward=False)
+def add_contact_forces(
+    # In
+    start: int,
+    surface: Surface,
+    pace: Pace,
+    offset: int,
+    v: wp.array[wp.vec4],
+    # In and out
+    f: wp.array[wp.vec4],
+    account: wp.array2d[wp.float64],
+    # Out
+    contact_forces: wp.array[wp.vec4],
+):
+    """Add what was found to a body's forces, and to its account the work: of each force along half of the motion before
+    and half of the motion after it, as symplectic Euler keeps energy."""
+    k = wp.tid()
+    s = start + k
+    i = surface.node[s]
+    if i < 0:
+        return
+    force = surface.f[s]
+    store_node(contact_forces, i, force)
+    if wp.dot(force, force) == 0.0:
+        return
+    before = float(pace.seconds[DT])
+    if offset == 0:
+        before = float(length_before(pace))
+    store_node(f, i, load_node(f, i) + force)
+    moved = 0.5 * (before * load_node(v, i) + surface.d[s])
+    work = wp.float64(wp.dot(force, moved))
+    account[0, k] = account[0, k] + work
+    account[1, k] = account[1, k] + wp.abs(work)
+
+
+@wp.func
+def between(a: wp.transform, b: wp.transform, share: float):
+    """From one pose to another on a straight line, turning evenly by the shorter way."""
+    p = wp.transform_get_translation(a)
+    q = wp.transform_get_rotation(a)
+    r = wp.transform_get_rotation(b)
+    if wp.dot(q, r) < 0.0:
+        r = -r
+    place = p + share * (wp.transform_get_translation(b) - p)
+    return wp.transformation(place, wp.normalize(wp.quat_slerp(q, r, share)))
+
+
+@wp.func
+def sent(now: wp.transform, target: wp.transform, most: float, reach: float):
+    """Towards a place, no point of the obstacle by more than ``most`` [m]."""
+    far = wp.length(wp.transform_get_translation(target) - wp.transform_get_translation(now))
+    turn = wp.quat_inverse(wp.transform_get_rotation(now)) * wp.transform_get_rotation(target)
+    sine = wp.length(wp.vec3(turn[0], turn[1], turn[2]))
+    far += reach * 2.0 * wp.atan2(sine, wp.abs(turn[3]))
+    if far <= most:
+        return target
+    return between(now, target, most / far)
+
+
+@wp.kernel(enable_backward=False)
+def move_obstacles(motions: Motions, pace: Pace, world_starts: wp.array[wp.float64], offset: int):
+    """The pose of every obstacle now is the one that the last step has ended with; find that of this step."""
+    world, o = wp.tid()
+    now = motions.later[world, o]
+    motions.now[world, o] = now
+    mode = motions.mode[o]
+    if mode == KEYED:
+        t = time_after(pace, offset + 1) - world_starts[world]
+        first = motions.first[o]
+        last = first + motions.keys[o] - 1
+        key = first
+        while key < last - 1 and motions.times[key + 1] <= t:
+            key += 1
+        share = (t - motions.times[key]) / (motions.times[key + 1] - motions.times[key])
+        share = wp.clamp(share, wp.float64(0.0), wp.float64(1.0))
+        motions.target[world, o] = between(motions.poses[key], motions.poses[key + 1], float(share))
+    if mode != FIXED:
+        most = motions.speed[o] * float(pace.seconds[DT])
+        motions.later[world, o] = sent(now, motions.target[world, o], most, motions.reach[o])
+
+
+@wp.kernel(enable_backward=False)
+def take_targets(given: wp.array[wp.transform], o: int, target: wp.array2d[wp.transform]):
+    """Where somebody wants a tool to be: in each world, or in all alike."""
+    world = wp.tid()
+    target[world, o] = given[wp.min(world, given.shape[0] - 1)]
+
+
+@wp.kernel(enable_backward=False)
+def reset_obstacles(chosen: wp.array[wp.int32], initial: wp.array2d[wp.transform], motions: Motions):
+    """Put obstacles back to where they were first, in the worlds that are reset."""
+    world, o = wp.tid()
+    if chosen[world] != 0:
+        motions.now[world, o] = initial[world, o]
+        motions.later[world, o] = initial[world, o]
+        motions.target[world, o] = initial[world, o]
+
+
+@wp.kernel(enable_backward=False)
+def measure_rates(
+    start: int, node: wp.array[wp.int32], v: wp.array[wp.vec4], thinnest: float, rates: wp.array[wp.float32]
+):
+    """How often in a second the fastest node passes the thinnest obstacle [1/s]."""
+    i = node[start + wp.tid()]
+    if i >= 0:
+        rate = wp.length(load_node(v, i)) / thinnest
+        if rate > rates[1]:
+            wp.atomic_max(rates, 1, rate)
+
+
+PREDICT_MOTION = by_vectors(predict_motion, "load")

@@ -1,0 +1,25 @@
+"""How far points are from obstacles, before anything has moved."""
+
+import warp as wp
+
+from .motion import Motions
+from .shapes import Shapes, distance_to
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel(enable_backward=False)
+def find_gaps(
+    # In
+    shapes: Shapes,
+    motions: Motions,
+    points: wp.array[wp.vec3],
+    most: float,
+    # Out
+    gaps: wp.array2d[wp.float32],
+):
+    """Distances [O, n] of points from the obstacles of the first world, negative inside; some that is more beyond
+    ``most`` [m]."""
+    o, i = wp.tid()
+    gap, _normal = distance_to(shapes, o, motions.later[0, o], points[i], most)
+    gaps[o, i] = gap

@@ -1,0 +1,151 @@
+"""What users read of contact: wrenches on obstacles, and pressure on the bodies' triangles."""
+
+import warp as wp
+
+from warp_corot.kernels.stepping.balance import sum_of_lanes
+
+from .motion import Motions, Surface
+from .shapes import Shapes, distance_to
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel(enable_backward=False)
+def sum_wrenches(
+    # In
+    start: int,
+    count: int,
+    lanes: int,
+    threads: int,
+    surface: Surface,
+    motions: Motions,
+    forces: wp.array2d[wp.vec3],
+    # In and out
+    parts: wp.array3d[wp.spatial_vectord],
+):
+    """Add what a body's nodes do to obstacles, in one order: [O, W, parts] of ``lanes`` threads each.
+
+    Args:
+        count: Places of the body in each world, from ``start`` on.
+    """
+    o, world, thread = wp.tid()
+    origin = wp.transform_get_translation(motions.later[world, o])
+    sums = wp.spatial_vectord()
+    k = thread
+    while k < count:
+        s = start + world * count + k
+        force = forces[o, s]
+        if wp.dot(force, force) > 0.0:
+            torque = wp.cross(surface.x[s] + surface.d[s] - origin, force)
+            for axis in range(3):
+                sums[axis] = sums[axis] - wp.float64(force[axis])
+                sums[3 + axis] = sums[3 + axis] - wp.float64(torque[axis])
+        k += threads
+    for axis in range(6):
+        sums[axis] = sum_of_lanes(sums[axis])
+    if thread % lanes == 0:
+        parts[o, world, thread / lanes] = parts[o, world, thread / lanes] + sums
+
+
+@wp.kernel(enable_backward=False)
+def fold_wrenches(parts: wp.array3d[wp.spatial_vectord], wrenches: wp.array2d[wp.spatial_vector]):
+    """Add the parts up, which are zero then."""
+    o, world = wp.tid()
+    sums = wp.spatial_vectord()
+    for k in range(parts.shape[2]):
+        sums += parts[o, world, k]
+        parts[o, world, k] = wp.spatial_vectord()
+    wrench = wp.spatial_vector()
+    for axis in range(6):
+        wrench[axis] = float(sums[axis])
+    wrenches[o, world] = wrench
+
+
+@wp.func
+def area_vector(surface: Surface, corners: wp.vec3i):
+    """Half the cross product of two edges: outwards, as long as the area [m^2]."""
+    a = surface.x[corners[0]]
+    return 0.5 * wp.cross(surface.x[corners[1]] - a, surface.x[corners[2]] - a)
+
+
+@wp.kernel(enable_backward=False)
+def node_pressures(
+    # In
+    surface: Surface,
+    triangles: wp.array[wp.vec3i],
+    corner_starts: wp.array[wp.int32],
+    corners: wp.array[wp.int32],
+    # Out
+    pressures: wp.array[wp.vec3],
+):
+    """The force into the body at each node over a third of the area around it that it pushes on [Pa], along the mean
+    normal of that area."""
+    s = wp.tid()
+    pressures[s] = wp.vec3()
+    force = surface.f[s]
+    if wp.dot(force, force) == 0.0:
+        return
+    outward = wp.vec3()
+    for k in range(corner_starts[s], corner_starts[s + 1]):
+        own = area_vector(surface, triangles[corners[k] / 3])
+        outward += wp.max(-wp.dot(wp.normalize(own), force), 0.0) * own
+    outward = wp.normalize(outward)
+    area = float(0.0)
+    for k in range(corner_starts[s], corner_starts[s + 1]):
+        own = area_vector(surface, triangles[corners[k] / 3])
+        facing = wp.max(wp.dot(wp.normalize(own), outward), 0.0)
+        area += wp.length(own) * facing * facing / 3.0
+    if area > 0.0:
+        pressures[s] = (wp.max(-wp.dot(force, outward), 0.0) / area) * outward
+
+
+@wp.kernel(enable_backward=False)
+def triangle_pressures(
+    first: int,
+    surface: Surface,
+    triangles: wp.array[wp.vec3i],
+    pressures: wp.array[wp.vec3],
+    found: wp.array[wp.float32],
+):
+    """The mean over each triangle of a body, so that pressure times area adds up to the normal forces."""
+    t = wp.tid()
+    c = triangles[first + t]
+    pressure = float(0.0)
+    if c[0] >= 0:
+        normal = wp.normalize(area_vector(surface, c))
+        for k in range(3):
+            pressure += wp.max(wp.dot(pressures[c[k]], normal), 0.0) / 3.0
+    found[t] = pressure
+
+
+@wp.kernel(enable_backward=False)
+def describe_touches(
+    # In
+    shapes: Shapes,
+    motions: Motions,
+    surface: Surface,
+    forces: wp.array2d[wp.vec3],
+    # Out
+    gaps: wp.array2d[wp.float32],
+    normals: wp.array2d[wp.vec3],
+):
+    """Gap and normal of the nodes that obstacles push, at the beginning of the last step."""
+    o, s = wp.tid()
+    force = forces[o, s]
+    if wp.dot(force, force) > 0.0:
+        gap, n = distance_to(shapes, o, motions.now[surface.world[s], o], surface.x[s], 1.0)
+        gaps[o, s] = gap
+        normals[o, s] = n
+
+
+@wp.kernel(enable_backward=False)
+def find_depths(shapes: Shapes, motions: Motions, surface: Surface, depths: wp.array[wp.float32]):
+    """How deep each node is inside obstacles [m]; zero outside."""
+    s = wp.tid()
+    if surface.node[s] < 0 or surface.yielding[s] == 0.0:
+        return
+    deepest = float(0.0)
+    for o in range(shapes.kind.shape[0]):
+        gap, _n = distance_to(shapes, o, motions.later[surface.world[s], o], surface.x[s], 1.0e-3)
+        deepest = wp.max(deepest, -gap)
+    depths[s] = deepest

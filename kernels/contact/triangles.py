@@ -1,0 +1,235 @@
+"""Obstacles against the edges and the insides of triangles, where no node is: a needle between the nodes.
+
+What is left after nodes have been kept out is found for all triangles at once, in a few rounds. Contacts that share
+nodes share these: each takes so much of a node as its share there is of all contacts' shares. Then the rounds converge
+and add no energy, however many contacts there are (mass splitting; the bound is the sum of each row of J M^-1 J^T).
+"""
+
+import warp as wp
+
+from warp_corot.kernels.stepping.pace import DT, Pace
+
+from .closest import deepest_on_triangle, on_triangle, point_of, segment_to_triangle
+from .law import Law, held_back, least_motion
+from .motion import Motions, Surface
+from .shapes import CAPSULE, GROUND, SPHERE, Shapes, carried, distance_to
+from .vertices import across
+
+wp.set_module_options({"enable_backward": False})
+
+#: A point with so large a share of one corner is that corner, which is looked after.
+CORNER = wp.constant(0.999)
+#: Share of the last step's force from which rounds begin: with more, contacts that share nodes chatter; with less,
+#: they give way a little.
+WARMTH = wp.constant(0.5)
+
+
+@wp.struct
+class Touches:
+    """Obstacles at triangles, [O, T]."""
+
+    shares: wp.array2d[wp.vec3]  # of the corners in the point that is touched; zero where nothing is near
+    normal: wp.array2d[wp.vec3]  # from the obstacle to the triangle
+    gap: wp.array2d[wp.float32]
+    moved: wp.array2d[wp.vec3]  # how far the obstacle's point goes in this step [m]
+    acts: wp.array2d[wp.int32]
+    force: wp.array2d[wp.vec3]  # on the triangle [N]
+    more: wp.array2d[wp.vec3]  # what was added to it in this round
+
+
+@wp.func
+def nearest(shapes: Shapes, o: int, pose: wp.transform, most: float, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """Shares of the corners in the closest point, the gap there, and the way out of the obstacle."""
+    kind = shapes.kind[o]
+    size = shapes.size[o]
+    centre = wp.transform_get_translation(pose)
+    if kind == SPHERE or kind == CAPSULE:
+        w = wp.vec3()
+        if kind == CAPSULE:
+            half = wp.quat_rotate(wp.transform_get_rotation(pose), wp.vec3(0.0, 0.0, size[1]))
+            along, w = segment_to_triangle(centre - half, centre + half, a, b, c)
+            centre = centre + (2.0 * along - 1.0) * half
+        else:
+            w = on_triangle(centre, a, b, c)
+        d = point_of(w, a, b, c) - centre
+        length = wp.length(d)
+        if length > 1.0e-4 * size[0]:
+            return w, length - size[0], d / length
+        # The axis goes through: the obstacle came from outside.
+        return w, -size[0], -wp.normalize(wp.cross(b - a, c - a))
+    w = deepest_on_triangle(shapes, o, pose, most, a, b, c)
+    gap, n = distance_to(shapes, o, pose, point_of(w, a, b, c), most)
+    return w, gap, n
+
+
+@wp.kernel(enable_backward=False)
+def find_touches(
+    # In
+    shapes: Shapes,
+    motions: Motions,
+    law: Law,
+    surface: Surface,
+    triangles: wp.array[wp.vec3i],
+    # In and out
+    touches: Touches,
+):
+    """Where obstacles come close to triangles but not to their corners."""
+    o, t = wp.tid()
+    was = touches.force[o, t]
+    side = touches.normal[o, t]
+    touches.shares[o, t] = wp.vec3()
+    touches.force[o, t] = wp.vec3()
+    touches.acts[o, t] = 0
+    corners = triangles[t]
+    if shapes.kind[o] == GROUND or corners[0] < 0:
+        return
+    pose = motions.now[surface.world[corners[0]], o]
+    later = motions.later[surface.world[corners[0]], o]
+    a = surface.x[corners[0]]
+    b = surface.x[corners[1]]
+    c = surface.x[corners[2]]
+    middle = (a + b + c) / 3.0
+    size = wp.max(wp.length(a - middle), wp.max(wp.length(b - middle), wp.length(c - middle)))
+    far = wp.max(
+        wp.length(surface.d[corners[0]]), wp.max(wp.length(surface.d[corners[1]]), wp.length(surface.d[corners[2]]))
+    )
+    far += wp.length(carried(pose, later, middle)) + law.tolerance
+    distance, _away = distance_to(shapes, o, pose, middle, size + far)
+    if distance > size + far:
+        return
+    w, gap, n = nearest(shapes, o, pose, size + far, a, b, c)
+    if wp.dot(was, was) > 0.0 and wp.dot(n, side) < 0.0 and shapes.kind[o] == CAPSULE:
+        # The axis has come through since the last step.
+        n = -n
+        gap = -2.0 * shapes.size[o][0] - gap
+    if gap > far or wp.max(w) > CORNER:
+        return
+    touches.shares[o, t] = w
+    touches.normal[o, t] = n
+    touches.gap[o, t] = gap
+    touches.moved[o, t] = carried(pose, later, point_of(w, a, b, c))
+    # Few rounds begin where the last step has ended: what lasts is found over some steps.
+    push = WARMTH * wp.max(wp.dot(was, n), 0.0)
+    if push > 0.0:
+        touches.acts[o, t] = 1
+        force = push * n + held_back(across(was, n), push, shapes.friction[o])
+        touches.force[o, t] = force
+        touches.more[o, t] = force
+
+
+@wp.func
+def approach(touches: Touches, o: int, t: int, surface: Surface, corners: wp.vec3i):
+    """How far the triangle's point moves from the obstacle in this step [m]."""
+    w = touches.shares[o, t]
+    d = w[0] * surface.d[corners[0]] + w[1] * surface.d[corners[1]] + w[2] * surface.d[corners[2]]
+    return d - touches.moved[o, t]
+
+
+@wp.kernel(enable_backward=False)
+def judge_touches(law: Law, pace: Pace, surface: Surface, triangles: wp.array[wp.vec3i], touches: Touches):
+    """Which of them act."""
+    o, t = wp.tid()
+    w = touches.shares[o, t]
+    acts = int(0)
+    if w[0] + w[1] + w[2] > 0.0:
+        d = approach(touches, o, t, surface, triangles[t])
+        n = touches.normal[o, t]
+        wanted = least_motion(touches.gap[o, t], law, float(pace.seconds[DT])) - wp.dot(d, n)
+        if wanted > 0.0 or wp.dot(touches.force[o, t], n) > 0.0:
+            acts = 1
+    touches.acts[o, t] = acts
+
+
+@wp.kernel(enable_backward=False)
+def crowd_nodes(
+    corner_starts: wp.array[wp.int32], corners: wp.array[wp.int32], touches: Touches, crowd: wp.array[wp.float32]
+):
+    """The shares of all contacts that act at each node."""
+    s = wp.tid()
+    total = float(0.0)
+    for k in range(corner_starts[s], corner_starts[s + 1]):
+        t = corners[k] / 3
+        corner = corners[k] % 3
+        for o in range(touches.acts.shape[0]):
+            if touches.acts[o, t] != 0:
+                total += touches.shares[o, t][corner]
+    crowd[s] = total
+
+
+@wp.kernel(enable_backward=False)
+def solve_touches(
+    # In
+    shapes: Shapes,
+    law: Law,
+    pace: Pace,
+    surface: Surface,
+    triangles: wp.array[wp.vec3i],
+    crowd: wp.array[wp.float32],
+    # In and out
+    touches: Touches,
+):
+    """Correct the force of each that acts."""
+    o, t = wp.tid()
+    if touches.acts[o, t] == 0:
+        return
+    corners = triangles[t]
+    w = touches.shares[o, t]
+    yielding = float(0.0)
+    for k in range(3):
+        s = corners[k]
+        yielding += w[k] * crowd[s] * surface.yielding[s]
+    before = touches.force[o, t]
+    touches.more[o, t] = wp.vec3()
+    if yielding <= 0.0:
+        return
+    n = touches.normal[o, t]
+    d = approach(touches, o, t, surface, corners)
+    wanted = least_motion(touches.gap[o, t], law, float(pace.seconds[DT])) - wp.dot(d, n)
+    normal_force = wp.max(wp.dot(before, n) + wanted / yielding, 0.0)
+    sideways = held_back(across(before, n) - across(d, n) / yielding, normal_force, shapes.friction[o])
+    force = normal_force * n + sideways
+    touches.force[o, t] = force
+    touches.more[o, t] = force - before
+
+
+@wp.kernel(enable_backward=False)
+def apply_touches(
+    # In
+    corner_starts: wp.array[wp.int32],
+    corners: wp.array[wp.int32],
+    touches: Touches,
+    # In and out
+    surface: Surface,
+):
+    """Give each node its share of what was added, in one order."""
+    s = wp.tid()
+    total = wp.vec3()
+    for k in range(corner_starts[s], corner_starts[s + 1]):
+        t = corners[k] / 3
+        corner = corners[k] % 3
+        for o in range(touches.acts.shape[0]):
+            if touches.acts[o, t] != 0:
+                total += touches.shares[o, t][corner] * touches.more[o, t]
+    if wp.dot(total, total) > 0.0:
+        surface.f[s] = surface.f[s] + total
+        surface.d[s] = surface.d[s] + surface.yielding[s] * total
+
+
+@wp.kernel(enable_backward=False)
+def share_touches(
+    # In
+    corner_starts: wp.array[wp.int32],
+    corners: wp.array[wp.int32],
+    touches: Touches,
+    forces: wp.array2d[wp.vec3],
+    # Out
+    totals: wp.array2d[wp.vec3],
+):
+    """The forces of obstacles on nodes themselves, and the nodes' shares of those on triangles [N]."""
+    o, s = wp.tid()
+    total = forces[o, s]
+    for k in range(corner_starts[s], corner_starts[s + 1]):
+        t = corners[k] / 3
+        if touches.acts[o, t] != 0:
+            total += touches.shares[o, t][corners[k] % 3] * touches.force[o, t]
+    totals[o, s] = total

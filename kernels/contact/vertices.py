@@ -1,0 +1,118 @@
+"""Surface nodes against obstacles. Every node has a mass of its own, so that its forces follow at once."""
+
+import warp as wp
+
+from warp_corot.kernels.stepping.pace import DT, Pace
+
+from .law import SETTLING, Law, held_back, least_motion
+from .motion import Motions, Surface
+from .shapes import Shapes, carried, distance_to
+
+wp.set_module_options({"enable_backward": False})
+
+#: Rounds over the obstacles for a node that touches more than one.
+ROUNDS = wp.constant(8)
+
+
+@wp.func
+def across(a: wp.vec3, normal: wp.vec3):
+    return a - wp.dot(a, normal) * normal
+
+
+@wp.kernel(enable_backward=False)
+def touch_obstacles(
+    # In
+    is_first: int,
+    shapes: Shapes,
+    motions: Motions,
+    law: Law,
+    pace: Pace,
+    anchors: wp.array2d[wp.vec4],
+    # In and out
+    surface: Surface,
+    forces: wp.array2d[wp.vec3],
+):
+    """Forces [O, S] that keep nodes out of obstacles by the end of the step, with friction; corrected where something
+    else has moved nodes since the first time.
+
+    Where a node sticks it is held at an anchor, a point of the obstacle in its frame with 1 as fourth number.
+    """
+    s = wp.tid()
+    count = forces.shape[0]
+    total = wp.vec3()
+    for o in range(count):
+        if is_first != 0:
+            forces[o, s] = wp.vec3()
+        total -= forces[o, s]
+    yielding = surface.yielding[s]
+    if yielding == 0.0:
+        return
+    world = surface.world[s]
+    x = surface.x[s]
+    d = surface.d[s]
+    dt = float(pace.seconds[DT])
+    going = int(ROUNDS)
+    while going > 0:
+        touched = int(0)
+        for o in range(count):
+            now = motions.now[world, o]
+            far = wp.length(d) + law.tolerance
+            moved = carried(now, motions.later[world, o], x)
+            far += wp.length(moved)
+            gap, n = distance_to(shapes, o, now, x, far)
+            before = forces[o, s]
+            if gap <= far or wp.dot(before, before) > 0.0:
+                relative = d - moved
+                normal_force = wp.max(
+                    wp.dot(before, n) + (least_motion(gap, law, dt) - wp.dot(relative, n)) / yielding, 0.0
+                )
+                sideways = wp.vec3()
+                if normal_force > 0.0:
+                    touched += 1
+                    slip = across(relative, n)
+                    anchor = anchors[o, s]
+                    if anchor[3] > 0.0:
+                        held = wp.transform_point(now, wp.vec3(anchor[0], anchor[1], anchor[2]))
+                        slip += SETTLING * across(x - held, n)
+                    sideways = held_back(across(before, n) - slip / yielding, normal_force, shapes.friction[o])
+                force = normal_force * n + sideways
+                d += yielding * (force - before)
+                forces[o, s] = force
+        going -= 1
+        if touched < 2:
+            going = 0
+    for o in range(count):
+        total += forces[o, s]
+    surface.d[s] = d
+    surface.f[s] = surface.f[s] + total
+
+
+@wp.kernel(enable_backward=False)
+def keep_anchors(
+    # In
+    shapes: Shapes,
+    motions: Motions,
+    surface: Surface,
+    forces: wp.array2d[wp.vec3],
+    # Out
+    anchors: wp.array2d[wp.vec4],
+):
+    """Set anchors where nodes begin to stick, drag them along where nodes slip, and drop them where nothing touches."""
+    s = wp.tid()
+    if surface.yielding[s] == 0.0:
+        return
+    world = surface.world[s]
+    x = surface.x[s]
+    end = x + surface.d[s]
+    for o in range(forces.shape[0]):
+        force = forces[o, s]
+        if wp.dot(force, force) == 0.0:
+            anchors[o, s] = wp.vec4()
+        else:
+            pose = motions.later[world, o]
+            _gap, n = distance_to(shapes, o, motions.now[world, o], x, 1.0)
+            normal_force = wp.dot(force, n)
+            slips = wp.length(across(force, n)) >= 0.9999 * shapes.friction[o] * normal_force
+            if slips or anchors[o, s][3] == 0.0:
+                p = wp.quat_rotate_inv(wp.transform_get_rotation(pose), end - wp.transform_get_translation(pose))
+                anchors[o, s] = wp.vec4(p[0], p[1], p[2], 1.0)

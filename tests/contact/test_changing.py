@@ -1,0 +1,81 @@
+"""Contact of bodies whose meshes change, and of meshes of any shape."""
+
+import numpy as np
+import pytest
+
+import warp_corot as wc
+
+SOFT = wc.Isotropic(young=5e3, poisson=0.4, density=1000.0)
+CALM = wc.SymplecticEuler(viscosity=1e-3)
+DOWN = (0.0, 0.0, -9.81)
+
+
+def block(device, z, mesh=None):
+    mesh = mesh or wc.TetForest.box(cells=(2, 2, 1), cell_size=0.02, level=3, origin=(0.0, 0.0, z))
+    return wc.SoftBody(mesh, SOFT, device=device)
+
+
+def weight(body):
+    return 9.81 * body.masses.sum()
+
+
+def test_contact_follows_two_bodies_that_adapt(device):
+    """A ball pressed on two blocks refines one of them; the ground still carries all that presses on it."""
+    low, high = block(device, 0.0), block(device, 0.0205)
+    ground, ball = wc.Ground(), wc.Tool(wc.Sphere(0.012))
+    ball.follow([0.0, 0.2], [(0.02, 0.02, 0.0526), (0.02, 0.02, 0.046)])
+    sim = wc.Simulation(
+        [low, high],
+        obstacles=[ground, ball],
+        gravity=DOWN,
+        integrator=wc.SymplecticEuler(damping=20.0, viscosity=2e-3),
+        remesh=wc.OnlineRemesh(every=32, max_level=5, refine_above=1.02, simplify_below=1.005),
+    )
+    start = len(high.mesh.tets)
+    sim.advance(0.3)
+    assert len(high.mesh.tets) > start
+    mean = np.zeros(3)
+    for _ in range(10):
+        sim.advance(0.005)
+        pressed, carried = ball.wrench.numpy()[0, 2], ground.wrench.numpy()[0, 2]
+        mean += np.array([carried, pressed, weight(low) + weight(high)]) / 10
+        forces = [each.contact_forces.numpy().astype(float).sum(axis=0) for each in (low, high)]
+        felt = sum(each.wrench.numpy()[0].astype(float)[:3] for each in (ground, ball))
+        np.testing.assert_allclose(sum(forces) + felt, 0.0, atol=1e-5)
+    assert mean[1] > 0.1
+    assert -mean[0] == pytest.approx(mean[1] + mean[2], rel=0.02)
+    assert len(high.contact_pressure) == len(high.surface_triangles)
+    assert low.positions.numpy()[:, 2].min() > -1e-6
+
+
+def test_a_general_mesh_lies_on_a_forest(device, rng):
+    low = block(device, 0.0)
+    box = wc.TetForest.box(cells=(1, 1, 1), cell_size=0.015, level=3, origin=(0.01, 0.012, 0.0201))
+    points = box.points.copy()
+    inner = (points[:, 2] > points[:, 2].min() + 1e-9) & (points[:, 2] < points[:, 2].max() - 1e-9)
+    points[inner] += rng.uniform(-5e-4, 5e-4, (inner.sum(), 3))
+    high = block(device, 0.0, wc.TetMesh(points, box.tets))
+    ground = wc.Ground()
+    sim = wc.Simulation([low, high], obstacles=ground, gravity=DOWN, integrator=CALM)
+    sim.advance(0.6)
+    assert high.contact_forces.numpy()[:, 2].sum() == pytest.approx(weight(high), rel=2e-3)
+    assert -ground.wrench.numpy()[0, 2] == pytest.approx(weight(low) + weight(high), rel=2e-3)
+
+
+def test_runs_come_out_the_same(device):
+    """Obstacles with deterministic=True on every device; soft surfaces are refused on CUDA."""
+    found = []
+    for _ in range(2):
+        body, tool = block(device, 0.0), wc.Tool(wc.Capsule(0.002, 0.02))
+        tool.follow([0.0, 0.05], [(0.021, 0.02, 0.033), (0.023, 0.019, 0.03)])
+        sim = wc.Simulation(body, obstacles=[wc.Ground(), tool], gravity=DOWN, deterministic=True)
+        sim.advance(0.05)
+        found.append((body.positions.numpy(), tool.wrench.numpy()))
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    np.testing.assert_array_equal(found[0][1], found[1][1])
+    pair = [block(device, 0.0), block(device, 0.0205)]
+    if device == "cpu":
+        wc.Simulation(pair, contact=wc.Contact(), deterministic=True)
+    else:
+        with pytest.raises(wc.InputError, match="deterministic"):
+            wc.Simulation(pair, contact=wc.Contact(), deterministic=True)

@@ -1,0 +1,82 @@
+"""Patches that a tool holds."""
+
+import numpy as np
+import pytest
+
+import warp_corot as wc
+
+SOFT = wc.Isotropic(young=2e4, poisson=0.4, density=1000.0)
+CALM = wc.SymplecticEuler(viscosity=2e-3)
+
+
+def held_block(device, worlds=1, stiffness=None, gravity=(0.0, 0.0, 0.0), fixed=True):
+    mesh = wc.TetForest.box(cells=(2, 2, 1), cell_size=0.02, level=3)
+    body = wc.SoftBody(mesh, SOFT, device=device, worlds=worlds)
+    if fixed:
+        body.fix("z == zmin")
+    tool = wc.Tool(wc.Sphere(0.002, position=(0.02, 0.02, 0.03)), speed=0.1)
+    sim = wc.Simulation(body, obstacles=[tool], gravity=gravity, integrator=CALM)
+    return body, tool, sim, wc.Grasp(body, "z == zmax", tool=tool, stiffness=stiffness)
+
+
+def test_a_grasped_patch_goes_along(device):
+    body, tool, sim, grasp = held_block(device)
+    top = body.mesh.points[:, 2] > 0.0199
+    tool.move((0.02, 0.022, 0.032))
+    sim.advance(0.3)
+    np.testing.assert_allclose(body.displacements.numpy()[top], np.tile((0.0, 0.002, 0.002), (top.sum(), 1)), atol=1e-6)
+    felt, held = grasp.wrench.numpy()[0].astype(float), body.reactions.numpy().astype(float).sum(axis=0)
+    assert felt[2] < -0.1
+    np.testing.assert_allclose(felt[:3], held, atol=1e-3 * np.abs(held).max())
+
+
+def test_a_turning_tool_turns_the_patch(device):
+    body, tool, sim, _grasp = held_block(device)
+    top = body.mesh.points[:, 2] > 0.0199
+    angle = 0.1
+    tool.move((0.02, 0.02, 0.03), (0.0, 0.0, np.sin(angle / 2), np.cos(angle / 2)))
+    sim.advance(0.3)
+    rest = body.mesh.points[top] - (0.02, 0.02, 0.0)
+    turned = rest @ np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    np.testing.assert_allclose(body.displacements.numpy()[top], turned - rest, atol=2e-6)
+
+
+def test_a_hanging_body_weighs_what_it_weighs(device):
+    body, _tool, sim, grasp = held_block(device, worlds=2, gravity=(0.0, 0.0, -9.81), fixed=False)
+    sim.advance(0.6)
+    weight = 9.81 * body.masses.sum() / 2
+    np.testing.assert_allclose(grasp.wrench.numpy()[:, 2], -weight, rtol=1e-3)
+
+
+def test_a_springy_hold_gives_way(device):
+    """A rigid patch on a spring: the tool's way is shared between the spring and the body."""
+    body, tool, sim, grasp = held_block(device, stiffness=200.0)
+    tool.move((0.02, 0.02, 0.034))
+    sim.advance(0.4)
+    top = body.mesh.points[:, 2] > 0.0199
+    given = 0.004 - body.displacements.numpy()[top, 2].astype(float).mean()
+    assert 1e-4 < given < 0.004
+    assert -grasp.wrench.numpy()[0, 2] == pytest.approx(200.0 * given, rel=1e-3)
+
+
+def test_a_released_patch_falls_back(device):
+    body, tool, sim, grasp = held_block(device)
+    tool.move((0.02, 0.02, 0.033))
+    sim.advance(0.1)
+    assert grasp.is_holding
+    grasp.release()
+    grasp.release()
+    sim.advance(0.5)
+    assert not grasp.is_holding
+    assert not grasp.wrench.numpy().any()
+    assert np.abs(body.displacements.numpy()).max() < 1e-4
+
+
+def test_bad_grasps_are_refused(device):
+    body, tool, _sim, _grasp = held_block(device)
+    with pytest.raises(wc.InputError, match="simulation"):
+        wc.Grasp(body, "z == zmax", tool=wc.Tool(wc.Sphere(0.01)))
+    with pytest.raises(wc.InputError, match="stiffness"):
+        wc.Grasp(body, "z == zmax", tool=tool, stiffness=0.0)
+    with pytest.raises(wc.InputError, match="surface"):
+        wc.Grasp(body, np.zeros(body.node_count, bool), tool=tool)

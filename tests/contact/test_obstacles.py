@@ -1,0 +1,324 @@
+"""Soft bodies against rigid obstacles: weights, slopes, rebounds, a sharp needle, and who feels what."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warp_corot as wc
+
+SOFT = wc.Isotropic(young=2e4, poisson=0.4, density=1000.0)
+#: Takes vibrations out of bodies, and leaves their motion as a whole alone [s].
+CALM = wc.SymplecticEuler(viscosity=1e-3)
+DOWN = (0.0, 0.0, -9.81)
+
+
+def block(device, level=3, origin=(0.0, 0.0, 0.0), cells=(2, 2, 1), material=SOFT, **options):
+    mesh = wc.TetForest.box(cells=cells, cell_size=0.02, level=level, origin=origin)
+    return wc.SoftBody(mesh, material, device=device, **options)
+
+
+def weight(body):
+    return 9.81 * body.masses.sum() / body.worlds
+
+
+def force_on(obstacle, world=0):
+    return obstacle.wrench.numpy()[world].astype(float)[:3]
+
+
+def motion(body):
+    """Displacement and velocity of the centre of mass."""
+    m = body.masses / body.masses.sum()
+    return m @ body.displacements.numpy().astype(float), m @ body.velocities.numpy().astype(float)
+
+
+# --- weight and friction -------------------------------------------------------------------------------------------
+
+
+def test_the_ground_carries_the_weight(device):
+    body, ground = block(device), wc.Ground()
+    sim = wc.Simulation(body, obstacles=ground, gravity=DOWN, integrator=CALM)
+    sim.advance(0.4)
+    assert force_on(ground)[2] == pytest.approx(-weight(body), rel=1e-3)
+    assert body.contact_forces.numpy()[:, 2].sum() == pytest.approx(weight(body), rel=1e-3)
+    assert abs(body.positions.numpy()[:, 2].min()) < 1e-7
+
+
+def test_pressure_times_area_is_the_force(device):
+    body, ground = block(device), wc.Ground()
+    sim = wc.Simulation(body, obstacles=ground, gravity=DOWN, integrator=CALM)
+    sim.advance(0.2)
+    corners = body.positions.numpy().astype(float)[body.surface_triangles]
+    areas = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    pushed = -(body.contact_pressure.numpy()[:, None] * areas).sum(axis=0)
+    assert pushed[2] == pytest.approx(-force_on(ground)[2], rel=1e-3)
+
+
+@pytest.mark.parametrize("share", [0.99, 1.01])
+def test_a_block_slips_at_the_angle_of_friction(device, share):
+    """At rest below arctan mu, and with the right acceleration above."""
+    mu = 0.3
+    angle = share * np.arctan(mu)
+    body = block(device, material=wc.Isotropic(young=1e5, poisson=0.3, density=1000.0))
+    sim = wc.Simulation(
+        body,
+        obstacles=wc.Ground(),
+        gravity=9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)]),
+        integrator=CALM,
+        contact=wc.Contact(friction=mu),
+    )
+    sim.advance(0.2)
+    start, before = motion(body)
+    sim.advance(0.1)
+    end, after = motion(body)
+    if share < 1.0:
+        assert np.abs(after).max() < 1e-6
+        assert np.abs(end - start).max() < 1e-7
+    else:
+        acceleration = 9.81 * (np.sin(angle) - mu * np.cos(angle))
+        assert (after - before)[0] / 0.1 == pytest.approx(acceleration, rel=0.01)
+
+
+@pytest.mark.slow
+def test_a_block_rests_on_a_slope_for_ten_minutes(device):
+    angle = 0.9 * np.arctan(0.3)
+    body = block(device, cells=(1, 1, 1))
+    gravity = 9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)])
+    sim = wc.Simulation(body, obstacles=wc.Ground(), gravity=gravity, integrator=CALM, contact=wc.Contact(friction=0.3))
+    sim.advance(0.5)
+    before = body.displacements.numpy()
+    sim.advance(600.0)
+    assert np.abs(body.displacements.numpy() - before).max() < 1e-6
+
+
+def test_a_tilted_ground_is_a_tilted_gravity(device):
+    angle = 0.2
+    body = block(device)
+    normal = np.array([np.sin(angle), 0.0, np.cos(angle)])
+    lowest = (body.mesh.points @ normal).min()
+    sim = wc.Simulation(
+        body, obstacles=wc.Ground(normal, lowest), gravity=DOWN, integrator=CALM, contact=wc.Contact(friction=10.0)
+    )
+    sim.advance(0.02)
+    assert (body.positions.numpy() @ normal).min() > lowest - 1e-6
+
+
+def test_a_rebound_gains_no_energy(device):
+    body, ground = block(device, origin=(0.0, 0.0, 0.005)), wc.Ground()
+    sim = wc.Simulation(body, obstacles=ground, gravity=DOWN)
+    start = sim.energy().total
+    highest = start
+    for _ in range(20):
+        sim.advance(0.01)
+        highest = max(highest, sim.energy().total)
+    assert highest <= start + 0.01 * weight(body) * 0.005
+    assert body.positions.numpy()[:, 2].min() > -1e-6
+
+
+# --- shapes --------------------------------------------------------------------------------------------------------
+
+BOX_POINTS = 0.01 * np.array([(i, j, k) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+BOX_TRIANGLES = np.array([(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)])
+BOX_TRIANGLES = np.vstack([BOX_TRIANGLES, [(2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]])
+
+
+def ball(points):
+    return np.linalg.norm(points, axis=1) - 0.01
+
+
+HANDS = [
+    wc.TriangleMesh(1.11 * BOX_POINTS, BOX_TRIANGLES),
+    wc.SignedDistance(ball, (-0.015, -0.015, -0.015), upper=(0.015, 0.015, 0.015)),
+    wc.Sphere(0.01),
+    wc.Capsule(0.01, 0.02),
+    wc.Cylinder(0.01, 0.02),
+    wc.Box((0.023, 0.021, 0.02)),
+]
+
+
+def top_of(shape):
+    if isinstance(shape, wc.TriangleMesh | wc.SignedDistance | wc.Sphere):
+        return 0.0113 if isinstance(shape, wc.TriangleMesh) else 0.01
+    return (
+        shape.size[2]
+        if isinstance(shape, wc.Box)
+        else shape.size[1] + (0 if isinstance(shape, wc.Cylinder) else shape.size[0])
+    )
+
+
+@pytest.mark.parametrize("shape", HANDS, ids=repr)
+def test_a_shape_presses_with_what_the_support_takes(device, shape):
+    """Action is reaction: what the tool feels, the nodes feel, and the fixed side takes it."""
+    body = block(device)
+    body.fix("z == zmin")
+    tool = wc.Tool(shape)
+    down = top_of(shape)
+    tool.follow([0.0, 0.05], [(0.02, 0.02, 0.0201 + down), (0.02, 0.02, 0.0181 + down)])
+    sim = wc.Simulation(body, obstacles=[tool], gravity=(0.0, 0.0, 0.0), integrator=wc.SymplecticEuler(viscosity=3e-3))
+    sim.advance(0.2)
+    felt, held = [], []
+    for _ in range(200):  # at sharp edges single steps differ by some per cent
+        sim.step()
+        felt.append(force_on(tool))
+        held.append(body.reactions.numpy().astype(float).sum(axis=0))
+        on_nodes = body.contact_forces.numpy().astype(float).sum(axis=0)
+        np.testing.assert_allclose(felt[-1], -on_nodes, atol=1e-5 * felt[-1][2])
+    mean = np.mean(felt, axis=0)
+    assert mean[2] > 0.01
+    np.testing.assert_allclose(np.mean(held, axis=0), mean, atol=0.01 * mean[2])
+
+
+@pytest.mark.parametrize("shape", HANDS, ids=repr)
+def test_forces_of_contacts_add_up_to_the_wrench(device, shape):
+    body = block(device)
+    body.fix("z == zmin")
+    tool = wc.Tool(shape)
+    down = top_of(shape)
+    tool.follow([0.0, 0.02], [(0.021, 0.02, 0.0201 + down), (0.023, 0.02, 0.0191 + down)])
+    sim = wc.Simulation(body, obstacles=[tool], gravity=(0.0, 0.0, 0.0), integrator=CALM)
+    sim.advance(0.03)
+    wrench = tool.wrench.numpy()[0].astype(float)
+    points = sim.contacts()
+    assert points
+    assert all(point.body is body and point.other is tool for point in points)
+    forces = np.array([point.force for point in points])
+    origin = tool.present_pose[0, :3]
+    torques = np.cross(np.array([point.point for point in points]) - origin, forces)
+    np.testing.assert_allclose(-forces.sum(axis=0), wrench[:3], atol=1e-5 * abs(wrench[2]))
+    np.testing.assert_allclose(-torques.sum(axis=0), wrench[3:], atol=1e-3 * 0.01 * abs(wrench[2]))
+    for point in points:
+        assert point.normal_force >= 0.0
+        assert np.linalg.norm(point.friction_force) <= 0.3 * point.normal_force * (1 + 1e-4) + 1e-9
+
+
+def closest_to_axis(body, tool):
+    """The least distance between a capsule's axis and the body's surface [m], and whether it goes through."""
+    pose = tool.present_pose[0]
+    half = np.array([0.0, 0.0, tool.shape.size[1]])
+    axis = pose[:3] + np.linspace(-1.0, 1.0, 2001)[:, None] * half
+    a, b, c = np.moveaxis(body.positions.numpy().astype(float)[body.surface_triangles], 1, 0)
+    w = np.array([(i, j, 8 - i - j) for i in range(9) for j in range(9 - i)]) / 8.0
+    points = (
+        np.einsum("k,td->ktd", w[:, 0], a) + np.einsum("k,td->ktd", w[:, 1], b) + np.einsum("k,td->ktd", w[:, 2], c)
+    )
+    points = points.reshape(-1, 3)
+    far = points - np.array([pose[0], pose[1], 0.0])
+    low = axis[0, 2]
+    beyond = np.where(points[:, 2] < low, low - points[:, 2], 0.0)
+    return float(np.sqrt(far[:, 0] ** 2 + far[:, 1] ** 2 + beyond**2).min())
+
+
+@pytest.mark.parametrize("speed", [1.0, 10.0, 50.0])
+def test_a_needle_does_not_pass(device, speed):
+    """1 mm thick, on a sheet of 2 mm, between the nodes; the speed of waves in the sheet is 3.6 m/s."""
+    mesh = wc.TetForest.box(cells=(5, 5, 1), cell_size=0.002, level=0, origin=(-0.005, -0.005, -0.002))
+    body = wc.SoftBody(mesh, wc.Isotropic(young=5e3, poisson=0.4, density=1000.0), device=device)
+    body.fix("(x == xmin) | (x == xmax) | (y == ymin) | (y == ymax)")
+    tool = wc.Tool(wc.Capsule(radius=0.0005, length=0.05))
+    x, y = 0.00031, 0.00047
+    tool.follow([0.0, 0.006 / speed], [(x, y, 0.0255 + 0.001), (x, y, 0.0255 - 0.005)])
+    sim = wc.Simulation(body, obstacles=[tool], gravity=(0.0, 0.0, 0.0))
+    felt = 0.0
+    for _ in range(12):
+        sim.advance(0.0005 / speed)
+        felt = max(felt, force_on(tool)[2])
+        assert closest_to_axis(body, tool) > 0.8 * 0.0005
+    assert felt > 0.0
+
+
+# --- tools ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_tool_goes_where_it_is_sent(device):
+    body, tool = block(device), wc.Tool(wc.Sphere(0.01, position=(0.0, 0.0, 1.0)), speed=2.0)
+    sim = wc.Simulation(body, obstacles=[tool], gravity=(0.0, 0.0, 0.0))
+    tool.move((0.0, 0.1, 1.0))
+    sim.advance(0.02)
+    np.testing.assert_allclose(tool.present_pose[0, :3], (0.0, 0.04, 1.0), atol=1e-5)
+    sim.advance(0.05)
+    np.testing.assert_allclose(tool.present_pose[0, :3], (0.0, 0.1, 1.0), atol=1e-6)
+
+
+def test_a_tool_follows_an_array_on_the_device(device):
+    body, tool = block(device, worlds=2), wc.Tool(wc.Sphere(0.01, position=(0.0, 0.0, 1.0)), speed=100.0)
+    poses = wp.array([[0, 0, 1, 0, 0, 0, 1], [0, 0, 2, 0, 0, 0, 1]], dtype=wp.transform, device=device)
+    tool.use_poses(poses)
+    sim = wc.Simulation(body, obstacles=[tool], gravity=(0.0, 0.0, 0.0))
+    sim.advance(0.05)
+    np.testing.assert_allclose(tool.present_pose[:, 2], (1.0, 2.0), atol=1e-6)
+    poses.assign(np.array([[0, 0, 1.5, 0, 0, 0, 1], [0, 0, 2.5, 0, 0, 0, 1]], np.float32))
+    sim.advance(0.05)
+    np.testing.assert_allclose(tool.present_pose[:, 2], (1.5, 2.5), atol=1e-6)
+
+
+def test_worlds_have_tools_of_their_own(device):
+    body, ground = block(device, worlds=2), wc.Ground()
+    tool = wc.Tool(wc.Sphere(0.01), speed=100.0)
+    poses = wp.array([[0.02, 0.02, 0.0295, 0, 0, 0, 1], [0, 0, 2, 0, 0, 0, 1]], dtype=wp.transform, device=device)
+    tool.move((0.0, 0.0, 2.0))
+    tool.use_poses(poses)
+    sim = wc.Simulation(body, obstacles=[ground, tool], gravity=DOWN, integrator=CALM)
+    sim.advance(0.4)
+    assert force_on(tool, 1)[2] == 0.0
+    assert force_on(tool, 0)[2] > 0.0
+    assert force_on(ground, 1)[2] == pytest.approx(-weight(body), rel=1e-3)
+    assert force_on(ground, 0)[2] == pytest.approx(-weight(body) - force_on(tool, 0)[2], rel=1e-2)
+
+
+def test_a_start_in_overlap_is_said_and_undone_gently(device):
+    body, ground = block(device, origin=(0.0, 0.0, -0.002)), wc.Ground()
+    sim = wc.Simulation(body, obstacles=ground, gravity=DOWN, integrator=CALM)
+    fastest = 0.0
+    with pytest.warns(wc.StabilityWarning, match=r"25 surface nodes begin inside obstacles, by up to 2 mm"):
+        sim.advance(0.005)
+    for _ in range(30):
+        sim.advance(0.01)
+        fastest = max(fastest, np.abs(body.velocities.numpy()).max())
+    assert fastest < 0.5
+    assert body.positions.numpy()[:, 2].min() > -1e-5
+    assert motion(body)[0][2] < 0.003  # not thrown up
+
+
+def test_a_tool_that_is_too_fast_for_the_given_step_is_refused(device):
+    tool = wc.Tool(wc.Capsule(0.0005, 0.05, position=(0.0, 0.0, 0.1)))
+    options = {"obstacles": [tool], "integrator": wc.SymplecticEuler(dt=1e-4)}
+    wc.Simulation(block(device), **options)
+    with pytest.raises(wc.InputError, match=r"5 mm in a step.* dt must be at most 5e-06 s"):
+        tool.follow([0.0, 1.0], [(0.0, 0.0, 0.1), (0.0, 0.0, 50.1)])
+    assert tool.keys is None
+    tool.follow([0.0, 1.0], [(0.0, 0.0, 0.1), (0.0, 0.0, 0.2)])
+
+
+def test_checkpoints_refuse_contact(device, tmp_path):
+    sim = wc.Simulation(block(device), obstacles=wc.Ground(), gravity=DOWN)
+    with pytest.raises(wc.InputError, match="contact"):
+        sim.save(tmp_path / "sim.npz")
+
+
+# --- input ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: wc.Contact(friction=-0.1), "friction"),
+        (lambda: wc.Sphere(0.0), "radius"),
+        (lambda: wc.Ground(normal=(0, 0, 0)), "normal"),
+        (lambda: wc.Box((0.1, 0.1)), "size"),
+        (lambda: wc.Tool(0.1), "shape"),
+        (lambda: wc.TriangleMesh(BOX_POINTS, BOX_TRIANGLES[:, ::-1]), "inside out"),
+        (lambda: wc.TriangleMesh(BOX_POINTS, BOX_TRIANGLES[1:]), "closed"),
+        (lambda: wc.SignedDistance(lambda p: -ball(p), (-1, -1, -1), upper=(1, 1, 1)), "border"),
+        (lambda: wc.SignedDistance(np.ones((4, 4, 4)), (-1, -1, -1), spacing=0.1), "negative"),
+        (lambda: wc.Tool(wc.Sphere(0.1)).follow([0, 1], [(0, 0, 0), (0, 0, np.nan)]), "positions"),
+        (lambda: wc.Tool(wc.Sphere(0.1)).follow([1, 0], [(0, 0, 0), (0, 0, 1)]), "times"),
+        (lambda: wc.Tool(wc.Sphere(0.1)).move((0, 0, np.inf)), "position"),
+        (lambda: wc.Tool(wc.Sphere(0.1)).wrench, "simulation"),
+        (lambda: wc.Simulation(block("cpu"), obstacles=["floor"]), "obstacle"),
+        (lambda: wc.Simulation(block("cpu"), contact=0.3), "contact"),
+        (lambda: block("cpu").contact_forces, "touches nothing"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(make, says):
+    with pytest.raises(wc.InputError, match=says) as caught:
+        make()
+    assert "\n" not in str(caught.value)

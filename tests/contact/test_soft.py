@@ -1,0 +1,134 @@
+"""Soft bodies against one another and against themselves."""
+
+import numpy as np
+import pytest
+
+import warp_corot as wc
+
+SOFT = wc.Isotropic(young=2e4, poisson=0.4, density=1000.0)
+CALM = wc.SymplecticEuler(viscosity=1e-3)
+DOWN = (0.0, 0.0, -9.81)
+
+
+def block(device, z, cells=(2, 2, 1), level=3, at=0.0, **options):
+    mesh = wc.TetForest.box(cells=cells, cell_size=0.02, level=level, origin=(at, at, z))
+    return wc.SoftBody(mesh, SOFT, device=device, **options)
+
+
+def weight(body):
+    return 9.81 * body.masses.sum() / body.worlds
+
+
+def force_on(body):
+    return body.contact_forces.numpy().astype(float).sum(axis=0)
+
+
+@pytest.mark.parametrize("alike", [True, False], ids=["alike", "unlike"])
+def test_a_block_on_a_block_carries_its_weight(device, alike):
+    """To 0.1 %, with meshes that are alike or not; what one feels the other feels, to rounding."""
+    low = block(device, 0.0)
+    high = block(device, 0.0202) if alike else block(device, 0.0202, cells=(1, 1, 1), level=4, at=0.011)
+    ground = wc.Ground()
+    sim = wc.Simulation([low, high], obstacles=ground, gravity=DOWN, integrator=CALM)
+    sim.advance(0.6)
+    assert force_on(high)[2] == pytest.approx(weight(high), rel=1e-3)
+    on_ground = ground.wrench.numpy()[0].astype(float)[:3]
+    assert on_ground[2] == pytest.approx(-weight(high) - weight(low), rel=1e-3)
+    np.testing.assert_allclose(force_on(low) + force_on(high) + on_ground, 0.0, atol=1e-6 * weight(low))
+
+
+def test_worlds_do_not_meet(device):
+    """Blocks of several worlds lie in the same place."""
+    low, high = block(device, 0.0, worlds=2), block(device, 0.0202, worlds=2)
+    lifted = high.positions.numpy()
+    lifted[high.world_node_count :, 2] += 0.1
+    high.positions = lifted
+    sim = wc.Simulation([low, high], contact=wc.Contact(), gravity=(0.0, 0.0, 0.0), integrator=CALM)
+    high.velocities = np.tile((0.0, 0.0, -0.1), (high.node_count, 1))
+    sim.advance(0.01)
+    forces = high.contact_forces.numpy().reshape(2, -1, 3)
+    assert forces[0, :, 2].sum() > 0.0
+    assert not forces[1].any()
+
+
+def roof(device, along, z):
+    """A square beam that lies on one of its edges."""
+    cells = (4, 1, 1) if along == 0 else (1, 4, 1)
+    mesh = wc.TetForest.box(cells=cells, cell_size=0.01, level=3)
+    points = mesh.points - mesh.points.mean(axis=0)
+    c = np.sqrt(0.5)
+    turn = np.array([[1, 0, 0], [0, c, -c], [0, c, c]]) if along == 0 else np.array([[c, 0, c], [0, 1, 0], [-c, 0, c]])
+    points = points @ turn.T
+    points[:, 2] += z - points[:, 2].min()
+    return wc.SoftBody(wc.TetMesh(points, mesh.tets), wc.Isotropic(5e4, 0.3, 1000.0), device=device)
+
+
+@pytest.mark.parametrize("speed", [0.2, 3.0])
+def test_an_edge_does_not_pass_an_edge(device, speed):
+    """Two beams on their edges, crossed, where neither has a node; waves run at 8 m/s."""
+    low = roof(device, 0, 0.0)
+    top = np.sqrt(2.0) * 0.01
+    high = roof(device, 1, top + 0.0005)
+    moved = high.positions.numpy()
+    moved[:, :2] += 0.0017
+    high.positions = moved
+    low.fix("z < zmin + 0.003")
+    high.velocities = np.tile((0.0, 0.0, -speed), (high.node_count, 1))
+    sim = wc.Simulation([low, high], contact=wc.Contact(), gravity=(0.0, 0.0, 0.0))
+    start = sim.energy().total
+    edges, touched = 0, 0.0
+    for _ in range(20):
+        sim.advance(0.0005)
+        edges += sum(len(point.nodes) == 2 for point in sim.contacts())
+        touched = max(touched, force_on(high)[2])
+        np.testing.assert_allclose(force_on(low) + force_on(high), 0.0, atol=1e-5 * (touched + 1e-3))
+        assert sim.energy().total <= 1.01 * start  # velocities are half a step behind
+    assert touched > 0.0
+    assert edges > 0
+    # It has not fallen through: where they cross, the upper one is above the lower one.
+    crossing = [
+        np.linalg.norm((each.mesh.points - each.mesh.points.mean(axis=0)), axis=1) < 0.006 for each in (low, high)
+    ]
+    heights = [each.positions.numpy()[near, 2].mean() for each, near in zip((low, high), crossing, strict=True)]
+    assert heights[1] - heights[0] > 0.5 * top
+
+
+def horseshoe(device):
+    mesh = wc.TetForest.box(cells=(5, 1, 4), cell_size=0.01, level=3)
+    centres = mesh.points[mesh.tets].mean(axis=1)
+    inside = ~((centres[:, 0] > 0.02) & (centres[:, 0] < 0.03) & (centres[:, 2] > 0.01))
+    used, tets = np.unique(mesh.tets[inside], return_inverse=True)
+    return wc.SoftBody(wc.TetMesh(mesh.points[used], tets.reshape(-1, 4)), SOFT, device=device)
+
+
+@pytest.mark.parametrize("itself", [True, False])
+def test_a_folded_body_touches_itself(device, itself):
+    """The arms of a horseshoe are bent together by more than the gap between them; without contact they cross."""
+    body = horseshoe(device)
+    x = body.mesh.points
+    arms = [np.flatnonzero((np.abs(x[:, 0] - side) < 1e-6) & (x[:, 2] > 0.03)) for side in (0.0, 0.05)]
+    for nodes, sign in zip(arms, (1.0, -1.0), strict=True):
+        body.prescribe(nodes, times=[0.0, 0.1], displacements=[(0, 0, 0), (sign * 0.007, 0, 0)])
+    sim = wc.Simulation(body, contact=wc.Contact(self_contact=itself), gravity=(0.0, 0.0, 0.0), integrator=CALM)
+    sim.advance(0.12)
+    now = body.positions.numpy().astype(float)
+    left = np.flatnonzero((np.abs(x[:, 0] - 0.02) < 1e-6) & (x[:, 2] > 0.015))
+    right = np.flatnonzero((np.abs(x[:, 0] - 0.03) < 1e-6) & (x[:, 2] > 0.015))
+    crossing = now[left, 0].max() - now[right, 0].min()
+    if itself:
+        assert crossing < 1e-5
+        np.testing.assert_allclose(force_on(body), 0.0, atol=1e-5)
+        assert np.abs(body.contact_forces.numpy()).max() > 1e-3
+    else:
+        assert crossing > 1e-3
+
+
+def test_room_for_contacts_grows(device):
+    """What the room is too small for is not left out: the run is made again with more."""
+    low, high = block(device, 0.0), block(device, 0.0202)
+    ground = wc.Ground()
+    sim = wc.Simulation([low, high], obstacles=ground, gravity=DOWN, integrator=CALM)
+    sim.contact.pairs._make_room(3)
+    sim.advance(0.1)
+    assert sim.contact.pairs._room > 3
+    assert high.positions.numpy()[:, 2].min() > 0.019

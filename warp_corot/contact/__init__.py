@@ -1,0 +1,1 @@
+"""Contact of soft bodies with obstacles and with one another."""

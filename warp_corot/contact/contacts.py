@@ -1,0 +1,305 @@
+"""Contact as a constraint of a system: forces after all others, so that the step ends with surfaces side by side."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from warp_corot.errors import InputError, StabilityWarning, depth_of_user
+from warp_corot.kernels.contact import motion, sums, triangles, vertices
+from warp_corot.kernels.contact.law import Law
+from warp_corot.solvers.system import System
+
+from .obstacles import Obstacles
+from .options import Contact
+from .pairs import Pairs, smallest_size
+from .surface import ContactSurface
+from .tool import Obstacle
+
+#: Gaps that rounding leaves, in roundings of the largest coordinate.
+ROUNDINGS = 16.0
+#: Things that overlap are pushed apart at this share of the speed of waves.
+RECOVERY = 0.05
+#: Overlaps at the start that are said, as a share of the smallest element's size.
+OVERLAP = 0.01
+#: Rounds in which obstacles between the nodes are held off.
+ROUNDS = 3
+#: Warps that add up a wrench.
+WARP, MOST_WARPS = 32, 64
+
+
+class Contacts:
+    """Contact of the bodies of a system.
+
+    Args:
+        system: The bodies.
+        obstacles: Shapes and tools.
+        options: How things touch.
+        stable_dt: Largest stable step of the bodies at rest [s], which tells the speed of waves.
+        dt: The length of a step, if it was given [s].
+        deterministic: Whether a run must come out the same bit by bit.
+
+    Attributes:
+        surface: The surface nodes and triangles of all bodies.
+        obstacles: What is rigid.
+        forces: Of each obstacle on each surface node itself in the last step [N], vec3 [O, S].
+        touches: Obstacles at triangles.
+        totals: The same with the nodes' shares of the forces between them, when they were last published.
+
+    Raises:
+        InputError: As ``Obstacles``; or soft surfaces may touch, and the run must be deterministic on CUDA.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        obstacles: Sequence[Obstacle],
+        options: Contact,
+        *,
+        stable_dt: float,
+        dt: float | None = None,
+        deterministic: bool = False,
+    ):
+        self.system, self.device, self.options = system, system.device, options
+        self.obstacles = Obstacles(obstacles, options.friction, system, dt)
+        self.surface = ContactSurface(system.bodies)
+        self.law = self._law(stable_dt)
+        #: Soft surfaces that may touch one another; None without.
+        self.pairs: Pairs | None = None
+        if len(system.bodies) > 1 or options.self_contact:
+            if deterministic and system.device.is_cuda:
+                raise InputError(
+                    "a deterministic run on CUDA cannot have soft surfaces touch: forces are added as threads come"
+                )
+            self.pairs = Pairs(self.surface, options.friction, options.self_contact, self._smallest)
+        self._revision = 0
+        self._make_arrays()
+
+    # --- as a constraint -------------------------------------------------------------------------------------------
+
+    @property
+    def launch_revision(self) -> int:
+        pairs = 0 if self.pairs is None else self.pairs.revision
+        return self._revision + self.surface.revision + self.obstacles.revision + pairs
+
+    @property
+    def accounts(self) -> list[wp.array]:
+        return self._accounts
+
+    @property
+    def state(self) -> dict[str, wp.array]:
+        touches = self.touches
+        sides = {"touch_normals": touches.normal.flatten(), "touch_forces": touches.force.flatten()}
+        arrays = {"anchors": self._anchors.flatten(), **sides, **self.obstacles.state}
+        return {name: array for name, array in arrays.items() if array.size}
+
+    def prepare(self) -> None:
+        before = self.surface.revision
+        if self.surface.follow():
+            if self.surface.revision != before:
+                self._make_arrays()
+            else:
+                self._anchors.zero_()
+                self.touches.force.zero_()
+            self._share_arrays()
+            if self.pairs is not None:
+                self.pairs.follow()
+        if self.pairs is not None:
+            if not self.pairs.is_planted:
+                self._predict(0, 0.0)
+            self.pairs.prepare()
+
+    @property
+    def is_full(self) -> bool:
+        return self.pairs is not None and self.pairs.is_full
+
+    def grow(self) -> None:
+        if self.pairs is not None:
+            self.pairs.grow()
+
+    def forget(self) -> None:
+        if self.pairs is not None:
+            self.pairs.forget()
+
+    def check_start(self) -> None:
+        """See whether nodes begin inside obstacles, which push them out slowly.
+
+        Warns:
+            StabilityWarning: Some do.
+        """
+        if not self.obstacles.count:
+            return
+        self._predict(0, 0.0)
+        inputs = [self.obstacles.shapes, self.obstacles.motions, self.surface.arrays]
+        depths = wp.zeros(self.surface.count, dtype=wp.float32, device=self.device)
+        self._launch(sums.find_depths, self.surface.count, inputs, [depths])
+        deep = depths.numpy()
+        count = int((deep > OVERLAP * self._smallest).sum())
+        if count:
+            warnings.warn(
+                f"{count} surface nodes begin inside obstacles, by up to {1e3 * deep.max():.3g} mm; they are "
+                f"pushed out at no more than {self.law.recovery:.2g} m/s",
+                StabilityWarning,
+                stacklevel=depth_of_user(),
+            )
+
+    def launch(self, offset: int, damping: float) -> None:
+        system, surface = self.system, self.surface
+        pace = system.pace.arrays
+        if self.obstacles.count:
+            self.obstacles.launch_motion(offset)
+        self._predict(offset, damping)
+        if self.pairs is not None:
+            self.pairs.launch_begin(offset)
+        self._solve()
+        for k, body in enumerate(system.bodies):
+            inputs = [surface.parts[k].start, surface.arrays, pace, offset, body.state.velocities]
+            outputs = [body.state.forces, self._accounts[k], body.state.contact_forces]
+            self._launch(motion.add_contact_forces, self._count(k), inputs, outputs)
+
+    def measure(self) -> None:
+        thinnest = self.obstacles.thinnest
+        if self.pairs is not None:
+            thinnest = min(thinnest, 0.5 * self._smallest)
+        if not np.isfinite(thinnest):
+            return
+        for k, body in enumerate(self.system.bodies):
+            inputs = [self.surface.parts[k].start, self.surface.arrays.node, body.state.velocities, thinnest]
+            self._launch(motion.measure_rates, self._count(k), inputs, [self.system.motion_rates])
+
+    def publish(self) -> None:
+        surface, obstacles = self.surface, self.obstacles
+        if obstacles.count:
+            forces = self.forces
+            if obstacles.have_edges:
+                forces = self.totals
+                inputs = [surface.corner_starts, surface.corners, self.touches, self.forces]
+                wp.launch(triangles.share_touches, forces.shape, inputs, [forces], device=self.device)
+            threads = self._parts.shape[2] * self._lanes
+            for part in surface.parts:
+                inputs = [part.start, part.nodes, self._lanes, threads, surface.arrays, obstacles.motions, forces]
+                wp.launch(
+                    sums.sum_wrenches, (*obstacles.wrenches.shape, threads), inputs, [self._parts], device=self.device
+                )
+            wp.launch(
+                sums.fold_wrenches, obstacles.wrenches.shape, [self._parts], [obstacles.wrenches], device=self.device
+            )
+        if self.pairs is not None:
+            self.pairs.launch_report()
+        inputs = [surface.arrays, surface.triangles, surface.corner_starts, surface.corners]
+        self._launch(sums.node_pressures, surface.count, inputs, [self._pressures])
+        for k, part in enumerate(surface.parts):
+            inputs = [part.triangle_start, surface.arrays, surface.triangles, self._pressures]
+            outputs = [self._triangle_pressures[k]]
+            self._launch(sums.triangle_pressures, self.system.worlds * part.triangles, inputs, outputs)
+
+    def reset(self, chosen: wp.array) -> None:
+        self._anchors.zero_()
+        self.touches.force.zero_()
+        self.forget()
+        self.obstacles.reset(chosen)
+
+    # --- pieces ----------------------------------------------------------------------------------------------------
+
+    @property
+    def _smallest(self) -> float:
+        """The size of the smallest element [m]."""
+        return smallest_size([body.discretization.smallest_volume for body in self.system.bodies])
+
+    def _law(self, stable_dt: float) -> Law:
+        points = [np.abs(body.mesh.points).max() for body in self.system.bodies]
+        law = Law()
+        law.tolerance = ROUNDINGS * 2.0**-24 * max(*points, 1e-3)
+        law.recovery = RECOVERY * self._smallest / stable_dt if np.isfinite(stable_dt) else 0.1
+        return law
+
+    def _predict(self, offset: int, damping: float) -> None:
+        """Launch where the surfaces go without contact."""
+        system, surface = self.system, self.surface
+        for k, body in enumerate(system.bodies):
+            state, conditions = body.state, body.conditions
+            inputs = [surface.parts[k].start, damping, system.gravity, conditions.inverse_mass]
+            inputs += [int(conditions.has_loads), conditions.loads, system.pace.arrays, offset]
+            inputs += [state.rest, state.forces, state.displacements, state.velocities]
+            kernel = motion.PREDICT_MOTION[conditions.loads.dtype]
+            self._launch(kernel, self._count(k), inputs, [surface.arrays])
+
+    def _solve(self) -> None:
+        """Launch the forces in turn: of obstacles on nodes, of obstacles between these, and of soft surfaces."""
+        surface, obstacles = self.surface, self.obstacles
+        rigid = [obstacles.shapes, obstacles.motions]
+        step = [*rigid, self.law, self.system.pace.arrays, self._anchors]
+        both = [surface.arrays, self.forces]
+        around = [surface.corner_starts, surface.corners, self.touches]
+        dim = (obstacles.count, surface.triangle_count)
+        if obstacles.have_edges:
+            inputs = [*rigid, self.law, surface.arrays, surface.triangles]
+            wp.launch(triangles.find_touches, dim, inputs, [self.touches], device=self.device)
+            self._launch(triangles.apply_touches, surface.count, around, [surface.arrays])
+        if obstacles.count:
+            self._launch(vertices.touch_obstacles, surface.count, [1, *step], both)
+        for _ in range(ROUNDS if obstacles.have_edges or self.pairs is not None else 0):
+            if obstacles.have_edges:
+                self._touch_triangles(dim)
+            if self.pairs is not None:
+                self.pairs.launch_round(self.law, self.system.pace.arrays)
+            if obstacles.count:
+                self._launch(vertices.touch_obstacles, surface.count, [0, *step], both)
+        if obstacles.count:
+            self._launch(vertices.keep_anchors, surface.count, [*rigid, *both], [self._anchors])
+
+    def _touch_triangles(self, dim: tuple[int, int]) -> None:
+        """Launch one round of the forces of obstacles between the nodes."""
+        surface, touches = self.surface, self.touches
+        around = [surface.corner_starts, surface.corners, touches]
+        step = [self.law, self.system.pace.arrays, surface.arrays, surface.triangles]
+        wp.launch(triangles.judge_touches, dim, step, [touches], device=self.device)
+        self._launch(triangles.crowd_nodes, surface.count, around, [self._crowd])
+        inputs = [self.obstacles.shapes, *step, self._crowd]
+        wp.launch(triangles.solve_touches, dim, inputs, [touches], device=self.device)
+        self._launch(triangles.apply_touches, surface.count, around, [surface.arrays])
+
+    def _make_arrays(self) -> None:
+        surface, device = self.surface, self.device
+        count, obstacles = surface.count, self.obstacles.count
+        self.forces = wp.zeros((obstacles, count), dtype=wp.vec3, device=device)
+        self.totals = wp.zeros_like(self.forces)
+        self._anchors = wp.zeros((obstacles, count), dtype=wp.vec4, device=device)
+        self._accounts = [
+            wp.zeros((2, self._count(k)), dtype=wp.float64, device=device) for k in range(len(surface.parts))
+        ]
+        self.touches = triangles.Touches()
+        shape = (obstacles, surface.triangle_count if self.obstacles.have_edges else 0)
+        for name in ("shares", "normal", "moved", "force", "more"):
+            setattr(self.touches, name, wp.zeros(shape, dtype=wp.vec3, device=device))
+        self.touches.gap = wp.zeros(shape, dtype=wp.float32, device=device)
+        self.touches.acts = wp.zeros(shape, dtype=wp.int32, device=device)
+        self._crowd = wp.zeros(count, dtype=wp.float32, device=device)
+        self._lanes = 1 if device.is_cpu else WARP
+        most = max(part.nodes for part in surface.parts)
+        warps = 1 if device.is_cpu else max(min(most // WARP, MOST_WARPS), 1)
+        self._parts = wp.zeros((obstacles, self.system.worlds, warps), dtype=wp.spatial_vectord, device=device)
+        self._pressures = wp.zeros(count, dtype=wp.vec3, device=device)
+        self._triangle_pressures = [
+            wp.zeros(self.system.worlds * part.triangles, dtype=wp.float32, device=device) for part in surface.parts
+        ]
+        self._revision += 1
+        self._share_arrays()
+
+    def _share_arrays(self) -> None:
+        """Let bodies have what users read of them."""
+        for body, part, pressures in zip(self.system.bodies, self.surface.parts, self._triangle_pressures, strict=True):
+            body.state.make_contact_forces()
+            body.state.contact_forces.zero_()
+            triangles = len(part.skin.triangles)
+            body.state.contact_pressures = pressures if self.system.worlds > 1 else pressures[:triangles]
+
+    def _count(self, k: int) -> int:
+        """Places of a body in all worlds."""
+        return self.system.worlds * self.surface.parts[k].nodes
+
+    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

@@ -1,0 +1,208 @@
+"""The obstacles of a simulation on the device: their shapes, how they move, and what they feel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.errors import InputError
+from warp_corot.kernels.contact import motion as kernels
+from warp_corot.kernels.contact.shapes import Shapes
+from warp_corot.solvers.system import System
+
+from .sampled import SignedDistance, TriangleMesh
+from .shapes import Ground, Shape
+from .tool import Obstacle, Tool, as_tool
+
+#: Share of half a tool's thickness that it may go in a step of a given length.
+LARGEST_SHARE = 0.5
+#: A tool that has to catch up with its keyframes goes so many times as fast as they ever do.
+CATCHING_UP = 2.0
+
+
+class Obstacles:
+    """Obstacles of all worlds, each of which may be at another place in each.
+
+    Args:
+        given: Shapes and tools.
+        friction: Of those that have none of their own.
+        system: The simulation's.
+        dt: The length of a step, if it was given [s].
+
+    Attributes:
+        system: As given.
+        given: As they were given.
+        tools: All as tools.
+        shapes, motions: As kernels take them.
+        thinnest: Half of the smallest way through any of them [m].
+        revision: Changes whenever launches do.
+
+    Raises:
+        InputError: Something else among them, a tool that another simulation has, one given twice, or one that is too
+            fast for the given step.
+    """
+
+    def __init__(self, given: Sequence[Obstacle], friction: float, system: System, dt: float | None = None):
+        self.given = tuple(given)
+        self.tools = [as_tool(each) for each in given]
+        if len(set(map(id, given))) < len(given):
+            raise InputError("an obstacle is given twice; each must be named once")
+        self.worlds, self.device, self.system = system.worlds, system.device, system
+        self.revision = 0
+        self._meshes: list[wp.Mesh] = []
+        self.shapes = self._shapes([tool.shape for tool in self.tools], friction)
+        self.thinnest = min((tool.shape.thickness for tool in self.tools), default=np.inf)
+        count = max(len(self.tools), 1)
+        motions, device = kernels.Motions(), self.device
+        motions.mode, motions.first, motions.keys = (wp.zeros(count, dtype=wp.int32, device=device) for _ in range(3))
+        motions.speed = wp.zeros(count, dtype=wp.float32, device=device)
+        reach = [min(tool.shape.reach, 1e6) for tool in self.tools]
+        motions.reach = wp.array(reach or [0.0], dtype=wp.float32, device=device)
+        poses = np.array([_first_pose(tool) for tool in self.tools]).reshape(-1, 7)
+        everywhere = np.broadcast_to(poses, (self.worlds, len(self.tools), 7)).astype(np.float32)
+        self.initial, motions.now, motions.later, motions.target = (
+            wp.array(everywhere, dtype=wp.transform, device=device) for _ in range(4)
+        )
+        self.motions = motions
+        self.wrenches: wp.array = wp.zeros((self.count, self.worlds), dtype=wp.spatial_vectorf, device=device)
+        self._keys, self._dt = -1, dt
+        self.update()
+        for number, tool in enumerate(self.tools):
+            tool.bind(self, number)
+            if isinstance(each := given[number], Shape):
+                each.felt = tool
+
+    @property
+    def count(self) -> int:
+        return len(self.tools)
+
+    @property
+    def have_edges(self) -> bool:
+        """Whether any of them can come between the nodes of a body; a half-space cannot."""
+        return any(not isinstance(tool.shape, Ground) for tool in self.tools)
+
+    @property
+    def state(self) -> dict[str, wp.array]:
+        """Where they are."""
+        return {"later": self.motions.later, "target": self.motions.target} if self.tools else {}
+
+    def update(self) -> None:
+        """Take how the tools are to move.
+
+        Raises:
+            InputError: One is too fast for the given step.
+        """
+        rates = [tool.fastest() / tool.shape.thickness for tool in self.tools]
+        if self._dt is not None and max(rates, default=0.0) * self._dt > LARGEST_SHARE:
+            fastest = self.tools[int(np.argmax(rates))]
+            raise InputError(
+                f"a {fastest!r} goes {1e3 * fastest.fastest() * self._dt:.3g} mm in a step, and bodies may pass "
+                f"through it; dt must be at most {LARGEST_SHARE / max(rates):.2g} s, or None"
+            )
+        mode, first, keys, speed = [], [], [], []
+        times, poses = [np.zeros(1)], [np.zeros((1, 7))]
+        placed = 1
+        for tool in self.tools:
+            own = tool.keys
+            mode.append(kernels.KEYED if own is not None else kernels.SENT if tool.is_sent else kernels.FIXED)
+            first.append(placed)
+            keys.append(0 if own is None else len(own[0]))
+            speed.append(CATCHING_UP * tool.fastest() if own is not None and tool.fastest() > 0.0 else tool.speed)
+            if own is not None:
+                times.append(own[0])
+                poses.append(own[1])
+                placed += len(own[0])
+        motions = self.motions
+        for array, values in ((motions.mode, mode), (motions.first, first), (motions.keys, keys)):
+            array[: len(values)].assign(np.array([int(value) for value in values], np.int32))
+        motions.speed[: len(speed)].assign(np.array(speed, np.float32))
+        if placed != self._keys:
+            motions.times = wp.empty(placed, dtype=wp.float64, device=self.device)
+            motions.poses = wp.empty(placed, dtype=wp.transform, device=self.device)
+            self._keys = placed
+        motions.times.assign(np.concatenate(times))
+        motions.poses.assign(np.vstack(poses).astype(np.float32))
+        self.system.motion_rates[:1].fill_(max(rates, default=0.0))
+        self.revision += 1
+
+    def send(self, number: int, pose: npt.NDArray[np.float64]) -> None:
+        """Let a tool go to a place in all worlds."""
+        given = wp.array(pose.astype(np.float32).reshape(1, 7), dtype=wp.transform, device=self.device)
+        inputs = [given, number, self.motions.target]
+        wp.launch(kernels.take_targets, self.worlds, inputs, device=self.device)
+
+    def launch_motion(self, offset: int) -> None:
+        """Launch where obstacles go in this step."""
+        for number, tool in enumerate(self.tools):
+            if tool.poses is not None:
+                if tool.poses.device != self.device or len(tool.poses) not in (1, self.worlds):
+                    raise InputError(
+                        f"poses is [{len(tool.poses)}] on {tool.poses.device}; it must be [1] or [{self.worlds}] on "
+                        f"{self.device}"
+                    )
+                inputs = [tool.poses, number, self.motions.target]
+                wp.launch(kernels.take_targets, self.worlds, inputs, device=self.device)
+        pace, starts = self.system.pace.arrays, self.system.bodies[0].conditions.world_starts
+        inputs = [self.motions, pace, starts, offset]
+        wp.launch(kernels.move_obstacles, (self.worlds, self.count), inputs, device=self.device)
+
+    def reset(self, chosen: wp.array) -> None:
+        """Put obstacles of these worlds back to where they were first."""
+        if self.tools:
+            inputs = [chosen, self.initial, self.motions]
+            wp.launch(kernels.reset_obstacles, (self.worlds, self.count), inputs, device=self.device)
+
+    def poses(self) -> npt.NDArray[np.float64]:
+        """Where they are, float64 [worlds, O, 7]; waits for the device."""
+        return self.motions.later.numpy().astype(np.float64)
+
+    def wrench(self, number: int) -> wp.array:
+        """What one of them feels [N, N m], spatial vectors [worlds]."""
+        return self.wrenches[number]
+
+    def _shapes(self, shapes: Sequence[Shape], friction: float) -> Any:
+        device = self.device
+        made = Shapes()
+        made.kind = wp.array([shape.kind for shape in shapes], dtype=wp.int32, device=device)
+        made.size = wp.array(np.array([shape.size for shape in shapes]).reshape(-1, 3), dtype=wp.vec3, device=device)
+        own = [friction if shape.friction is None else shape.friction for shape in shapes]
+        made.friction = wp.array(own, dtype=wp.float32, device=device)
+        count = max(len(shapes), 1)
+        source, first = np.zeros(count, np.uint64), np.zeros(count, np.int32)
+        counts, lower, values = np.zeros((count, 3), np.int32), np.zeros((count, 3)), [np.zeros(1, np.float32)]
+        for k, shape in enumerate(shapes):
+            if isinstance(shape, TriangleMesh):
+                mesh = wp.Mesh(
+                    wp.array(shape.points, dtype=wp.vec3, device=device),
+                    wp.array(shape.triangles.ravel(), dtype=wp.int32, device=device),
+                )
+                self._meshes.append(mesh)
+                source[k] = mesh.id
+            elif isinstance(shape, SignedDistance):
+                first[k], counts[k], lower[k] = sum(map(len, values)), shape.values.shape, shape.lower
+                values.append(shape.values.ravel())
+        made.source = wp.array(source, dtype=wp.uint64, device=device)
+        made.first = wp.array(first, dtype=wp.int32, device=device)
+        made.count = wp.array(counts, dtype=wp.vec3i, device=device)
+        made.lower = wp.array(lower, dtype=wp.vec3, device=device)
+        made.values = wp.array(np.concatenate(values), dtype=wp.float32, device=device)
+        return made
+
+
+def _first_pose(tool: Tool) -> npt.NDArray[np.float64]:
+    """Where a tool is at time zero."""
+    if tool.keys is None:
+        return tool.pose
+    times, poses = tool.keys
+    key = int(np.clip(np.searchsorted(times, 0.0, side="right") - 1, 0, len(times) - 2))
+    share = float(np.clip((0.0 - times[key]) / (times[key + 1] - times[key]), 0.0, 1.0))
+    turned = poses[key + 1, 3:] * (1.0 if poses[key, 3:] @ poses[key + 1, 3:] >= 0.0 else -1.0)
+    pose = np.concatenate([poses[key, :3], poses[key, 3:]])
+    pose[:3] += share * (poses[key + 1, :3] - poses[key, :3])
+    pose[3:] += share * (turned - poses[key, 3:])
+    pose[3:] /= np.linalg.norm(pose[3:])
+    return pose

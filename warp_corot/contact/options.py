@@ -1,0 +1,39 @@
+"""How things touch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_number
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Contact of a simulation's bodies with obstacles and with one another.
+
+    Attributes:
+        friction: Coulomb's coefficient of friction >= 0 of all contacts; an obstacle may have one of its own.
+        self_contact: Whether bodies touch themselves, too. They touch one another in any case.
+
+    Raises:
+        InputError: A value out of its range.
+    """
+
+    friction: float = 0.3
+    self_contact: bool = False
+
+    def __post_init__(self) -> None:
+        checked_friction(self.friction)
+
+
+def checked_friction(given: float) -> float:
+    """A coefficient of friction.
+
+    Raises:
+        InputError: It is negative or not finite.
+    """
+    if not 0.0 <= checked_number(given, "friction") < math.inf:
+        raise InputError(f"friction is {given}; it must be zero or a positive number")
+    return float(given)

@@ -1,0 +1,147 @@
+"""The contacts of the last step, one by one, for the host."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.kernels.contact import sums
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+
+    from .contacts import Contacts
+    from .pairs import Pairs
+    from .tool import Obstacle
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ContactPoint:
+    """One place where a body was touched in the last step.
+
+    Attributes:
+        body: The soft body.
+        other: What touches it: an obstacle as it was given, or a soft body, which may be the same.
+        world: In which world.
+        nodes: The body's nodes at that place: one, the ends of an edge, or the corners of a triangle; numbered within
+            the world.
+        shares: Of each of them in the point [1], [2] or [3].
+        point: Where [m], [3].
+        normal: From the other to the body, [3].
+        gap: Between them at the beginning of the step, negative where they overlapped [m].
+        normal_force: On the body along the normal [N], never negative.
+        friction_force: On the body across the normal [N], [3].
+        other_nodes: The nodes of the other, if that is a soft body.
+    """
+
+    body: SoftBody
+    other: Obstacle | SoftBody
+    world: int
+    nodes: tuple[int, ...]
+    shares: Floats
+    point: Floats
+    normal: Floats
+    gap: float
+    normal_force: float
+    friction_force: Floats
+    other_nodes: tuple[int, ...] = ()
+
+    @property
+    def force(self) -> Floats:
+        """The whole force on the body [N], [3]."""
+        return self.normal_force * self.normal + self.friction_force
+
+
+def contact_points(contacts: Contacts) -> list[ContactPoint]:
+    """All contacts of the last step; waits for the device."""
+    found = [] if contacts.pairs is None else _of_pairs(contacts, contacts.pairs)
+    if contacts.obstacles.count:
+        found += _at_nodes(contacts)
+    return found + (_at_triangles(contacts) if contacts.obstacles.have_edges else [])
+
+
+def _of_pairs(contacts: Contacts, pairs: Pairs) -> list[ContactPoint]:
+    """Each pair once: the force on the node, or on the first edge."""
+    rows, x = pairs.rows, contacts.surface.arrays.x.numpy().astype(float)
+    nodes, bodies = contacts.surface.count, contacts.system.bodies
+    count = min(int(rows.starts.numpy()[-1]), len(rows.owner))
+    acts, owner = rows.acts.numpy()[:count], rows.owner.numpy()[:count]
+    force, normal = (array.numpy()[:count].astype(float) for array in (rows.force, rows.normal))
+    places, shares, gap = rows.places.numpy(), rows.shares.numpy().astype(float), rows.gap.numpy()
+    found = []
+    for row in np.flatnonzero((acts != 0) & force.any(axis=1)):
+        size = 1 if owner[row] < nodes else 2
+        k, world, own = contacts.surface.nodes_at(places[row, :size])
+        m, _, others = contacts.surface.nodes_at(places[row, size:])
+        along, w = float(force[row] @ normal[row]), shares[row, :size]
+        found.append(
+            ContactPoint(
+                bodies[k],
+                bodies[m],
+                world,
+                own,
+                w,
+                w @ x[places[row, :size]],
+                normal[row],
+                float(gap[row]),
+                along,
+                force[row] - along * normal[row],
+                others,
+            )
+        )
+    return found
+
+
+def _at_nodes(contacts: Contacts) -> list[ContactPoint]:
+    surface, obstacles = contacts.surface, contacts.obstacles
+    gaps = wp.zeros(contacts.forces.shape, dtype=wp.float32, device=contacts.device)
+    normals = wp.zeros(contacts.forces.shape, dtype=wp.vec3, device=contacts.device)
+    inputs = [obstacles.shapes, obstacles.motions, surface.arrays, contacts.forces]
+    wp.launch(sums.describe_touches, contacts.forces.shape, inputs, [gaps, normals], device=contacts.device)
+    forces = contacts.forces.numpy().astype(float)
+    gap, normal, x = gaps.numpy(), normals.numpy().astype(float), surface.arrays.x.numpy().astype(float)
+    found = []
+    for o, s in np.argwhere(forces.any(axis=2)):
+        places = np.array([s])
+        found.append(_point(contacts, o, places, np.ones(1), x[s], normal[o, s], gap[o, s], forces[o, s]))
+    return found
+
+
+def _at_triangles(contacts: Contacts) -> list[ContactPoint]:
+    touches, surface = contacts.touches, contacts.surface
+    acts, force = touches.acts.numpy(), touches.force.numpy().astype(float)
+    shares, normal, gap = (
+        touches.shares.numpy().astype(float),
+        touches.normal.numpy().astype(float),
+        touches.gap.numpy(),
+    )
+    corners, x = surface.triangles.numpy(), surface.arrays.x.numpy().astype(float)
+    found = []
+    for o, t in np.argwhere((acts != 0) & force.any(axis=2)):
+        w, places = shares[o, t], corners[t]
+        found.append(_point(contacts, o, places, w, w @ x[places], normal[o, t], gap[o, t], force[o, t]))
+    return found
+
+
+def _point(
+    contacts: Contacts,
+    o: int,
+    places: npt.NDArray[np.integer],
+    shares: Floats,
+    point: Floats,
+    normal: Floats,
+    gap: float,
+    force: Floats,
+) -> ContactPoint:
+    k, world, nodes = contacts.surface.nodes_at(places)
+    along = float(force @ normal)
+    other = contacts.obstacles.given[o]
+    return ContactPoint(
+        contacts.system.bodies[k], other, world, nodes, shares, point, normal, float(gap), along, force - along * normal
+    )

@@ -1,0 +1,190 @@
+"""Obstacles that move as they are told."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_number, checked_numbers, shown
+from warp_corot.inputs.keys import checked_times
+
+from .shapes import Shape, Vector, checked_quaternion, checked_vector
+
+if TYPE_CHECKING:
+    from .obstacles import Obstacles
+
+#: Times [s], [K], and poses, [K, 7].
+Keys = tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
+#: The highest speed of a tool whose poses are given from step to step, where none is named [m/s].
+SPEED = 1.0
+
+
+class Tool:
+    """A rigid obstacle that moves along keyframes, to where it is sent, or as an array on the device says.
+
+    Args:
+        shape: What it is. Its pose is the tool's first one.
+        speed: How fast it goes where it is sent, at most [m/s]. It bounds the length of steps, so that nothing passes
+            through it.
+
+    Raises:
+        InputError: Not a shape, or a speed that is not positive.
+    """
+
+    def __init__(self, shape: Shape, *, speed: float = SPEED):
+        if not isinstance(shape, Shape):
+            raise InputError(f"shape is {shown(shape)}; it must be a shape such as Capsule(radius=0.004, length=0.1)")
+        if not 0.0 < checked_number(speed, "speed", "m/s") < math.inf:
+            raise InputError(f"speed is {speed}; it must be a positive number of metres per second")
+        self.shape, self.speed = shape, float(speed)
+        self.pose = shape.pose
+        #: Keyframes: times [s], float64 [K], and poses, float64 [K, 7]; None without.
+        self.keys: Keys | None = None
+        #: Somebody's array of poses that steps read; None without.
+        self.poses: wp.array | None = None
+        self.is_sent = False
+        self._bound: tuple[Obstacles, int] | None = None
+
+    def __repr__(self) -> str:
+        return f"tool ({self.shape!r})"
+
+    # --- how it moves ----------------------------------------------------------------------------------------------
+
+    def follow(self, times: npt.ArrayLike, positions: npt.ArrayLike, quaternions: npt.ArrayLike | None = None) -> None:
+        """Move along keyframes: on straight lines between them, and not at all before the first and after the last.
+
+        Args:
+            times: Increasing, at least two [s], [K].
+            positions: [m], [K, 3].
+            quaternions: (x, y, z, w), [K, 4], or one for all; None: as it is turned now.
+
+        Raises:
+            InputError: Wrong shapes, times that do not increase, or numbers that are not finite.
+        """
+        t = checked_times(times)
+        p = checked_numbers(positions, "positions", f"[{len(t)}, 3]")
+        if p.shape != (len(t), 3) or not np.isfinite(p).all():
+            raise InputError(f"positions has shape {p.shape}; it must be finite, [{len(t)}, 3]")
+        q = checked_numbers(self.pose[3:] if quaternions is None else quaternions, "quaternions", f"[{len(t)}, 4]")
+        if q.shape not in ((4,), (len(t), 4)) or not np.isfinite(q).all():
+            raise InputError(f"quaternions has shape {q.shape}; it must be finite, [{len(t)}, 4] or [4]")
+        q = np.broadcast_to(q, (len(t), 4))
+        q = np.array([checked_quaternion(row) for row in q])
+        self._move_by((t, np.hstack([p, q])), None, False)
+
+    def move(self, position: Vector, quaternion: Vector | None = None) -> None:
+        """Go to a place, straight and at no more than ``speed``; at once if no simulation has the tool yet.
+
+        Raises:
+            InputError: Not three finite numbers, or not a quaternion (x, y, z, w).
+        """
+        p = checked_vector(position, "position")
+        q = self.pose[3:] if quaternion is None else checked_quaternion(quaternion)
+        self.pose = np.concatenate([p, q])
+        if not self.is_sent or self.poses is not None:
+            self._move_by(None, None, self._bound is not None)
+        if self._bound is not None:
+            obstacles, number = self._bound
+            obstacles.send(number, self.pose)
+
+    def use_poses(self, poses: wp.array) -> None:
+        """Go where an array on the device says, which every step reads, at no more than ``speed``.
+
+        Args:
+            poses: ``wp.transform`` [1], or [worlds] with one for each.
+
+        Raises:
+            InputError: Another type.
+        """
+        if not isinstance(poses, wp.array) or poses.dtype != wp.transformf or poses.ndim != 1 or not len(poses):
+            raise InputError(f"poses is {shown(poses)}; it must be a Warp array of wp.transform, [1] or [worlds]")
+        self._move_by(None, poses, True)
+
+    # --- what it feels ---------------------------------------------------------------------------------------------
+
+    @property
+    def wrench(self) -> wp.array:
+        """Force on the tool and torque about its origin in the last step [N, N m], a live ``wp.spatial_vector``
+        [worlds]: force first.
+
+        Raises:
+            InputError: No simulation has the tool.
+        """
+        obstacles, number = self.place_among_obstacles()
+        return obstacles.wrench(number)
+
+    @property
+    def present_pose(self) -> npt.NDArray[np.float64]:
+        """Where it is in each world: position and quaternion, float64 [worlds, 7]; waits for the device.
+
+        Raises:
+            InputError: No simulation has the tool.
+        """
+        obstacles, number = self.place_among_obstacles()
+        return obstacles.poses()[:, number]
+
+    def place_among_obstacles(self) -> tuple[Obstacles, int]:
+        """The obstacles of the tool's simulation, and which of them it is.
+
+        Raises:
+            InputError: No simulation has the tool.
+        """
+        if self._bound is None:
+            raise InputError("no simulation has this tool; name it among obstacles of a Simulation")
+        return self._bound
+
+    # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def bind(self, obstacles: Obstacles, number: int) -> None:
+        """Be an obstacle of a simulation, which calls this.
+
+        Raises:
+            InputError: It is another's already.
+        """
+        if self._bound is not None:
+            raise InputError("a tool is in two simulations; make another one of its shape")
+        self._bound = (obstacles, number)
+
+    def fastest(self) -> float:
+        """The highest speed of any of its points [m/s]."""
+        if self.keys is None:
+            return self.speed if self.is_sent else 0.0
+        times, poses = self.keys
+        far = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
+        cosines = np.abs(np.sum(poses[1:, 3:] * poses[:-1, 3:], axis=1))
+        turns = 2.0 * np.arccos(np.clip(cosines, 0.0, 1.0))
+        if turns.max() > 1e-7:
+            far = far + turns * self.shape.reach
+        return float((far / np.diff(times)).max())
+
+    def _move_by(self, keys: Keys | None, poses: wp.array | None, is_sent: bool) -> None:
+        """Move in another way from now on; or as before, if the simulation refuses."""
+        before = self.keys, self.poses, self.is_sent
+        self.keys, self.poses, self.is_sent = keys, poses, is_sent
+        try:
+            if self._bound is not None:
+                self._bound[0].update()
+        except InputError:
+            self.keys, self.poses, self.is_sent = before
+            raise
+
+
+Obstacle = Shape | Tool
+
+
+def as_tool(given: Any) -> Tool:
+    """A tool, or a shape that stays where it is.
+
+    Raises:
+        InputError: Something else.
+    """
+    if isinstance(given, Tool):
+        return given
+    if isinstance(given, Shape):
+        return Tool(given)
+    raise InputError(f"an obstacle is {shown(given)}; it must be a shape such as Ground() or a Tool")
