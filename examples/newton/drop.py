@@ -1,9 +1,9 @@
 """A ball of soft tissue, meshed adaptively, falls on a rigid box; both come to rest on the ground. Stress is logged.
 
-The ball's surface is drawn, bound to its tetrahedra: these reach a little beyond, since those that it cuts are whole.
+The ball's surface is drawn, bound to its tetrahedra, which extend a little beyond it, since cut ones are whole.
 
 python examples/newton/drop.py --viewer null --test, or --viewer usd --output-path drop.usd, gl, rerun, viser.
-Without a display and --viewer frames go to a USD file.
+Without a display and --viewer, frames go to a USD file.
 """
 
 import newton
@@ -18,11 +18,11 @@ RADIUS = 0.15
 
 
 def add_surface(builder, forest, added, pos):
-    """Have viewers draw the surface of what was meshed, which follows the forest's tetrahedra."""
+    """Let viewers draw the meshed surface, which follows the forest's tetrahedra."""
     surface, tets = forest.surface(), added.tetrahedra
-    elements, weights = forest.embed(surface.points)  # outside of all tetrahedra: in the nearest
+    elements, weights = forest.embed(surface.points)  # points outside all tetrahedra use the nearest one
     weights = np.clip(weights, 0.0, None) / np.clip(weights, 0.0, None).sum(axis=1, keepdims=True)
-    # Newton has the corners of mirrored elements in another order.
+    # In Newton the corners of mirrored elements have another order.
     corners = np.array(builder.tet_indices)[tets.start + elements] - added.particles.start
     same = corners[:, :, None] == forest.tets[elements][:, None, :]
     builder.add_deformable_visual_mesh(
@@ -55,7 +55,7 @@ class Example:
         self.model.shape_material_ke.fill_(4e4)
         self.model.shape_material_kd.fill_(400.0)
         self.solver = wn.SolverCorotated(self.model, damping=2.0)  # 1/s, so that the ball comes to rest
-        # How often contacts are found in a frame; the solver divides steps further, as it takes to be stable.
+        # Number of contact detections in a frame; the solver divides steps further to stay stable.
         self.steps = 8
         self.pipeline = newton.CollisionPipeline(self.model)
         self.contacts = self.pipeline.contacts()
@@ -64,7 +64,7 @@ class Example:
         self.control = self.model.control()
         viewer.set_model(self.model)
         viewer.set_camera(wp.vec3(0.95, -0.8, 0.65), pitch=-17.0, yaw=140.0)
-        self.simulate()  # compiles what the recording launches
+        self.simulate()  # compiles the kernels that the recording launches
         self.state_0.assign(self.model.state())
         with wp.ScopedCapture() as capture:
             self.simulate()
@@ -106,5 +106,5 @@ if __name__ == "__main__":
     viewer, args = wn.open_viewer("drop")
     try:
         newton.examples.run(Example(viewer, args), args)
-    except KeyboardInterrupt:  # rerun and viser run until then; what is written is kept
+    except KeyboardInterrupt:  # rerun and viser run until then; the output is kept
         viewer.close()

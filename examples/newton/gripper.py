@@ -1,7 +1,7 @@
 """Two fingers close on a soft block, lift it and hold it.
 
 python examples/newton/gripper.py --viewer null --test --num-frames 180, or --viewer usd --output-path gripper.usd, gl,
-rerun, viser. Without a display and --viewer frames go to a USD file.
+rerun, viser. Without a display and --viewer, frames go to a USD file.
 """
 
 import newton
@@ -13,7 +13,7 @@ import warp_corot as wc
 import warp_corot.newton as wn
 
 HALF, FINGER, GREY = 0.05, 0.02, (0.35, 0.42, 0.5)
-CLOSED, LIFTED = 0.5, 1.5  # when the fingers are closed and when they are up [s]
+CLOSED, LIFTED = 0.5, 1.5  # times when the fingers are closed and when they are up [s]
 SQUEEZE, HEIGHT = 0.012, 0.2  # how far they press in, and how far they lift [m]
 
 
@@ -67,7 +67,7 @@ class Example:
         self.control = self.model.control()
         viewer.set_model(self.model)
         viewer.set_camera(wp.vec3(0.28, -0.68, 0.3), pitch=-13.0, yaw=112.0)
-        self.simulate()  # compiles what the recording launches
+        self.simulate()  # compiles the kernels that the recording launches
         self.state_0.assign(self.model.state())
         self.time.zero_()
         with wp.ScopedCapture() as capture:
@@ -75,7 +75,7 @@ class Example:
         self.graph = capture.graph
 
     def simulate(self):
-        dt = self.frame_dt / self.substeps  # short enough for the solver not to divide it
+        dt = self.frame_dt / self.substeps  # short enough that the solver does not divide it
         for _ in range(self.substeps):
             self.state_0.clear_forces()
             wp.launch(move_fingers, dim=2, inputs=[self.time, dt, self.state_0.body_q, self.state_0.body_qd])
@@ -106,5 +106,5 @@ if __name__ == "__main__":
     viewer, args = wn.open_viewer("gripper")
     try:
         newton.examples.run(Example(viewer, args), args)
-    except KeyboardInterrupt:  # rerun and viser run until then; what is written is kept
+    except KeyboardInterrupt:  # rerun and viser run until then; the output is kept
         viewer.close()

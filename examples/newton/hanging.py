@@ -1,7 +1,7 @@
-"""Four cantilevers of the same rubber in Newton, of tetrahedra that are damped less and less, the last one a forest.
+"""Four cantilevers of the same rubber in Newton, with less and less damping; the last one is a forest.
 
 python examples/newton/hanging.py --viewer null --test, or --viewer usd --output-path hanging.usd, gl, rerun, viser.
-Without a display and --viewer frames go to a USD file.
+Without a display and --viewer, frames go to a USD file.
 """
 
 import newton
@@ -54,14 +54,14 @@ class Example:
         self.control = self.model.control()
         viewer.set_model(self.model)
         viewer.set_camera(wp.vec3(3.6, -1.3, 2.0), pitch=-14.0, yaw=142.0)
-        self.simulate()  # compiles what the recording launches
+        self.simulate()  # compiles the kernels that the recording launches
         self.state_0.assign(self.model.state())
         with wp.ScopedCapture() as capture:
             self.simulate()
         self.graph = capture.graph
 
     def simulate(self):
-        # Two, so that the states end as they began; the solver divides them as it takes to be stable.
+        # Two, so that the states end as they began; the solver divides them to stay stable.
         for _ in range(2):
             self.state_0.clear_forces()
             self.viewer.apply_forces(self.state_0)
@@ -91,5 +91,5 @@ if __name__ == "__main__":
     viewer, args = wn.open_viewer("hanging")
     try:
         newton.examples.run(Example(viewer, args), args)
-    except KeyboardInterrupt:  # rerun and viser run until then; what is written is kept
+    except KeyboardInterrupt:  # rerun and viser run until then; the output is kept
         viewer.close()

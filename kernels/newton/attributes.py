@@ -1,14 +1,15 @@
-"""Tetrahedra of a Newton model to and from its arrays: materials read, rotations and stresses written."""
+"""Conversion between Newton's arrays and tetrahedra: materials are read, rotations and stresses written."""
 
 import functools
 
 import warp as wp
 
+from warp_corot.kernels.elements.constitutive import corotated_strain, hooke
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.forces import von_mises
-from warp_corot.kernels.math.rotation import byers_xu, warm_rotation
+from warp_corot.kernels.math.rotation import byers_xu, identity3, warm_rotation
 
-from .elements import difference_gradient, place_in_model, rotated_stress
+from .elements import difference_gradient, place_in_model
 
 wp.set_module_options({"enable_backward": False})
 
@@ -26,8 +27,8 @@ def split_materials(
     k_lambda: wp.array[wp.float32],
     k_damp: wp.array[wp.float32],
 ):
-    """Lamé's parameters of chosen elements, mu = a k_mu, lambda = k_lambda + b k_mu, and what else is in Newton's rows,
-    one after another."""
+    """Lamé's parameters of chosen elements, mu = a k_mu, lambda = k_lambda + b k_mu, and the other values in Newton's
+    rows, in separate arrays."""
     t = wp.tid()
     row = place_in_model(ids, 0, t)
     k_mu = materials[row, 0]
@@ -39,7 +40,7 @@ def split_materials(
 
 @functools.cache
 def write_attributes(has_rotation: bool, has_stress: bool, has_von_mises: bool, is_warm: bool) -> wp.Kernel:
-    """Rotation and Cauchy stress of every element, those of them that the state has room for."""
+    """Write rotation and Cauchy stress of every element, as far as the state has attributes for them."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def write_attributes(
@@ -69,7 +70,7 @@ def write_attributes(has_rotation: bool, has_stress: bool, has_von_mises: bool, 
             if wp.static(has_rotation):
                 rotations[t] = wp.normalize(wp.quat_from_matrix(r))
         share = 1.0 / fill[t * fill_stride]
-        stress = share * rotated_stress(gradient, r, mu[t], lam[t])
+        stress = share * hooke(corotated_strain(gradient - identity3(), identity3(), r), mu[t], lam[t])
         if wp.static(has_stress):
             stresses[t] = r * stress * wp.transpose(r)
         if wp.static(has_von_mises):

@@ -1,14 +1,15 @@
 """Tetrahedra of a Newton model: forces, rotations and stresses from nodal positions and inverse rest matrices.
 
-Newton's state is positions, and an element's rest shape is its matrix alone: no rest positions need go with it (a body
-may have been turned after it was built, or its elements strained against one another). So F = (x1-x0 x2-x0 x3-x0) B.
+Newton's state consists of positions, and only its matrix defines an element's rest shape: there need be no consistent
+rest positions (a body may have been turned after it was built, or its elements strained against one another). So
+F = (x1-x0 x2-x0 x3-x0) B.
 """
 
 import functools
 
 import warp as wp
 
-from warp_corot.kernels.elements.constitutive import corotated_strain, hooke
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, rotated_stress
 from warp_corot.kernels.elements.elements import GeneralElements, load_node, scatter_stress
 from warp_corot.kernels.elements.general_cuda import (
     PosedElements,
@@ -17,13 +18,13 @@ from warp_corot.kernels.elements.general_cuda import (
     load_four,
     rest_inverse_of,
 )
-from warp_corot.kernels.elements.lanes import COMPILER_FLAGS, native, on_cpu
+from warp_corot.kernels.elements.lanes import ISOTROPIC, native, scatter_lanes
 from warp_corot.kernels.elements.law_lanes import LAWS
 from warp_corot.kernels.math.rotation import byers_xu, cofactor, identity3, warm_rotation
 
 wp.set_module_options({"enable_backward": False})
 
-#: Tetrahedra that a thread looks at whether they are active.
+#: Number of tetrahedra that a thread checks for activation.
 EACH = wp.constant(4)
 
 
@@ -44,24 +45,18 @@ def difference_gradient(elements: GeneralElements, t: int, a: wp.array[wp.vec3])
 
 
 @wp.func
-def rotated_stress(f: wp.mat33, r: wp.mat33, mu: float, lam: float):
-    """Stress [Pa] of F in the axes that its rotation turns."""
-    return hooke(corotated_strain(f - identity3(), identity3(), r), mu, lam)
-
-
-@wp.func
 def corotated_stress(f: wp.mat33, r: wp.mat33, mu: float, lam: float):
     """First Piola-Kirchhoff stress [Pa] of F and its rotation."""
-    return r * rotated_stress(f, r, mu, lam)
+    return rotated_stress(f - identity3(), identity3(), r, mu, lam)
 
 
 @wp.func
 def viscous_stress(f: wp.mat33, rate_of_f: wp.mat33, k: float):
-    """Of k_damp [Pa s]: with Green's strain E, P = 3 / tr(F^T F) F (k dE/dt + k tr(dE/dt) I).
+    """Viscous stress for k_damp [Pa s]: with Green's strain E, P = 3 / tr(F^T F) F (k dE/dt + k tr(dE/dt) I).
 
-    Nothing for a rigid motion, no torque, never any work put in. For small strains it is the k (dF/dt + tr(dF/dt) I) of
-    Newton's solvers, which also damps turning (and translation, as they have it). The factor keeps it from growing
-    with the stretch.
+    It vanishes for rigid motion, exerts no torque, and never adds energy. For small strains it equals the
+    k (dF/dt + tr(dF/dt) I) of Newton's solvers, which also damps rotation (and, in their form, translation). The factor
+    keeps it from growing with the stretch.
     """
     product = wp.transpose(f) * rate_of_f
     rate = 0.5 * (product + wp.transpose(product))
@@ -71,13 +66,13 @@ def viscous_stress(f: wp.mat33, rate_of_f: wp.mat33, k: float):
 
 @wp.func
 def active_stress(f: wp.mat33, k: float):
-    """k cof F, the gradient of k J: with k = k_lambda times the activation what Newton's solvers have."""
+    """k cof F, the gradient of k J; with k = k_lambda times the activation it is that of Newton's solvers."""
     return k * cofactor(f)
 
 
 @wp.func
 def place_in_model(ids: wp.array[wp.int32], first: int, t: int):
-    """Which of the model's tetrahedra the t-th of a part is: of a list, or of a range where the list is empty."""
+    """The model's index of the t-th tetrahedron of a part: from a list, or from a range if the list is empty."""
     place = first + t
     if ids.shape[0] > 0:
         place = ids[t]
@@ -86,7 +81,7 @@ def place_in_model(ids: wp.array[wp.int32], first: int, t: int):
 
 @functools.cache
 def scatter_posed(rotation: wp.Function, damped: bool, rounds: int = 1) -> wp.Kernel:
-    """All forces of tetrahedra, each with the rotation of its own deformation gradient; ``ids`` are their places in
+    """All forces of tetrahedra, each with the rotation of its own deformation gradient; ``ids`` are their indices in
     ``stepping.activation``; ``rounds``: see ``add_four_forces``."""
     add = add_stress(rounds)
 
@@ -135,7 +130,7 @@ def scatter_posed_warm(
     # Out
     f: wp.array[wp.vec4],
 ):
-    """Elastic forces from the rotations that the state came with; ``ids`` are the elements' places there."""
+    """Elastic forces with the rotations in the input state; ``ids`` are the elements' indices there."""
     t = wp.tid()
     gradient = deformation_gradient(elements, t, x)
     r = wp.quat_to_matrix(warm_rotation(gradient, guesses[place_in_model(ids, 0, t)]))
@@ -144,67 +139,31 @@ def scatter_posed_warm(
 
 # --- the same on the CPU, eight elements in the lanes of vector registers; see ``elements.lanes`` ---------------------
 
-_FORCES = on_cpu(LAWS["corotated"], native("elements", "posed_elements", "element_forces", "left_out_elements"))
+#: Corotated forces, each element with its own rotation.
+scatter_posed_lanes = scatter_lanes(
+    LAWS["corotated"] + ISOTROPIC + native("elements", "posed_elements", "element_forces", "left_out_elements"),
+    GeneralElements,
+    IsotropicMaterial,
+    wp.int32,
+)
 
 
-@wp.func_native(_FORCES)
-def eight_posed(
-    elements: GeneralElements,
-    block: int,
-    count: int,
-    mu: wp.array[wp.float32],
-    lam: wp.array[wp.float32],
-    u: wp.array[wp.vec4],
-    f: wp.array[wp.vec4],
-    left_out: wp.array[wp.int32],
-): ...
+@wp.func
+def posed_stress(elements: GeneralElements, t: int, material: IsotropicMaterial, x: wp.array[wp.vec4]):
+    """The stress of element t at positions x, right for every F, for ``elements.forces.repair_forces``."""
+    f = deformation_gradient(elements, t, x)
+    return corotated_stress(f, byers_xu(f), material.mu[t], material.lam[t])
 
 
-@wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": COMPILER_FLAGS})
-def scatter_posed_lanes(
-    # In
-    elements: GeneralElements,
-    count: int,
-    mu: wp.array[wp.float32],
-    lam: wp.array[wp.float32],
-    x: wp.array[wp.vec4],
-    # Out
-    f: wp.array[wp.vec4],
-    left_out: wp.array[wp.int32],
-):
-    """Corotated forces, each element with its own rotation; a thread is eight elements."""
-    eight_posed(elements, wp.tid(), count, mu, lam, x, f, left_out)
-
-
-@wp.kernel(enable_backward=False)
-def repair_posed(
-    # In
-    elements: GeneralElements,
-    mu: wp.array[wp.float32],
-    lam: wp.array[wp.float32],
-    x: wp.array[wp.vec4],
-    # In and out
-    left_out: wp.array[wp.int32],
-    # Out
-    f: wp.array[wp.vec4],
-):
-    """Forces of the elements on the list, with the rotation that is right for every F, by one thread; empties it."""
-    for i in range(left_out[0]):
-        t = left_out[i + 1]
-        gradient = deformation_gradient(elements, t, x)
-        scatter_stress(elements, t, corotated_stress(gradient, byers_xu(gradient), mu[t], lam[t]), f)
-    left_out[0] = 0
-
-
-# --- what is Newton's own, whatever the elastic model ----------------------------------------------------------------
+# --- Newton's own stresses, for every elastic model ------------------------------------------------------------------
 
 
 @functools.cache
 def scatter_damping_and_activation(damped: bool) -> wp.Kernel:
-    """What is not elastic in the forces of ``count`` tetrahedra of a model, for those whose elastic part is another
-    kernel's.
+    """Forces of damping and activation of ``count`` tetrahedra of a model whose elastic forces come from another
+    kernel.
 
-    A thread looks at ``EACH`` of them, so that where none is active or damped it waits for memory once.
+    A thread checks ``EACH`` of them, so that it waits for memory once if none is active or damped.
     """
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -1,4 +1,4 @@
-"""How stiff the tetrahedra of a Newton model are now: what ``stepping.gauge`` does, for positions and rest matrices."""
+"""Current stiffness of the tetrahedra of a Newton model: ``stepping.gauge`` for positions and rest matrices."""
 
 import warp as wp
 
@@ -24,8 +24,8 @@ def find_posed_strains(
     # Out
     found: wp.array2d[wp.float32],
 ):
-    """The largest entry of F^T F - I among one element of ``TURNS``, now and after ``ahead`` [s] at the present rate;
-    the next measurement looks at others."""
+    """The largest entry of F^T F - I among one in ``TURNS`` elements, now and after ``ahead`` [s] at the current rate;
+    the next measurement checks others."""
     t = wp.tid() * TURNS + turn[0] % TURNS
     if t >= count:
         return
@@ -53,12 +53,12 @@ def take_safe_substep(
     # Out
     seen: wp.array[wp.float64],
 ):
-    """The substep that is safe until the next measurement [s]: shorter at once, longer slowly.
+    """Find the substep that is safe until the next measurement [s]: it shrinks at once and grows slowly.
 
     Args:
-        recorded: Length of the substep of a recorded step [s]; zero where the host chooses the next one.
-        excess: By what factor a recorded one was too long at most.
-        seen: The safe one for the host, in its own memory.
+        recorded: Length of the substep of a recorded step [s]; zero if the host chooses the next one.
+        excess: Largest factor by which a recorded one was too long.
+        seen: The safe substep, in the host's memory.
     """
     longest = at_rest[0, SAFE] * at_rest[0, STABLE]
     safe = wp.min(longest, safe_step(at_rest, found, 0))

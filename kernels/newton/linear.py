@@ -1,8 +1,8 @@
-"""Small motions of what Newton has besides tetrahedra: linear forces of its springs, triangles and bending edges.
+"""Small motions of Newton's other elements: linear forces of springs, triangles and bending edges.
 
-They are those of ``newton.solvers.SolverSemiImplicit``, linearised about given positions: f -= K u, or, as u is then a
-velocity, f -= C u of their dampers. What is shorter or smaller there than at rest counts as if it were at rest, since
-that is where it becomes stiffer to; what is longer has its tension across it, too.
+These are the forces of ``newton.solvers.SolverSemiImplicit``, linearised about given positions: f -= K u, or, with a
+velocity u, f -= C u of their dampers. An element that is shorter or smaller there than at rest counts as if it were at
+rest, since that is its stiffer state; a longer one also has its tension across it.
 """
 
 import warp as wp
@@ -11,7 +11,7 @@ from warp_corot.kernels.elements.elements import add_force, load_node
 
 wp.set_module_options({"enable_backward": False})
 
-#: Twice the area and the length below which Newton leaves bending edges out [m^2, m].
+#: Newton leaves out bending edges below twice this area and this length [m^2, m].
 LEAST = wp.constant(1.0e-6)
 
 
@@ -58,7 +58,8 @@ def scatter_triangles(
     # Out
     f: wp.array[wp.vec4],
 ):
-    """Of the energy A (k_mu/2 F:F + k_lambda/2 (J - 1 - k_mu/k_lambda)^2), J = |F1 x F2|, and of dampers of F and J."""
+    """Forces of the energy A (k_mu/2 F:F + k_lambda/2 (J - 1 - k_mu/k_lambda)^2), J = |F1 x F2|, and of dampers of F
+    and J."""
     t = wp.tid()
     mu = materials[t, 0]
     lam = wp.max(materials[t, 1], 0.0)
@@ -129,10 +130,11 @@ def scatter_bending(
     # Out
     f: wp.array[wp.vec4],
 ):
-    """Of dihedral angles near their rest.
+    """Forces of dihedral angles near their rest values.
 
-    Newton's forces are e k (theta - theta_0) d, where d is the angle's gradient g with lengths for its inverse heights:
-    K = e k d g^T. What is taken of it, (K + K^T) / 2, has an eigenvalue at least as large as the real part of any of K.
+    Newton's forces are e k (theta - theta_0) d, where d is the angle's gradient g with lengths in place of inverse
+    heights: K = e k d g^T. The symmetric part (K + K^T) / 2, used here, has an eigenvalue at least as large as the real
+    part of any of K.
     """
     edge = wp.tid()
     i = indices[edge, 0]

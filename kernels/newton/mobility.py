@@ -1,4 +1,4 @@
-"""How light a particle and a body are where they touch, and how much of a damper they can follow."""
+"""Mobility of a particle and a body at their contact, and the largest damping that they can follow."""
 
 import warp as wp
 
@@ -16,12 +16,12 @@ def body_point_velocity(twist: wp.spatial_vector, arm: wp.vec3):
 
 @wp.struct
 class Mobility:
-    """How a body's piece at a contact gives way, and a particle."""
+    """Response of a particle, and of a body's piece at a contact."""
 
     particle: float  # 1/m [1/kg]
     linear: float  # 1/m of the body's piece [1/kg]
-    angular: wp.mat33  # Its inverse inertia in world axes [1/(kg m^2)]
-    arm: wp.vec3  # From the body's centre of mass [m]
+    angular: wp.mat33  # inverse inertia of the piece in world axes [1/(kg m^2)]
+    arm: wp.vec3  # from the body's centre of mass [m]
 
 
 @wp.func
@@ -36,16 +36,16 @@ def mobility_of(
     pose: wp.transform,
     arm: wp.vec3,
 ):
-    """Of a particle of an inverse mass, and of a body; its share where it is touched in several places."""
+    """The mobility of a particle with an inverse mass, and of a body; its share if it is touched in several places."""
     m = Mobility()
     m.particle = particle
     m.arm = arm
-    if body >= 0:  # noqa: SIM102 - what is read next is there only then
+    if body >= 0:  # noqa: SIM102 - the next value exists only then
         if (body_flags[body] & fixed_flag) == 0:
             n = float(wp.max(places[body], 1))
-            turn = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+            rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
             m.linear = n * inverse_mass[body]
-            m.angular = n * (turn * inverse_inertia[body] * wp.transpose(turn))
+            m.angular = n * (rotation * inverse_inertia[body] * wp.transpose(rotation))
     return m
 
 
@@ -58,7 +58,7 @@ def body_mobility(m: Mobility, direction: wp.vec3):
 
 @wp.func
 def most_damping(m: Mobility, direction: wp.vec3, dt: float):
-    """What stops the relative velocity along a unit vector within a step [kg/s]."""
+    """The damping that stops the relative velocity along a unit vector within a step [kg/s]."""
     w = m.particle + body_mobility(m, direction)
     most = float(NO_LIMIT)
     if w > 0.0:
@@ -68,5 +68,5 @@ def most_damping(m: Mobility, direction: wp.vec3, dt: float):
 
 @wp.func
 def spring_row(normal: wp.vec3, arm: wp.vec3):
-    """How fast a body's point at ``arm`` goes along a unit vector, by the body's twist."""
+    """Velocity of a body's point at ``arm`` along a unit vector, as a row for the body's twist."""
     return wp.spatial_vector(normal, wp.cross(arm, normal))

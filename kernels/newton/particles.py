@@ -1,7 +1,7 @@
 """Particles of a Newton model through a step: into padded arrays, one step of symplectic Euler, and out again.
 
-A step is taken world by world or not at all. A world in which anything is not finite is marked, and ``worlds``
-puts it back to the state it came with. One that came with what is not finite is not written at all.
+A world is stepped completely or not at all. A world with a value that is not finite is marked, and ``worlds``
+restores its input state. If the input was not finite, the world is not written at all.
 """
 
 import warp as wp
@@ -35,10 +35,10 @@ ACTIVE = wp.constant(1)
     wp::index(a, i) = value;
 """)
 def store_vector(a: wp.array[wp.vec3], i: int, value: wp.vec3):
-    """Write vector i, where neighbouring threads write neighbouring ones.
+    """Write vector i; neighbouring threads write neighbouring vectors.
 
-    A vec3 is three words of four bytes, each of which a warp would write to every third place: twelve sectors of memory
-    three times over. So where all its threads are there they exchange their words first, and write whole sectors.
+    A vec3 is three words of four bytes, and a warp would write each to every third place: twelve sectors of memory,
+    three times. So if all its threads are active, they exchange their words first and write whole sectors.
     """
     ...
 
@@ -60,8 +60,8 @@ def gather_particles(
     kept_qd: wp.array[wp.vec3],
     trouble: wp.array[wp.int32],
 ):
-    """Positions, displacements from ``rest``, and copies, of those the arrays that are not empty; forces begin with the
-    external ones [N]. What is not finite marks its world."""
+    """Gather positions, displacements from ``rest``, and copies into the arrays that are not empty; forces start with
+    the external ones [N]. A value that is not finite marks its world."""
     i = wp.tid()
     at = q[i]
     velocity = qd[i]
@@ -87,7 +87,7 @@ def gather_nodes(
     # Out
     u: wp.array[wp.vec4],
 ):
-    """Displacements of a forest's nodes from where they rest."""
+    """Displacements of a forest's nodes from their rest positions."""
     k = wp.tid()
     store_node(u, k, load_node(x, particles[k]) - load_node(rest, k))
 
@@ -101,7 +101,7 @@ def add_nodes(
     # Out
     f: wp.array[wp.vec4],
 ):
-    """Add a forest's nodal forces to the particles' and begin anew with none. A particle is one node at most."""
+    """Add a forest's nodal forces to the particles' and reset them to zero. A particle is at most one node."""
     k = wp.tid()
     i = particles[k]
     store_node(f, i, load_node(f, i) + load_node(nodal, k))
@@ -129,8 +129,8 @@ def step_particles(
 ):
     """v <- (v + dt (f/m + g)) / (1 + dt damping), no faster than ``most``; x <- x + dt v.
 
-    A particle of no mass is kinematic: it keeps its velocity. One that is not active is frozen. What would be faster
-    than ``fastest`` marks its world as what is not finite does; in worlds marked before nothing moves.
+    A particle without mass is kinematic: it keeps its velocity. An inactive one is frozen. A particle faster
+    than ``fastest`` marks its world, like a value that is not finite; in worlds marked before nothing moves.
     """
     i = wp.tid()
     place = place_of(world[i], trouble.shape[0])
@@ -144,7 +144,7 @@ def step_particles(
         if w > 0.0:
             g = gravity[place_of(world[i], gravity.shape[0])]
             velocity = (velocity + dt * (w * load_node(f, i) + g)) / (1.0 + dt * damping)
-        # Scaled, so that nothing is out of range.
+        # Scaled, so that nothing overflows.
         size = wp.max(wp.max(wp.abs(velocity)), 1.0)
         speed = size * wp.length(velocity / size)
         runs_away = speed >= fastest
@@ -168,7 +168,7 @@ def damp_particles(
     q: wp.array[wp.vec3],
     qd: wp.array[wp.vec3],
 ):
-    """What ``step_particles`` has of damping, after a step that was taken without."""
+    """Apply the damping of ``step_particles`` after a step without it."""
     i = wp.tid()
     if inverse_mass[i] > 0.0 and (flags[i] & ACTIVE) != 0:
         velocity = qd[i]

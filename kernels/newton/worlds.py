@@ -1,6 +1,6 @@
-"""Worlds of a Newton model in which something is wrong: found, put back as they were, and reported; and worlds reset.
+"""Worlds of a Newton model with a failure: found, restored, and reported; and worlds that are reset.
 
-Entities of no world (-1) have the last place in arrays over worlds.
+Entities in no world (-1) use the last entry of arrays over worlds.
 """
 
 import warp as wp
@@ -9,22 +9,22 @@ from warp_corot.kernels.stepping.integrate import is_finite
 
 wp.set_module_options({"enable_backward": False})
 
-# What is wrong with a world in this step; the report keeps the largest number of a world it was seen in, plus one.
-# The graver of two has the larger number.
+# Failures of a world in this step; the report keeps the largest number of a world with a failure, plus one.
+# Of two failures, the graver one has the larger number.
 SOUND = wp.constant(0)
 UNSTABLE = wp.constant(1)
 TOO_MANY_CONTACTS = wp.constant(2)
-SURFACE_CONTACTS = wp.constant(3)
+TOO_MANY_PAIRS = wp.constant(3)
 BAD_INPUT = wp.constant(4)
 REPORTS = 5
 
-#: Newton's default for how fast a particle may be [m/s]. What gets there is no motion any more.
+#: Newton's default for the largest speed of a particle [m/s]. Beyond it the state is a failure.
 RUNAWAY = wp.constant(1.0e5)
 
 
 @wp.func
 def place_of(world: int, count: int):
-    """A world's place in an array over worlds; the last one is that of no world."""
+    """A world's entry in an array over worlds; the last one stands for no world."""
     return wp.where(world < 0, count - 1, world)
 
 
@@ -36,7 +36,7 @@ def check_contact_count(
     # Out
     trouble: wp.array[wp.int32],
 ):
-    """More contacts than there is room for: nobody knows which worlds' are missing, so none is stepped."""
+    """There are more contacts than the buffer holds: the worlds of the missing ones are unknown, so none is stepped."""
     w = wp.tid()
     if count[0] > most:
         wp.atomic_max(trouble, w, TOO_MANY_CONTACTS)
@@ -73,9 +73,9 @@ def put_back_particles(
     """Undo what was written to particles of marked worlds.
 
     Args:
-        before_q, before_qd: The state that the step began with.
-        kept_q, kept_qd: What was in the state that it went to, for worlds that began with what is not finite; or empty,
-            where those were not written.
+        before_q, before_qd: The state before the step.
+        kept_q, kept_qd: Former values of the output state, for worlds whose input was not finite; or empty,
+            if those were not written.
     """
     i = wp.tid()
     wrong = trouble[place_of(world[i], trouble.shape[0])]
@@ -118,7 +118,7 @@ def put_back_bodies(
     q: wp.array[wp.transform],
     qd: wp.array[wp.spatial_vector],
 ):
-    """Undo what a rigid solver wrote to bodies of marked worlds; as ``put_back_particles``."""
+    """Undo what a rigid solver wrote to bodies of marked worlds; like ``put_back_particles``."""
     b = wp.tid()
     wrong = trouble[place_of(world[b], trouble.shape[0])]
     if wrong == BAD_INPUT:
@@ -137,10 +137,10 @@ def report_trouble(
     report: wp.array[wp.int32],
     seen: wp.array[wp.int32],
 ):
-    """Remember what was wrong and in which world, and begin the next step with nothing wrong.
+    """Record the failure and its world, and clear failures for the next step.
 
     Args:
-        seen: That something was, for the host, in its own memory.
+        seen: Whether there was a failure, in the host's memory.
     """
     w = wp.tid()
     wrong = trouble[w]
@@ -180,7 +180,7 @@ def reset_rotations(
     # Out
     rotations: wp.array[wp.quat],
 ):
-    """Start the rotations of elements in chosen worlds from the identity again; an element is where its nodes are."""
+    """Reset the rotations of elements in chosen worlds to the identity; an element is in the world of its nodes."""
     t = wp.tid()
     if chosen[place_of(world[tets[t][0]], chosen.shape[0])]:
         rotations[t] = wp.quat_identity()

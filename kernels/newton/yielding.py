@@ -1,23 +1,23 @@
-"""How far bodies give way to springs of contacts and attachments within a step.
+"""How far bodies yield to springs of contacts and attachments within a step.
 
-Springs of many contacts are together far too stiff for a light body; explicit steps could not follow it. So they act
-on the body not where it is but where it would give way to them: their energy V becomes its Moreau envelope in the
-metric of the body's mass matrix M,
+Together, the springs of many contacts are far too stiff for explicit steps of a light body. So they act
+on the body not at its position but at the one to which it would yield: their energy V becomes its Moreau envelope in
+the metric of the body's mass matrix M,
 
     V'(x, b) = min over d of V(x, b + d) + d . M d / (2 dt^2),
 
-x particles, b the body, d its small displacement and turn. The gradient is that of V at b + d: every spring is still
-one between a particle and the body, only shorter. V' is an energy, so that nothing is gained as contacts come and go;
-M^-1 times its curvature is below 1/dt^2, whatever their number and stiffness; where nothing is stiff, d vanishes. At
-rest springs carry what they would, with the body deeper by g dt^2. As V is quadratic but for which contacts hold, d is
-found by Newton's method.
+with particles x, the body b, and its small displacement and rotation d. The gradient is that of V at b + d: every
+spring still connects a particle and the body, only shorter. V' is an energy, so contacts that come and go add none;
+M^-1 times its curvature is below 1/dt^2 for any number and stiffness of springs; without stiff springs, d vanishes. At
+rest springs carry the same forces, with the body deeper by g dt^2. V is quadratic except for the set of closed
+contacts, so Newton's method finds d.
 """
 
 import warp as wp
 
-from .contacts import ContactLaw, contact_gap
+from .contacts import ContactLaw
 from .mobility import spring_row
-from .particles import ACTIVE
+from .touching import contact_gap, is_active, largest_of, mean_of, point_of, share_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,6 +28,9 @@ def gather_soft_contacts(
     law: ContactLaw,
     count: wp.array[wp.int32],
     contact_particle: wp.array[wp.int32],
+    contact_nodes: wp.array[wp.vec3i],
+    contact_weights: wp.array[wp.vec3],
+    load: wp.array[wp.float32],
     contact_shape: wp.array[wp.int32],
     contact_point: wp.array[wp.vec3],
     contact_normal: wp.array[wp.vec3],
@@ -48,29 +51,27 @@ def gather_soft_contacts(
     curvature: wp.array[wp.spatial_matrix],
     slope: wp.array[wp.spatial_vector],
 ):
-    """What ``solve_yielding`` takes, of the contacts that hold where bodies have given way already; the first time, of
-    those that hold where they are, and in how many places they are touched."""
+    """Gather the data of contacts for ``solve_yielding`` that hold after bodies have yielded so far; the first time, of
+    those that hold at the current positions, and the number of places where each body is touched."""
     c = wp.tid()
     if c >= wp.min(count[0], contact_particle.shape[0]):
         return
-    i = contact_particle[c]
+    p = point_of(c, contact_particle, contact_nodes, contact_weights)
     shape = contact_shape[c]
-    if i < 0:
-        return
     body = shape_body[shape]
-    if body < 0 or (flags[i] & ACTIVE) == 0:
+    if body < 0 or not is_active(p, flags):
         return
     if (body_flags[body] & fixed_flag) != 0:
         return
     point = wp.transform_point(body_q[body], contact_point[c])
     arm = point - wp.transform_point(body_q[body], body_com[body])
     row = spring_row(contact_normal[c], arm)
-    gap = contact_gap(contact_normal[c], q[i], radius[i], point, shape, shape_margin)
+    gap = contact_gap(contact_normal[c], mean_of(p, q), largest_of(p, radius), point, shape, shape_margin)
     now = float(gap)
     if number > 0:
         now -= wp.dot(row, yielding[body])
     if now <= law.adhesion:
-        k = 0.5 * (law.stiffness + shape_ke[shape])
+        k = 0.5 * p.measure * share_of(p, load, law.crowd) * (law.stiffness + shape_ke[shape])
         wp.atomic_add(curvature, body, k * wp.outer(row, row))
         wp.atomic_add(slope, body, k * gap * row)
         if number == 0:
@@ -94,7 +95,7 @@ def gather_attachments(
     curvature: wp.array[wp.spatial_matrix],
     slope: wp.array[wp.spatial_vector],
 ):
-    """As ``gather_soft_contacts``."""
+    """Gather the data of attachments like ``gather_soft_contacts``."""
     a = wp.tid()
     if not enabled[a]:
         return
@@ -143,7 +144,7 @@ def solve_yielding(
     # Out
     yielding: wp.array[wp.spatial_vector],
 ):
-    """d of bodies: (K + M/dt^2) d = s with V = d . K d / 2 - s . d; K and s begin anew.
+    """Solve for d of bodies: (K + M/dt^2) d = s with V = d . K d / 2 - s . d; K and s are reset to zero.
 
     With M^-1 = L L^T, which may be singular, and d = dt L e this is (1 + dt^2 L^T K L) e = dt L^T s.
     """

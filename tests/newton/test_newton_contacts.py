@@ -32,7 +32,7 @@ def on_ground(device, gravity=(0.0, 0.0, -9.81), mu=0.5, **options):
 
 class TestGround:
     def test_carries_the_weight(self, device):
-        """At rest the springs of the contacts carry m g: as they do under Newton's own solver."""
+        """At rest the contact springs carry m g, as under Newton's own solver."""
         weights = []
         for make in (lambda m: wn.SolverCorotated(m, damping=20.0), semi_implicit):
             model, pipeline = on_ground(device, mu=0.3, damp=100.0)
@@ -44,7 +44,7 @@ class TestGround:
         assert weights == pytest.approx([1.0, 1.0], abs=0.01)
 
     def slope(self, device, tangent, steps, **options):
-        """A block under gravity at an angle, with mu = 0.5: its velocities, and its lowest layer's places."""
+        """A block under inclined gravity, with mu = 0.5: its velocities, and the positions of its lowest layer."""
         angle = np.arctan(tangent)
         g = 9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)])
         model, pipeline = on_ground(device, gravity=tuple(g), mu=0.5, **options)
@@ -62,13 +62,13 @@ class TestGround:
         return speeds, places, float(m.sum()) * g, int(below.sum())
 
     def test_slides_where_friction_is_too_little(self, device):
-        """By g (sin - mu cos)."""
+        """The acceleration is g (sin - mu cos)."""
         speeds, _, weight, _ = self.slope(device, 0.8, 1500)
         mass = np.linalg.norm(weight) / 9.81
         assert (speeds[-1] - speeds[499]) / (1000 * DT) == pytest.approx((weight[0] + 0.5 * weight[2]) / mass, rel=0.05)
 
     def test_sticks_where_friction_is_enough(self, device):
-        """But for what the law's slope allows, F / kf of each node, however light these are; once it does not sway."""
+        """Except for the law's slope, F / kf of each node, for nodes of any mass; once it has stopped swaying."""
         _, places, weight, nodes = self.slope(device, 0.3, 2500, damp=500.0)
         creep = (places[-1] - places[1749]) / (750 * DT)
         assert creep == pytest.approx(weight[0] / (nodes * KF), rel=0.2)
@@ -152,7 +152,7 @@ class TestBodies:
         assert p == pytest.approx(2.0 * model.particle_count * 1e-4, rel=1e-3)
 
     def test_nobody_steps_the_bodies(self, device):
-        """rigid_solver=None: reactions are left in state_in.body_f, and bodies where they are."""
+        """With rigid_solver=None, reactions are left in state_in.body_f, and bodies do not move."""
         model, pipeline = with_box(device, velocity=(0.0, 0.0, -1.0))
         solver = wn.SolverCorotated(model, rigid_solver=None)
         before, after = model.state(), model.state()
@@ -172,7 +172,7 @@ class TestBodies:
 
 
 def test_attachments_hang(device):
-    """A soft body on four springs under a body that is held: they are stretched by its weight."""
+    """A soft body hangs on four springs under a fixed body: its weight stretches them."""
     made = builder()
     body = made.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 2.0), wp.quat_identity()), mass=1.0)
     add_grid(made, dims=(1, 1, 1), pos=(-0.05, -0.05, 1.0))
@@ -197,7 +197,7 @@ def test_attachments_hang(device):
 
 
 def test_springs_and_triangles_act(device):
-    """What is not a tetrahedron goes as in SemiImplicit: the same pull on top of the tetrahedra's."""
+    """Elements other than tetrahedra behave as in SemiImplicit: they add the same pull."""
     speeds = []
     for make in (wn.SolverCorotated, semi_implicit):
         made = builder(gravity=(0.0, 0.0, 0.0))
@@ -238,3 +238,26 @@ def test_a_forest_on_a_box_on_the_ground_comes_to_rest(device):
     assert np.abs(state.particle_qd.numpy()).max() < 0.02
     assert x[:, 2].min() > 0.38
     assert 0.15 < state.body_q.numpy()[0, 2] < 0.201
+
+
+def test_attachments_pull_both_ways(device):
+    """A free body on springs to a free soft body: momentum is exchanged, as in a contact."""
+    made = builder(gravity=(0.0, 0.0, 0.0))
+    body = made.add_body(xform=wp.transform(wp.vec3(0.05, 0.05, 0.3), wp.quat_identity()))
+    made.add_shape_sphere(body, radius=0.03)
+    made.body_qd[body] = (0.3, 0.0, 1.0, 0.0, 0.0, 0.0)
+    add_grid(made, dims=(1, 1, 1))
+    for i in [i for i, x in enumerate(made.particle_q) if x[2] > 0.05]:
+        x = made.particle_q[i]
+        made.add_attachment_particle_body(
+            i, body, body_point=wp.vec3(x[0] - 0.05, x[1] - 0.05, x[2] - 0.3), stiffness=2e3, damping=2.0
+        )
+    model = made.finalize(device=device)
+    first = momentum(model, model.state())
+    ball = float(model.body_mass.numpy()[0])
+    rigid = newton.solvers.SolverSemiImplicit(model_without_particles(model), angular_damping=0.0)
+    state = run(wn.SolverCorotated(model, rigid_solver=rigid), model, 300, 5e-4)
+    last = momentum(model, state)
+    assert ball * abs(float(state.body_qd.numpy()[0, 2]) - 1.0) > 0.2 * ball
+    np.testing.assert_allclose(last[0], first[0], atol=1e-3 * ball)
+    np.testing.assert_allclose(last[1], first[1], atol=1e-2 * 0.3 * ball)

@@ -1,4 +1,4 @@
-"""The Newton solver next to other solvers: with one of them for the bodies, and in Newton's coupled solvers."""
+"""The Newton solver with other solvers: one of them for the bodies, and in Newton's coupled solvers."""
 
 import numpy as np
 import pytest

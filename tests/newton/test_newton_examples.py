@@ -52,7 +52,7 @@ def test_example(harness, path):
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
 def test_example_draws(harness, path, monkeypatch):
-    """Newton's USD viewer writes frames in which things move; the short form of the above."""
+    """Newton's USD viewer writes frames in which things move; a short form of the test above."""
     made = runpy.run_path(str(path), run_name="example")["Example"]
     monkeypatch.setattr(made, "test_final", lambda self: self.solver.check())
 
@@ -71,7 +71,7 @@ def test_example_draws(harness, path, monkeypatch):
 
 
 class Exchange:
-    """Takes the place of one of Newton's solvers where there are tetrahedra; elsewhere that solver is made."""
+    """Replaces one of Newton's solvers for models with tetrahedra; for others that solver is made."""
 
     def __init__(self, solver, **options):
         self.solver, self.options, self.made = solver, options, []
@@ -87,10 +87,10 @@ class Exchange:
 
 @pytest.fixture
 def exchanged(harness, monkeypatch):
-    """Run one of Newton's examples in test mode with the solver in it, for so many frames.
+    """Run one of Newton's examples in test mode with this solver, for a number of frames.
 
     Returns:
-        The example, and of every frame the positions [m] and velocities [m/s] of particles of tetrahedra, [F, N, 3].
+        The example, and the positions [m] and velocities [m/s] of the tetrahedra's particles in every frame, [F, N, 3].
     """
 
     def run(name, frames, options=(), *, solver="SolverVBD", prepare=None, **solver_options):
@@ -137,7 +137,7 @@ def test_newtons_hanging_bodies(exchanged, frames):
 
 @pytest.mark.slow
 def test_newtons_hanging_bodies_come_to_rest(exchanged):
-    """With damping by mass; the softest damped of them would swing for minutes without."""
+    """With mass-proportional damping; without it the softest damped one would swing for minutes."""
     _, x, v = exchanged("softbody.example_softbody_hanging", 300, damping=4.0)
     assert np.abs(v[-1]).max() < 5e-3 < 0.1 * np.abs(v).max()
     assert x[-1, :, 2].mean() < x[0, :, 2].mean()
@@ -152,7 +152,7 @@ def test_newtons_ball_on_a_soft_body(exchanged):
 
 @pytest.mark.slow
 def test_newtons_ball_on_a_soft_body_coupled(exchanged):
-    """The ball by MuJoCo: it is caught."""
+    """MuJoCo steps the ball: it is caught."""
     pytest.importorskip("mujoco_warp")
     example, x, _ = exchanged("multiphysics.example_rigid_soft_contact", 40, ("--solver", "coupled"))
     assert x[:, :, 2].min() > -0.02
@@ -162,9 +162,9 @@ def test_newtons_ball_on_a_soft_body_coupled(exchanged):
 
 @pytest.mark.slow
 def test_newtons_coupled_gripper(exchanged):
-    """Fingers by MuJoCo, which are proxies here with their joints, close on a soft block.
+    """MuJoCo steps the fingers, which are proxies here with their joints and close on a soft block.
 
-    The block has next to no damping, which implicit steps bring along and explicit ones do not.
+    The block has next to no damping; implicit steps have numerical damping, explicit ones do not.
     """
     pytest.importorskip("mujoco_warp")
     _, x, v = exchanged("multiphysics.example_proxy_joint_gripper", 120, substeps=24, damping=200.0)
@@ -177,7 +177,7 @@ def test_newtons_coupled_gripper(exchanged):
 
 @pytest.mark.slow
 def test_newtons_soft_body_on_cloth(exchanged):
-    """The cloth stays with SolverVBD, the block is a proxy in it: it pushes the cloth down, and is thrown back."""
+    """SolverVBD steps the cloth, in which the block is a proxy: it pushes the cloth down and bounces back."""
     name, options = "multiphysics.example_softbody_dropping_to_cloth", ("--solver", "coupled")
     example, x, _ = exchanged(name, 60, options)
     cloth = example.state_0.particle_q.numpy()[example.cloth_particles]
@@ -190,7 +190,7 @@ def test_newtons_soft_body_on_cloth(exchanged):
 
 @pytest.mark.slow
 def test_newtons_boxes_cloth_and_soft_bodies(exchanged):
-    """Boxes and a chain by MuJoCo; cloth and soft bodies by one solver, which has no contact between these."""
+    """MuJoCo steps boxes and a chain; one solver steps cloth and soft bodies, without contact between them."""
     pytest.importorskip("mujoco_warp")
     example, x, _ = exchanged("multiphysics.example_mujoco_vbd_coupled_solver", 40)
     assert x[:, :, 2].min() > -0.02
@@ -199,9 +199,9 @@ def test_newtons_boxes_cloth_and_soft_bodies(exchanged):
 
 @pytest.mark.slow
 def test_newtons_arm_lifts_a_soft_block(exchanged, monkeypatch, tmp_path):
-    """A Franka arm, moved by inverse kinematics: it closes its fingers on a block, lifts it, puts it down, lets it go.
+    """A Franka arm, moved by inverse kinematics, grips a block, lifts it, puts it down and releases it.
 
-    Boxes stand in for the arm's parts and a block for the duck, since these are downloads; at four times the speed.
+    Boxes replace the arm's parts and a block the duck, since these are downloads; at four times the speed.
     """
     utils = importlib.import_module("newton.utils")
     monkeypatch.setattr(utils, "download_asset", lambda name: stand_in(tmp_path, name))

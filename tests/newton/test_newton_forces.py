@@ -23,7 +23,7 @@ from warp_corot.kernels.newton.elements import scatter_posed
 
 
 def bend(x, amount=0.6):
-    """Bent, stretched and turned, some of it a lot."""
+    """Bend, stretch and rotate a body, some of it a lot."""
     x = np.asarray(x, float)
     a = amount * x[:, 0] / 0.1
     return np.stack([np.sin(a) * (0.3 - x[:, 1]), np.cos(a) * (x[:, 1] - 0.3), 1.2 * x[:, 2] + 0.3 * x[:, 0]], axis=1)
@@ -60,8 +60,8 @@ def columns(model):
 
 @pytest.mark.parametrize("damped", [False, True])
 def test_all_forces_at_once_as_one_after_another(device, rng, damped):
-    """What runs on CUDA also on the CPU, where eight elements go together and what is not elastic apart from them: any
-    F, also such as Newton's iteration cannot do."""
+    """CUDA's kernel also runs on the CPU, where eight elements run together and non-elastic forces separately: for any
+    F, even where Newton's iteration fails."""
     model = grid_model(device, damp=50.0 * damped)
     x = model.particle_q.numpy() + 0.06 * rng.standard_normal((model.particle_count, 3))
     v = rng.standard_normal(x.shape)
@@ -81,7 +81,7 @@ def test_all_forces_at_once_as_one_after_another(device, rng, damped):
 
 @pytest.mark.parametrize("copies", [1, 3])
 def test_forests_against_the_oracle(device, rng, copies):
-    """Leaves in subtrees, single leaves, mirrored ones; copies of a forest, turned, amid other things."""
+    """Leaves in subtrees, single leaves, mirrored ones; copies of a forest, rotated, among other things."""
     forest = adaptive_forest()
     made = builder()
     turn = wp.quat_from_axis_angle(wp.normalize(wp.vec3(1.0, 2.0, 3.0)), 0.7)
@@ -104,7 +104,7 @@ def test_forests_against_the_oracle(device, rng, copies):
 
 
 def test_rotations_of_ancestors(device, rng):
-    """rotation_level: as the same forest has them in this package."""
+    """With rotation_level: the same as the forest in this package."""
     forest = wc.TetForest.box((1, 1, 1), 0.3, 6)
     material = wc.Isotropic(young=1e4, poisson=0.35, density=1000.0)
     made = builder()
@@ -120,7 +120,7 @@ def test_rotations_of_ancestors(device, rng):
 
 
 def test_materials_of_each_tetrahedron(device, rng):
-    """Of general meshes and forests, of which parts are cut; both ways to read k_mu and k_lambda; changed ones."""
+    """General meshes and forests with cut elements; both meanings of k_mu and k_lambda; changed materials."""
     forest = adaptive_forest(3)
     young = 1e4 * (1 + rng.random(len(forest.tets)))
     made = builder()
@@ -146,7 +146,7 @@ def test_materials_of_each_tetrahedron(device, rng):
 
 
 def test_a_body_turned_after_it_was_built_is_at_rest(device):
-    """``add_builder`` turns particles, not the elements' rest matrices."""
+    """``add_builder`` rotates particles, not the elements' rest matrices."""
     part = builder()
     add_grid(part)
     wn.add_forest(part, adaptive_forest(3), wc.Isotropic(1e4, 0.3, 1000.0), pos=(0.0, 0.0, 2.0))
@@ -161,7 +161,7 @@ def test_a_body_turned_after_it_was_built_is_at_rest(device):
 
 
 def test_small_strains_as_in_semi_implicit(device, rng):
-    """With lame="semi-implicit" forces differ by second-order terms in the strain only, with the other by more."""
+    """With lame="semi-implicit" forces differ only by second-order terms in the strain, with the other by more."""
     model = grid_model(device)
     rest = model.particle_q.numpy().astype(float)
     direction = 0.1 * rng.standard_normal(rest.shape)
@@ -180,7 +180,7 @@ def test_small_strains_as_in_semi_implicit(device, rng):
 
 
 def test_activation_is_newtons(device, rng):
-    """k_lambda a cof F, at any deformation, and from the control as from the model."""
+    """k_lambda a cof F, at any deformation, from the control and from the model."""
     model = grid_model(device)
     x = bend(model.particle_q.numpy()) + 0.01 * rng.standard_normal((model.particle_count, 3))
     control = model.control()
@@ -197,13 +197,13 @@ class TestDamping:
     K = 5e4
 
     def viscous(self, device, x, v):
-        """Forces with k_damp less those without."""
+        """Forces with k_damp minus those without."""
         damped, free = (grid_model(device, damp=k) for k in (self.K, 0.0))
         solver = wn.SolverCorotated(damped, stable_dt=1.0)
         return impulse(solver, damped, x, v) - impulse(wn.SolverCorotated(free, stable_dt=1.0), free, x, v)
 
     def test_is_newtons_for_small_strains_that_do_not_turn(self, device, rng):
-        """Of one tetrahedron whose first node rests: Newton's volume damping takes the others' velocities as they are,
+        """One tetrahedron whose first node rests: Newton's volume damping uses the other nodes' absolute velocities,
         and so slows down translation, too."""
         made, free = builder(), builder()
         for to, k in ((made, self.K), (free, 0.0)):

@@ -1,4 +1,4 @@
-"""The code in the guide for writers of solvers does what the guide says."""
+"""The code in the solver guide does what the guide says."""
 
 import pytest
 from pages import ROOT, run_python

@@ -1,4 +1,4 @@
-"""What is handed to ``add_forest``, ``add_mesh`` and, through Newton's own builder, to the solver: one clear line."""
+"""Bad input of ``add_forest``, ``add_mesh`` and, through Newton's own builder, of the solver: one clear line."""
 
 import numpy as np
 import pytest
@@ -60,7 +60,7 @@ def test_bad_arguments_are_one_line_and_add_nothing(add, made, options, message)
 
 @pytest.mark.parametrize(("add", "made"), ADDING)
 def test_what_is_added_is_where_it_is_put(add, made):
-    """Turned by SciPy's rotation of the same quaternion; Warp's types are as good as tuples."""
+    """Against SciPy's rotation of the same quaternion; Warp's types work like tuples."""
     turn, there = Rotation.from_rotvec([0.3, -0.5, 0.8]), np.array([1.0, -2.0, 0.5])
     quaternion = wp.quat(*turn.as_quat().tolist())
     to = builder()
@@ -83,13 +83,15 @@ def soft_mesh(to, points, tets, label=None):
 
 class TestWhatTheBuilderLeftOut:
     def test_all_tetrahedra(self, device):
-        """All wrongly wound: Newton's builder has none of them, and it is said which body's, and what to do."""
+        """All are wrongly wound: Newton's builder drops them, and the error names the body and the remedy."""
         one = mesh()
         to = builder()
         soft_mesh(to, one.points, one.tets[:, [1, 0, 2, 3]], "liver")
         model = to.finalize(device=device)
         assert model.tet_count == 0
-        with pytest.raises(wc.InputError, match=r"1 soft body \(liver\): .*all so; build with .*add_mesh\(") as said:
+        with pytest.raises(
+            wc.InputError, match=r"1 soft body \(liver\): .*wrongly wound; build with .*add_mesh\("
+        ) as said:
             wn.SolverCorotated(model)
         assert "\n" not in str(said.value)
         to = builder()
@@ -103,7 +105,7 @@ class TestWhatTheBuilderLeftOut:
             wn.SolverCorotated(to.finalize(device=device))
 
     def test_a_tetrahedron_at_a_corner(self, device):
-        """Its corner was in no other; there are fewer outer faces now, not more."""
+        """Its corner was in no other tetrahedron; now there are fewer outer faces, not more."""
         points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 1.0]])
         to = builder()
         soft_mesh(to, points, np.array([[0, 1, 2, 3], [2, 1, 3, 4]]))
@@ -114,7 +116,7 @@ class TestWhatTheBuilderLeftOut:
 
     @pytest.mark.filterwarnings("error")
     def test_points_that_no_tetrahedron_has(self, device):
-        """They are nobody's loss: nothing is said of them."""
+        """They are not reported as lost."""
         one = mesh()
         to = builder()
         soft_mesh(to, np.concatenate([one.points, [[9.0, 9.0, 9.0]]]), one.tets)

@@ -1,4 +1,4 @@
-"""Contact of soft bodies with far lighter rigid ones: no energy is gained, and they are carried."""
+"""Contact of soft bodies with far lighter rigid ones: they gain no energy and are carried."""
 
 import numpy as np
 import pytest
@@ -22,9 +22,9 @@ class TestLightBodies:
         [pytest.param(5.0, 1e5, 1e3, marks=pytest.mark.slow), (5.0, None, None), (200.0, None, None)],
     )
     def test_come_to_rest(self, device, density, ke, kd):
-        """At half the safe step a box far lighter than what is below it does not rise above where it was dropped.
+        """At half the safe step a box far lighter than the body below does not rise above its initial height.
 
-        What is left is rocking: it stands on the highest particle, in the middle.
+        Only rocking remains: it stands on the highest particle, in the middle.
         """
         model = light_box(device, density)
         if ke is not None:
@@ -45,7 +45,7 @@ class TestLightBodies:
         assert np.abs(state.body_q.numpy()[0, 3:5]).max() < 0.01
 
     def test_all_dampers_of_a_body_together_turn_no_velocity_round(self, device):
-        """However strong: 25 kinematic particles under a box without springs stop it at most, also its turning."""
+        """At any strength: 25 kinematic particles under a box without springs at most stop it, also its rotation."""
         made = builder(gravity=(0.0, 0.0, 0.0))
         body = made.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 0.05), wp.quat_identity()))
         made.add_shape_box(body, hx=0.05, hy=0.05, hz=0.05, cfg=newton.ModelBuilder.ShapeConfig(density=5.0))
@@ -80,7 +80,7 @@ class TestLightBodies:
             rates.append(w * w)
             inverse.append(1.0 / float(model.body_mass.numpy()[0]))
         assert inverse[0] == pytest.approx(1000.0, rel=1e-3)
-        # The block's damping makes its own share of dt depend on w a little.
+        # The block's own damping makes dt depend slightly on w.
         assert rates[0] - rates[1] == pytest.approx(1e5 * (inverse[0] - inverse[1]), rel=0.2)
         solver = wn.SolverCorotated(model)
         model.body_inv_mass.fill_(1000.0)
@@ -92,7 +92,7 @@ class TestLightBodies:
 
 
 def thrown(device, shape="box", mass=0.05, aside=0.0, cell=0.05, height=0.002, speed=2.5, ground=False):
-    """A light body of 1 dm over a soft block of 2 dm, flying down at it; no gravity."""
+    """A light body of 1 dm flies down at a soft block of 2 dm; no gravity."""
     made = builder(gravity=(0.0, 0.0, 0.0), radius=0.005)
     add = {
         "box": (made.add_shape_box, {"hx": 0.05, "hy": 0.05, "hz": 0.05}, 1e-3),
@@ -111,12 +111,12 @@ def thrown(device, shape="box", mass=0.05, aside=0.0, cell=0.05, height=0.002, s
 
 
 def velocities(state):
-    """Of particles and of the body, float64."""
+    """Velocities of particles and of the body, float64."""
     return state.particle_qd.numpy().astype(float), state.body_qd.numpy()[0].astype(float)
 
 
 def kinetic_energy(model, state, v, twist):
-    """Of all and of the body [J]."""
+    """Kinetic energy of all and of the body [J]."""
     turn = np.array(wp.quat_to_matrix(wp.quat(*state.body_q.numpy()[0, 3:]))).reshape(3, 3)
     of_body = 0.5 * float(model.body_mass.numpy()[0]) * twist[:3] @ twist[:3]
     of_body += 0.5 * twist[3:] @ turn @ model.body_inertia.numpy()[0] @ turn.T @ twist[3:]
@@ -124,10 +124,10 @@ def kinetic_energy(model, state, v, twist):
 
 
 def throw(model, duration, dt=None, contacts=True):
-    """Kinetic energies of all and of the body through a throw, over what all have at first, and the last state.
+    """Kinetic energies of all and of the body during a throw, relative to the initial total, and the last state.
 
-    They are of the mean of the velocities before and after a position: for an oscillator of symplectic Euler that is
-    never more than its energy; with either velocity alone it is.
+    They use the mean of the velocities before and after a position: for an oscillator under symplectic Euler this
+    never exceeds its energy; with either velocity alone it does.
     """
     solver = wn.SolverCorotated(model)
     dt = 0.7 * solver.contact_dt if dt is None else dt
@@ -151,16 +151,16 @@ class TestEnergy:
     @pytest.mark.parametrize(
         ("shape", "mass", "aside", "cell"),
         [
-            ("box", 0.01, 0.0, 0.05),  # Its edges are at particles.
+            ("box", 0.01, 0.0, 0.05),  # its edges are at particles
             ("box", 0.05, 0.013, 0.05),
             ("box", 0.1, 0.0, 0.05),
-            ("box", 0.1, 0.0, 0.025),  # Many contacts.
+            ("box", 0.1, 0.0, 0.025),  # many contacts
             ("sphere", 0.01, 0.013, 0.05),
             ("capsule", 0.05, 0.0, 0.05),
         ],
     )
     def test_throws_gain_none(self, device, shape, mass, aside, cell, ke):
-        """Without dampers and friction: there is never more kinetic energy than before, and the body comes back."""
+        """Without dampers and friction: the kinetic energy never exceeds the initial one, and the body comes back."""
         model = thrown(device, shape, mass, aside, cell, height=0.0037)
         contact_parameters(model, ke=ke, kd=0.0, kf=0.0, mu=0.0)
         first = model.state()
@@ -184,7 +184,7 @@ class TestEnergy:
         assert left[1] < 0.9 * left[0]
 
     def test_attached_bodies_swing_for_ever(self, device):
-        """Ten grams on 25 springs, together nine times too stiff for them: energy goes to and fro, and stays."""
+        """Ten grams on 25 springs, together nine times too stiff for them: energy oscillates and is conserved."""
         model = attached(device, mass=0.01, stiffness=1e4)
         ratios, _ = throw(model, 0.2, dt=1e-3, contacts=False)
         assert ratios[:, 0].max() < 1.01
@@ -208,7 +208,7 @@ def attached(device, mass, stiffness, gravity=0.0):
 
 class TestGivingWay:
     def test_springs_act_where_the_body_gives_way_to_them(self, device):
-        """Contacts push by k times their depth after the body has gone by d = dt^2 M^-1 (wrench of all of them)."""
+        """Contacts push by k times their depth after the body has moved by d = dt^2 M^-1 (total wrench)."""
         model = thrown(device, mass=0.05, aside=0.017, cell=0.025, height=-0.0031, speed=0.0)
         contact_parameters(model, ke=1e5, kd=0.0, kf=0.0, mu=0.0)
         pipeline, dt = newton.CollisionPipeline(model), 1e-3
@@ -242,7 +242,7 @@ class TestGivingWay:
 
     @pytest.mark.slow
     def test_bounces_as_high_as_in_newtons_solver(self, device):
-        """A light box of which steps are short enough for both: how high it comes back."""
+        """A light box for which both solvers' steps are short enough: the height of its bounce."""
         heights = []
         for make in (lambda m: wn.SolverCorotated(m, lame="semi-implicit"), semi_implicit):
             model = thrown(device, mass=0.05, aside=0.013)

@@ -1,4 +1,4 @@
-"""The Newton solver as a solver: the same motions as this package's simulation, Newton's conventions, bad input."""
+"""The Newton solver as a solver: the motions of this package's simulation, Newton's conventions, bad input."""
 
 import gc
 import re
@@ -20,7 +20,7 @@ PACKAGE = Path(wn.__file__).parent
 
 @pytest.mark.parametrize("kind", ["mesh", "forest"])
 def test_a_beam_ends_where_simulation_has_it(device, kind):
-    """The same beam, by its own weight, in this package's simulation and in Newton."""
+    """The same beam sags under its weight in this package's simulation and in Newton."""
     forest = wc.TetForest.box((4, 1, 1), 0.1, 3, up_axis="Z")
     mesh = forest if kind == "forest" else wc.TetMesh(forest.points, forest.tets, up_axis="Z")
     material = wc.Isotropic(young=1e5, poisson=0.35, density=1000.0)
@@ -98,7 +98,7 @@ class TestParticles:
         both.particle_q.assign(x)
         solver.step(before, after, None, None, 1e-4)
         solver.step(both, both, None, None, 1e-4)
-        # CUDA adds forces up in any order.
+        # CUDA sums forces in any order.
         few = 0.0 if model.device.is_cpu else 2e-6
         for name in ("particle_q", "particle_qd"):
             a, b = (getattr(state, name).numpy() for state in (after, both))
@@ -155,7 +155,7 @@ class TestAttributes:
         np.testing.assert_array_equal(copied.particle_q.numpy(), model.particle_q.numpy())
 
     def test_are_found_again_in_newtons_recordings(self, device, rng, tmp_path):
-        """What Newton's recorder gives back is a model and states that step on as those recorded, forests and all."""
+        """Newton's recorder returns a model and states that continue like the recorded ones, forests included."""
         from newton.viewer import ViewerFile
 
         model = self.model(device, forest=True)
@@ -295,16 +295,6 @@ class TestBadInput:
         add_grid(made)
         model = made.finalize(device=device)
         self.refuses(model, "more soft contacts than contacts.soft_contact_max", soft_contact_max=4)
-        # As contacts of edges and faces are told from others.
-        self.refuses(model, "enable_rigid_soft_full_surface_contact", lambda c: c.soft_contact_particle.fill_(-1))
-
-    @pytest.mark.slow
-    def test_contacts_of_edges_and_faces(self, device):
-        made = builder()
-        made.add_ground_plane()
-        add_grid(made)
-        name = "enable_rigid_soft_full_surface_contact"
-        self.refuses(made.finalize(device=device), name, **{name: True})
 
     def refuses(self, model, message, change=lambda contacts: None, **options):
         solver = wn.SolverCorotated(model)
@@ -330,7 +320,7 @@ class TestBadInput:
             solver.step(model.state(), model.state(), other.control(), None, 1e-4)
 
     def test_states_on_other_devices(self, device):
-        """There may be one device only: what is asked of a state is its arrays' device."""
+        """A machine may have one device only: the check uses the device of a state's arrays."""
         model = grid_model(device)
         solver = wn.SolverCorotated(model)
 
@@ -344,7 +334,7 @@ class TestBadInput:
                 solver.step(*states, None, None, 1e-4)
 
     def test_changed_models(self, device):
-        """Stable steps follow stiffness and mass; gravity alone changes nothing; a bad material is told."""
+        """Stable steps follow stiffness and mass; gravity alone changes nothing; a bad material is an error."""
         model = grid_model(device)
         solver = wn.SolverCorotated(model)
         stable = solver.stable_dt
@@ -369,7 +359,7 @@ class TestBadInput:
         self.expect("attachment 0 has stiffness inf", made.finalize(device=device))
 
     def test_tetrahedra_that_the_builder_left_out(self, device):
-        """Are spoken of; ``add_mesh`` turns them round."""
+        """They are reported; ``add_mesh`` repairs them."""
         grid = grid_model(device)
         points, tets = grid.particle_q.numpy(), grid.tet_indices.numpy().reshape(-1, 4).copy()
         tets[:, 2:] = tets[:, :1:-1]
@@ -381,7 +371,7 @@ class TestBadInput:
         )  # fmt: skip
         with pytest.warns(UserWarning, match=r"32 particles .* in no tetrahedron.*add_mesh"):
             wn.SolverCorotated(made.finalize(device=device))
-        # One of them only, in the middle of the others: no particle is lost.
+        # Only one of them, in the middle of the others: no particle is lost.
         tets = grid.tet_indices.numpy().reshape(-1, 4).copy()
         tets[7] = tets[7][[0, 1, 3, 2]]
         made = builder()
@@ -420,7 +410,7 @@ def test_a_forest_from_elsewhere_goes_one_by_one(device, rng):
     model = made.finalize(device=device)
     x = model.particle_q.numpy() + 0.01 * rng.standard_normal((model.particle_count, 3))
     wanted = impulse(wn.SolverCorotated(model), model, x)
-    # A name that has been through a file, or that of one that is as this one but larger.
+    # A name that was written to a file, or that of a larger forest with the same name.
     for name in (str(model.warp_corot.forest[0]), ForestName.of(adaptive_forest(3, 0.5))):
         model.warp_corot.forest[0] = name
         with pytest.warns(UserWarning, match="one by one"):
@@ -430,7 +420,7 @@ def test_a_forest_from_elsewhere_goes_one_by_one(device, rng):
 
 
 def test_a_forest_lives_as_long_as_its_models(device):
-    """Whoever makes a model of a forest need not keep it; and no list keeps those of models that are gone."""
+    """The model keeps its forest alive, and no list keeps the forests of deleted models."""
     forest = adaptive_forest(2)
     watched, made = weakref.ref(forest), builder()
     for k in range(2):

@@ -1,4 +1,4 @@
-"""The largest stable steps of the Newton solver: closed forms, its own forces' linear ones, and what steps then do."""
+"""The largest stable steps of the Newton solver: closed forms, linearised forces, and the motion at these steps."""
 
 import warnings
 
@@ -11,7 +11,7 @@ M = 0.02
 
 
 def held_builder(gravity=(0.0, 0.0, 0.0)):
-    """Tetrahedra that nothing moves, so that what is added is all there is."""
+    """A builder with fixed tetrahedra, so that only added things move."""
     made = builder(gravity=gravity)
     add_grid(made, dims=(1, 1, 1), pos=(0.0, 0.0, -3.0))
     made.particle_mass[:] = [0.0] * made.particle_count
@@ -19,7 +19,7 @@ def held_builder(gravity=(0.0, 0.0, 0.0)):
 
 
 def particles(made, points, mass=M):
-    """Particles of one mass, or of a list of masses; their indices."""
+    """Add particles of one mass, or of a list of masses; returns their indices."""
     first = made.particle_count
     for x, m in zip(points, np.broadcast_to(mass, len(points)), strict=True):
         made.add_particle(wp.vec3(*map(float, x)), wp.vec3(), float(m))
@@ -41,7 +41,7 @@ def cloth(made, dims=(5, 4), cell=0.1, mass=M, tri_ke=1e3, tri_ka=1e3, tri_kd=0.
 
 
 def ragged_cloth(made, rng, **options):
-    """One of triangles of many shapes, which is not flat."""
+    """A cloth of triangles of many shapes that is not flat."""
     from scipy.spatial import Delaunay
 
     points = rng.uniform(0.0, 1.0, (20, 2))
@@ -54,7 +54,7 @@ def ragged_cloth(made, rng, **options):
 
 
 def spring_net(made, rng):
-    """Particles of several masses, each of which has springs to some others, or that are held."""
+    """Particles of several masses, each fixed or with springs to some others."""
     mass = rng.uniform(0.01, 0.05, 20)
     mass[:2] = 0.0
     ids = particles(made, rng.uniform(0.0, 0.5, (20, 3)), mass)
@@ -91,7 +91,7 @@ class TestClosedForms:
 
     @pytest.mark.parametrize(("rest", "springs"), [(1.0, 2.0), (0.5, 3.0), (1.5, 2.0)])
     def test_springs_in_tension(self, device, rest, springs):
-        """A mass in the middle of a cross: along one bar 2k, and across the other 2k (1 - L/l), where that pulls."""
+        """A mass in the middle of a cross: 2k along one bar, and 2k (1 - L/l) across the other, which is in tension."""
         made = held_builder()
         a = particles(made, [[0, 0, 0]])[0]
         for b in particles(made, [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], 0.0):
@@ -101,7 +101,8 @@ class TestClosedForms:
 
     @pytest.mark.parametrize(("ka", "kd"), [(700.0, 0.0), (700.0, 5.0), (0.0, 5.0)])
     def test_a_triangle(self, device, ka, kd):
-        """Its one free corner at right angles to the held side: W = A (k_mu + k_lambda) (u/a)^2 / 2, A = a^2 / 2."""
+        """Its one free corner moves perpendicular to the fixed side: W = A (k_mu + k_lambda) (u/a)^2 / 2, A = a^2 /
+        2."""
         made = held_builder()
         i, j, k = particles(made, [[0, 0, 0], [0.2, 0, 0], [0, 0.2, 0]], [0.0, 0.0, M])
         made.add_triangle(i, j, k, tri_ke=400.0, tri_ka=ka, tri_kd=kd, tri_drag=0.0, tri_lift=0.0)
@@ -121,7 +122,7 @@ class TestClosedForms:
 
     @pytest.mark.parametrize("kd", [0.5, 20.0, 200.0])
     def test_a_stiff_spring_and_a_damper_apart(self, device, kd):
-        """Neither makes the other's steps shorter."""
+        """Neither shortens the other's step."""
         made = held_builder()
         a, b, c, d = particles(made, [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], [M, 0.0, M, 0.0])
         made.add_spring(a, b, ke=5000.0, kd=0.0, control=0.0)
@@ -130,7 +131,7 @@ class TestClosedForms:
         assert self.stable(made, device) == pytest.approx(wanted, rel=0.015)
 
     def test_several_things_apart(self, device):
-        """The shortest counts."""
+        """The smallest step counts."""
         steps = []
         for which in ([0], [1], [2], [0, 1, 2]):
             made = builder()
@@ -149,7 +150,7 @@ class TestClosedForms:
 
 
 def linear_limit(model):
-    """Where dt^2 M^-1 K + 2 dt M^-1 C has the eigenvalue 4, by differences of the solver's own steps."""
+    """The step at which dt^2 M^-1 K + 2 dt M^-1 C has the eigenvalue 4, by differences of the solver's own steps."""
     solver = wn.SolverCorotated(model, stable_dt=1.0)
     states = model.state(), model.state()
     x, dt = model.particle_q.numpy().astype(float), 1e-3
@@ -176,7 +177,7 @@ def linear_limit(model):
 
 
 class TestOwnForces:
-    """Forces of small motions are those that the solver's steps have, Newton's among them."""
+    """Forces of small motions equal those in the solver's steps, Newton's included."""
 
     @pytest.mark.parametrize("stretch", [1.0, 1.2])
     @pytest.mark.parametrize(
@@ -220,7 +221,7 @@ class TestOwnForces:
 
 
 class TestSteps:
-    """A little under the largest stable step a small motion stays small, a little over it it does not."""
+    """Slightly below the largest stable step a small motion stays small, slightly above it does not."""
 
     def tetrahedra(damp):
         made = builder(gravity=(0.0, 0.0, 0.0))
@@ -272,7 +273,7 @@ class TestSteps:
         assert moved[1] > 30.0
 
     def test_of_hanging_cloth(self, device):
-        """It swings under gravity at substeps=None: no faster than what falls, no longer than it is by its weight."""
+        """It swings under gravity at substeps=None: no faster than in free fall, no longer than under its weight."""
         made = held_builder(gravity=(0.0, 0.0, -9.81))
         cloth(made, tri_ke=2e3, tri_ka=2e3, tri_kd=0.05, edge_ke=0.01, fix_left=True)
         model = made.finalize(device=device)
@@ -287,7 +288,7 @@ class TestSteps:
 
 class TestContactOfParticles:
     def test_a_heap_gains_no_energy(self, device):
-        """55 spheres in closest packing, pushed together a little: what pushes them apart is all that they have."""
+        """55 spheres in closest packing, slightly compressed: their repulsion is their only energy."""
         made = held_builder()
         ijk = np.stack(np.meshgrid(*3 * [np.arange(-2, 3)], indexing="ij"), axis=-1).reshape(-1, 3)
         ijk = ijk[(ijk.sum(axis=1) % 2 == 0) & (np.square(ijk).sum(axis=1) <= 8)]
@@ -314,7 +315,7 @@ class TestContactOfParticles:
         assert kinetic[-1] > 0.5 * energy
 
     def test_is_newtons(self, device, rng):
-        """Whatever grid neighbours are found with."""
+        """With any grid for the neighbour search."""
         made = held_builder()
         points = rng.uniform(0.0, 1.0, (300, 3))
         for x, v in zip(points, rng.standard_normal((300, 3)), strict=True):
@@ -364,7 +365,7 @@ class TestChangedModels:
 
 
 def test_damping_acts_on_everything(device):
-    """Also where Newton's solver moves the particles: v / (1 + dt c) a step, and positions with that velocity."""
+    """Also if Newton's solver moves the particles: v / (1 + dt c) in a step, and positions with that velocity."""
     made = builder(gravity=(0.0, 0.0, 0.0))
     add_grid(made, dims=(1, 1, 1), vel=(1.0, 0.0, 0.0))
     made.add_spring(0, 1, ke=10.0, kd=0.0, control=0.0)

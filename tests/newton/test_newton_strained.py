@@ -1,4 +1,4 @@
-"""Soft bodies under load through Newton's solver, by its defaults: finite, and no energy out of nothing."""
+"""Soft bodies under load through Newton's solver with defaults: finite, and without energy from nowhere."""
 
 import warnings
 
@@ -14,13 +14,13 @@ SOFT = wc.Isotropic(young=3e3, poisson=0.4, density=1000.0)
 
 
 def followed(model, frames, *, up=2, contact=True, limit=1.05):
-    """Step frames from the model's state by defaults; motion and height never hold more than the start had.
+    """Step frames from the model's state with defaults; kinetic and potential energy never exceed the initial ones.
 
-    What contacts and elements hold is not counted, so that the sum is at most what there was. Symplectic Euler keeps a
-    nearby energy, off by an oscillation of a few per cent: 5 % of what the fall can give.
+    The energy of contacts and elements is not counted, so the sum is at most the initial energy. Symplectic Euler keeps
+    a nearby energy that oscillates by a few per cent: 5 % of the potential energy of the fall.
 
     Returns:
-        The solver, and the substeps of every frame.
+        The solver, and the number of substeps of every frame.
     """
     solver = wn.SolverCorotated(model)
     pipeline = newton.CollisionPipeline(model, soft_contact_gap=0.05) if contact else None
@@ -44,7 +44,7 @@ def followed(model, frames, *, up=2, contact=True, limit=1.05):
 
 
 def lowest_point(model, up):
-    """Where the end of a body that hangs over can get to: as far below what holds it as it is long."""
+    """The lowest possible place of a hanging body's end: as far below its support as it is long."""
     x = model.particle_q.numpy()
     return float(x[:, up].min() - np.linalg.norm(np.ptp(x, axis=0)))
 
@@ -55,7 +55,7 @@ def energy(state, m, up, floor):
 
 
 def falling_block(kind, device):
-    """12 cm of 3 kPa, 10 cm above the ground."""
+    """A block of 12 cm and 3 kPa, 10 cm above the ground."""
     made = builder(radius=0.002)
     made.add_ground_plane()
     if kind == "grid":
@@ -69,7 +69,7 @@ def falling_block(kind, device):
 
 
 def leaning_capsule(kind, count, device):
-    """112 mm of 5 kPa, its lowest tenth held."""
+    """A capsule of 112 mm and 5 kPa with its lowest tenth fixed."""
     mesh = loaded.SHAPES["capsule"][0](count)
     if kind == "general":
         mesh = wc.TetMesh(mesh.points, mesh.tets, up_axis=mesh.up_axis)
@@ -84,7 +84,7 @@ def leaning_capsule(kind, count, device):
 @pytest.mark.parametrize("kind", ["grid", "forest"])
 def test_a_soft_block_falls_on_the_ground(device, kind):
     _, counts = followed(falling_block(kind, device), 45)
-    # It is squeezed to a fraction of its height, and may stiffen then.
+    # It is squeezed to a fraction of its height and may stiffen then.
     assert max(counts) > counts[0]
 
 
@@ -106,7 +106,7 @@ def test_a_leaning_capsule_swings_for_long(device, kind):
 
 
 class TestWhatWentWrong:
-    """A body whose substep is thought to be eight times as long as what is stable."""
+    """A body whose assumed substep is eight times as long as the stable one."""
 
     def solver(self, device):
         made = builder(gravity=(0.0, 0.0, 0.0))
@@ -122,7 +122,7 @@ class TestWhatWentWrong:
 
     @pytest.mark.parametrize("in_place", [False, True])
     def test_is_tried_again_with_more_substeps(self, in_place):
-        """On CPUs at once: the whole time is stepped, as little as a smaller step would have moved it."""
+        """On CPUs at once: the whole time is stepped, with the motion of smaller steps."""
         model, solver, before, dt = self.solver("cpu")
         after = before if in_place else model.state()
         start = energy(before, model.particle_mass.numpy(), 2, 0.0)
@@ -149,14 +149,14 @@ class TestWhatWentWrong:
         assert np.abs(before.particle_q.numpy() - kept).max() < 100.0
         with wp.ScopedCapture(device=device):
             solver.step(before, before, None, None, dt)
-        # Twice as many, less what the measurement that is recorded gives back.
+        # Twice as many, less what the recorded measurement gives back.
         assert solver.substeps_made > 1.8 * first
 
     def test_a_recorded_step_with_too_few_substeps(self, device):
-        """Recorded at rest, it steps a body that is drawn out to a thread.
+        """Recorded at rest, it steps a body that is stretched to a thread.
 
-        With stretches s, turning about the long axis is held by (lambda tr(S - I) - 2 mu) / (s_2 + s_3), which is
-        twice the stiffness at rest.
+        At stretches s, the stiffness against rotation about the long axis is (lambda tr(S - I) - 2 mu) / (s_2 + s_3),
+        twice that at rest.
         """
         made = builder(gravity=(0.0, 0.0, 0.0))
         add_grid(made, (4, 2, 2))
@@ -177,5 +177,5 @@ class TestWhatWentWrong:
             solver.check()
         with wp.ScopedCapture(device=device):
             solver.step(state, after, None, None, dt)
-        # More than the half as many again that a recording at rest has.
+        # More than a recording at rest adds, which is half as many again.
         assert solver.substeps_made > 1.1 * 1.5 * 10.0 / 0.9

@@ -1,4 +1,4 @@
-"""Newton's viewers that need no display draw the examples, and what they wrote holds what was simulated.
+"""Newton's viewers that need no display draw the examples, and their files hold the simulation.
 
 Viewers whose packages are missing are skipped; the test extra installs none but USD.
 """
@@ -31,7 +31,7 @@ def made_before():
 
 @pytest.fixture
 def example(device, made_before):
-    """An example by its name, with a viewer; the same one for all that do not draw from its camera's place."""
+    """An example by its name, with a viewer; all that do not draw with its camera share one."""
 
     def make(name, viewer, own=False):
         if own or (name, device) not in made_before:
@@ -47,7 +47,7 @@ def example(device, made_before):
 
 
 def run(made, frames=FRAMES):
-    """Some frames as the harness has them; the particles' positions in each that is drawn [frames, P, 3]."""
+    """Run some frames like the harness; returns the particles' positions in each drawn frame [frames, P, 3]."""
     drawn = []
     for _ in range(frames):
         made.step()
@@ -59,7 +59,7 @@ def run(made, frames=FRAMES):
 
 @pytest.mark.parametrize("name", ["drop", "gripper"])
 def test_usd_has_every_frame(example, tmp_path, name):
-    """Meshes in the stage are where the particles were, frame by frame."""
+    """Meshes in the stage are at the particles' positions, frame by frame."""
     path = tmp_path / "out.usd"
     viewer = newton.viewer.ViewerUSD(output_path=str(path), num_frames=FRAMES)
     made = example(name, viewer)
@@ -83,7 +83,7 @@ def test_usd_has_every_frame(example, tmp_path, name):
 
 
 def test_the_drawn_surface_is_the_ball(example):
-    """At rest the skin that is drawn in place of the tetrahedra lies on the sphere that was meshed."""
+    """At rest the skin that is drawn instead of the tetrahedra lies on the meshed sphere."""
     made = example("drop", newton.viewer.ViewerNull(num_frames=1))
     (skin,) = made.model.deformable_visual_meshes
     visuals = newton.geometry.DeformableVisuals(made.model)
@@ -96,7 +96,7 @@ def test_the_drawn_surface_is_the_ball(example):
 
 @pytest.mark.parametrize("ending", ["json", "bin"])
 def test_recordings_come_back(example, tmp_path, ending):
-    """Newton's recordings give back model and states; ``write_attributes`` finds rotations and stress again."""
+    """Newton's recordings restore model and states; ``write_attributes`` computes rotations and stress again."""
     if ending == "bin":
         pytest.importorskip("cbor2")
     path = tmp_path / f"out.{ending}"
@@ -137,7 +137,7 @@ def gl(monkeypatch):
 
 
 def test_gl_draws_what_moves(example, gl):
-    """Pictures hold the scene and change with it, and the soft block is where the camera should see it."""
+    """Pictures show the scene and change with it, and the soft block is in the camera's view."""
     made = example("gripper", gl, own=True)
     pictures = []
     for k in range(31):
@@ -149,13 +149,13 @@ def test_gl_draws_what_moves(example, gl):
     assert all(len(np.unique(picture.reshape(-1, 3), axis=0)) > 50 for picture in pictures)
     assert all((np.abs(a - b).max(axis=2) > 8).sum() > 100 for a, b in itertools.pairwise(pictures))
     red, _, blue = np.moveaxis(pictures[0], 2, 0)
-    warm = np.argwhere(red > blue + 60)  # of all that is drawn, only soft bodies are yellow
+    warm = np.argwhere(red > blue + 60)  # only soft bodies are drawn in yellow
     assert len(warm) > 300
     assert np.abs(warm.mean(axis=0) / [180, 320] - 0.5).max() < 0.25
 
 
 def test_rerun_writes_a_recording(example, tmp_path, monkeypatch):
-    """Into a file, not to a server, which Newton's viewer always looks for."""
+    """It goes to a file, not to the server for which Newton's viewer always looks."""
     rerun = pytest.importorskip("rerun")
     path = tmp_path / "out.rrd"
     monkeypatch.setattr(rerun, "connect_grpc", lambda _address: None)
@@ -171,7 +171,7 @@ def test_rerun_writes_a_recording(example, tmp_path, monkeypatch):
 
 
 def test_viser_starts_and_stops(example):
-    """Without a browser; what it serves is a web page."""
+    """Without a browser; it serves a web page."""
     pytest.importorskip("viser")
     viewer = newton.viewer.ViewerViser(port=0, verbose=False)
     try:
@@ -185,7 +185,7 @@ def test_viser_starts_and_stops(example):
 
 
 class TestOpenViewer:
-    """Examples choose a viewer that this machine has, and say what is missing in one line."""
+    """Examples choose a viewer that this machine has, and name missing packages in one line."""
 
     @pytest.fixture(autouse=True)
     def no_display(self, monkeypatch, tmp_path):

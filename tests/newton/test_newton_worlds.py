@@ -1,4 +1,4 @@
-"""Many worlds of a Newton model: independent, reset alone, recorded in graphs."""
+"""Many worlds of a Newton model: independent, reset separately, recorded in graphs."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def by_world(array, count):
 
 
 def test_worlds_are_independent(device):
-    """Each goes as it would alone: with its own gravity, activation and velocities, one of them with nonsense."""
+    """Each moves as it would alone: with its own gravity, activation and velocities, one with invalid values."""
     model = worlds(WORLDS, device)
     solver = wn.SolverCorotated(model)
     assert [group.copies for group in solver.tetrahedra.groups] == [WORLDS]
@@ -102,7 +102,7 @@ def test_one_world_is_reset_alone(device):
 
 
 def test_recorded_steps_are_the_same(device):
-    """Captured and replayed, nothing is allocated, and the result is what steps one by one have, bit by bit on CPUs."""
+    """Captured and replayed, nothing is allocated, and the result equals single steps, bit for bit on CPUs."""
     model = worlds(2, device)
     pipeline = newton.CollisionPipeline(model)
     ends = []
@@ -134,7 +134,7 @@ def test_a_replayed_step_says_what_was_wrong(device):
 @pytest.mark.parametrize("recorded", [False, True])
 @pytest.mark.parametrize("in_place", [False, True])
 def test_substeps_are_taken_all_or_none(device, in_place, recorded):
-    """What runs away in the second of three substeps has moved by then; its world, bodies too, is where it was."""
+    """A failure in the second of three substeps has moved things by then; its world, bodies too, is restored."""
     model = worlds(2, device)
     solver = wn.SolverCorotated(model, substeps=3)
     before, dt = model.state(), 3e-4
@@ -195,7 +195,7 @@ def test_nothing_is_allocated_after_the_first_step(device, monkeypatch):
 
 
 def test_steps_do_not_wait_for_the_device(device):
-    """They come back while work that was queued before them, and takes long, is still going on."""
+    """They return while long work that was queued before them is still running."""
     if not wp.get_device(device).is_cuda:
         pytest.skip("the CPU has no queue")
     solver, arguments = with_everything(device, substeps=2)
@@ -206,7 +206,7 @@ def test_steps_do_not_wait_for_the_device(device):
     wp.synchronize_device(device)
     wp.launch(dawdle, dim=1, inputs=[30_000_000], outputs=[done], device=device)
     dawdled = wp.record_event(wp.Event(device))
-    # A thousand launches are as many as CUDA queues: those of some more steps would wait for a place.
+    # A thousand launches are CUDA's queue limit: those of more steps would wait.
     for _ in range(4):
         solver.step(*arguments)
         solver.reset(arguments[1])
@@ -215,8 +215,8 @@ def test_steps_do_not_wait_for_the_device(device):
     assert dawdled.is_complete
 
 
-def test_steps_on_somebody_elses_stream(device):
-    """A stream that waits for nobody: whatever ran on another one would come too early."""
+def test_steps_on_another_programs_stream(device):
+    """A stream that waits for no other: work on another stream would come too early."""
     if not wp.get_device(device).is_cuda:
         pytest.skip("streams are for CUDA")
     ends = []

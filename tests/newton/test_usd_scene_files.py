@@ -1,4 +1,4 @@
-"""The stages that are written over scenes: what they hold, what they keep, and that they open."""
+"""The stages that are written over scenes: their content, what they keep, and that they are valid."""
 
 import os
 import re
@@ -62,7 +62,7 @@ def test_colours_show_the_stress_where_nothing_else_is_said(tmp_path):
     color = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(SIM)).GetPrimvar("displayColor")
     assert len(color.Get()) == len(stress_colors())
     assert color.GetInterpolation() == "vertex"
-    # A node's colour is in the middle of the tetrahedra around it: none is beyond the highest of them.
+    # A node's colour is a mean over the tetrahedra around it: none exceeds the highest of them.
     tets = np.array(UsdGeom.TetMesh.Get(stage, SIM).GetTetVertexIndicesAttr().Get())
     for frame in (2, 6):
         stress = shown[frame].von_mises[0]
@@ -135,7 +135,7 @@ def test_stress_can_take_the_place_of_materials(tmp_path):
 
 
 def test_faces_are_drawn_from_outside(tmp_path):
-    """TetMesh prims are drawn by their surface faces, which come along where the stage has none."""
+    """TetMesh prims are drawn by their surface faces, which are added if the stage has none."""
     written(standing(tmp_path / "in.usda"), tmp_path / "out.usda", 1)
     stage = Usd.Stage.Open(str(tmp_path / "out.usda"))
     faces = np.array(UsdGeom.TetMesh.Get(stage, SIM).GetSurfaceFaceVertexIndicesAttr().Get())
@@ -185,7 +185,7 @@ def test_prims_under_what_is_animated_are_where_the_solver_has_them(tmp_path):
 
 
 def test_graphics_meshes_go_along(tmp_path):
-    """A Mesh beside the simulated tetrahedra is bound to them: here its points are some of theirs, and one inside."""
+    """A Mesh beside the simulated tetrahedra is bound to them: its points are some of theirs, and one inside."""
     made = StageMaker(tmp_path / "in.usda")
     mesh = made.block(at=(-0.1, -0.1, 0.02))
     made.material(mesh)
@@ -295,7 +295,7 @@ def test_a_state_that_is_not_finite_leaves_the_frames_before(tmp_path, monkeypat
     [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow), (signal.SIGKILL, -9)],
 )
 def test_whatever_ends_a_run_the_stage_opens(tmp_path, number, status):
-    """Also at the hardest end, when what plays are the pieces: with the looks of the stage below, and our motion."""
+    """Even after a kill, when the pieces play: with the looks of the stage below, and our motion."""
     crowd(tmp_path / "in.usda").save()
     command = [sys.executable, "-m", "warp_corot", "scene", "in.usda", "-o", "out.usda", "--device", "cpu"]
     process = subprocess.Popen(
@@ -323,7 +323,7 @@ def test_whatever_ends_a_run_the_stage_opens(tmp_path, number, status):
         assert int(match[1]) == end + 1
         assert sorted(file.name for file in tmp_path.iterdir()) == ["in.usda", "out.usda"]
     assert bound(stage, "full") == "/Looks/Skin"
-    # In free fall, both of them: (z0 - g t^2 / 2).
+    # Both are in free fall: (z0 - g t^2 / 2).
     t = 1 / 24
     fallen = [world_points(stage, SIM, f)[:, 2].min() for f in (0, 1)]
     assert fallen[0] - fallen[1] == pytest.approx(0.5 * 9.81 * t**2, rel=0.1)

@@ -1,4 +1,4 @@
-"""What is wrong with a stage, an option or an installation is said in one line, and nothing is written."""
+"""Errors in a stage, an option or an installation are one line, and nothing is written."""
 
 import subprocess
 import sys
@@ -17,7 +17,7 @@ def run(*args) -> int:
 
 
 def spoil(made: StageMaker, how: str) -> None:
-    """Make something of a stage of one block wrong."""
+    """Introduce an error into a stage of one block."""
     mesh = UsdGeom.TetMesh.Get(made.stage, SIM)
     material = made.stage.GetPrimAtPath("/Materials/Soft")
     if how == "no TetMesh":
@@ -72,14 +72,14 @@ def spoil(made: StageMaker, how: str) -> None:
         ("flat", "/World/Soft/sim: 72 of 72 tetrahedra have no volume, the first is 0"),
         ("nan", "/World/Soft/sim: point 7 is not finite"),
         ("no stiffness", "/World/Soft/sim: its material is not positive definite"),
-        ("units", "metersPerUnit is 0.0, should be a positive number"),
-        ("mass units", "kilogramsPerUnit is -1.0, should be a positive number"),
+        ("units", "metersPerUnit is 0.0; it must be a positive number"),
+        ("mass units", "kilogramsPerUnit is -1.0; it must be a positive number"),
         ("disabled", "Newton takes none of its TetMesh prims for a soft body"),
         ("scale", "/World/Soft/sim: 72 of 72 tetrahedra have too little volume for float32"),
         ("far", "/World/Soft/sim: 72 of 72 tetrahedra have too little volume for float32"),
-        ("gravity", "/physicsScene: physics:gravityMagnitude is nan, should be finite"),
-        ("direction", "/physicsScene: physics:gravityDirection is (0, 0, inf), should be finite"),
-        ("pattern", "its only TetMesh prims are patterns of a point instancer: /World/Soft/sim"),
+        ("gravity", "/physicsScene: gravityMagnitude is nan; it must be finite"),
+        ("direction", "/physicsScene: gravityDirection is (0, 0, inf); it must be finite"),
+        ("pattern", "its only TetMesh prims are prototypes of a point instancer: /World/Soft/sim"),
         ("sublayer", "does not compose: "),
     ],
 )
@@ -100,7 +100,7 @@ def test_bad_stages_are_one_line(tmp_path, capsys, how, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--dt", "1"], "dt is 1 s; the largest stable step is about"),
+        (["--dt", "1"], "dt is 1 s; it must be at most the largest stable step, about"),
         (["--dt", "-1"], "dt is -1 s; it must be a positive number"),
         (["--fps", "0"], "fps is 0; it must be a positive number"),
         (["--duration", "0"], "duration is 0 s; it must be a positive number"),
@@ -168,8 +168,8 @@ def test_cables_are_refused_with_what_can_be_done(tmp_path, capsys):
         pytest.skip("this Newton comes without its tests' stages")
     assert run(source, "-o", tmp_path / "out.usda") == 2
     err = capsys.readouterr().err
-    assert "has cables, as /World/CableA/sim" in err
-    assert "--rigid none leaves cables and rigid bodies where they are" in err
+    assert "has cables, for example /World/CableA/sim" in err
+    assert "--rigid none leaves cables and rigid bodies in place" in err
     assert run(source, "-o", tmp_path / "out.usda", "--rigid", "none", "--duration", "0.05") == 0
     assert "stay where they are (--rigid none): /World/CableA/sim, /World/CableB/sim" in capsys.readouterr().err
 

@@ -1,4 +1,4 @@
-"""How scenes begin: what is taken where a stage does not say it, and what is told of before anything moves."""
+"""Initial states of scenes: defaults for what a stage does not define, and warnings before anything moves."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def block(path, change=None, material=True, marked=True, ground=True, at=(-0.1, 
 
 
 def bind(made, mesh, api=True, **values):
-    """A material that says only some values, in the stage's units."""
+    """Bind a material with only some values, in the stage's units."""
     material = UsdShade.Material.Define(made.stage, "/Materials/Part").GetPrim()
     if api:
         material.AddAppliedSchema("PhysicsVolumeDeformableMaterialAPI")
@@ -47,7 +47,7 @@ class TestMaterials:
     @pytest.mark.parametrize("marked", [True, False])
     @pytest.mark.parametrize("form", [{}, {"metres": 0.01, "kilograms": 0.001}])
     def test_options_are_what_the_stage_does_not_say(self, tmp_path, marked, form):
-        """Of any TetMesh, in any units; the mass is the density times the volume."""
+        """For any TetMesh, in any units; the mass is the density times the volume."""
         path = block(tmp_path / "in.usda", material=False, marked=marked, **form)
         made = parts(path, young=7e3, poisson=0.25, density=500.0)
         body = made.soft[0]
@@ -72,7 +72,7 @@ class TestMaterials:
         assert said in made.notes[0]
 
     def test_half_of_a_material_and_options(self, tmp_path):
-        """What it says stays, what it does not say is the user's."""
+        """Values of the stage are kept, missing ones are the user's."""
         path = block(
             tmp_path / "in.usda", lambda made, mesh: bind(made, mesh, poissonsRatio=0.2), material=False, metres=0.01
         )
@@ -92,7 +92,7 @@ class TestMaterials:
 
     @pytest.mark.filterwarnings("ignore:.*treating it as unauthored")
     def test_values_that_are_none(self, tmp_path):
-        """Newton takes them for not given; what is taken instead is said."""
+        """Newton treats them as missing; the substitutes are reported."""
 
         def spoil(made, mesh):
             bind(made, mesh, youngsModulus=-1e5, poissonsRatio=-1.0, density=-5.0)
@@ -104,7 +104,7 @@ class TestMaterials:
 class TestFriction:
     @pytest.mark.parametrize(("soft", "ground"), [(0.0, 0.0), (0.2, 0.4)])
     def test_a_body_slides_by_the_mean_of_both(self, tmp_path, soft, ground):
-        """Pulled sideways by s g, it gains s g - mu g a second: it slides without turning over."""
+        """Pulled sideways by s g, it gains s g - mu g a second: it slides without tipping over."""
 
         def change(made, mesh):
             bind(made, mesh, youngsModulus=2e5, poissonsRatio=0.0, density=1000.0, dynamicFriction=soft)
@@ -139,7 +139,7 @@ class TestGravity:
     @pytest.mark.parametrize("metres", [1.0, 0.01])
     @pytest.mark.parametrize("magnitude", [-1.0, -9.81, float("-inf")])
     def test_negative_ones_are_the_earths(self, tmp_path, metres, magnitude):
-        """As UsdPhysics has it."""
+        """As defined in UsdPhysics."""
 
         def change(made, _):
             scene = UsdPhysics.Scene.Get(made.stage, "/physicsScene")
@@ -163,20 +163,20 @@ class TestGravity:
 
         made = parts(block(tmp_path / "in.usda", change))
         assert made.model.gravity.numpy()[-1][2] == pytest.approx(-9.81)
-        assert "gravity is that of the first of 2 physics scenes, /physicsScene" in "\n".join(made.notes)
+        assert "gravity is from the first of 2 physics scenes, /physicsScene" in "\n".join(made.notes)
 
 
 class TestLyingInOneAnother:
     @pytest.mark.parametrize(("form", "axis"), [({}, "z"), ({"metres": 0.001, "up": "Y"}, "y")])
     @pytest.mark.parametrize("height", [0.15, 0.5])
     def test_a_ground_that_cuts_a_body(self, tmp_path, form, axis, height):
-        """It is refused, with what would be free; and that is."""
+        """It is refused, with the highest valid value; and that value is accepted."""
         path = block(tmp_path / "in.usda", ground=False, at=(-0.1, -0.1, 0.02), **form)
         with pytest.raises(wc.InputError, match=rf"ground is {height:g} m; {SIM} .* {axis} = 0\.02 m.*at most 0\.02"):
             parts(path, ground=height)
-        # So is what is a little too high, against the edge of a tetrahedron.
+        # A ground slightly too high for the edge of a tetrahedron is also refused.
         assert all(parts(path, ground=free).ground is not None for free in (0.02, 0.024))
-        with pytest.raises(wc.InputError, match=r"at most -0\.03 is free"):
+        with pytest.raises(wc.InputError, match=r"at most -0\.03, or"):
             parts(path, ground=0.0, radius=0.05)
 
     def test_points_that_are_held_may_be_below(self, tmp_path):
@@ -190,10 +190,10 @@ class TestLyingInOneAnother:
 
     @pytest.mark.parametrize("what", ["ground", "box"])
     def test_a_body_in_a_collider(self, tmp_path, what):
-        """It is said which, and how deep its deepest point is; what only touches is not spoken of."""
+        """The warning names it and the depth of its deepest point; mere contact is not reported."""
 
         def change(made, _):
-            # Turned and moved, so that contacts are in a frame of their own.
+            # Rotated and moved, so that contacts have their own frame.
             cube = made.box(at=(0.05, -0.1, 0.3), size=0.28, mass=50.0)
             UsdGeom.Xformable(cube).SetXformOpOrder([])
             cube.ClearXformOpOrder()
@@ -259,11 +259,11 @@ class TestNotes:
         made = parts(block(tmp_path / "in.usda", change))
         assert [body.prim.path for body in made.soft] == [SIM]
         assert made.model.tet_count == 72
-        assert "patterns of point instancers are not simulated: /World/Many/Pattern/sim" in made.notes
+        assert "prototypes of point instancers are not simulated: /World/Many/Pattern/sim" in made.notes
 
     @pytest.mark.filterwarnings("error:.*in no tetrahedron")
     def test_points_in_no_tetrahedron(self, tmp_path):
-        """They are no reason for a lower ground, and not what Newton would have left out."""
+        """They do not lower the ground, and are not reported as dropped by Newton."""
 
         def change(_, mesh):
             mesh.GetPointsAttr().Set(Vt.Vec3fArray([*mesh.GetPointsAttr().Get(), Gf.Vec3f(0.0, 0.0, -9.0)]))
@@ -278,12 +278,14 @@ class TestNotes:
         path = block(tmp_path / "in.usda", lambda made, _: made.box(at=(0.03, 0.02, 0.5), size=size))
         assert (f"/World/Box is {size:g} m wide and can slip in between the points of {SIM}" in notes(path)) == said
 
-    def test_soft_bodies_do_not_touch_one_another(self, tmp_path):
+    def test_soft_bodies_that_do_not_touch_one_another(self, tmp_path):
         def change(made, _):
             made.material(made.block(body="/World/Other", at=(0.5, 0.0, 0.1)))
 
-        assert "not one another" in notes(block(tmp_path / "in.usda", change))
-        assert "not one another" not in notes(block(tmp_path / "other.usda"))
+        two = block(tmp_path / "in.usda", change)
+        assert "not one another" not in notes(two)
+        assert "not one another" in notes(two, soft_contact=False)
+        assert "not one another" not in notes(block(tmp_path / "other.usda"), soft_contact=False)
 
     def test_collision_that_cannot_be_disabled(self, tmp_path):
         def change(_, mesh):

@@ -1,4 +1,4 @@
-"""Stages stepped through Newton's reader: what moves moves as it should, in any units."""
+"""Stages stepped through Newton's reader: correct motion in any units."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def at_rest(tmp_path_factory):
 
 class TestAtRest:
     def test_it_carries_its_weight(self, at_rest):
-        """Contact is a spring at each point of the base: all of them together push back with the weight."""
+        """Contact is a spring at each point of the base: together they balance the weight."""
         state, model = at_rest.show(), at_rest.parts.model
         weight = DENSITY * AREA * HEIGHT * G
         assert np.abs(state.velocities[0]).max() < 1e-3
@@ -42,7 +42,7 @@ class TestAtRest:
         assert 0.0 < depth.max() < 0.02 * CELL
 
     def test_stress_is_that_of_its_own_weight(self, at_rest):
-        """Without Poisson's effect it is rho g (H - z) in every tetrahedron, in the mean half of that at the base."""
+        """Without Poisson's effect it is rho g (H - z) in every tetrahedron, on average half of that at the base."""
         state = at_rest.show()
         tets = at_rest.scene.tets[0].tets
         depth = HEIGHT - at_rest.parts.model.particle_q.numpy()[tets].mean(axis=1)[:, 2] + 0.02
@@ -61,8 +61,26 @@ class TestAtRest:
         assert sag == pytest.approx(0.5 * DENSITY * G * HEIGHT**2 / YOUNG, rel=0.1)
 
 
+@pytest.mark.parametrize("metres", [1.0, pytest.param(0.01, marks=pytest.mark.slow)])
+def test_a_soft_body_falls_on_another(device, tmp_path, metres):
+    """It stays there, in any units; without contact between them, it falls to the ground."""
+    made = StageMaker(tmp_path / "stage.usda", metres=metres)
+    made.material(made.block(cells=(3, 3, 1)))
+    made.material(
+        made.block(body="/World/Other", cells=(1, 1, 1), at=(0.07, 0.13, CELL + 0.02)), path="/Materials/Other"
+    )
+    made.ground()
+    path = made.save()
+    lowest = {}
+    for touch in (True, False):
+        sim = simulated(path, 12, device, options=StageOptions(viscosity=5e-3, soft_contact=touch))
+        lowest[touch] = metres * sim.show().positions[1][:, 2].min()
+    assert lowest[True] > 0.9 * CELL
+    assert lowest[False] < 0.5 * CELL
+
+
 def test_stresses_are_those_of_the_positions(device, tmp_path):
-    """Hooke's stress of the strain that is left without the rotation, by SciPy's polar decomposition."""
+    """Hooke's stress of the strain without the rotation, by SciPy's polar decomposition."""
     made = StageMaker(tmp_path / "stage.usda", metres=0.01)
     young = 4e4
     made.material(made.block(), young=young, poisson=0.3)
@@ -86,7 +104,7 @@ def test_stresses_are_those_of_the_positions(device, tmp_path):
 
 @pytest.mark.parametrize("form", [{"metres": 0.01}, {"up": "Y"}, {"metres": 0.001, "kilograms": 0.001, "up": "Y"}])
 def test_units_and_axes_are_those_of_the_stage(device, tmp_path, form):
-    """A block that is dropped and hit by a box moves the same, whatever the stage's numbers are in."""
+    """A block that is dropped and hit by a box moves the same in any units of the stage."""
     ends = []
     for name, options in (("one.usda", {}), ("other.usda", form)):
         made = StageMaker(tmp_path / name, **options)
@@ -108,7 +126,7 @@ def test_units_and_axes_are_those_of_the_stage(device, tmp_path, form):
 
 
 def test_a_fall_is_free(device, tmp_path):
-    """Viscosity slows no fall: what frames show is g t^2 / 2, and the velocity g t."""
+    """Viscosity does not slow a fall: frames show g t^2 / 2, and the velocity g t."""
     sim = simulated(standing(tmp_path / "stage.usda", height=1.0), 6, device)
     state, t = sim.show(), sim.time
     assert t == pytest.approx(0.25)
@@ -161,7 +179,7 @@ def test_what_a_stage_does_not_say_is_chosen_and_said(tmp_path):
 
 @pytest.mark.parametrize(("kinematic", "height"), [(False, -0.3), (True, None)])
 def test_there_is_a_ground_unless_a_collider_stays(tmp_path, kinematic, height):
-    """A block on a box that falls needs one below the box; one that does not fall is what it stands on."""
+    """A block on a falling box needs a ground below the box; a fixed box supports it."""
     made = StageMaker(tmp_path / "stage.usda", metres=0.01, up="Y")
     made.material(made.block(at=(-0.1, -0.1, 0.0)))
     cube = made.box(at=(0.0, 0.0, -0.2))
@@ -216,7 +234,7 @@ def test_wrongly_wound_tetrahedra_are_turned_round(tmp_path):
             tets = np.array(mesh.GetTetVertexIndicesAttr().Get())
             tets[:5] = tets[:5][:, [1, 0, 2, 3]]
             mesh.GetTetVertexIndicesAttr().Set(Vt.Vec4iArray.FromNumpy(tets))
-            with pytest.warns(UserWarning, match="5 tetrahedra are wound wrongly and have been turned round"):
+            with pytest.warns(UserWarning, match="5 tetrahedra are wound wrongly and have been repaired"):
                 sim = written(made.save(), tmp_path / "out.usda", 6)
         else:
             sim = simulated(made.save(), 6)
@@ -284,7 +302,7 @@ def test_attachments_to_the_world_hold_points(tmp_path):
 
 
 def test_a_bar_hangs_by_what_its_weight_makes_of_it(tmp_path):
-    """rho g L^2 / (2 E), which linear tetrahedra have exactly where there is no Poisson's effect."""
+    """rho g L^2 / (2 E), exact for linear tetrahedra at zero Poisson's ratio."""
     made = StageMaker(tmp_path / "stage.usda", metres=0.01)
     made.material(made.block(cells=(1, 1, 6), at=(0.0, 0.0, 1.0)), young=2e6)
     options = StageOptions(fix="z > zmax - 1e-4", viscosity=0.01)
@@ -297,7 +315,7 @@ def test_a_bar_hangs_by_what_its_weight_makes_of_it(tmp_path):
 
 
 def test_attachments_to_a_rigid_body_carry_it(tmp_path):
-    """A box hangs from a block that hangs from the world: the stress below is the box's weight over the area."""
+    """A box hangs from a block that hangs from the world: the stress is the box's weight over the area."""
     made = StageMaker(tmp_path / "stage.usda")
     made.material(made.block(at=(0.0, 0.0, 1.0)))
     made.box(at=(0.1, 0.1, 0.9), mass=20.0)

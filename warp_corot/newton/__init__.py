@@ -2,7 +2,7 @@
 
 ``SolverCorotated`` steps the tetrahedra of any ``newton.Model``; ``add_forest`` and ``add_mesh`` put this package's
 meshes into a ``newton.ModelBuilder``; ``StageSimulation`` steps the scene of a USD stage. Only Newton's public
-interface is used. It is imported when the first of these names is asked for, and comes with
+interface is used. It is imported when one of these names is first used, and installed by
 ``pip install "warp-corot[newton]"``.
 """
 
@@ -14,12 +14,14 @@ if TYPE_CHECKING:
     from warp_corot.newton.stages.steps import StageSimulation
 
     from .scene import Added, add_forest, add_mesh
+    from .sensor import SensorSoftContact
     from .solver import SolverCorotated
     from .state import register_custom_attributes
     from .viewing import open_viewer
 
 __all__ = [
     "Added",
+    "SensorSoftContact",
     "SolverCorotated",
     "StageOptions",
     "StageSimulation",
@@ -31,6 +33,7 @@ __all__ = [
 
 _MODULES = {
     "Added": ".scene",
+    "SensorSoftContact": ".sensor",
     "SolverCorotated": ".solver",
     "StageOptions": ".stages.material",
     "StageSimulation": ".stages.steps",

@@ -1,9 +1,9 @@
-"""Soft contacts and attachments: what particles and rigid bodies do to one another.
+"""Contacts of soft bodies with rigid bodies and with one another, and attachments to rigid bodies.
 
-Contacts are of particles: a body smaller than their spacing sinks in between them, and one whose edge they pass in a
-step is pushed aside. So particles' radii should exceed what a body goes in a step, and half of the spacing where bodies
-are as small as that; the pipeline's ``soft_contact_gap`` should exceed what a body goes between two ``collide``, or
-contacts are found too late, when they are deep, and throw it out.
+Newton's pipeline finds the contacts: at particles, and on request at points of edges and triangles. Without these, a
+body smaller than the particles' spacing sinks in between them. Particles' radii should exceed a body's motion in a
+step; the pipeline's ``soft_contact_gap`` should exceed a body's motion between two ``collide``, or
+contacts are found late, start with deep penetration, and can launch the body.
 """
 
 from __future__ import annotations
@@ -12,23 +12,31 @@ import numpy as np
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.kernels.newton.contacts import ContactLaw, scatter_attachments, scatter_soft_contacts
+from warp_corot.kernels.newton.attachments import scatter_attachments
+from warp_corot.kernels.newton.contacts import ContactLaw, scatter_soft_contacts
 from warp_corot.kernels.newton.worlds import check_contact_count
 from warp_corot.kernels.newton.yielding import gather_attachments, gather_soft_contacts, solve_yielding
 
 from .library import newton
+from .pairs import SoftPairs
+from .touching import CROWD, Loads, has_surfaces, records_of
 
-#: ``newton.BodyFlags.KINEMATIC``, of bodies that move as they are told.
+#: ``newton.BodyFlags.KINEMATIC``, for bodies with prescribed motion.
 KINEMATIC = int(newton.BodyFlags.KINEMATIC)
 
-#: How often it is asked which contacts still hold where bodies have given way.
+#: Number of iterations that find which contacts still hold after bodies have yielded.
 ROUNDS = 4
 
 
 class Contacts:
-    """Forces between particles and bodies; reactions are wrenches about the bodies' centres of mass."""
+    """Forces of contacts and attachments; reactions are wrenches about the bodies' centres of mass.
 
-    def __init__(self, model: newton.Model):
+    Args:
+        model: The model.
+        margin: Distance at which soft bodies begin to push one another [m]; None: they do not.
+    """
+
+    def __init__(self, model: newton.Model, margin: float | None = None):
         self.model = model
         self.device = model.device
         bodies = model.body_count
@@ -37,21 +45,36 @@ class Contacts:
         self._no_points = wp.empty(0, dtype=wp.vec3, device=self.device)
         self._no_inertia = wp.empty(0, dtype=wp.mat33, device=self.device)
         self._no_flags = wp.empty(0, dtype=wp.int32, device=self.device)
-        #: In how many places bodies are touched or held, int32 [B].
+        self._no_wrenches = wp.empty(0, dtype=wp.spatial_vectorf, device=self.device)
+        #: Contacts of soft bodies with one another, if they have any.
+        self.pairs = None if margin is None else SoftPairs(model, margin)
+        self._loads = Loads(model)
+        #: Number of places at which each body is touched or held, int32 [B].
         self._places = wp.zeros(bodies, dtype=wp.int32, device=self.device)
-        #: Forces on particles before those of contacts [N], which friction takes account of.
+        #: Forces on particles before contact forces [N], which friction uses.
         self._before = wp.empty(model.particle_count, dtype=wp.vec4, device=self.device)
         self._no_numbers = wp.empty(0, dtype=wp.float32, device=self.device)
-        #: Curvature and slope of springs on bodies, and how far these give way to them [m]; of twists, [B].
+        #: Curvature and slope of springs on bodies, and how far these yield to them [m]; and twists, [B].
         self._curvature = wp.zeros(bodies, dtype=wp.spatial_matrixf, device=self.device)
         self._slope = wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device)
         self._yielding = wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device)
         #: Wrenches of the particles on the bodies in the last substep [N, N m], spatial_vector [B].
         self.reactions = wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device)
+        #: Whether contacts of edges and triangles have been handed in.
+        self.crowded = False
         self.refresh()
 
+    def has_surfaces(self, contacts: newton.Contacts) -> bool:
+        """Whether contacts may be of edges and triangles while their stiffness is not counted yet.
+
+        Raises:
+            InputError: They may be, with a triangle mesh.
+        """
+        there = contacts.soft_contact_max and self.model.shape_count
+        return bool(there) and not self.crowded and has_surfaces(self.model, contacts)
+
     def refresh(self) -> None:
-        """See that attachments can be stepped, and how stiff they and contacts are.
+        """Check that attachments can be stepped, and find the stiffness of attachments and contacts.
 
         Raises:
             InputError: An attachment is rigid.
@@ -61,15 +84,19 @@ class Contacts:
             bad = np.flatnonzero(~np.isfinite(stiffness))
             if len(bad):
                 raise InputError(f"attachment {bad[0]} has stiffness {stiffness[bad[0]]}; it must be finite [N/m]")
-        #: The largest stiffness that a contact or an attachment can have [N/m].
+        #: Largest possible stiffness of a contact or an attachment [N/m].
         self.stiffest = self._find_stiffest()
-        #: Inverse mass of the lightest body that particles can touch or are attached to [1/kg]; 0: none that moves.
+        #: Inverse mass of the lightest moving body that particles can touch or are attached to [1/kg]; 0: there is
+        #: none.
         self.lightest = self._find_lightest()
 
     def _find_stiffest(self) -> float:
         found = [0.0]
         if self.model.shape_count:
-            found.append(0.5 * (self.model.soft_contact_ke + float(self.model.shape_material_ke.numpy().max())))
+            one = 0.5 * (self.model.soft_contact_ke + float(self.model.shape_material_ke.numpy().max()))
+            found.append(one * (CROWD if self.crowded else 1.0))
+        if self.pairs is not None:
+            found.append(CROWD * self.model.soft_contact_ke)
         if self.model.attachment_particle_body_count:
             found.append(float(self.model.attachment_particle_body_stiffness.numpy().max()))
         return max(found)
@@ -101,58 +128,105 @@ class Contacts:
         dt: float,
         f: wp.array,
         trouble: wp.array,
+        reported: wp.array | None = None,
+        share: float = 1.0,
     ) -> None:
-        """Add forces on a state's particles to f, vec4 [P], and set ``reactions``. Bodies are where ``of_bodies`` has
-        them."""
+        """Add forces on a state's particles to f, vec4 [P], and set ``reactions``.
+
+        Args:
+            state: The state of the particles.
+            of_bodies: The state of the bodies.
+            contacts: Newton's contacts, or None.
+            dt: Length of the substep [s].
+            f: Forces [N], which already hold all others.
+            trouble: Failures of worlds.
+            reported: Wrenches of rigid and then soft contacts, spatial_vector [R + S], or None.
+            share: The substep's share of the step, in the mean of ``reported``.
+        """
         model = self.model
-        q, qd = state.particle_q, state.particle_qd
         touching = contacts if contacts is not None and contacts.soft_contact_max and model.shape_count else None
         attached = model.attachment_particle_body_count
         law = self._law()
+        pairs = None if self.pairs is None or contacts is None else self.pairs.data_of(contacts)
+        records: list[wp.array] = []
+        if touching is not None or pairs is not None:
+            wp.copy(self._before, f)
+        if touching is not None:
+            records = records_of(touching)
+        self._count_loads(state, of_bodies, touching, records, pairs)
+        bodies = self._find_bodies(state, of_bodies, touching, records, dt, law)
+        if touching is not None:
+            rows = self._no_wrenches if reported is None else reported
+            inputs = [law, dt, *self._found(touching, records), touching.soft_contact_body_vel]
+            inputs += [touching.soft_contact_normal, *self._shapes(), model.shape_material_kd]
+            inputs += [model.shape_material_kf, model.shape_material_mu, model.particle_flags, model.particle_world]
+            inputs += [model.particle_radius, model.particle_inv_mass, state.particle_q, state.particle_qd]
+            inputs += [model.gravity, self._before, *bodies, share, touching.rigid_contact_max]
+            self._launch(scatter_soft_contacts, touching.soft_contact_max, inputs, [f, self.reactions, rows])
+        if pairs is not None and self.pairs is not None:
+            self.pairs.add_forces(pairs, state, law, dt, self._loads.array, self._before, f, trouble)
+        if attached:
+            inputs = [dt, *self._attachments(), model.attachment_particle_body_damping]
+            inputs += [model.attachment_particle_body_enabled, model.particle_inv_mass]
+            inputs += [state.particle_q, state.particle_qd, *bodies]
+            self._launch(scatter_attachments, attached, inputs, [f, self.reactions])
+
+    def _count_loads(
+        self,
+        state: newton.State,
+        of_bodies: newton.State,
+        touching: newton.Contacts | None,
+        records: list[wp.array],
+        pairs: list[wp.array] | None,
+    ) -> None:
+        """Find how many contacts share each particle, if several may."""
+        self._loads.begin((touching is not None and self.crowded) or pairs is not None)
+        if touching is not None and len(self._loads.array):
+            poses = of_bodies.body_q if self.model.body_count else self._no_poses
+            shapes = [self.model.shape_body, self._margins(), self.model.particle_adhesion]
+            self._loads.count(touching, records, shapes, state.particle_q, poses)
+        if pairs is not None and self.pairs is not None:
+            self.pairs.count_loads(pairs, state.particle_q, self._loads.array)
+
+    def _find_bodies(
+        self,
+        state: newton.State,
+        of_bodies: newton.State,
+        touching: newton.Contacts | None,
+        records: list[wp.array],
+        dt: float,
+        law: ContactLaw,
+    ) -> list:
+        """Everything that forces need of bodies."""
+        model = self.model
         if model.body_count:
             self.reactions.zero_()
-            if touching is not None or attached:
-                self._find_yielding(state, of_bodies, touching, dt, law)
+            if touching is not None or model.attachment_particle_body_count:
+                self._find_yielding(state, of_bodies, touching, records, dt, law)
             masses = [model.body_flags, model.body_inv_mass, model.body_inv_inertia, self._places]
             bodies = [of_bodies.body_q, of_bodies.body_qd, model.body_com, self._yielding]
         else:
             masses = [self._no_flags, self._no_numbers, self._no_inertia, self._places]
             bodies = [self._no_poses, self._no_twists, self._no_points, self._no_twists]
-        bodies = [KINEMATIC, *masses, *bodies]
-        if touching is not None:
-            found = [
-                touching.soft_contact_count,
-                touching.soft_contact_particle,
-                touching.soft_contact_indices,
-                touching.soft_contact_shape,
-                touching.soft_contact_body_pos,
-                touching.soft_contact_body_vel,
-                touching.soft_contact_normal,
-            ]
-            shapes = [model.shape_body, self._margins(), model.shape_material_ke, model.shape_material_kd]
-            shapes += [model.shape_material_kf, model.shape_material_mu]
-            particles = [model.particle_flags, model.particle_world, model.particle_radius, model.particle_inv_mass]
-            wp.copy(self._before, f)
-            inputs = [law, dt, *found, *shapes, *particles, q, qd, model.gravity, self._before, *bodies]
-            self._launch(scatter_soft_contacts, touching.soft_contact_max, inputs, [f, self.reactions, trouble])
-        if attached:
-            inputs = [dt, *self._attachments(), model.attachment_particle_body_damping]
-            inputs += [model.attachment_particle_body_enabled, model.particle_inv_mass, q, qd, *bodies]
-            self._launch(scatter_attachments, attached, inputs, [f, self.reactions])
+        return [KINEMATIC, *masses, *bodies]
 
     def _find_yielding(
-        self, state: newton.State, of_bodies: newton.State, touching: newton.Contacts | None, dt: float, law: ContactLaw
+        self,
+        state: newton.State,
+        of_bodies: newton.State,
+        touching: newton.Contacts | None,
+        records: list[wp.array],
+        dt: float,
+        law: ContactLaw,
     ) -> None:
-        """How far bodies give way to springs, and in how many places they are touched."""
+        """Find how far bodies yield to springs, and at how many places they are touched."""
         model, q = self.model, state.particle_q
         self._places.zero_()
         outputs = [self._places, self._curvature, self._slope]
         bodies = [of_bodies.body_q, model.body_com]
         for number in range(ROUNDS if touching is not None else 1):
             if touching is not None:
-                inputs = [law, touching.soft_contact_count, touching.soft_contact_particle, touching.soft_contact_shape]
-                inputs += [touching.soft_contact_body_pos, touching.soft_contact_normal]
-                inputs += [model.shape_body, self._margins(), model.shape_material_ke]
+                inputs = [law, *self._found(touching, records), touching.soft_contact_normal, *self._shapes()]
                 inputs += [model.particle_flags, model.particle_radius, q, KINEMATIC, model.body_flags, *bodies]
                 inputs += [self._yielding, number]
                 self._launch(gather_soft_contacts, touching.soft_contact_max, inputs, outputs)
@@ -162,11 +236,17 @@ class Contacts:
             inputs = [dt, KINEMATIC, model.body_flags, model.body_inv_mass, model.body_inv_inertia, of_bodies.body_q]
             self._launch(solve_yielding, model.body_count, inputs, [self._curvature, self._slope, self._yielding])
 
+    def _found(self, touching: newton.Contacts, records: list[wp.array]) -> list[wp.array]:
+        return [*records, self._loads.array, touching.soft_contact_shape, touching.soft_contact_body_pos]
+
+    def _shapes(self) -> list[wp.array]:
+        return [self.model.shape_body, self._margins(), self.model.shape_material_ke]
+
     def _law(self) -> ContactLaw:
         law, model = ContactLaw(), self.model
         law.stiffness, law.damping = model.soft_contact_ke, model.soft_contact_kd
         law.friction_slope, law.friction = model.soft_contact_kf, model.soft_contact_mu
-        law.adhesion = model.particle_adhesion
+        law.adhesion, law.crowd = model.particle_adhesion, CROWD
         return law
 
     def _margins(self) -> wp.array:

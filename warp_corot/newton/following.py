@@ -1,4 +1,4 @@
-"""How many substeps a step needs in the present state; see ``kernels.stepping.gauge``."""
+"""The number of substeps that the current state needs; see ``kernels.stepping.gauge``."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ from warp_corot.solvers.steps.stable_step import PROBE
 from .library import newton
 from .tetrahedra import Tetrahedra
 
-#: Substeps from one measurement to the next. A measurement takes about as long as four substeps.
+#: Number of substeps between measurements. A measurement takes about as long as four substeps.
 INTERVAL = 64
-#: A recorded step has at least so many times the substeps that the model needs at rest, since they stay as many.
+#: A recorded step has at least this many times the substeps that the model needs at rest, since it cannot change them.
 HEADROOM = 1.5
-#: How often a step that went wrong is tried again, each time with twice the substeps.
+#: Number of retries of a failed step, each with twice the substeps.
 RETRIES = 4
-#: By how much the share of the safe substep that is taken grows at each measurement after such a retry.
+#: Factor on the used fraction of the safe substep at each measurement after a retry.
 RECOVERY = 1.02
 
 
 class Following:
     """The safe substep of a model, which follows the state by launches that may be recorded.
 
-    On the CPU the host knows at once what a measurement finds. On CUDA it waits for nothing: it takes what the device
-    has left in the host's memory by then.
+    On the CPU the host gets the result of a measurement at once. On CUDA it does not wait: it uses the values that the
+    device has written to the host's memory so far.
 
     Args:
         model: The model.
-        tetrahedra: Its tetrahedra. What else is in the model is as stiff as it is at rest.
+        tetrahedra: Its tetrahedra. Everything else in the model is assumed to be as stiff as at rest.
 
     Attributes:
-        share: The share of the safe substep that is taken; less than one after a step that went wrong.
-        reach: The size of the largest body [m]: what moves farther in a substep has gone wrong.
-        made: Substeps of the last step.
+        share: The fraction of the safe substep that is used; less than one after a failed step.
+        reach: The size of the largest body [m]: a larger motion in a substep is a failure.
+        made: Number of substeps of the last step.
         was_recorded: Whether the last step was recorded.
     """
 
@@ -63,16 +63,16 @@ class Following:
         self._seen = wp.zeros(1, dtype=wp.float64, device="cpu", pinned=self.device.is_cuda)
         self._seen_by_device = self._seen
         if self.device.is_cuda:
-            # The same memory: what is pinned has one address everywhere.
+            # The same memory: a pinned array has the same address on host and device.
             self._seen_by_device = wp.array(ptr=self._seen.ptr, shape=1, dtype=wp.float64, device=self.device)
         self.share, self.made, self.was_recorded = 1.0, 1, False
         self.reach = _size(model, tetrahedra.tets)
         self._since, self._recording = INTERVAL, False
-        # Loading within a recording would end it on some drivers.
+        # Loading kernels within a recording would end it on some drivers.
         wp.load_module(newton_gauge.find_posed_strains.module, self.device)
 
     def find_rest(self, stable: float) -> None:
-        """Take the largest stable substep at rest [s] for what measurements are compared with."""
+        """Set the largest stable substep at rest [s], the reference of measurements."""
         model, tets = self.model, self.tetrahedra
         active = (model.particle_flags.numpy() & int(newton.ParticleFlags.ACTIVE)) != 0
         inverse = np.where(active, model.particle_inv_mass.numpy(), 0.0)
@@ -99,22 +99,22 @@ class Following:
 
     @property
     def substep(self) -> float:
-        """The substep that the host would take now [s]; waits for nothing."""
+        """The substep that the host would use now [s]; does not wait."""
         return self.share * float(self._seen.numpy()[0])
 
     @property
     def recorded_substep(self) -> float:
-        """The longest substep that would be recorded now [s]; waits for nothing."""
+        """The longest substep that would be recorded now [s]; does not wait."""
         return min(self.substep, self._longest / HEADROOM)
 
     def count_for(self, dt: float) -> int:
-        """Substeps of a time [s]."""
+        """Number of substeps in a time [s]."""
         longest = self.recorded_substep if self.device.is_capturing else self.substep
-        # A quotient of one and its rounding is one.
+        # A quotient that exceeds one by rounding counts as one.
         return max(1, math.ceil(dt / longest * (1.0 - 1e-6)))
 
     def is_due(self) -> bool:
-        """Whether the substep that comes begins with a measurement; the first one of a recording does."""
+        """Whether the next substep begins with a measurement; the first one of a recording does."""
         begins, self._recording = self.device.is_capturing and not self._recording, self.device.is_capturing
         self.was_recorded = self.device.is_capturing
         due = begins or self._since >= INTERVAL
@@ -122,12 +122,12 @@ class Following:
         return due
 
     def measure(self, state: newton.State, dt: float, substep: float) -> None:
-        """Measure about a state of which positions and displacements have been gathered.
+        """Measure at a state whose positions and displacements have been gathered.
 
         Args:
             state: The state.
-            dt: What is left of the step [s].
-            substep: The length of a substep as it would be [s].
+            dt: The remaining time of the step [s].
+            substep: The planned length of a substep [s].
         """
         tets, model = self.tetrahedra, self.model
         for base, probed, inverse_mass in (
@@ -155,11 +155,11 @@ class Following:
         self.recover()
 
     def recover(self) -> None:
-        """Take a little more of the safe substep again, after one that went wrong."""
+        """Increase the used fraction of the safe substep a little after a failed step."""
         self.share = min(1.0, RECOVERY * self.share)
 
     def take_excess(self) -> float:
-        """By what factor recorded substeps were too long at most since this was last called; waits for the device."""
+        """The largest factor by which recorded substeps were too long since the last call; waits for the device."""
         excess = float(self._excess.numpy()[0])
         if excess > 0.0:
             self._excess.zero_()
@@ -168,7 +168,7 @@ class Following:
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _curvature_at_rest(self) -> float:
-        """The largest curvature about rest shapes [1/s^2]; directions begin with those that were found there."""
+        """The largest curvature about rest shapes [1/s^2]; measurements start with its directions."""
         tets = self.tetrahedra
         u, probed = (wp.zeros(self.model.particle_count, dtype=wp.vec4, device=self.device) for _ in range(2))
         self._directions.zero_()
@@ -193,7 +193,7 @@ class Following:
 
 
 def _size(model: newton.Model, tets: npt.NDArray[np.integer]) -> float:
-    """The diagonal of the box about the largest body of tetrahedra that hang together [m]."""
+    """The diagonal of the bounding box of the largest connected body of tetrahedra [m]."""
     count = model.particle_count
     edges = csr_array((np.ones(3 * len(tets), bool), (np.repeat(tets[:, 0], 3), tets[:, 1:].ravel())), (count, count))
     number, body = connected_components(edges, directed=False)

@@ -1,4 +1,4 @@
-"""The forests of a model: which tetrahedra they are, and their forces on the fast path."""
+"""The forests of a model: their tetrahedra, and their forces on the fast path."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class ForestGroup:
         tets: First tetrahedron of each copy.
 
     Attributes:
-        tets: All copies' tetrahedra among the model's, int [copies * T].
-        nodes: All copies' particles, int [copies * N].
-        rest: Where these rest [m], float32 [copies * N, 4].
-        follow_one_another: Whether the particles are a range, so that forces need not go by way of the forest's own.
+        tets: Tetrahedra of all copies, indices into the model's, int [copies * T].
+        nodes: Particles of all copies, int [copies * N].
+        rest: Rest positions of these [m], float32 [copies * N, 4].
+        follow_one_another: Whether the particles are contiguous, so that forces need no arrays of the forest's own.
     """
 
     def __init__(
@@ -48,13 +48,13 @@ class ForestGroup:
         self.nodes = (particles[:, None] + np.arange(len(forest.points))).ravel()
         self.count = len(self.nodes)
         self.follow_one_another = bool((np.diff(self.nodes) == 1).all())
-        # Displacements are from the forest's own axes, so only where a copy stands is taken off: no digits are lost.
+        # Displacements use the forest's own axes, so only a copy's position is subtracted, and no digits are lost.
         rest = np.tile(forest.points, (self.copies, 1)).reshape(self.copies, -1, 3)
         there = model.particle_q.numpy().astype(np.float64)[self.nodes].reshape(rest.shape)
         rest = rest + (there - rest).mean(axis=1, keepdims=True)
         self.rest = np.zeros((self.count, 4), np.float32)
         self.rest[:, :3] = rest.reshape(-1, 3)
-        #: Its nodes in arrays over particles; kept, since these are the same arrays in every step.
+        #: Its nodes in arrays over particles; cached, since these arrays are the same in every step.
         self._parts: dict[int, wp.array] = {}
         if not self.follow_one_another:
             self._particles = wp.array(self.nodes, dtype=wp.int32, device=self.device)
@@ -62,7 +62,7 @@ class ForestGroup:
             self._u, self._f = (wp.zeros(self.count, dtype=wp.vec4, device=self.device) for _ in range(2))
 
     def set_material(self, mu: npt.NDArray[np.float64], lam: npt.NDArray[np.float64]) -> None:
-        """Take over Lamé's parameters of the model's tetrahedra [Pa], float64 [all T]."""
+        """Set Lamé's parameters from those of the model's tetrahedra [Pa], float64 [all T]."""
         share = mesh_fill(self.forest)
         own_mu, own_lam = (_squeezed(a[self.tets].reshape(self.copies, -1) / share) for a in (mu, lam))
         made_of = FixedMesh.of_lame(self.forest, own_mu, own_lam, self.copies, self.device)
@@ -71,7 +71,7 @@ class ForestGroup:
     def add_forces(self, x: wp.array, u: wp.array, f: wp.array) -> None:
         """Add the elastic forces of particles at x, displaced by u, to f, all vec4 [P].
 
-        Of x and u it reads one: displacements where its particles follow one another, positions where they do not.
+        It reads only one of x and u: displacements if its particles are contiguous, else positions.
         """
         if self.follow_one_another:
             self._field.add_forces(self._part_of(u), self._part_of(f))
@@ -88,7 +88,7 @@ class ForestGroup:
 
 
 def forest_groups(model: newton.Model, tets: npt.NDArray[np.integer], rotation_level: int | None) -> list[ForestGroup]:
-    """The forests in a model; tetrahedra that are no longer as they were added are left to the general path."""
+    """The forests in a model; tetrahedra that were changed after they were added are left to the general path."""
     names = attribute_of(model, "forest") or []
     rows = [attribute_of(model, f"forest_{name}") for name in ("particle", "tet")]
     particles, first = (np.empty(0, int) if row is None else row.numpy() for row in rows)
@@ -100,7 +100,7 @@ def forest_groups(model: newton.Model, tets: npt.NDArray[np.integer], rotation_l
         forest, starts = forests[chosen[0]], (particles[chosen], first[chosen])
         if not isinstance(forest, TetForest) or not _is_there(forest, model, tets, *starts):
             warnings.warn(
-                "a forest of this model comes from a file, or has been changed since it was added; its tetrahedra are "
+                "a forest of this model comes from a file, or was changed after it was added; its tetrahedra are "
                 "stepped one by one",
                 UserWarning,
                 stacklevel=5,
@@ -117,7 +117,7 @@ def _is_there(
     particles: npt.NDArray[np.integer],
     first: npt.NDArray[np.integer],
 ) -> bool:
-    """Whether a model's tetrahedra have the forest's nodes and rest shapes, however they are turned."""
+    """Whether a model's tetrahedra have the forest's nodes and rest shapes, in any orientation."""
     own = right_handed(forest)
     if not ((particles >= 0).all() and (particles + len(forest.points) <= model.particle_count).all()):
         return False
@@ -134,11 +134,11 @@ def _is_there(
 
 
 def _shapes(poses: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """What is left of inverse rest matrices B when elements are turned, B B^T."""
+    """The part of inverse rest matrices B that does not depend on rotation, B B^T."""
     return poses @ np.swapaxes(poses, 1, 2)
 
 
 def _squeezed(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | float:
-    """[copies, T] as one number where all are alike, to rounding in float32, so that kernels read one only."""
+    """[copies, T], or one number if all are equal to float32 rounding, so that kernels read only one."""
     one = float(values.flat[0])
     return one if np.allclose(values, one, rtol=2e-7, atol=0.0) else values

@@ -1,4 +1,4 @@
-"""Newton itself, imported here and nowhere else."""
+"""The only module that imports Newton."""
 
 from __future__ import annotations
 
@@ -20,11 +20,20 @@ except ImportError as error:
         f'warp_corot.newton needs Newton 1.8 or newer: pip install "warp-corot[newton]" ({error})'
     ) from None
 
-__all__ = ["CouplingInterface", "MissingNewton", "ModelView", "SolverBase", "SolverSemiImplicit", "examples", "newton"]
+__all__ = [
+    "CouplingInterface",
+    "MissingNewton",
+    "ModelView",
+    "SolverBase",
+    "SolverSemiImplicit",
+    "examples",
+    "newton",
+]
 
 
 def examples() -> ModuleType:
-    """What Newton's examples share, which needs more packages than Newton; an ImportError where they are not there."""
+    """The common module of Newton's examples, which needs more packages than Newton; raises ImportError without
+    them."""
     import newton.examples
 
     return newton.examples

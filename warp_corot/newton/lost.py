@@ -1,4 +1,4 @@
-"""Tetrahedra that Newton's builder has left out: wrongly wound ones, mass and all, with a line in the log."""
+"""Tetrahedra that Newton's builder left out: wrongly wound ones with their mass, with one line in the log."""
 
 from __future__ import annotations
 
@@ -11,29 +11,27 @@ from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 from .library import newton
 
-_REPAIR = (
-    "build with warp_corot.newton.add_mesh(builder, warp_corot.TetMesh(points, tets), ...), which turns them round"
-)
+_REPAIR = "build with warp_corot.newton.add_mesh(builder, warp_corot.TetMesh(points, tets), ...), which repairs them"
 
 
 def why_none(model: newton.Model) -> str:
-    """In a line, why a model has no tetrahedra, and what to do."""
+    """In one line, why a model has no tetrahedra, and what to do."""
     bodies = 0 if model.volume_particle_start is None else len(model.volume_particle_start)
     if not bodies:
         return "the model has no tetrahedra; add some with add_soft_mesh, add_soft_grid or add_forest"
     labels = [str(label) for label in model.volume_label]
     named = f"{bodies} soft bod{'y' if bodies == 1 else 'ies'} ({', '.join(labels[:3])}{', ...' * (bodies > 3)})"
     return (
-        f"the model has no tetrahedra, though {named}: Newton's builder leaves out wrongly wound tetrahedra, mass and "
-        f"all, and these are all so; {_REPAIR}"
+        f"the model has no tetrahedra, though {named}: Newton's builder leaves out wrongly wound tetrahedra and their "
+        f"mass, and all of these are wrongly wound; {_REPAIR}"
     )
 
 
 def warn_of_lost(model: newton.Model, tets: npt.NDArray[np.integer]) -> None:
-    """Say it where soft bodies of a model seem to lack tetrahedra.
+    """Warn if soft bodies of a model seem to lack tetrahedra.
 
-    Their surface triangles were found from all tetrahedra: with some left out, these have more faces that are no
-    other's. Or particles are in none at all, and the triangles do not show that no tetrahedron ever had them.
+    Their surface triangles were found from all tetrahedra: if some were left out, the rest have more outer faces. Or
+    particles are in no tetrahedron, and the triangles do not show that they never were in one.
     """
     if model.volume_particle_start is None or not len(model.volume_particle_start):
         return
@@ -56,7 +54,7 @@ def warn_of_lost(model: newton.Model, tets: npt.NDArray[np.integer]) -> None:
         lost.append(f"soft bodies with {surface} surface triangles have {faces} outer faces")
     if lost:
         warnings.warn(
-            f"{' and '.join(lost)}: Newton's builder leaves out wrongly wound tetrahedra, mass and all; {_REPAIR}",
+            f"{' and '.join(lost)}: Newton's builder leaves out wrongly wound tetrahedra and their mass; {_REPAIR}",
             UserWarning,
             stacklevel=5,
         )

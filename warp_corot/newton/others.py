@@ -1,6 +1,6 @@
-"""All that is in a model besides tetrahedra: rigid bodies and joints, springs, triangles and bending edges.
+"""Everything in a model besides tetrahedra: rigid bodies and joints, springs, triangles and bending edges.
 
-These are stepped by another of Newton's solvers, on a view of the model in which there are no tetrahedra.
+Another of Newton's solvers steps these, on a view of the model without tetrahedra.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from warp_corot.kernels.newton.linear import scatter_bending, scatter_springs, s
 
 from .library import ModelView, SolverBase, SolverSemiImplicit, newton
 
-#: Contacts with other particles that one is in, in a heap of them, for how stiff these are together. Those of two that
-#: move against each other count twice, and those on opposite sides as the square of their directions' cosines.
+#: Effective number of contacts of a particle with others in a heap, for their total stiffness. A pair that moves
+#: against each other counts twice, and opposite contacts count with the square of the cosine of their directions.
 CONTACTS = 4.0
 
 
 class Others:
-    """Steps of everything else.
+    """Steps of everything besides tetrahedra.
 
     Args:
         model: The model.
-        rigid_solver: "semi-implicit", a solver of the user's, or None: bodies are not moved.
+        rigid_solver: "semi-implicit", a user's solver, or None: bodies do not move.
         particle_contact: Whether particles collide with one another.
 
     Attributes:
-        has_particles: Whether particles are integrated here, as something besides tetrahedra acts on them.
-        has_bodies: Whether bodies are.
+        has_particles: Whether particles are integrated here, because something besides tetrahedra acts on them.
+        has_bodies: Whether bodies are integrated here.
         damped: Whether springs, triangles or bending edges have dampers.
-        contact: Stiffness [N/m] and damping [N s/m] of particles' contacts with one another, at each of them.
+        contact: Stiffness [N/m] and damping [N s/m] of each contact between particles.
     """
 
     def __init__(self, model: newton.Model, rigid_solver: SolverBase | str | None, particle_contact: bool):
@@ -72,18 +72,18 @@ class Others:
                 self._solver = SolverSemiImplicit(view, enable_tri_contact=False)
             except ValueError as error:
                 raise InputError(f"{error} Give another rigid_solver, or None.") from None
-        #: Copies of contacts in which there are none of particles, by the contacts they are of.
+        #: Copies of contacts without those of particles, by the original contacts.
         self._rigid_contacts: tuple[newton.Contacts, newton.Contacts] | None = None
         self._particle_f = wp.empty(model.particle_count, dtype=wp.vec3, device=model.device)
-        #: Stiffness and damping that were last taken over.
+        #: Stiffness and damping at the last ``refresh``.
         self._seen: list[np.ndarray] = []
         self.refresh()
 
     def refresh(self) -> bool:
-        """Take over how stiff and damped everything is at present.
+        """Read the current stiffness and damping of everything.
 
         Returns:
-            Whether that is otherwise than when this was last called.
+            Whether they have changed since the last call.
         """
         model = self.model
         present: list[np.ndarray] = [np.zeros(2)]
@@ -108,7 +108,7 @@ class Others:
     def add_linear_forces(self, u: wp.array, f: wp.array, damping: bool) -> None:
         """Add the forces of small displacements from the model's initial positions, or of velocities there, vec4 [P].
 
-        Contact of particles with one another is none of them.
+        Contact between particles is not included.
         """
         model, x = self.model, self.model.particle_q
         if model.spring_count:
@@ -124,7 +124,7 @@ class Others:
 
     @property
     def particle_forces(self) -> wp.array:
-        """Where the forces on particles go that the step is to be made with [N], vec3 [P]."""
+        """The array for the forces on particles in the step [N], vec3 [P]."""
         return self._particle_f
 
     def step(
@@ -136,7 +136,7 @@ class Others:
         dt: float,
         body_f: wp.array | None,
     ) -> None:
-        """A step from ``now`` to ``out`` with the given wrenches on bodies and forces on particles."""
+        """Step from ``now`` to ``out`` with the given wrenches on bodies and forces on particles."""
         rigid = self._without_soft(contacts)
         with _forces(now, self._particle_f if self.has_particles else now.particle_f, body_f):
             if self._solver is not None:
@@ -165,18 +165,18 @@ class Others:
 
 
 def _grid_for(model: newton.Model) -> wp.HashGrid:
-    """A grid of about as many cells as there are particles: clearing Newton's two million would be most of a step."""
+    """A grid with about as many cells as particles: clearing Newton's two million cells would dominate a step."""
     size = 2 ** math.ceil(math.log2(max(model.particle_count, 1)) / 3)
     return wp.HashGrid(*3 * [min(max(size, 8), 128)], device=model.device)
 
 
 def _warn_of_ignored(model: newton.Model) -> None:
-    """Say in a line what is in a model that nothing steps."""
+    """Warn, in one line, of parts of a model that nothing steps."""
     counts = {"tendons": model.tendon_count, "muscles": model.muscle_count}
     there = [f"{count} {name}" for name, count in counts.items() if count]
     if there:
         warnings.warn(
-            f"the model has {' and '.join(there)}, which do nothing here; a rigid_solver that knows them can step them",
+            f"the model has {' and '.join(there)}, which are ignored here; another rigid_solver may step them",
             UserWarning,
             stacklevel=4,
         )
@@ -184,7 +184,7 @@ def _warn_of_ignored(model: newton.Model) -> None:
 
 @contextmanager
 def _forces(state: newton.State, particle_f: wp.array | None, body_f: wp.array | None) -> Iterator[None]:
-    """A state with other forces, for as long as it lasts."""
+    """Replace a state's forces inside the block."""
     kept = state.particle_f, state.body_f
     state.particle_f, state.body_f = particle_f, body_f
     try:

@@ -22,7 +22,7 @@ from .state import NAMESPACE, ForestName, register_forests
 
 
 class Added(NamedTuple):
-    """What was added: ranges of indices in the builder."""
+    """The result of adding a mesh: ranges of indices in the builder."""
 
     particles: range
     tetrahedra: range
@@ -43,28 +43,27 @@ def add_forest(
 ) -> Added:
     """Add an adaptive forest. ``SolverCorotated`` steps it by its subtrees, several times as fast as other tetrahedra.
 
-    To any other solver it is tetrahedra like all others. Where it holds only part of its tetrahedra, stiffness and
-    mass are that part's.
+    For any other solver it consists of ordinary tetrahedra. Tetrahedra that are partly filled have the stiffness and
+    mass of that part.
 
     Args:
-        builder: Where to add it; it can be added to other builders and be replicated afterwards.
+        builder: The builder; it can be added to other builders and replicated afterwards.
         mesh: The forest.
         material: Its material; Lamé's parameters become ``k_mu`` and ``k_lambda``.
-        pos: Where the mesh's origin goes [m].
-        rot: How it is turned, a unit quaternion (x, y, z, w).
+        pos: Position of the mesh's origin [m].
+        rot: Rotation, a unit quaternion (x, y, z, w).
         vel: Velocity of all its particles [m/s].
         k_damp: Viscosity [Pa s], a number or [T].
-        fixed: Nodes that get no mass, so that they are kinematic: mask bool [N] or indices.
-        particle_radius: For contact [m], zero or positive; None: the builder's default.
-        surface: Whether triangles without stiffness are added at its boundary, by which viewers draw it.
+        fixed: Nodes without mass, which are kinematic: mask bool [N] or indices.
+        particle_radius: Radius for contact [m], zero or positive; None: the builder's default.
+        surface: Whether to add triangles and edges without stiffness at its boundary, for viewers and contact.
 
     Returns:
         The particles and tetrahedra, in the forest's order.
 
     Raises:
         InputError: Not a forest, an anisotropic material, an argument of the wrong type or shape or out of its range,
-            or a place so far away that positions in float32 cannot tell the corners of a tetrahedron from one another.
-            Nothing has been added then.
+            or a position so far away that float32 cannot separate the corners of a tetrahedron. Then nothing was added.
     """
     if not isinstance(mesh, TetForest):
         raise InputError(f"mesh is a {type(mesh).__name__}; add_forest takes a TetForest, add_mesh any tetrahedra")
@@ -94,9 +93,9 @@ def add_mesh(
     particle_radius: float | None = None,
     surface: bool = True,
 ) -> Added:
-    """Add general tetrahedra. Wrongly wound ones, which Newton's builder leaves out, ``TetMesh`` has turned round.
+    """Add general tetrahedra. ``TetMesh`` has repaired wrongly wound ones, which Newton's builder leaves out.
 
-    Arguments, result and errors as ``add_forest``.
+    Arguments, result and errors are those of ``add_forest``.
     """
     if not isinstance(mesh, TetMesh):
         raise InputError(f"mesh is a {type(mesh).__name__}; add_mesh takes a TetMesh")
@@ -135,7 +134,7 @@ def _add(
     first, first_tet = builder.particle_count, builder.tet_count
 
     builder.add_particles([tuple(p) for p in x.tolist()], [velocity] * len(x), masses.tolist(), radii)
-    # As ``add_tetrahedron`` does one by one.
+    # The same as ``add_tetrahedron`` does one by one.
     corners = x[tets]
     edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
     builder.tet_indices.extend(map(tuple, (tets + first).tolist()))
@@ -149,17 +148,32 @@ def _add(
         builder.add_triangles(
             i, j, k, tri_ke=nothing, tri_ka=nothing, tri_kd=nothing, tri_drag=nothing, tri_lift=nothing
         )
+        sides = _edges_of(faces)
+        nothing = [0.0] * len(sides)
+        builder.add_edges(*sides.T.tolist(), rest=nothing, edge_ke=nothing, edge_kd=nothing)
     return Added(range(first, first + len(x)), range(first_tet, first_tet + count))
 
 
+def _edges_of(faces: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
+    """Each edge of a surface as Newton's builder has it: opposite vertices, -1 where there is none, and the ends,
+    [E, 4]."""
+    sides = np.concatenate([np.roll(faces, -k, axis=1) for k in range(3)])
+    ends = np.sort(sides[:, :2], axis=1)
+    _, first, place = np.unique(ends, axis=0, return_index=True, return_inverse=True)
+    second = np.full(len(first), -1)
+    later = np.setdiff1d(np.arange(len(sides)), first)
+    second[np.ravel(place)[later]] = sides[later, 2]
+    return np.stack([sides[first, 2], second, sides[first, 0], sides[first, 1]], axis=1)
+
+
 def mesh_fill(mesh: TetForest | TetMesh) -> Any:
-    """Share of each element that the body takes, float64 [T], or 1 where it takes all of each."""
+    """Fraction of each element inside the body, float64 [T], or 1 if all elements are full."""
     fill = getattr(mesh, "fill", None)
     return 1.0 if fill is None else fill
 
 
 def right_handed(mesh: TetForest | TetMesh) -> npt.NDArray[np.int32]:
-    """The mesh's elements as Newton wants them, of positive volume; half of a forest's are mirrored. int32 [T, 4]."""
+    """The mesh's elements with positive volume, as Newton needs them; half of a forest's are mirrored. int32 [T, 4]."""
     tets = np.array(mesh.tets)
     mirrored = signed_volumes(mesh.points, tets) < 0
     tets[mirrored] = tets[mirrored][:, [0, 1, 3, 2]]
@@ -167,19 +181,19 @@ def right_handed(mesh: TetForest | TetMesh) -> npt.NDArray[np.int32]:
 
 
 def _check_resolved(x: npt.NDArray[np.float64], tets: npt.NDArray[np.int32], pos: npt.ArrayLike) -> None:
-    """Refuse a place where rounding to float32 changes the volume of a tetrahedron by more than a tenth."""
+    """Refuse a position where rounding to float32 changes the volume of a tetrahedron by more than a tenth."""
     volumes = signed_volumes(x, tets)
     rounded = signed_volumes(x.astype(np.float32).astype(np.float64), tets)
     if not (np.abs(rounded - volumes) < 0.1 * volumes).all():
         step = float(np.spacing(np.abs(x).max().astype(np.float32)))
         raise InputError(
             f"pos is {pos!r}: positions there are {step:.2g} m apart in float32, too coarse for tetrahedra of "
-            f"{volumes.min():.2g} m^3; build nearer to the origin"
+            f"{volumes.min():.2g} m^3; pos must be nearer to the origin"
         )
 
 
 def _rotation(given: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """The matrix of a unit quaternion (x, y, z, w), which may be one to rounding in float32, float64 [3, 3]."""
+    """The matrix of a quaternion (x, y, z, w) with unit length to float32 rounding, float64 [3, 3]."""
     rot = _vector(given, 4, "rot")
     norm = float(np.linalg.norm(rot))
     if abs(norm - 1.0) > 1e-3:
@@ -213,7 +227,7 @@ def _vector(given: npt.ArrayLike, size: int, name: str) -> npt.NDArray[np.float6
 
 
 def _numbers(given: npt.ArrayLike) -> npt.NDArray[np.float64] | None:
-    """Numbers one after the other, float64 [n], or None if they are no numbers."""
+    """Numbers as a flat array, float64 [n], or None if the input has no numbers."""
     try:
         return np.asarray(given, dtype=np.float64).ravel()
     except (TypeError, ValueError):

@@ -18,13 +18,13 @@ from .library import CouplingInterface, ModelView, SolverBase, newton
 from .others import Others
 from .stability import stable_step
 from .state import STATE, attribute_of, register_custom_attributes
-from .steps import Steps
+from .steps import Step, Steps
 from .tetrahedra import LAME, Tetrahedra
 
-#: Share of the largest stable step that errors suggest: elements stiffen when strained.
+#: Fraction of the largest stable step that errors suggest: elements stiffen when strained.
 SAFETY = 0.7
 
-#: By what factor a recorded substep may be longer than is safe, less than the smallest margin of what is safe.
+#: Factor by which a recorded substep may exceed the safe one; below the smallest margin of the safe substep.
 EXCESS = 1.1
 
 ROTATIONS = ("byers-xu", "warm")
@@ -33,33 +33,32 @@ ROTATIONS = ("byers-xu", "warm")
 class SolverCorotated(SolverBase, CouplingInterface):
     """Corotated linear elasticity for the tetrahedra of a Newton model, by symplectic Euler.
 
-    Every tetrahedron has its own rotation (forests added by ``add_forest``: also a shared one); the force is the
-    gradient of W = V (mu e:e + lambda/2 tr(e)^2) with e = sym(R^T F) - I, for every F, inverted ones too. Added to it:
-    ``k_damp`` as a viscosity that leaves rigid motion alone, ``Control.tet_activations`` as Newton's other solvers
-    have them (k_lambda a cof F), soft contacts with regularised Coulomb friction, attachments of particles to bodies,
-    external forces, and gravity of each world. Particles without mass are kinematic, those that are not active frozen.
+    Every tetrahedron has its own rotation (forests from ``add_forest`` may share rotations); the force is the
+    gradient of W = V (mu e:e + lambda/2 tr(e)^2) with e = sym(R^T F) - I, for every F, inverted ones too. The solver
+    adds ``k_damp`` as a viscosity that leaves rigid motion alone, ``Control.tet_activations`` as in Newton's other
+    solvers (k_lambda a cof F), soft contacts with regularised Coulomb friction, attachments of particles to bodies,
+    external forces, and gravity of each world. Particles without mass are kinematic, inactive ones frozen.
 
-    Rigid bodies, joints and rigid contacts, and springs, triangles and bending edges with stiffness, are stepped along
-    by Newton's ``SolverSemiImplicit`` on a view of the model without tetrahedra; reactions of soft contacts and
+    Newton's ``SolverSemiImplicit`` steps rigid bodies, joints, rigid contacts, and springs, triangles and bending edges
+    with stiffness, on a view of the model without tetrahedra; reactions of soft contacts and
     attachments act on the bodies in the same step. Contacts come from ``newton.CollisionPipeline``, whose
-    ``soft_contact_gap`` should exceed what anything goes between two ``collide``: what is found late is deep by then,
-    and throws light bodies out. Particles do not collide with one another unless asked to, soft bodies not with
-    themselves.
+    ``soft_contact_gap`` should exceed any motion between two ``collide``: contacts found late start with deep
+    penetration and can launch light bodies. Soft bodies and cloth collide with one another only on request.
 
-    Substeps follow the state: every 64 of them, two force evaluations find how stiff the elements are now, and their
-    strains and strain rates tell how soon that may change. All worlds share the substep. On the CPU a step takes up
-    what it finds at once; on CUDA, where it waits for nothing, a later step does. A recorded step has the substeps that
-    it needed when it was recorded, and at least half as many more as at rest; ``check`` warns where that was too few.
+    Substeps follow the state: every 64 substeps, two force evaluations find the current stiffness of the elements, and
+    their strains and strain rates tell how soon it may change. All worlds share the substep. On the CPU a step uses
+    a measurement at once; on CUDA, where it does not wait, a later step does. A recorded step has the substeps that
+    it needed when it was recorded, and at least half as many more as at rest; ``check`` warns if these were too few.
 
-    A step is taken for a world or not at all: where something is not finite, or a particle moves farther in a substep
-    than the largest body is long, the state stays what it was. On the CPU the step is then tried again, with up to 16
-    times the substeps, and ``step`` says so if that does not help. On CUDA, where the world has stood still for a step
-    by then, a later ``step`` warns, and has twice the substeps; ``check`` raises an error. With given substeps it is an
+    A world is stepped completely or not at all: if a value is not finite, or a particle moves farther in a substep
+    than the largest body is long, the state of the world stays unchanged. On the CPU the step is then repeated with up
+    to 16 times the substeps, and ``step`` reports if that does not help. On CUDA, where the world has missed a step by
+    then, a later ``step`` warns and uses twice the substeps; ``check`` raises an error. With given substeps it is an
     error at once, on CUDA from a later ``step`` or ``check``. There are no gradients.
 
-    Newton's positions are float32, and small motions drown in their rounding. An undamped beam of 19 cm, 5 kPa and
-    1000 kg/m^3, set off with v = a (z/L)^2, keeps its energy to 1 % over 20,000 steps down to a = 0.012 m/s; at
-    1 mm/s it doubles it. ``Simulation`` holds displacements, and does better.
+    Newton's positions are float32, and small motions vanish in their rounding. An undamped beam of 19 cm, 5 kPa and
+    1000 kg/m^3 with initial velocity v = a (z/L)^2 keeps its energy to 1 % over 20,000 steps down to a = 0.012 m/s; at
+    1 mm/s its energy doubles. ``Simulation`` stores displacements and does better.
 
     Example::
 
@@ -68,31 +67,36 @@ class SolverCorotated(SolverBase, CouplingInterface):
 
     Args:
         model: A model with tetrahedra.
-        lame: What k_mu and k_lambda are: "documented", Lamé's parameters, as Newton's documentation has it; or
-            "semi-implicit", what ``SolverSemiImplicit`` makes of them for small strains: mu = 3/4 k_mu,
+        lame: Meaning of k_mu and k_lambda: "documented", Lamé's parameters, as in Newton's documentation; or
+            "semi-implicit", their effect in ``SolverSemiImplicit`` for small strains: mu = 3/4 k_mu,
             lambda = k_lambda - 5/8 k_mu.
         damping: Rate of mass-proportional damping [1/s], besides k_damp.
-        substeps: Into how many steps a step is divided; None: as many as the present state takes to be stable, see
+        substeps: Number of substeps of a step; None: as many as the current state needs to be stable, see
             ``safe_dt``.
-        rotation: "byers-xu", or "warm": found from the one in the state, ``state.warp_corot.rotation``, so that also
-            an inverted element's is continuous in time. It needs ``register_custom_attributes``, and forests then go
-            tetrahedron by tetrahedron.
-        rotation_level: Of forests: whose rotation is used; see ``Corotated``.
-        rigid_solver: What steps rigid bodies: "semi-implicit"; another solver, made for this model, which also gets
-            their forces; or None: nothing does, and reactions are added to ``state_in.body_f`` for who does.
+        rotation: "byers-xu", or "warm": starting from the rotation in the state, ``state.warp_corot.rotation``, so that
+            it is continuous in time for inverted elements, too. This needs ``register_custom_attributes``, and the
+            tetrahedra of forests are then computed one by one.
+        rotation_level: Level of shared rotations in forests; see ``Corotated``.
+        rigid_solver: The solver of rigid bodies: "semi-implicit"; another solver, made for this model, which also gets
+            their forces; or None: no solver, and reactions are added to ``state_in.body_f`` for another program.
         particle_contact: Whether particles collide with one another, as in ``SolverSemiImplicit``. Newton's default
-            radius of 0.1 m makes finer meshes fight themselves.
-        stable_dt: The largest stable step [s], where it is known; None: it is found from elements and masses.
+                radius of 0.1 m makes the particles of finer meshes repel one another.
+        self_contact_margin: Distance [m] at which the surfaces of soft bodies and cloth begin to push one another and
+            themselves, like ``margin`` of ``CollisionPipeline.init_soft_self_contact``, which finds the pairs; None:
+            they pass through one another.
+        stable_dt: The largest stable step [s], if known; None: found from elements and masses.
 
     Attributes:
         stable_dt: The largest stable step about rest [s], of tetrahedra, springs, triangles (cloth) and bending edges
-            with their damping. Joints are left out of it, of ``contact_dt``, and of ``substeps=None``.
-        contact_dt: The same with contact or an attachment at every particle [s], as stiff as they can be here, with the
-            lightest rigid body at its other end; with ``particle_contact``, among other particles, too.
+                with their damping. It excludes joints, and so do ``contact_dt`` and ``substeps=None``.
+        contact_dt: The same with a contact or an attachment at every particle [s], with the largest stiffness here and
+            the lightest rigid body at its other end; with ``particle_contact``, also contacts with other particles.
 
     Raises:
         InputError: No tetrahedra, a material that is not positive definite, or an option out of its range.
     """
+
+    SUPPORTED_OBSERVABLES = frozenset({SolverBase.ObservableKind.CONTACT_F})
 
     def __init__(
         self,
@@ -105,10 +109,11 @@ class SolverCorotated(SolverBase, CouplingInterface):
         rotation_level: int | None = None,
         rigid_solver: SolverBase | str | None = "semi-implicit",
         particle_contact: bool = False,
+        self_contact_margin: float | None = None,
         stable_dt: float | None = None,
     ):
         if not isinstance(model, newton.Model) and not isinstance(model, ModelView):
-            raise InputError(f"model is {_named(model)}; it must be a newton.Model, as builder.finalize() makes it")
+            raise InputError(f"model is {_named(model)}; it must be a newton.Model, the result of builder.finalize()")
         if not isinstance(lame, str) or lame not in LAME:
             raise InputError(f"lame is {lame!r}; it must be one of {', '.join(LAME)}")
         if not isinstance(rotation, str) or rotation not in ROTATIONS:
@@ -119,11 +124,15 @@ class SolverCorotated(SolverBase, CouplingInterface):
             raise InputError(f"substeps is {substeps!r}; it must be a positive whole number or None")
         if stable_dt is not None and not (isinstance(stable_dt, Real) and stable_dt > 0):
             raise InputError(f"stable_dt is {stable_dt!r}; it must be a positive number of seconds or None")
+        if self_contact_margin is not None and not (_is_finite(self_contact_margin) and self_contact_margin > 0):
+            raise InputError(
+                f"self_contact_margin is {self_contact_margin!r}; it must be a positive distance in m or None"
+            )
         super().__init__(model)
         self._substeps = None if substeps is None else int(substeps)
         self._given_stable_dt = stable_dt
         self.tetrahedra = Tetrahedra(model, lame, rotation == "warm", rotation_level)
-        self._contacts = Contacts(model)
+        self._contacts = Contacts(model, self_contact_margin)
         self._others = Others(model, rigid_solver, particle_contact)
         self._steps = Steps(model, self.tetrahedra, self._contacts, self._others, damping)
         self._following = Following(model, self.tetrahedra) if substeps is None else None
@@ -132,26 +141,26 @@ class SolverCorotated(SolverBase, CouplingInterface):
 
     @property
     def substeps(self) -> int | None:
-        """Into how many steps a step is divided; None where that follows the state."""
+        """Number of substeps of a step; None if it follows the state."""
         return self._substeps
 
     @property
     def safe_dt(self) -> float:
-        """The substep that ``substeps=None`` takes at present [s]; on CUDA as far as is known without waiting.
+        """The current substep of ``substeps=None`` [s]; on CUDA the value known without waiting.
 
-        At rest 0.9 of ``contact_dt``; shorter where elements are stiffer, or strained so much that they may soon be.
+        At rest 0.9 of ``contact_dt``; shorter if elements are stiffer, or strained so much that they may soon be.
         With given substeps it stays 0.7 of ``contact_dt``.
         """
         return SAFETY * self.contact_dt if self._following is None else self._following.substep
 
     @property
     def recorded_dt(self) -> float:
-        """The longest step that has a single substep when it is recorded now [s]."""
+        """The longest step that would be recorded with a single substep now [s]."""
         return self.safe_dt if self._following is None else self._following.recorded_substep
 
     @property
     def substeps_made(self) -> int:
-        """Substeps of the last step that was launched or recorded."""
+        """Number of substeps of the last step that was launched or recorded."""
         return self._substeps or 1 if self._following is None else self._following.made
 
     @property
@@ -171,51 +180,57 @@ class SolverCorotated(SolverBase, CouplingInterface):
     ) -> None:
         """Step from one state to the other, which may be the same.
 
-        Forces in ``state_in`` act throughout the step and stay as they are. May be captured; launches only.
+        Forces in ``state_in`` act throughout the step and are not changed. The step only launches kernels and may be
+        captured.
 
         Args:
             state_in, state_out: States of the model.
-            control: Activations, and what joints are driven by; None: the model's.
-            contacts: What ``newton.CollisionPipeline`` found; None: no contact.
+            control: Activations and joint controls; None: the model's.
+            contacts: The result of ``newton.CollisionPipeline``; None: no contact.
             dt: Time step [s].
-            observables: None, or an empty container of this solver's.
+            observables: None, or a container of this solver, whose ``contact_f`` gets the mean wrenches of soft
+                contacts in the step; those of rigid contacts, which another solver finds, are zero. A wrench acts on
+                the shape's body, about its centre of mass, or about the origin if the shape has no body.
 
         Raises:
-            InputError: A time step that is not stable, arrays on another device, or states without what the solver
-                needs; then nothing has been launched. On the CPU, unless capturing, also: a state that is not finite,
-                more contacts than the buffer holds, contacts of edges and faces; as ``check``.
-            UnstableError: On the CPU, unless capturing: the step's result is not finite.
+            InputError: A time step that is not stable, arrays on another device, or states without attributes that the
+                solver needs; then nothing was launched. On the CPU, except in a capture, also: a state that is not
+                finite, or more contacts than the buffer holds; as in ``check``. In a recording: contacts of edges
+                and triangles that no step before had.
+            UnstableError: On the CPU, except in a capture: the step's result is not finite.
         """
         refuse_tape()
         self.validate_observables(observables, contacts)
         self._check_arguments(state_in, state_out, control, contacts)
         following = self._following
         self._steps.check_earlier(following)
-        count = self._count_for(dt)
+        self._see_surfaces(contacts)
+        reported = None if observables is None else observables.contact_f
+        step, count = Step(state_in, state_out, control, contacts, dt, reported), self._count_for(dt)
         if following is not None and self.device.is_cpu and not self.device.is_capturing:
-            self._steps.launch_retried(state_in, state_out, control, contacts, dt, following)
+            self._steps.launch_retried(step, following)
         else:
-            self._steps.launch(state_in, state_out, control, contacts, dt, count, following)
+            self._steps.launch(step, count, following)
         if self.device.is_cpu and not self.device.is_capturing:
             self.check()
 
     def check(self) -> None:
-        """Say what has been wrong since somebody last asked, and warn of recorded steps with too few substeps.
+        """Report errors since the last call, and warn of recorded steps with too few substeps.
 
         Waits for the device.
 
-        Worlds of which something is said have stayed as they were. Those in which a state was handed in that is not
-        finite keep what ``state_out`` held before.
+        Worlds with an error keep their former state. If the state handed in for a world was not finite,
+        ``state_out`` keeps its former values there.
 
         Raises:
-            InputError: States that were handed in, or contacts.
+            InputError: Invalid states or contacts were handed in.
             UnstableError: A step's result was not finite, or beyond reason.
         """
         excess = 0.0 if self._following is None else self._following.take_excess()
         if excess > EXCESS:
             warnings.warn(
-                f"a recorded step has fewer substeps than are safe: {excess:.2g} times as many would be; "
-                "record it again in the present state, or give SolverCorotated more substeps",
+                f"a recorded step has too few substeps: {excess:.2g} times as many would be safe; "
+                "record it again in the current state, or give SolverCorotated more substeps",
                 UserWarning,
                 stacklevel=2,
             )
@@ -229,12 +244,12 @@ class SolverCorotated(SolverBase, CouplingInterface):
         world_mask: wp.array | None = None,
         flags: int | None = None,
     ) -> None:
-        """Put chosen worlds of a state back to the model's initial one, rotations too.
+        """Reset chosen worlds of a state to the model's initial state, rotations included.
 
         Args:
             state: The state, changed in place.
-            world_mask: bool [world_count + 1], the last one for what is in no world; None: all.
-            flags: ``newton.StateFlags`` of what is put back: PARTICLE_Q, PARTICLE_QD, and, if this solver steps the
+            world_mask: bool [world_count + 1], the last entry for things in no world; None: all.
+            flags: ``newton.StateFlags`` of what is reset: PARTICLE_Q, PARTICLE_QD, and, if this solver steps the
                 bodies, BODY_Q and BODY_QD; None: all.
         """
         mask = self._all_worlds if world_mask is None else self._checked_mask(world_mask)
@@ -242,22 +257,22 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self._others.reset(state, world_mask, flags)
 
     def write_attributes(self, state: newton.State) -> None:
-        """Write rotations and stresses of a state's positions into it; ``step`` does so for ``state_out`` itself.
+        """Write rotations and stresses for a state's positions into it; ``step`` does so for ``state_out``.
 
-        For states that this solver does not hand out, such as those of Newton's coupled solvers.
+        Use it for states that this solver does not write, for example those of Newton's coupled solvers.
         """
         self.tetrahedra.write_attributes(state, state)
 
     def notify_model_changed(self, flags: int) -> None:
-        """Take over what has changed in the model; stable steps are found again where they may have changed.
+        """Read changes of the model; stable steps are found again if they may have changed.
 
-        ``ModelFlags.MODEL_PROPERTIES`` says that materials of elements, or masses, have; ``SHAPE_PROPERTIES`` and
-        ``CONSTRAINT_PROPERTIES`` that stiffness of contacts and attachments has. Gravity, activations and forces of
-        contact are read from the model in every step. Waits for the device, except in a capture, in which materials
-        are left as they were.
+        ``ModelFlags.MODEL_PROPERTIES`` stands for changed materials of elements or masses; ``SHAPE_PROPERTIES`` and
+        ``CONSTRAINT_PROPERTIES`` for changed stiffness of contacts and attachments. Every step reads gravity,
+        activations and forces of contact from the model. This waits for the device, except in a capture, in which
+        materials are not updated.
 
         Raises:
-            InputError: As on construction.
+            InputError: As in the constructor.
         """
         self._others.notify_model_changed(flags)
         if self.device.is_capturing:
@@ -279,7 +294,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         register_custom_attributes(builder)
 
     def coupling_supports_inertial_property_refresh(self) -> bool:
-        """True: masses are read from the model in every step."""
+        """True: every step reads masses from the model."""
         return True
 
     # --- pieces ----------------------------------------------------------------------------------------------------
@@ -295,6 +310,19 @@ class SolverCorotated(SolverBase, CouplingInterface):
             self.contact_dt = min(self.stable_dt, stable_step(tets, others, stiffness, damping, of_bodies))
         if self._following is not None:
             self._following.find_rest(self.contact_dt)
+
+    def _see_surfaces(self, contacts: newton.Contacts | None) -> None:
+        """Count the stiffness of contacts of edges and triangles in the stable step from the first time on."""
+        if contacts is None or not self._contacts.has_surfaces(contacts):
+            return
+        if self.device.is_capturing:
+            raise InputError(
+                "contacts hold contacts of edges and triangles for the first time, and a step that is being recorded "
+                "cannot find the substeps for them: make one step with these contacts before the recording"
+            )
+        self._contacts.crowded = True
+        self._contacts.refresh()
+        self._find_stable_steps()
 
     def _count_for(self, dt: float) -> int:
         if not (_is_finite(dt) and dt > 0):
@@ -321,7 +349,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         model = self.model
         for name, state in (("state_in", state_in), ("state_out", state_out)):
             if getattr(state, "particle_q", self) is self:
-                raise InputError(f"{name} is {_named(state)}; it must be a newton.State, as model.state() makes it")
+                raise InputError(f"{name} is {_named(state)}; it must be a newton.State, the result of model.state()")
             if state.particle_q is None or len(state.particle_q) != model.particle_count:
                 there = 0 if state.particle_q is None else len(state.particle_q)
                 raise InputError(f"{name} has {there} particles; the model has {model.particle_count}")
@@ -358,7 +386,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
 
 
 def _is_finite(value: Any) -> bool:
-    """Whether something is a finite number."""
+    """Whether a value is a finite number."""
     return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 

@@ -1,18 +1,18 @@
-"""How large a time step of a model may be; see ``solvers.stable_step``."""
+"""The largest stable time step of a model; see ``solvers.stable_step``."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warp_corot.kernels.elements.constitutive import linear_stress
+from warp_corot.discretization.clusters.single import isotropic_material
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, linear_stress
 from warp_corot.kernels.elements.elements import GeneralElements
-from warp_corot.kernels.elements.forces import scatter_forces
+from warp_corot.kernels.elements.forces import law_stress, scatter_forces
 from warp_corot.kernels.stepping.lanczos import add_scaled, scale_by
 from warp_corot.solvers.steps.stable_step import SmallForces, largest_eigenvalue
 
@@ -20,26 +20,28 @@ from .library import newton
 from .others import Others
 from .tetrahedra import Tetrahedra
 
-#: How often a step is lengthened, and from which largest eigenvalue on, of 4, it is long enough.
+#: Number of attempts to lengthen a step, and the largest eigenvalue, of 4, from which it is long enough.
 LENGTHENINGS = 6
 ENOUGH = 3.95
 
 
 class _SmallMotions:
-    """Forces of small displacements from rest, or of velocities there: of elements, of what else there is, and of a
+    """Forces of small displacements from rest, or of velocities there: of elements, of everything else, and of a
     spring or damper at every particle.
 
-    Elements turn with their rotations; where there are none to speak of, the model is linear elasticity.
+    Elements turn with their rotations; if these are negligible, the model is linear elasticity.
     """
 
-    def __init__(self, elements: Any, mu: wp.array, lam: wp.array, others: Others, damping: bool, at_particles: float):
+    def __init__(
+        self, elements: GeneralElements, mu: wp.array, lam: wp.array, others: Others, damping: bool, at_particles: float
+    ):
         self.elements, self.others, self.damping, self.at_particles = elements, others, damping, at_particles
-        self.lame = [mu, lam, 1]
-        self.kernel = scatter_forces(GeneralElements, linear_stress)
+        self.material = isotropic_material([mu, lam, 1])
+        self.kernel = scatter_forces(GeneralElements, IsotropicMaterial, law_stress(linear_stress))
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
         count = len(self.elements.volume)
-        wp.launch(self.kernel, dim=count, inputs=[self.elements, *self.lame, u], outputs=[f], device=u.device)
+        wp.launch(self.kernel, dim=count, inputs=[self.elements, self.material, u], outputs=[f], device=u.device)
         self.others.add_linear_forces(u, f, self.damping)
         wp.launch(add_scaled, dim=len(u), inputs=[-self.at_particles, u], outputs=[f], device=u.device)
 
@@ -70,16 +72,16 @@ def stable_step(
 ) -> float:
     """The largest stable step of symplectic Euler about rest [s]; infinite if nothing can move.
 
-    It is stable while no eigenvalue of dt^2 M^-1 K + 2 dt M^-1 C is above 4. With w^2 the largest of M^-1 K and c that
-    of M^-1 C, which may be of other motions, w^2 dt^2 + 2 c dt = 4 gives a step that is short enough; from there it is
-    lengthened as far as it goes. K and C are those of tetrahedra at rest and of springs, triangles and bending edges
-    about the model's initial positions, all together.
+    It is stable while no eigenvalue of dt^2 M^-1 K + 2 dt M^-1 C is above 4. With w^2 the largest eigenvalue of M^-1 K
+    and c that of M^-1 C, which may belong to other motions, w^2 dt^2 + 2 c dt = 4 gives a step that is short enough;
+    then it is lengthened as far as possible. K and C are those of tetrahedra at rest and of springs, triangles and
+    bending edges about the model's initial positions, all together.
 
     Args:
-        tets, others: What there is.
-        stiffness: Of a spring at every particle [N/m], for contact.
-        damping: Of a damper at every particle [N s/m].
-        of_bodies: Stiffness over mass at the other end of such a spring [1/s^2]; 0: nothing moves there. Bodies that
+        tets, others: The parts of the model.
+        stiffness: Stiffness of a spring at every particle [N/m], for contact.
+        damping: Damping of a damper at every particle [N s/m].
+        of_bodies: Stiffness over mass at the other end of this spring [1/s^2]; 0: that end does not move. Bodies that
             are touched in several places need no shorter steps; see ``kernels.newton.yielding``.
     """
     model = tets.model

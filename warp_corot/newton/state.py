@@ -1,4 +1,4 @@
-"""What the solver keeps in Newton's models and states: custom attributes of the namespace ``warp_corot``."""
+"""The solver's data in Newton's models and states: custom attributes in the namespace ``warp_corot``."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ STATE = {"rotation": wp.quat, "stress": wp.mat33, "von_mises": wp.float32}
 
 
 class ForestName(str):
-    """The name of a forest in builders and models, which has the forest with it for as long as they last.
+    """The name of a forest in builders and models, with a reference to the forest.
 
-    Newton keeps text as it is given; whatever writes it to a file and reads it again has a plain ``str``.
+    Newton keeps text unchanged; a model that was written to a file and read again has a plain ``str``.
     """
 
     forest: TetForest
@@ -34,12 +34,12 @@ class ForestName(str):
 
 
 def register_custom_attributes(builder: newton.ModelBuilder) -> None:
-    """Have states carry what the solver finds in each tetrahedron, as ``state.warp_corot``: before ``finalize``.
+    """Let states carry results for each tetrahedron, as ``state.warp_corot``; call it before ``finalize``.
 
     ``rotation``: wp.quat [T], from rest to world. ``stress``: wp.mat33 [T], Cauchy stress in world axes [Pa].
-    ``von_mises``: wp.float32 [T] [Pa]. All are those of the positions in the same state. They cost about one force
-    evaluation a step. ``State.assign`` takes them along. Newton 1.8's ``ViewerFile`` records no namespaces, and could
-    not load a model that has attributes of states without: ``SolverCorotated.write_attributes`` finds them again.
+    ``von_mises``: wp.float32 [T] [Pa]. All belong to the positions in the same state. They cost about one force
+    evaluation a step. ``State.assign`` copies them. Newton 1.8's ``ViewerFile`` does not record namespaces, and could
+    not load a model whose state attributes have none; ``SolverCorotated.write_attributes`` computes them again.
     """
     for name, dtype in STATE.items():
         builder.add_custom_attribute(
@@ -54,7 +54,7 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
 
 
 def register_forests(builder: newton.ModelBuilder) -> None:
-    """Room in the model for which tetrahedra are which forest's, and how full they are."""
+    """Add attributes to the model for the forest and the fill of each tetrahedron."""
     if f"{NAMESPACE}:forest" in builder.custom_attributes:
         return
     attribute = newton.ModelBuilder.CustomAttribute
@@ -76,5 +76,5 @@ def register_forests(builder: newton.ModelBuilder) -> None:
 
 
 def attribute_of(owner: Any, name: str) -> Any:
-    """An attribute of a model's or a state's namespace, if it is there."""
+    """An attribute in a model's or a state's namespace, or None."""
     return getattr(getattr(owner, NAMESPACE, None), name, None)

@@ -1,8 +1,9 @@
-"""The launches of a step, and what they report."""
+"""The launches of a step, and their report."""
 
 from __future__ import annotations
 
 import warnings
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -20,16 +21,27 @@ from .others import Others
 from .state import attribute_of
 from .tetrahedra import Tetrahedra
 
-#: Particles of this speed [m/s] have gone wrong, however long the step is.
+#: A particle speed [m/s] that is a failure for any step.
 RUNAWAY = float(worlds.RUNAWAY)
 
 
+class Step(NamedTuple):
+    """The arguments of ``SolverCorotated.step``, and the array for the mean wrenches of contacts in the step."""
+
+    state_in: newton.State
+    state_out: newton.State
+    control: newton.Control | None
+    contacts: newton.Contacts | None
+    dt: float
+    reported: wp.array | None = None
+
+
 class Steps:
-    """Symplectic Euler for all particles of a model, and everything else along with it.
+    """Symplectic Euler for all particles of a model, together with everything else.
 
     Args:
         model: The model.
-        tetrahedra, contacts, others: Its forces and what else is in it.
+        tetrahedra, contacts, others: The parts of the model.
         damping: Rate of mass-proportional damping [1/s].
     """
 
@@ -43,11 +55,11 @@ class Steps:
         self._places = max(int(model.world_count), 1) + 1
         self._trouble = wp.zeros(self._places, dtype=wp.int32, device=self.device)
         self._report = wp.zeros(worlds.REPORTS, dtype=wp.int32, device=self.device)
-        #: That there is a report: what the host can look at without waiting.
+        #: The report, which the host can read without waiting.
         self._seen = wp.zeros(1, dtype=wp.int32, device="cpu", pinned=self.device.is_cuda)
         self._seen_by_device = self._seen
         if self.device.is_cuda:
-            # The same memory: what is pinned has one address everywhere.
+            # The same memory: a pinned array has the same address on host and device.
             self._seen_by_device = wp.array(ptr=self._seen.ptr, shape=1, dtype=wp.int32, device=self.device)
         types = (wp.vec3, wp.vec3)
         self._particles_before = [wp.empty(p, dtype=dtype, device=self.device) for dtype in types]
@@ -59,65 +71,41 @@ class Steps:
         self._bodies_before = [wp.empty(b, dtype=dtype, device=self.device) for dtype in of_bodies]
         self._kept_bodies = [wp.empty(b, dtype=dtype, device=self.device) for dtype in of_bodies]
 
-    def launch(
-        self,
-        state_in: newton.State,
-        state_out: newton.State,
-        control: newton.Control | None,
-        contacts: newton.Contacts | None,
-        dt: float,
-        count: int,
-        following: Following | None = None,
-    ) -> None:
-        """Launch a step of ``count`` substeps. What goes wrong in a world in one of them undoes all, and ends it.
+    def launch(self, step: Step, count: int, following: Following | None = None) -> None:
+        """Launch a step of ``count`` substeps. A failure in one substep of a world undoes and ends the world's step.
 
         Args:
-            state_in, state_out, control, contacts, dt: As ``SolverCorotated.step`` has them.
-            count: Into how many substeps the step is divided.
-            following: What measures how many that should be; None: so many and no others.
+            step: The arguments of ``SolverCorotated.step``.
+            count: Number of substeps.
+            following: The measurement of the number needed; None: the number is fixed.
         """
         with self._flushed():
-            self._launch_step(state_in, state_out, control, contacts, dt, count, following)
+            self._launch_step(step, count, following)
 
-    def launch_retried(
-        self,
-        state_in: newton.State,
-        state_out: newton.State,
-        control: newton.Control | None,
-        contacts: newton.Contacts | None,
-        dt: float,
-        following: Following,
-    ) -> None:
-        """The same on the CPU, where what went wrong is tried again, each time with twice the substeps."""
-        arguments = state_in, state_out, control, contacts, dt
+    def launch_retried(self, step: Step, following: Following) -> None:
+        """Launch a step on the CPU, and repeat it after a failure, each time with twice the substeps."""
+        state_in, dt = step.state_in, step.dt
         kept = self.model.body_count and not self.others.has_bodies
         if kept:
             wp.copy(self._body_f, state_in.body_f)
         share = following.share
         for attempt in range(RETRIES + 1):
-            self.launch(*arguments, following.count_for(dt), following)
+            self.launch(step, following.count_for(dt), following)
             if not self._report.numpy()[worlds.UNSTABLE]:
                 return
             if attempt == RETRIES:
                 break
             following.share *= 0.5
             self._report[worlds.UNSTABLE : worlds.UNSTABLE + 1].zero_()
-            self._bring_back(state_in, state_out)
+            self._bring_back(state_in, step.state_out)
             if kept:
                 wp.copy(state_in.body_f, self._body_f)
         following.share = share
 
-    def _launch_step(
-        self,
-        state_in: newton.State,
-        state_out: newton.State,
-        control: newton.Control | None,
-        contacts: newton.Contacts | None,
-        dt: float,
-        count: int,
-        following: Following | None,
-    ) -> None:
-        model = self.model
+    def _launch_step(self, step: Step, count: int, following: Following | None) -> None:
+        model, (state_in, state_out, control, contacts, dt, reported) = self.model, step
+        if reported is not None:
+            reported.zero_()
         activation = model.tet_activations
         if control is not None and control.tet_activations is not None:
             activation = control.tet_activations
@@ -132,7 +120,7 @@ class Steps:
                 if self.device.is_cpu and not self.device.is_capturing:
                     left = following.count_for(dt - done)
                     substep = (dt - done) / left
-            self._launch_forces(now, state_in, activation, contacts, substep)
+            self._launch_forces(now, state_in, activation, contacts, substep, reported, substep / dt)
             if self.others.has_bodies:
                 wp.copy(self._body_f, state_in.body_f)
                 self._add_wrenches(1.0, self._body_f)
@@ -152,13 +140,13 @@ class Steps:
             self._launch(worlds.report_trouble, self._places, inputs, outputs)
 
     def _may_be_wrong(self) -> bool:
-        # On the CPU a look costs less than a launch; a recorded step must be ready for what comes.
+        # On the CPU a check costs less than a launch; a recorded step must handle all cases.
         return self.device.is_cuda or self.device.is_capturing or bool(self._trouble.numpy().any())
 
     def check_earlier(self, following: Following | None) -> None:
-        """Say what a step that is done already has reported. On CUDA, outside of captures; waits for nothing.
+        """Report errors of steps that have finished. On CUDA, outside captures; does not wait.
 
-        Where substeps follow the state, a world that went wrong goes on with twice as many, and a warning says so.
+        If substeps follow the state, a world that failed continues with twice as many, and a warning says so.
         """
         if self.device.is_cpu or self.device.is_capturing or not self._seen.numpy()[0]:
             return
@@ -180,11 +168,11 @@ class Steps:
         world = int(report[worst]) - 1
         where = f" in world {world}" if self.model.world_count > 1 and world < self.model.world_count else ""
         if worst == int(worlds.BAD_INPUT):
-            raise InputError(f"state_in is not finite{where}; state_out there was left as it was")
-        if worst == int(worlds.SURFACE_CONTACTS):
+            raise InputError(f"state_in is not finite{where}; state_out keeps its former values there")
+        if worst == int(worlds.TOO_MANY_PAIRS):
             raise InputError(
-                "contacts hold contacts of edges and faces (enable_rigid_soft_full_surface_contact=True), which "
-                "SolverCorotated does not take: make the CollisionPipeline without it; no step was made"
+                "there are more pairs of soft bodies than Newton has room for: call pipeline.init_soft_self_contact "
+                f"with larger vertex_buffer_pre_alloc and edge_buffer_pre_alloc{where}; no step was made"
             )
         if worst == int(worlds.TOO_MANY_CONTACTS):
             raise InputError(
@@ -198,7 +186,7 @@ class Steps:
         elif following is not None:
             following.share *= 0.5
             hint += "; from now on steps have twice the substeps, recorded ones when they are recorded again"
-        raise UnstableError(f"the step's result is {wrong}{where}; that state stayed as it was{hint}")
+        raise UnstableError(f"the step's result is {wrong}{where}; that state was not changed{hint}")
 
     def reset(self, state: newton.State, mask: wp.array, flags: int) -> None:
         model, bits = self.model, newton.StateFlags
@@ -221,10 +209,10 @@ class Steps:
     def _launch_begin(
         self, state_in: newton.State, state_out: newton.State, contacts: newton.Contacts | None
     ) -> tuple[list[wp.array], list[wp.array]]:
-        """What is done once a step.
+        """Launch what is done once a step.
 
         Returns:
-            Particles and bodies as they are before the step: those of ``state_in``, or, if they are written to, copies.
+            Particles and bodies before the step: those of ``state_in``, or copies if the step overwrites them.
         """
         model, others = self.model, self.others
         if others.has_particles:
@@ -256,10 +244,10 @@ class Steps:
                 _copy(bodies, self._bodies_before)
 
     def _launch_gathering(self, now: newton.State, state_in: newton.State, number: int, copied: bool) -> None:
-        """Forces from outside, and places of particles, which are copied if the step begins with them and writes over
-        them."""
+        """Gather external forces and positions of particles; these are copied if the step begins with them and
+        overwrites them."""
         model, tets = self.model, self.tetrahedra
-        # Where this was finite before, it has become what it is by the step.
+        # If the state was finite before, the step made it infinite.
         wrong = int(worlds.UNSTABLE if number else worlds.BAD_INPUT)
         inputs = [now.particle_q, now.particle_qd, state_in.particle_f, model.particle_world, tets.rest, wrong]
         copies = self._particles_before if copied else self._nothing
@@ -273,12 +261,14 @@ class Steps:
         activation: wp.array,
         contacts: newton.Contacts | None,
         dt: float,
+        reported: wp.array | None,
+        share: float,
     ) -> None:
         """All other forces on particles."""
         tets = self.tetrahedra
         tets.add_forces(now, activation, self._f)
         of_bodies = now if self.others.has_bodies else state_in
-        self.contacts.add_forces(now, of_bodies, contacts, dt, self._f, self._trouble)
+        self.contacts.add_forces(now, of_bodies, contacts, dt, self._f, self._trouble, reported, share)
 
     def _launch_motion(
         self,
@@ -311,7 +301,7 @@ class Steps:
             self._launch(worlds.check_particles, model.particle_count, inputs, [self._trouble])
 
     def _launch_undoing(self, out: newton.State, particles: list[wp.array], bodies: list[wp.array]) -> None:
-        """Put back worlds in which something is wrong."""
+        """Restore the worlds with a failure."""
         if not self._may_be_wrong():
             return
         model = self.model
@@ -335,5 +325,5 @@ def _copy(to: list[wp.array], given: list[wp.array]) -> None:
 
 
 def _overlap(a: list[wp.array], b: list[wp.array]) -> bool:
-    """Whether any of some arrays is one of the others."""
+    """Whether the two lists share an array."""
     return bool({array.ptr for array in a} & {array.ptr for array in b})

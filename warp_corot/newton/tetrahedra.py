@@ -1,24 +1,24 @@
-"""The tetrahedra of a model as force kernels take them: those of forests by subtrees, all others one by one."""
+"""The tetrahedra of a model for force kernels: those of forests by subtrees, all others one by one."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.discretization.clusters.single import isotropic_material
+from warp_corot.elasticity.structs import Kept
 from warp_corot.errors import InputError
-from warp_corot.kernels.elements.constitutive import linear_stress
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, linear_stress
 from warp_corot.kernels.elements.elements import GeneralElements
-from warp_corot.kernels.elements.forces import scatter_forces
+from warp_corot.kernels.elements.forces import law_stress, repair_forces, scatter_forces
 from warp_corot.kernels.elements.general_cuda import BLOCK, PosedElements
 from warp_corot.kernels.elements.lanes import LANES
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.newton.attributes import split_materials, write_attributes
 from warp_corot.kernels.newton.elements import (
     EACH,
-    repair_posed,
+    posed_stress,
     scatter_damping_and_activation,
     scatter_posed,
     scatter_posed_lanes,
@@ -30,12 +30,12 @@ from .library import newton
 from .lost import warn_of_lost, why_none
 from .state import STATE, attribute_of
 
-#: How k_mu and k_lambda are read: mu = a k_mu, lambda = k_lambda + b k_mu, as (a, b).
+#: Meanings of k_mu and k_lambda: mu = a k_mu, lambda = k_lambda + b k_mu, as (a, b).
 LAME = {"documented": (1.0, 0.0), "semi-implicit": (0.75, -0.625)}
 
 
 class Part:
-    """Some of a model's tetrahedra, as a kernel takes them: a range, or a list."""
+    """A part of a model's tetrahedra for a kernel: a range, or a list."""
 
     def __init__(self, tets: npt.NDArray[np.integer], device: wp.Device):
         self.first, self.count = int(tets[0]), len(tets)
@@ -46,21 +46,21 @@ class Part:
 class Tetrahedra:
     """Forces, rotations and stresses of all tetrahedra of a model.
 
-    Forces are of positions that have been gathered (see ``kernels.newton.particles``) into arrays that are empty where
+    Forces use positions that have been gathered (see ``kernels.newton.particles``) into arrays that are empty if
     no element needs them.
 
     Args:
         model: The model.
         lame: A key of ``LAME``.
-        warm: Whether rotations are found from those in the state.
-        rotation_level: Whose rotation the leaves of forests use; see ``Corotated``.
+        warm: Whether rotations start from those in the state.
+        rotation_level: Level of shared rotations in forests; see ``Corotated``.
 
     Attributes:
-        x: Positions of particles [m], vec4 [P]; for elements one by one.
-        rest, u: Where particles of forests rest, and their displacements from there [m], vec4 [P].
+        x: Positions of particles [m], vec4 [P]; for elements that are computed one by one.
+        rest, u: Rest positions and displacements of the particles of forests [m], vec4 [P].
 
     Raises:
-        InputError: There are none, or a material is not positive definite.
+        InputError: There are no tetrahedra, or a material is not positive definite.
     """
 
     def __init__(self, model: newton.Model, lame: str, warm: bool, rotation_level: int | None):
@@ -70,11 +70,11 @@ class Tetrahedra:
         self.device = model.device
         self.tets = model.tet_indices.numpy().reshape(-1, 4)
         self.elements = self._elements(np.arange(model.tet_count))
-        #: mu, lambda, k_lambda [Pa] and k_damp [Pa s] of all.
+        #: mu, lambda, k_lambda [Pa] and k_damp [Pa s] of all tetrahedra.
         self._materials = self._room_for_materials(model.tet_count)
         self.mu, self.lam = self._materials[:2]
         self.groups: list[ForestGroup] = [] if warm else forest_groups(model, self.tets, rotation_level)
-        #: Whether activation and damping of those that go one by one are in the elastic forces' kernel.
+        #: Whether the elastic kernel of single tetrahedra includes activation and damping.
         self._fused = self.device.is_cuda and not warm
         single = np.ones(model.tet_count, bool)
         for group in self.groups:
@@ -87,16 +87,16 @@ class Tetrahedra:
         self._fill = wp.ones(1, dtype=wp.float32, device=self.device) if fill is None else fill
         self._no_rotations = wp.empty(0, dtype=wp.quat, device=self.device)
         self._nothing = {name: wp.empty(0, dtype=dtype, device=self.device) for name, dtype in STATE.items()}
-        #: Materials and inverse masses that were last taken over.
+        #: Materials and inverse masses at the last ``refresh``.
         self._seen: list[np.ndarray] = [np.empty(0), np.empty(0)]
         self.refresh()
         warn_of_lost(model, self.tets)
 
     def refresh(self) -> bool:
-        """Take over the model's present materials.
+        """Read the model's current materials.
 
         Returns:
-            Whether these or the masses are others than when this was last called.
+            Whether these or the masses have changed since the last call.
 
         Raises:
             InputError: A material is not positive definite, or not finite.
@@ -128,10 +128,10 @@ class Tetrahedra:
         return True
 
     def add_forces(self, state: newton.State, activation: wp.array, f: wp.array) -> None:
-        """Add the forces [N] of a state, of which positions have been gathered, to f, vec4 [P]."""
+        """Add the forces [N] for a state, whose positions have been gathered, to f, vec4 [P]."""
         q, v = state.particle_q, state.particle_qd
         self._add_forces(state, self.x, self.u, activation, v, f)
-        # On the CPU a look costs less than a launch; a recorded step must be ready for what comes.
+        # On the CPU a check costs less than a launch; a recorded step must handle all cases.
         looks = self.device.is_cpu and not self.device.is_capturing and not self.damped
         if looks and not activation.numpy().any():
             return
@@ -141,19 +141,20 @@ class Tetrahedra:
             self._launch(scatter_damping_and_activation(self.damped), threads, inputs, [f])
 
     def add_elastic_forces(self, state: newton.State, x: wp.array | None, u: wp.array | None, f: wp.array) -> None:
-        """Add the elastic forces [N] of some places to f, vec4 [P].
+        """Add the elastic forces [N] for given positions to f, vec4 [P].
 
         Args:
-            state: Has the rotations from which warm ones are found.
-            x: Positions; None: those elements are left out of which positions are taken.
-            u: Displacements; None: the same of displacements.
+            state: The state with the rotations from which warm ones start.
+            x: Positions; None: elements that need them are left out.
+            u: Displacements; None: elements that need them are left out.
         """
         self._add_forces(state, x, u, self._no_activation, self._no_velocities, f)
 
     def add_linear_forces(self, u: wp.array, f: wp.array) -> None:
         """Add the elastic forces of small displacements from rest shapes [N] to f, vec4 [P]."""
-        kernel = scatter_forces(GeneralElements, linear_stress)
-        self._launch(kernel, self.model.tet_count, [self.elements, self.mu, self.lam, 1, u], [f])
+        kernel = scatter_forces(GeneralElements, IsotropicMaterial, law_stress(linear_stress))
+        material = isotropic_material([self.mu, self.lam, 1])
+        self._launch(kernel, self.model.tet_count, [self.elements, material, u], [f])
 
     @property
     def nodes_by_positions(self) -> npt.NDArray[np.integer]:
@@ -166,7 +167,7 @@ class Tetrahedra:
         return self._nodes[1]
 
     def write_attributes(self, state: newton.State, before: newton.State) -> None:
-        """Write rotations and stresses of a state's positions, where it has room for them."""
+        """Write rotations and stresses for a state's positions, if it has attributes for them."""
         there = {name: attribute_of(state, name) for name in STATE}
         if all(array is None for array in there.values()):
             return
@@ -177,8 +178,8 @@ class Tetrahedra:
         outputs = [self._nothing[name] if array is None else array for name, array in there.items()]
         self._launch(kernel, self.model.tet_count, inputs, outputs)
 
-    def posed(self, ids: npt.NDArray[np.integer]) -> Any:
-        """Chosen elements as ``scatter_posed`` takes them."""
+    def posed(self, ids: npt.NDArray[np.integer]) -> PosedElements:
+        """Chosen elements in the form for ``scatter_posed``."""
         posed = PosedElements()
         posed.nodes = wp.array(self.tets[ids], dtype=wp.vec4i, device=self.device)
         rows = np.ascontiguousarray(self.model.tet_poses.numpy().reshape(-1, 9)[ids].T)
@@ -195,7 +196,7 @@ class Tetrahedra:
         v: wp.array,
         f: wp.array,
     ) -> None:
-        """Elastic forces, with what else is in the same kernel."""
+        """Add elastic forces, and others in the same kernel."""
         if self.single_count and x is not None:
             elastic = [self._single, *self._single_materials[:2]]
             if self.warm:
@@ -205,29 +206,33 @@ class Tetrahedra:
                 inputs = [self._single, *self._single_materials, self._single_ids, activation, x, v]
                 self._launch(scatter_posed(quick_rotation, self.damped), self.single_count, inputs, [f], BLOCK)
             else:
-                inputs = [self._single, self.single_count, *elastic[1:], x]
+                material = self._single_isotropic(*elastic[1:])
+                inputs = [self._single, self.single_count, material, x]
                 self._launch(scatter_posed_lanes, -(-self.single_count // LANES), inputs, [f, self._left_out])
-                self._launch(repair_posed, 1, [*elastic, x], [self._left_out, f])
+                repair = repair_forces(GeneralElements, IsotropicMaterial, posed_stress)
+                self._launch(repair, 1, [self._single, material, x], [self._left_out, f])
         for group in self.groups:
             at = u if group.follow_one_another else x
             if at is not None:
                 group.add_forces(at, at, f)
 
     def _take_single(self, ids: npt.NDArray[np.integer]) -> None:
-        """Tetrahedra that go one by one."""
+        """Set the tetrahedra that are computed one by one."""
         self.single_count, self._single_places = len(ids), ids
         self._no_ids = wp.empty(0, dtype=wp.int32, device=self.device)
-        # Read by the kernel that has damping and activation, too.
+        # The kernel with damping and activation reads these, too.
         room = (self.model.tet_count, self.model.particle_count) if self._fused else (0, 0)
         self._no_activation = wp.zeros(room[0], dtype=wp.float32, device=self.device)
         self._no_velocities = wp.zeros(room[1], dtype=wp.vec3, device=self.device)
         self._left_out = wp.zeros(len(ids) + 1, dtype=wp.int32, device=self.device)
         everything = len(ids) == self.model.tet_count
+        self._single: PosedElements | GeneralElements
         if self._fused:
             self._single = self.posed(ids)
         else:
             self._single = self.elements if everything else self._elements(ids)
         self._single_ids, self._single_materials = self._no_ids, self._materials
+        self._single_isotropic = Kept(lambda mu, lam: isotropic_material([mu, lam, 1]))
         if not everything:
             self._single_ids = wp.array(ids, dtype=wp.int32, device=self.device)
             self._single_materials = self._room_for_materials(len(ids))
@@ -253,7 +258,7 @@ class Tetrahedra:
     def _room_for_materials(self, count: int) -> list[wp.array]:
         return [wp.empty(count, dtype=wp.float32, device=self.device) for _ in range(4)]
 
-    def _elements(self, ids: npt.NDArray[np.integer]) -> Any:
+    def _elements(self, ids: npt.NDArray[np.integer]) -> GeneralElements:
         poses = self.model.tet_poses.numpy().reshape(-1, 3, 3)[ids]
         elements = GeneralElements()
         elements.nodes = wp.array(self.tets[ids], dtype=wp.vec4i, device=self.device)

@@ -15,27 +15,27 @@ NEEDS = {"gl": "pyglet", "rerun": "rerun", "viser": "viser", "usd": "pxr"}
 
 
 def has_display() -> bool:
-    """Whether a window can be opened: on Linux a display server is named."""
+    """Whether a window can be opened: on Linux, a display server must be named."""
     return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def open_viewer(name: str, parser: argparse.ArgumentParser | None = None) -> tuple[Any, argparse.Namespace]:
     """The viewer that the command line names, as ``newton.examples.init`` makes it, and the command line's arguments.
 
-    Where it names none and there is no display, or no package for a window, the frames go to a USD file, and that is
-    said. ``--viewer gl`` without a display draws off screen.
+    If it names none and there is no display, or no package for a window, the frames go to a USD file, and a line says
+    so. ``--viewer gl`` without a display draws off screen.
 
     Args:
-        name: Of the example; the file is NAME.usd unless ``--output-path`` names another.
-        parser: With options of the example's own; None: Newton's.
+        name: Name of the example; the file is NAME.usd unless ``--output-path`` names another.
+        parser: A parser with the example's own options; None: Newton's.
 
     Raises:
-        SystemExit: A package is not there, or the viewer cannot start; one line that says so.
+        SystemExit: A package is missing, or the viewer cannot start; one line says so.
     """
     try:
         newtons = examples()
     except ImportError as error:
-        raise SystemExit(f"Newton's examples need a package that is not there: {error}") from None
+        raise SystemExit(f"Newton's examples need a package that is missing: {error}") from None
     parser = newtons.create_parser() if parser is None else parser
     parser.set_defaults(output_path=f"{name}.usd")
     window = has_display() and find_spec(NEEDS["gl"]) is not None

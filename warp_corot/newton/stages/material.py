@@ -1,4 +1,4 @@
-"""Soft bodies of USD stages and what they are made of, where the stage says it and where it does not."""
+"""Soft bodies of USD stages and their materials, from the stage or by default."""
 
 from __future__ import annotations
 
@@ -14,34 +14,36 @@ from warp_corot.io.read.usd.scene import Scene, TetPrim
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.newton.library import newton
 
-#: Young's modulus over the weight of a column as high as the body, where a stage gives no material.
+#: Young's modulus over the weight of a column as high as the body, if a stage gives no material.
 STIFFNESS_PER_WEIGHT = 20.0
-#: Share of critical damping of a body's slowest vibration, where no viscosity is given.
+#: Fraction of critical damping of a body's slowest vibration, if no viscosity is given.
 DAMPED_SHARE = 0.05
-#: Stiffness of contact over that of a tetrahedron, Young's modulus times edge: how deep bodies sink into the ground.
+#: Stiffness of contact over Young's modulus times edge of a tetrahedron: it limits how deep bodies sink into the
+#: ground.
 CONTACT_STIFFNESS = 3.0
-#: What is taken where a stage has no material, and nothing else is wanted; density in kg/m^3.
+#: Defaults if a stage has no material and no option gives one; density in kg/m^3.
 POISSON, DENSITY = 0.45, 1000.0
-#: Young's modulus [Pa] and Poisson's ratio of a material that does not say them, as Newton has it.
+#: Newton's Young's modulus [Pa] and Poisson's ratio for a material without them.
 FALLBACK = (1e6, 0.3)
 
 
 @dataclass(frozen=True)
 class StageOptions:
-    """What the stage does not say, in SI units.
+    """Values for what the stage does not define, in SI units.
 
     Attributes:
-        young: Young's modulus where the stage gives none [Pa]; None: by the weight of bodies without a material, 1 MPa
+        young: Young's modulus if the stage gives none [Pa]; None: from the weight for bodies without a material, 1 MPa
             for materials without it.
         poisson: The same for Poisson's ratio; None: 0.45 for bodies without a material, 0.3 for materials without it.
         density: The same for density [kg/m^3]; None: 1000.
-        gravity: [m/s^2], in place of the stage's own.
-        viscosity: Viscous stress over elastic shear stress of one strain [s]; None: so much that the slowest vibration
-            of each body is damped by a twentieth of critical damping.
-        ground: Height of a ground plane [m]; "auto": under everything, if the stage has nothing to stand on or to hang
-            from; "none".
+        gravity: Acceleration [m/s^2], in place of the stage's own.
+        viscosity: Viscous stress over elastic shear stress of one strain [s]; None: the slowest vibration
+            of each body has a twentieth of critical damping.
+        ground: Height of a ground plane [m]; "auto": below everything, if nothing in the stage supports the bodies;
+            "none".
         fix: Expression for the nodes that are held; see ``select_nodes``.
-        radius: How far around each point of a soft body contact is felt [m].
+        radius: Contact radius around each point of a soft body [m].
+        soft_contact: Whether soft bodies and cloth touch one another, and themselves.
     """
 
     young: float | None = None
@@ -52,10 +54,11 @@ class StageOptions:
     ground: float | str = "auto"
     fix: str | None = None
     radius: float = 0.0
+    soft_contact: bool = True
 
     def __post_init__(self) -> None:
         young, poisson, density = self.young, self.poisson, self.density
-        # Checks them.
+        # The constructor checks the values.
         Isotropic(_first(young, 1.0), _first(poisson, POISSON), _first(density, DENSITY))
         if self.viscosity is not None and not (math.isfinite(self.viscosity) and self.viscosity >= 0):
             raise InputError(f"viscosity is {self.viscosity:g}; it must be zero or a positive time in seconds")
@@ -70,11 +73,11 @@ class Body:
     """A soft body of a stage.
 
     Attributes:
-        prim: Where it comes from.
+        prim: Its prim.
         particles, tets: Its ranges in the model.
         young: Young's modulus [Pa], of its first tetrahedron.
         poisson: Poisson's ratio.
-        density: [kg/m^3], mean.
+        density: Mean density [kg/m^3].
         edge: Mean edge of its tetrahedra [m].
         given: Whether the stage gives the material.
     """
@@ -92,17 +95,17 @@ class Body:
 def give_material(
     body: Body, builder: newton.ModelBuilder, scene: Scene, options: StageOptions, gravity: float
 ) -> str | None:
-    """Give a body in a builder what the stage does not say of its material, and its viscosity.
+    """Give a body in a builder the material values that the stage lacks, and its viscosity.
 
     Args:
-        body: Gets its values.
-        builder: What is not given is NaN in it.
+        body: The body; its values are set.
+        builder: The builder; values that the stage lacks are NaN.
         scene: The stage.
-        options: What is taken instead.
-        gravity: [m/s^2].
+        options: The substitutes.
+        gravity: Acceleration [m/s^2].
 
     Returns:
-        What was chosen, in words, or None.
+        The chosen values in words, or None.
 
     Raises:
         InputError: A material that is not positive definite, or no mass.
@@ -116,14 +119,14 @@ def give_material(
     masses = np.array(builder.particle_mass[body.particles], dtype=np.float64)
     if "density" not in said:
         density = _first(options.density, DENSITY)
-        # A body's are there already, of a default; those of other tetrahedra are not.
+        # A body's masses exist already, with a default; those of other tetrahedra do not.
         masses = _lumped(tets, volumes, len(x)) if np.isnan(masses).any() else masses / (masses.sum() / volumes.sum())
         masses *= density / units.density
         builder.particle_mass[body.particles] = masses.tolist()
         chosen.append(("density", f"density {density:g} kg/m^3"))
     body.density = float(masses.sum() / volumes.sum()) * units.density
     if not body.density > 0.0:
-        raise InputError(f"{scene.path}: {path}: has no mass")
+        raise InputError(f"{scene.path}: {path}: has no mass; it must have a positive mass")
     size = np.ptp(x, axis=0) * units.metres
     lame = np.array(builder.tet_materials[body.tets], dtype=np.float64)
     body.given = not np.isnan(lame[:, :2]).any()
@@ -153,7 +156,7 @@ def give_material(
     builder.tet_materials[body.tets] = [tuple(row) for row in lame.tolist()]
     if not chosen:
         return None
-    missing = "no physics material for a volume" if not body.given else "a physics material that does not say all"
+    missing = "no physics material for a volume" if not body.given else "a physics material with missing values"
     return f"{path} has {missing}: {', '.join(text for _, text in chosen)} ({', '.join(f'--{n}' for n, _ in chosen)})"
 
 

@@ -1,7 +1,7 @@
 """USD stages as Newton's models: tetrahedra with the materials that Newton reads, rigid bodies, colliders, a ground.
 
-A model is in its stage's own units: UsdPhysics has all its quantities in those, and Newton reads them as they are. Only
-what is a default, here or in Newton, is a length or a mass in SI, and converted.
+A model is in its stage's own units: UsdPhysics gives all quantities in them, and Newton reads them unchanged. Only
+defaults, here or in Newton, are lengths or masses in SI and are converted.
 """
 
 from __future__ import annotations
@@ -25,10 +25,12 @@ from warp_corot.newton.library import newton
 from warp_corot.newton.state import register_custom_attributes
 
 from .material import Body, StageOptions, contact_law, give_material
-from .start import check_ground, notes_of, staying, used_points
+from .start import check_colliders, check_ground, notes_of, staying, used_points
 
 GRAVITY = 9.81
-#: Of Newton's messages, those about what is seen to here.
+#: Distance at which soft bodies begin to push one another, over the mean edge of their tetrahedra.
+THICKNESS = 0.1
+#: Messages of Newton about things that are handled here.
 _SEEN_TO = re.compile(
     r"non-unit (linear|mass) units are not supported|static xforms or the world are not supported|"
     r"cannot disable deformable particle collision|add_usd\(\) still reads them"
@@ -37,20 +39,21 @@ _SEEN_TO = re.compile(
 
 @dataclass(eq=False)
 class StageModel:
-    """A stage's model, and which of the stage's prims are what in it.
+    """A stage's model, and the role of each of the stage's prims.
 
     Attributes:
         scene: The stage.
         model: ``newton.Model``, in the stage's units.
         soft: Its soft bodies.
         rigid: Indices of rigid bodies by their prims' paths.
-        surfaces: Meshes that go along: graphics of soft bodies first, then cloth.
-        surface_points: For each of the graphics, which of Newton's skinned points its points are.
+        surfaces: Meshes that follow: graphics of soft bodies first, then cloth.
+        surface_points: For each graphics mesh, the index of each point among Newton's skinned points.
         cloth: For each cloth, the range of its particles in the model.
         ground: Corners of a ground plane that was added [4, 3], or None.
-        margin: How far from each other contacts are looked for.
+        margin: Distance within which contacts are searched.
+        thickness: Distance at which soft bodies begin to push one another; None: they do not.
         cables: Paths of cables.
-        notes: What was chosen, a line each.
+        notes: The choices that were made, one line each.
     """
 
     scene: Scene
@@ -62,22 +65,24 @@ class StageModel:
     cloth: list[slice] = field(default_factory=list)
     ground: npt.NDArray[np.float64] | None = None
     margin: float = 0.0
+    thickness: float | None = None
     cables: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
 def stage_model(scene: Scene, options: StageOptions, device: Any = None) -> StageModel:
-    """The model of a stage.
+    """Make the model of a stage.
 
     Raises:
-        InputError: What Newton cannot read, a material that is not positive definite, or a ground that cuts a body.
+        InputError: Something that Newton cannot read, a material that is not positive definite, or a ground that cuts a
+            body.
     """
     made, units = StageModel(scene), scene.units
     repaired = sum(prim.repaired for prim in scene.tets)
     if repaired:
         first = next(prim.path for prim in scene.tets if prim.repaired)
         warnings.warn(
-            f"{scene.path}: {repaired} tetrahedra are wound wrongly and have been turned round (first in {first}); "
+            f"{scene.path}: {repaired} tetrahedra are wound wrongly and have been repaired (first in {first}); "
             "Newton would leave them out",
             UserWarning,
             stacklevel=2,
@@ -96,6 +101,7 @@ def stage_model(scene: Scene, options: StageOptions, device: Any = None) -> Stag
     made.notes += notes_of(made, builder, options)
     _set_contacts(made, builder)
     register_custom_attributes(builder)
+    check_colliders(builder, scene.path)
     try:
         made.model = model = builder.finalize(device=device)
     except (RuntimeError, ValueError) as error:
@@ -107,11 +113,13 @@ def stage_model(scene: Scene, options: StageOptions, device: Any = None) -> Stag
     model.particle_max_velocity /= units.metres
     made.margin = max(body.edge for body in made.soft) / units.metres
     _find_surfaces(made, found)
+    if options.soft_contact and len(made.soft) + len(made.cloth) > 1 and model.edge_count:
+        made.thickness = THICKNESS * min(body.edge for body in made.soft) / units.metres
     return made
 
 
 def _builder(scene: Scene, options: StageOptions) -> newton.ModelBuilder:
-    """A builder with its defaults in the stage's units, and marks for materials that are not given."""
+    """A builder with its defaults in the stage's units, and marks for materials that the stage does not give."""
     metres, kilograms = scene.units
     builder = newton.ModelBuilder(up_axis=scene.up_axis, gravity=_down(scene.up_axis, GRAVITY / metres))
     builder.default_particle_radius = options.radius / metres
@@ -169,9 +177,9 @@ def _find_bodies(made: StageModel, builder: newton.ModelBuilder, found: dict[str
 
 
 def _hold(made: StageModel, builder: newton.ModelBuilder, found: dict[str, Any], options: StageOptions) -> int:
-    """Particles that are held, by an expression or by attachments to what cannot move; how many there are.
+    """Fix particles by an expression or by attachments to fixed bodies; returns their number.
 
-    Attachments to rigid bodies that are infinitely stiff become as stiff as the tetrahedra around.
+    Infinitely stiff attachments to rigid bodies become as stiff as the tetrahedra around them.
     """
     held: set[int] = set()
     ranges = {body.prim.path: body for body in made.soft}
@@ -204,12 +212,12 @@ def _hold(made: StageModel, builder: newton.ModelBuilder, found: dict[str, Any],
     if held:
         made.notes.append(f"{len(held)} points of soft bodies are held")
     if len(held) == sum(body.particles.stop - body.particles.start for body in made.soft):
-        raise InputError(f"{made.scene.path}: all points of soft bodies are held, at least one must be free to move")
+        raise InputError(f"{made.scene.path}: all points of soft bodies are held; at least one must be free to move")
     return len(held)
 
 
 def _stand(made: StageModel, builder: newton.ModelBuilder, options: StageOptions, held: int) -> None:
-    """Add a ground plane if one is wanted."""
+    """Add a ground plane if requested."""
     ground = options.ground
     stands = bool(held) or _something_stays(builder)
     if ground == "none" or (ground == "auto" and stands):
@@ -226,8 +234,7 @@ def _stand(made: StageModel, builder: newton.ModelBuilder, options: StageOptions
     builder.add_ground_plane(height=height)
     if isinstance(ground, str):
         made.notes.append(
-            f"the stage has nothing to stand on: there is a ground at {'xyz'[axis]} = {height * units.metres:g} m "
-            "(--ground)"
+            f"nothing supports the bodies: there is a ground at {'xyz'[axis]} = {height * units.metres:g} m (--ground)"
         )
     others = [(axis + 1) % 3, (axis + 2) % 3]
     middle, reach = x.mean(axis=0), 5.0 * float(np.ptp(x, axis=0).max())
@@ -238,7 +245,7 @@ def _stand(made: StageModel, builder: newton.ModelBuilder, options: StageOptions
 
 
 def _something_stays(builder: newton.ModelBuilder) -> bool:
-    """Whether there is a collider that does not fall: on no body, a kinematic one, or one jointed to what stays."""
+    """Whether a collider does not fall: it has no body, a kinematic one, or one jointed to such a body."""
     collides = int(newton.ShapeFlags.COLLIDE_SHAPES) | int(newton.ShapeFlags.COLLIDE_PARTICLES)
     still = staying(builder)
     shapes = zip(builder.shape_body, builder.shape_flags, strict=True)
@@ -246,7 +253,7 @@ def _something_stays(builder: newton.ModelBuilder) -> bool:
 
 
 def _set_contacts(made: StageModel, builder: newton.ModelBuilder) -> None:
-    """Where no rigid body moves, have colliders without a stiffness of their own be as stiff as the soft bodies."""
+    """If no rigid body moves, make colliders without a stiffness of their own as stiff as the soft bodies."""
     if builder.body_count:
         return
     stiffness, damping = (value / made.scene.units.kilograms for value in contact_law(made.soft))
@@ -259,7 +266,7 @@ def _set_contacts(made: StageModel, builder: newton.ModelBuilder) -> None:
 
 
 def _set_friction(made: StageModel) -> None:
-    """Take the friction of the soft bodies from the stage: one number in Newton, used in the mean with a shape's."""
+    """Set the friction of the soft bodies from the stage: one number in Newton, averaged with a shape's."""
     said = [made.scene.says(body.prim.path) for body in made.soft]
     given = [one["friction"] for one in said if "friction" in one]
     if given:
@@ -269,7 +276,7 @@ def _set_friction(made: StageModel) -> None:
 
 
 def _find_surfaces(made: StageModel, found: dict[str, Any]) -> None:
-    """Graphics meshes of the soft bodies, which Newton has bound to their tetrahedra."""
+    """Find graphics meshes of the soft bodies, which Newton has bound to their tetrahedra."""
     from scipy.spatial import cKDTree
 
     start = 0
@@ -280,7 +287,7 @@ def _find_surfaces(made: StageModel, found: dict[str, Any]) -> None:
     for path, index in found["path_deformable_visual_map"].items():
         points = made.scene.world_points(path)
         rest = made.model.deformable_visual_meshes[index].rest_vertices.numpy()
-        # Newton doubles points at sharp edges; all that are in one place move alike.
+        # Newton duplicates points at sharp edges; coincident points move alike.
         _, nearest = cKDTree(rest).query(points)
         made.surfaces.append(Surface(path, points))
         made.surface_points.append(nearest + starts[index])

@@ -1,4 +1,4 @@
-"""How a stage's scene begins, as far as somebody should be told: what lies in one another, what cannot be touched."""
+"""The initial state of a stage's scene, as far as users should know: overlaps, and bodies that contact cannot feel."""
 
 from __future__ import annotations
 
@@ -17,14 +17,16 @@ from .material import StageOptions
 if TYPE_CHECKING:
     from .stage import StageModel
 
-#: How deep a point may begin in a collider, over the edge of its tetrahedra, before that is spoken of.
+#: Initial depth of a point in a collider, over the edge of its tetrahedra, that is reported.
 TOUCHING = 0.05
-#: How many names a line has.
+#: Maximum of a collider's longest side over the cube root of its bounds' volume: Newton counts voxels one by one.
+LONGEST = 1e5
+#: Maximum number of names in a line.
 _NAMES = 4
 
 
 def used_points(made: StageModel, builder: newton.ModelBuilder) -> npt.NDArray[np.bool_]:
-    """Which of a builder's particles are no points of soft bodies that no tetrahedron has, bool [P]."""
+    """A builder's particles without those points of soft bodies that belong to no tetrahedron, bool [P]."""
     used = np.ones(builder.particle_count, bool)
     for body in made.soft:
         used[body.particles] = False
@@ -32,8 +34,33 @@ def used_points(made: StageModel, builder: newton.ModelBuilder) -> npt.NDArray[n
     return used
 
 
+def check_colliders(builder: newton.ModelBuilder, source: Any) -> None:
+    """Check that Newton can divide the size of every collider into voxels, in the stage's units.
+
+    Args:
+        builder: The builder with the colliders.
+        source: The stage's file, for the message.
+
+    Raises:
+        InputError: A size is not finite, or absurdly long and thin.
+    """
+    divided = [getattr(newton.GeoType, name) for name in ("MESH", "CONVEX_MESH", "BOX", "ELLIPSOID")]
+    shapes = zip(builder.shape_type, builder.shape_scale, builder.shape_source, builder.shape_label, strict=True)
+    for kind, scale, data, label in shapes:
+        points = getattr(data, "vertices", None)
+        if kind not in divided or (points is not None and not len(points)):
+            continue
+        own = np.full(3, 2.0) if points is None else np.ptp(np.asarray(points, dtype=np.float64), axis=0)
+        size = np.abs(own * np.asarray(scale, dtype=np.float64))
+        if not np.isfinite(size).all():
+            raise InputError(f"{source}: collider {label} must have a finite size")
+        sides = np.maximum(size, 1e-6)
+        if sides.max() > LONGEST * np.prod(sides) ** (1.0 / 3.0):
+            raise InputError(f"{source}: collider {label} is {sides.max():.3g} long and {sides.min():.3g} thin")
+
+
 def check_ground(made: StageModel, builder: newton.ModelBuilder, height: float, radius: float) -> None:
-    """See that a ground plane that somebody wants is under all that can move, in the stage's units.
+    """Check that a requested ground plane is below everything that can move, in the stage's units.
 
     Raises:
         InputError: It cuts a soft body, or is above one.
@@ -49,8 +76,8 @@ def check_ground(made: StageModel, builder: newton.ModelBuilder, height: float, 
     if low < height - TOUCHING * body.edge / metres:
         raise InputError(
             f"ground is {height * metres:g} m; {body.prim.path} reaches down to {'xyz'[axis]} = {_round(low * metres)} "
-            f"m, {(height - low) * metres:.3g} m below it, and would be thrown up: at most {_round(low * metres)} is "
-            'free, or "auto" (--ground)'
+            f"m, {(height - low) * metres:.3g} m below it, and would be thrown up; it must be at most "
+            f'{_round(low * metres)}, or "auto" (--ground)'
         )
     for path, bounds in _falling(made, builder):
         if bounds[0, axis] < height - 0.01 * (bounds[1, axis] - bounds[0, axis]):
@@ -59,11 +86,11 @@ def check_ground(made: StageModel, builder: newton.ModelBuilder, height: float, 
 
 
 def warn_of_overlaps(made: StageModel, contacts: newton.Contacts) -> None:
-    """Say it where soft bodies begin in colliders, from which contact will throw them.
+    """Warn of soft bodies that begin in colliders, from which contact will push them.
 
     Args:
         made: The stage's model.
-        contacts: Those of its initial state.
+        contacts: Contacts of its initial state.
     """
     model, metres = made.model, made.scene.units.metres
     count = min(int(contacts.soft_contact_count.numpy()[0]), contacts.soft_contact_max)
@@ -86,14 +113,14 @@ def warn_of_overlaps(made: StageModel, contacts: newton.Contacts) -> None:
 
 
 def notes_of(made: StageModel, builder: newton.ModelBuilder, options: StageOptions) -> Iterator[str]:
-    """What is otherwise than somebody might think, a line each."""
+    """Facts that a user may not expect, one line each."""
     scene = made.scene
     if not scene.says_metres:
         yield "the stage has no metersPerUnit: by USD's default its unit is a centimetre"
     if len(scene.physics_scenes) > 1:
-        yield f"gravity is that of the first of {len(scene.physics_scenes)} physics scenes, {scene.physics_scenes[0]}"
+        yield f"gravity is from the first of {len(scene.physics_scenes)} physics scenes, {scene.physics_scenes[0]}"
     if scene.skipped:
-        yield f"patterns of point instancers are not simulated: {_names(scene.skipped)}"
+        yield f"prototypes of point instancers are not simulated: {_names(scene.skipped)}"
     if scene.stopped:
         yield f"bodies and colliders do not follow the stage's animation, which is stopped: {_names(scene.stopped)}"
     used = used_points(made, builder)
@@ -106,8 +133,8 @@ def notes_of(made: StageModel, builder: newton.ModelBuilder, options: StageOptio
     given = {"young": options.young, "poisson": options.poisson, "density": options.density}
     for name, value in given.items():
         if value is not None and all(name in scene.says(body.prim.path) for body in made.soft):
-            yield f"--{name} is not used: the stage says it for all soft bodies"
-    if len(made.soft) > 1:
+            yield f"--{name} is not used: the stage gives it for all soft bodies"
+    if len(made.soft) > 1 and not options.soft_contact:
         yield "soft bodies touch colliders and rigid bodies, not one another"
     yield from _narrow(made, builder, options.radius)
 
@@ -120,12 +147,12 @@ def _narrow(made: StageModel, builder: newton.ModelBuilder, radius: float) -> It
         if width < body.edge and body.edge > 2.0 * radius:
             yield (
                 f"{path} is {width:.3g} m wide and can slip in between the points of {body.prim.path}, {body.edge:.3g} "
-                "m apart, at which alone contact is felt; a finer mesh or points with a radius help (--radius)"
+                "m apart, because contact is only at points; a finer mesh or points with a radius help (--radius)"
             )
 
 
 def staying(builder: newton.ModelBuilder) -> set[int]:
-    """What does not fall: -1 for the world, kinematic bodies, and those that are jointed to what stays."""
+    """Bodies that do not fall: -1 for the world, kinematic bodies, and those jointed to these."""
     found = {-1} | {k for k, flags in enumerate(builder.body_flags) if flags & int(newton.BodyFlags.KINEMATIC)}
     joints = [
         (parent, child)
@@ -149,7 +176,7 @@ def _falling(made: StageModel, builder: newton.ModelBuilder) -> Iterator[tuple[s
 
 
 def _in_world(model: Any, shape: npt.NDArray[np.integer], point: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-    """Points in the frames of the bodies that shapes are of, in the world, float64 [C, 3]."""
+    """Points given in the frames of the shapes' bodies, in the world, float64 [C, 3]."""
     found = point.astype(np.float64)
     body = model.shape_body.numpy()[shape]
     moving = body >= 0
@@ -166,5 +193,5 @@ def _names(paths: list[str]) -> str:
 
 
 def _round(value: float) -> str:
-    """A height in few digits, and never minus zero."""
+    """A height with few digits, and never minus zero."""
     return f"{round(value, 9) + 0.0:.6g}"

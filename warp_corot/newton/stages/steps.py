@@ -24,37 +24,42 @@ from warp_corot.newton.solver import SolverCorotated
 from .stage import StageOptions, stage_model
 from .start import warn_of_overlaps
 
-#: Most steps that are recorded and replayed together, one measurement with them; a frame is a whole number of chunks.
+#: Maximum number of steps that are recorded together, with one measurement; a frame is a whole number of chunks.
 CHUNK = INTERVAL
-#: What can step rigid bodies.
+#: Solvers of rigid bodies.
 RIGID = ("semi-implicit", "xpbd", "none")
-#: Longest step where rigid bodies touch something [s].
+#: Pairs of soft bodies are searched within this many times their thickness beyond it, and so far pushed out.
+GAP = 3.0
+#: Number of triangles that a vertex can touch, and half the number of edges that an edge can.
+ROOM = 64
+#: Longest step if rigid bodies touch something [s].
 RIGID_STEP = 5e-4
 
 
 class StageSimulation:
-    """A USD stage as a scene, stepped by ``SolverCorotated``.
+    """A USD stage as a scene that ``SolverCorotated`` steps.
 
-    Its materials, colliders, rigid bodies, joints, attachments and gravity are what ``newton.ModelBuilder.add_usd``
-    reads; rigid bodies are stepped along by Newton. Time begins at zero, and animation in the stage stands still.
+    Its materials, colliders, rigid bodies, joints, attachments and gravity are those that
+    ``newton.ModelBuilder.add_usd`` reads; Newton steps the rigid bodies. Time begins at zero, and animation in the
+    stage is stopped.
 
     Args:
         path: A stage with TetMesh prims.
-        fps: Frames per second of simulated time; None: time codes per second of the stage if it says so, else 24.
+        fps: Frames per second of simulated time; None: the stage's time codes per second if given, else 24.
         dt: Longest time step [s]; None: a safe one, which follows the state from frame to frame.
-        options: What the stage does not say.
-        damping: Rate of mass-proportional damping [1/s], of free fall, too.
-        rigid: Which of Newton's solvers steps rigid bodies and joints: "semi-implicit", "xpbd", or "none".
-        device: What to simulate on.
+        options: Values for what the stage does not define.
+        damping: Rate of mass-proportional damping [1/s], which also damps free fall.
+        rigid: Newton's solver for rigid bodies and joints: "semi-implicit", "xpbd", or "none".
+        device: The device of the simulation.
 
     Attributes:
         scene: The stage.
-        parts: Its model, and which prim is what in it.
+        parts: Its model, and the role of each prim.
         solver: The solver.
         state: ``newton.State``, in the stage's units.
         dt: The time step [s].
-        steps: How many make a frame, the last one so far.
-        time: Simulated so far [s].
+        steps: Number of steps of the last frame.
+        time: Simulated time so far [s].
 
     Raises:
         InputError: A stage or an option that cannot be used.
@@ -84,11 +89,21 @@ class StageSimulation:
         self._given_dt, self.steps = dt, 0
         self.solver = self._new_solver(rigid, damping)
         self._pipeline = newton.CollisionPipeline(model, soft_contact_gap=self.parts.margin)
+        self._touch = self.parts.thickness is not None
+        if self.parts.thickness is not None:
+            # Nothing else of Newton's filter of neighbours is needed: a body does not push itself in its first shape.
+            self._pipeline.init_soft_self_contact(
+                margin=self.parts.thickness,
+                gap=GAP * self.parts.thickness,
+                vertex_buffer_pre_alloc=ROOM,
+                edge_buffer_pre_alloc=2 * ROOM,
+                topological_filter_threshold=1,
+            )
         self._contacts = self._pipeline.contacts()
         self._pipeline.collide(model.state(), self._contacts)
         warn_of_overlaps(self.parts, self._contacts)
         self.state, self._kept = self._new_state(), self._new_state()
-        # Shares its positions with the state, and has stresses, which are wanted once a frame and not once a step.
+        # Shares its positions with the state; it has stresses, which are needed once a frame and not once a step.
         self._shown = model.state()
         self._shown.particle_q = self.state.particle_q
         self._visuals = newton.geometry.DeformableVisuals(model) if self.parts.surface_points else None
@@ -98,11 +113,11 @@ class StageSimulation:
         self.frames = 0
 
     def advance(self) -> None:
-        """Simulate one frame. What goes wrong without a given step is tried again with shorter ones.
+        """Simulate one frame. Without a given step, a failed step is repeated with shorter ones.
 
         Raises:
-            UnstableError: The state would not be finite, or there are more contacts than there is room for; it stays
-                what it was before that.
+            UnstableError: The state would not be finite, or there are more contacts than the buffer holds; the state
+                before that is kept.
         """
         self._record_steps()
         self._kept.assign(self.state)
@@ -117,14 +132,14 @@ class StageSimulation:
             except UnstableError:
                 if self._given_dt is not None or attempt == RETRIES:
                     raise
-            # From here on the solver takes half the step.
+            # From now on the solver uses half the step.
             self.state.assign(self._kept)
             self._record_steps()
         self.frames += 1
         self.time = self.frames / self.fps
 
     def show(self) -> State:
-        """What a frame shows, copied to the host."""
+        """The content of a frame, copied to the host."""
         parts = self.parts
         x, v = self.state.particle_q.numpy(), self.state.particle_qd.numpy()
         self.solver.write_attributes(self._shown)
@@ -143,7 +158,7 @@ class StageSimulation:
         )
 
     def writer(self, path: str | PathLike[str], *, show_stress: bool = False, flatten: bool = False) -> SceneWriter:
-        """What writes frames over the stage; see ``SceneWriter``.
+        """A writer of frames over the stage; see ``SceneWriter``.
 
         Example::
 
@@ -198,26 +213,32 @@ class StageSimulation:
             if rigid == "xpbd":
                 solver = newton.solvers.SolverXPBD(model)
             substeps = None if self._given_dt is None else 1
-            return SolverCorotated(model, damping=damping, substeps=substeps, rigid_solver=solver)
+            return SolverCorotated(
+                model,
+                damping=damping,
+                substeps=substeps,
+                rigid_solver=solver,
+                self_contact_margin=self.parts.thickness,
+            )
         except ValueError as error:  # Newton's, and InputError, which is one
             said = str(error).replace(" Give another rigid_solver, or None.", "").rstrip(".")
             hint = f"; another than {rigid} can be chosen (--rigid)" if "does not support" in said else ""
             if hint and self.parts.cables:
-                said = f"has cables, as {self.parts.cables[0]}, which no solver here steps: {said}"
-                hint = "; --rigid none leaves cables and rigid bodies where they are"
+                said = f"has cables, for example {self.parts.cables[0]}, which no solver here steps: {said}"
+                hint = "; --rigid none leaves cables and rigid bodies in place"
             raise InputError(f"{self.scene.path}: {said}{hint}") from None
 
     def _longest_step(self) -> float:
         stable, dt = self.solver.stable_dt, self._given_dt
         if dt is not None:
             if dt > stable:
-                raise InputError(f"dt is {dt:g} s; the largest stable step is about {stable:.3g} s")
+                raise InputError(f"dt is {dt:g} s; it must be at most the largest stable step, about {stable:.3g} s")
             return dt
         longest = min(self.solver.recorded_dt, 1.0 / self.fps)
         return min(longest, RIGID_STEP) if self.parts.rigid else longest
 
     def _record_steps(self) -> None:
-        """Record a chunk of steps that are safe in the present state, where there are not as many as before."""
+        """Record a chunk of steps that are safe in the current state, if their number has changed."""
         count = steps_per_frame(self.fps, self._longest_step())
         chunks = -(-count // CHUNK)
         self._chunk = -(-count // chunks)
@@ -230,7 +251,7 @@ class StageSimulation:
     def _check(self) -> None:
         with warnings.catch_warnings():
             # The next frame has the steps that this one lacked.
-            warnings.filterwarnings("ignore", "a recorded step has fewer substeps")
+            warnings.filterwarnings("ignore", "a recorded step has too few substeps")
             self.solver.check()
 
     def _new_state(self) -> newton.State:
@@ -240,11 +261,11 @@ class StageSimulation:
 
     def _step(self, state: newton.State) -> None:
         state.clear_forces()
-        self._pipeline.collide(state, self._contacts)
+        self._pipeline.collide(state, self._contacts, soft_self_contact=self._touch)
         self.solver.step(state, state, None, self._contacts, self.dt)
 
     def _load_kernels(self) -> None:
-        """Make a step of a state that is thrown away: loading within a recording would end it on some drivers."""
+        """Step a copy of the state: loading kernels within a recording would end it on some drivers."""
         self.dt = min(self._longest_step(), 1e-6)
         self._step(self._new_state())
         self.solver.check()

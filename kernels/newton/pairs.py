@@ -1,0 +1,291 @@
+"""Contact of soft surfaces with one another: vertices with triangles and edges with edges, as Newton's detector lists
+them.
+
+A vertex at the distance d from a triangle has the energy k (margin - d)^2 / 2 while d < margin. It is a function of
+positions only, and so adds no energy. Edges that are closest at their ends repeat this: their force is multiplied by a
+measure from 0 there to 1 in the middle. Surfaces of tetrahedra have an inside: there d becomes negative if the vertex
+or edge belongs to another body, so that what has sunk in is pushed out. Cloth has two sides. Loads are those of
+``touching``; a pair counts twice, because its two sides may move against one another. What is closer at
+first than the margin has this distance as its margin, so that nothing starts with a push: between bodies no less than
+a fraction of the margin, to keep cloth apart.
+"""
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import add_force, load_node
+
+from .closest import closest_weights
+from .contacts import ContactLaw, contact_force
+from .mobility import Mobility
+from .particles import ACTIVE
+from .worlds import TOO_MANY_PAIRS, place_of
+
+wp.set_module_options({"enable_backward": False})
+
+#: A distance below which a direction is rounding [m].
+COINCIDENT = wp.constant(1.0e-9)
+#: Least margin between bodies, over the margin.
+LEAST = wp.constant(0.25)
+#: Weights of closest points inside a triangle are above this.
+INSIDE = wp.constant(1.0e-6)
+
+
+@wp.struct
+class Surfaces:
+    """Triangles and edges of a model."""
+
+    triangles: wp.array2d[wp.int32]
+    edges: wp.array2d[wp.int32]  # opposite vertices, then the edge's
+    facing: wp.array[wp.float32]  # of each triangle: 1 if its normal points out of tetrahedra, -1 into them, 0 of cloth
+    outward: wp.array[wp.vec2i]  # of each edge: its triangles on tetrahedra, or -1
+    part: wp.array[wp.int32]  # of each particle: its connected body
+    exposed: wp.array[wp.int32]  # of each particle: whether it is on a triangle
+    rest: wp.array[wp.vec3]  # positions at first [m]
+
+
+@wp.struct
+class Pair:
+    """Two points that touch; x = sum of weights x_j is their difference, from the second to the first."""
+
+    nodes: wp.vec4i
+    weights: wp.vec4
+    normal: wp.vec3  # from the second to the first
+    gap: float  # distance less the margin [m]
+    measure: float
+
+
+@wp.func
+def outward_normal(surfaces: Surfaces, t: int, q: wp.array[wp.vec3]):
+    """Normal of a triangle of tetrahedra, times twice its area."""
+    a = q[surfaces.triangles[t, 0]]
+    n = wp.cross(q[surfaces.triangles[t, 1]] - a, q[surfaces.triangles[t, 2]] - a)
+    return surfaces.facing[t] * n
+
+
+@wp.func
+def margin_of(surfaces: Surfaces, i: int, j: int, margin: float, first: float):
+    """The margin of a pair, with one particle of each side and the distance at first [m]."""
+    least = float(0.0)
+    if surfaces.part[i] != surfaces.part[j]:
+        least = LEAST * margin
+    return wp.min(margin, wp.max(first, least))
+
+
+@wp.func
+def vertex_pair(surfaces: Surfaces, v: int, t: int, margin: float, q: wp.array[wp.vec3]):
+    """A vertex and a triangle."""
+    pair = Pair()
+    pair.gap = 1.0
+    pair.measure = 1.0
+    i = surfaces.triangles[t, 0]
+    j = surfaces.triangles[t, 1]
+    k = surfaces.triangles[t, 2]
+    if surfaces.exposed[v] == 0:
+        return pair
+    w = closest_weights(q[i], q[j], q[k], q[v])
+    apart = q[v] - (w[0] * q[i] + w[1] * q[j] + w[2] * q[k])
+    distance = wp.length(apart)
+    pair.nodes = wp.vec4i(v, i, j, k)
+    pair.weights = wp.vec4(1.0, -w[0], -w[1], -w[2])
+    out = outward_normal(surfaces, t, q)
+    sunk = bool(False)
+    if surfaces.facing[t] != 0.0 and surfaces.part[v] != surfaces.part[i]:
+        sunk = wp.dot(apart, out) < 0.0
+        if sunk and wp.min(w) < INSIDE:
+            # Beside the triangle: another one faces the vertex.
+            return pair
+    x = surfaces.rest
+    w = closest_weights(x[i], x[j], x[k], x[v])
+    first = wp.length(x[v] - w[0] * x[i] - w[1] * x[j] - w[2] * x[k])
+    if distance > COINCIDENT:
+        pair.normal = apart / distance
+    else:
+        pair.normal = wp.normalize(out)
+    if sunk:
+        pair.normal = -pair.normal
+        distance = -distance
+    pair.gap = distance - margin_of(surfaces, v, i, margin, first)
+    return pair
+
+
+@wp.func
+def points_out(surfaces: Surfaces, e: int, direction: wp.vec3, q: wp.array[wp.vec3]):
+    """1 or -1 if a direction points out of or into the tetrahedra at an edge; 0 if there are none."""
+    sum = wp.vec3()
+    for side in range(2):
+        t = surfaces.outward[e][side]
+        if t >= 0:
+            sum += wp.normalize(outward_normal(surfaces, t, q))
+    return wp.sign(wp.dot(sum, direction)) * wp.where(wp.length_sq(sum) > 0.0, 1.0, 0.0)
+
+
+@wp.func
+def edge_pair(surfaces: Surfaces, e: int, other: int, margin: float, parallel: float, q: wp.array[wp.vec3]):
+    """Two edges."""
+    pair = Pair()
+    pair.gap = 1.0
+    pair.measure = 1.0
+    i = surfaces.edges[e, 2]
+    j = surfaces.edges[e, 3]
+    k = surfaces.edges[other, 2]
+    m = surfaces.edges[other, 3]
+    found = wp.closest_point_edge_edge(q[i], q[j], q[k], q[m], parallel)
+    s = found[0]
+    t = found[1]
+    apart = q[i] + s * (q[j] - q[i]) - q[k] - t * (q[m] - q[k])
+    distance = wp.length(apart)
+    if distance < COINCIDENT:
+        return pair
+    pair.measure = 16.0 * s * (1.0 - s) * t * (1.0 - t)
+    pair.nodes = wp.vec4i(i, j, k, m)
+    pair.weights = wp.vec4(1.0 - s, s, t - 1.0, -t)
+    pair.normal = apart / distance
+    if surfaces.part[i] != surfaces.part[k]:
+        one = points_out(surfaces, e, -pair.normal, q)
+        two = points_out(surfaces, other, pair.normal, q)
+        if one + two < 0.0 and one <= 0.0 and two <= 0.0:
+            pair.normal = -pair.normal
+            distance = -distance
+    x = surfaces.rest
+    first = wp.closest_point_edge_edge(x[i], x[j], x[k], x[m], parallel)[2]
+    pair.gap = distance - margin_of(surfaces, i, k, margin, first)
+    return pair
+
+
+@wp.func
+def add_pair_load(pair: Pair, load: wp.array[wp.float32]):
+    for n in range(4):
+        weight = 2.0 * pair.measure * wp.abs(pair.weights[n])
+        if weight > 0.0:
+            wp.atomic_add(load, pair.nodes[n], weight)
+
+
+@wp.func
+def add_pair_force(
+    pair: Pair,
+    law: ContactLaw,
+    dt: float,
+    load: wp.array[wp.float32],
+    flags: wp.array[wp.int32],
+    world: wp.array[wp.int32],
+    inverse_mass: wp.array[wp.float32],
+    qd: wp.array[wp.vec3],
+    gravity: wp.array[wp.vec3],
+    before: wp.array[wp.vec4],
+    f: wp.array[wp.vec4],
+):
+    velocity = wp.vec3()
+    pull = wp.vec3()
+    most = float(1.0)
+    m = Mobility()
+    for n in range(4):
+        i = pair.nodes[n]
+        weight = pair.weights[n]
+        velocity += weight * qd[i]
+        if weight != 0.0:
+            most = wp.max(most, load[i])
+            if (flags[i] & ACTIVE) != 0 and inverse_mass[i] > 0.0:
+                m.particle = wp.max(m.particle, inverse_mass[i] * load[i])
+                g = gravity[place_of(world[i], gravity.shape[0])]
+                pull += weight * dt * (inverse_mass[i] * load_node(before, i) + g)
+    stiffness = law.stiffness * wp.min(1.0, law.crowd / most)
+    force = pair.measure * contact_force(
+        pair.normal,
+        pair.gap,
+        velocity,
+        stiffness,
+        law.damping,
+        law.friction_slope,
+        law.friction,
+        pull,
+        m,
+        0.0,
+        dt,
+    )
+    for n in range(4):
+        add_force(f, pair.nodes[n], pair.weights[n] * force)
+
+
+@wp.kernel(enable_backward=False)
+def count_pair_loads(
+    # In
+    surfaces: Surfaces,
+    margin: float,
+    parallel: float,
+    triangle_starts: wp.array[wp.int32],
+    triangle_counts: wp.array[wp.int32],
+    triangles: wp.array[wp.int32],
+    edge_starts: wp.array[wp.int32],
+    edge_counts: wp.array[wp.int32],
+    edges: wp.array[wp.int32],
+    q: wp.array[wp.vec3],
+    # In and out
+    load: wp.array[wp.float32],
+):
+    """Add twice the weights of all pairs that touch."""
+    n = wp.tid()
+    if n < triangle_counts.shape[0]:
+        start = triangle_starts[n]
+        for c in range(wp.min(triangle_counts[n], triangle_starts[n + 1] - start)):
+            pair = vertex_pair(surfaces, n, triangles[2 * (start + c) + 1], margin, q)
+            if pair.gap < 0.0:
+                add_pair_load(pair, load)
+    if n < edge_counts.shape[0]:
+        start = edge_starts[n]
+        for c in range(wp.min(edge_counts[n], edge_starts[n + 1] - start)):
+            other = edges[2 * (start + c) + 1]
+            if n < other:
+                pair = edge_pair(surfaces, n, other, margin, parallel, q)
+                if pair.gap < 0.0:
+                    add_pair_load(pair, load)
+
+
+@wp.kernel(enable_backward=False)
+def scatter_pairs(
+    # In
+    surfaces: Surfaces,
+    margin: float,
+    parallel: float,
+    triangle_starts: wp.array[wp.int32],
+    triangle_counts: wp.array[wp.int32],
+    triangles: wp.array[wp.int32],
+    edge_starts: wp.array[wp.int32],
+    edge_counts: wp.array[wp.int32],
+    edges: wp.array[wp.int32],
+    law: ContactLaw,
+    dt: float,
+    load: wp.array[wp.float32],
+    flags: wp.array[wp.int32],
+    world: wp.array[wp.int32],
+    inverse_mass: wp.array[wp.float32],
+    q: wp.array[wp.vec3],
+    qd: wp.array[wp.vec3],
+    gravity: wp.array[wp.vec3],
+    before: wp.array[wp.vec4],
+    # Out
+    f: wp.array[wp.vec4],
+    trouble: wp.array[wp.int32],
+):
+    """Forces of all pairs. A row that holds fewer pairs than were found marks the world."""
+    n = wp.tid()
+    if n < triangle_counts.shape[0]:
+        start = triangle_starts[n]
+        room = triangle_starts[n + 1] - start
+        if triangle_counts[n] > room:
+            wp.atomic_max(trouble, place_of(world[n], trouble.shape[0]), TOO_MANY_PAIRS)
+        for c in range(wp.min(triangle_counts[n], room)):
+            pair = vertex_pair(surfaces, n, triangles[2 * (start + c) + 1], margin, q)
+            if pair.gap < 0.0:
+                add_pair_force(pair, law, dt, load, flags, world, inverse_mass, qd, gravity, before, f)
+    if n < edge_counts.shape[0]:
+        start = edge_starts[n]
+        room = edge_starts[n + 1] - start
+        if edge_counts[n] > room:
+            i = surfaces.edges[n, 2]
+            wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), TOO_MANY_PAIRS)
+        for c in range(wp.min(edge_counts[n], room)):
+            other = edges[2 * (start + c) + 1]
+            if n < other:
+                pair = edge_pair(surfaces, n, other, margin, parallel, q)
+                if pair.gap < 0.0:
+                    add_pair_force(pair, law, dt, load, flags, world, inverse_mass, qd, gravity, before, f)
