@@ -1,0 +1,79 @@
+#!/usr/bin/env python3
+"""Jitter and delay of the haptic loop while a hand presses and strokes a block of tissue.
+
+    python benchmarks/haptics.py [--device cuda:0] [--level 9] [--seconds 10] [--json FILE]
+
+A scripted hand moves a sphere of 2 cm in and out of a block 4 x 4 x 2 cm, 3 mm deep, and around on it, at 1 kHz, for so
+many seconds on the wall; ``--seconds 600`` is ten minutes. The simulation publishes a state every 2 ms of its time, or
+as fast as it goes. The script checks that the hand felt a force, that the device did not fail, and that the energy put
+out stayed within the bound.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict
+
+import numpy as np
+from measure import checked, machine, parser, save, tell
+
+import warp_corot as wc
+
+YOUNG, VISCOSITY = 2e4, 1e-3
+RADIUS, TOP, DEPTH = 0.01, 0.02, 0.003
+#: Presses and turns in a second [1/s], and keyframes in a second.
+PRESSES, TURNS, KEYS = 0.7, 0.3, 100
+BOUND = 1e-3
+
+
+def main() -> int:
+    of = parser(__doc__.split("\n")[0], "haptics.py")
+    of.add_argument("--seconds", type=float, default=10.0, help="how long, on the wall (default: 10)")
+    of.add_argument("--rate", type=float, default=1000.0, help="readings per second (default: 1000)")
+    options = of.parse_args()
+    if not (options.seconds > 0.0 and options.rate > 0.0):
+        of.error("--seconds and --rate must be positive")
+    if options.level is None:
+        options.level = 3
+    device = checked(options, of, range(16))
+    mesh = wc.TetForest.box((2, 2, 1), 0.02, options.level)
+    body = wc.SoftBody(mesh, wc.Isotropic(YOUNG, 0.4, 1e3), device=device)
+    body.fix("z == zmin")
+    tool = wc.Tool(wc.Sphere(RADIUS, position=(0.02, 0.02, TOP + RADIUS)), speed=1.0)
+    integrator = wc.SymplecticEuler(viscosity=VISCOSITY)
+    sim = wc.Simulation(body, obstacles=[tool], gravity=(0, 0, 0), integrator=integrator)
+    tell(f"{len(mesh.tets)} tetrahedra")
+    sim.advance(0.02)  # compiles and records
+    hand = wc.haptics.ScriptedDevice(*stroke(options.seconds))
+    with wc.haptics.HapticLoop(sim, tool, hand, rate=options.rate, energy_bound=BOUND) as loop:
+        share = loop.run(options.seconds)
+    report = loop.report
+    print(report)
+    print(f"simulated  {share:.3g} times real time, {len(mesh.tets)} tetrahedra on {device}")
+    felt = np.array(hand.felt)[:, 4:7] if hand.felt else np.zeros((1, 3))
+    print(f"force      {np.linalg.norm(felt, axis=1).max():.3g} N at most")
+    wrong = []
+    if not np.linalg.norm(felt, axis=1).max() > 0.0:
+        wrong.append("no force was felt")
+    if loop.error is not None:
+        wrong.append(loop.error)
+    if report.put_out > BOUND * (1.0 + options.seconds) and not report.beyond:
+        wrong.append(f"{report.put_out:.3g} J were put out, beyond the bound")
+    if options.json:
+        save(options.json, {**machine(device), **asdict(report), "real_time": share, "wrong": wrong})
+    for each in wrong:
+        print(f"WRONG: {each}", file=sys.stderr)
+    return int(bool(wrong))
+
+
+def stroke(seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times and positions of the hand."""
+    times = np.arange(0.0, seconds + 2.0 / KEYS, 1.0 / KEYS)
+    depth = DEPTH * np.sin(np.pi * PRESSES * times) ** 2
+    angle = 2.0 * np.pi * TURNS * times
+    places = [0.02 + 0.005 * np.sin(angle), 0.02 + 0.005 * (1.0 - np.cos(angle)), TOP + RADIUS - depth]
+    return times, np.stack(places, axis=1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

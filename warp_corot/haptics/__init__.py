@@ -1,0 +1,8 @@
+"""Forces for the hand: a loop on a clock of its own between a haptic device and a tool of a simulation."""
+
+from .devices import Device, MouseDevice, ScriptedDevice
+from .loop import HapticLoop
+from .poses import DeviceError
+from .report import Report
+
+__all__ = ["Device", "DeviceError", "HapticLoop", "MouseDevice", "Report", "ScriptedDevice"]

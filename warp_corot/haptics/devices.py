@@ -1,0 +1,122 @@
+"""What a driver of a haptic device is, and two devices without hardware."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.contact.shapes import NO_TURN, checked_quaternion, checked_vector
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_numbers
+from warp_corot.inputs.keys import checked_times
+
+Vector = Sequence[float] | npt.NDArray[np.floating]
+Floats = npt.NDArray[np.float64]
+
+
+@runtime_checkable
+class Device(Protocol):
+    """A haptic device, in the coordinates of the simulation.
+
+    A loop calls both methods from its own thread, at its rate. Whatever they raise ends the loop.
+    """
+
+    def read(self) -> tuple[Vector, Vector]:
+        """Position [m], [3], and orientation as a quaternion (x, y, z, w), [4], of the tool in the hand."""
+        ...
+
+    def write(self, force: Floats, torque: Floats) -> None:
+        """Push the hand with this force [N], [3], and torque [N m], [3], until the next call."""
+        ...
+
+
+class ScriptedDevice:
+    """A device that a script moves along keyframes, in straight lines, and that keeps what it is made to feel.
+
+    Args:
+        times: Increasing, at least two, from the first reading on [s], [K].
+        positions: [m], [K, 3].
+        quaternions: (x, y, z, w), [K, 4]; None: not turned.
+        clock: Seconds of a clock.
+
+    Attributes:
+        felt: What was written: time [s], position [m], force [N] and torque [N m], ten numbers each.
+
+    Raises:
+        InputError: As ``Tool.follow``.
+    """
+
+    def __init__(
+        self,
+        times: npt.ArrayLike,
+        positions: npt.ArrayLike,
+        quaternions: npt.ArrayLike | None = None,
+        *,
+        clock: Callable[[], float] = time.perf_counter,
+    ):
+        self._times = checked_times(times)
+        count = len(self._times)
+        places = checked_numbers(positions, "positions", f"[{count}, 3]")
+        turns = checked_numbers(np.tile(NO_TURN, (count, 1)) if quaternions is None else quaternions, "quaternions", "")
+        if places.shape != (count, 3) or not np.isfinite(places).all():
+            raise InputError(f"positions has shape {places.shape}; it must be finite, [{count}, 3]")
+        if turns.shape != (count, 4):
+            raise InputError(f"quaternions has shape {turns.shape}; it must be [{count}, 4]")
+        turns = np.array([checked_quaternion(turn) for turn in turns])
+        for before, after in pairwise(turns):
+            after *= 1.0 if before @ after >= 0.0 else -1.0
+        self._poses = np.hstack([places, turns])
+        self._clock, self._start = clock, math.nan
+        self._now, self._place = 0.0, self._poses[0]
+        self.felt: list[tuple[float, ...]] = []
+
+    def read(self) -> tuple[Floats, Floats]:
+        now = self._clock()
+        if math.isnan(self._start):
+            self._start = now
+        self._now = now - self._start
+        self._place = np.array([np.interp(self._now, self._times, column) for column in self._poses.T])
+        return self._place[:3], self._place[3:] / np.linalg.norm(self._place[3:])
+
+    def write(self, force: Floats, torque: Floats) -> None:
+        self.felt.append((self._now, *self._place[:3].tolist(), *map(float, force), *map(float, torque)))
+
+
+class MouseDevice:
+    """A device that takes its position from a caller in any thread, such as a page or a window, and shows the force.
+
+    Args:
+        position: Where it is first [m].
+        quaternion: How it is turned first, (x, y, z, w).
+
+    Attributes:
+        force, torque: What was written last [N], [N m].
+
+    Raises:
+        InputError: Not finite numbers.
+    """
+
+    def __init__(self, position: Vector = (0.0, 0.0, 0.0), quaternion: Vector = NO_TURN):
+        self.force, self.torque = np.zeros(3), np.zeros(3)
+        self._pose = (checked_vector(position, "position"), checked_quaternion(quaternion))
+
+    def move(self, position: Vector, quaternion: Vector | None = None) -> None:
+        """Be somewhere else from the next reading on.
+
+        Raises:
+            InputError: Not finite numbers; the device stays where it is.
+        """
+        turn = self._pose[1] if quaternion is None else checked_quaternion(quaternion)
+        self._pose = (checked_vector(position, "position"), turn)
+
+    def read(self) -> tuple[Floats, Floats]:
+        return self._pose
+
+    def write(self, force: Floats, torque: Floats) -> None:
+        self.force, self.torque = np.array(force), np.array(torque)

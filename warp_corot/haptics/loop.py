@@ -1,0 +1,285 @@
+"""The haptic loop: reads the device, sends the tool after it, and gives it a force, a thousand times a second."""
+
+from __future__ import annotations
+
+import logging
+import math
+import sys
+import threading
+import time
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.contact.tool import Tool
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_number, shown
+from warp_corot.simulation.simulation import Simulation
+
+from .devices import Device
+from .exchange import Exchange, ToolState
+from .local_model import LocalModel
+from .passivity import PassivityControl
+from .poses import DeviceError, Pose, checked_pose, way
+from .report import Report, Times
+
+if TYPE_CHECKING:
+    from warp_corot.materials.isotropic import Isotropic
+
+Floats = npt.NDArray[np.float64]
+
+#: Speed [m/s] and rate of turning [rad/s] of a hand that the bound on energy counts with.
+SPEED, TURN_RATE = 1.0, 10.0
+#: A force is kept this long without a new state of the simulation, and fades in the same time after that [s].
+PATIENCE = 0.25
+#: Threads that run Python code let the loop's thread go first after so long [s].
+SWITCH = 2e-4
+#: Time between two publications of ``run`` [s].
+EVERY = 0.002
+
+
+class HapticLoop:
+    """Runs a haptic device against a tool of a simulation, from a thread of its own.
+
+    The loop reads the device, lets the tool follow it, takes the newest state of the tool that the simulation has
+    published, without waiting, and writes the force of a local model (`local_model`), bounded in energy
+    (`passivity`). Meanwhile somebody steps the simulation: ``run``, or any loop of ``sim.advance``. The force of a
+    simulation that stops fades.
+
+    Args:
+        sim: The simulation, of one world, with the tool among its obstacles.
+        tool: The tool in the hand. It follows the device at no more than ``Tool.speed``.
+        device: The device.
+        rate: Readings per second [1/s].
+        stiffness: Expected stiffness of the tissue at the tool [N/m]; None: of a half-space of the first body's
+            material under a flat punch as thick as the tool.
+        most_force: Largest force [N]; larger ones are scaled down together with the torque.
+        energy_bound: What may be put out beyond what was put in [J], and in each second after [W]; see
+            ``PassivityControl``.
+
+    Attributes:
+        error: The line on why the loop stopped, if the device failed; else None.
+
+    Raises:
+        InputError: Something that is none of these, a tool of another simulation, several worlds, or a number out of
+            range.
+    """
+
+    def __init__(
+        self,
+        sim: Simulation,
+        tool: Tool,
+        device: Device,
+        *,
+        rate: float = 1000.0,
+        stiffness: float | None = None,
+        most_force: float = 10.0,
+        energy_bound: float = 1e-3,
+    ):
+        if not isinstance(sim, Simulation):
+            raise InputError(f"sim is {shown(sim)}; it must be a Simulation")
+        given = () if sim.contact is None else sim.contact.obstacles.given
+        if not any(each is tool for each in given):
+            raise InputError(f"tool is {shown(tool)}; it must be a Tool among the simulation's obstacles")
+        if sim.worlds > 1:
+            raise InputError(f"the simulation has {sim.worlds} worlds; a hand is in one")
+        if not isinstance(device, Device):
+            raise InputError(f"device is {shown(device)}; it must have the methods read() and write(force, torque)")
+        self.period = 1.0 / _positive(rate, "rate", "1/s")
+        self._most_force = _positive(most_force, "most_force", "N")
+        bound, reach = _positive(energy_bound, "energy_bound", "J"), SPEED * self.period
+        expected = _stiffness(sim.bodies[0].material.isotropic, tool) if stiffness is None else stiffness
+        self._sim, self._tool, self._device = sim, tool, device
+        self._model = LocalModel(_positive(expected, "stiffness", "N/m"), 2.0 * bound / reach**2)
+        self._control = PassivityControl(bound, reach, TURN_RATE * self.period)
+        assert sim.contact is not None
+        self._exchange = Exchange(sim.system, sim.contact.obstacles, [each is tool for each in given].index(True))
+        self._state: ToolState | None = None
+        self._pose: Pose | None = None
+        self._updated = self._last = math.nan
+        self._periods, self._delays, self._busy = Times(), Times(), Times()
+        self._missed = self._updates = 0
+        self._is_to_stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.error: str | None = None
+
+    # --- running ---------------------------------------------------------------------------------------------------
+
+    @property
+    def is_running(self) -> bool:
+        return self._thread is not None and self._thread.is_alive()
+
+    def start(self) -> None:
+        """Connect the tool to the device, and start the thread.
+
+        Raises:
+            InputError: The loop was started before; make another one.
+        """
+        if self._thread is not None:
+            raise InputError("the haptic loop was started before; make another one")
+        self.connect()
+        self._thread = threading.Thread(target=self._run, name="haptics", daemon=True)
+        self._thread.start()
+
+    def connect(self) -> None:
+        """Let the simulation publish the tool's state, and the tool follow the device; ``start`` does so."""
+        if self._exchange not in self._sim.system.constraints:
+            self._exchange.send(self._tool.pose[:3], self._tool.pose[3:], 0.0)
+            self._sim.system.constraints.append(self._exchange)
+            self._tool.use_poses(self._exchange.target)
+
+    def stop(self) -> None:
+        """Stop the thread, leave the device without force, and the tool where it was sent last. May be called twice."""
+        self._is_to_stop.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join()
+        if self._exchange in self._sim.system.constraints:
+            self._sim.system.constraints.remove(self._exchange)
+            place = self._exchange.place
+            self._tool.move(place[:3], place[3:])
+
+    def __enter__(self) -> HapticLoop:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def run(self, seconds: float, every: float = EVERY) -> float:
+        """Advance the simulation with the clock on the wall, or as fast as it goes if that is slower.
+
+        Args:
+            seconds: On the wall [s].
+            every: Simulated time between two states that the loop reads [s].
+
+        Returns:
+            Simulated time over time on the wall.
+
+        Raises:
+            InputError: A time that is not positive.
+            DeviceError: The device failed; the simulation can go on without it.
+            UnstableError: As ``Simulation.advance``.
+        """
+        _positive(seconds, "seconds", "s")
+        _positive(every, "every", "s")
+        begun, simulated = time.perf_counter(), self._sim.total_time
+        while (past := time.perf_counter() - begun) < seconds:
+            if self.error is not None:
+                raise DeviceError(self.error)
+            ahead = self._sim.total_time - simulated - past
+            if ahead > 0.0:
+                time.sleep(min(ahead, seconds - past))
+            else:
+                self._sim.advance(every)
+        return (self._sim.total_time - simulated) / (time.perf_counter() - begun)
+
+    @property
+    def report(self) -> Report:
+        """How well it has kept its time so far."""
+        periods, delays, control = self._periods, self._delays, self._control
+        return Report(
+            readings=self._busy.count,
+            missed=self._missed,
+            period=periods.share(50),
+            period_99=periods.share(99),
+            period_most=periods.largest,
+            busy=self._busy.share(50),
+            delay=delays.share(50),
+            delay_99=delays.share(99),
+            delay_most=delays.largest,
+            updates=self._updates,
+            put_out=control.most_put_out,
+            damped=control.damped,
+            beyond=control.beyond,
+            stiffness=self._model.stiffness,
+        )
+
+    # --- one reading -----------------------------------------------------------------------------------------------
+
+    def tick(self, now: float) -> None:
+        """Read the device, send the tool after it, and write a force; the thread does so in each period.
+
+        Args:
+            now: The time on a clock that only goes forward [s].
+
+        Raises:
+            DeviceError: What the device read is not a position and an orientation.
+        """
+        position, quaternion = checked_pose(*self._device.read())
+        self._exchange.send(position, quaternion, now)
+        newest = self._exchange.newest(self._state)
+        if newest is not None and newest is not self._state:
+            self._take(newest, now)
+        moved, turned = (np.zeros(3), np.zeros(3)) if self._pose is None else way(self._pose, (position, quaternion))
+        elapsed = 0.0 if math.isnan(self._last) else now - self._last
+        self._control.observe(moved, turned, elapsed)
+        force, torque = self._wanted(position, now)
+        self._device.write(*self._control.control(force, torque, moved, turned))
+        self._pose, self._last = (position, quaternion), now
+
+    def _take(self, newest: ToolState, now: float) -> None:
+        self._state, self._updated = newest, now
+        self._updates += 1
+        if newest.stamp > 0.0:
+            self._delays.add(now - newest.stamp)
+        if np.isfinite(newest.force).all() and np.isfinite(newest.torque).all():
+            self._model.follow(newest)
+
+    def _wanted(self, position: Floats, now: float) -> tuple[Floats, Floats]:
+        """The model's force and torque, no larger than the device bears, fading if the simulation is silent."""
+        force, torque = self._model.forces(position)
+        size = float(np.linalg.norm(force))
+        share = 1.0 if size <= self._most_force else self._most_force / size
+        silent = 0.0 if self._state is None else now - self._updated - PATIENCE
+        if silent > 0.0:
+            share *= max(1.0 - silent / PATIENCE, 0.0)
+        return share * force, share * torque
+
+    def _run(self) -> None:
+        """The thread."""
+        interval = sys.getswitchinterval()
+        sys.setswitchinterval(min(interval, SWITCH))
+        try:
+            self._keep_time()
+        except Exception as error:
+            words = " ".join(f"{type(error).__name__}: {error}".split())
+            self.error = words if isinstance(error, DeviceError) else f"the haptic device failed: {words}"
+            logging.getLogger(__name__).error("%s; the loop has stopped", self.error)
+        finally:
+            sys.setswitchinterval(interval)
+            try:
+                self._device.write(np.zeros(3), np.zeros(3))
+            except Exception:
+                logging.getLogger(__name__).debug("the device takes no last force", exc_info=True)
+
+    def _keep_time(self) -> None:
+        due = last = time.perf_counter()
+        while not self._is_to_stop.is_set():
+            started = time.perf_counter()
+            if self._busy.count:
+                self._periods.add(started - last)
+            last = started
+            self.tick(started)
+            ended = time.perf_counter()
+            self._busy.add(ended - started)
+            late = int((ended - due) / self.period)
+            self._missed += late
+            due += (late + 1) * self.period
+            time.sleep(max(due - time.perf_counter(), 0.0))
+
+
+def _stiffness(material: Isotropic, tool: Tool) -> float:
+    """The stiffness of a half-space under a flat punch as thick as the tool [N/m] (Johnson, Contact Mechanics, 3.4)."""
+    young, poisson = float(np.median(material.young)), float(np.median(material.poisson))
+    radius = min(tool.shape.thickness, 0.01)
+    return 2.0 * radius * young / (1.0 - poisson**2)
+
+
+def _positive(given: float, name: str, unit: str) -> float:
+    if not 0.0 < checked_number(given, name, unit) < math.inf:
+        raise InputError(f"{name} is {given}; it must be a positive number [{unit}]")
+    return float(given)
