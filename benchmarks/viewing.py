@@ -1,0 +1,88 @@
+"""How many frames a second the page's server makes, and what takes the time.
+
+``python benchmarks/viewing.py [INPUT] [OPTION ...]``: INPUT and options as ``warp-corot view`` has them. A visitor
+without a screen takes all that is sent, in a process of its own. Needs the extra ``view``.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import sys
+import time
+
+from warp_corot.cli import make_parser
+from warp_corot.cli.prepared import prepared
+from warp_corot.viewing.view import View
+
+#: Time of a measurement, and before it [s].
+SECONDS, BEFORE = 10.0, 3.0
+
+
+def visitor(address: str, protocol: str, count) -> None:
+    """Take all that a page sends, and count bytes."""
+    from websockets.sync.client import connect
+
+    with connect(address, subprotocols=[protocol], max_size=None, compression=None) as socket:
+        while True:
+            count.value += len(socket.recv())
+
+
+def timed(work, seconds: float) -> float:
+    """Milliseconds of a call, the mean of those in so many seconds."""
+    calls, started = 0, time.perf_counter()
+    while time.perf_counter() - started < seconds:
+        work()
+        calls += 1
+    return 1e3 * (time.perf_counter() - started) / calls
+
+
+def main() -> None:
+    import viser
+
+    given = sys.argv[1:] or ["warp:bunny", "--tets", "20000"]
+    args = make_parser().parse_args(["view", *given])
+    ready = prepared([args])
+    own = [body.subject.skin or body.subject.surface for body in ready.bodies]
+    count = multiprocessing.get_context("spawn").Value("q", 0)
+    with View(ready.sim, port=0, own=own) as page:
+        address, protocol = f"ws://127.0.0.1:{page.port}/", f"viser-v{viser.__version__}"
+        process = multiprocessing.get_context("spawn").Process(
+            target=visitor, args=(address, protocol, count), daemon=True
+        )
+        process.start()
+        session, shown = page.session, page.session.shown
+        points, triangles = (
+            sum(len(x) for x in each) for each in ([s.rest for s in shown], [s.triangles for s in shown])
+        )
+        elements = sum(body.element_count for body in session.sim.bodies)
+        print(f"{' '.join(given)}: {elements} tetrahedra, {points} points, {triangles} triangles, {session.sim.device}")
+        for name in ("stress", "displacement", ""):
+            session.change(colors=name)
+            session.change(fps=1000.0)
+            session.pace.rest = 0.0
+            for period, label in ((30.0, "30 a second asked for"), (60.0, "60 a second asked for")):
+                session.change(fps=period)
+                timed(page._show, BEFORE)
+                sent, started, simulated = count.value, time.perf_counter(), session.sim.total_time
+                frames = 0
+                while time.perf_counter() - started < SECONDS:
+                    begun = time.perf_counter()
+                    page._show()
+                    frames += 1
+                    time.sleep(max(1.0 / period - (time.perf_counter() - begun), 0.0))
+                took = time.perf_counter() - started
+                print(
+                    f"  {name or 'no colours'}, {label}: {frames / took:.1f} frames/s, "
+                    f"{(session.sim.total_time - simulated) / took:.3g} x real time, "
+                    f"{(count.value - sent) / frames / 1e3:.0f} kB a frame"
+                )
+            session.change(running=False)
+            print(f"    reading {timed(session.frame, 2.0):.2f} ms, ", end="")
+            frame = session.frame()
+            print(f"sending {timed(lambda f=frame, n=name: page._scene.show(f, bool(n)), 2.0):.2f} ms a frame")
+            session.change(running=True)
+        process.kill()
+
+
+if __name__ == "__main__":
+    main()

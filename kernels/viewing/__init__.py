@@ -1,0 +1,1 @@
+"""Kernels of the page: hands that pull on a surface, and values at its points."""

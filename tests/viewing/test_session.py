@@ -1,0 +1,381 @@
+"""A session without a browser: commands between advances, hands, switches, and time."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+from hands import TOP, block, session
+
+import warp_corot as wc
+from warp_corot.viewing.cutting import Plane
+from warp_corot.viewing.pacing import Pace
+from warp_corot.viewing.session import Session
+from warp_corot.viewing.shown import ELEMENTS, INPUT, MARCHED
+
+UP = np.array([0.0, 0.0, 0.004])
+
+
+def ticks(of, count):
+    for _ in range(count):
+        frame = of.tick()
+    return frame
+
+
+def still(of, seconds):
+    """A frame after so much simulated time, whatever the clock on the wall says."""
+    of.take_commands()
+    of.sim.advance(seconds)
+    return of.frame()
+
+
+def test_a_drag_moves_tissue_and_tells_its_force(device):
+    page = session(device)
+    frame = page.tick()
+    here = frame.positions[0][np.linalg.norm(frame.positions[0] - TOP, axis=1).argmin()]
+    page.ask(lambda: page.press("me", 0, here))
+    page.ask(lambda: page.move("me", UP))
+    frame = still(page, 0.5)
+    assert frame.forces["me"][2] > 0.0
+    start, end = frame.ends["me"]
+    assert TOP[2] < start[2] < end[2] < TOP[2] + 0.0041
+    top = np.linalg.norm(page.shown[0].rest - TOP, axis=1).argmin()
+    assert frame.positions[0][top, 2] > TOP[2] + 1e-4
+    page.ask(lambda: page.let_go("me"))
+    frame = still(page, 3.0)
+    assert not frame.forces
+    np.testing.assert_allclose(frame.positions[0], page.shown[0].rest, atol=5e-5)
+
+
+def test_two_visitors_hold_the_body_at_the_same_time():
+    page = session()
+    page.ask(lambda: page.press(1, 0, TOP))
+    page.ask(lambda: page.press(2, 0, (0.1, 0.05, 0.1)))
+    page.ask(lambda: page.move(1, UP))
+    page.ask(lambda: page.move(2, (0.003, 0.0, 0.0)))
+    frame = still(page, 0.5)
+    assert frame.forces[1][2] > 0.0
+    assert frame.forces[2][0] > 0.0
+    page.ask(lambda: page.let_go(1))
+    assert set(still(page, 0.1).forces) == {2}
+
+
+def test_commands_about_nothing_do_no_harm():
+    page = session()
+    for command in (lambda: page.move(1, UP), lambda: page.let_go(1), page.release_all):
+        page.ask(command)
+    page.ask(lambda: page.press(1, 0, TOP))
+    page.ask(lambda: page.move(1, (np.nan, 0.0, 0.0)))
+    frame = still(page, 0.1)
+    assert np.isfinite(frame.forces[1]).all()
+    assert page.note == ""
+
+
+def test_commands_come_from_other_threads_in_their_order():
+    page, done = session(), []
+    threads = [
+        threading.Thread(target=lambda k=k: [page.ask(lambda n=n: done.append((k, n))) for n in range(100)])
+        for k in range(4)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert done == []
+    page.take_commands()
+    for k in range(4):
+        assert [n for thread, n in done if thread == k] == list(range(100))
+
+
+def test_what_is_grasped_stays_and_can_be_moved_on():
+    page = session()
+    page.ask(lambda: page.change(hand="grasp"))
+    page.ask(lambda: page.press(1, 0, TOP))
+    page.ask(lambda: page.move(1, UP))
+    page.ask(lambda: page.let_go(1))
+    frame = still(page, 0.5)
+    (force,) = frame.forces.values()
+    assert force[2] > 0.0
+    page.ask(lambda: page.press(2, 0, frame.positions[0][np.linalg.norm(page.shown[0].rest - TOP, axis=1).argmin()]))
+    page.ask(lambda: page.move(2, UP))
+    frame = still(page, 0.5)
+    assert len(frame.forces) == 1
+    assert frame.forces[2][2] == pytest.approx(2.0 * force[2], rel=0.1)
+    page.ask(page.release_all)
+    assert not still(page, 0.1).forces
+
+
+def test_a_press_goes_into_the_body_whichever_way_the_mouse_goes():
+    for motion in ((0.004, 0.0, 0.0), (0.0, 0.0, 0.004)):
+        page = session()
+        page.change(hand="press")
+        page.press(1, 0, TOP)
+        page.move(1, motion)
+        force = still(page, 0.5).forces[1]
+        assert force[2] < 0.0
+        assert abs(force[2]) > 10.0 * np.linalg.norm(force[:2])
+
+
+def test_time_stands_still_and_goes_step_by_step():
+    page = session()
+    page.change(running=False)
+    before = page.sim.total_steps
+    ticks(page, 3)
+    assert page.sim.total_steps == before
+    page.ask(page.step)
+    page.ask(page.step)
+    ticks(page, 2)
+    assert page.sim.total_steps == before + 2
+
+
+def test_reset_goes_back_to_the_beginning():
+    page = session()
+    page.press(1, 0, TOP)
+    page.move(1, UP)
+    ticks(page, 5)
+    page.ask(page.reset)
+    page.ask(lambda: page.change(running=False))
+    frame = page.tick()
+    assert frame.time == 0.0
+    assert not frame.forces
+    np.testing.assert_allclose(frame.positions[0], page.shown[0].rest, atol=1e-7)
+
+
+def test_time_goes_by_as_asked_and_says_when_it_cannot():
+    pace = Pace(rate=0.1)
+    assert pace.wanted(1.0, 0.03) == pytest.approx(0.1 * 0.03)
+    assert pace.wanted(0.05, 0.03) == pytest.approx(0.05 * 0.03)
+    pace.rest = 1.0  # reading and sending take longer than a frame may
+    assert 0.0 < pace.wanted(1.0, 0.03) < 0.1 * 0.03
+    pace.ratio = 0.5
+    assert pace.is_slow(1.0)
+    assert not pace.is_slow(0.5)
+
+
+def test_slowed_down_it_goes_slower():
+    page = session()
+    page.change(speed=0.01)
+    page.tick()
+    started, before = time.perf_counter(), page.sim.time
+    for _ in range(20):
+        page.tick()
+        time.sleep(0.005)
+    assert 0.0 < page.sim.time - before < 0.02 * (time.perf_counter() - started)
+
+
+@pytest.mark.parametrize("colors", ["stress", "displacement", "level", ""])
+def test_colours(colors):
+    page = session()
+    page.change(colors=colors)
+    page.press(1, 0, TOP)
+    page.move(1, UP)
+    frame = still(page, 0.3)
+    assert frame.colors[0].shape == frame.positions[0].shape
+    kinds = len(np.unique(frame.colors[0], axis=0))
+    assert kinds == 1 if colors in ("level", "") else kinds > 5
+    assert frame.highest == {"level": 6.0, "": 0.0}.get(colors, frame.highest)
+
+
+def test_a_level_that_is_no_tree_s_is_no_source():
+    forest = wc.TetForest.box(cells=(1, 1, 1), cell_size=0.1, level=3)
+    body = wc.SoftBody(wc.TetMesh(forest.points, forest.tets), wc.Isotropic(5e3, 0.4, 1000.0), device="cpu")
+    page = Session(wc.Simulation(body))
+    assert not page.sources["level"].applies(body)
+    page.change(colors="level")
+    page.tick()
+
+
+def test_a_cut_shows_what_is_inside_and_hands_let_go():
+    page = session()
+    page.press(1, 0, TOP)
+    first = page.tick()
+    page.ask(lambda: page.change(plane=Plane(0, 0.5)))
+    frame = page.tick()
+    assert frame.number > first.number
+    assert not frame.forces
+    assert page.shown[0].rest[:, 0].max() == pytest.approx(0.05)
+    page.press(1, 0, (0.05, 0.05, 0.15))  # on the section
+    page.move(1, (0.002, 0.0, 0.0))
+    assert still(page, 0.3).forces[1][0] > 0.0
+
+
+@pytest.mark.parametrize("name", [INPUT, MARCHED, ELEMENTS])
+def test_surfaces(name):
+    trimesh = pytest.importorskip("trimesh")
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
+    points, triangles = np.asarray(ball.vertices), np.asarray(ball.faces)
+    domain = wc.Domain.from_surface((points, triangles))
+    mesh = wc.TetForest.from_domain(domain, target_elements=2000)
+    body = wc.SoftBody(mesh, wc.Isotropic(5e3, 0.4, 1000.0), device="cpu")
+    page = Session(wc.Simulation(body), [mesh.bind(points, triangles)])
+    assert list(page.surfaces[0]) == [INPUT, MARCHED, ELEMENTS]
+    page.change(surface=name)
+    frame = page.tick()
+    if name == INPUT:
+        assert len(frame.positions[0]) == len(points)
+    pick = page.shown[0].pick(0, page.shown[0].positions[3])
+    np.testing.assert_allclose(page.shown[0].at(pick, page.shown[0].rest), page.shown[0].rest[3], atol=1e-4)
+
+
+def moving(device="cpu"):
+    page = session(device)
+    page.sim.body.load("z == zmax", (0.001, 0.0, 0.0))
+    page.sim.advance(0.1)
+    return page
+
+
+@pytest.mark.parametrize(
+    ("what", "of"),
+    [
+        ({"models": [wc.NeoHookean()]}, lambda sim: sim.models[0]),
+        ({"models": [wc.Corotated(rotation_level=3)]}, lambda sim: sim.models[0].rotation_level),
+        ({"materials": [wc.Isotropic(1e4, 0.3, 1000.0)]}, lambda sim: sim.body.material.young),
+        ({"remesh": [wc.OnlineRemesh()]}, lambda sim: sim.remeshing.every),
+    ],
+    ids=["law", "rotations", "material", "remeshing"],
+)
+def test_switched_motion_goes_on(what, of, device):
+    page = moving(device)
+    former = page.sim
+    before = of(former), former.time, former.body.positions.numpy().copy(), former.body.velocities.numpy().copy()
+    page.press(1, 0, TOP)
+    page.ask(lambda: page.switch(**what))
+    page.take_commands()
+    assert page.note == ""
+    assert page.sim is not former
+    assert of(page.sim) != before[0]
+    assert page.sim.time == pytest.approx(before[1], abs=1e-12)
+    np.testing.assert_allclose(page.sim.body.positions.numpy(), before[2], atol=1e-7)
+    np.testing.assert_allclose(page.sim.body.velocities.numpy(), before[3], atol=1e-7)
+    assert page.sim.body.constrained.sum() == former.body.constrained.sum()
+    np.testing.assert_array_equal(page.sim.body.loads.numpy(), former.body.loads.numpy())
+    assert not page.hands
+    page.press(1, 0, TOP)
+    page.move(1, UP)
+    frame = still(page, 0.2)
+    assert frame.forces[1][2] > 0.0
+
+
+def test_switched_and_back_it_is_the_same_motion():
+    """What goes on with the same law ends where it would have."""
+    one, other = moving(), moving()
+    other.switch()
+    for page in (one, other):
+        page.sim.advance(0.5)
+    found, expected = (page.sim.body.displacements.numpy() for page in (other, one))
+    np.testing.assert_allclose(found, expected, atol=0.02 * np.abs(expected).max())
+
+
+def test_keyframes_go_on_at_their_time():
+    sim = block()
+    sim.body.prescribe("z == zmax", times=[0.0, 1.0], displacements=[[0, 0, 0], [0.0, 0.0, 0.02]])
+    page = Session(sim)
+    sim.advance(0.5)
+    page.switch(models=[wc.StVenantKirchhoff()])
+    page.sim.advance(0.25)
+    top = page.sim.body.mesh.points[:, 2] > 0.199
+    np.testing.assert_allclose(page.sim.body.displacements.numpy()[top, 2], 0.015, atol=1e-4)
+
+
+def test_what_is_refused_leaves_all_as_it_was():
+    page = session()
+    former = page.sim
+    page.press(1, 0, TOP)
+    page.ask(lambda: page.switch(models=[wc.Corotated(rotation_level=99)]))
+    page.take_commands()
+    assert page.note
+    assert page.sim is former
+    assert page.hands
+    page.busy = True
+    page.ask(page.reset)
+    page.take_commands()
+    assert "being saved" in page.note
+
+
+def test_a_simulation_with_tools_is_not_switched():
+    tool = wc.Tool(wc.Sphere(radius=0.01, position=(0.05, 0.05, 0.22)))
+    page = Session(block(obstacles=[tool]))
+    former = page.sim
+    page.ask(page.switch)
+    page.take_commands()
+    assert page.sim is former
+    assert "a tool belongs to one simulation" in page.note
+    tool.move((0.05, 0.05, 0.205))
+    frame = still(page, 0.2)
+    assert frame.poses[0][2] == pytest.approx(0.205, abs=1e-4)
+    assert tool.wrench.numpy()[0, 2] > 0.0
+
+
+def test_closed_the_simulation_is_free():
+    page = session()
+    page.press(1, 0, TOP)
+    page.close()
+    assert page.sim.system.forces == []
+    page.sim.advance(0.1)
+
+
+def test_stresses_are_averages_of_the_elements_around(device, rng):
+    """As the pictures of ``simulate`` have them."""
+    from warp_corot.io.pictures.colors import VertexAverage
+    from warp_corot.mesh.surfaces.boundary import signed_volumes
+
+    page = session(device)
+    body, shown = page.sim.body, page.shown[0]
+    mesh = body.mesh
+    body.displacements = 1e-3 * rng.standard_normal(mesh.points.shape)
+    found = page.sources["stress"].values(page.sim, shown)
+    average = VertexAverage(mesh.tets, np.abs(signed_volumes(mesh.points, mesh.tets)), len(mesh.points))
+    nodes, weights = shown.binding.nodes.numpy(), shown.binding.weights.numpy()
+    expected = (weights * average(page.sim.von_mises())[nodes]).sum(axis=1)
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    assert (page.sources["level"].values(page.sim, shown) == 6.0).all()
+
+
+def test_a_body_on_the_ground_shows_what_it_touches_and_is_switched_with_it():
+    mesh = wc.TetForest.box(cells=(1, 1, 1), cell_size=0.1, level=6, origin=(0.0, 0.0, 0.001))
+    body = wc.SoftBody(mesh, wc.Isotropic(5e4, 0.4, 1000.0), device="cpu")
+    ball = wc.Sphere(radius=0.02, position=(0.3, 0.0, 0.0))
+    integrator, down = wc.SymplecticEuler(damping=20.0), (0.0, 0.0, -9.81)
+    sim = wc.Simulation(body, integrator=integrator, gravity=down, obstacles=[wc.Ground(), ball])
+    page = Session(sim)
+    assert page.sources["contact pressure"].applies(body)
+    page.change(colors="contact pressure")
+    for _ in range(2):
+        frame = still(page, 0.5)
+        values = page.sources["contact pressure"].values(page.sim, page.shown[0])
+        low = page.shown[0].rest[:, 2] < 0.002
+        inner = low & (np.abs(page.shown[0].rest[:, :2] - 0.05) < 0.03).all(axis=1)
+        assert values[inner].mean() == pytest.approx(1000.0 * 9.81 * 0.1, rel=0.15)
+        assert values[~low].max() < 0.3 * values[low].mean()
+        assert frame.positions[0][:, 2].min() > -0.002
+        np.testing.assert_allclose(frame.poses[1][:3], (0.3, 0.0, 0.0))
+        page.switch(models=[wc.NeoHookean()])
+    assert not session().sources["contact pressure"].applies(session().sim.body)
+
+
+FACES = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+
+
+@pytest.mark.parametrize(
+    ("shape", "volume"),
+    [
+        (wc.Sphere(radius=0.1), 4 / 3 * np.pi * 1e-3),
+        (wc.Capsule(radius=0.1, length=0.2), 4 / 3 * np.pi * 1e-3 + 0.2 * np.pi * 1e-2),
+        (wc.Cylinder(radius=0.1, length=0.2), 0.2 * np.pi * 1e-2),
+        (wc.Box((0.1, 0.2, 0.3)), 0.006),
+        (wc.Ground(), 0.04),
+        (wc.TriangleMesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]], FACES), 1e-3 / 6),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_obstacles_are_drawn_as_large_as_they_are(shape, volume):
+    pytest.importorskip("trimesh")
+    from warp_corot.viewing.rigid import mesh_of
+
+    mesh = mesh_of(shape, 1.0)
+    assert mesh.volume == pytest.approx(volume, rel=0.03)
+    assert mesh.center_mass[:2] == pytest.approx(0.025 if isinstance(shape, wc.TriangleMesh) else 0.0, abs=1e-6)
+    if isinstance(shape, wc.Ground):
+        assert mesh.bounds[1][2] == pytest.approx(0.0)
+    elif not isinstance(shape, wc.TriangleMesh):
+        assert mesh.bounds.mean(axis=0) == pytest.approx(0.0, abs=1e-6)

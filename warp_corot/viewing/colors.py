@@ -1,0 +1,151 @@
+"""What the colours of a surface say: sources of values by name, and their colours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.io.pictures.colors import TISSUE, color_index, round_limit, stress_colors
+from warp_corot.kernels.viewing import values as kernels
+from warp_corot.mesh import TetForest
+from warp_corot.mesh.surfaces.boundary import signed_volumes
+from warp_corot.simulation.simulation import Simulation
+
+from .shown import Shown
+
+Values: TypeAlias = npt.NDArray[np.floating]
+
+#: The colour map, uint8 [256, 3].
+_TABLE = np.rint(255.0 * stress_colors()).astype(np.uint8)
+#: A range of colours that is more than this many times too wide becomes narrower.
+TOO_WIDE = 3.0
+
+
+@dataclass(frozen=True)
+class Source:
+    """Values that colours can show.
+
+    Attributes:
+        unit: Of the values.
+        values: At the points of a shown surface, [V], for a simulation and one of its bodies.
+        applies: Whether a body has such values.
+    """
+
+    unit: str
+    values: Callable[[Simulation, Shown], Values]
+    applies: Callable[[SoftBody], bool] = lambda _: True
+
+
+def displacement(sim: Simulation, shown: Shown) -> Values:
+    """How far the points are from where they were at rest [m]."""
+    return np.linalg.norm(shown.positions - shown.rest, axis=1)
+
+
+class ElementValues:
+    """Values of elements, averaged to nodes by volume and carried to the points of a surface, on the device.
+
+    Args:
+        values: Of the elements of the first world, float32 [T] or more, on the body's device.
+    """
+
+    def __init__(self, values: Callable[[Simulation, SoftBody], wp.array]):
+        self._values = values
+        self._averages: dict[SoftBody, _Average] = {}
+
+    def __call__(self, sim: Simulation, shown: Shown) -> Values:
+        body = shown.body
+        average = self._averages.get(body)
+        if average is None or average.version != body.version:
+            average = self._averages[body] = _Average(body)
+        return average(self._values(sim, body), shown)
+
+
+class _Average:
+    """Averages of the elements around each node of a body's present mesh."""
+
+    def __init__(self, body: SoftBody):
+        mesh, self._device, self.version = body.mesh, body.device, body.version
+        volumes = np.abs(signed_volumes(mesh.points, mesh.tets))
+        around = np.bincount(mesh.tets.ravel(), np.repeat(volumes, 4), len(mesh.points))
+        self._tets = wp.array(mesh.tets, dtype=wp.vec4i, device=self._device)
+        # Over the mean, as float32 holds no cubes of small lengths.
+        scale = float(volumes.mean())
+        self._volumes, self._around = (
+            wp.array(each / scale, dtype=wp.float32, device=self._device) for each in (volumes, around)
+        )
+        self._sums = wp.zeros_like(self._around)
+
+    def __call__(self, values: wp.array, shown: Shown) -> Values:
+        binding, found = shown.binding, wp.empty(len(shown.rest), dtype=wp.float32, device=self._device)
+        self._sums.zero_()
+        inputs = [values, self._tets, self._volumes]
+        wp.launch(kernels.add_to_nodes, len(self._tets), inputs, [self._sums], device=self._device)
+        inputs = [binding.nodes, binding.weights, self._sums, self._around]
+        wp.launch(kernels.carry_to_points, len(found), inputs, [found], device=self._device)
+        return found.numpy()
+
+
+def _stress(sim: Simulation, body: SoftBody) -> wp.array:
+    field = sim.fields[sim.bodies.index(body)]
+    stress = wp.zeros(field.element_count, dtype=wp.float32, device=body.device)
+    with field.state_kept():
+        field.write_von_mises(body.state.displacements, stress)
+    return stress
+
+
+def _level(sim: Simulation, body: SoftBody) -> wp.array:
+    assert isinstance(body.mesh, TetForest)
+    return wp.array(body.mesh.levels, dtype=wp.float32, device=body.device)
+
+
+def contact_pressure(sim: Simulation, shown: Shown) -> Values:
+    """Pressure of contact in the last step [Pa]: of triangles, averaged to nodes by area."""
+    body = shown.body
+    corners, pressure = body.surface_triangles, body.contact_pressure.numpy()
+    a, b, c = np.moveaxis(body.mesh.points[corners], 1, 0)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    count = len(body.mesh.points)
+    weighted = np.bincount(corners.ravel(), np.repeat(areas * pressure[: len(corners)], 3), count)
+    nodal = weighted / np.maximum(np.bincount(corners.ravel(), np.repeat(areas, 3), count), 1e-300)
+    return np.einsum("vn,vn->v", shown.binding.weights.numpy(), nodal[shown.binding.nodes.numpy()])
+
+
+def sources() -> dict[str, Source]:
+    """What can be shown, by name; those that keep something of a body belong to one session."""
+    return {
+        "stress": Source("Pa", ElementValues(_stress)),
+        "displacement": Source("m", displacement),
+        "contact pressure": Source("Pa", contact_pressure, lambda body: body.state.is_touched),
+        "level": Source("", ElementValues(_level), lambda body: isinstance(body.mesh, TetForest)),
+    }
+
+
+class Range:
+    """From where to where colours go: from zero to a round number that follows the largest value."""
+
+    def __init__(self) -> None:
+        self.highest = 0.0
+
+    def follow(self, largest: float) -> float:
+        """The highest value of the range, after values of which this is the largest."""
+        if largest > self.highest or largest < self.highest / TOO_WIDE:
+            self.highest = round_limit(largest)
+        return self.highest
+
+
+def colored(values: Values | None, highest: float, count: int) -> npt.NDArray[np.uint8]:
+    """Colours of values from zero to ``highest``, uint8 [V, 3]; of tissue where there are none.
+
+    Args:
+        values: [V].
+        count: V.
+    """
+    if values is None:
+        return np.tile(np.rint(255.0 * np.array(TISSUE)).astype(np.uint8), (count, 1))
+    return _TABLE[color_index(values, 0.0, highest)]

@@ -1,0 +1,176 @@
+"""Who may come in: a check of every request that viser's server gets, before anything is answered.
+
+A browser sends requests for every page that it shows. Without a token only those count that name this computer, so that
+no name on the network can be made to mean it, and websockets must come from the page itself. With a token every request
+must bring it, at first in the address, later in a cookie.
+"""
+
+from __future__ import annotations
+
+import hmac
+import http
+import http.client
+import http.cookies
+import secrets
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from ipaddress import ip_address
+from typing import Any
+from urllib.parse import parse_qs, quote, urlsplit
+
+from warp_corot.errors import InputError
+
+#: What a browser may call the computer that it runs on.
+LOOPBACK = ("localhost", "127.0.0.1", "::1")
+#: How long the server may take to answer when it is tried [s].
+PATIENCE = 5.0
+#: Servers are started one at a time: a name of the module ``websockets`` is another one meanwhile.
+_starting = threading.Lock()
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address can be reached from this computer alone."""
+    try:
+        return ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def new_token() -> str:
+    """A token that nobody guesses."""
+    return secrets.token_urlsafe(16)
+
+
+class Gate:
+    """Lets requests pass or refuses them.
+
+    Args:
+        host: The address that is listened to.
+        token: What requests must bring; None: they must come from this computer.
+
+    Raises:
+        InputError: No token where others can reach the address, or one that is empty.
+    """
+
+    def __init__(self, host: str, token: str | None = None):
+        if token is not None and not token.strip():
+            raise InputError("token is empty; it must be a word that only those know who may come in")
+        if token is None and not is_loopback(host):
+            raise InputError(f"host is {host}, which others can reach; it must have a token")
+        self.host, self.token = host, token
+        self._cookie = "warp-corot-" + secrets.token_hex(4)
+
+    def address(self, port: int) -> str:
+        """What to open in a browser."""
+        host = "localhost" if self.host in ("0.0.0.0", "::", "") else self.host
+        shown = f"http://{f'[{host}]' if ':' in host else host}:{port}/"
+        return shown if self.token is None else f"{shown}?token={quote(self.token, safe='')}"
+
+    def refusal(self, path: str, headers: Any) -> tuple[http.HTTPStatus, dict[str, str]] | None:
+        """The status and the headers of the answer to a request, None if it may pass.
+
+        Args:
+            path: With its query.
+            headers: A mapping of names, whatever their case.
+        """
+        forbidden: tuple[http.HTTPStatus, dict[str, str]] = (http.HTTPStatus.FORBIDDEN, {})
+        try:
+            host = headers.get("Host") or ""
+            origin = headers.get("Origin")
+            if self.token is None and urlsplit(f"//{host}").hostname not in (*LOOPBACK, self.host):
+                return forbidden
+            if origin is not None and urlsplit(origin).netloc != host:
+                return forbidden
+            if self.token is None or self._has_cookie(headers):
+                return None
+            given = parse_qs(urlsplit(path).query).get("token", [])
+        except Exception:  # whatever cannot be read may not pass
+            return forbidden
+        if len(given) != 1 or not self._is_token(given[0]):
+            return forbidden
+        if (headers.get("Upgrade") or "").lower() == "websocket":
+            return None
+        # The address in the browser's line, its history and what it tells others is without the token from now on.
+        cookie = f"{self._cookie}={quote(given[0], safe='')}; HttpOnly; SameSite=Strict; Path=/"
+        return http.HTTPStatus.SEE_OTHER, {"Location": urlsplit(path).path or "/", "Set-Cookie": cookie}
+
+    def _has_cookie(self, headers: Any) -> bool:
+        jar = http.cookies.SimpleCookie(headers.get("Cookie") or "")
+        found = jar.get(self._cookie)
+        assert self.token is not None
+        return found is not None and hmac.compare_digest(
+            found.value.encode(errors="surrogatepass"), quote(self.token, safe="").encode()
+        )
+
+    def _is_token(self, given: str) -> bool:
+        assert self.token is not None
+        return hmac.compare_digest(given.encode(errors="surrogatepass"), self.token.encode())
+
+
+@contextmanager
+def guarded(gate: Gate) -> Iterator[None]:
+    """Servers that begin inside ask the gate about each request, of the page's files and of websockets alike."""
+    import websockets.asyncio.server as servers
+    from websockets.datastructures import Headers
+    from websockets.http11 import Response
+
+    with _starting:
+        serve = servers.serve
+
+        def asking(*args: Any, process_request: Any = None, **options: Any) -> Any:
+            def process(connection: Any, request: Any) -> Any:
+                refused = gate.refusal(request.path, request.headers)
+                if refused is None:
+                    return None if process_request is None else process_request(connection, request)
+                status, told = refused
+                body = b"" if told else b"The page is closed to this request; open the address with its token.\n"
+                headers = Headers(**{"Content-Type": "text/plain", "Content-Length": str(len(body)), **told})
+                return Response(status, status.phrase, headers, body)
+
+            return serve(*args, process_request=process, **options)
+
+        servers.serve = asking
+        try:
+            yield
+        finally:
+            servers.serve = serve
+
+
+def is_closed(gate: Gate, port: int) -> bool:
+    """Whether the server refuses what the gate does: requests from elsewhere, or without the token."""
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(gate.host, gate.host)
+    upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
+    upgrade["Sec-WebSocket-Key"] = "dGhlIHNhbXBsZSBub25jZQ=="
+    for headers in ({}, upgrade):
+        connection = http.client.HTTPConnection(host, port, timeout=PATIENCE)
+        try:
+            connection.request("GET", "/?token=", headers={"Host": "elsewhere.invalid", **headers})
+            if connection.getresponse().status != http.HTTPStatus.FORBIDDEN:
+                return False
+        except (OSError, http.client.HTTPException):
+            return False
+        finally:
+            connection.close()
+    return True
+
+
+def check_port(host: str, port: int) -> None:
+    """See that a port is free; 0 stands for any that is.
+
+    Raises:
+        InputError: It is not, or there is no such address here.
+    """
+    if not 0 <= port <= 65535:
+        raise InputError(f"port is {port}; it must be 0 to 65535")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as tried:
+            tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            tried.bind(address)
+    except OSError as error:
+        if isinstance(error, socket.gaierror):
+            raise InputError(f"host is {host!r}; it must be an address of this computer") from None
+        why = error.strerror or str(error)
+        raise InputError(f"port {port} of {host} cannot be had ({why}); it must be a free one, or 0 for any") from None

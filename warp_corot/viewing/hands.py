@@ -1,0 +1,128 @@
+"""What a person does to a body: one small class for each way, listed in ``HANDS``.
+
+A hand takes hold of a picked place, is moved, and says the force that it exerts. Those here are springs; a hand that
+moves a rigid tool needs the same few members.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from .shown import Pick, Shown
+from .springs import MOST_POINTS, Patch, Springs
+
+Vector = npt.NDArray[np.float64]
+
+
+class Hand(Protocol):
+    """Something that a person holds a body with.
+
+    Class attributes:
+        stays: Whether it holds on when the mouse lets go.
+    """
+
+    stays: ClassVar[bool]
+    pick: Pick
+
+    def move(self, motion: Vector) -> None:
+        """The mouse is so far from where it was pressed [m], [3]."""
+        ...
+
+    def release(self) -> None:
+        """Let go; once more does no harm."""
+        ...
+
+    @property
+    def force(self) -> Vector:
+        """On the body, in the last step [N], float64 [3]."""
+        ...
+
+    @property
+    def ends(self) -> tuple[Vector, Vector]:
+        """From where to where it pulls [m], float64 [3] each."""
+        ...
+
+
+class SpringHand:
+    """A spring between the mouse and a patch around the picked place.
+
+    Args:
+        springs: Of the simulation.
+        shown: The surface that the place is on.
+        pick: The place.
+        radius: Of the patch, at rest [m].
+        strength: Stiffness over the largest that the time step carries, 0 to 1.
+    """
+
+    rigid: ClassVar[bool] = False
+    stays: ClassVar[bool] = False
+
+    def __init__(self, springs: Springs, shown: Shown, pick: Pick, radius: float, strength: float = 1.0):
+        self.pick = pick
+        self._inward = -shown.normal(pick)
+        self._spring = springs.hold(pick.body, patch_around(shown, pick, radius), rigid=self.rigid, strength=strength)
+        self._before: Vector = np.zeros(3)
+
+    def begin(self) -> None:
+        """The mouse takes hold once more: motion counts from here."""
+        self._before = self._spring.motion
+
+    def move(self, motion: Vector) -> None:
+        self._spring.move(self._before + motion)
+
+    def release(self) -> None:
+        self._spring.release()
+
+    @property
+    def force(self) -> Vector:
+        return self._spring.force
+
+    @property
+    def ends(self) -> tuple[Vector, Vector]:
+        return self._spring.ends
+
+
+class Drag(SpringHand):
+    """Draws the tissue after the mouse; the patch may turn and stretch."""
+
+
+class Press(SpringHand):
+    """Pushes the patch as it is into the body, as deep as the mouse goes away, like a stamp of the patch's shape."""
+
+    rigid = True
+
+    def move(self, motion: Vector) -> None:
+        self._spring.move(float(np.linalg.norm(motion)) * self._inward)
+
+
+class Grasp(SpringHand):
+    """Holds the patch as it is, and stays where the mouse leaves it, until it is released."""
+
+    rigid = True
+    stays = True
+
+
+HANDS: dict[str, type[SpringHand]] = {"drag": Drag, "press": Press, "grasp": Grasp}
+
+
+def patch_around(shown: Shown, pick: Pick, radius: float) -> Patch:
+    """The points of the shown surface within a radius at rest [m] of a place, more where they are nearer; the corners
+    of its triangle at the least."""
+    corners = shown.triangles[pick.triangle]
+    distance = np.linalg.norm(shown.rest - shown.at(pick, shown.rest), axis=1)
+    near = np.flatnonzero(distance < radius)
+    near = near[np.argsort(distance[near], kind="stable")]
+    # Evenly thinned: the nearest ones alone would be a smaller patch.
+    near = near[:: -(-len(near) // (MOST_POINTS - 3))] if len(near) > MOST_POINTS - 3 else near
+    points, place = np.unique(np.concatenate([corners, near]), return_inverse=True)
+    shares = np.concatenate([pick.place, (1.0 - (distance[near] / max(radius, 1e-300)) ** 2) ** 2])
+    total = np.bincount(place, shares, len(points))
+    there = np.zeros(len(shown.rest), bool)
+    there[points] = there[distance < radius] = True
+    a, b, c = np.moveaxis(shown.rest[shown.triangles], 1, 0)
+    areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    area = float(areas @ there[shown.triangles].mean(axis=1))
+    return Patch(points.astype(np.int32), total / total.sum(), area)

@@ -1,0 +1,70 @@
+"""viser's server, behind the gate and without what it does unasked."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from typing import TYPE_CHECKING, Any
+
+from warp_corot.errors import InputError
+
+from .gate import Gate, check_port, guarded, is_closed
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+
+def library() -> Any:
+    """The package viser.
+
+    Raises:
+        InputError: It is not installed.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise InputError(f'the page needs viser ({error}): pip install "warp-corot[view]"') from None
+    return viser
+
+
+def open_server(gate: Gate, port: int, title: str) -> ViserServer:
+    """Start the server.
+
+    Args:
+        gate: Says who may come in.
+        port: Where to listen, 0 for any free port.
+        title: Of the page.
+
+    Raises:
+        InputError: viser is not there, the port is taken, or the gate would not be asked.
+    """
+    viser = library()
+    check_port(gate.host, port)
+    with guarded(gate), contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host=gate.host, port=port, label=title, verbose=False)
+    bound = server.get_port()
+    try:
+        if port not in (0, bound):
+            raise InputError(f"port is {port}, which is taken; it must be free, or 0 for any")
+        if not is_closed(gate, bound):
+            raise InputError(f"viser {viser.__version__} does not ask who may come in; the page needs another version")
+        _without_tunnel(server)
+    except BaseException:
+        stop(server)
+        raise
+    return server
+
+
+def stop(server: ViserServer) -> None:
+    """Stop the server, quietly."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+def _without_tunnel(server: ViserServer) -> None:
+    """No visitor may have the page published through a tunnel."""
+    from viser import _messages
+
+    server._connection.unregister_handler(_messages.ShareUrlRequest)
+    server.gui.configure_theme(show_logo=False, show_share_button=False)
+    server.gui.main_panel.dock_right()

@@ -1,0 +1,273 @@
+"""A simulation under a person's hands: commands taken between advances, time shared with a clock on the wall, frames.
+
+Nothing here knows a browser. One thread calls ``tick``; others hand it commands by ``ask`` and touch nothing else.
+"""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.contact.tool import Tool
+from warp_corot.errors import InputError, UnstableError
+from warp_corot.mesh.surfaces.bound import SurfaceMesh
+from warp_corot.simulation.remade import remade
+from warp_corot.simulation.simulation import Simulation
+
+from .colors import Range, Source, colored, sources
+from .cutting import cut
+from .frames import Controls, Frame, Vector
+from .hands import HANDS, SpringHand
+from .pacing import Pace
+from .shown import Shown, surfaces_of
+from .springs import Springs
+
+
+class Session:
+    """A simulation, what is shown of it, and the hands that hold it.
+
+    Args:
+        sim: The simulation.
+        own: Of each body the user's own surface, or None.
+        made: Called with every simulation that takes the place of another.
+
+    Attributes:
+        sim: The present simulation: another one after its law, material or remeshing was switched.
+        controls: As the page has them; only commands change them.
+        shown: What is shown of each body.
+        hands: Those that hold something, by who moves them.
+        note: What the person should know, if anything.
+        sending: How long it took to send the last frame [s], as who sends it says.
+        busy: Whether something is being saved, for which the simulation must stay the same one.
+    """
+
+    def __init__(
+        self,
+        sim: Simulation,
+        own: Sequence[Any] | None = None,
+        made: Callable[[Simulation], None] | None = None,
+    ):
+        self.sim, self.controls, self.note, self.busy = sim, Controls(), "", False
+        self._own = list(own or [None] * len(sim.bodies))
+        self._made = made
+        self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self.hands: dict[Any, SpringHand] = {}
+        self.pace, self.sending = Pace(), 0.0
+        self.number = 0
+        self._versions: list[int] = []
+        self._steps_asked = 0
+        self._open()
+
+    # --- commands --------------------------------------------------------------------------------------------------
+
+    def ask(self, command: Callable[[], None]) -> None:
+        """Have a command called between two advances; from any thread."""
+        self._commands.put(command)
+
+    def take_commands(self) -> None:
+        """Call all commands that wait. One that is refused leaves a note."""
+        while True:
+            try:
+                command = self._commands.get_nowait()
+            except queue.Empty:
+                return
+            try:
+                command()
+            except (InputError, LookupError, UnstableError) as error:
+                self.note = str(error)
+
+    def change(self, **values: Any) -> None:
+        """Change controls; what is shown follows."""
+        shown = self.controls.surface, self.controls.plane
+        self.controls = replace(self.controls, **values)
+        if (self.controls.surface, self.controls.plane) != shown:
+            self._show()
+
+    def step(self, count: int = 1) -> None:
+        """Make so many steps although time stands still."""
+        self._steps_asked += count
+
+    def reset(self) -> None:
+        """Let everything go and go back to the beginning.
+
+        Raises:
+            InputError: Something is being saved.
+        """
+        self._check_free()
+        self.release_all()
+        self.sim.reset()
+        self.note = ""
+
+    def switch(self, **what: Any) -> None:
+        """Go on with other laws, materials or remeshing: ``remade``'s arguments. Hands let go.
+
+        Raises:
+            InputError: Something is being saved, or as ``remade``; then nothing has changed.
+        """
+        self._check_free()
+        what.setdefault("remesh", [None if c is None else c.options for c in self.sim.remeshing.changing])
+        again = remade(self.sim, **what)
+        if self._made is not None:
+            self._made(again)
+        self._close()
+        self.sim = again
+        self._open()
+
+    def close(self) -> None:
+        """Let everything go and leave the simulation as it is."""
+        self._close()
+
+    # --- hands -----------------------------------------------------------------------------------------------------
+
+    def press(self, owner: Any, body: int, position: npt.ArrayLike) -> None:
+        """A mouse takes hold of the place of a body's shown surface that is nearest to a position [m].
+
+        A hand that stays and holds that place is moved on.
+        """
+        pick = self.shown[body].pick(body, position)
+        for held, hand in list(self.hands.items()):
+            if hand.stays and hand.pick.body == body and self._is_near(hand, pick):
+                self.hands[owner] = self.hands.pop(held)
+                hand.begin()
+                return
+        self.let_go(owner)
+        kind = HANDS[self.controls.hand]
+        radius = self.controls.radius * self.size
+        self.hands[owner] = kind(self.springs, self.shown[body], pick, radius, self.controls.strength)
+
+    def move(self, owner: Any, motion: npt.ArrayLike) -> None:
+        """The mouse is so far from where it was pressed [m], [3]."""
+        if owner in self.hands and np.isfinite(motion).all():
+            self.hands[owner].move(np.asarray(motion, dtype=np.float64))
+
+    def let_go(self, owner: Any) -> None:
+        """The mouse was released; hands that stay do."""
+        hand = self.hands.get(owner)
+        if hand is None:
+            return
+        if hand.stays:
+            self.hands[(owner, id(hand))] = self.hands.pop(owner)
+        else:
+            self.hands.pop(owner).release()
+
+    def release_all(self) -> None:
+        """All hands let go."""
+        for hand in self.hands.values():
+            hand.release()
+        self.hands.clear()
+
+    # --- time ------------------------------------------------------------------------------------------------------
+
+    def tick(self) -> Frame:
+        """Take commands, advance by as much as a frame's time allows, and read the frame."""
+        started = time.perf_counter()
+        self.take_commands()
+        before = self.sim.total_time
+        stepping = -time.perf_counter()
+        try:
+            if self.controls.running:
+                self.sim.advance(self.pace.wanted(self.controls.speed, 1.0 / self.controls.fps))
+            elif self._steps_asked:
+                self.sim.advance_steps(self._steps_asked)
+        except UnstableError as error:
+            self.note = f"{error}; time stands still, reset goes back to the beginning"
+            self.controls = replace(self.controls, running=False)
+        stepping += time.perf_counter()
+        self._steps_asked = 0
+        frame = self.frame()
+        simulated = self.sim.total_time - before
+        # What was sent since the last frame counts, and waiting for the next one does not.
+        self.pace.took(simulated, stepping, time.perf_counter() - started - stepping + self.sending)
+        return frame
+
+    def frame(self) -> Frame:
+        """What is seen now."""
+        versions = [body.version for body in self.sim.bodies]
+        if versions != self._versions:
+            self._versions = versions
+            self.springs.refit()
+        positions = [shown.read() for shown in self.shown]
+        source = self.sources.get(self.controls.colors)
+        values = [self._values(source, shown) for shown in self.shown]
+        highest = self._range.follow(max((float(v.max(initial=0.0)) for v in values if v is not None), default=0.0))
+        return Frame(
+            number=self.number,
+            positions=positions,
+            triangles=[shown.triangles for shown in self.shown],
+            colors=[colored(v, highest, len(p)) for v, p in zip(values, positions, strict=True)],
+            highest=highest,
+            poses=[tool.present_pose[0] for tool in self.tools],
+            time=self.sim.time,
+            ratio=self.pace.ratio,
+            slow=self.controls.running and self.pace.is_slow(self.controls.speed),
+            forces={owner: hand.force for owner, hand in self.hands.items()},
+            ends={owner: hand.ends for owner, hand in self.hands.items()},
+        )
+
+    # --- pieces ----------------------------------------------------------------------------------------------------
+
+    @property
+    def size(self) -> float:
+        """The longest side of the box around all bodies at rest [m]."""
+        return float(np.ptp(self.bounds, axis=0).max())
+
+    @property
+    def bounds(self) -> Vector:
+        """Lowest and highest coordinates of all bodies at rest [m], [2, 3]."""
+        points = [body.mesh.points for body in self.sim.bodies]
+        return np.stack([np.min([p.min(axis=0) for p in points], 0), np.max([p.max(axis=0) for p in points], 0)])
+
+    @property
+    def tools(self) -> list[Tool]:
+        """The rigid obstacles that bodies touch."""
+        return [] if self.sim.contact is None else self.sim.contact.obstacles.tools
+
+    def _check_free(self) -> None:
+        if self.busy:
+            raise InputError("something is being saved; it must end first")
+
+    def _open(self) -> None:
+        """Begin with the present simulation."""
+        self.sources, self._range = sources(), Range()
+        own = zip(self.sim.bodies, self._own, strict=True)
+        self.surfaces = [surfaces_of(body.mesh, each) for body, each in own]
+        self.shown: list[Shown] = []
+        self._show(first=True)
+
+    def _show(self, first: bool = False) -> None:
+        """Show the surfaces that the controls name; hands let go."""
+        if not first:
+            self._close()
+        pairs = zip(self.sim.bodies, self.surfaces, strict=True)
+        self.shown = [Shown(body, self._surface(body.mesh, surfaces)) for body, surfaces in pairs]
+        self.springs = Springs(self.sim, self.shown)
+        self.number += 1
+        for shown in self.shown:
+            shown.read()
+
+    def _surface(self, mesh: Any, surfaces: dict[str, SurfaceMesh]) -> SurfaceMesh:
+        name = self.controls.surface
+        surface = surfaces[name] if name in surfaces else next(iter(surfaces.values()))
+        return surface if self.controls.plane is None else cut(surface, mesh, self.controls.plane)
+
+    def _close(self) -> None:
+        self.release_all()
+        self.springs.close()
+        for shown in self.shown:
+            shown.close()
+
+    def _values(self, source: Source | None, shown: Shown) -> npt.NDArray[np.floating] | None:
+        if source is None or not source.applies(shown.body):
+            return None
+        return source.values(self.sim, shown)
+
+    def _is_near(self, hand: SpringHand, pick: Any) -> bool:
+        shown = self.shown[pick.body]
+        apart = shown.at(hand.pick, shown.rest) - shown.at(pick, shown.rest)
+        return float(np.linalg.norm(apart)) < max(self.controls.radius, 0.02) * self.size

@@ -1,0 +1,226 @@
+"""Springs between hands and the shown surfaces: forces of the system, launched within each step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.kernels.viewing import hands as kernels
+from warp_corot.simulation.simulation import Simulation
+
+from .shown import Shown
+
+#: Hands that can hold a body at the same time, and points that a patch has at most: one thread goes through them.
+MOST_HANDS, MOST_POINTS = 8, 64
+#: The spring's own frequency squared, times the longest step squared; elasticity takes up to 3.3 of the 4 there are.
+STIFF = 0.2
+#: Damping of the spring over critical damping.
+DAMPED = 0.1
+#: The largest force on a patch over Young's modulus and the patch's area: beyond, elements turn over and stay so.
+HARDEST = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """Points of a shown surface, and how much each counts.
+
+    Attributes:
+        points: int32 [k], at most MOST_POINTS.
+        shares: They sum to one, float64 [k].
+        area: Of the surface around them at rest [m^2].
+    """
+
+    points: npt.NDArray[np.int32]
+    shares: npt.NDArray[np.float64]
+    area: float
+
+
+class Springs:
+    """The springs of all hands of a simulation. ``sim.system.forces`` has one of these.
+
+    Args:
+        sim: The simulation.
+        shown: The shown surface of each body.
+
+    Attributes:
+        revision: Changes when a body is first held, since its launches then begin.
+    """
+
+    def __init__(self, sim: Simulation, shown: Sequence[Shown]):
+        self.sim, self.shown, self.revision = sim, shown, 0
+        self._bodies: dict[int, _BodySprings] = {}
+        sim.system.forces.append(self)
+
+    def close(self) -> None:
+        """Let everything go and leave the simulation."""
+        self.sim.system.forces.remove(self)
+        self._bodies.clear()
+
+    def add_forces(self) -> None:
+        """Launch the forces of all hands; may be recorded."""
+        for springs in self._bodies.values():
+            springs.launch()
+
+    def complete_work(self) -> None:
+        """Launch that the work of all hands is counted up to the present state; may be recorded."""
+        for springs in self._bodies.values():
+            springs.launch_completion()
+
+    def hold(self, body: int, patch: Patch, *, rigid: bool, strength: float = 1.0) -> Spring:
+        """Take hold of a patch as it is now.
+
+        Args:
+            body: Which body.
+            patch: Points of its shown surface.
+            rigid: Whether every point is held; else their mean.
+            strength: Stiffness over the largest that the time step carries, 0 to 1.
+
+        Raises:
+            LookupError: As many hands as there can be hold the body already.
+        """
+        if body not in self._bodies:
+            self._bodies[body] = _BodySprings(self.sim, self.shown[body])
+            self.revision += 1
+        return self._bodies[body].hold(patch, rigid, strength)
+
+    def refit(self) -> None:
+        """Find the stiffness anew where meshes, or their nodes' masses, are others now."""
+        for springs in self._bodies.values():
+            springs.refit()
+
+
+class Spring:
+    """The spring of one hand; see ``Springs.hold``.
+
+    Attributes:
+        stiffness: Of the whole patch [N/m].
+        limit: The largest force on it [N].
+        slot: Its place among the hands of the body.
+        motion: How far the hand has moved since it took hold [m], float64 [3].
+    """
+
+    def __init__(self, owner: _BodySprings, slot: int, patch: Patch, rigid: bool, strength: float):
+        self._owner, self.slot = owner, slot
+        self.patch, self.rigid, self.strength = patch, rigid, strength
+        self.stiffness = self.damping = self.limit = 0.0
+        self.motion: npt.NDArray[np.float64] = np.zeros(3)
+        self.start: npt.NDArray[np.float64] = np.zeros(3)
+
+    def move(self, motion: npt.ArrayLike) -> None:
+        """The hand is so far from where it took hold [m], [3]."""
+        self.motion = np.asarray(motion, dtype=np.float64)
+        self._owner.write(self.slot)
+
+    def release(self) -> None:
+        """Let go; once more does no harm."""
+        self._owner.release(self.slot, self)
+
+    @property
+    def force(self) -> npt.NDArray[np.float64]:
+        """The force on the body in the last step [N], float64 [3]; waits for the device."""
+        return self._owner.found()[self.slot, 0]
+
+    @property
+    def ends(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Where the middle of the patch is and where the hand would have it [m], float64 [3] each."""
+        middle = self.patch.shares @ self._owner.shown.rest[self.patch.points]
+        return middle + self._owner.found()[self.slot, 1], middle + self.start + self.motion
+
+
+class _BodySprings:
+    """The springs that hold one body."""
+
+    def __init__(self, sim: Simulation, shown: Shown):
+        self.sim, self.shown, self.body = sim, shown, shown.body
+        device, size = self.body.device, (MOST_HANDS, MOST_POINTS)
+        self._held: list[Spring | None] = [None] * MOST_HANDS
+        self._springs = wp.zeros(MOST_HANDS, dtype=kernels.Spring, device=device)
+        self._patches = wp.zeros(size, dtype=wp.int32, device=device)
+        self._shares = wp.zeros(size, dtype=wp.float32, device=device)
+        self._starts = wp.zeros(size, dtype=wp.vec3, device=device)
+        self._parts = wp.zeros(size, dtype=wp.vec4, device=device)
+        self._counted = wp.zeros(MOST_HANDS, dtype=wp.float32, device=device)
+        self._last = wp.zeros(size, dtype=wp.vec3, device=device)
+        self._found = wp.zeros((MOST_HANDS, 2), dtype=wp.vec3, device=device)
+
+    def launch(self) -> None:
+        system, state, binding = self.sim.system, self.body.state, self.shown.binding
+        inputs = [self._springs, self._patches, self._shares, self._starts, self._parts, binding.nodes]
+        inputs += [binding.weights, system.pace.arrays, system.offset, system.gravity]
+        inputs += [self.body.conditions.inverse_mass, state.displacements, state.velocities]
+        outputs = [self._last, self._counted, state.forces, self._found, system.support_work]
+        wp.launch(kernels.pull, MOST_HANDS, inputs, outputs, device=self.body.device)
+
+    def launch_completion(self) -> None:
+        system, binding = self.sim.system, self.shown.binding
+        inputs = [self._springs, self._patches, binding.nodes, binding.weights]
+        inputs += [system.pace.arrays, self.body.state.velocities]
+        outputs = [self._last, self._counted, system.support_work]
+        wp.launch(kernels.complete_work, MOST_HANDS, inputs, outputs, device=self.body.device)
+
+    def hold(self, patch: Patch, rigid: bool, strength: float) -> Spring:
+        if None not in self._held:
+            raise LookupError(f"{MOST_HANDS} hands hold the body already")
+        slot = self._held.index(None)
+        spring = self._held[slot] = Spring(self, slot, patch, rigid, strength)
+        count = len(patch.points)
+        self._patches[slot, :count].assign(patch.points.astype(np.int32))
+        self._shares[slot, :count].assign(patch.shares.astype(np.float32))
+        binding = self.shown.binding
+        inputs = [self._patches[slot], binding.nodes, binding.weights, self.body.state.displacements]
+        wp.launch(kernels.take_hold, count, inputs, [self._starts[slot]], device=self.body.device)
+        spring.start = patch.shares @ self._starts[slot].numpy()[:count]
+        self._last[slot].zero_()
+        self._fit(spring)
+        self.write(slot)
+        return spring
+
+    def release(self, slot: int, spring: Spring) -> None:
+        if self._held[slot] is spring:
+            self._held[slot] = None
+            self.write(slot)
+
+    def refit(self) -> None:
+        for slot, spring in enumerate(self._held):
+            if spring is not None:
+                self._fit(spring)
+                self.write(slot)
+
+    def write(self, slot: int) -> None:
+        """Let the device have a hand as it is now."""
+        spring = self._held[slot]
+        row: Any = np.zeros(1, dtype=kernels.Spring.numpy_dtype())
+        if spring is not None:
+            row["motion"], row["stiffness"], row["damping"] = spring.motion, spring.stiffness, spring.damping
+            row["limit"], row["rigid"], row["count"] = spring.limit, int(spring.rigid), len(spring.patch.points)
+        given = wp.array(row, dtype=kernels.Spring, device=self.body.device)
+        wp.copy(self._springs, given, dest_offset=slot, count=1)
+
+    def found(self) -> npt.NDArray[np.float64]:
+        """Force [N] and mean displacement [m] of every hand in the last step, float64 [hands, 2, 3]."""
+        return self._found.numpy().astype(np.float64)
+
+    def _fit(self, spring: Spring) -> None:
+        """The stiffness and the damping that the time step carries."""
+        # Copied, since a view of a device's array may be the array itself.
+        nodes = np.array(self.shown.binding.nodes.numpy()[spring.patch.points])
+        weights = np.array(self.shown.binding.weights.numpy()[spring.patch.points], dtype=np.float64)
+        weights *= spring.patch.shares[:, None]
+        used, place, visits = np.unique(nodes, return_inverse=True, return_counts=True)
+        place = place.reshape(nodes.shape)
+        self._parts[spring.slot, : len(nodes)].assign((1.0 / visits[place]).astype(np.float32))
+        total = np.bincount(place.ravel(), np.abs(weights).ravel(), len(used))
+        mass = self.body.masses[used]
+        # The largest eigenvalue of the spring over masses for a stiffness of one: exact where the patch is pulled as
+        # one, else a bound.
+        softness = float((total / mass).max() if spring.rigid else (total**2 / mass).sum())
+        safe = self.sim.safe_step
+        dt = self.sim.dt if safe is None else safe.at_rest
+        spring.stiffness = spring.strength * STIFF / (dt**2 * softness)
+        spring.limit = HARDEST * float(np.mean(self.body.material.isotropic.young)) * spring.patch.area
+        spring.damping = 2.0 * DAMPED * (spring.stiffness / softness) ** 0.5

@@ -1,0 +1,192 @@
+"""The page of a simulation: ``view`` opens it, ``View`` is what stays open."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import shown as as_shown
+from warp_corot.simulation.simulation import Simulation
+
+from .frames import Frame
+from .gate import Gate, is_loopback, new_token
+from .panel import Panel
+from .saving import Saving
+from .scene import Scene
+from .server import open_server, stop
+from .session import Session
+
+#: The page's port where none is named: viser's own.
+PORT = 8080
+
+
+class View:
+    """A page that is open.
+
+    The simulation goes on in one thread: the one that calls ``run``, or one of the page's own after ``start``. Touch it
+    only inside ``with page.held():``.
+
+    Args:
+        sim: The simulation.
+        host: The address to listen at.
+        port: Where, 0 for any free port.
+        token: What visitors must bring; see ``view``.
+        own: Of each body the user's own surface, or None.
+        made: Called with every simulation that takes the place of another.
+        run_file: What the page saves as a run file; None: nothing.
+        title: Of the page.
+
+    Attributes:
+        address: What to open in a browser.
+        port: Where the page is.
+        session: What happens.
+
+    Raises:
+        InputError: See ``view``.
+    """
+
+    def __init__(
+        self,
+        sim: Simulation,
+        *,
+        host: str = "127.0.0.1",
+        port: int = PORT,
+        token: str | None = None,
+        own: Sequence[Any] | None = None,
+        made: Callable[[Simulation], None] | None = None,
+        run_file: Callable[[Simulation], bytes] | None = None,
+        title: str = "warp_corot",
+    ):
+        if not isinstance(sim, Simulation):
+            raise InputError(f"sim is {as_shown(sim)}; it must be a Simulation, as Simulation(body) makes one")
+        gate = Gate(host, token if token is not None or is_loopback(host) else new_token())
+        self._server = open_server(gate, port, title)
+        self.port = self._server.get_port()
+        self.address = gate.address(self.port)
+        self._lock, self._over = threading.RLock(), threading.Event()
+        self._thread: threading.Thread | None = None
+        try:
+            self.session = Session(sim, own, made)
+            self._scene, self._panel = Scene(self._server, self.session), Panel(self._server, self.session)
+            Saving(self._server, self.session, lambda: self._send(self.session.frame()), run_file)
+            self._show()
+        except BaseException:
+            stop(self._server)
+            raise
+
+    @property
+    def sim(self) -> Simulation:
+        """The present simulation: another one after its law, material or remeshing was switched on the page."""
+        return self.session.sim
+
+    def run(self) -> None:
+        """Let time go on, until ``close`` or an exception such as Ctrl-C's."""
+        while not self._over.is_set():
+            started = time.perf_counter()
+            with self._lock:
+                if self._over.is_set():
+                    break
+                self._show()
+                period = 1.0 / self.session.controls.fps
+            self._over.wait(max(period - (time.perf_counter() - started), 0.0))
+
+    def start(self) -> None:
+        """Let time go on in a thread of the page's own."""
+        if self._thread is None:
+            self._thread = threading.Thread(target=self.run, name="warp_corot page", daemon=True)
+            self._thread.start()
+
+    @contextmanager
+    def held(self) -> Iterator[Simulation]:
+        """Inside, time stands still and the simulation may be looked at and changed."""
+        with self._lock:
+            yield self.session.sim
+
+    def close(self) -> None:
+        """Close the page; the simulation is the caller's again. Once more does no harm."""
+        self._over.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join()
+        with self._lock:
+            if self._server is not None:
+                self.session.close()
+                stop(self._server)
+                self._server = None
+
+    def _show(self) -> None:
+        self._send(self.session.tick())
+
+    def _send(self, frame: Frame) -> None:
+        started = time.perf_counter()
+        self._scene.show(frame, colored=bool(self.session.controls.colors))
+        self._panel.tell(frame, started)
+        self.session.sending = time.perf_counter() - started
+
+    def __enter__(self) -> View:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<a page at {self.address}{' (closed)' if self._over.is_set() else ''}>"
+
+    def _repr_html_(self) -> str:
+        """The page within a notebook."""
+        return f'<iframe src="{self.address}" width="100%" height="640" style="border:0"></iframe>'
+
+
+def view(
+    sim: Simulation,
+    *,
+    host: str = "127.0.0.1",
+    port: int = PORT,
+    token: str | None = None,
+    surface: Any = None,
+    wait: bool | None = None,
+) -> View:
+    """Open a page in which a person sees a simulation and takes hold of it with the mouse.
+
+    In a script the call returns when Ctrl-C ends the page. In a notebook, or with ``wait=False``, it returns at once,
+    and time goes on in a thread: look at the simulation inside ``with page.held() as sim:`` only.
+
+    Args:
+        sim: The simulation. Of several worlds the first is shown.
+        host: The address to listen at; the loopback address is reached from this computer alone.
+        port: Where, 0 for any free port.
+        token: What visitors must bring, as ``http://HOST:PORT/?token=…`` does. Without one only browsers on this
+            computer may come in; at an address that others reach one is made up, and is part of the page's address.
+        surface: The user's own surface of each body, as ``record`` takes it: a ``SurfaceMesh``, or None.
+        wait: Whether to return at the end of the page; None: unless Python is interactive.
+
+    Returns:
+        The page; ``close`` ends it.
+
+    Raises:
+        InputError: viser is not installed, the port is taken, or something above is out of its range.
+    """
+    own = None if surface is None else list(surface) if isinstance(surface, Sequence) else [surface]
+    if own is not None and len(own) != len(getattr(sim, "bodies", own)):
+        raise InputError(f"surface names {len(own)} surfaces; there must be one for each body")
+    page = View(sim, host=host, port=port, token=token, own=own)
+    print(f"the page is at {page.address}", flush=True)
+    if wait or (wait is None and not _is_interactive()):
+        try:
+            page.run()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            page.close()
+    else:
+        page.start()
+    return page
+
+
+def _is_interactive() -> bool:
+    """Whether Python reads what a person types, as in a notebook."""
+    return hasattr(sys, "ps1") or bool(sys.flags.interactive) or "ipykernel" in sys.modules
