@@ -1,4 +1,4 @@
-"""The command line: what it says and writes, and that it simulates what the library does."""
+"""The command line: its messages and files, and that it simulates the same as the library."""
 
 import re
 
@@ -33,7 +33,7 @@ def test_box_is_what_the_library_simulates(folder, device, capsys):
     np.testing.assert_array_equal(recorded[0], mesh.points.astype(np.float32))
     for k in (1, 2):
         sim.advance_steps(steps)
-        # On a GPU sums come in another order each time.
+        # On a GPU sums come in a different order each time.
         np.testing.assert_allclose(recorded[k], body.positions.numpy(), rtol=0, atol=0 if device == "cpu" else 1e-6)
     fixed = np.array(UsdGeom.PrimvarsAPI(tets).GetPrimvar("fixed").Get())
     np.testing.assert_array_equal(fixed == 1, mesh.points[:, 2] < 1e-9)
@@ -51,7 +51,7 @@ def test_options_reach_the_simulation(folder, capsys):
     fixed = np.array(primvars.GetPrimvar("fixed").Get()) == 1
     np.testing.assert_array_equal(fixed, first[:, 2] > 0.384 - 0.01)
     np.testing.assert_array_equal(last[fixed], first[fixed])
-    # Free fall of the far end, before the pull of the held one arrives there; in whole steps it is 1 % more.
+    # Free fall of the far end, before the wave from the fixed end arrives there; whole steps make it 1 % more.
     t, c = 0.05, 1.0
     fall = (10.0 / c) * (t - (1.0 - np.exp(-c * t)) / c)
     assert (first - last)[first[:, 2] == 0, 2] == pytest.approx(fall, rel=0.02)
@@ -73,7 +73,7 @@ def test_bear(folder, capsys):
     assert simulate("warp:bear", "-o", "bear.usd", *SHORT) == 0
     out, err = capsys.readouterr()
     assert "1986 nodes, 5354 tetrahedra" in out
-    assert "note" not in err  # it comes with all it needs
+    assert "note" not in err  # an asset has all values
     stage, _ = opened(folder / "bear.usd")
     first, *_, last = frames(folder / "bear.usd")
     assert UsdGeom.GetStageUpAxis(stage) == "Y"
@@ -86,7 +86,7 @@ def test_bear(folder, capsys):
 @pytest.mark.parametrize(
     "options",
     [
-        # Near critical damping: where it ends, soon.
+        # Near critical damping, so that it soon comes to rest.
         ["--damping", 20, "--duration", 1],
         pytest.param([], marks=pytest.mark.slow),
     ],
@@ -105,7 +105,7 @@ def test_bear_sags_by_a_tenth_and_comes_to_rest(folder, options):
 
 
 def test_any_mesh_needs_no_options(folder, capsys):
-    """A mesh in millimetres, wound wrongly here and there, with a stray node: said, and simulated all the same."""
+    """A mesh in millimetres with some wrongly wound tetrahedra and a stray node is reported and simulated."""
     tets = CUBE.tets.copy()
     points = np.concatenate([CUBE.points, [[9.0, 9.0, -9.0]]])
     write_vtk(folder / "cube.vtk", 1e3 * points, tets)
@@ -121,7 +121,7 @@ def test_any_mesh_needs_no_options(folder, capsys):
     assert "Young's modulus is" in err
     assert "coordinates" not in err
     first, *_, last = frames(folder / "a.usd")
-    bottom = np.append(CUBE.points[:, 2] == 0, False)  # meshio's formats name no up axis: Z
+    bottom = np.append(CUBE.points[:, 2] == 0, False)  # meshio's formats have no up axis: Z
     np.testing.assert_array_equal(last[bottom], first[bottom])
     assert (last - first)[:-1][~bottom[:-1], 2].max() < 0
     np.testing.assert_array_equal(last[-1], first[-1])
@@ -129,9 +129,9 @@ def test_any_mesh_needs_no_options(folder, capsys):
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 50.0])
 def test_default_stiffness_suits_every_size(folder, scale, capsys):
-    """Bodies of one shape sag by the same share of their height whatever their size."""
+    """Bodies of one shape sag by the same fraction of their height at any size."""
     write_vtk(folder / "cube.vtk", CUBE.points, CUBE.tets)
-    duration = 0.6 * scale**0.5  # time goes with the root of the size
+    duration = 0.6 * scale**0.5  # time scales with the root of the size
     args = ["--duration", duration, "--fps", 1 / duration, "--damping", 30 / scale**0.5]
     assert simulate("cube.vtk", "-o", "a.usd", "--scale", scale, "--device", "cpu", *args) == 0
     first, *_, last = frames(folder / "a.usd")

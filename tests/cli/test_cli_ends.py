@@ -1,4 +1,4 @@
-"""How commands end: what is said, and with which exit status."""
+"""Ends of commands: their messages and exit statuses."""
 
 import errno
 import functools
@@ -24,8 +24,8 @@ OPTIONS += ["smoothing", "draw-tets", "draw-labels"]
 
 @pytest.fixture(autouse=True)
 def nothing_said_of_compiling(monkeypatch):
-    """Whether kernels are compiled depends on what ran before, and no test here is about that."""
-    monkeypatch.setattr("warp_corot.cli.simulate.compiling_said", lambda device: nullcontext())
+    """Suppress the message about compiling, which depends on what ran before and is tested elsewhere."""
+    monkeypatch.setattr("warp_corot.cli.prepared.compiling_said", lambda device: nullcontext())
 
 
 def test_nothing_fixed_falls_freely_with_a_word(folder, capsys):
@@ -102,8 +102,8 @@ def test_interrupted_before_anything_runs(stage, capsys, monkeypatch):
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_signals_wait_for_the_end_of_an_import(number, status, request, tmp_path, monkeypatch):
-    """An exception in the middle is swallowed by some modules; after them it is not."""
-    # A shell has its background jobs ignore Ctrl-C.
+    """Some modules swallow an exception during their import; after it they do not."""
+    # A shell lets its background jobs ignore Ctrl-C.
     request.addfinalizer(functools.partial(signal.signal, number, signal.getsignal(number)))
     signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     (tmp_path / "swallowing.py").write_text(f"""

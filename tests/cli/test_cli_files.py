@@ -1,4 +1,4 @@
-"""``warp-corot simulate`` of people's files: units, regions, folders of slices, scenes, and files for ParaView."""
+"""``warp-corot simulate`` with files of other programs: units, regions, folders, scenes, and files for ParaView."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def bounds(said: str) -> str:
 
 
 def two_regions(folder, suffix=".vtu", size=0.1):
-    """Cubes of hexahedra of which the upper half in x is numbered 9, the lower 7."""
+    """Cubes of hexahedra with the number 9 in the upper half in x and 7 in the lower."""
     points, (block,) = grid(2, np.random.default_rng(0), ["hexahedron"])
     rows = block.nodes.tolist()
     middles = points[block.nodes].mean(axis=1)[:, 0]
@@ -55,8 +55,8 @@ def test_regions_have_materials(folder, suffix, materials, capsys):
 @pytest.mark.parametrize(
     ("args", "said"),
     [
-        (["--materials", "8=3kPa"], "--materials names 8, no region by 'physical group'; there are: 7, 9"),
-        (["--materials", "liver=3kPa"], "--materials names 'liver', no region"),
+        (["--materials", "8=3kPa"], "--materials names 8, not a region by 'physical group'; there are: 7, 9"),
+        (["--materials", "liver=3kPa"], "--materials names 'liver', not a region"),
         (["--materials", "a@7=3kPa,b@7=4kPa"], "the number 7 is given twice"),
         (
             ["--materials", "7=3kPa", "--regions-by", "organ"],
@@ -67,8 +67,8 @@ def test_regions_have_materials(folder, suffix, materials, capsys):
         (["--smoothing", "1mm"], "--smoothing is for scans"),
         (["--young", "5kg"], "argument --young: '5kg': 'kg' is no unit like Pa"),
         (["--duration", "5 parsec"], "argument --duration: '5 parsec': 'parsec' is no unit like s"),
-        (["--also", "a.vtp"], "a.vtp: extension .vtp, should be .vtu, .pvd, .xdmf"),
-        (["--also", "nowhere/a.vtu"], "output folder nowhere is not there"),
+        (["--also", "a.vtp"], "a.vtp: extension .vtp; it must be .vtu, .pvd, .xdmf"),
+        (["--also", "nowhere/a.vtu"], "output folder nowhere does not exist"),
     ],
 )
 def test_what_is_of_no_use_is_refused(folder, args, said, capsys):
@@ -81,7 +81,7 @@ def test_what_is_of_no_use_is_refused(folder, args, said, capsys):
 
 
 def test_units_and_factors_of_every_input(folder, capsys):
-    """A length of 100 in the file is 100 mm unless it is told otherwise; what was guessed is said."""
+    """A length of 100 in the file is 100 mm unless options say otherwise; a guess is reported."""
     write_surface(folder / "organ.obj", True)
     write_gmsh_1(folder / "tet.msh", 100 * np.eye(4, 3, k=-1), [(4, 1, [0, 1, 2, 3])])
     write_scan(folder / "scan.nii", unit="unknown")
@@ -114,7 +114,7 @@ def test_up(folder):
 
 
 def test_a_folder_of_slices(folder, capsys):
-    """A ball of 300 in 0, 40 voxels of 2 mm wide, as CT writes it: slices in files of their own, below a folder."""
+    """A ball of 300 in 0, 40 voxels of 2 mm wide, as CT writes it: each slice in a separate file in a subfolder."""
     sitk = pytest.importorskip("SimpleITK")
     axis = 2.0 * (np.arange(40) - 19.5)
     away = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1), axis=-1)
@@ -151,7 +151,7 @@ def test_a_folder_of_slices(folder, capsys):
 
 
 def test_frames_for_paraview(folder, capsys):
-    """The same numbers in all three as in the stage; rest and displacement make the positions that it shows."""
+    """All three have the numbers of the stage; rest plus displacement gives its positions."""
     meshio, h5py = pytest.importorskip("meshio"), pytest.importorskip("h5py")
     path = two_regions(folder, ".msh")
     args = ["--also", "a.vtu", "--also", "b.pvd", "--also", "c.xdmf", "--materials", "9=1MPa"]
@@ -184,7 +184,7 @@ def test_frames_for_paraview(folder, capsys):
 
 @pytest.mark.parametrize("suffix", [".glb", ".obj"])
 def test_objects_of_a_file_are_bodies_or_one(folder, suffix, capsys):
-    """Two balls with a gap of 2 mm, which one mesh would close; one of them twice as large has more elements. A surface
+    """Two balls with a gap of 2 mm, which one mesh would close; the larger one gets more elements. A surface
     in two open halves is one body."""
     scene = trimesh.Scene()
     for name, radius, x in (("small", 0.05, 0.0), ("large", 0.1, 0.152)):
@@ -195,13 +195,13 @@ def test_objects_of_a_file_are_bodies_or_one(folder, suffix, capsys):
     args = ["--unit", "m", "--tets", 1800, "-o", "a.usd", *SHORT]
     assert simulate(f"two{suffix}", *args) == 0
     out, err = capsys.readouterr()
-    assert "2 bodies, each for itself: " in err
+    assert "2 separate bodies: " in err
     counts = [int(line.split(" tetrahedra")[0].split()[-1]) for line in out.splitlines() if "  mesh" in line]
     assert max(counts) > 4 * min(counts)
     assert sum(counts) <= 1800
     assert simulate(f"two{suffix}", "--join", *args) == 0
     out, err = capsys.readouterr()
-    assert "each for itself" not in err
+    assert "separate bodies" not in err
     assert "2 separate parts" in out
     ball = trimesh.creation.icosphere(2, 0.05)
     scene = trimesh.Scene()
@@ -210,25 +210,25 @@ def test_objects_of_a_file_are_bodies_or_one(folder, suffix, capsys):
     scene.export(f"halves{suffix}")
     assert simulate(f"halves{suffix}", *args) == 0
     out, err = capsys.readouterr()
-    assert "each for itself" not in err
+    assert "separate bodies" not in err
     assert "  closed" in out
 
 
 def test_joined_nodes(folder, capsys):
-    """Two tetrahedra that share a face by place and not by number."""
+    """Two tetrahedra whose common face has the same positions and different numbers."""
     points = [*(0.1 * np.eye(4, 3, k=-1)), *(0.1 * np.eye(4, 3, k=-1)[1:]), (0.1, 0.1, 0.1)]
     write_gmsh_1(folder / "two.msh", points, [(4, 1, [0, 1, 2, 3]), (4, 1, [4, 5, 6, 7])])
     assert simulate("two.msh", "--join", "--fix", "x + y + z < 0.05", "-o", "a.usd", *SHORT) == 0
     out, err = capsys.readouterr()
-    assert "3 nodes are in the places of others, and joined with them" in err
+    assert "3 nodes coincide with others and are merged" in err
     assert "5 nodes, 2 tetrahedra" in out
     write_gmsh_1(folder / "one.msh", points[:4], [(4, 1, [0, 1, 2, 3])])
     assert simulate("one.msh", "--join", "-o", "b.usd", *SHORT) == 2
-    assert "no two nodes are in the same place" in capsys.readouterr().err
+    assert "no two nodes coincide" in capsys.readouterr().err
 
 
 def test_scenes_are_placed_by_their_transforms(folder):
-    """A glTF scene with one mesh at two nodes, one of them turned and twice as large."""
+    """A glTF scene has one mesh at two nodes, one of them rotated and twice as large."""
     ball = trimesh.creation.icosphere(1, 0.05)
     turned = trimesh.transformations.rotation_matrix(np.pi / 2, (0, 0, 1)) @ np.diag([2, 2, 2, 1])
     turned[:3, 3] = (0.5, 0, 0)

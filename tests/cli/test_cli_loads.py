@@ -1,4 +1,4 @@
-"""What the command does to a body over time, what it measures, and runs that are written down."""
+"""Loads of the command over time, its measurements, and run files."""
 
 import csv
 import tomllib
@@ -32,7 +32,7 @@ def table(path) -> tuple[list[str], np.ndarray]:
 
 
 def test_a_pull_reaches_its_end_and_is_answered_by_the_stiffness(bar, folder):
-    """One per cent longer, the end pulls back with E A times that, nearly: the held face cannot narrow."""
+    """At one per cent strain, the end pulls back with nearly E A times that: the fixed face cannot narrow."""
     args = ["--young", 1e4, "--poisson", 0, "--pull", "x == xmax", 0.002, 0, 0, "--ramp", 0.5, "--duration", 1]
     probes = ["--probe", "x == xmax", "--probe", "0.1 0.025 0.025", "--csv", "a.csv"]
     assert simulate("bar.vtk", "-o", "a.usd", *args, *probes, *STILL, "--fps", 10) == 0
@@ -112,7 +112,7 @@ def test_regions_have_their_own_material(bar, folder):
     expected = np.select([x > 0.15, x > 0.1], [5e4, 3e4], 1e4)
     np.testing.assert_allclose(primvars.GetPrimvar("young").Get(), expected)
     np.testing.assert_allclose(primvars.GetPrimvar("density").Get(), np.where(x > 0.15, 1200, 1000))
-    # The same as physics materials of subsets, every tetrahedron in one.
+    # The same materials as subsets, with every tetrahedron in one of them.
     seen = np.zeros(len(x))
     for prim in tets.GetPrim().GetChildren():
         material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0].GetPrim()
@@ -160,7 +160,7 @@ def test_a_run_file_has_several_bodies_and_comes_back(bar, folder):
     first = frames_of(folder / "out/a.usd")
     assert simulate("out/again.toml") == 0
     np.testing.assert_array_equal(frames_of(folder / "out/a.usd"), first)
-    # What the command line adds counts, and is written down with the rest.
+    # Options on the command line are used and written with the rest.
     assert simulate("out/again.toml", "-o", "b.usd", "--fps", 5, "--write-run", "third.toml") == 0
     third = tomllib.loads((folder / "third.toml").read_text(encoding="utf-8"))
     assert (third["fps"], third["output"]) == (5.0, "b.usd")
@@ -247,7 +247,7 @@ REFUSED = [
     (["--ramp", "1"], "--ramp is for --pull"),
     (["--ramp", "0", "--press", "top", "5"], "--ramp is 0 s"),
     (["--patch", "tip"], "it must be NAME=EXPR"),
-    (["--patch", "x=all"], "x is a name already"),
+    (["--patch", "x=all"], "x is already a name"),
     (["--fix", "tip"], "'tip' is not known"),
     (["--fix", "botom"], "'botom' is not known (did you mean bottom?); names are all, bottom, "),
     (["--fix", "x == xmax", "--pull", "x == xmax", "0", "0", "1"], "all of its nodes are held by --fix"),
@@ -257,15 +257,15 @@ REFUSED = [
     (["--skin", "marched"], "--skin is for surfaces"),
     (["--rotation-level", "2"], "--rotation-level is for box, surfaces and scans"),
     (["more"], "'more' is one word too many"),
-    (["--fix", "sphere(x, 0, 0, 1)"], "is not the same at all nodes"),
+    (["--fix", "sphere(x, 0, 0, 1)"], "differs from node to node"),
     (["--fix", "nearest(0, 0, 0, 0.5)"], "nearest takes a number of nodes"),
     (["--fix", "box(0, 0, 1)"], "box takes 6 arguments, not 3"),
-    (["--region", "x > 0.1", "hard"], "is no Young's modulus"),
+    (["--region", "x > 0.1", "hard"], "Young's modulus is 'hard'; it must be"),
     (["--region", "x > 9", "5kPa"], "there is no tetrahedron in it"),
     (["--probe", "top"], "--probe is for --csv"),
     (["--probe", "9 9 9", "--csv", "a.csv"], "m outside the body"),
     (["--csv", "a.txt"], "a.txt: extension .txt"),
-    (["--csv", "nowhere/a.csv"], "output folder nowhere is not there"),
+    (["--csv", "nowhere/a.csv"], "output folder nowhere does not exist"),
     (["--write-run", "run.txt"], "run.txt: extension .txt"),
 ]
 
@@ -278,8 +278,8 @@ def test_bad_options_are_one_line(bar, folder, args, said, capsys):
 BAD_RUNS = [
     ("input = ", "is not TOML"),
     ("duration = 1", "a body has no 'input'"),
-    ("input = 'bar.vtk'\ncolour = 'red'", "'colour' is no option"),
-    ("input = 'bar.vtk'\nyoung = []", "young = [] is not what the option takes"),
+    ("input = 'bar.vtk'\ncolour = 'red'", "'colour' is not an option"),
+    ("input = 'bar.vtk'\nyoung = []", "young = [] does not fit the option"),
     ("input = 'bar.vtk'\nyoung = 'soft'", "run.toml: argument --young"),
     ("input = 7", "input = 7 must be a name"),
     ("body = 3", "'body' must be tables"),

@@ -1,4 +1,4 @@
-"""The command line as a process: signals, streams that are closed, full or left, locales."""
+"""The command line as a process: signals, streams that are closed, full or abandoned, locales."""
 
 import os
 import re
@@ -32,10 +32,10 @@ def frame_count(path: Path) -> int:
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_signals_keep_frames(tmp_path, number, status):
     command = ["simulate", "box", "-o", "a.usd", "--duration", "1000", "--device", "cpu"]
-    # What was started in the background ignores SIGINT, and so would its children.
+    # Background processes ignore SIGINT, and so would their children.
     process = started(tmp_path, *command, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
     try:
-        for _ in range(600):  # until the first frames are there
+        for _ in range(600):  # until the first frames exist
             if (tmp_path / "a.usd").exists() or process.poll() is not None:
                 break
             time.sleep(0.1)
@@ -45,7 +45,7 @@ def test_signals_keep_frames(tmp_path, number, status):
         process.kill()
     assert process.returncode == status, err
     assert out == ""
-    # On a machine that has run nothing yet, kernels are compiled first, and that is said.
+    # On a fresh machine kernels are compiled first, with a message.
     said = r"(?:warp-corot: compiling kernels .*\n)?warp-corot: interrupted; (\d+) frames, .* s, are kept in a\.usd\n"
     match = re.fullmatch(said, err)
     assert match, err
@@ -56,7 +56,7 @@ def test_signals_keep_frames(tmp_path, number, status):
 @pytest.mark.parametrize("module", ["warp", "warp_corot.body.soft_body", "pxr"])
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_signal_while_modules_are_imported_is_one_line(tmp_path, module, number, status):
-    """Python tells of each module that it begins to import; the signal comes at the first import of this one."""
+    """Python reports each module at the start of its import; the signal comes at the first import of this one."""
     (tmp_path / "interrupted.py").write_text(f"""
 import runpy, signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -99,7 +99,7 @@ def test_reader_that_leaves_is_no_error(tmp_path):
     ],
 )
 def test_streams_that_take_nothing_cost_no_frames(tmp_path, streams, status, said):
-    """The notes that --young left out gives go to stderr, the summary to stdout."""
+    """stderr gets the notes about the missing --young, stdout the summary."""
     if "/dev/full" in streams and not os.path.exists("/dev/full"):
         pytest.skip("no /dev/full")
     mesh = wc.TetForest.box((1, 1, 1), 0.1, 3)
@@ -108,7 +108,7 @@ def test_streams_that_take_nothing_cost_no_frames(tmp_path, streams, status, sai
     shell = ["sh", "-c", f'exec "$@" {streams}', "sh", *COMMAND, *command]
     done = subprocess.run(shell, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == status, done.stderr
-    # Whether kernels are compiled, and that is said, depends on what ran before.
+    # The message about compiling depends on what ran before.
     lines = [line for line in done.stderr.splitlines(True) if "note:" not in line and "compiling kernels" not in line]
     assert lines == said.splitlines(True)
     assert frame_count(tmp_path / "a.usd") == 3
@@ -135,7 +135,7 @@ def test_a_kernel_cache_that_cannot_be_made_is_one_line(tmp_path):
 
 
 def test_compiling_is_said_when_kernels_are_compiled_and_only_then(tmp_path):
-    """On stderr, once, in a line of its own; stdout does not tell whether the cache was cold."""
+    """The message comes once, on stderr, in a separate line; stdout does not depend on the cache."""
     cache = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache")}
     ran = [started(tmp_path, *BOX, "--model", "mass-spring", env=cache).communicate(timeout=120) for _ in range(2)]
     (first, cold), (again, warm) = ran

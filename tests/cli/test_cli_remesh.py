@@ -1,4 +1,4 @@
-"""``warp-corot simulate --remesh``: what it says, writes and refuses."""
+"""``warp-corot simulate --remesh``: its messages, its files and its errors."""
 
 import csv
 import os
@@ -66,7 +66,7 @@ def table(path) -> dict[str, np.ndarray]:
 
 
 def test_a_pressure_stays_what_it_is_while_the_mesh_changes(folder, capsys):
-    """On one side of the free half: the supports answer with pressure times area, and the beam bends to that side."""
+    """Pressure on one side of the free half: the reactions are pressure times area, and the beam bends to that side."""
     still = ["--gravity", 0, 0, 0, "--device", "cpu"]
     follows = [
         "--remesh",
@@ -89,13 +89,13 @@ def test_a_pressure_stays_what_it_is_while_the_mesh_changes(folder, capsys):
     area = 0.064 * 0.096
     assert columns["z < zmin + 1e-6 reaction y [N]"][-1] == pytest.approx(10.0 * area, rel=0.02)
     assert columns["z > zmax - 1e-6 uy [m]"][-1] < -0.01
-    # The probe of the free end is the mean over the nodes that it has now.
+    # The probe of the free end is the mean over its current nodes.
     _, tets = opened(folder / "a.usd")
     rest = np.array(UsdGeom.PrimvarsAPI(tets).GetPrimvar("rest").Get(9))
     end = rest[:, 2] > 0.192 - 1e-6
     moved = (np.array(tets.GetPointsAttr().Get(9)) - rest)[end, 1]
     assert columns["z > zmax - 1e-6 uy [m]"][-1] == pytest.approx(moved.mean(), rel=0.03)
-    # The same pressure bends the mesh that stays about as far.
+    # The same pressure bends a mesh without remeshing about as far.
     assert simulate("box", "-o", "b.usd", *still, *press, *probes, "--csv", "b.csv") == 0
     stays = table(folder / "b.csv")["z > zmax - 1e-6 uy [m]"][-1]
     assert columns["z > zmax - 1e-6 uy [m]"][-1] == pytest.approx(stays, rel=0.1)
@@ -120,7 +120,7 @@ def test_of_a_surface_the_one_given_is_drawn(folder, capsys):
     ("args", "said"),
     [
         (["warp:bear", "--remesh"], "--remesh is for box, surfaces and scans"),
-        (["good.vtk", "--remesh"], "good.vtk has tetrahedra of its own"),
+        (["good.vtk", "--remesh"], "good.vtk has its own tetrahedra"),
         (["missing.vtk", "--remesh"], "missing.vtk: no such file"),
         (["box", "--refine-above", 1.1], "--refine-above is for --remesh"),
         (["box", "--remesh-levels", 1, 2], "--remesh-levels is for --remesh"),

@@ -1,4 +1,4 @@
-"""Sets of nodes with names, from the formats that have them, and what they are good for."""
+"""Named node sets, from the formats that have them, and their use."""
 
 import meshio
 import numpy as np
@@ -42,7 +42,7 @@ ABAQUS = """*Part, name=Tip
 
 
 def test_abaqus(tmp_path):
-    """By lists, ranges, other sets and nodes' own lines; of an instance alone; and the nodes of sets of elements."""
+    """By lists, ranges, other sets and node lines; of a single instance; and the nodes of element sets."""
     (tmp_path / "a.inp").write_text(ABAQUS)
     sets = wc.TetMesh.load(tmp_path / "a.inp").node_sets
     expected = {
@@ -108,7 +108,7 @@ def test_numbers_of_nodes_are_no_sets():
 
 
 def test_they_are_patches(folder, capsys):
-    """By name, also one that is no identifier; the file's own "top" stands for that set, not for the highest tenth."""
+    """Sets are patches by name, even if it is no identifier; the file's "top" is that set, not the highest tenth."""
     data = {"left-end": np.isin(np.arange(len(BAR.points)), LEFT).astype(np.int32)}
     data["top"] = np.isin(np.arange(len(BAR.points)), RIGHT).astype(np.int32)
     with_point_data(folder / "bar.vtu", **data)
@@ -119,7 +119,7 @@ def test_they_are_patches(folder, capsys):
     assert f"{len(LEFT)} nodes, held where left_end" in said.out
     rest, *_, last = frames(folder / "a.usd")
     np.testing.assert_allclose((last - rest)[RIGHT], [[0, 0, 0.01]] * len(RIGHT), atol=1e-6)
-    # The stage that was written has a set of its own: what was held.
+    # The written stage has a set of its own: the held nodes.
     assert simulate("a.usd", "-o", "b.usd", "--fix", "fixed", *SHORT) == 0
     assert f"{len(LEFT) + len(RIGHT)} nodes, held where fixed" in capsys.readouterr().out
 
@@ -134,7 +134,7 @@ def test_in_python():
 
 
 def write_pair(path) -> None:
-    """Two bars as prims of a stage, the second one behind the first, where they touch."""
+    """Two bars as prims of a stage, the second one behind the first and in contact with it."""
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     UsdGeom.SetStageUpAxis(stage, "Z")
@@ -149,14 +149,14 @@ def test_prims_of_a_stage_are_bodies_or_one(folder, capsys):
     write_pair(folder / "pair.usda")
     assert simulate("pair.usda", "-o", "a.usd", "--fix", "x < 0.01", *SHORT) == 0
     said = capsys.readouterr()
-    assert "2 bodies, each for itself: near, far (--join takes them as one)" in said.err
+    assert "2 separate bodies: near, far (--join makes them one)" in said.err
     assert "near, held where x < 0.01" in said.out
     assert "far, free, nothing is held" in said.out
     count = len(BAR.points)
     rest, *_, last = frames(folder / "a.usd")
     assert (last - rest)[count:, 2].max() < -0.01  # the far one falls
     assert simulate("pair.usda", "-o", "b.usd", "--join", "--fix", "x < 0.01", *SHORT) == 0
-    assert f"{len(RIGHT)} nodes are in the places of others" in capsys.readouterr().err
+    assert f"{len(RIGHT)} nodes coincide with others" in capsys.readouterr().err
     _, tets = opened(folder / "b.usd")
     assert len(tets.GetPointsAttr().Get(0)) == 2 * count - len(RIGHT)
 

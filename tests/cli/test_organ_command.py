@@ -14,7 +14,7 @@ from pxr import Usd, UsdGeom
 from stages import SURFACE, TETS, drawn, prims
 
 import warp_corot as wc
-import warp_corot.cli.simulate as command
+import warp_corot.cli.prepared as command
 from warp_corot.cli import bodies
 from warp_corot.cli.organs import DETAIL
 from warp_corot.domain import Domain
@@ -50,7 +50,7 @@ def test_surfaces_of_every_format(folder, suffix, capsys):
 
 
 def test_the_bunny_sags_and_stands(folder, capsys):
-    """Near critical damping it comes to rest, upright: ears and back below where they were, above the ground."""
+    """Near critical damping it comes to rest upright: ears and back below their rest positions, above the ground."""
     args = [
         "--tets",
         1500,
@@ -77,9 +77,9 @@ def test_the_bunny_sags_and_stands(folder, capsys):
 
 
 def test_the_level_of_detail_is_kept(folder, capsys):
-    """More tetrahedra, and a surface that is nearer: its volume comes to that of the ellipsoid from below.
+    """More tetrahedra bring the surface closer: its volume approaches the ellipsoid's from below.
 
-    What is drawn is finer than the mesh, so it is near for few tetrahedra already; the mesh's own comes nearer evenly.
+    The drawn surface is finer than the mesh, so it is close with few tetrahedra; the mesh's own approaches steadily.
     """
     write_surface(folder / "organ.glb", False)
     domain, errors, own = Domain.from_surface("organ.glb"), [], []
@@ -150,7 +150,7 @@ def test_labels_are_drawn_and_left_out(folder, capsys):
     core_alone = drawn(Usd.Stage.Open("b.usd"))
     assert core_alone.volume == pytest.approx(4 / 3 * np.pi * 0.02**3, rel=0.15)
     capsys.readouterr()
-    assert simulate("scan.nii.gz", "-o", "c.usd", *args) == 0  # all labels, of one material
+    assert simulate("scan.nii.gz", "-o", "c.usd", *args) == 0  # all labels, with one material
     assert "labels: 2, 7" in capsys.readouterr().out
     assert drawn(Usd.Stage.Open("c.usd")).volume == pytest.approx(4 / 3 * np.pi * 0.04**3, rel=0.1)
 
@@ -179,7 +179,7 @@ def test_unlikely_units_are_warned_of(folder, capsys):
 
 
 def test_compiling_is_said_once_for_mesh_and_body(folder, capsys, monkeypatch):
-    """Python tells of folders made in Warp's cache (PEP 578): here one before the mesh, one before the body."""
+    """Python reports folders made in Warp's cache (PEP 578): here one before the mesh, one before the body."""
 
     def compiled_before(function):
         def compiled(*args):

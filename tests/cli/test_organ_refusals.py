@@ -1,4 +1,4 @@
-"""What ``warp-corot simulate`` refuses of surfaces, scans and their options."""
+"""Surfaces, scans and their options that ``warp-corot simulate`` refuses."""
 
 from pathlib import Path
 
@@ -37,7 +37,7 @@ REFUSED = [
     (["empty.glb"], "empty.glb: is empty"),
     (["half.ply"], "half.ply: the surface is open"),
     (["flat.off"], "flat.off: the surface has zero thickness"),
-    (["warp:hare"], "warp:hare: no such asset, should be warp:bunny, warp:bear"),
+    (["warp:hare"], "warp:hare: no such asset; it must be warp:bunny, warp:bear"),
     (
         ["organ.obj", "--unit", "kPa"],
         "argument --unit: 'kPa'; it must be a length such as 'mm', 'cm', 'm', 'inch' or '3.2cm'",
@@ -69,18 +69,18 @@ REFUSED = [
     (["scan.nii.gz", "--labels", "liver"], "--labels 'liver': it must be NAME"),
     (["scan.nii.gz", "--labels", ""], "--labels '': it must be NAME"),
     (["scan.nii.gz", "--labels", "a=3kPa:0.45:1000:2,b=3kPa"], "it must be NAME"),
-    (["scan.nii.gz", "--labels", "a=soft,b=3kPa"], "'soft' is no Young's modulus"),
-    (["scan.nii.gz", "--labels", "a=3inch,b=3kPa"], "'3inch' is no Young's modulus"),
-    (["scan.nii.gz", "--labels", "a=3kPa:half,b=3kPa"], "'half' is no Poisson's ratio"),
-    (["scan.nii.gz", "--labels", "a=3kPa:nan,b=3kPa"], "'nan' is no Poisson's ratio"),
+    (["scan.nii.gz", "--labels", "a=soft,b=3kPa"], "Young's modulus is 'soft'; it must be"),
+    (["scan.nii.gz", "--labels", "a=3inch,b=3kPa"], "Young's modulus is '3inch'; it must be"),
+    (["scan.nii.gz", "--labels", "a=3kPa:half,b=3kPa"], "Poisson's ratio is 'half'; it must be"),
+    (["scan.nii.gz", "--labels", "a=3kPa:nan,b=3kPa"], "Poisson's ratio is 'nan'; it must be"),
     (["scan.nii.gz", "--labels", "a=3kPa:0.5,b=3kPa"], "--labels 'a=3kPa:0.5': poisson is 0.5"),
     (["scan.nii.gz", "--labels", "a=-3kPa,b=3kPa"], "young is -3000 Pa"),
     (["scan.nii.gz", "--labels", "a=3kPa:0.4:0,b=3kPa"], "density is 0"),
     (["scan.nii.gz", "--labels", "a=3kPa,a=4kPa"], "the label a is given twice"),
     (["scan.nii.gz", "--labels", "a@2=3kPa,b@2+7=4kPa"], "the number 2 is given twice"),
-    (["scan.nii.gz", "--labels", "a=3kPa"], "which label 'a' is, is not known; say its number, as in a@1=3kPa; "),
+    (["scan.nii.gz", "--labels", "a=3kPa"], "the number of label 'a' is not known; it must be given, as in a@1=3kPa; "),
     (["scan.nii.gz", "--labels", "a=3kPa,b=3kPa,c=3kPa"], "the volume's labels: 2, 7"),
-    (["scan.nii.gz", "--labels", "a@2=3kPa,b=3kPa"], "which label 'b' is"),
+    (["scan.nii.gz", "--labels", "a@2=3kPa,b=3kPa"], "the number of label 'b' is not known"),
     (["scan.nii.gz", "--labels", "2=3kPa,3=3kPa"], "label 3 ('3') is not in the volume"),
     (["scan.nii.gz", "--labels", "2=3kPa", "--young", "500"], "--young is given, but --labels gives each"),
     (["scan.nii.gz", "--draw-labels"], "--draw-labels draws the labels that --labels or --materials names"),

@@ -1,4 +1,4 @@
-"""``--preview``: frames, views and films; a legend that is never cut."""
+"""``--preview``: frames, views and films; a legend that is never truncated."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ RUN = ["box", "-o", "a.usd", *SHORT]  # frames 0, 1 and 2
     ],
 )
 def test_the_legend_is_never_cut(tmp_path, largest, label, size):
-    """Its ink ends before the picture does, on all sides."""
+    """Its drawing ends before the picture does, on all sides."""
     path = tmp_path / "a.png"
     stress = np.linspace(0.0, largest, len(CUBE))
     render_preview(path, CUBE, FACES, scalars=stress, value_range=(0, largest), scalar_label=label, size=size)
@@ -67,7 +67,7 @@ def test_views_and_frames_are_panels(folder):
     panels = [panel for row in rows for panel in np.array_split(row[:, : 2 * 535], 2, axis=1)]
     widths = [np.ptp(np.nonzero(panel.any(axis=0))[0]) for panel in panels]
     assert len(widths) == 4
-    # The box is three times as long as wide, and seen from its end in one of the two views.
+    # The box is three times as long as wide, and one of the two views shows its end.
     assert max(widths[0], widths[1]) > 2 * min(widths[0], widths[1])
     assert np.abs(panels[0] ^ panels[2])[:, :-40].any()  # it has moved
 
@@ -83,7 +83,7 @@ def test_a_frame_is_the_one_that_was_asked_for(folder):
 def test_a_gif_has_all_frames_in_time(folder):
     assert simulate(*RUN, "--preview", "a.gif") == 0
     with Image.open(folder / "a.gif") as film:
-        assert film.n_frames == 2  # of 40 a second every other one
+        assert film.n_frames == 2  # every other one of 40 a second
         assert film.info["duration"] == 50
         sizes = []
         for k in range(film.n_frames):
@@ -127,7 +127,7 @@ def test_an_mp4_has_all_frames(folder):
         (["--preview", "a.png", "--preview-views", "up"], "'up' must be corner, front"),
         (["--preview", "a.png", "--preview-views", "10:95"], "'10:95' must be"),
         (["--preview-views", "front"], "--preview-views is for --preview, which is not given"),
-        (["--preview", "a.jpg"], "a.jpg: extension .jpg, should be .png or .gif or .mp4"),
+        (["--preview", "a.jpg"], "a.jpg: extension .jpg; it must be .png or .gif or .mp4"),
     ],
 )
 def test_what_is_refused(folder, capsys, options, said):
@@ -141,4 +141,4 @@ def test_what_is_refused(folder, capsys, options, said):
 def test_a_film_without_its_package_is_one_line(folder, capsys, monkeypatch):
     monkeypatch.setattr("warp_corot.io.pictures.film.find_spec", lambda name: None)
     assert simulate(*RUN, "--preview", "a.mp4") == 2
-    assert 'pip install "warp-corot[film]"; a .gif needs nothing more' in capsys.readouterr().err
+    assert 'pip install "warp-corot[film]"; a .gif needs no package' in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""What is shown on a terminal while one waits."""
+"""Progress on a terminal during long work."""
 
 import os
 import struct
@@ -14,16 +14,16 @@ termios = pytest.importorskip("termios")
 
 SLOW_SCAN = """
 import sys, time
-from warp_corot.cli import waiting, simulate, main
+from warp_corot.cli import prepared, waiting, main
 waiting.SILENT = waiting.EVERY = 0.05
-found = simulate.find_body
+found = prepared.find_body
 def slow(body):
     from warp_corot.cli.say import complain
     time.sleep(1.0)
     complain("of something", kind="note")
     time.sleep(1.0)
     return found(body)
-simulate.find_body = slow
+prepared.find_body = slow
 sys.exit(main(["simulate", "box", "-o", "a.usd", "--duration", "0.05", "--fps", "40", "--device", "cpu"]))
 """
 
@@ -39,7 +39,7 @@ wc.record(sim, "a.usd", duration=0.2, fps=50.0, world=3)
 
 
 def on_terminal(code: str, folder) -> str:
-    """What a terminal gets of a program's stderr."""
+    """The text that a terminal receives from a program's stderr."""
     main, end = pty.openpty()
     fcntl.ioctl(end, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
     process = subprocess.Popen([sys.executable, "-c", code], cwd=folder, stdout=subprocess.DEVNULL, stderr=end)
@@ -62,7 +62,7 @@ def on_terminal(code: str, folder) -> str:
 def test_reading_and_meshing_show_since_when_and_lines_stay_whole(tmp_path):
     said = on_terminal(SLOW_SCAN, tmp_path)
     assert "meshing box, 00:00" in said
-    # The note stands in a line of its own, and the bar is gone at the end.
+    # The note has a separate line, and the bar is gone at the end.
     assert "\rwarp-corot: note: of something\r\n" in said
     assert said.rpartition("meshing box")[2].count("\r") >= 1
 

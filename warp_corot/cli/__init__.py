@@ -1,4 +1,4 @@
-"""The command ``warp-corot``: its subcommands, one file each, and what becomes of their errors."""
+"""The command ``warp-corot``: its subcommands, one module each, and the handling of their errors."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from .signals import leaving_at_once, terminable
 
 
 def commands() -> dict[str, ModuleType]:
-    """The subcommands by name; they need all of the package, so that importing them takes a while."""
-    from . import paper, scene, simulate
+    """The subcommands by name; they import the whole package, which takes a while."""
+    from . import paper, scene, simulate, view
 
-    return {"simulate": simulate, "scene": scene, "paper": paper}
+    return {"simulate": simulate, "view": view, "scene": scene, "paper": paper}
 
 
 class Parser(StrictParser):
-    """Complains in one line, and takes -1e3 for a number."""
+    """Reports errors in one line, and accepts -1e3 as a number."""
 
     def __init__(self, **options):
         options.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
@@ -45,7 +45,7 @@ class Parser(StrictParser):
         sys.exit(2)
 
     def parse_known_args(self, args=None, namespace=None):
-        """As argparse's; options that are not known are told by the parser of the command, which knows others."""
+        """Parse like argparse; the subcommand's parser reports unknown options, since it knows similar ones."""
         found, unknown = super().parse_known_args(args, namespace)
         options = [word for word in unknown if word.startswith("-") and len(word) > 1]
         if options:
@@ -94,10 +94,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as signalled:
         complain("interrupted", kind="")
         return interrupt_status(signalled)
-    except BrokenPipeError:  # who read the output has gone, as `head` does
+    except BrokenPipeError:  # the reader of the output has gone, for example `head`
         silence(sys.stdout)
         return 141
-    except OSError as error:  # commands see to the files they write: stdout, or Warp's kernel cache
+    except OSError as error:  # commands handle the files they write: this is stdout, or Warp's kernel cache
         silence(sys.stdout)
         complain(f"{error.filename or 'standard output'}: {error.strerror or error}")
         return 1
@@ -107,7 +107,7 @@ def _run(argv: Sequence[str] | None) -> int:
     with leaving_at_once():
         import warp as wp
 
-        wp.config.log_level = wp.LOG_ERROR  # before Warp starts, so that it says nothing about itself
+        wp.config.log_level = wp.LOG_ERROR  # before Warp starts, so that it prints no banner
         logging.basicConfig(format="warp-corot: warning: %(message)s", level=logging.WARNING)
         parser = make_parser()
     args = parser.parse_args(argv)
@@ -124,7 +124,7 @@ def _run(argv: Sequence[str] | None) -> int:
 
 
 def _start_warp() -> None:
-    """Start Warp, which writes straight to the terminal; that there is no NVIDIA driver is no news to who has none."""
+    """Start Warp, which writes straight to the terminal; hide its message that there is no NVIDIA driver."""
     import warp as wp
 
     sys.stderr.flush()

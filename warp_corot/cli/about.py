@@ -1,4 +1,4 @@
-"""What a stage says of the run that made it."""
+"""The description of a run in its stage."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .bodies import Body
 
-#: What stands for bytes that are not UTF-8, which USD's strings must be.
+#: Replacement for bytes that are not UTF-8, which USD's strings must be.
 _ERRORS = "backslashreplace"
 
 
 def about(args: argparse.Namespace, bodies: Sequence[Body]) -> dict[str, Any]:
-    """The command, its run file if it has one, and of each body its input's name and hash, what holds it, and what is
-    done to it; for the layer's custom data.
+    """The command, its run file if any, and for each body its input's name and hash, its supports and its loads; for
+    the layer's custom data.
 
     Args:
-        args: Of the command.
-        bodies: That it simulates.
+        args: The command's arguments.
+        bodies: The bodies that it simulates.
     """
     said: dict[str, Any] = {"command": _text(getattr(args, "command_line", "warp-corot simulate"))}
     if args.input.lower().endswith(".toml"):
@@ -42,7 +42,7 @@ def _of_body(body: Body) -> dict[str, Any]:
 
 
 def _hash(path: Path) -> str:
-    """SHA-256 of a file; of a folder, of the names and contents of its files in order."""
+    """SHA-256 of a file; for a folder, of the names and contents of its files in order."""
     if not path.is_dir():
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()

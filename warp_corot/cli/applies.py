@@ -1,4 +1,4 @@
-"""One rule for options: one that would do nothing for this input is refused, with the reason."""
+"""One rule for options: an option without effect on this input is refused, with the reason."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from .opened import Opened
 
 
 class Rule(NamedTuple):
-    """When options do something.
+    """A rule for when options have an effect.
 
     Attributes:
         options: Their names in Python.
-        applies: Whether they do, given the command's arguments and the input.
-        purpose: What they are for, to follow "--NAME is for".
+        applies: Whether they have an effect, given the command's arguments and the input.
+        purpose: Their purpose, to follow "--NAME is for".
     """
 
     options: tuple[str, ...]
@@ -80,10 +80,10 @@ RULES = (
 
 
 def refuse_options(args: argparse.Namespace, opened: Opened) -> None:
-    """See that no option is given that would be of no effect.
+    """Check that every given option has an effect.
 
     Raises:
-        InputError: One is; the message names it and says what it is for.
+        InputError: An option has none; the message names it and its purpose.
     """
     for rule in RULES:
         for name in rule.options:

@@ -1,4 +1,4 @@
-"""The bodies of a run: from options and an input to a mesh with its material, held and moved."""
+"""The bodies of a run: from options and an input to a mesh with its material, supports and loads."""
 
 from __future__ import annotations
 
@@ -27,8 +27,9 @@ from .remesh import remesh_of
 from .several import bodies_in
 from .subject import Subject, find_subject
 from .summary import pressure
+from .touching import stands_free
 
-#: A density that is given below this [kg/m^3] is meant in g/cm^3, most likely.
+#: A density below this [kg/m^3] is most likely meant in g/cm^3.
 LIGHT = 5.0
 
 
@@ -38,15 +39,15 @@ class Body:
 
     Attributes:
         args: Its options.
-        subject: What is simulated, and defaults for it.
+        subject: The mesh, and its defaults.
         opened: Its input.
         model: Its elastic model.
-        remesh: How its mesh follows the motion, if it does.
-        loads: What is done to it.
+        remesh: Its remeshing, if any.
+        loads: Its loads.
         patches: Its patches.
-        held: What holds it.
+        held: Its fixed nodes.
         soft: The body itself.
-        probes: What is measured of it.
+        probes: Its probes.
     """
 
     args: argparse.Namespace
@@ -62,7 +63,7 @@ class Body:
 
 
 def asked_bodies(args: argparse.Namespace) -> list[Body]:
-    """The bodies of an input, their options looked at as far as that goes before there are meshes."""
+    """The bodies of an input, with their options checked as far as possible without meshes."""
     model = _model(args.model, args.rotation_level)
     opened = open_input(args.input)
     refuse_options(args, opened)
@@ -75,13 +76,13 @@ def find_body(body: Body) -> Subject:
     find = find_subject if body.opened.kind in ("box", "tets") else find_organ
     subject = find(body.opened, args)
     for output in (args.output, *(args.also or ())):
-        if subject.source and output.exists() and output.samefile(subject.source):
-            raise InputError(f"{output}: is the input, should be another file")
+        if subject.source and output is not None and output.exists() and output.samefile(subject.source):
+            raise InputError(f"{output}: is the input; it must be another file")
     return subject
 
 
 def find_patches(bodies: Sequence[Body]) -> None:
-    """Find the patches of all bodies of an input, each of which has the loads and probes whose patch it has."""
+    """Find the patches of all bodies of an input; each body gets the loads and probes on its patches."""
     args = bodies[0].args
     probes, loads = list(args.probe or ()), bodies[0].loads
     if probes and args.csv is None:
@@ -102,18 +103,23 @@ def find_patches(bodies: Sequence[Body]) -> None:
 
 
 def make_body(body: Body, duration: float) -> None:
-    """Make the body, held, and have its patches move as told."""
+    """Make the body with its fixed nodes and moving patches."""
     args, subject = body.args, body.subject
     gravity = gravity_of(args, subject)
     material, chosen = _material(args, subject, body.patches)
-    expressions = args.fix if args.fix is not None else None if subject.fix is None else [subject.fix]
+    free = stands_free(args)
+    expressions = ["none"] if free else args.fix
+    if expressions is None and subject.fix is not None:
+        expressions = [subject.fix]
     if expressions is None:
         body.held, stiffer = held_by_default(subject, material, gravity, may_stiffen=chosen is not None)
         if stiffer > 1.0:
             material, chosen = _material(args, subject, body.patches, stiffer)
     else:
         moved = any(load.kind != "press" for load in body.loads)
-        body.held = held_as_told(subject, body.patches, expressions, moved)
+        body.held = held_as_told(subject, body.patches, expressions, moved or free)
+        if free:
+            subject.notes.append("the ground carries the body, and nothing is fixed (--fix)")
     if chosen is not None:
         rest = " of the others" if subject.labels else ""
         subject.notes.append(f"Young's modulus{rest} is {pressure(chosen)}, chosen for the weight (--young)")
@@ -146,7 +152,7 @@ def _model(name: str, rotation_level: int | float | str | None) -> Model:
 def _material(
     args: argparse.Namespace, subject: Subject, patches: Patches, stiffer: float = 1.0
 ) -> tuple[Isotropic, float | None]:
-    """The material, and Young's modulus [Pa] where it was chosen for the body's weight, so many times as stiff."""
+    """The material, and Young's modulus [Pa] if it was chosen for the body's weight, times a factor."""
     density = subject.density if args.density is None else args.density
     poisson = subject.poisson if args.poisson is None else args.poisson
     Isotropic(1.0, poisson, density)  # both must be checked before they are used

@@ -1,7 +1,7 @@
-"""Saying that kernels are being compiled, at the moment the first one is.
+"""A message that kernels are being compiled, at the start of the first compilation.
 
-Warp speaks of a module when it is done. But for each module that it begins to compile it makes a folder in its kernel
-cache, and for none that it finds there; and Python tells whoever listens of every folder that is made (PEP 578).
+Warp reports a module only when it is compiled. But it makes a folder in its kernel cache for each module that it
+begins to compile, and for none that it finds there; and Python reports every new folder to audit hooks (PEP 578).
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from .say import complain
 
 Say = Callable[[str], None]
 
-#: Who wants to be told of the next module that is compiled.
+#: Called at the start of the next compilation.
 _waiting: list[Callable[[], None]] = []
 
 
 def say_plainly(text: str) -> None:
-    """On stderr, in a line of its own."""
+    """Print a line on stderr."""
     complain(text, kind="")
 
 
 @contextmanager
 def compiling_said(device: wp.Device, say: Say = say_plainly) -> Iterator[None]:
-    """Say in one line that kernels are being compiled, if any are; nothing where all are in Warp's cache.
+    """Say in one line that kernels are being compiled, if any are; say nothing if all are in Warp's cache.
 
     Args:
-        device: What they are compiled for.
+        device: The device for which they are compiled.
         say: Prints the line.
     """
 
@@ -51,7 +51,7 @@ def compiling_said(device: wp.Device, say: Say = say_plainly) -> Iterator[None]:
 
 @functools.cache
 def _listen() -> None:
-    """Begin to listen; cached, since listeners cannot be taken away again."""
+    """Install the audit hook; cached, since hooks cannot be removed."""
     sys.addaudithook(_heard)
 
 

@@ -1,4 +1,4 @@
-"""What holds the body: ``--fix``, or what is chosen where it is not given."""
+"""The fixed nodes of a body: by ``--fix``, or chosen if it is not given."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from .subject import Subject
 
 
-#: Times what is needed at least.
+#: Factor on the stiffness that is needed at least.
 MORE = 1.05
 
 
 def up_of(subject: Subject, gravity: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Against gravity, unit vector; the mesh's up axis without any."""
+    """The unit vector against gravity; the mesh's up axis without gravity."""
     if not gravity.any():
         return np.eye(3)["XYZ".index(subject.mesh.up_axis)]
     return -gravity / np.linalg.norm(gravity)
@@ -31,12 +31,12 @@ def up_of(subject: Subject, gravity: npt.NDArray[np.float64]) -> npt.NDArray[np.
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """The nodes that are held.
+    """The fixed nodes.
 
     Attributes:
         nodes: Mask bool [N].
-        words: For the summary: "standing on its lowest 10 %", "free".
-        title: For the picture, of many pieces in fewer words; empty: these.
+        words: Text for the summary: "standing on its lowest 10 %", "free".
+        title: A shorter text for the picture if there are many pieces; empty: ``words``.
     """
 
     nodes: npt.NDArray[np.bool_]
@@ -49,13 +49,13 @@ class Held:
 
 
 def held_as_told(subject: Subject, patches: Patches, expressions: Sequence[str], pulled: bool) -> Held:
-    """The nodes of ``--fix``, all its patches together.
+    """The nodes of ``--fix``, from all its patches.
 
     Args:
-        subject: Gets a note if nothing is held.
-        patches: Of the body.
-        expressions: One or several.
-        pulled: Whether something else moves nodes.
+        subject: Gets a note if no node is fixed.
+        patches: The body's patches.
+        expressions: One or several expressions.
+        pulled: Whether another option moves nodes.
 
     Raises:
         InputError: A bad expression, or no node is left free.
@@ -63,7 +63,7 @@ def held_as_told(subject: Subject, patches: Patches, expressions: Sequence[str],
     nodes = np.logical_or.reduce([patches.nodes(expression) for expression in expressions])
     said = " or ".join(expressions)
     if nodes.sum() == len(patches.used):
-        raise InputError(f"expression {said!r}: holds all {nodes.sum()} nodes, at least one must be free to move")
+        raise InputError(f"expression {said!r}: holds all {nodes.sum()} nodes; at least one must be free to move")
     if not nodes.any():
         if not pulled:
             subject.notes.append(f"no node is held ({said!r}): the body falls freely")
@@ -74,14 +74,14 @@ def held_as_told(subject: Subject, patches: Patches, expressions: Sequence[str],
 def held_by_default(
     subject: Subject, material: Isotropic, gravity: npt.NDArray[np.float64], *, may_stiffen: bool
 ) -> tuple[Held, float]:
-    """What carries the body, and how many times as stiff it shall be: more than once if no patch would carry it as it
-    is.
+    """The support of the body, and a factor on its stiffness: above one if no patch would support it with its present
+    stiffness.
 
     Args:
-        subject: Gets notes of what was chosen and why.
-        material: Of the body.
-        gravity: [m/s^2].
-        may_stiffen: Whether nobody gave Young's modulus.
+        subject: Gets notes on the choice and its reasons.
+        material: The body's material.
+        gravity: Acceleration [m/s^2].
+        may_stiffen: Whether Young's modulus was not given.
     """
     holds = holds_of(
         subject.mesh, young=material.young, density=material.density, gravity=gravity, surface=subject.surface

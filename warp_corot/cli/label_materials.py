@@ -1,4 +1,4 @@
-"""Materials by label or region, as ``--labels`` and ``--materials`` give them, such as
+"""Materials by label or region in the form of ``--labels`` and ``--materials``:
 ``liver=3kPa:0.45,vessel@4+5=30kPa:0.45:1.06g/cm3``."""
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ _ENTRY = re.compile(r"\s*(?P<name>[^@=:]+?)\s*(?:@\s*(?P<numbers>\d+(?:\s*\+\s*\
 
 @dataclass(frozen=True)
 class LabelMaterial:
-    """A label and what its tissue is like.
+    """A label and its material.
 
     Attributes:
-        name: For the mesh and the summary.
-        numbers: Of its voxels; () where only a name was given.
+        name: Name for the mesh and the summary.
+        numbers: Numbers of its voxels; () if only a name was given.
         young: Young's modulus [Pa].
-        poisson: Poisson's ratio, None where it was left out.
-        density: [kg/m^3], as ``poisson``.
+        poisson: Poisson's ratio, None if not given.
+        density: Density [kg/m^3], None if not given.
     """
 
     name: str
@@ -48,7 +48,7 @@ def parse_labels(text: str, option: str = "--labels") -> list[LabelMaterial]:
     """The labels that an option names.
 
     Raises:
-        InputError: Not of that form, or a label given twice.
+        InputError: Another form, or a label given twice.
     """
     found = [_entry(part, option) for part in text.split(",")]
     for what, given in (
@@ -62,10 +62,10 @@ def parse_labels(text: str, option: str = "--labels") -> list[LabelMaterial]:
 
 
 def parse_pressure(text: str) -> float:
-    """A pressure [Pa], such as "3kPa", "0.1 MPa" or "500".
+    """A pressure [Pa] from "3kPa", "0.1 MPa" or "500".
 
     Raises:
-        InputError: No number, or another unit.
+        InputError: Not a number, or another unit.
     """
     return _quantity(text, "Pa", "Young's modulus", "500, 3kPa or 0.1MPa")
 
@@ -74,7 +74,7 @@ def _entry(part: str, option: str, form: str | None = None) -> LabelMaterial:
     match = _ENTRY.fullmatch(part)
     values = match["values"].split(":") if match else []
     if not match or not 1 <= len(values) <= 3:
-        raise InputError(form or f"{option} {part.strip()!r}: it must be {FORM}, such as liver=3kPa:0.45")
+        raise InputError(form or f"{option} {part.strip()!r}: it must be {FORM}, for example liver=3kPa:0.45")
     name = match["name"]
     numbers = tuple(int(number) for number in (match["numbers"] or "").split("+") if number)
     if not numbers and name.isdecimal():
@@ -96,19 +96,19 @@ def _quantity(text: str, unit: str, what: str, such_as: str) -> float:
     except InputError:
         value = math.nan
     if not math.isfinite(value):
-        raise InputError(f"{text.strip()!r} is no {what}; it must be one such as {such_as}")
+        raise InputError(f"{what} is {text.strip()!r}; it must be a value like {such_as}")
     return value
 
 
 def numbers_by_name(
     entries: Sequence[LabelMaterial], volume: LoadedVolume
 ) -> tuple[dict[str, tuple[int, ...]], str | None]:
-    """The numbers of each label in a volume, and what to say of it.
+    """The numbers of each label in a volume, and a note for the user.
 
-    Where names alone are given, and as many as the volume has labels, they are its labels in ascending order.
+    If only names are given, as many as the volume has labels, they are its labels in ascending order.
 
     Raises:
-        InputError: Some names have numbers and some not, or there are more or fewer names than labels.
+        InputError: Only some names have numbers, or there are more or fewer names than labels.
     """
     bare = [entry.name for entry in entries if not entry.numbers]
     if not bare:
@@ -118,8 +118,8 @@ def numbers_by_name(
     if len(bare) != len(entries) or len(there) != len(bare):
         known = ", ".join(f"{number:g}" for number in there[:40]) or "none"
         raise InputError(
-            f"{volume.source}: which label {bare[0]!r} is, is not known; say its number, as in {bare[0]}@1=3kPa; the "
-            f"volume's labels: {known}"
+            f"{volume.source}: the number of label {bare[0]!r} is not known; it must be given, as in {bare[0]}@1=3kPa; "
+            f"the volume's labels: {known}"
         )
     pairs = dict(zip(bare, there, strict=True))
     said = ", ".join(f"{name} is {number:g}" for name, number in pairs.items())
@@ -130,12 +130,12 @@ def numbers_by_name(
 
 
 def of_regions(entries: Sequence[LabelMaterial], regions: Regions) -> tuple[tuple[str, ...], list[LabelMaterial]]:
-    """A mesh's regions by the names that entries give them, and an entry for each region that one names.
+    """A mesh's regions with the names in the entries, and an entry for each region that one names.
 
-    Entries name regions by number where they give any, else by name; case does not count.
+    Entries name regions by number if they have any, else by name; case does not matter.
 
     Raises:
-        InputError: An entry names no region, or two name the same; the message lists those there are.
+        InputError: An entry names no region, or two name the same; the message lists the regions.
     """
     names, taken, found = list(regions.names), dict[int, str](), list[LabelMaterial]()
     for entry in entries:
@@ -147,7 +147,7 @@ def of_regions(entries: Sequence[LabelMaterial], regions: Regions) -> tuple[tupl
                 name if name == str(number) else f"{name} ({number})"
                 for name, number in zip(regions.names[:40], regions.numbers, strict=False)
             )
-            raise InputError(f"--materials names {missing[0]!r}, no region by {regions.array!r}; there are: {known}")
+            raise InputError(f"--materials names {missing[0]!r}, not a region by {regions.array!r}; there are: {known}")
         places = [keys.index(key) for key in wanted]
         if len(places) == 1 and not entry.name.isdecimal() and entry.name not in names:
             names[places[0]] = entry.name
@@ -167,9 +167,9 @@ def label_material(
     Args:
         mesh: A mesh with labels.
         entries: Materials by label.
-        young: Young's modulus [Pa] of elements of no label, or of one that has no entry.
-        poisson: Poisson's ratio of these, and where an entry leaves it out.
-        density: Density [kg/m^3], likewise.
+        young: Young's modulus [Pa] of elements without a label, or whose label has no entry.
+        poisson: Poisson's ratio of these elements, and of entries without one.
+        density: Density [kg/m^3] of these elements, and of entries without one.
     """
     of_label = {name: number for number, name in enumerate(mesh.label_names, start=1)}
     table = np.repeat([[young], [poisson], [density]], len(mesh.label_names) + 1, axis=1)
@@ -191,16 +191,16 @@ def covers_all(mesh: TetForest | TetMesh, entries: Sequence[LabelMaterial]) -> b
 def region_material(
     mesh: Mesh, inside: Callable[[str], np.ndarray], regions: Sequence[Sequence[str]], base: Isotropic
 ) -> Isotropic:
-    """The material where ``--region`` gives tetrahedra one of their own.
+    """The material with those that ``--region`` gives to tetrahedra.
 
     Args:
-        mesh: The body's.
+        mesh: The body's mesh.
         inside: Which tetrahedra are in a patch, bool [T].
-        regions: Pairs of a patch and ``YOUNG[:POISSON[:DENSITY]]``; the last one that holds a tetrahedron counts.
-        base: What the others are made of, and what values that are left out come from.
+        regions: Pairs of a patch and ``YOUNG[:POISSON[:DENSITY]]``; the last one that contains a tetrahedron is used.
+        base: The material of other tetrahedra, and the source of omitted values.
 
     Raises:
-        InputError: Not of that form, or no tetrahedron in a region.
+        InputError: Another form, or no tetrahedron in a region.
     """
     count = len(mesh.tets)
     values = [np.array(np.broadcast_to(value, count)) for value in (base.young, base.poisson, base.density)]

@@ -1,4 +1,4 @@
-"""``--pull``, ``--twist`` and ``--press``: what is done to a body over time."""
+"""``--pull``, ``--twist`` and ``--press``: loads on a body over time."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
     from .patches import Patches
 
-#: Numbers after PATCH, and what they are.
+#: Number of values after PATCH, and their names.
 FORMS = {"pull": (3, "DX DY DZ"), "twist": (1, "DEGREES"), "press": (1, "PASCALS")}
-#: Their units where they name none.
+#: Units of values that have none.
 UNITS = {"pull": "m", "twist": "degree", "press": "Pa"}
-#: Largest angle from one keyframe of a twist to the next [degrees]: in between nodes go straight.
+#: Largest angle between keyframes of a twist [degrees]: nodes move straight in between.
 KEY_ANGLE = 5.0
 
 Array = npt.NDArray[np.float64]
@@ -36,15 +36,15 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Load:
-    """Something done to a patch.
+    """A load on a patch.
 
     Attributes:
         kind: "pull", "twist" or "press".
         patch: The expression.
         values: Displacement [m], angle [degrees] or pressure [Pa].
         times: Increasing [s]; () for a ramp as long as is said elsewhere.
-        shares: Of the values at these times; linear in between, constant before and after.
-        axis: Of a twist; None: the mean normal of the patch's surface.
+        shares: Fractions of the values at these times; linear in between, constant before and after.
+        axis: Axis of a twist; None: the mean normal of the patch's surface.
     """
 
     kind: str
@@ -55,10 +55,10 @@ class Load:
     axis: tuple[float, float, float] | None = None
 
     def curve(self, ramp: float) -> tuple[Array, Array]:
-        """Times [s] and shares at them.
+        """Times [s] and fractions at them.
 
         Raises:
-            InputError: They are not as many, or times that do not increase.
+            InputError: Their numbers differ, or times do not increase.
         """
         if not self.times:
             return np.array([0.0, ramp]), np.array([0.0, 1.0])
@@ -72,7 +72,7 @@ class Load:
 
 
 def add_load_options(group: argparse._ArgumentGroup) -> None:
-    """Add the options to a group of the command's."""
+    """Add the options to a group of the command's parser."""
     for kind, (count, names) in FORMS.items():
         group.add_argument(
             f"--{kind}",
@@ -80,7 +80,7 @@ def add_load_options(group: argparse._ArgumentGroup) -> None:
             nargs=1 + count,
             metavar=("PATCH", *names.split()),
             help={
-                "pull": "move a patch by this much [m], such as 0 0 3cm",
+                "pull": "move a patch by this much [m], for example 0 0 3cm",
                 "twist": "turn a patch about its mean normal, counter-clockwise seen from outside",
                 "press": "press on the surface of a patch, along its normals at rest; a negative pressure pulls",
             }[kind],
@@ -94,10 +94,10 @@ def add_load_options(group: argparse._ArgumentGroup) -> None:
 
 
 def loads_of(args: argparse.Namespace) -> list[Load]:
-    """What the options ask for.
+    """The loads in the options.
 
     Raises:
-        InputError: Something that is no number.
+        InputError: A value is not a number.
     """
     found = list(getattr(args, "curves", ()))
     for kind in FORMS:
@@ -120,10 +120,10 @@ def ramp_of(args: argparse.Namespace, duration: float) -> float:
 
 
 def value_of(kind: str, text: str) -> float:
-    """A displacement [m], an angle [degrees] or a pressure [Pa], as a number or with a unit of its own.
+    """A displacement [m], an angle [degrees] or a pressure [Pa], from a number with or without a unit.
 
     Raises:
-        InputError: It is none.
+        InputError: It is not a number.
     """
     value = in_units(text, UNITS[kind])
     if not math.isfinite(value):
@@ -134,18 +134,19 @@ def value_of(kind: str, text: str) -> float:
 def move_patches(
     body: SoftBody, loads: Sequence[Load], patches: Patches, ramp: float, fixed: npt.NDArray[np.bool_] | None
 ) -> None:
-    """Have the patches of ``--pull`` and ``--twist`` move as told.
+    """Prescribe the motion of the patches of ``--pull`` and ``--twist``.
 
     Args:
         body: The body.
-        loads: What is done to it.
-        patches: Of the body.
+        loads: Its loads.
+        patches: Its patches.
         ramp: Time over which loads without times grow [s].
-        fixed: Nodes that the user holds, bool [N]; None if nobody said. Those of a patch that moves go along with it.
+        fixed: Nodes of ``--fix``, bool [N]; None if it was not given. If a patch moves, its nodes among these move,
+            too.
 
     Raises:
-        InputError: A patch without nodes or, where one is needed, without a direction; a node in two of them; or a
-            patch all of which is held.
+        InputError: A patch without nodes, or without a direction if one is needed; a node in two patches; or a
+            patch with all nodes fixed.
     """
     taken = np.zeros(len(patches.subject.mesh.points), bool)
     for load in loads:
@@ -183,8 +184,8 @@ def _turned(
     if not (np.isfinite(axis).all() and length > 0.0):
         raise InputError(f"{load}: has no axis; it must be three numbers, not all zero")
     fine = [times[:1]]
-    for start, end, turn in zip(times, times[1:], np.abs(np.diff(shares)) * abs(load.values[0]), strict=False):
-        fine.append(np.linspace(start, end, 1 + max(1, math.ceil(turn / KEY_ANGLE)))[1:])
+    for start, end, span in zip(times, times[1:], np.abs(np.diff(shares)) * abs(load.values[0]), strict=False):
+        fine.append(np.linspace(start, end, 1 + max(1, math.ceil(span / KEY_ANGLE)))[1:])
     keys = np.concatenate(fine)
     angles = np.radians(load.values[0]) * np.interp(keys, times, shares)
     points = patches.subject.mesh.points[mask]

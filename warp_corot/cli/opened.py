@@ -1,4 +1,4 @@
-"""What INPUT is: read once, told apart by what is in it, and placed by unit, scale and up axis."""
+"""The input: read once, classified by its content, and placed by unit, scale and up axis."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from warp_corot.io.read.surfaces import UP_AXES, LoadedSurface, load_surface
 from warp_corot.io.read.tetrahedra import USD_SUFFIXES, LoadedMesh, check_file, load_tets, unknown_format
 from warp_corot.io.read.volumes import LoadedVolume, is_volume, load_volume, volume_of_image
 
-#: Meshes larger than this [m] are asked whether they are in millimetres.
+#: Larger meshes [m] get a note that they may be in millimetres.
 LARGEST_PLAUSIBLE = 10.0
 
 
 @dataclass
 class Opened:
-    """An input that has been looked into.
+    """An input that has been read.
 
     Attributes:
-        name: INPUT as it was given.
+        name: The argument INPUT.
         kind: "box", "tets", "surface" or "scan".
-        asset: The asset that it names, if one.
-        found: What its mesh file holds, if it is one.
+        asset: The asset with this name, if any.
+        found: The content of its mesh file, if it is one.
         surface: Its triangles, if it is a surface.
         volume: Its voxels, if it is a scan.
-        tets: Its tetrahedra in the file's unit [m where it has one], where they are one body of several in the file.
-        notes: What the user should know, a line each.
-        size: Longest side in the file's unit of all that is in it, where this is only one body of several.
+        tets: Its tetrahedra in the file's unit [m if it has one], for one of several bodies in the file.
+        notes: Notes for the user, one line each.
+        size: Longest side in the file's unit of everything in it, for one of several bodies.
     """
 
     name: str
@@ -54,16 +54,16 @@ class Opened:
 
     @property
     def has_regions(self) -> bool:
-        """Whether its cells bear numbers that may tell regions apart."""
+        """Whether its cells have numbers that may distinguish regions."""
         return self.found is not None and any(block.data for block in self.found.solids)
 
 
 def open_input(name: str) -> Opened:
-    """Look into INPUT.
+    """Read the input.
 
     Raises:
-        InputError: No such file or asset, an unknown format, a file that cannot be read, or nothing in it that makes a
-            body.
+        InputError: No such file or asset, an unknown format, a file that cannot be read, or a file with nothing that
+            makes a body.
     """
     if name == "box":
         return Opened(name, "box")
@@ -126,7 +126,7 @@ def loaded_tets(opened: Opened, args: argparse.Namespace) -> LoadedMesh:
 
 
 def offset_of(args: argparse.Namespace) -> np.ndarray:
-    """How far a body is moved before it begins [m], [3]."""
+    """The initial displacement of a body [m], [3]."""
     return np.zeros(3) if args.offset is None else np.array(args.offset, dtype=np.float64)
 
 
@@ -137,14 +137,14 @@ def placed_surface(opened: Opened, args: argparse.Namespace) -> tuple[LoadedSurf
     unit, scale = args.unit, 1.0 if args.scale is None else args.scale
     own_notes = loaded.notes
     if opened.asset and (args.unit is not None or args.scale is not None):
-        # The asset's own scale gives way to what was asked for.
+        # The requested size replaces the asset's own scale.
         scale, own_notes = scale / opened.asset.scale, []
     if unit is None and loaded.metres is None and args.scale is None:
         size = opened.size or longest_side(loaded.points[np.unique(loaded.triangles)])
         unit = likely_unit(size)
         if unit:
             opened.notes.append(_guessed(unit, size))
-        elif LARGEST_PLAUSIBLE < size <= LARGEST:  # beyond, there is a warning
+        elif LARGEST_PLAUSIBLE < size <= LARGEST:  # for larger ones, there is a warning
             opened.notes.append(f"the body is taken to be {size:.3g} m long: the file names no unit (--unit)")
     notes = [*own_notes, *([f"scaled by {args.scale:g}, as asked for"] if args.scale is not None else [])]
     points = loaded.points * scale + offset_of(args) / (metres_per_unit(unit) if unit else loaded.metres or 1.0)

@@ -29,6 +29,7 @@ from .remesh import add_remesh_options
 from .say import EXIT_CODES
 from .several import TETS
 from .subject import STIFFNESS_PER_WEIGHT
+from .touching import add_touch_options
 
 FPS = 24.0
 
@@ -37,7 +38,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParse
     """Add the command to ``warp-corot``."""
     parser = subparsers.add_parser(
         "simulate",
-        help="let a soft body move and write it as a USD animation",
+        help="simulate a soft body and write its motion as a USD animation",
         description="Lets a soft body sag and sway under gravity and writes a USD animation, coloured by stress.",
         epilog=f"""examples:
   warp-corot simulate warp:bunny -o bunny.usd --preview bunny.gif
@@ -51,6 +52,8 @@ def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParse
   warp-corot simulate box --remesh --refine-above 1.03 --simplify-below 1.01 -o beam.usd
   warp-corot simulate liver.stl --unit mm --fix bottom --pull "nearest(0.1, 0, 0.05, 20)" 0 0 0.03 -o liver.usd
   warp-corot simulate box --fix "z == zmin" --twist "z == zmax" 90 --probe "z == zmax" --csv beam.csv -o beam.usd
+  warp-corot simulate warp:bunny --drop 5cm -o falls.usd --preview falls.gif
+  warp-corot simulate liver.stl --unit mm --tool capsule:r=4mm,l=100mm --tool-path path.csv --csv force.csv -o liver.usd
   warp-corot simulate run.toml -o out.usd
 
 {patches.HELP}
@@ -61,9 +64,9 @@ a label in --labels and --materials is {FORM}: a name and the
 numbers of its voxels or region, or a number for both; names alone are the file's
 regions, or a volume's labels in ascending order.
 
-quantities are in SI units, or name their own: 5kPa, 1.06g/cm3, 500ms, 0.2inch.
+quantities are in SI units or have a unit: 5kPa, 1.06g/cm3, 500ms, 0.2inch.
 
-warp:bear, warp:bunny and box have defaults of their own for body and motion.
+warp:bear, warp:bunny and box have their own defaults for body and motion.
 
 {EXIT_CODES}""",
     )
@@ -73,6 +76,30 @@ warp:bear, warp:bunny and box have defaults of their own for body and motion.
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the command's options to a parser."""
+    add_input(parser)
+    _add_outputs(parser)
+    add_scene_options(parser)
+    more = parser.add_argument_group("more results")
+    add_preview_options(more)
+    more.add_argument(
+        "--probe",
+        action="append",
+        metavar="POINT|PATCH",
+        help='record this point, "X Y Z" [m], or patch in --csv; can be given several times',
+    )
+    more.add_argument(
+        "--csv",
+        type=Path,
+        metavar="FILE.csv",
+        help="write displacement, velocity and reaction of each probe, the forces on ground and tools, and the "
+        "energies, of every frame",
+    )
+    more.add_argument("--write-run", type=Path, metavar="RUN.toml", help="save these options as a run file")
+    add_device(parser)
+
+
+def add_input(parser: argparse.ArgumentParser) -> None:
+    """Add what is simulated."""
     parser.add_argument(
         "input",
         metavar="INPUT",
@@ -83,6 +110,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "files with triangles alone; or warp:bunny. A segmented scan: .nii, .nii.gz, .mgz, .mha, .mhd, .nrrd, "
         ".vti, or a folder with a DICOM series. Or a run file, .toml",
     )
+
+
+def _add_outputs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", type=Path, metavar="OUT.usd", help="animation to write (.usd, .usdc or .usda)"
     )
@@ -95,18 +125,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "frames, or .vtu with the last; can be given several times",
     )
 
+
+def add_scene_options(parser: argparse.ArgumentParser) -> None:
+    """Add what is to be known of bodies and their motion, whatever is made of them."""
     body = parser.add_argument_group("the body")
     body.add_argument(
         "--unit",
         type=unit_of_length,
         metavar="LENGTH",
-        help="unit of the file's coordinates: mm, inch, 3.2cm, ... (default: the file's own; if it names none, mm "
-        "for what is 50 to 2500 long, else m)",
+        help="unit of the file's coordinates: mm, inch, 3.2cm, ... (default: the file's own; if it has none, mm "
+        "for a length of 50 to 2500, else m)",
     )
     body.add_argument(
         "--join",
         action="store_true",
-        help="take everything in the file as one body, and merge nodes of tetrahedra that are in the same place "
+        help="make everything in the file one body, and merge coincident nodes of tetrahedra "
         "(default: closed surfaces, and prims, blocks and instances of tetrahedra, are separate bodies)",
     )
     body.add_argument("--scale", type=number, metavar="S", help="multiply the coordinates by this, after --unit")
@@ -137,7 +170,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     body.add_argument(
         "--materials",
         metavar="LIST",
-        help="materials of the file's regions (physical groups, sets or cell data) or of a scan's labels, as in "
+        help="materials of the file's regions (physical groups, sets or cell data) or of a scan's labels, for example "
         "liver=3kPa:0.45,vessel@4=30kPa; everything else has --young, --poisson and --density",
     )
     body.add_argument(
@@ -148,16 +181,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--rotation-level",
         type=rotation_level,
         metavar="L",
-        help="share rotations among elements, on the mesh of box, a surface or a scan: those of the tree's level "
-        "L; or, with auto or a tolerance in radians, where they are alike (default: each element has its own)",
+        help="share rotations among elements, on the mesh of box, a surface or a scan: at the tree's level L; or, "
+        "with auto or a tolerance in radians, where they are similar (default: each element has its own)",
     )
     body.add_argument(
         "--region",
         nargs=2,
         action="append",
         metavar=("PATCH", "VALUES"),
-        help="another material for the tetrahedra whose centre is in a patch: YOUNG[:POISSON[:DENSITY]], such as "
-        "30kPa:0.45; can be given several times; where patches overlap the last one counts",
+        help="another material for the tetrahedra whose centre is in a patch: YOUNG[:POISSON[:DENSITY]], for example "
+        "30kPa:0.45; can be given several times; where patches overlap the last one is used",
     )
     body.add_argument(
         "--patch",
@@ -169,8 +202,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--fix",
         action="append",
         metavar="PATCH",
-        help='hold these nodes, such as bottom or "z < 0.01"; none holds nothing; can be given several times '
-        "(default: what the body stands on, if that carries it, else its largest flat region or a broad side)",
+        help='fix these nodes, for example bottom or "z < 0.01"; none fixes nothing; can be given several times '
+        "(default: what the body stands on, if that supports it, else its largest flat region or a broad side)",
     )
 
     _add_organ_options(parser.add_argument_group("a body from a surface or a scan"))
@@ -181,7 +214,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=acceleration,
         nargs=3,
         metavar=("X", "Y", "Z"),
-        help="gravity [m/s^2] (default: 9.81 down the up axis, z where a file names none)",
+        help="gravity [m/s^2] (default: 9.81 down the up axis, z if a file has none)",
     )
     add_load_options(motion)
     motion.add_argument("--damping", type=per_second, metavar="C", help="mass-proportional damping [1/s] (default: 2)")
@@ -201,23 +234,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "state)",
     )
 
+    add_touch_options(parser.add_argument_group("what the body touches"))
     add_remesh_options(parser.add_argument_group("a mesh that follows the motion, of box, surfaces and scans"))
 
-    more = parser.add_argument_group("more results")
-    add_preview_options(more)
-    more.add_argument(
-        "--probe",
-        action="append",
-        metavar="POINT|PATCH",
-        help='record this point, "X Y Z" [m], or patch in --csv; can be given several times',
-    )
-    more.add_argument(
-        "--csv",
-        type=Path,
-        metavar="FILE.csv",
-        help="write displacement, velocity and reaction of each probe, and the energies, of every frame",
-    )
-    more.add_argument("--write-run", type=Path, metavar="RUN.toml", help="save what is asked here as a run file")
+
+def add_device(parser: argparse.ArgumentParser) -> None:
+    """Add where it is computed."""
     parser.add_argument("--device", help='where to compute: "cpu", "cuda:0", ... (default: a GPU if there is one)')
 
 
@@ -226,7 +248,7 @@ def _add_organ_options(organ: argparse._ArgumentGroup) -> None:
         "--tets",
         type=whole_number,
         metavar="N",
-        help=f"largest number of tetrahedra, which the mesh comes close to (default: {TETS}, unless --max-level or "
+        help=f"largest number of tetrahedra; the mesh has nearly as many (default: {TETS}, unless --max-level or "
         f"--surface-error is given)",
     )
     organ.add_argument(
@@ -242,7 +264,7 @@ def _add_organ_options(organ: argparse._ArgumentGroup) -> None:
         "--max-level",
         type=whole_number,
         metavar="L",
-        help=f"how often cubes are bisected at most; three times halve the edge (default: chosen to suit --tets; "
+        help=f"maximum number of bisections of a cube; three halve the edge (default: chosen to suit --tets; "
         f"{MAX_LEVEL_FOR_ERROR} with --surface-error)",
     )
     organ.add_argument(
@@ -255,7 +277,7 @@ def _add_organ_options(organ: argparse._ArgumentGroup) -> None:
     organ.add_argument(
         "--labels",
         metavar="LIST",
-        help="of a scan: the labels that make up the body, and their materials, as in "
+        help="for a scan: the labels that make up the body, and their materials, for example "
         "liver=3kPa:0.45,vessel@4=30kPa:0.45 (default: all labels, one material)",
     )
     organ.add_argument(
@@ -265,13 +287,13 @@ def _add_organ_options(organ: argparse._ArgumentGroup) -> None:
         "--threshold",
         type=value_range,
         metavar="LOW[:HIGH]",
-        help="of a scan without labels: voxels with these values make up the body, as in 200 or -200:300",
+        help="for a scan without labels: voxels with these values make up the body, for example 200 or -200:300",
     )
     organ.add_argument(
         "--skin",
         choices=("input", "marched"),
-        help="surface to draw: the input's own, with its texture coordinates, names and materials, or the one that "
-        "the tetrahedra hold (default: input)",
+        help="surface to draw: the input's own, with its texture coordinates, names and materials, or the marched "
+        "surface of the tetrahedra (default: input)",
     )
     organ.add_argument("--draw-tets", action="store_true", help="write the tetrahedra as well as the surface")
     organ.add_argument("--draw-labels", action="store_true", help="write a closed surface for each label")

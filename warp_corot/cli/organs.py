@@ -1,4 +1,4 @@
-"""Bodies from surfaces and scans: what becomes of INPUT when it is not made of tetrahedra."""
+"""Bodies from surfaces and scans: the processing of an input that has no tetrahedra."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ if TYPE_CHECKING:
     from warp_corot.io.write.skins import OwnSurface
     from warp_corot.mesh import SurfaceMesh
 
-#: Where a surface error or a level is asked for in place of a number: so many of these tetrahedra make a root cube of a
-#: length's cube worthwhile.
+#: With a surface error or a level instead of a number of tetrahedra: the default number for each root cube in a cube of
+#: the body's length, which gives the size of root cubes.
 TETS_PER_CUBE = 30
-#: How often cubes are bisected at most then, and to how many levels below it is looked for what lies between nodes.
+#: Maximum number of bisections of cubes in this case, and of further levels for details between nodes.
 MAX_LEVEL_FOR_ERROR, DETAIL = 12, 6
-#: Root cubes reach beyond the body by this share of its length.
+#: Root cubes extend beyond the body by this fraction of its length.
 MARGIN = 1.0e-3
-#: With more root cubes in the body's box for each tetrahedron that is allowed, no body fits.
+#: With more root cubes in the body's box for each allowed tetrahedron, no body fits.
 CUBES_PER_TET = 1000
-#: What Python's arguments are called on the command line.
+#: Names of Python's arguments on the command line.
 ARGUMENTS = {
     "unit": "--unit",
     "cell_size": "--cell-size",
@@ -47,21 +47,21 @@ ARGUMENTS = {
     "min_layers": "--min-layers",
     "smoothing": "--smoothing",
 }
-#: A scan of more different values than these, or of negative ones, holds intensities, not labels.
+#: A scan with more distinct values, or with negative ones, holds intensities, not labels.
 MOST_LABELS = 256
-#: So many voxels are looked at to see it.
+#: Number of voxels that are checked for this.
 LOOKED_AT = 10**6
 
 
 def find_organ(opened: Opened, args: argparse.Namespace) -> Subject:
-    """The body that a surface or a scan encloses, meshed.
+    """Mesh the body that a surface or a scan encloses.
 
     Args:
-        opened: INPUT, a surface or a scan.
-        args: Of the command.
+        opened: The input, a surface or a scan.
+        args: The command's arguments.
 
     Raises:
-        InputError: It encloses none, or an option is out of its range.
+        InputError: It encloses no body, or an option is out of its range.
     """
     with _as_options():
         started = time.perf_counter()
@@ -127,7 +127,7 @@ def _scan(opened: Opened, args: argparse.Namespace, entries: list[LabelMaterial]
 
 
 def _see_labels(volume: LoadedVolume) -> None:
-    """See that a scan holds labels.
+    """Check that a scan holds labels.
 
     Raises:
         InputError: It holds intensities.
@@ -153,8 +153,6 @@ def _mesh(args: argparse.Namespace, domain: Domain) -> TetForest:
             size = float(np.ptp(domain.bounds, axis=0).max()) * (1.0 + MARGIN) / cubes
         if level is None:
             level = MAX_LEVEL_FOR_ERROR
-    elif size is not None and size > 0.0:
-        _check_cubes(domain, size, count)
     layers = {} if args.min_layers is None else {"min_layers": args.min_layers}
     try:
         return TetForest.from_domain(
@@ -173,34 +171,20 @@ def _mesh(args: argparse.Namespace, domain: Domain) -> TetForest:
         raise InputError(f"{with_tets}{error}") from None
 
 
-def _check_cubes(domain: Domain, size: float, count: int) -> None:
-    """See that cubes of a size [m] are not hopelessly many for a number of tetrahedra.
-
-    Raises:
-        InputError: They are.
-    """
-    cubes = float(np.prod(np.ceil(np.ptp(domain.bounds, axis=0) / size)))
-    if cubes > CUBES_PER_TET * max(count, 1):
-        raise InputError(
-            f"cell_size is {size:g} m, of which the body's box has {cubes:.3g} cubes; --tets {count} is too few for "
-            "them: take a larger --cell-size or more tetrahedra"
-        )
-
-
 def _own_surface(opened: Opened, args: argparse.Namespace, domain: Domain) -> OwnSurface | None:
-    """The surface that was given, if it is to be drawn."""
+    """The input surface, if it is to be drawn."""
     if opened.surface is None or args.skin == "marched":
         return None
     from warp_corot.io.write.skins import OwnSurface
 
     found = OwnSurface.of_domain(opened.source, opened.surface, domain.bounds, offset_of(args))
     if found is None:
-        opened.notes.append("the surface is not what it was before it was closed: the marched one is drawn")
+        opened.notes.append("the surface was changed when it was closed: the marched one is drawn")
     return found
 
 
 def _measured(args: argparse.Namespace, mesh: TetForest, domain: Domain, surface: SurfaceMesh) -> Fidelity:
-    """How true the mesh is to the body; what is not is warned of."""
+    """Measure how well the mesh approximates the body, and warn of deviations."""
     from warp_corot.domain.fidelity import fidelity
     from warp_corot.domain.units import length
 
@@ -220,7 +204,7 @@ def _measured(args: argparse.Namespace, mesh: TetForest, domain: Domain, surface
 
 @contextmanager
 def _as_options() -> Iterator[None]:
-    """Complaints name options in place of Python's arguments."""
+    """Replace Python's argument names by options in error messages."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:

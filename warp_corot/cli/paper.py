@@ -26,16 +26,16 @@ def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParse
         "paper",
         help="run the paper's experiment: a table, results.json and figures 5 to 8",
         description="""\
-Lets the beam of Tagawa, Yamada and Tanaka (IEEE EMBC 2013) fall under its own
+Simulates the beam of Tagawa, Yamada and Tanaka (IEEE EMBC 2013) under its own
 weight with linear, corotated (rotations at every level of the tree),
 St. Venant-Kirchhoff and neo-Hookean elements; compares the displacement of its
-free end, its volume and the computation time; puts the claims to the test.
+free end, its volume and the computation time; tests the paper's claims.
 Prints a table and writes results.json and the counterparts of figures 5 to 8 as PNG.""",
         epilog="""\
 Absolute times are given for CUDA devices only; a CPU's are relative to linear
 FEM in the same run. Nothing is written before all models have run.""",
     )
-    parser.add_argument("-o", "--output", required=True, type=Path, metavar="DIR", help="folder; made if need be")
+    parser.add_argument("-o", "--output", required=True, type=Path, metavar="DIR", help="folder; made if necessary")
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--full", action="store_true", help=f"the paper's {FULL_DURATION:g} s (minutes on a CPU)")
     length.add_argument(
@@ -57,8 +57,8 @@ def run(args: argparse.Namespace) -> int:
     """Run the command; returns the exit status.
 
     Raises:
-        InputError: Bad options; nothing has been simulated or written.
-        UnstableError: A state is not finite any more; nothing has been written.
+        InputError: Bad options; nothing was simulated or written.
+        UnstableError: A state is no longer finite; nothing was written.
     """
     from warp_corot.experiments import figures, report
     from warp_corot.experiments.paper import FULL_DURATION, SHORT_DURATION, Settings
@@ -73,14 +73,14 @@ def run(args: argparse.Namespace) -> int:
             flush=True,
         )
     results = _with_progress(settings, args.device)
-    # The table comes last: a reader that goes away, as `head` does, must not cost the files, nor a full disk the table.
+    # The table comes last: a reader that goes away, like `head`, must not cost the files, nor a full disk the table.
     text = report.table(results)
     try:
         folder.mkdir(exist_ok=True)
         report.write_json(folder / RESULTS, results)
         files = [folder / RESULTS, *figures.draw_figures(folder, results)]
     except KeyboardInterrupt as signalled:
-        complain(f"interrupted while writing; every file in {folder} is whole", kind="")
+        complain(f"interrupted while writing; every file in {folder} is complete", kind="")
         return interrupt_status(signalled)
     except OSError as error:
         print(text, flush=True)
@@ -92,21 +92,21 @@ def run(args: argparse.Namespace) -> int:
 
 
 def checked_folder(folder: Path, names: Iterable[str] = ()) -> Path:
-    """Says before a long run whether files of these names can be written there; makes nothing yet.
+    """Check, before a long run, that files of these names can be written there; makes nothing yet.
 
     Raises:
-        InputError: A file or folder in the way, no folder to make it in, or no permission.
+        InputError: A file or folder with this name exists, its parent folder does not, or permission is missing.
     """
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file, should be a folder")
+        raise InputError(f"{folder}: is a file; it must be a folder")
     there = folder if folder.exists() else folder.absolute().parent
     if not there.is_dir():
-        raise InputError(f"{folder}: its parent folder {there} is not there")
+        raise InputError(f"{folder}: its parent folder {there} does not exist")
     if not os.access(there, os.W_OK | os.X_OK):
         raise InputError(f"{folder}: cannot be written to")
     for name in names:
         if (folder / name).is_dir():
-            raise InputError(f"{folder / name}: is a folder, should be a file or nothing")
+            raise InputError(f"{folder / name}: is a folder; it must be a file or nothing")
     return folder
 
 

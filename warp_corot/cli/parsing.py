@@ -1,4 +1,4 @@
-"""What the parsers of the command line and of run files have in common."""
+"""The common base of the parsers of the command line and of run files."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 
 class StrictParser(argparse.ArgumentParser):
-    """Takes no abbreviations, and ``--`` for no option's value, which argparse makes an empty list of."""
+    """Accepts neither abbreviations nor ``--`` as a value, of which argparse makes an empty list."""
 
     def __init__(self, **options: Any):
         options.setdefault("allow_abbrev", False)

@@ -1,4 +1,4 @@
-"""Parts of a body that options name: expressions, regions that every body has, and those of ``--patch``."""
+"""Parts of a body that options name: expressions, regions of every body, and those of ``--patch``."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ class Patches:
 
     Args:
         subject: The body.
-        up: Against gravity, unit vector.
-        given: What ``--patch`` says, ``NAME=EXPR`` each.
+        up: Unit vector against gravity.
+        given: The arguments of ``--patch``, each ``NAME=EXPR``.
 
     Raises:
-        InputError: Not of that form, or a name that cannot be one.
+        InputError: Another form, or an invalid name.
     """
 
     def __init__(self, subject: Subject, up: npt.NDArray[np.float64], given: Sequence[str] = ()):
@@ -62,20 +62,20 @@ class Patches:
         for text in given:
             name, equals, expression = (part.strip() for part in text.partition("="))
             if not equals or not re.fullmatch(r"[A-Za-z_]\w*", name) or not expression:
-                raise InputError(f"--patch {text!r}: it must be NAME=EXPR, such as tip=nearest(0, 0, 0.1)")
+                raise InputError(f"--patch {text!r}: it must be NAME=EXPR, for example tip=nearest(0, 0, 0.1)")
             if name in TAKEN or keyword.iskeyword(name) or name in self._named:
-                raise InputError(f"--patch {text!r}: {name} is a name already; take another one")
+                raise InputError(f"--patch {text!r}: {name} is already a name; it must be another one")
             self._named[name] = partial(np.array, self.nodes(expression)[self.used])
 
     def of_mesh(self, mesh: Mesh) -> Patches:
-        """The same patches on what the body's mesh has become."""
+        """The same patches on the body's changed mesh."""
         return self if mesh is self.subject.mesh else Patches(replace(self.subject, mesh=mesh), self._up, self._given)
 
     def nodes(self, expression: str) -> Mask:
-        """Nodes of a patch, bool [N]; those in no tetrahedron are in none.
+        """Nodes of a patch, bool [N]; nodes in no tetrahedron are in no patch.
 
         Raises:
-            InputError: As `select_nodes`.
+            InputError: As in `select_nodes`.
         """
         mesh, mask = self.subject.mesh, np.zeros(len(self.subject.mesh.points), bool)
         points = mesh.points[self.used]
@@ -83,10 +83,10 @@ class Patches:
         return mask
 
     def some(self, expression: str, option: str) -> Mask:
-        """Nodes of a patch that must have some.
+        """Nodes of a patch that must not be empty.
 
         Raises:
-            InputError: It has none, or as `nodes`.
+            InputError: It is empty, or as in `nodes`.
         """
         mask = self.nodes(expression)
         if not mask.any():
@@ -94,10 +94,10 @@ class Patches:
         return mask
 
     def tetrahedra(self, expression: str) -> Mask:
-        """Tetrahedra whose middle is in a patch, bool [T]; of patches that are given by names, all of whose nodes are.
+        """Tetrahedra whose centre is in a patch, bool [T]; for named patches, those with all nodes in it.
 
         Raises:
-            InputError: As `select_nodes`.
+            InputError: As in `select_nodes`.
         """
         tets, mesh = self.subject.mesh.tets, self.subject.mesh
         places = np.searchsorted(self.used, tets)
@@ -105,10 +105,11 @@ class Patches:
         return select_nodes(expression, mesh.points[tets].mean(axis=1), bounds=self.subject.bounds, named=middles)
 
     def on_surface(self, expression: str, surface: SurfaceMesh) -> Mask:
-        """Points of a bound surface that are in a patch, bool [V]; of named patches, those bound to it by half or more.
+        """Points of a bound surface that are in a patch, bool [V]; for named patches, those bound to it by half or
+        more.
 
         Raises:
-            InputError: As `select_nodes`.
+            InputError: As in `select_nodes`.
         """
         named = {name: partial(self._bound, nodes, surface) for name, nodes in self._named.items()}
         return select_nodes(expression, surface.points, bounds=self.subject.bounds, named=named)
@@ -143,5 +144,5 @@ class Patches:
 
 
 def _all_four(nodes: Callable[[], Mask], places: npt.NDArray[np.integer]) -> Mask:
-    """Tetrahedra all of whose nodes are in a patch."""
+    """Tetrahedra with all four nodes in a patch."""
     return nodes()[places].all(axis=1)

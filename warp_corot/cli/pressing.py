@@ -19,24 +19,24 @@ if TYPE_CHECKING:
     from .loading import Load
     from .patches import Patches
 
-#: A pressure that changes is set again at least so often while it does.
+#: A changing pressure is updated at least this often.
 UPDATES = 200
 
 Array = npt.NDArray[np.float64]
 
 
 def press_patches(sim: Simulation, body: SoftBody, loads: Sequence[Load], patches: Patches, ramp: float) -> None:
-    """Have the pressures of ``--press`` act and grow.
+    """Apply the pressures of ``--press``.
 
     Args:
         sim: The simulation.
-        body: One of its bodies; its mesh may follow the motion.
-        loads: Of the body.
-        patches: Of the body.
+        body: One of its bodies; it may be remeshed.
+        loads: The body's loads.
+        patches: The body's patches.
         ramp: Time over which loads without times grow [s].
 
     Raises:
-        InputError: A patch without surface.
+        InputError: A patch contains no part of the surface.
     """
     pressing = [load for load in loads if load.kind == "press"]
     if not pressing:
@@ -50,16 +50,16 @@ def press_patches(sim: Simulation, body: SoftBody, loads: Sequence[Load], patche
 
 
 class _Pressure:
-    """The pressures on a body at any time.
+    """The pressures on a body over time.
 
     Args:
         body: The body.
         loads: Pressures.
-        patches: Of the body.
+        patches: The body's patches.
         ramp: Time over which loads without times grow [s].
 
     Attributes:
-        span: From the first to the last time at which one of them changes [s].
+        span: Time from the first to the last change of a pressure [s].
     """
 
     def __init__(self, body: SoftBody, loads: Sequence[Load], patches: Patches, ramp: float):
@@ -79,7 +79,7 @@ class _Pressure:
         self._done = False
 
     def set(self, time: float) -> None:
-        """Load the body's nodes as it should be at a time [s], if that has changed."""
+        """Load the body's nodes for a time [s], if the loads have changed."""
         if self._revision != self._body.version:
             self._done = False
         if self._done or (self._revision == self._body.version and time < self._first):
@@ -102,7 +102,7 @@ def pressed(load: Load, patches: Patches, surface: SurfaceMesh) -> Array:
     """Forces of one pascal on a patch, at the points of the surface [N], [V, 3].
 
     Raises:
-        InputError: The patch has no surface.
+        InputError: The patch contains no part of the surface.
     """
     inside = patches.on_surface(load.patch, surface)
     triangles = surface.triangles[inside[surface.triangles].all(axis=1)]
@@ -115,7 +115,7 @@ def pressed(load: Load, patches: Patches, surface: SurfaceMesh) -> Array:
 
 
 def nodal(forces: Array, nodes: npt.NDArray[np.integer], weights: npt.NDArray[np.floating], count: int) -> Array:
-    """Forces at bound points [N], [V, 3], as forces on the nodes [N], [count, 3]."""
+    """Forces at bound points [N], [V, 3], distributed to the nodes [N], [count, 3]."""
     found = np.zeros((count, 3))
     np.add.at(found, nodes.ravel(), (weights[:, :, None] * forces[:, None]).reshape(-1, 3))
     return found

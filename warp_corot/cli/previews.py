@@ -39,7 +39,7 @@ VIEWS = {
     "bottom": (0.0, -89.9),
 }
 MOST_PANELS, MOST_COLUMNS = 12, 4
-#: Pixels of each view of a film, and about how many polygons it is drawn of.
+#: Pixels of each view of a film, and its approximate number of polygons.
 FILM_SIZE, FILM_PIECES = (640, 540), 15_000
 
 
@@ -53,26 +53,26 @@ def add_preview_options(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--preview-frames",
         metavar="LIST",
-        help="draw these frames side by side into the .png, counted from 0, or back from -1, as in 0,12,-1",
+        help="draw these frames side by side into the .png, counted from 0, or back from -1, for example 0,12,-1",
     )
     group.add_argument(
         "--preview-views",
         metavar="LIST",
-        help=f"draw from these sides: {', '.join(VIEWS)}, or AZIMUTH:ELEVATION in degrees, as in front,left,35:14 "
+        help=f"draw from these sides: {', '.join(VIEWS)}, or AZIMUTH:ELEVATION [°], for example front,left,35:14 "
         "(default: corner)",
     )
 
 
 @dataclass(frozen=True)
 class Look:
-    """What all frames of a preview have in common.
+    """The common view of all frames of a preview.
 
     Attributes:
         box: Lowest and highest coordinates of all frames [m], [2, 3].
-        cameras: One for each view.
+        cameras: A camera for each view.
         window: Lowest and highest picture coordinates of all frames.
         limits: Values at the ends of the colour map.
-        ground: Its height [m].
+        ground: Height of the ground [m].
     """
 
     box: np.ndarray
@@ -84,14 +84,14 @@ class Look:
 
 @dataclass
 class Previews:
-    """What ``--preview`` draws: frames are kept aside while the run goes on, and drawn at its end.
+    """The pictures of ``--preview``: frames are stored during the run and drawn at its end.
 
     Args:
-        args: Of the command.
-        count: How many frames follow the first.
+        args: The command's arguments.
+        count: Number of frames after the first one.
 
     Raises:
-        InputError: Not a list of frames that there are, not a view, or a package is missing.
+        InputError: Invalid frames or views, or a package is missing.
     """
 
     args: argparse.Namespace
@@ -114,7 +114,7 @@ class Previews:
             raise InputError(f"--preview would have {panels}; a picture has at most {MOST_PANELS} panels")
 
     def add(self, frame: int, bodies: Sequence[Body], sim: Simulation) -> None:
-        """Keep the present state if it is one of the frames that are drawn."""
+        """Store the current state if its frame is drawn."""
         if frame not in self.frames:
             return
         if self._file is None:
@@ -123,11 +123,11 @@ class Previews:
         shown_now(bodies, sim).write(self._file)
 
     def draw(self, bodies: Sequence[Body], name: str) -> None:
-        """Draw what was kept.
+        """Draw the stored frames.
 
         Args:
-            bodies: Of the run.
-            name: For the title, which the time follows.
+            bodies: The bodies of the run.
+            name: The title, before the time.
 
         Raises:
             OSError: It cannot be written.
@@ -154,7 +154,7 @@ class Previews:
                 self._draw_picture(name, up_axis, look, bar)
 
     def _look(self, up_axis: str) -> Look:
-        """What all frames have in common."""
+        """The common view of all frames."""
         from warp_corot.io.pictures.drawing import value_limits
         from warp_corot.io.pictures.preview import Picture, bounds_of, cameras_of, window_of
 
@@ -162,7 +162,8 @@ class Previews:
         for shown in self._kept():
             boxes.append(bounds_of([Picture(shown.positions, shown.triangles, rest=shown.rest)]))
             highest = max(highest, value_limits(shown.values)[1])
-            ground = min(ground, boxes[-1][0, "XYZ".index(up_axis)])
+            axis = "XYZ".index(up_axis)
+            ground = min(ground, boxes[-1][0, axis], *shown.ground[:, axis])
         box = np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
         cameras = cameras_of(self._pictures(shown, ""), up_axis, *VIEWS["corner"], box)
         window = window_of((self._pictures(each, "") for each in self._kept()), cameras, float(ground))
@@ -175,6 +176,8 @@ class Previews:
         named = (self.args.preview_views or "").split(",") if len(self.views) > 1 else [""]
         titles = [", ".join(filter(None, (name, frame_title))) for name in named]
         options: dict[str, Any] = {"held": shown.held} if shown.held.any() else {}
+        if len(shown.ground):
+            options["square"] = shown.ground
         if is_film(self.args.preview):
             options["pieces"] = FILM_PIECES
         return [
@@ -194,7 +197,9 @@ class Previews:
         several = len(self.views) > 1 and len(self.frames) > 1
         columns = len(self.views) if several else min(len(panels), MOST_COLUMNS)
         words = name if len(self.frames) > 1 else f"{name}; {shown.time:.3g} s"
-        drawn = draw_strip(panels, cameras, value_range=look.limits, title=words, size=size, columns=columns)
+        drawn = draw_strip(
+            panels, cameras, value_range=look.limits, title=words, size=size, columns=columns, ground=look.ground
+        )
         save_picture(drawn, self.args.preview)
 
     def _images(self, name: str, look: Look, bar: Any) -> Generator[Image, None, None]:
@@ -227,10 +232,10 @@ def is_film(path: Path) -> bool:
 
 
 def check_preview(args: argparse.Namespace) -> None:
-    """Say before a long run what would stop its picture from being drawn.
+    """Check, before a long run, that its picture can be drawn.
 
     Raises:
-        InputError: Something would.
+        InputError: It cannot.
     """
     from warp_corot.io.pictures.preview import check_picture_path
 

@@ -1,17 +1,18 @@
-"""``--probe`` and ``--csv``: what patches and points of bodies do, and energies, frame by frame as a table."""
+"""``--probe`` and ``--csv``: motion of patches and points of bodies, and energies, as a table by frames."""
 
 from __future__ import annotations
 
 import csv
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,25 +23,25 @@ if TYPE_CHECKING:
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _POINT = re.compile(rf"\s*({_NUMBER})[\s,]+({_NUMBER})[\s,]+({_NUMBER})\s*")
-#: A point this share of the body's size outside is not taken for the nearest one in it.
+#: A point outside by more than this fraction of the body's size is not moved to the nearest point inside.
 OUTSIDE = 0.05
 
 Array = npt.NDArray[np.float64]
 
 
 class Probe:
-    """A point of a body, or a patch, and what becomes of it.
+    """A probed point or patch of a body.
 
-    A point is what the tetrahedron around it makes of its four nodes. Of a patch it is the mean over its nodes, each
-    counted with its mass; reactions are summed. Both are found again where the mesh has become another one.
+    A point interpolates the four nodes of its tetrahedron. A patch has the mass-weighted mean over its nodes, and the
+    sum of their reactions. Both are found again when the mesh has changed.
 
     Args:
         text: "X Y Z" [m] at rest, or a patch's expression.
-        body: Whose.
-        patches: Of the body.
+        body: The body.
+        patches: The body's patches.
 
     Raises:
-        InputError: A point that is not in the body, a patch without nodes, or no expression.
+        InputError: A point outside the body, a patch without nodes, or an invalid expression.
     """
 
     def __init__(self, text: str, body: SoftBody, patches: Patches):
@@ -66,7 +67,7 @@ class Probe:
         return [float(x) for x in (*(self._weights @ u), *(self._weights @ v), *(share @ r))]
 
     def _find(self) -> None:
-        """Find the nodes in the present mesh, and how much each counts."""
+        """Find the nodes in the current mesh, and their weights."""
         self._revision = self.body.version
         if not self.is_patch:
             self._place()
@@ -77,7 +78,7 @@ class Probe:
         self._weights = weights[self._nodes] / weights.sum()
 
     def _place(self) -> None:
-        """Find the tetrahedron that the point is in, or the nearest."""
+        """Find the tetrahedron that contains the point, or the nearest one."""
         mesh = self.body.mesh
         corners = mesh.points[mesh.tets]
         edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
@@ -93,10 +94,10 @@ class Probe:
 
 
 def probes_body(text: str, patches: Patches) -> bool:
-    """Whether a body has the patch, or the point in its box.
+    """Whether a body has the patch, or contains the point in its box.
 
     Raises:
-        InputError: As `Patches.nodes`.
+        InputError: As in `Patches.nodes`.
     """
     match = _POINT.fullmatch(text)
     if match is None:
@@ -106,23 +107,27 @@ def probes_body(text: str, patches: Patches) -> bool:
 
 
 class Table:
-    """A CSV file of one row a frame; each row is in it as soon as it is made.
+    """A CSV file with one row for each frame; each row is written at once.
 
     Args:
-        path: The file; what was there stays until the first row.
+        path: The file; a former one stays until the first row.
         sim: The simulation.
-        probes: Of its bodies.
+        probes: Probes of its bodies.
+        obstacles: What they touch, by name; the forces on it have columns, and the places of tools.
 
     Raises:
-        InputError: Another extension, a folder, or none to write to.
+        InputError: Another extension, a folder with this name, or no folder to write to.
     """
 
-    def __init__(self, path: Path, sim: Simulation, probes: Sequence[Probe]):
+    def __init__(
+        self, path: Path, sim: Simulation, probes: Sequence[Probe], obstacles: Mapping[str, Obstacle] | None = None
+    ):
         self.path, self._sim, self._probes = path, sim, probes
+        self._obstacles = dict(obstacles or {})
         self._file: IO[str] | None = None
 
     def add(self) -> None:
-        """Add a row of the present state.
+        """Add a row with the current state.
 
         Raises:
             OSError: It cannot be written.
@@ -133,6 +138,7 @@ class Table:
                 csv.writer(self._file).writerow(self._header())
             energy = self._sim.energy()
             values = [value for probe in self._probes for value in probe.values()]
+            values += [value for each in self._obstacles.values() for value in _felt(each)]
             row = [self._sim.time, *values, energy.kinetic, energy.elastic, energy.gravitational, self._sim.dt]
             csv.writer(self._file).writerow([f"{value:.9g}" for value in row])
             self._file.flush()
@@ -149,20 +155,39 @@ class Table:
         for probe in self._probes:
             of = f"body {bodies.index(probe.body) + 1}: " if len(bodies) > 1 else ""
             names += [f"{of}{probe.text} {column}" for column in probe.columns]
+        for name, each in self._obstacles.items():
+            names += [f"{name} {column}" for column in _felt_columns(each)]
         return [*names, "kinetic [J]", "elastic [J]", "gravitational [J]", "dt [s]"]
 
 
+def _felt_columns(obstacle: Obstacle) -> list[str]:
+    """Names and units of `_felt`."""
+    forces = [f"force {axis} [N]" for axis in "xyz"]
+    if not isinstance(obstacle, Tool):
+        return forces
+    return [f"{axis} [m]" for axis in "xyz"] + forces + [f"torque {axis} [N m]" for axis in "xyz"]
+
+
+def _felt(obstacle: Obstacle) -> list[float]:
+    """The force on an obstacle in the last step [N]; for a tool its place [m] before, and the torque about it [N m]
+    after."""
+    wrench = [float(value) for value in obstacle.wrench.numpy()[0]]
+    if not isinstance(obstacle, Tool):
+        return wrench[:3]
+    return [*obstacle.present_pose[0, :3].tolist(), *wrench]
+
+
 def check_table_path(path: Path) -> None:
-    """Say before a long run what would stop a table from being written.
+    """Check, before a long run, that a table can be written.
 
     Raises:
-        InputError: Something would.
+        InputError: It cannot.
     """
     if path.suffix.lower() != ".csv":
-        raise InputError(f"{path}: extension {path.suffix or '(none)'}, should be .csv")
+        raise InputError(f"{path}: extension {path.suffix or '(none)'}; it must be .csv")
     if path.is_dir():
-        raise InputError(f"{path}: is a folder, should be a file name")
+        raise InputError(f"{path}: is a folder; it must be a file name")
     if not path.parent.is_dir():
-        raise InputError(f"{path}: output folder {path.parent} is not there")
+        raise InputError(f"{path}: output folder {path.parent} does not exist")
     if not os.access(path if path.exists() else path.parent, os.W_OK):
         raise InputError(f"{path}: cannot be written to")

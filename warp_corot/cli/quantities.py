@@ -1,4 +1,4 @@
-"""Quantities as options take them: a number in SI units, or with a unit of its own, as in 5kPa."""
+"""Quantities in options: a number in SI units, or with a unit, for example 5kPa."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from warp_corot.errors import InputError
 
 
 def quantity(unit: str) -> Callable[[str], float]:
-    """What turns an option's text into a number in a unit, for ``add_argument(type=...)``."""
+    """A function that converts an option's text to a number in a unit, for ``add_argument(type=...)``."""
 
     def parse(text: str) -> float:
         try:
@@ -27,18 +27,18 @@ def number(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} must be a number, as in 0.45") from None
+        raise argparse.ArgumentTypeError(f"{text!r} must be a number, for example 0.45") from None
 
 
 def whole_number(text: str) -> int:
-    """A whole number, as in 20000 or 2e4."""
+    """A whole number: 20000 or 2e4."""
     try:
         value = float(text)
         if value == int(value):
             return int(text) if text.strip().lstrip("+-").isdecimal() else int(value)
     except (ValueError, OverflowError):
         pass
-    raise argparse.ArgumentTypeError(f"{text!r} must be a whole number, as in 20000 or 2e4")
+    raise argparse.ArgumentTypeError(f"{text!r} must be a whole number, for example 20000 or 2e4")
 
 
 def rotation_level(text: str) -> int | float | str:
@@ -61,7 +61,7 @@ acceleration = quantity("m/s^2")
 
 @dataclass(frozen=True)
 class ValueRange:
-    """Numbers from one to another, both included."""
+    """A range of numbers with both ends."""
 
     low: float
     high: float
@@ -71,19 +71,19 @@ class ValueRange:
 
 
 def value_range(text: str) -> ValueRange:
-    """Two numbers as LOW:HIGH, or one, to which everything larger belongs."""
+    """Two numbers LOW:HIGH, or one without an upper limit."""
     words = text.split(":")
     try:
         low, high = [float(word) for word in words] if len(words) == 2 else (float(text), float("inf"))
     except ValueError:
         low, high = float("nan"), float("nan")
     if not low <= high:
-        raise argparse.ArgumentTypeError(f"{text!r} must be a number or LOW:HIGH, such as 200 or -200:300")
+        raise argparse.ArgumentTypeError(f"{text!r} must be a number or LOW:HIGH, for example 200 or -200:300")
     return ValueRange(low, high)
 
 
 def unit_of_length(text: str) -> str:
-    """A unit, or a length that is one, such as mm or 3.2cm."""
+    """A unit, or a length used as a unit: mm or 3.2cm."""
     try:
         metres_per_unit(text)
     except InputError as error:

@@ -1,4 +1,4 @@
-"""``--remesh``: its options, what they ask for, and what has become of the mesh."""
+"""``--remesh``: its options, and its summary."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from warp_corot.io.write.animate import Recording
     from warp_corot.simulation.simulation import Simulation
 
-#: What Python's arguments are called on the command line.
+#: Names of Python's arguments on the command line.
 ARGUMENTS = {
     "refine_above": "--refine-above",
     "simplify_below": "--simplify-below",
@@ -26,12 +26,12 @@ ARGUMENTS = {
     "every": "--remesh-every",
     "capacity": "--capacity",
 }
-#: Options that go with ``--remesh`` only.
+#: Options that need ``--remesh``.
 OPTIONS = ("refine_above", "simplify_below", "remesh_levels", "remesh_every", "capacity")
 
 
 def add_remesh_options(group: argparse._ArgumentGroup) -> None:
-    """Add the options to a group of the command's."""
+    """Add the options to a group of the command's parser."""
     group.add_argument(
         "--remesh",
         action="store_true",
@@ -56,7 +56,7 @@ def add_remesh_options(group: argparse._ArgumentGroup) -> None:
         type=whole_number,
         nargs=2,
         metavar=("MIN", "MAX"),
-        help="how often cubes are bisected at least and at most (default: from the coarsest level at the start to "
+        help="minimum and maximum number of bisections of a cube (default: from the coarsest level at the start to "
         "three more than the finest)",
     )
     group.add_argument(
@@ -74,14 +74,14 @@ def add_remesh_options(group: argparse._ArgumentGroup) -> None:
 
 
 def remesh_of(args: argparse.Namespace, kind: str) -> OnlineRemesh | None:
-    """What the options ask for, None if the mesh stays as it is.
+    """The remeshing that the options request, None for none.
 
     Args:
-        args: Of the command.
-        kind: What INPUT is: "box", "tets", "surface" or "scan".
+        args: The command's arguments.
+        kind: Kind of input: "box", "tets", "surface" or "scan".
 
     Raises:
-        InputError: An option that is out of its range or of no effect, or a mesh that cannot be remeshed.
+        InputError: An option that is out of its range or has no effect, or a mesh that cannot be remeshed.
     """
     if not args.remesh:
         for name in OPTIONS:
@@ -90,8 +90,8 @@ def remesh_of(args: argparse.Namespace, kind: str) -> OnlineRemesh | None:
         return None
     if kind == "tets":
         raise InputError(
-            f"--remesh is for box, surfaces and scans, whose meshes are bisected cubes; {args.input} has tetrahedra of "
-            "its own"
+            f"--remesh is for box, surfaces and scans, whose meshes are bisected cubes; {args.input} has its own "
+            "tetrahedra"
         )
     asked = {name: getattr(args, name) for name in ("refine_above", "simplify_below", "capacity")}
     asked |= {"every": args.remesh_every}
@@ -102,7 +102,7 @@ def remesh_of(args: argparse.Namespace, kind: str) -> OnlineRemesh | None:
 
 @contextmanager
 def as_remesh_options() -> Iterator[None]:
-    """Complaints name options in place of Python's arguments."""
+    """Replace Python's argument names by options in error messages."""
     try:
         yield
     except InputError as error:
@@ -113,7 +113,7 @@ def as_remesh_options() -> Iterator[None]:
 
 
 def remesh_rows(sim: Simulation, done: Recording) -> list[tuple[str, str]]:
-    """What has become of the mesh, for the summary; nothing if it stays as it is."""
+    """The mesh's changes for the summary; empty without remeshing."""
     changing = sim.remeshing.changing[0]
     if changing is None or not done.elements:
         return []

@@ -1,4 +1,4 @@
-"""Runs written down: TOML files whose keys are the names of ``simulate``'s options."""
+"""Run files: TOML files whose keys are the names of ``simulate``'s options."""
 
 from __future__ import annotations
 
@@ -16,27 +16,28 @@ from warp_corot.io.files.whole import written_whole
 from .loading import FORMS, Load, value_of
 from .parsing import StrictParser
 
-HELP = """a run file (.toml) has the names of options for keys: several values are a list, an option without a value is
+HELP = """a run file (.toml) has the options' names as keys: several values are a list, an option without a value is
 true. Options on the command line are added to all its bodies; paths are relative to the file:
   input = "liver.stl"
   unit = "mm"
   fix = ["bottom"]
   pull = [{ patch = "top", by = [0, 0, 0.02], times = [0, 1, 2], shares = [0, 1, 0] }]
-several bodies are tables [[body]], each with an input and options of its own, such as offset = [0, 0, "5cm"]"""
+several bodies are tables [[body]], each with an input and its own options, for example offset = [0, 0, "5cm"]"""
 
-#: What paths of files are, which a run file has beside it.
-PATHS = ("input", "output", "also", "preview", "csv")
-#: Of these there is one for all bodies.
+#: Options with paths, which are relative to the run file.
+PATHS = ("input", "output", "also", "preview", "csv", "tool_path")
+#: Options that all bodies share.
 SHARED = (
     *("output", "also", "preview", "preview_frames", "preview_views", "csv"),
     *("gravity", "damping", "viscosity", "duration", "fps", "dt", "device", "ramp"),
+    *("ground", "drop", "tool", "tool_path", "touch", "self_contact", "friction"),
 )
-#: What tables of loads have, besides times and shares.
+#: Keys in tables of loads, besides times and shares.
 VALUES = {"pull": "by", "twist": "degrees", "press": "pressure"}
 
 
 class _Parser(StrictParser):
-    """Complains about a file."""
+    """Reports errors in a file."""
 
     path = Path()
 
@@ -45,10 +46,10 @@ class _Parser(StrictParser):
 
 
 def bodies_of(args: argparse.Namespace) -> list[argparse.Namespace]:
-    """The options of each body: those of the command, or of the run file that INPUT is, with the command's.
+    """The options of each body: the command's, or those of the run file with the command's added.
 
     Raises:
-        InputError: No such file, not TOML, or something in it that is no option.
+        InputError: No such file, not TOML, or a key that is not an option.
     """
     if not args.input.lower().endswith(".toml"):
         return [args]
@@ -65,14 +66,14 @@ def bodies_of(args: argparse.Namespace) -> list[argparse.Namespace]:
     if not isinstance(tables, list) or not tables or not all(isinstance(table, dict) for table in tables):
         raise InputError(f"{path}: 'body' must be tables, each below a line [[body]]")
     for key in (key for table in tables for key in table if key in SHARED):
-        raise InputError(f"{path}: {key!r} is for the whole run, should stand above the first [[body]]")
+        raise InputError(f"{path}: {key!r} is for the whole run; it must stand above the first [[body]]")
     parser, actions = _parser(path)
     asked = list(_tokens_given(args, actions))
     return [_body_of(parser, actions, {**data, **table}, asked, path) for table in tables]
 
 
 def write_run(path: Path, bodies: Sequence[argparse.Namespace]) -> None:
-    """Write down a run, whole or not at all.
+    """Write a run file, completely or not at all.
 
     Raises:
         OSError: It cannot be written.
@@ -100,17 +101,17 @@ def write_run(path: Path, bodies: Sequence[argparse.Namespace]) -> None:
 
 
 def check_run_path(path: Path, source: str) -> None:
-    """Say before a long run what would stop it from being written down.
+    """Check, before a long run, that a run file can be written.
 
     Raises:
-        InputError: Something would.
+        InputError: It cannot.
     """
     if path.suffix.lower() != ".toml":
-        raise InputError(f"{path}: extension {path.suffix or '(none)'}, should be .toml")
+        raise InputError(f"{path}: extension {path.suffix or '(none)'}; it must be .toml")
     if path.is_dir() or not path.parent.is_dir():
-        raise InputError(f"{path}: {'is a folder' if path.is_dir() else f'output folder {path.parent} is not there'}")
+        raise InputError(f"{path}: {'is a folder' if path.is_dir() else f'output folder {path.parent} does not exist'}")
     if path.exists() and Path(source).exists() and path.samefile(source):
-        raise InputError(f"{path}: is the input, should be another file")
+        raise InputError(f"{path}: is the input; it must be another file")
     if not os.access(path if path.exists() else path.parent, os.W_OK):
         raise InputError(f"{path}: cannot be written to")
 
@@ -126,7 +127,7 @@ def _parser(path: Path) -> tuple[_Parser, dict[str, argparse.Action]]:
 
 
 class _Numbers:
-    """Takes all that begins with a minus and is no option for a value."""
+    """Matches every text that begins with a minus and is not an option, as a value."""
 
     @staticmethod
     def match(text: str) -> bool:
@@ -137,23 +138,23 @@ def _body_of(
     parser: _Parser, actions: dict[str, argparse.Action], table: dict[str, Any], asked: list[str], path: Path
 ) -> argparse.Namespace:
     if "input" not in table:
-        raise InputError(f"{path}: a body has no 'input'")
+        raise InputError(f"{path}: a body has no 'input'; it must have one")
     tokens: list[str] = []
     curves: list[Load] = []
     for key, value in table.items():
         name = key.replace("-", "_")
         if name not in actions:
-            raise InputError(f"{path}: {key!r} is no option; see warp-corot simulate --help")
+            raise InputError(f"{path}: {key!r} is not an option; see warp-corot simulate --help")
         if name in FORMS and isinstance(value, list):
             curves += [_load(name, entry, path) for entry in value if isinstance(entry, dict)]
             value = [entry for entry in value if not isinstance(entry, dict)]
         if name in PATHS:
-            several = name == "also" and isinstance(value, list)
+            several = name in ("also", "tool_path") and isinstance(value, list)
             value = [_beside(one, path, name) for one in value] if several else _beside(value, path, name)
         try:
             tokens += _tokens(actions[name], value)
         except TypeError:
-            raise InputError(f"{path}: {key} = {value!r} is not what the option takes") from None
+            raise InputError(f"{path}: {key} = {value!r} does not fit the option") from None
     body = parser.parse_args([*tokens, *asked])
     body.curves, body.write_run = curves, None
     return body
@@ -179,7 +180,7 @@ def _load(kind: str, table: dict[str, Any], path: Path) -> Load:
     except InputError as error:
         raise InputError(f"{path}: {kind} of {table['patch']!r}: {error}") from None
     except (TypeError, ValueError):
-        raise InputError(f"{path}: {kind} = {table!r}: something in it must be a number and is none") from None
+        raise InputError(f"{path}: {kind} = {table!r}: a value in it is not a number; it must be one") from None
     if len(values) != FORMS[kind][0] or (axis is not None and len(axis) != 3):
         needed = f"{VALUES[kind]} must be {FORMS[kind][0]} numbers, an axis 3"
         raise InputError(f"{path}: {kind} of {table['patch']!r}: {needed}")
@@ -187,10 +188,10 @@ def _load(kind: str, table: dict[str, Any], path: Path) -> Load:
 
 
 def _tokens(action: argparse.Action, value: Any) -> list[str]:
-    """A value as the command line has it.
+    """A value as words of a command line.
 
     Raises:
-        TypeError: It is not of the kind that the option takes.
+        TypeError: Its type does not fit the option.
     """
     if not action.option_strings:
         return [str(value)]
@@ -198,6 +199,8 @@ def _tokens(action: argparse.Action, value: Any) -> list[str]:
     if action.nargs == 0:
         if not isinstance(value, bool):
             raise TypeError
+        return [option] if value else []
+    if action.nargs == "?" and isinstance(value, bool):
         return [option] if value else []
     if isinstance(value, bool | dict):
         raise TypeError
@@ -208,7 +211,7 @@ def _tokens(action: argparse.Action, value: Any) -> list[str]:
 
 
 def _valued(action: argparse.Action, option: str, value: Any) -> list[str]:
-    if action.nargs is None:
+    if action.nargs in (None, "?"):
         if isinstance(value, list | dict):
             raise TypeError
         return [f"{option}={value}"]
@@ -218,7 +221,7 @@ def _valued(action: argparse.Action, option: str, value: Any) -> list[str]:
 
 
 def _tokens_given(args: argparse.Namespace, actions: dict[str, argparse.Action]) -> Iterator[str]:
-    """What the command line says in addition."""
+    """The words of the command line besides the run file."""
     for name, action in actions.items():
         value = getattr(args, name)
         if name != "input" and value != action.default:
@@ -250,7 +253,7 @@ def _relative(value: str, folder: Path, name: str) -> str:
 
 
 def _number(text: str) -> float | str:
-    """A number, or a quantity as it is written."""
+    """A number, or a quantity as text."""
     try:
         return float(text)
     except ValueError:

@@ -1,4 +1,4 @@
-"""``warp-corot scene``: a USD stage in, the same stage out with its soft and rigid bodies moving."""
+"""``warp-corot scene``: steps the soft and rigid bodies of a USD stage and writes a stage over it."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ what is read, as Newton reads it:
   rigid bodies, colliders, joints and the gravity of UsdPhysics, at their first moment if they are animated;
   metersPerUnit, kilogramsPerUnit, upAxis, transforms
 
-what touches what: points of soft bodies, and of cloth, touch colliders and rigid bodies, but not one another; rigid
-  bodies touch rigid bodies and colliders
+what touches what: points of soft bodies, and of cloth, touch colliders and rigid bodies; surfaces of soft bodies and
+  cloth touch one another; rigid bodies touch rigid bodies and colliders
 
 what is written, on top of OUT's sublayer INPUT, which must stay beside it unless --flatten is given:
-  of TetMesh prims points, velocities, primvars:vonMises [Pa], one a tetrahedron, and its colours
-  of rigid bodies their transforms; of graphics meshes and cloth their points
+  for TetMesh prims points, velocities, primvars:vonMises [Pa], one a tetrahedron, and its colours
+  for rigid bodies their transforms; for graphics meshes and cloth their points
 
 {EXIT_CODES}""",
     )
@@ -65,7 +65,7 @@ what is written, on top of OUT's sublayer INPUT, which must stay beside it unles
     parser.add_argument(
         "-o", "--output", required=True, type=Path, metavar="OUT.usd", help="stage to write (.usd, .usdc or .usda)"
     )
-    said = parser.add_argument_group("what the stage does not say")
+    said = parser.add_argument_group("what the stage does not define")
     said.add_argument(
         "--young",
         type=quantities.pressure,
@@ -78,7 +78,7 @@ what is written, on top of OUT's sublayer INPUT, which must stay beside it unles
         "--ground",
         default="auto",
         metavar="HEIGHT",
-        help="height of a ground plane [m]; auto: under the bodies if nothing is held and no collider stays in place "
+        help="height of a ground plane [m]; auto: below the bodies if nothing is held and no collider stays in place "
         "(default); or none",
     )
     said.add_argument(
@@ -86,11 +86,16 @@ what is written, on top of OUT's sublayer INPUT, which must stay beside it unles
         type=quantities.metres,
         default=0.0,
         metavar="R",
-        help="how far around each point of soft bodies contact is felt [m]: half of an edge closes the gaps between "
-        "points, through which what is smaller slips, and keeps bodies that far off what they touch (default: 0)",
+        help="contact radius around each point of soft bodies [m]: half of an edge closes the gaps between "
+        "points, through which smaller things slip, and keeps bodies that far from others (default: 0)",
     )
     said.add_argument(
-        "--fix", metavar="EXPR", help='points that are held, such as "z > zmax - 0.01": see simulate --help [m]'
+        "--no-soft-contact",
+        action="store_true",
+        help="soft bodies and cloth pass through one another, which takes less time",
+    )
+    said.add_argument(
+        "--fix", metavar="EXPR", help='points that are held, for example "z > zmax - 0.01": see simulate --help [m]'
     )
     motion = parser.add_argument_group("the motion")
     motion.add_argument(
@@ -112,7 +117,7 @@ what is written, on top of OUT's sublayer INPUT, which must stay beside it unles
         type=quantities.per_second,
         default=0.0,
         metavar="C",
-        help="mass-proportional damping, of falls too [1/s] (0)",
+        help="mass-proportional damping [1/s], which also damps falls (default: 0)",
     )
     motion.add_argument(
         "--duration",
@@ -127,7 +132,7 @@ what is written, on top of OUT's sublayer INPUT, which must stay beside it unles
         metavar="F",
         help="frames per second (default: the stage's time codes per second, else 24)",
     )
-    motion.add_argument("--dt", type=quantities.seconds, help="longest time step [s] (default: a safe one, found)")
+    motion.add_argument("--dt", type=quantities.seconds, help="longest time step [s] (default: a safe one)")
     motion.add_argument(
         "--rigid",
         choices=("semi-implicit", "xpbd", "none"),
@@ -136,7 +141,7 @@ what is written, on top of OUT's sublayer INPUT, which must stay beside it unles
     )
     shown = parser.add_argument_group("the output")
     shown.add_argument(
-        "--show-stress", action="store_true", help="colour soft bodies by stress, whatever material they are drawn with"
+        "--show-stress", action="store_true", help="colour soft bodies by stress, in place of their materials"
     )
     shown.add_argument("--flatten", action="store_true", help="write one file that needs no other stage")
     parser.add_argument("--device", help='"cpu", "cuda:0", ... (default: a GPU if there is one)')
@@ -147,7 +152,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the command; returns the exit status.
 
     Raises:
-        InputError: Newton is not there, bad options, or a bad stage; nothing has been simulated or written.
+        InputError: Newton is missing, bad options, or a bad stage; nothing was simulated or written.
     """
     from warp_corot.io.write.animate import Recording, frame_count, signals_held_back
     from warp_corot.io.write.usd.pieces import PieceStore
@@ -156,11 +161,19 @@ def run(args: argparse.Namespace) -> int:
 
     gravity = None if args.gravity is None else tuple(args.gravity)
     options = StageOptions(
-        args.young, args.poisson, args.density, gravity, args.viscosity, _ground(args.ground), args.fix, args.radius
+        args.young,
+        args.poisson,
+        args.density,
+        gravity,
+        args.viscosity,
+        _ground(args.ground),
+        args.fix,
+        args.radius,
+        not args.no_soft_contact,
     )
     if args.fps is not None:
         frame_count(args.duration, args.fps)
-    PieceStore(args.output)  # checks, and writes nothing before the first frame
+    PieceStore(args.output)  # checks the path, and writes nothing before the first frame
     device = checked_device(args.device)
     with compiling_said(device):
         sim = StageSimulation(
@@ -225,7 +238,7 @@ def _close(writer: SceneWriter, done: Recording) -> None:
 
 
 def _end(error: BaseException, writer: SceneWriter, done: Recording) -> int:
-    """Close the stage after an early end, and say what became of it; returns the exit status."""
+    """Close the stage after an early end, and report its state; returns the exit status."""
     try:
         _close(writer, done)
     except OSError as other:

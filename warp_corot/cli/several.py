@@ -1,4 +1,4 @@
-"""Several bodies of one file: each for itself, or all as one with ``--join``."""
+"""Several bodies of one file: separate, or as one with ``--join``."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from warp_corot.io.read.tetrahedra import LoadedMesh
 
 from .opened import Opened, loaded_tets, longest_side
 
-#: Tetrahedra, about, where nothing is said of their size.
+#: Default number of tetrahedra, approximately.
 TETS = 20_000
-#: More objects than these are taken as one: each would be a body, with a mesh of its own.
+#: More objects are joined: otherwise each would be a body with its own mesh.
 MOST_BODIES = 32
-#: Tetrahedra that each of several bodies has at least, where they share a number.
+#: Minimum number of tetrahedra of each of several bodies that share a number.
 FEWEST_TETS = 100
-#: Points of an object nearer to one another than this share of its length are one.
+#: Points of an object that are closer than this fraction of its length are merged.
 SAME = 1.0e-6
 
 
 def bodies_in(opened: Opened, args: argparse.Namespace) -> list[tuple[Opened, argparse.Namespace]]:
     """The bodies of an input with their options.
 
-    The objects of a surface's file are bodies of their own if each is closed, none is a cavity of another, and
-    ``--join`` is not given. They share the number of tetrahedra by their volumes. So are prims, blocks and instances of
-    tetrahedra.
+    The objects of a surface's file are separate bodies if each is closed, none is a cavity of another, and
+    ``--join`` is not given. They share the number of tetrahedra by volume. Prims, blocks and instances of
+    tetrahedra are separate bodies, too.
     """
     if opened.kind == "tets":
         return _of_tets(opened, args)
@@ -70,7 +70,7 @@ def _of_tets(opened: Opened, args: argparse.Namespace) -> list[tuple[Opened, arg
 
 
 def _part(loaded: LoadedMesh, name: str, chosen: npt.NDArray[np.integer]) -> LoadedMesh:
-    """The body of some of the tetrahedra."""
+    """The body with some of the tetrahedra."""
     used, tets = np.unique(loaded.tets[chosen], return_inverse=True)
     sets = {known: np.flatnonzero(np.isin(used, nodes)) for known, nodes in loaded.node_sets.items()}
     regions = loaded.regions
@@ -90,19 +90,19 @@ def _part(loaded: LoadedMesh, name: str, chosen: npt.NDArray[np.integer]) -> Loa
 
 def _told(parts: Sequence[LoadedMesh] | Sequence[LoadedSurface]) -> str:
     names = ", ".join(part.name for part in parts[:8]) + (", ..." if len(parts) > 8 else "")
-    return f"{len(parts)} bodies, each for itself: {names} (--join takes them as one)"
+    return f"{len(parts)} separate bodies: {names} (--join makes them one)"
 
 
 def merged_nodes(
     points: npt.NDArray[np.float64], tets: npt.NDArray[np.int32]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32], npt.NDArray[np.int64]]:
-    """Tetrahedra whose nodes in the same place are one node, and which node each of the points has become."""
+    """Tetrahedra with coincident nodes merged, and the new node of each point."""
     kept, place = _welded(points)
     return points[kept], place[tets].astype(np.int32), place
 
 
 def _welded(points: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """The first point of each place, and each point's place among them."""
+    """The first point at each position, and the position of each point among them."""
     step = SAME * longest_side(points) or 1.0
     _, kept, place = np.unique(np.round(points / step), axis=0, return_index=True, return_inverse=True)
     return kept, place.reshape(-1)
@@ -119,7 +119,7 @@ def _parts(surface: LoadedSurface) -> list[LoadedSurface]:
 
 
 def _is_closed(part: LoadedSurface) -> bool:
-    """Whether each edge is walked as often in one direction as in the other."""
+    """Whether each edge occurs equally often in both directions."""
     _, place = _welded(part.points)
     corners = place[part.triangles]
     edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])

@@ -1,12 +1,14 @@
-"""A frame of all bodies as pictures show it, and as it waits on the disk."""
+"""A frame of all bodies for pictures, and its form on the disk."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import IO, TYPE_CHECKING
 
 import numpy as np
+
+from warp_corot.contact.shapes import Ground
 
 if TYPE_CHECKING:
     from warp_corot.simulation.simulation import Simulation
@@ -16,27 +18,30 @@ if TYPE_CHECKING:
 
 @dataclass
 class Shown:
-    """A frame: moved points, triangles, values at the points, points at rest, which are held, and the time [s]."""
+    """A frame: moved points, triangles, values at the points (NaN on obstacles), rest positions, held nodes, corners of
+    the ground [4, 3] or [0, 3], and the time [s]."""
 
     positions: np.ndarray
     triangles: np.ndarray
     values: np.ndarray
     rest: np.ndarray
     held: np.ndarray
+    ground: np.ndarray
     time: float
 
     def write(self, file: IO[bytes]) -> None:
-        for array in (self.positions, self.triangles, self.values, self.rest, self.held, np.float64(self.time)):
+        arrays = (self.positions, self.triangles, self.values, self.rest, self.held, self.ground)
+        for array in (*arrays, np.float64(self.time)):
             np.save(file, array, allow_pickle=False)
 
     @classmethod
     def read(cls, file: IO[bytes]) -> Shown:
-        positions, triangles, values, rest, held, time = (np.load(file, allow_pickle=False) for _ in range(6))
-        return cls(positions, triangles, values, rest, held, float(time))
+        x, faces, values, rest, held, ground, time = (np.load(file, allow_pickle=False) for _ in range(7))
+        return cls(x, faces, values, rest, held, ground, float(time))
 
 
 def shown_now(bodies: Sequence[Body], sim: Simulation) -> Shown:
-    """The present state of all bodies as it is drawn."""
+    """The current state of all bodies for drawing."""
     from warp_corot.io.pictures.colors import VertexAverage
     from warp_corot.io.write.skins import BoundSkins
     from warp_corot.mesh.surfaces.boundary import signed_volumes
@@ -55,7 +60,34 @@ def shown_now(bodies: Sequence[Body], sim: Simulation) -> Shown:
             rest.append(skin.surface.points)
             values.append(skin.values(stress))
             held.append(skin.values(body.soft.constrained.astype(float)) > 0.5)
+    ground = _ground(sim, np.concatenate(rest))
+    for points, faces in _solids(sim):
+        triangles.append(faces + sum(len(points) for points in rest))
+        moved.append(points)
+        rest.append(points)
+        values.append(np.full(len(points), np.nan))
+        held.append(np.zeros(len(points), bool))
     arrays = [np.concatenate(each) for each in (moved, triangles, values, rest, held)]
     return Shown(
-        arrays[0].astype(np.float32), arrays[1], arrays[2].astype(np.float32), arrays[3], arrays[4], time=sim.time
+        arrays[0].astype(np.float32), arrays[1], arrays[2].astype(np.float32), arrays[3], arrays[4], ground, sim.time
     )
+
+
+def _solids(sim: Simulation) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Points [m] and triangles of the obstacles where they are."""
+    from warp_corot.io.write.solids import poses_of, shape_of, solid_of
+
+    given = () if sim.contact is None else sim.contact.obstacles.given
+    for each, pose in zip(given, poses_of(given), strict=True):
+        solid = solid_of(shape_of(each))
+        if solid is not None:
+            yield solid.at(pose), solid.triangles
+
+
+def _ground(sim: Simulation, points: np.ndarray) -> np.ndarray:
+    """Corners of a square of the first ground below the bodies [4, 3]; [0, 3] without."""
+    from warp_corot.io.write.solids import ground_corners, shape_of
+
+    given = () if sim.contact is None else sim.contact.obstacles.given
+    grounds = [shape for shape in map(shape_of, given) if isinstance(shape, Ground)]
+    return ground_corners(grounds[0], points) if grounds else np.zeros((0, 3))

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM: what they end, and when they have to wait."""
+"""SIGINT and SIGTERM: what they end, and when they are delayed."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from typing import NoReturn
 
 from .say import Terminated, complain
 
-#: How long a signal that came during an import waits before it is looked at again [s].
+#: Delay before a signal that came during an import is checked again [s].
 WAIT = 0.02
 
-#: Whether the process may end in the middle of an import.
+#: Whether the process may end during an import.
 _may_leave = False
 
 
 @contextmanager
 def terminable() -> Iterator[None]:
-    """SIGINT and SIGTERM end what runs here by an exception, after the import that is under way, if one is.
+    """Let SIGINT and SIGTERM end the block by an exception, after the current import, if any.
 
-    In the middle of one an exception is swallowed by USD's modules, and the run would go on; NumPy's turn it into
-    another.
+    During an import, USD's modules swallow the exception, and the run would continue; NumPy's turn it into
+    another one.
     """
 
     def interrupt() -> NoReturn:
@@ -40,7 +40,7 @@ def terminable() -> Iterator[None]:
 
 @contextmanager
 def leaving_at_once() -> Iterator[None]:
-    """Where nothing has begun that could be lost, a signal ends the process without waiting for long imports."""
+    """Let a signal end the process at once, without waiting for long imports, while nothing can be lost."""
     global _may_leave
     before, _may_leave = _may_leave, True
     try:
@@ -64,7 +64,7 @@ def _after_imports(end: Callable[[], NoReturn]) -> Callable[[int, FrameType | No
 
 
 def _is_importing(frame: FrameType | None) -> bool:
-    """Whether a module is being imported, by what runs since ``main`` was called."""
+    """Whether a module is being imported by code called from ``main``."""
     while frame is not None and not (frame.f_code.co_name == "main" and frame.f_globals.get("__name__") == __package__):
         if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
             return True
@@ -74,7 +74,7 @@ def _is_importing(frame: FrameType | None) -> bool:
 
 @contextmanager
 def _handled(handler: Callable[[int, FrameType | None], None], number: signal.Signals) -> Iterator[None]:
-    """Another handler for a signal that is not ignored, as those of what is started in the background are."""
+    """Set another handler for a signal unless it is ignored, as it is in background processes."""
     before = signal.getsignal(number)
     mine = threading.current_thread() is threading.main_thread()
     changed = mine and before not in (signal.SIG_IGN, None)

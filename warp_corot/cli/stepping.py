@@ -1,4 +1,4 @@
-"""The simulation of a run's bodies, with a time step that has been tried."""
+"""The simulation of a run's bodies, with a time step that was tried."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ from warp_corot.solvers import SymplecticEuler
 
 from .bodies import Body, gravity_of
 from .remesh import as_remesh_options
+from .touching import Touched
 
 
-def make_simulation(args: argparse.Namespace, bodies: Sequence[Body]) -> Simulation:
+def make_simulation(args: argparse.Namespace, bodies: Sequence[Body], touched: Touched) -> Simulation:
     """The simulation, its kernels compiled; a given step is shortened until a whole number of them makes a frame."""
     from warp_corot.io.write.animate import steps_per_frame
 
     first = bodies[0].subject
     damping = first.damping if args.damping is None else args.damping
     viscosity = args.viscosity or 0.0
-    SymplecticEuler(args.dt, damping, viscosity)  # checks all, the step before it is shortened
+    SymplecticEuler(args.dt, damping, viscosity)  # checks all values; the step is shortened later
     tried = min(_tried_step(body, damping, viscosity) for body in bodies)
-    steps = steps_per_frame(args.fps, args.dt or tried)  # refuses more than anybody can wait for
+    steps = steps_per_frame(args.fps, args.dt or tried)  # refuses an excessive number
     dt = None if args.dt is None else 1.0 / (args.fps * steps)
     with as_remesh_options():
         return Simulation(
@@ -34,6 +35,8 @@ def make_simulation(args: argparse.Namespace, bodies: Sequence[Body]) -> Simulat
             integrator=SymplecticEuler(dt, damping, viscosity),
             gravity=gravity_of(args, first),
             remesh=[body.remesh for body in bodies] if any(body.remesh for body in bodies) else None,
+            obstacles=list(touched.obstacles.values()),
+            contact=touched.contact,
         )
 
 
@@ -42,7 +45,7 @@ def _tried_step(one: Body, damping: float, viscosity: float) -> float:
     tried = body = one.soft
     model, remesh = one.model, one.remesh
     if remesh:
-        # The body's own mesh is not to change before it begins.
+        # The body's own mesh must not change before the run begins.
         tried, remesh = SoftBody(body.mesh, body.material, device=body.device), replace(remesh, every=1)
         tried.fix(body.constrained)
     integrator = SymplecticEuler(damping=damping, viscosity=viscosity)

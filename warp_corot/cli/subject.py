@@ -1,4 +1,4 @@
-"""What is simulated when INPUT is named, and defaults for what was not said about it."""
+"""The mesh of an input, and defaults for options that were not given."""
 
 from __future__ import annotations
 
@@ -36,26 +36,26 @@ BOX_LEVEL = 6
 
 @dataclass
 class Subject:
-    """A mesh and defaults for it.
+    """A mesh and its defaults.
 
     Attributes:
         mesh: The mesh, scaled.
-        name: For titles.
-        source: The file it came from, if one.
+        name: Name for titles.
+        source: Its file, if any.
         young: Young's modulus [Pa]; None: from the body's weight.
         poisson: Poisson's ratio.
-        density: [kg/m^3].
-        fix: Expression for the nodes that are held.
-        gravity: [m/s^2]; None: down the mesh's up axis.
-        damping: [1/s].
-        duration: [s].
-        domain: What the mesh was made from, if from a surface or a scan.
-        surface: The smooth surface of such a mesh.
-        fidelity: How true the mesh is to that.
-        skin: The user's own surface, drawn in place of that one.
+        density: Density [kg/m^3].
+        fix: Expression for the fixed nodes.
+        gravity: Acceleration [m/s^2]; None: down the mesh's up axis.
+        damping: Rate of mass-proportional damping [1/s].
+        duration: Simulated time [s].
+        domain: Its domain, if it was made from a surface or a scan.
+        surface: The smooth surface of a mesh made from a domain.
+        fidelity: The comparison of the mesh with the domain.
+        skin: The user's own surface, drawn in place of the smooth one.
         labels: Materials of its labels, if they were given.
-        times: Seconds that its stages took.
-        notes: What the user should know, a line each.
+        times: Times of its stages [s].
+        notes: Notes for the user, one line each.
     """
 
     mesh: TetMesh | TetForest
@@ -78,7 +78,7 @@ class Subject:
 
     @property
     def used(self) -> np.ndarray:
-        """Nodes that some tetrahedron names, indices."""
+        """Indices of nodes that belong to a tetrahedron."""
         return np.unique(self.mesh.tets)
 
     @property
@@ -99,8 +99,8 @@ class Subject:
         return float(f"{STIFFNESS_PER_WEIGHT * density * g * self.height:.1e}")
 
     def take(self, asset: Asset, args: argparse.Namespace) -> None:
-        """Take an asset's defaults, as far as they suit what was asked for: its held nodes carry a body of its size
-        that is no softer than it is meant to be."""
+        """Use an asset's defaults, as far as they suit the options: its fixed nodes support a body of its size
+        that is at least as stiff as the asset."""
         self.poisson, self.density = asset.poisson, asset.density
         self.damping, self.duration = asset.damping, asset.duration
         if args.unit is None and args.scale in (None, asset.scale):
@@ -110,11 +110,11 @@ class Subject:
 
 
 def find_subject(opened: Opened, args: argparse.Namespace) -> Subject:
-    """The mesh that INPUT names.
+    """The mesh of an input.
 
     Args:
-        opened: INPUT: "box" or tetrahedra.
-        args: Of the command.
+        opened: The input: "box" or tetrahedra.
+        args: The command's arguments.
 
     Raises:
         InputError: A mesh that cannot be simulated, or options that do not suit it.
@@ -131,7 +131,7 @@ def find_subject(opened: Opened, args: argparse.Namespace) -> Subject:
     entries, found = parse_labels(args.materials, "--materials") if args.materials else [], loaded.regions
     try:
         if entries and found is None:
-            raise InputError("its arrays number no regions, so that --materials does nothing")
+            raise InputError("its arrays number no regions, so that --materials has no effect")
         names, entries = of_regions(entries, found) if found is not None else ((), entries)
         labels = None if found is None else found.of_tet
         mesh = TetMesh(points, tets, up_axis=loaded.up_axis, labels=labels, label_names=names, node_sets=sets)
@@ -153,17 +153,17 @@ def find_subject(opened: Opened, args: argparse.Namespace) -> Subject:
 def _joined(
     loaded: LoadedMesh, sets: dict[str, np.ndarray], notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Points, tetrahedra and sets of nodes, with the nodes in the same place as one.
+    """Points, tetrahedra and node sets, with coincident nodes merged.
 
     Raises:
-        InputError: There is nothing to join.
+        InputError: There are no coincident nodes.
     """
     points, tets, place = merged_nodes(loaded.points, loaded.tets)
     merged = len(place) - len(points)
     if not merged and not loaded.objects:
-        raise InputError(f"{loaded.source}: no two nodes are in the same place, so that --join does nothing")
+        raise InputError(f"{loaded.source}: no two nodes coincide, so that --join has no effect")
     if merged:
-        notes.append(f"{merged} nodes are in the places of others, and joined with them")
+        notes.append(f"{merged} nodes coincide with others and are merged")
     return points, tets, {name: np.bincount(place, mask, len(points)) > 0 for name, mask in sets.items()}
 
 

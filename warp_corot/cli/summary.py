@@ -1,4 +1,4 @@
-"""What ``warp-corot simulate`` says at the end."""
+"""The summary at the end of ``warp-corot simulate``."""
 
 from __future__ import annotations
 
@@ -24,17 +24,18 @@ if TYPE_CHECKING:
     from .bodies import Body
     from .subject import Subject
 
-#: Materials of regions that are named.
+#: Maximum number of regions whose materials are listed.
 MOST_KINDS = 8
 
 
-def summary(bodies: Sequence[Body], sim: Simulation, done: Recording) -> str:
+def summary(bodies: Sequence[Body], sim: Simulation, done: Recording, touched: Sequence[tuple[str, str]] = ()) -> str:
     """The run in a dozen lines.
 
     Args:
-        bodies: What was simulated.
+        bodies: The bodies.
         sim: The simulation at its end.
-        done: What was recorded.
+        done: The recording.
+        touched: Lines on what the bodies touch.
     """
     shared = bodies[0].args
     integrator = asdict(sim.integrator)  # type: ignore[call-overload]
@@ -50,6 +51,7 @@ def summary(bodies: Sequence[Body], sim: Simulation, done: Recording) -> str:
         lines += [f"{body.subject.name}, {body.held.words}", *_aligned(_of_body(body))]
     rows = [
         *remesh_rows(sim, done),
+        *touched,
         ("gravity", f"{' '.join(f'{g:g}' for g in sim.gravity)} m/s^2, {damping}"),
         ("time step", f"{_steps(sim)}; largest stable one at rest about {milliseconds(sim.stable_dt)}{at_last}"),
         ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"),
@@ -66,7 +68,7 @@ def summary(bodies: Sequence[Body], sim: Simulation, done: Recording) -> str:
 
 
 def title_of(bodies: Sequence[Body]) -> str:
-    """The title of a picture: what is simulated, and what holds it."""
+    """The title of a picture: the body, and its support."""
     names, held = [body.subject.name for body in bodies], bodies[0].held
     left = len(names) - NAMED
     name = ", ".join(names[:NAMED]) + (f" and {left} more" if left > 0 else "")
@@ -90,7 +92,7 @@ def _aligned(rows: Sequence[tuple[str, str]]) -> list[str]:
 
 
 def _body(subject: Subject) -> list[tuple[str, str]]:
-    """Of a body from a surface or a scan, all that its domain and its mesh have to say, and the time that it took."""
+    """For a body from a surface or a scan, the reports of its domain and its mesh, and their time."""
     if subject.domain is None:
         return [("mesh", _mesh(subject))]
     assert isinstance(subject.mesh, TetForest)

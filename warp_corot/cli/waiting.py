@@ -1,4 +1,4 @@
-"""What a terminal shows while a command works: after two seconds what it does and since when, and how far a run is."""
+"""Progress on a terminal: after two seconds the activity and its time, and the progress of a run."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from warp_corot.io.write.animate import Progress
 
-#: What passes without a word [s], and how often the time is shown anew.
+#: Time before anything is shown [s], and the interval between updates.
 SILENT, EVERY = 2.0, 0.5
 
 
 @contextmanager
 def waiting(what: str) -> Iterator[None]:
-    """Show what is waited for, and for how long, while the block runs; on terminals only.
+    """Show the activity and its duration while the block runs; on terminals only.
 
     Args:
-        what: In words, as in "meshing liver.stl".
+        what: The activity in words: "meshing liver.stl".
     """
     if not sys.stderr.isatty():
         yield

@@ -1,0 +1,99 @@
+"""A run made ready: inputs read and meshed, bodies held and moved, the simulation of all of them."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from warp_corot.inputs.device import checked_device
+from warp_corot.simulation.simulation import Simulation
+
+from .bodies import Body, asked_bodies, find_body, find_patches, gravity_of, make_body
+from .compiling import compiling_said
+from .loading import ramp_of
+from .pressing import press_patches
+from .probing import Probe
+from .say import complain
+from .stepping import make_simulation
+from .touching import Touched, place_ground, say_overlaps, touched_by
+from .waiting import waiting
+
+#: The command warns that a run will take long if a frame has more steps than this.
+MANY_STEPS = 1e5
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A run that is ready to start.
+
+    Attributes:
+        bodies: The bodies.
+        sim: The simulation of all of them.
+        probes: The probes of the table.
+        duration: Simulated time [s].
+        count: Number of frames after the first one.
+        touched: What the bodies touch.
+    """
+
+    bodies: Sequence[Body]
+    sim: Simulation
+    probes: Sequence[Probe]
+    duration: float
+    count: int
+    touched: Touched
+
+
+def prepared(options: Sequence[argparse.Namespace]) -> Run:
+    """Read and mesh the bodies, and set up their simulation.
+
+    Args:
+        options: Options of each input.
+    """
+    shared = options[0]
+    device = checked_device(shared.device)
+    touched = touched_by(options)
+    inputs = []
+    for each in options:
+        with waiting(f"reading {each.input}"):
+            inputs.append(asked_bodies(each))
+    bodies = [body for found in inputs for body in found]
+    with compiling_said(device):
+        for body in bodies:
+            with waiting(f"meshing {body.args.input}"):
+                body.subject = find_body(body)
+        duration, count = _frames(shared, bodies)
+        started = time.perf_counter()
+        for found in inputs:
+            find_patches(found)
+        for body in bodies:
+            make_body(body, duration)
+        place_ground(touched, shared, bodies, gravity_of(shared, bodies[0].subject))
+        with waiting("preparing the simulation"):
+            sim = make_simulation(shared, bodies, touched)
+            say_overlaps(touched, bodies, sim)
+        for body in bodies:
+            press_patches(sim, body.soft, body.loads, body.patches, ramp_of(shared, duration))
+        probes = [Probe(text, body.soft, body.patches) for body in bodies for text in body.probes]
+    bodies[0].subject.times["body"] = time.perf_counter() - started
+    steps = 1.0 / (shared.fps * sim.dt)
+    if steps > MANY_STEPS:
+        bodies[0].subject.notes.append(f"{steps:.2g} steps of {sim.dt:.2g} s make a frame: this will take long")
+    _say_notes(bodies)
+    return Run(bodies, sim, probes, duration, count, touched)
+
+
+def _frames(args: argparse.Namespace, bodies: Sequence[Body]) -> tuple[float, int]:
+    """The duration [s], and the number of frames after the first one."""
+    from warp_corot.io.write.animate import frame_count
+
+    duration = max(body.subject.duration for body in bodies) if args.duration is None else args.duration
+    return duration, frame_count(duration, args.fps)
+
+
+def _say_notes(bodies: Sequence[Body]) -> None:
+    for body in bodies:
+        name = f"{body.subject.name}: " if len(bodies) > 1 else ""
+        for note in body.subject.notes:
+            complain(f"{name}{note}", kind="note")

@@ -1,0 +1,228 @@
+"""``--ground``, ``--drop``, ``--tool``, ``--tool-path`` and ``--touch``: what the bodies of a run touch."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from warp_corot.contact.options import Contact, checked_friction
+from warp_corot.contact.shapes import Capsule, Cylinder, Ground
+from warp_corot.contact.tool import Obstacle, Tool
+from warp_corot.errors import InputError
+from warp_corot.kernels.contact.overlaps import find_gaps
+
+from .holding import up_of
+from .quantities import metres, number
+from .summary import length
+from .tool_paths import make_tool, tool_shape
+
+if TYPE_CHECKING:
+    from warp_corot.simulation.simulation import Simulation
+
+    from .bodies import Body
+
+AUTO = "auto"
+#: Overlaps below this share of a body's height are rounding, and nothing is printed about them.
+SMALL = 1e-5
+
+Floats = np.ndarray
+
+
+def ground_height(text: str) -> float | str:
+    """A height [m] or "auto", for ``add_argument(type=...)``."""
+    if text == AUTO:
+        return text
+    try:
+        return metres(text)
+    except argparse.ArgumentTypeError as error:
+        raise argparse.ArgumentTypeError(f"{error}; it must be a height or {AUTO} (INPUT stands before it)") from None
+
+
+def add_touch_options(group: argparse._ArgumentGroup) -> None:
+    """Add the options to a group of the command's parser."""
+    group.add_argument(
+        "--ground",
+        type=ground_height,
+        nargs="?",
+        const=AUTO,
+        metavar="HEIGHT",
+        help="put a ground at this height against gravity [m], or just below the bodies (auto, the default height); "
+        "bodies stand on it, and nothing is fixed without --fix",
+    )
+    group.add_argument(
+        "--drop",
+        type=metres,
+        metavar="HEIGHT",
+        help="let the bodies fall freely onto a ground this far below them [m]",
+    )
+    group.add_argument(
+        "--tool",
+        type=tool_shape,
+        action="append",
+        metavar="SHAPE",
+        help="press with a rigid tool: sphere:r=5mm, capsule:r=4mm,l=100mm, cylinder:r=4mm,l=100mm or "
+        "box:x=2cm,y=2cm,z=5mm, with its axis along z; a friction=MU of its own may follow; can be given several times",
+    )
+    group.add_argument(
+        "--tool-path",
+        type=Path,
+        action="append",
+        metavar="PATH.csv",
+        help="how the tool moves: rows of time [s], x, y, z of its centre [m] and, if it turns, quaternions qx, qy, "
+        "qz, qw; one row for a tool that stays; one path for each --tool, in the same order",
+    )
+    group.add_argument(
+        "--touch", action="store_true", help="let the bodies touch one another; with a ground or a tool they do"
+    )
+    group.add_argument("--self-contact", action="store_true", help="let the bodies touch themselves, too")
+    group.add_argument(
+        "--friction", type=number, metavar="MU", help="coefficient of friction of all contacts (default: 0.3)"
+    )
+
+
+@dataclass(eq=False)
+class Touched:
+    """What the bodies of a run touch.
+
+    Attributes:
+        contact: How things touch; None: nothing does.
+        obstacles: By their names in tables.
+    """
+
+    contact: Contact | None
+    obstacles: dict[str, Obstacle] = field(default_factory=dict)
+
+    @property
+    def rows(self) -> list[tuple[str, str]]:
+        """Lines of the summary."""
+        if self.contact is None:
+            return []
+        found = [f"{name}: {_described(each)}" for name, each in self.obstacles.items()]
+        found.append("themselves and one another" if self.contact.self_contact else "one another")
+        found[-1] += f"; friction {self.contact.friction:g}"
+        return [("touches" if place == 0 else "", text) for place, text in enumerate(found)]
+
+
+def stands_free(args: argparse.Namespace) -> bool:
+    """Whether a ground carries the body in place of fixed nodes."""
+    return args.fix is None and (args.ground is not None or args.drop is not None)
+
+
+def touched_by(options: Sequence[argparse.Namespace]) -> Touched:
+    """What the options ask for, without the ground, for which bodies must be there.
+
+    Args:
+        options: The options of each input.
+
+    Raises:
+        InputError: Options that do not go together, or a path that is none.
+    """
+    shared = options[0]
+    shapes, paths = shared.tool or [], shared.tool_path or []
+    if len(shapes) != len(paths):
+        raise InputError(
+            f"--tool is given {len(shapes)} times and --tool-path {len(paths)} times; each tool must have one path"
+        )
+    _check_drop(options)
+    touches = bool(shapes) or shared.ground is not None or shared.drop is not None
+    touches = touches or shared.touch or shared.self_contact
+    if shared.friction is not None:
+        if not touches:
+            raise InputError("--friction is for --ground, --drop, --tool, --touch and --self-contact; none is given")
+        checked_friction(shared.friction)
+    if isinstance(shared.ground, float) and not math.isfinite(shared.ground):
+        raise InputError(f"--ground is {shared.ground:g} m; it must be a finite height or auto")
+    tools: dict[str, Obstacle] = {
+        f"tool {place}": make_tool(shape, path)
+        for place, (shape, path) in enumerate(zip(shapes, paths, strict=True), 1)
+    }
+    friction = Contact().friction if shared.friction is None else shared.friction
+    contact = Contact(friction=friction, self_contact=shared.self_contact)
+    return Touched(contact if touches else None, tools)
+
+
+def _check_drop(options: Sequence[argparse.Namespace]) -> None:
+    shared = options[0]
+    if shared.drop is None:
+        return
+    if not 0.0 < shared.drop < math.inf:
+        raise InputError(f"--drop is {shared.drop:g} m; it must be a positive height")
+    if isinstance(shared.ground, float):
+        raise InputError("--drop puts the ground below the bodies; --ground must be auto then, or left out")
+    if any(each.fix not in (None, ["none"]) for each in options):
+        raise InputError("--drop lets the bodies fall; --fix must be none then, or left out")
+
+
+def place_ground(touched: Touched, args: argparse.Namespace, bodies: Sequence[Body], gravity: Floats) -> None:
+    """Add the ground of ``--ground`` or ``--drop`` to what bodies touch.
+
+    Raises:
+        InputError: ``--touch`` for a single body.
+    """
+    if args.touch and len(bodies) == 1:
+        raise InputError("--touch is for several bodies, and there is one (--self-contact is for one body)")
+    if args.ground is None and args.drop is None:
+        return
+    up = up_of(bodies[0].subject, gravity)
+    height = args.ground
+    if height in (None, AUTO):
+        height = min(float((body.subject.mesh.points[body.subject.used] @ up).min()) for body in bodies)
+        height -= args.drop or 0.0
+    touched.obstacles = {"ground": Ground(up, height), **touched.obstacles}
+
+
+def say_overlaps(touched: Touched, bodies: Sequence[Body], sim: Simulation) -> None:
+    """Note for each body what it overlaps before the run begins."""
+    if sim.contact is None or not touched.obstacles:
+        return
+    obstacles = sim.contact.obstacles
+    for body in bodies:
+        used = body.subject.used
+        points = wp.array(body.soft.mesh.points[used].astype(np.float32), dtype=wp.vec3, device=sim.device)
+        gaps = wp.zeros((obstacles.count, len(used)), dtype=wp.float32, device=sim.device)
+        inputs = [obstacles.shapes, obstacles.motions, points, float(body.subject.height)]
+        wp.launch(find_gaps, gaps.shape, inputs, [gaps], device=sim.device)
+        deepest = -gaps.numpy().min(axis=1)
+        poses = obstacles.poses()[0]
+        for (name, each), depth, pose in zip(touched.obstacles.items(), deepest, poses, strict=True):
+            where = f"{name} starts {length(float(depth))} deep in the body"
+            if depth <= SMALL * body.subject.height:
+                if isinstance(each, Ground) or not _holds_axis(body.soft.mesh, each, pose):
+                    continue
+                where = f"{name} starts in the body"
+            body.subject.notes.append(f"{where}; they are pushed apart gently")
+
+
+def _holds_axis(mesh: object, obstacle: Obstacle, pose: Floats) -> bool:
+    """Whether a mesh holds a point of the axis of an obstacle, which may lie between its nodes."""
+    shape = obstacle.shape if isinstance(obstacle, Tool) else obstacle
+    half = shape.size[1] if isinstance(shape, Capsule | Cylinder) else 0.0
+    x, y, z, w = pose[3:]
+    axis = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+    places = pose[:3] + np.linspace(-half, half, 33)[:, None] * axis
+    corners = mesh.points[mesh.tets]  # type: ignore[attr-defined]
+    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    near = [np.flatnonzero(((corners.min(axis=1) <= p) & (p <= corners.max(axis=1))).all(axis=1)) for p in places]
+    for place, found in zip(places, near, strict=True):
+        inner = np.linalg.solve(edges[found], (place - corners[found, 0])[:, :, None])[:, :, 0]
+        if ((inner >= 0.0).all(axis=1) & (inner.sum(axis=1) <= 1.0)).any():
+            return True
+    return False
+
+
+def _described(obstacle: Obstacle) -> str:
+    shape = obstacle.shape if isinstance(obstacle, Tool) else obstacle
+    if isinstance(shape, Ground):
+        x, y, z, w = shape.quaternion
+        normal = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+        return f"at {float(normal @ shape.position) + 0.0:.4g} m"
+    moves = isinstance(obstacle, Tool) and obstacle.keys is not None
+    sizes = ", ".join(length(size) for size in shape.size if size > 0.0)
+    return f"{shape!r} ({sizes}), {'moves along its path' if moves else 'stays where it is'}"
