@@ -18,7 +18,7 @@ def uniform():
 
 
 def mixed():
-    """Levels 2 to 11."""
+    """A forest with levels 2 to 11."""
     forest = wc.TetForest.box((1, 2, 1), 0.1, 2)
     for _ in range(9):
         forest = forest.refine([0])
@@ -31,7 +31,7 @@ def sphere():
 
 
 def speck():
-    """A ball much smaller than its cube: most of what its leaves come from is void."""
+    """A ball much smaller than its cube: most ancestors of its leaves contain void."""
     domain = wc.Domain.sphere(0.06, (0.12, 0.07, -0.11), device="cpu")
     return wc.TetForest.from_domain(domain, 0.5, max_level=10, surface_error=0.003)
 
@@ -70,7 +70,7 @@ def changing_body(mesh, device):
 
 
 def remesh(body, rng, passes):
-    """Refine and simplify at random; how many nodes were made and removed."""
+    """Refine and simplify at random; returns the numbers of new and removed nodes."""
     added = removed = 0
     for _ in range(passes):
         body.changing.passes.apply(random_marks(body.changing.forest, rng, 0.05, 0.3))
@@ -82,7 +82,7 @@ def remesh(body, rng, passes):
 
 
 def lattice_and_tree(body):
-    """All places of nodes, and the tree that names them."""
+    """All lattice points of nodes, and the tree with their numbers."""
     if body.changing is None:
         return body.mesh.lattice, body.mesh.tree
     forest = body.changing.forest
@@ -90,12 +90,12 @@ def lattice_and_tree(body):
 
 
 def places_of(levels):
-    """Where the nodes stand in the mesh's own numbering."""
+    """Places of the nodes in the mesh's own numbering."""
     return np.concatenate([np.arange(levels.mesh_nodes), levels.others.numpy()])
 
 
 def assert_is_the_trees(levels, body):
-    """Levels, ends and finest levels are those found by walking down the tree; and every order is settled."""
+    """Levels, ends and finest levels equal those from walking down the tree; and every order is deterministic."""
     lattice, tree = lattice_and_tree(body)
     expected = TreeLevels.of(tree, len(lattice))
     places, order, starts = places_of(levels), levels.nodes.numpy(), levels.starts
@@ -115,7 +115,7 @@ def assert_is_the_trees(levels, body):
 
 
 def assert_gathers_every_end(levels):
-    """What each level gathers from are its own nodes, each at both of its ends, in the order of their numbers."""
+    """Each level gathers from its own nodes, each at both of its ends, in the order of their numbers."""
     order, ends, coarse = levels.nodes.numpy(), levels.ends.numpy(), levels.coarse.numpy()
     where, midpoints = levels.midpoint_starts.numpy(), levels.midpoints.numpy()
     assert levels.coarse_starts[:2] == (0, 0)
@@ -135,7 +135,7 @@ def nodal(values, device):
 
 
 def assert_prolongates_linear_functions(levels, lattice):
-    """From every level to all finer nodes: coordinates of lattice points exactly, others to rounding."""
+    """Prolongation from every level to all finer nodes: lattice coordinates exactly, others to rounding."""
     points = lattice[places_of(levels)].astype(float)
     gradient = np.random.default_rng(3).standard_normal((3, 4))
     linear = 0.5 + points @ (gradient / points.max())
@@ -164,7 +164,7 @@ def test_linear_functions_are_prolongated_exactly(name, device):
 
 @pytest.mark.parametrize("name", ["sphere", "labels"])
 def test_coarse_levels_of_a_carved_forest_have_nodes_that_no_leaf_names(name, device):
-    """And there are nodes that these levels do not have, as only void tetrahedra name them."""
+    """Some nodes are missing in these levels, too, because only void tetrahedra name them."""
     body = body_of(name, device)
     levels = body.discretization.levels()
     assert len(body.mesh.points) == levels.mesh_nodes < levels.node_count < len(body.mesh.lattice)
@@ -182,7 +182,7 @@ def test_levels_follow_a_mesh_that_changes(name, device, rng):
         lattice, _ = lattice_and_tree(body)
         assert_prolongates_linear_functions(levels, lattice)
         assert (levels.node_count > levels.mesh_nodes) == (name != "mixed")
-        # The pools know the ends of each node, too.
+        # The pools also store the ends of each node.
         places, made = places_of(levels), slice(levels.starts[1], None)
         of_pools = body.changing.forest.pools.ends.numpy()[places[levels.nodes.numpy()[made]]]
         assert np.array_equal(places[levels.ends.numpy()[made]], of_pools)
@@ -203,7 +203,7 @@ def test_levels_are_found_once_for_each_mesh(device, rng):
 
 @pytest.mark.parametrize("name", ["mixed", "sphere"])
 def test_restriction_is_the_transpose(name, device, rng):
-    """Beside dense float64 matrices, between any two levels, in two worlds at once."""
+    """Against dense float64 matrices, between any two levels, in two worlds at once."""
     body = body_of(name, device, worlds=2)
     levels, (lattice, tree) = body.discretization.levels(), lattice_and_tree(body)
     expected, places = TreeLevels.of(tree, len(lattice)), places_of(levels)
@@ -219,7 +219,7 @@ def test_restriction_is_the_transpose(name, device, rng):
         np.testing.assert_allclose(up[:, found], (matrix @ x)[:, found], rtol=0, atol=4 * ROUNDING * np.abs(x).max())
         summed = matrix.T @ np.where(found[:, None], y, 0.0)
         np.testing.assert_allclose(down[:, known], summed[:, known], rtol=0, atol=16 * ROUNDING * np.abs(summed).max())
-        # Nodes beyond both levels keep what they have.
+        # Nodes beyond both levels keep their values.
         np.testing.assert_array_equal(up[:, ~found], x[:, ~found].astype(np.float32))
         np.testing.assert_array_equal(down[:, ~found], y[:, ~found].astype(np.float32))
 

@@ -1,4 +1,4 @@
-"""Active stress along fibres: closed forms, the float64 oracle, keyframes that the device follows."""
+"""Active stress along fibres: closed forms, the float64 oracle, keyframes on the device."""
 
 import numpy as np
 import oracle
@@ -35,7 +35,7 @@ def held_bar(material, device, dt=1e-5, **options):
 
 
 def test_supports_of_an_isometric_bar_carry_the_active_stress(device):
-    """At fixed length the pull on each support is sigma A, from the first step on, and nothing moves."""
+    """At fixed length the pull on each support is sigma A from the first step on, and nothing moves."""
     sim, body, top = held_bar(muscle([0, 0, 1]), device)
     body.activate(2e3)
     for _ in range(3):
@@ -48,7 +48,7 @@ def test_supports_of_an_isometric_bar_carry_the_active_stress(device):
 @pytest.mark.parametrize("amount", [0.1, 0.9])
 @pytest.mark.parametrize("name", ["level 3", "mixed levels", "general"])
 def test_forces_equal_the_oracle(name, amount, device, rng):
-    """P = s (F d) d^T of each element, inverted ones too; without net force or torque."""
+    """P = s (F d) d^T in each element, inverted ones too; without net force or torque."""
     mesh = MESHES[name]()
     axes, stress = random_axes(rng, len(mesh.tets)), rng.uniform(-1e4, 1e4, len(mesh.tets))
     sim, body = simulated(mesh, wood(axes), device)
@@ -64,13 +64,13 @@ def test_forces_equal_the_oracle(name, amount, device, rng):
     x = mesh.points + u.astype(float)
     _, expected = oracle.continuum(density, oracle_mesh(mesh), x, stress, axes[:, 0])
     assert np.abs(active - expected).max() < 2e-6 * (np.abs(expected).max() + np.abs(passive).max())
-    assert sim.energy().elastic == energy  # there is none of active stress
+    assert sim.energy().elastic == energy  # active stress has none
     assert np.abs(active.sum(axis=0)).max() < 1e-6 * np.abs(active).sum()
     assert np.abs(np.cross(x, active).sum(axis=0)).max() < 1e-6 * np.linalg.norm(active, axis=1).sum() * np.abs(x).max()
 
 
 def test_von_mises_stress(device, rng):
-    """At rest active stress is uniaxial, so that von Mises stress is its size."""
+    """At rest active stress is uniaxial, so the von Mises stress is its magnitude."""
     sim, body = simulated(MESHES["general"](), muscle([1, 2, 3]), device)
     stress = rng.uniform(-1e4, 1e4, len(body.mesh.tets))
     body.activate(stress)
@@ -78,8 +78,8 @@ def test_von_mises_stress(device, rng):
 
 
 def test_stable_step(device):
-    """Found about the rest shape with the activation that there is: a weak one makes no difference, one that
-    adds fifteen times Young's modulus along the fibres makes the step some three times shorter."""
+    """The step includes the current activation about the rest shape: weak activation makes no difference; one that
+    adds fifteen times Young's modulus along the fibres makes the step about a third."""
     steps = []
     for stress in (0.0, 10.0, 15 * E_ALONG):
         body = wc.SoftBody(MESHES["level 4"](), muscle([0, 0, 1]), device=device)
@@ -91,7 +91,7 @@ def test_stable_step(device):
 
 @pytest.mark.parametrize("single", [True, False])
 def test_keyframes_are_followed(single, device):
-    """In steps one by one and in recorded runs: the support of an isometric bar carries the stress of each time."""
+    """In single steps and in recorded runs, the support of an isometric bar carries the stress of each time."""
     dt = 5e-5
     sim, body, top = held_bar(muscle([0, 0, 1]), device, dt=dt)
     body.activate(wc.Activation(TIMES, STRESS))
@@ -101,14 +101,14 @@ def test_keyframes_are_followed(single, device):
                 sim.step()
         else:
             sim.advance_steps(23)
-        expected = np.interp((sim.steps - 1) * dt, TIMES, STRESS)  # a step's forces are those of its beginning
+        expected = np.interp((sim.steps - 1) * dt, TIMES, STRESS)  # a step uses the forces at its beginning
         assert body.activation.numpy() == pytest.approx(expected, abs=1e-4)
         assert body.reactions.numpy()[top, 2].sum() == pytest.approx(expected * 0.1**2, abs=2e-3 * 30 * 0.1**2)
     assert sim.time > TIMES[-1]
 
 
 def test_elements_and_worlds_of_their_own(device, rng):
-    """Keyframes of some elements in some worlds, a later call taking elements over, the others by hand."""
+    """Keyframes for some elements in some worlds; a later call replaces those of elements, others are set by hand."""
     sim, body, _ = held_bar(muscle([0, 0, 1]), device, dt=1e-4, worlds=3)
     count = len(body.mesh.tets)
     keys = rng.uniform(0, 50, (3, 4))
@@ -138,7 +138,7 @@ def test_written_between_recorded_steps(device):
 
 
 def test_another_number_needs_no_new_recording(device):
-    """What steps launch changes with the keyframes that there are, not with the stress that is set."""
+    """A step's launches depend on the existing keyframes, not on the stress."""
     _, body, _ = held_bar(muscle([0, 0, 1]), device)
     body.activate(1.0)
     recorded = [body.launch_revision]
@@ -156,7 +156,7 @@ def test_another_number_needs_no_new_recording(device):
 
 
 def test_reset_begins_anew(device):
-    """A world that is reset follows its keyframes from their beginning, the others go on."""
+    """A reset world restarts its keyframes, the others continue."""
     sim, body, _ = held_bar(muscle([0, 0, 1]), device, dt=1e-4, worlds=2)
     body.activate(wc.Activation(TIMES, STRESS))
     sim.advance_steps(30)

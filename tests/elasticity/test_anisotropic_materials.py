@@ -1,4 +1,4 @@
-"""Materials that vary from place to place and world to world, what is done with them, and which are refused."""
+"""Materials that vary in space and between worlds, their use, and invalid ones."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def centroids(mesh):
 @pytest.mark.parametrize("model", [wc.Corotated(), wc.NeoHookean(), wc.EdgeStVK(), wc.MassSpring(), wc.Linear()])
 @pytest.mark.parametrize("make", [mixed_forest, jittered])
 def test_isotropic_functions_of_the_rest_position(make, model, device, rng):
-    """The same as arrays of their values at the elements' centroids."""
+    """They equal arrays of their values at the elements' centroids."""
     mesh = make()
     x = centroids(mesh)
     given = wc.Isotropic(stiffening, lambda p: 0.3 + p[:, 0], lambda p: 800 + 1e4 * p[:, 1])
@@ -67,7 +67,7 @@ def test_directions_and_constants_as_functions(device, rng):
 
 @pytest.mark.parametrize("name", ["level 3", "general"])
 def test_worlds_of_different_materials(name, device, rng):
-    """Each of three worlds does what a body with its material does alone."""
+    """Each of three worlds behaves like a single body with its material."""
     mesh = MESHES[name]()
     count = len(mesh.tets)
     along, directions = rng.uniform(1e4, 5e4, (3, 1)), rng.standard_normal((3, count, 3))

@@ -32,7 +32,7 @@ def turned(mesh, rng, amount):
 
 
 def definiteness(F):
-    """(s1 + s2)(s2 + s3)(s3 + s1) / |s|^3, below 0.4 of which the law goes over to the isotropic one [T]."""
+    """(s1 + s2)(s2 + s3)(s3 + s1) / |s|^3; below 0.4 the law blends into the isotropic one [T]."""
     s = np.linalg.svd(F, compute_uv=False)
     s[:, 2] *= np.sign(np.linalg.det(F))
     return np.prod(s + np.roll(s, 1, axis=1), axis=1) / np.linalg.norm(s, axis=1) ** 3
@@ -66,7 +66,7 @@ def test_product_equals_differences_of_the_oracles_forces(kind, case, device, rn
 
 
 def separate(rng, count, stretches):
-    """Elements that share no node, their stretches [count, 3] turned at random, and a nodal p."""
+    """Elements without common nodes, their stretches [count, 3] in random orientations, and a nodal p."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) + rng.uniform(-0.1, 0.1, (count, 4, 3))
     mesh = wc.TetMesh(0.1 * corners.reshape(-1, 3), np.arange(4 * count).reshape(-1, 4))
     F = random_axes(rng, count) * stretches[:, None] @ random_axes(rng, count)
@@ -79,8 +79,8 @@ def separate(rng, count, stretches):
 
 
 def test_elements_where_the_law_goes_over_to_the_isotropic_one(device, rng):
-    """Each element by itself, crushed and inverted ones among them: between the laws K has the derivatives of both
-    and of the share of each. Where rotations are hardly definite float32's are not, and K is bounded: left out."""
+    """Single elements, crushed and inverted ones included: in the blend, K has the derivatives of both laws
+    and of their weights. Where rotations are nearly undefined, float32's K is bounded but inexact: left out."""
     count = 1000
     stretches = np.exp(rng.uniform(np.log(0.2), np.log(3.0), (count, 3)))
     stretches[:, 2] *= np.where(rng.random(count) < 0.3, -0.3, 1.0)
@@ -92,7 +92,7 @@ def test_elements_where_the_law_goes_over_to_the_isotropic_one(device, rng):
     F = oracle_mesh(mesh).deformation_gradients(mesh.points + u.astype(float))
     definite = definiteness(F)
     between, isotropic = (definite > 0.05) & (definite < 0.395), definite < 0.05
-    # Within a step of differences of the border of the laws, where the second derivative jumps.
+    # Within a difference step of the border of the laws, where the second derivative jumps.
     apart = np.abs(definite - 0.4) > 5e-3
     assert between.sum() > 100
     assert isotropic.sum() > 10
@@ -117,7 +117,7 @@ def test_no_state_gives_what_is_not_finite(case, device, rng):
 
 @pytest.mark.parametrize("case", ["level 3", "general"])
 def test_active_stress(case, device, rng):
-    """s (F d) d^T is linear in F: its part of K is exact, and that of the present stress."""
+    """s (F d) d^T is linear in F: its part of K is exact and uses the current stress."""
     mesh = MESHES[case]()
     count = len(mesh.tets)
     material, tensor = made("muscle field", mesh, rng)
@@ -157,7 +157,7 @@ def test_other_rotations_give_the_same(model, device, rng):
 
 
 def test_a_mesh_that_has_changed(device, rng):
-    """As on a mesh made that way, fibres and their stress having been carried along."""
+    """The result equals that of a mesh made that way, with fibres and their stress carried over."""
     forest = wc.TetForest.box((2, 1, 1), CUBE, 6)
     forest = forest.refine(rng.choice(len(forest.tets), 5, replace=False))
     body = wc.SoftBody(forest, muscle(rng.standard_normal((len(forest.tets), 3))), device=device)

@@ -37,7 +37,7 @@ def everywhere(tensor, mesh):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", FORCE_MESHES)
 def test_forces_and_energy_equal_the_oracle(name, kind, device, rng):
-    """Strains around 0.3, turned by a large rotation."""
+    """Strains around 0.3, with a large rotation."""
     mesh = MESHES[name]()
     material, tensor = made(kind, mesh, rng)
     sim, body = simulated(mesh, material, device)
@@ -51,8 +51,8 @@ def test_forces_and_energy_equal_the_oracle(name, kind, device, rng):
 
 @pytest.mark.parametrize("name", ["level 3", "general"])
 def test_crushed_and_inverted_elements_equal_the_oracle(name, device, rng):
-    """Displacements of a whole edge. Rotations that are not definite make no difference here: the law goes over to an
-    isotropic one, and its force is the derivative of its energy all the way."""
+    """Displacements of a whole edge. Undefined rotations do not matter here: the law blends into an isotropic one,
+    and its force is the derivative of its energy everywhere."""
     mesh = MESHES[name]()
     material, tensor = made("wood field", mesh, rng)
     sim, body = simulated(mesh, material, device)
@@ -67,8 +67,8 @@ def test_crushed_and_inverted_elements_equal_the_oracle(name, device, rng):
 
 
 def test_single_elements_of_all_stretches(device, rng):
-    """Elements that share no node, each compared by itself: those that the fast iteration turns, those that it leaves,
-    and those flattened to where the law goes over to the isotropic one."""
+    """Elements without common nodes, compared one by one: those that the fast iteration handles, those that it leaves
+    out, and those flattened to where the law blends into the isotropic one."""
     count = 2003
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) + rng.uniform(-0.1, 0.1, (count, 4, 3))
     mesh = wc.TetMesh(corners.reshape(-1, 3), np.arange(4 * count).reshape(-1, 4))
@@ -85,14 +85,14 @@ def test_single_elements_of_all_stretches(device, rng):
     x = mesh.points + body.displacements.numpy().astype(float)
     _, forces = oracle.continuum(oracle.anisotropic, oracle_mesh(mesh), x, tensor, None)
     off, scale = (np.abs(f).reshape(count, -1).max(axis=1) for f in (sim.forces().numpy() - forces, forces))
-    # Differences of the oracle's energy are not to be had across the bend in its second derivative.
+    # Differences of the oracle's energy are not valid across the kink in its second derivative.
     wrong = (off > TOLERANCE * scale) & (np.abs(definite - 0.4) > 0.01)
     assert not wrong.any(), f"{wrong.sum()} of {count} elements"
 
 
 @pytest.mark.parametrize("stretches", [(3.2, 3.2**-0.5, 3.2**-0.5), (0.4, 0.4, 0.4), (1.5, 0.9, 0.02), (2.0, 0.3, 1.5)])
 def test_energy_of_a_stretched_body(stretches, device, rng):
-    """V/2 e : C : e with e the principal stretches less one: even this far, the law is the one given."""
+    """V/2 e : C : e with e the principal stretches minus one: the law holds at these strains, too."""
     mesh = MESHES["general"]()
     material, C = made("wood", mesh, rng)
     V = random_axes(rng)
@@ -106,8 +106,8 @@ def test_energy_of_a_stretched_body(stretches, device, rng):
 @pytest.mark.parametrize("kind", ["muscle field", "wood"])
 @pytest.mark.parametrize("general", [False, True])
 def test_thousands_of_elements_node_by_node(general, kind, device, rng):
-    """Every tenth node far displaced, so that elements that the fast kernel leaves to the second lie in lanes between
-    those that it does, and a number of elements that eight lanes do not divide: a wrong lane or register shows."""
+    """Every tenth node is far displaced, so that elements for the second kernel lie in lanes between those of the fast
+    one, and eight does not divide the number of elements: a wrong lane or register shows."""
     mesh = wc.TetForest.box((1, 1, 1), 0.1, 9)
     if general:
         mesh = jittered(cells=(1, 1, 1), level=9)
@@ -128,7 +128,8 @@ def test_thousands_of_elements_node_by_node(general, kind, device, rng):
 @pytest.mark.parametrize("amount", [0.1, 0.9])
 @pytest.mark.parametrize("kind", KINDS)
 def test_force_is_minus_energy_gradient(kind, amount, device, rng):
-    """Of the solver's own energy, by differences as in test_forces; the larger displacements invert elements."""
+    """The gradient of the solver's own energy, by differences as in test_forces; large displacements invert
+    elements."""
     mesh = mixed_forest()
     sim, body = simulated(mesh, made(kind, mesh, rng)[0], device)
     u = random_displacement(mesh, rng, amount).astype(float)
@@ -170,7 +171,7 @@ def test_no_net_force_and_no_torque(name, kind, amount, device, rng):
 
 
 def test_without_the_turning_of_rotations_there_is_torque(rng):
-    """R (C : e) alone, which the force is not: what the test above would see."""
+    """R (C : e) alone is not the force: the test above would detect it."""
     mesh = MESHES["level 0"]()
     _, C = made("wood", mesh, rng)
     u = turned_displacement(mesh, rng, 0.3)
@@ -205,7 +206,7 @@ def test_momenta_are_kept(kind, device, rng):
 
 @pytest.mark.parametrize("name", ["mixed levels", "general"])
 def test_isotropic_constants_give_the_isotropic_law(name, device, rng):
-    """Forces, energy, von Mises stress and stable step of ``Corotated``, inverted elements too."""
+    """Forces, energy, von Mises stress and stable step equal those of ``Corotated``, for inverted elements, too."""
     mesh = MESHES[name]()
     young, nu = 5e3, 0.4
     shear = young / (2 * (1 + nu))
@@ -216,7 +217,7 @@ def test_isotropic_constants_give_the_isotropic_law(name, device, rng):
     isotropic, reference = simulated(mesh, wc.Isotropic(young, nu, DENSITY), device)
     for material in materials:
         sim, body = simulated(mesh, material, device)
-        # Found by an iteration that stops before its last digits.
+        # The iteration stops before the last digits.
         assert sim.stable_dt == pytest.approx(isotropic.stable_dt, rel=1e-3)
         for amount in (0.1, 0.9):
             u = turned_displacement(mesh, rng, amount)
@@ -229,7 +230,7 @@ def test_isotropic_constants_give_the_isotropic_law(name, device, rng):
 
 
 def test_a_body_turned_as_a_whole_feels_turned_forces(device, rng):
-    """Mesh, fibres and displacements turned in rest space: the forces turn with them."""
+    """Mesh, fibres and displacements are rotated in rest space: the forces rotate with them."""
     mesh = jittered()
     directions, Q = rng.standard_normal((len(mesh.tets), 3)), random_axes(rng)
     u = random_displacement(mesh, rng, 0.2)
@@ -243,7 +244,7 @@ def test_a_body_turned_as_a_whole_feels_turned_forces(device, rng):
 
 @pytest.mark.parametrize("angle", [0, 30, 90])
 def test_bar_under_tension(angle, device):
-    """Fibres at an angle to the pull: stretch, contraction across and shear are those of the compliance.
+    """Fibres at an angle to the pull: stretch, lateral contraction and shear follow the compliance.
 
     Along the pull 1/E = c^4/E_f + s^4/E_t + (1/G - 2 nu/E_f) s^2 c^2. Strains of 1e-3 are linear to some 1e-3.
     """
@@ -254,7 +255,7 @@ def test_bar_under_tension(angle, device):
     bar.pull(1e-3 * modulus)
     strain, spread = bar.strain()
     assert strain[2, 2] == pytest.approx(1e-3, rel=3e-3)
-    # Across fibres and pull: -nu of the fibres' share and -nu_t of the other's.
+    # Across fibres and pull: -nu times the fibres' share and -nu_t times the other's.
     assert strain[0, 0] == pytest.approx(-1e-3 * modulus * (c**2 * nu / E_f + s**2 * nu_t / E_t), rel=5e-3)
     axes = np.array([[0, s, c], [0, c, -s], [1, 0, 0]])
     sigma = np.zeros((3, 3))
@@ -306,7 +307,7 @@ def test_stiffness_is_the_inverse_of_the_compliance(rng):
 
 @pytest.mark.parametrize("name", ["level 3", "general"])
 def test_nothing_becomes_nan(name, device, rng):
-    """Crushed to a plane, a line and a point, mirrored, tiny and huge: finite forces, and none where there is none."""
+    """Crushed to a plane, a line and a point, mirrored, tiny and huge: finite forces, and zero ones at zero."""
     mesh = MESHES[name]()
     sim, body = simulated(mesh, made("wood field", mesh, rng)[0], device)
     for stretch in (

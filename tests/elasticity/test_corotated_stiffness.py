@@ -1,6 +1,6 @@
 """Corotated K p against R K R^T assembled in float64 from the oracle's rotations and small-strain stiffness.
 
-The exact K, with the turning of the rotations, is in ``test_stiffness_products``.
+The exact K, with the derivative of the rotations, is in ``test_stiffness_products``.
 """
 
 import numpy as np
@@ -75,7 +75,7 @@ def test_diagonal_blocks_are_those_of_the_product(make, options, device, rng):
 
 @pytest.mark.parametrize("case", ["level 3", "general"])
 def test_inverted_elements(case, device, rng):
-    """Rotations that are hardly definite differ between methods: their elements' nodes are left out."""
+    """Nearly undefined rotations differ between methods: nodes of these elements are left out."""
     mesh = MESHES[case]()
     u, p = random_displacement(mesh, rng, 0.9), random_displacement(mesh, rng, 1.0)
     F = oracle_mesh(mesh).deformation_gradients(places(mesh, u))
@@ -91,7 +91,7 @@ def test_inverted_elements(case, device, rng):
 @pytest.mark.parametrize("is_exact", [False, True])
 @pytest.mark.parametrize("case", ["mixed levels", "general"])
 def test_without_strain_both_are_the_derivative_of_the_forces(case, is_exact, device, rng):
-    """The turning of rotations adds a term in proportion to the stress: none in a body that is turned as a whole."""
+    """The derivative of rotations is proportional to the stress: it vanishes in a body that is only rotated."""
     mesh = MESHES[case]()
     u, p = turned(mesh, rng, 0.0), random_displacement(mesh, rng, 1.0)
     reference = oracle_mesh(mesh)
@@ -114,7 +114,7 @@ def test_semidefinite_unless_exact(device, rng):
 
 
 def rotations_of_elements(mesh, rng):
-    """Displacements that turn the surroundings of a node, which compression rewards."""
+    """Displacements that rotate the neighbourhood of a node, which compression favours."""
     for node in rng.choice(len(mesh.points), 20):
         offset = mesh.points - mesh.points[node]
         near = np.linalg.norm(offset, axis=1, keepdims=True) < 2 * edge_scale(mesh)
@@ -139,10 +139,10 @@ def test_rotations_of_ancestors(make, rotation_level, is_fast, device, rng):
 
 @pytest.mark.parametrize("level", [6, 7, 8])
 def test_rotations_within_a_tolerance(level, device, rng):
-    """Elements have the rotations that forces have: where their root's is near, that one."""
+    """Elements have the rotations of the forces: their root's if it is close."""
     tolerance = 0.1
     mesh = wc.TetForest.box((1, 1, 1), CUBE, level)
-    # Strains grow along the body: some subtrees share their root's rotation, others do not.
+    # Strains grow along the body: only some subtrees share their root's rotation.
     amount = np.where(mesh.points[:, 2:] < 0.5 * CUBE, 0.01, 0.12)
     scale = edge_scale(mesh) * amount * rng.uniform(-1, 1, mesh.points.shape)
     turn = oracle.polar(rng.standard_normal((3, 3)))
@@ -152,7 +152,7 @@ def test_rotations_within_a_tolerance(level, device, rng):
     own = own_rotations(reference, x)
     near, share = near_rotations(mesh, x, own, tolerance)
     assert 0.1 < share < 0.9
-    # On CUDA bodies of few leaves have own rotations, whatever the tolerance; forces tell.
+    # On CUDA bodies with few leaves have own rotations at any tolerance; forces show which.
     field = bound(mesh, device, rotation_level=tolerance)
     forces = field.elastic_forces(on_device(u, field)).numpy()[:, :3]
     expected = [oracle.evaluate("corotated", reference, x, MU, LAM, R=R)[1] for R in (near, own)]
@@ -165,8 +165,8 @@ def test_rotations_within_a_tolerance(level, device, rng):
 
 
 def near_rotations(mesh, x, own, tolerance):
-    """The rotation of each leaf: its ancestor's three levels up where R^T F - I has a skew part of at most the
-    tolerance and a symmetric one of at most 1/2 in all eight leaves. And how many have that."""
+    """The rotation of each leaf: its ancestor's three levels up if in all eight leaves R^T F - I has a skew part of at
+    most the tolerance and a symmetric part of at most 1/2. Also returns the number of these leaves."""
     roots, subtree = np.unique(mesh.tree.above(mesh.tree.leaves, 3), return_inverse=True)
     assert 8 * len(roots) == len(mesh.tets)
     R = own_rotations(oracle.Mesh(mesh.points, mesh.tree.tets[roots]), x)[subtree]
@@ -175,14 +175,14 @@ def near_rotations(mesh, x, own, tolerance):
     apart = np.maximum(np.linalg.norm(skew, axis=(1, 2)) / tolerance, np.linalg.norm(symmetric, axis=(1, 2)) / 0.5)
     most = np.zeros(len(roots))
     np.maximum.at(most, subtree, apart)
-    assert np.abs(most - 1.0).min() > 1e-4  # rounding decides nothing
+    assert np.abs(most - 1.0).min() > 1e-4  # rounding does not decide
     is_near = (most <= 1.0)[subtree]
     return np.where(is_near[:, None, None], R, own), is_near.mean()
 
 
 @pytest.mark.parametrize("case", ["level 3", "general"])
 def test_no_state_gives_what_is_not_finite(case, device, rng):
-    """Nothing moved, flat, a point, a point reflection, turned over and stretched a thousandfold."""
+    """At rest, flat, a point, a point reflection, inverted and stretched a thousandfold."""
     mesh = MESHES[case]()
     field = bound(mesh, device)
     p = random_displacement(mesh, rng, 1.0)
@@ -194,7 +194,7 @@ def test_no_state_gives_what_is_not_finite(case, device, rng):
 
 
 def test_warm_rotations_are_left_as_they_are(device, rng):
-    """Products leave no trace in what steps go on from."""
+    """Products do not change the state from which steps continue."""
     mesh = mixed_forest()
     field = bound(mesh, device, rotation="warm")
     before = {name: array.numpy().copy() for name, array in field.state.items()}

@@ -1,4 +1,4 @@
-"""What force fields get of a mesh: plans of meshes that stay as they are, and of meshes that change."""
+"""The mesh data of force fields: plans of static meshes, and of meshes that change."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,9 @@ import warp as wp
 from remesh_cases import CUBE, random_marks
 
 import warp_corot as wc
-from warp_corot.kernels.elements.constitutive import stvk_stress
-from warp_corot.kernels.elements.forces import scatter_forces
+from warp_corot.discretization.clusters.single import isotropic_material
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, stvk_stress
+from warp_corot.kernels.elements.forces import law_stress, scatter_forces
 
 MATERIAL = wc.Isotropic(young=1e4, poisson=0.4, density=1000.0)
 
@@ -33,16 +34,15 @@ def random_displacements(count, places, rng, device):
 @pytest.mark.parametrize("general", [False, True])
 @pytest.mark.parametrize("subtrees", [False, True])
 def test_forces_by_way_of_slots_are_those_added_to_the_nodes(subtrees, general, worlds, device, rng):
-    """The elements of a plan with slots add to these, and gathering comes to what goes to the nodes at once."""
+    """Elements of a plan with slots write to slots, and gathering gives the same sums as adding to the nodes."""
     mesh = adaptive(rng)
     mesh = wc.TetMesh(mesh.points, mesh.tets) if general else mesh
     body = wc.SoftBody(mesh, MATERIAL, worlds=worlds, device=device)
     plan = body.discretization.plan(subtrees=subtrees, deterministic=True)
     u = random_displacements(body.node_count, body.node_count, rng, device)
-    kernel, inputs = (
-        scatter_forces(body.discretization.element_kind, stvk_stress),
-        [body.discretization.mu, body.discretization.lam, body.discretization.material_stride, u],
-    )
+    own = body.discretization
+    kernel = scatter_forces(own.element_kind, IsotropicMaterial, law_stress(stvk_stress))
+    inputs = [isotropic_material([own.mu, own.lam, own.material_stride]), u]
     expected, found = wp.zeros_like(u), wp.zeros_like(u)
     wp.launch(
         kernel, body.element_count, inputs=[body.discretization.elements, *inputs], outputs=[expected], device=device

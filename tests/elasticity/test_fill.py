@@ -1,4 +1,4 @@
-"""Elements that a body takes a share of: mass, stiffness, energy and active stress count by it, stresses do not."""
+"""Partly filled elements: mass, stiffness, energy and active stress scale with the filled fraction, stresses do not."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ MODELS = [
 
 @pytest.fixture(scope="module")
 def ball():
-    """A sphere in elements of two levels, half of which it only cuts."""
+    """A sphere in elements of two levels, half of them cut by it."""
     mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.05), 0.04, max_level=6, surface_error=1e-3)
     assert mesh.fill is not None
     assert 0.2 < np.mean(mesh.fill != 1.0) < 0.9
@@ -39,12 +39,12 @@ def ball():
 
 
 def filled(mesh):
-    """The same forest, with nothing known of what its elements hold."""
+    """The same forest without its filled fractions."""
     return replace(mesh, phi=None, fill=None)
 
 
 def bodies(mesh, device, materials):
-    """The body, and one with the same elements, all full, whose material is as much less as they hold."""
+    """The body, and one with full elements whose material is reduced by the filled fractions."""
     whole = wc.TetMesh(mesh.points, mesh.tets)
     return [wc.SoftBody(m, material, device=device) for m, material in zip((mesh, whole), materials, strict=True)]
 
@@ -78,7 +78,7 @@ def test_forces_and_energy_are_those_of_a_material_of_that_share(ball, model, de
 
 @pytest.mark.parametrize("model", [MODELS[0], MODELS[1], *MODELS[5:9]], ids=str)
 def test_stress_is_that_of_the_material(ball, model, device, rng):
-    """Of what is there, whether it fills the element or not: as with the same material in full elements."""
+    """The stress is that of the filled part: the same as in full elements of the material."""
     cut, whole = (wc.SoftBody(m, wc.Isotropic(3e3, 0.4, 1000.0), device=device) for m in (ball, filled(ball)))
     moved(cut, rng)
     whole.displacements = cut.displacements.numpy()

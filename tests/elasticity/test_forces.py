@@ -1,7 +1,7 @@
 """Elastic forces and energies of every model, on every kind of mesh, against the float64 oracle.
 
-The forces are float32: each is a sum of terms that rounding changes by some 1e-7 of the largest stress, times the few
-operations and elements around a node. A wrong weight, sign or index is 1e-2 or more.
+The forces are float32: each is a sum of terms that rounding changes by some 1e-7 of the largest stress, times the
+number of operations and elements around a node. A wrong weight, sign or index is 1e-2 or more.
 """
 
 import numpy as np
@@ -39,7 +39,7 @@ def compare(sim, body, model, u, mu=MU, lam=LAM, tolerance=FORCE_TOLERANCE, **op
 @pytest.mark.parametrize("mesh", MESHES)
 @pytest.mark.parametrize("model", MODELS)
 def test_forces_and_energy_equal_the_oracle(model, mesh, device, rng):
-    """Strains around 0.3, turned by a large rotation where the model allows it."""
+    """Strains around 0.3, with a large rotation if the model allows it."""
     mesh = MESHES[mesh]()
     sim, body = simulation(mesh, model, device)
     u = random_displacement(mesh, rng, 0.1)
@@ -52,7 +52,7 @@ def test_forces_and_energy_equal_the_oracle(model, mesh, device, rng):
 
 @pytest.mark.parametrize("model", [model for model in MODELS if "quadratic" not in model and model != "mass_spring"])
 def test_inverted_elements_equal_the_oracle(model, device, rng):
-    """Displacements of a whole edge turn elements inside out; forces stay those of the stated energy.
+    """Displacements of a whole edge invert elements; forces still follow from the energy.
 
     Corotated: an inverted element whose two smaller singular values nearly meet has no well-defined rotation; only
     nodes that no such element touches are compared.
@@ -91,9 +91,9 @@ def test_material_per_element(model, make, device, rng):
 def test_force_is_minus_energy_gradient(model, device, rng):
     """The solver's forces are minus the gradient of the solver's own energy.
 
-    Along a direction d, W(u + h d) - W(u - h d) = -2 h f.d + O(h^3). The energy is a sum of float32 terms, so that h is
-    large (a fiftieth of an edge), the O(h^3) term is removed by Richardson extrapolation from h and h/2, and d is
-    random but not across f.
+    Along a direction d, W(u + h d) - W(u - h d) = -2 h f.d + O(h^3). The energy is a sum of float32 terms, so h is
+    large (a fiftieth of an edge), Richardson extrapolation from h and h/2 removes the O(h^3) term, and d is
+    random but not perpendicular to f.
     """
     mesh = mixed_forest()
     sim, body = simulation(mesh, model, device)
@@ -126,7 +126,7 @@ def test_edge_springs_equal_the_total_lagrangian_form(device, rng):
 
 @pytest.mark.parametrize("model", [model for model in MODELS if model != "mass_spring"])
 def test_small_strain_stiffness(model, device, rng):
-    """At strains of 1e-3 every model feels the same small-strain stiffness, to first order in the strain."""
+    """At strains of 1e-3 every model has the same small-strain stiffness, to first order in the strain."""
     mesh = mixed_forest()
     sim, body = simulation(mesh, model, device)
     u = random_displacement(mesh, rng, 1e-3)
@@ -201,10 +201,10 @@ def test_von_mises_stress(model, make, device, rng):
 @pytest.mark.parametrize("strain", [1e-3, 1e-5])
 @pytest.mark.parametrize("model", ["linear", "stvk", "edge_stvk", "edge_stvk_quadratic", "corotated", "neo_hookean"])
 def test_digits_of_small_strains(model, strain, device, rng):
-    """What is left of float32's seven digits when strains are small.
+    """The digits that remain of float32's seven at small strains.
 
-    Models written in the displacement gradient alone keep them all, in forces and energy. Corotated strain is a
-    difference R^T F - I: it sees strains no smaller than the rounding of a rotation, 1e-7.
+    Models written in the displacement gradient alone keep all, in forces and energy. Corotated strain is a
+    difference R^T F - I: it resolves strains down to the rounding of a rotation, 1e-7.
     """
     mesh = mixed_forest()
     sim, body = simulation(mesh, model, device)

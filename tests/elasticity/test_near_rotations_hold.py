@@ -1,7 +1,8 @@
-"""Rotations within a tolerance hold what own rotations hold: bodies let go from strong deformations, and under weight.
+"""Rotations within a tolerance are as stable as own rotations: bodies released from strong deformation, and under
+weight.
 
-Shared rotations have no energy. What they add or take is measured beside the drift that own rotations have at the same
-steps.
+Forces with shared rotations have no energy. Their effect is measured relative to the drift of own rotations with the
+same steps.
 """
 
 import functools
@@ -15,11 +16,11 @@ import warp_corot as wc
 COUNT = 2500
 DENSITY = 1000.0
 SECONDS, PARTS = 0.3, 12
-#: Of the energy that a body begins with, or of what gravity has given it: how much more sharing may add.
+#: How much more energy sharing may add, as a fraction of the initial energy or of gravity's work.
 ADDED = 0.02
 
 
-#: Root cubes, their edge [m] and the level; of all three types of leaves.
+#: Root cubes, their edge [m] and the level, for all three types of leaves.
 BOXES = {
     "beam 6": ((1, 1, 3), 0.04, 6),
     "beam 7": ((1, 1, 3), 0.04, 7),
@@ -30,7 +31,7 @@ BOXES = {
 
 @functools.cache
 def mesh_of(shape):
-    """A forest, its axis, and which nodes are held: the lowest tenth along the axis."""
+    """A forest, its axis, and its fixed nodes: the lowest tenth along the axis."""
     if shape in BOXES:
         cells, size, level = BOXES[shape]
         forest, axis = wc.TetForest.box(cells, size, level), 2
@@ -42,7 +43,7 @@ def mesh_of(shape):
 
 
 def deformed(points, axis, held, state):
-    """Displacements that begin where the held part ends."""
+    """Displacements that begin at the end of the fixed part."""
     x = np.roll(points, 2 - axis, axis=1)  # the axis last
     low = x[held, 2].max()
     z = np.maximum(x[:, 2] - low, 0.0)
@@ -70,7 +71,7 @@ STATES = ("bent", "twisted by pi", "stretched to 1.8", "squeezed to 0.5", "under
 
 
 def energies(shape, state, kilopascals, rotation_level, device):
-    """Energies after each part of the time [J], and how large they are."""
+    """Energies after each part of the time [J], and their scale."""
     mesh, axis, held = mesh_of(shape)
     body = wc.SoftBody(mesh, wc.Isotropic(1e3 * kilopascals, 0.45, DENSITY), device=device)
     body.fix(held)

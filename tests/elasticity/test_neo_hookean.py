@@ -1,4 +1,4 @@
-"""Neo-Hookean where it leaves the plain law: below J = 0.5 its volumetric energy is a parabola."""
+"""Neo-Hookean outside the plain law: below J = 0.5 its volumetric energy is a parabola."""
 
 import numpy as np
 import oracle
@@ -13,7 +13,7 @@ MATERIAL = {"young": 5e3, "poisson": 0.4, "density": 1000.0}
 
 
 def random_gradients(rng, count, low, high):
-    """F [count, 3, 3] of principal stretches from low to high, negative ones among them where low is."""
+    """F [count, 3, 3] with principal stretches from low to high, negative ones if low is negative."""
     turns = oracle.polar(rng.standard_normal((2, count, 3, 3)))
     return turns[0] * rng.uniform(low, high, (count, 1, 3)) @ turns[1]
 
@@ -31,8 +31,8 @@ def stiffness(F):
 
 
 def test_stiffness_is_bounded_however_crushed_and_turned_over(rng):
-    """At most mu + 2 s |U'| + U'' |cof F|^2 for stretches up to s = 1 in size, with U'' no more than at J = 0.5 and U'
-    steepest at J = -1. (The second derivative of det F is 2 s at most.) At rest it is 2 mu + 3 lambda."""
+    """At most mu + 2 s |U'| + U'' |cof F|^2 for stretches of magnitude up to s = 1, with U'' at most that at J = 0.5
+    and U' steepest at J = -1. (The second derivative of det F is at most 2 s.) At rest it is 2 mu + 3 lambda."""
     F = random_gradients(rng, 5000, -1.0, 1.0)
     assert np.linalg.det(F).min() < -0.8
     curvature = 4 * (MU + LAM * (1 + np.log(2)))
@@ -40,7 +40,7 @@ def test_stiffness_is_bounded_however_crushed_and_turned_over(rng):
     bound = MU + 2 * slope + 3 * curvature
     assert bound == pytest.approx(29 * MU + 43.4 * LAM, rel=0.01)
     assert stiffness(F).max() < bound
-    # Crushed to any volume, but not turned over.
+    # Crushed to any volume, but not inverted.
     rest = 2 * MU + 3 * LAM
     crushed = F[(np.linalg.det(F) > 0) & (np.linalg.det(F) < 0.5)]
     print(stiffness(F).max() / rest, stiffness(crushed).max() / rest)
@@ -60,14 +60,14 @@ def test_stress_is_the_derivative_of_the_energy(rng):
 
 
 def single_elements(F, rng):
-    """A mesh of elements that share no node, and displacements that give each its F."""
+    """A mesh of elements without common nodes, and displacements that give each its F."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) + rng.uniform(-0.1, 0.1, (len(F), 4, 3))
     mesh = wc.TetMesh(corners.reshape(-1, 3), np.arange(4 * len(F)).reshape(-1, 4))
     return mesh, (corners @ np.swapaxes(F, 1, 2)).reshape(-1, 3) - mesh.points
 
 
 def forces_of(F, device, rng):
-    """What the solver has for each element, and the same mesh and positions for the oracle."""
+    """The solver's forces on each element, and the same mesh and positions for the oracle."""
     mesh, u = single_elements(F, rng)
     sim, body = simulation(mesh, "neo_hookean", device, dt=1e-5, material=MATERIAL)
     place(body, u)
@@ -76,7 +76,7 @@ def forces_of(F, device, rng):
 
 
 def test_each_element_equals_the_oracle(device, rng):
-    """From turned over to threefold stretch, element by element, with a tenth of them at J = 0.5 within rounding."""
+    """From inverted to threefold stretch, element by element, with a tenth of them at J = 0.5 within rounding."""
     F = random_gradients(rng, 3000, -1.0, 3.0)
     F[:300] = random_gradients(rng, 300, 0.5, 1.5)
     F[:300] *= np.cbrt(CONTINUED_BELOW / np.linalg.det(F[:300]))[:, None, None]

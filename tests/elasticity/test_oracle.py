@@ -75,7 +75,7 @@ def test_polar_is_the_best_proper_rotation(rng):
 
 @pytest.mark.parametrize("model", oracle.MODELS)
 def test_rigid_motion_gives_no_force(model, rng):
-    """No stiffness is felt under a rigid motion, but for linear elasticity, under a translation only."""
+    """A rigid motion gives no force; for linear elasticity, this holds only for translations."""
     mesh = random_mesh(rng)
     turn = np.eye(3) if model == "linear" else oracle.polar(rng.standard_normal((3, 3)))
     energies, forces = oracle.evaluate(model, mesh, mesh.points @ turn.T + [0.3, -0.1, 0.2], MU, LAM)
@@ -96,7 +96,7 @@ def test_small_strain_limit(model, rng):
 
 
 def test_mass_spring_is_poisson_quarter_on_average(rng):
-    """Over random edge directions the springs store what E and nu = 1/4 store, whatever nu the material names."""
+    """Over random edge directions the springs store the energy of E and nu = 1/4, for any nu of the material."""
     corners = oracle.polar(rng.standard_normal((20000, 3, 3))) @ rng.standard_normal((3, 4))
     points = np.swapaxes(corners, 1, 2)
     mesh = oracle.Mesh(points.reshape(-1, 3), np.arange(80000).reshape(-1, 4))

@@ -1,4 +1,4 @@
-"""Shared rotations within a tolerance: an ancestor's where it is near the leaves' own ones, own rotations elsewhere."""
+"""Shared rotations within a tolerance: an ancestor's if it is close to the leaves' own, own rotations elsewhere."""
 
 import numpy as np
 import oracle
@@ -7,6 +7,7 @@ import warp as wp
 from cases import edge_scale, oracle_mesh
 
 import warp_corot as wc
+from warp_corot.discretization.clusters.single import isotropic_material
 from warp_corot.discretization.plan import ForcePlan
 from warp_corot.elasticity.corotated.model import AUTO_TOLERANCE
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
@@ -17,10 +18,10 @@ MU, LAM = oracle.lame(1e4, 0.4)
 ROUNDING = 1e-5  # of the largest force
 
 
-#: Both ways to the forces: eight subtrees in the lanes of a CPU, and the kernel that CUDA has, without groups.
+#: Both force paths: eight subtrees in the lanes of a CPU, and CUDA's kernel without groups.
 LANES, SUBTREES = "lanes", "subtrees"
 WAYS = [LANES, SUBTREES]
-#: Of the second, each tolerance compiles kernels of its own.
+#: For the second path, each tolerance compiles its own kernels.
 TOLERANCES = [
     *((LANES, tolerance) for tolerance in (0.01, AUTO_TOLERANCE, 0.3)),
     (SUBTREES, AUTO_TOLERANCE),
@@ -29,10 +30,11 @@ TOLERANCES = [
 
 
 def forces(forest, u, tolerance, way, device):
-    """Forces, and which leaves are left out, as bits of subtrees."""
+    """Forces, and the omitted leaves as bits of subtrees."""
     body = wc.SoftBody(forest, wc.Isotropic(1e4, 0.4, 1000.0), device=device)
     body.displacements = u
-    (batch,) = ForcePlan.of_forest(forest, None, body.device, grouped=False).batches
+    plan = ForcePlan.of_forest(forest, None, body.device, grouped=False)
+    (batch,) = plan.batches
     f = wp.zeros_like(body.state.displacements)
     material, u, outputs = (
         [body.discretization.mu, body.discretization.lam],
@@ -42,11 +44,12 @@ def forces(forest, u, tolerance, way, device):
     if way == LANES:
         if body.device.is_cuda:
             pytest.skip("for the CPU")
-        inputs = [batch.subtrees, batch.count, *material, 0, u]
-        kernel = subtree_cpu.scatter_subtrees_own(batch.shape)
+        kernel, of_kernel = subtree_cpu.scatter_law_subtrees(batch.shape), isotropic_material([*material, 0])
         if tolerance is not None:
-            inputs.append(tolerance)
-            kernel = subtree_cpu.scatter_subtrees_near(batch.shape)
+            kernel, near = subtree_cpu.scatter_subtrees_near(batch.shape), subtree_cpu.NearMaterial()
+            near.isotropic, near.tolerance = of_kernel, tolerance
+            of_kernel = near
+        inputs = [batch.subtrees, batch.count, of_kernel, u]
         wp.launch(kernel, -(-batch.count // 8), inputs, outputs, device=body.device)
     else:
         if body.device.is_cpu:
@@ -54,13 +57,13 @@ def forces(forest, u, tolerance, way, device):
             batch.subtrees.nodes = batch.subtrees.targets = nodes
         kernel = subtree_cuda.scatter_subtrees_own(batch.shape, False, True, False, tolerance)
         outputs.append(LeftOut())
-        inputs = [batch.subtrees, *material, u]
+        inputs = [plan.elements, batch.subtrees, isotropic_material([*material, 0]), u]
         wp.launch(kernel, batch.count, inputs, outputs, device=body.device, block_dim=subtree_cuda.BLOCK)
     return f.numpy()[:, :3], batch.flagged.numpy()[: batch.count]
 
 
 def bent(points, radius):
-    """A bar along z bent to a circle, and its displacements: rotation from leaf to leaf by h / radius."""
+    """A bar along z bent to a circle, and its displacements: neighbouring leaves are rotated by h / radius."""
     angle = points[:, 2] / radius
     out = radius + points[:, 0]
     moved = np.stack([out * np.cos(angle) - radius, points[:, 1], out * np.sin(angle)], axis=1)
@@ -74,7 +77,7 @@ def own(forest, u):
 
 
 def bound(reference, F, tolerance, mu=MU, lam=LAM):
-    """How far forces may be off [N]."""
+    """Bound of the error of forces [N]."""
     U = np.swapaxes(oracle.polar(F), 1, 2) @ F
     w = 2 * tolerance
     strain, norm = (np.linalg.norm(A, axis=(1, 2)) for A in (U - np.eye(3), U))
@@ -100,7 +103,7 @@ def test_error_of_the_force_is_bounded(level, radius, tolerance, way, device):
 
 @pytest.mark.parametrize("way", WAYS)
 def test_both_kinds_are_used(way, device):
-    """Of a bar with one end bent the other is not: the straight part shares, and the error there is what shows it."""
+    """One end of a bar is bent, the other is straight: the straight part shares rotations, as the error there shows."""
     forest = wc.TetForest.box((1, 1, 3), 0.1, 9)
     z = forest.points[:, 2]
     u = np.where(
@@ -115,8 +118,8 @@ def test_both_kinds_are_used(way, device):
 
 @pytest.mark.parametrize(("way", "tolerance"), [(LANES, 0.5), (SUBTREES, AUTO_TOLERANCE)])
 def test_what_own_rotations_hold_is_theirs(way, tolerance, device, rng):
-    """Turned over, flat and strongly strained leaves never share: their forces are those of own rotations, or they are
-    left out as they are without a tolerance."""
+    """Inverted, flat and strongly strained leaves never share: their forces are those of own rotations, or they are
+    left out as without a tolerance."""
     forest = wc.TetForest.box((1, 1, 1), 0.1, 9)
     far = rng.random((len(forest.points), 1)) < 0.1
     u = np.where(far, 1.2, 0.02) * edge_scale(forest) * rng.uniform(-1, 1, forest.points.shape)
@@ -130,13 +133,13 @@ def test_what_own_rotations_hold_is_theirs(way, tolerance, device, rng):
     certain = np.ones(len(forest.points), bool)
     certain[subtrees[~strained]] = False
     assert certain.any()
-    # In lanes to the bit; on CUDA they are worked out in the root's frame.
+    # In lanes bit for bit; on CUDA they are computed in the root's frame.
     assert np.abs(shared - plain)[certain].max() <= (0.0 if way == LANES else ROUNDING * np.abs(plain).max())
 
 
 @pytest.mark.parametrize("way", WAYS)
 def test_rotations_of_the_whole_body_do_not_matter(way, device, rng):
-    """Decided by what is left once the root's rotation is taken off: the forces turn with the body."""
+    """The decision uses only what remains after removing the root's rotation: forces rotate with the body."""
     forest = wc.TetForest.box((1, 1, 3), 0.1, 6)
     turn = oracle.polar(rng.standard_normal((3, 3)))
     u = bent(forest.points, 1.0)
@@ -146,7 +149,7 @@ def test_rotations_of_the_whole_body_do_not_matter(way, device, rng):
 
 
 def test_materials_of_elements(device, rng):
-    """Shared and own rotations in one body of many materials."""
+    """Shared and own rotations in one body with many materials."""
     forest = wc.TetForest.box((1, 1, 3), 0.1, 8)
     young = rng.uniform(0.5e4, 2e4, len(forest.tets))
     u = np.where(forest.points[:, 2:] > 0.15, bent(forest.points - [0, 0, 0.15], 0.3), 0.0)
@@ -163,7 +166,7 @@ def test_materials_of_elements(device, rng):
     assert np.abs(with_own - expected).max() < rounding
     error = np.linalg.norm(near - expected, axis=1)
     assert (error < bound(reference, F, AUTO_TOLERANCE, *lame) + rounding).all()
-    if body.device.is_cpu:  # on CUDA so few leaves go in clusters, where sharing would save nothing
+    if body.device.is_cpu:  # on CUDA so few leaves are computed in clusters, where sharing would save nothing
         assert error.max() > 100 * rounding
 
 

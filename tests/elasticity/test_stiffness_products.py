@@ -36,7 +36,7 @@ def bound(mesh, model, device, *, worlds=1, deterministic=False, **material):
 
 
 def displaced(mesh, model, rng, amount=0.1):
-    """Random displacements, turned by a large rotation where the model allows it."""
+    """Random displacements, with a large rotation if the model allows it."""
     u = random_displacement(mesh, rng, amount)
     if model != "linear":
         turn = oracle.polar(rng.standard_normal((3, 3)))
@@ -52,7 +52,7 @@ def expected(model, mesh, u, p, mu=MU, lam=LAM):
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("model", MODELS)
 def test_product_equals_differences_of_the_oracles_forces(model, case, device, rng):
-    """Strains around 0.3, on forests of all three types and on a general mesh; also the invariants of K there."""
+    """Strains around 0.3, on forests of all three types and on a general mesh; with the invariants of K there."""
     mesh = MESHES[case]()
     field = bound(mesh, model, device)
     u, p = displaced(mesh, model, rng), random_displacement(mesh, rng, 1.0)
@@ -73,8 +73,8 @@ def test_diagonal_blocks_are_those_of_the_product(model, case, device, rng):
 @pytest.mark.parametrize("case", ["level 3", "general"])
 @pytest.mark.parametrize("model", [model for model in MODELS if "quadratic" not in model and model != "mass_spring"])
 def test_inverted_elements(model, case, device, rng):
-    """Displacements of a whole edge turn elements inside out. Corotated: nodes of elements whose rotation is hardly
-    definite are left out."""
+    """Displacements of a whole edge invert elements. Corotated: nodes of elements with nearly undefined rotations are
+    left out."""
     mesh = MESHES[case]()
     field = bound(mesh, model, device)
     u, p = random_displacement(mesh, rng, 0.9), random_displacement(mesh, rng, 1.0)
@@ -94,7 +94,7 @@ def test_inverted_elements(model, case, device, rng):
 @pytest.mark.parametrize("strain", [1e-3, 1e-5])
 @pytest.mark.parametrize("model", ["linear", "stvk", "neo_hookean", "edge_stvk", "corotated"])
 def test_digits_of_small_displacements(model, strain, device, rng):
-    """Small strains and small p lose no digits: both come in as differences of displacements, not of positions."""
+    """Small strains and small p keep their digits: both enter as differences of displacements, not of positions."""
     mesh = mixed_forest()
     field = bound(mesh, model, device)
     u, p = random_displacement(mesh, rng, 0.3 * strain), random_displacement(mesh, rng, strain)
@@ -104,7 +104,7 @@ def test_digits_of_small_displacements(model, strain, device, rng):
 @pytest.mark.parametrize("make", [mixed_forest, jittered])
 @pytest.mark.parametrize("model", MODELS)
 def test_worlds_of_different_materials(model, make, device, rng):
-    """Every world has its own material in each element, its own state and its own p."""
+    """Every world has a different material in each element, a different state and a different p."""
     mesh, worlds = make(), 3
     young, poisson = (rng.uniform(*limits, (worlds, len(mesh.tets))) for limits in ((200, 2000), (0.0, 0.45)))
     field = bound(mesh, model, device, worlds=worlds, young=young, poisson=poisson)
@@ -118,7 +118,7 @@ def test_worlds_of_different_materials(model, make, device, rng):
 
 @pytest.fixture(scope="module")
 def ball():
-    """A sphere in elements of two levels, half of which it only cuts."""
+    """A sphere in elements of two levels, half of them cut by it."""
     mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.05), 0.04, max_level=6, surface_error=1e-3)
     assert 0.2 < np.mean(mesh.fill != 1.0) < 0.9
     return mesh
@@ -126,7 +126,7 @@ def ball():
 
 @pytest.mark.parametrize("model", MODELS)
 def test_filled_share(ball, model, device, rng):
-    """Elements count by the share of them that the body takes up."""
+    """Elements count by their filled fraction."""
     field = bound(ball, model, device)
     u, p = displaced(ball, model, rng), random_displacement(ball, rng, 1.0)
     found = product(field, u, p, **exact(model))
@@ -135,7 +135,7 @@ def test_filled_share(ball, model, device, rng):
 
 @pytest.mark.parametrize("model", ["corotated", "neo_hookean", "mass_spring"])
 def test_products_are_added_and_need_no_slots(model, device, rng):
-    """To what is there; and a field whose forces go to slots adds to nodes."""
+    """Products are added to existing values; and a field whose forces go to slots adds to nodes."""
     mesh = mixed_forest()
     plain, field = (bound(mesh, model, device, deterministic=settled) for settled in (False, True))
     u, p = displaced(mesh, model, rng), random_displacement(mesh, rng, 1.0)
@@ -158,7 +158,7 @@ REMESHED = {
 
 @pytest.mark.parametrize("model", REMESHED)
 def test_a_mesh_that_has_changed(model, device, rng):
-    """As on a mesh made that way, with a material of its own in each element; nothing is added beyond the nodes."""
+    """The product equals that on a mesh made that way, with varying material; padding gets nothing."""
     forest = wc.TetForest.box((2, 1, 1), CUBE, 6)
     forest = forest.refine(rng.choice(len(forest.tets), 5, replace=False))
     material = {"poisson": 0.4, "density": 1000.0}
@@ -172,7 +172,7 @@ def test_a_mesh_that_has_changed(model, device, rng):
         changing.renew()
         mesh, count, places = changing.forest.to_forest(), body.node_count, len(body.node_displacements)
         alone = REMESHED[model].bind(wc.SoftBody(mesh, body.material, device=device))
-        # Small enough for rotations to be shared within the tolerance in some subtrees.
+        # Small enough that some subtrees share rotations within the tolerance.
         u, p = 0.05 * edge_scale(mesh) * rng.uniform(-1, 1, (count, 3)), rng.standard_normal((count, 3))
         found, reference = product(field, u, p, places=places), product(alone, u, p)
         assert_equal(found[:count], reference)

@@ -1,4 +1,4 @@
-"""Stiffness-proportional damping: what it takes out, what it leaves alone, and how long steps may be with it."""
+"""Stiffness-proportional damping: the energy it removes, the motion it leaves alone, and its stable step."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def forces(mesh, displacements, velocities, device, seconds=0.1, deterministic=F
 
 
 def strained(mesh, rng, amount=0.25) -> np.ndarray:
-    """Displacements of a body that is turned by a radian and strained."""
+    """Displacements of a body that is rotated by a radian and strained."""
     from scipy.spatial.transform import Rotation
 
     x = mesh.points
@@ -54,7 +54,7 @@ def test_it_takes_power_and_neither_momentum(mesh, device, rng):
 
 @pytest.mark.parametrize("mesh", [BOX, GENERAL], ids=["forest", "general"])
 def test_what_turns_as_a_whole_is_not_damped(mesh, device, rng):
-    """However it is strained."""
+    """At any strain."""
     u = strained(mesh, rng)
     stretching = np.abs(forces(mesh, u, (mesh.points + u) @ (SKEW + SKEW.T + np.eye(3)), device)).max()
     turning = np.abs(forces(mesh, u, (mesh.points + u) @ SKEW.T + [1.0, 2.0, 3.0], device)).max()
@@ -80,7 +80,7 @@ def test_it_comes_out_the_same_in_one_order_and_in_all_worlds(device, rng):
 
 
 def test_the_stable_step_is_where_steps_become_unstable():
-    """Central differences, damped by the velocities before: roots of z^2 - (2 - dt^2 w^2 - dt c) z + 1 - dt c."""
+    """Central differences, damped by the former velocities: roots of z^2 - (2 - dt^2 w^2 - dt c) z + 1 - dt c."""
     w = 40.0
     for viscosity in (0.0, 1e-4, 0.02, 3.0):
         dt = wc.SymplecticEuler(viscosity=viscosity).stable_step(w)
@@ -93,7 +93,7 @@ def test_the_stable_step_is_where_steps_become_unstable():
 
 
 def test_a_body_follows_the_stable_step(device):
-    """Strong damping limits the step, which is found; a longer one is warned of and goes wrong."""
+    """Strong damping limits the stable step; a longer step gives a warning and diverges."""
     made = wc.SoftBody(BOX, wc.Isotropic(1e5, 0.3, 1000.0), device=device)
     made.fix(BOX.points[:, 2] == 0.0)
     bare = wc.Simulation(made, gravity=(0.0, 0.0, 0.0)).stable_dt
@@ -119,7 +119,7 @@ def test_the_first_mode_of_a_beam_decays_by_half_of_viscosity_times_frequency_sq
     kick = np.zeros_like(mesh.points)
     kick[:, 0] = 0.1 * (mesh.points[:, 2] / 0.4) ** 2
     body.velocities = kick
-    sim.advance(0.5)  # higher modes die away
+    sim.advance(0.5)  # higher modes decay
     end = int(np.argmax(mesh.points[:, 2]))
     times, tip = [], []
     for _ in range(600):

@@ -1,4 +1,4 @@
-"""Supports, loads and keyframes of a patch: set on the device, at the cost of the patch, from arrays of any program."""
+"""Supports, loads and keyframes of a patch: set on the device, at the cost of the patch, from any program's arrays."""
 
 import numpy as np
 import pytest
@@ -79,7 +79,7 @@ def test_nodes_may_be_named_by_a_warp_array(device):
 
 
 def test_a_change_of_a_patch_brings_no_nodal_array_to_the_host(device, monkeypatch):
-    """What takes time in proportion to the body is to copy its arrays to the host and back."""
+    """Copying a body's arrays to the host and back takes time in proportion to the body."""
     sim = bar(device)
     sim.advance_steps(2)
     body, top = sim.body, top_of(sim)
@@ -96,12 +96,12 @@ def test_a_change_of_a_patch_brings_no_nodal_array_to_the_host(device, monkeypat
         body.fix(top)
     assert max(moved, default=0) <= len(top) < body.node_count / 4
     monkeypatch.undo()
-    body.constrained  # noqa: B018 (it looks at all nodes, and the count would have shown that)
+    body.constrained  # noqa: B018 (it reads all nodes, which the count would have shown)
     assert body.constrained[top].all()
 
 
 def test_a_hand_that_drags_leaves_recorded_steps_as_they_are(device):
-    """Other velocities, loads and keyframes of the same patch are other numbers in the same launches."""
+    """Other velocities, loads and keyframes of the same patch are other values in the same launches."""
     sim = bar(device)
     body, top = sim.body, top_of(sim)
     body.load(top, [0.0, 0.0, 0.0])

@@ -1,4 +1,4 @@
-"""Somebody else's arrays as loads and positions: where they are, as they are, and what does not fit."""
+"""Another program's arrays as loads and positions: used in place, in every form, and invalid ones."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def some_forces(sim, rng):
 
 @pytest.mark.parametrize("steps", [1, 70], ids=["a step", "runs of steps"])
 def test_every_form_of_array_comes_to_the_same_bit_by_bit(form, steps, device, rng):
-    """As loads and positions of the body's own."""
+    """Compared with loads and positions of the body itself."""
     ordinary, sim = bar(device, gravity=(0.0, -9.81, 0.0)), bar(device, gravity=(0.0, -9.81, 0.0))
     n = sim.body.node_count
     loads, positions = form(n, device), form(n, device)
@@ -36,7 +36,7 @@ def test_every_form_of_array_comes_to_the_same_bit_by_bit(form, steps, device, r
         np.testing.assert_array_equal(read(positions), ordinary.body.positions.numpy())
         np.testing.assert_array_equal(read(loads), forces)
     assert np.abs(read(positions) - sim.body.mesh.points).max() > 1e-8
-    # A fourth number is nobody's business.
+    # A fourth number is ignored.
     np.testing.assert_array_equal(loads.numpy()[..., 3:], before[..., 3:])
     np.testing.assert_array_equal(positions.numpy()[..., 3:], before[..., 3:])
 
@@ -56,7 +56,7 @@ def test_forces_become_momentum(form, device, rng):
 
 
 def test_written_positions_are_where_steps_go_on(form, device):
-    """A free body set down elsewhere, not strained, stays there; one that is stretched pulls together."""
+    """A free body placed elsewhere without strain stays there; a stretched one contracts."""
     sim = bar(device, fixed=False)
     x = sim.body.mesh.points
     positions = form(sim.body.node_count, device)
@@ -73,7 +73,7 @@ def test_written_positions_are_where_steps_go_on(form, device):
 
 
 def test_worlds_have_their_own_part(device, rng):
-    """[worlds, N] is [worlds * N]; and each world does what it does alone."""
+    """[worlds, N] is [worlds * N]; and each world behaves as it does alone."""
     shape = (3, len(bar("cpu").body.mesh.points))
     sim = bar(device, worlds=3)
     loads, positions = (wp.zeros(shape, dtype=wp.vec3, device=device) for _ in range(2))
@@ -96,7 +96,7 @@ def test_worlds_have_their_own_part(device, rng):
 
 
 def test_properties_mean_the_array(form, device):
-    """``loads``, ``load`` and ``positions`` of the body, and what is kept in a file."""
+    """``loads``, ``load`` and ``positions`` of the body, and the stored data."""
     sim = bar(device)
     body, n = sim.body, sim.body.node_count
     loads, positions = form(n, device), form(n, device)
@@ -126,7 +126,7 @@ def test_a_file_keeps_the_values(device, folder):
 
 
 def test_the_bodys_own_again(device):
-    """As they were: loads as they had been set, positions as they are."""
+    """They are restored: loads with their former values, positions with the current ones."""
     ordinary, sim = bar(device), bar(device)
     n = sim.body.node_count
     for each in (ordinary, sim):
@@ -152,7 +152,7 @@ def test_the_bodys_own_again(device):
 
 
 def test_what_was_written_before_is_not_lost(device):
-    """Positions written to the body's own array before it gives way, and another array after one."""
+    """Positions written to the body's own array before it is replaced, and another array after one."""
     sim = bar(device, fixed=False)
     n, x = sim.body.node_count, sim.body.mesh.points
     sim.body.positions.assign((x + SIDE).astype(np.float32))
@@ -189,7 +189,7 @@ def test_another_array_takes_effect_in_recorded_steps(device):
 
 
 def test_one_force_for_all_nodes_may_be_one_vector(device):
-    """Strides of zero: as a broadcast array of another framework has them. Not for positions, which are written."""
+    """Zero strides, like a broadcast array of another framework. Not for positions, which are written."""
     sim = bar(device, fixed=False, damping=0.0)
     n = sim.body.node_count
     one = wp.array([[0.0, 0.02, 0.0]], dtype=wp.vec3, device=device)
@@ -245,11 +245,11 @@ def test_one_array_cannot_be_both(form, device):
         body.use_loads(array)
 
 
-def test_a_body_with_somebodys_array_is_not_remeshed(form, device):
+def test_a_body_with_another_programs_array_is_not_remeshed(form, device):
     for name in ("loads", "positions"):
         body = bar(device).body
         getattr(body, f"use_{name}")(form(body.node_count, device))
-        with pytest.raises(wc.InputError, match=rf"^{name} is somebody else's.*use_{name}\(None\)"):
+        with pytest.raises(wc.InputError, match=rf"^{name} is another program's.*use_{name}\(None\)"):
             wc.Simulation(body, remesh=wc.OnlineRemesh())
         getattr(body, f"use_{name}")(None)
         wc.Simulation(body, remesh=wc.OnlineRemesh()).step()

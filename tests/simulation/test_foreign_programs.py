@@ -1,4 +1,4 @@
-"""Steps inside somebody else's Warp program: in their capture, on their stream, between their launches."""
+"""Steps inside another Warp program: in its capture, on its stream, between its launches."""
 
 import numpy as np
 import pytest
@@ -7,26 +7,26 @@ from foreign import FORMS, allocates, bar, dawdle, read, three_of, vec3, vec3_am
 
 import warp_corot as wc
 
-STIFFNESS, RATE = 40.0, 3.0  # of the springs that a stranger's kernel pulls with [N/m], and of what it reads off
-AWAY = np.array([0.0, 0.02, 0.01])  # where the springs' goals are from the nodes at rest [m]
+STIFFNESS, RATE = 40.0, 3.0  # stiffness of the springs in the other program's kernel [N/m], and its sampling rate
+AWAY = np.array([0.0, 0.02, 0.01])  # offset of the springs' goals from the nodes at rest [m]
 
 
 @wp.kernel(enable_backward=False)
 def pull(goals: wp.array[wp.vec3], positions: wp.array[wp.vec3], forces: wp.array[wp.vec3]):
-    """What comes before a step: a spring from each node to its goal."""
+    """The work before a step: a spring from each node to its goal."""
     i = wp.tid()
     forces[i] = STIFFNESS * (goals[i] - positions[i])
 
 
 @wp.kernel(enable_backward=False)
 def look(positions: wp.array[wp.vec3], seen: wp.array[wp.vec3]):
-    """What comes after a step: a running sum that depends on every step's positions."""
+    """The work after a step: a running sum that depends on every step's positions."""
     i = wp.tid()
     seen[i] = 0.5 * seen[i] + RATE * positions[i]
 
 
 class Stranger:
-    """A program with arrays of its own, and a body that it pulls and watches."""
+    """A program with its own arrays, and a body that it pulls and observes."""
 
     def __init__(self, sim, form=vec3_among_others):
         self.sim, self.device = sim, sim.device
@@ -36,7 +36,7 @@ class Stranger:
         self.seen = vec3(n, self.device)
         sim.body.use_loads(self.forces)
         sim.body.use_positions(self.positions)
-        # Of these arrays, whatever their form, what the kernels above take.
+        # Views of these arrays, in any form, that the kernels above take.
         self.pulled, self.watched = (three_of(array) for array in (self.forces, self.positions))
 
     def before(self):
@@ -54,7 +54,7 @@ class Stranger:
 
 
 def by_hand(sim, steps):
-    """The same program through the host, with nothing but the body's own arrays; what it has seen."""
+    """The same program through the host, with only the body's own arrays; returns its observations."""
     x = sim.body.mesh.points
     goals = np.tile((x + AWAY).astype(np.float32), (sim.worlds, 1))
     seen = np.zeros_like(goals)
@@ -66,7 +66,7 @@ def by_hand(sim, steps):
 
 
 def assert_as_by_hand(stranger, sim, steps):
-    """But for rounding: the stranger's kernels may round a product and a sum once, NumPy does so twice."""
+    """Equal except for rounding: the kernels may round a product and a sum once, NumPy rounds twice."""
     seen = by_hand(sim, steps)
     assert np.abs(sim.body.displacements.numpy()).max() > 1e-5
     np.testing.assert_allclose(stranger.sim.body.displacements.numpy(), sim.body.displacements.numpy(), atol=2e-8)
@@ -102,8 +102,8 @@ def test_recorded_and_called_steps_are_the_same_bit_by_bit(model, device):
 
 
 def test_nothing_is_allocated_after_the_first_step(device):
-    """By Warp on any device, and in the device's memory pool; not by arrays taken into use either."""
-    assert allocates(lambda: wp.zeros(5, device=device))  # it would be seen
+    """By Warp on any device, or in the device's memory pool; not for newly used arrays either."""
+    assert allocates(lambda: wp.zeros(5, device=device))  # it would be detected
     stranger = Stranger(bar(device))
     n = stranger.sim.body.node_count
     others = [form(n, device) for form in FORMS]
@@ -140,8 +140,8 @@ def test_recording_allocates_nothing(device):
     assert not allocates(record)
 
 
-def test_steps_on_somebody_elses_stream(device):
-    """A stream that waits for nobody: whatever ran on another one would come too early."""
+def test_steps_on_another_programs_stream(device):
+    """A stream that waits for no other: work on another stream would come too early."""
     if not wp.get_device(device).is_cuda:
         pytest.skip("streams are for CUDA")
     stranger = Stranger(bar(device))
@@ -165,7 +165,7 @@ def test_steps_on_somebody_elses_stream(device):
 @pytest.mark.parametrize("form", [vec3, vec3_among_others, vec4], ids=lambda form: form.__name__)
 @pytest.mark.parametrize("deterministic", [True, False])
 def test_steps_do_not_wait_for_the_device(form, deterministic, device):
-    """They come back while work that was queued before them, and takes long, is still going on."""
+    """They return while long work that was queued before them is still running."""
     if not wp.get_device(device).is_cuda:
         pytest.skip("the CPU has no queue")
     sim = bar(device)
@@ -192,7 +192,7 @@ def test_steps_do_not_wait_for_the_device(form, deterministic, device):
 
 @pytest.mark.parametrize("form", FORMS, ids=lambda form: form.__name__)
 def test_small_bodies_in_blocks_take_any_array(form, device, rng):
-    """The same steps in one launch; against the body's own arrays bit by bit."""
+    """The same steps in one launch; compared bit for bit with the body's own arrays."""
     if not wp.get_device(device).is_cuda:
         pytest.skip("blocks are for CUDA")
     own, theirs = bar(device, level=3), bar(device, level=3)

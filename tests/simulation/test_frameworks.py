@@ -68,7 +68,7 @@ class TestPyTorch:
 
     @pytest.mark.parametrize("recorded", [False, True], ids=["called", "in PyTorch's graph"])
     def test_steps_on_its_stream(self, torch, recorded, device):
-        """A control loop of tensors: with what PyTorch does before and after in order, and nothing allocated."""
+        """A control loop of tensors: PyTorch's work before and after is in order, and nothing is allocated."""
         if recorded and not wp.get_device(device).is_cuda:
             pytest.skip("PyTorch's graphs are for CUDA")
         sim = bar(device)
@@ -124,7 +124,7 @@ class TestJax:
             yield jax
 
     def test_node_positions_are_a_jax_array(self, jax, device):
-        """All four numbers of each node, which lie without gaps; a view of three does not."""
+        """All four numbers of each node are contiguous; a view of three is not."""
         sim = bar(device, gravity=(0.0, -9.81, 0.0))
         x = wp.to_jax(sim.body.node_positions)
         assert x.shape == (sim.body.node_count, 4)
@@ -134,7 +134,7 @@ class TestJax:
 
     @pytest.mark.parametrize("width", [3, 4])
     def test_arrays_of_jax_are_the_loads(self, jax, width, device, rng):
-        """JAX makes a new one each time; it is read where it is."""
+        """JAX makes a new array each time; it is read in place."""
         sim = bar(device)
         doubled = jax.jit(lambda forces: 2.0 * forces)
         given = some_forces(rng)
@@ -148,7 +148,7 @@ class TestJax:
 
     @pytest.mark.parametrize("mode", ["JAX", "WARP", "NONE"])
     def test_steps_are_an_operation_of_a_compiled_function(self, jax, mode, device, rng):
-        """Inside ``jit`` and ``scan``, with buffers that are JAX's, on its stream and in its graph."""
+        """Inside ``jit`` and ``scan``, with JAX's buffers, on its stream and in its graph."""
         if mode == "WARP" and not wp.get_device(device).is_cuda:
             pytest.skip("Warp's graphs in JAX are for CUDA")
         sim = bar(device)
@@ -179,7 +179,7 @@ class TestJax:
         assert sim.steps == 30
         np.testing.assert_array_equal(history[-1], ordinary(device, given, 5))
         np.testing.assert_array_equal(history[0], ordinary(device, given[:4], 5))
-        # JAX's buffers may be gone; nothing that the body does now touches them.
+        # JAX's buffers may be freed; the body does not touch them from now on.
         np.testing.assert_array_equal(body.positions.numpy(), history[-1])
-        assert not body.has_loads
+        assert not body.conditions.has_loads
         assert sim.energy().elastic > 0

@@ -1,4 +1,4 @@
-"""Bodies that nobody holds: what is chosen carries them, and the estimate of their sag is that of beam theory."""
+"""Bodies without given supports: the chosen patch supports them, and their estimated sag agrees with beam theory."""
 
 import functools
 
@@ -19,24 +19,24 @@ DENSITY = 1000.0
 
 
 def shaped(move, level=6, cells=(2, 2, 2)) -> wc.TetMesh:
-    """A ball of radius one, of tetrahedra, with its points moved."""
+    """A ball of radius one, made of tetrahedra, with moved points."""
     box = wc.TetForest.box(cells, 1.0, level)
     x = box.points - box.points.mean(axis=0)
     x /= np.abs(x).max(axis=0)
-    # A cube to a ball: each shell of the cube to one of the ball.
+    # From a cube to a ball: each shell of the cube becomes one of the ball.
     radius, length = np.abs(x).max(axis=1), np.linalg.norm(x, axis=1)
     ball = x * np.divide(radius, length, out=np.zeros_like(length), where=length > 0)[:, None]
     return wc.TetMesh(move(ball), box.tets, up_axis="Z")
 
 
 def kidney(x):
-    """On one pole, bent."""
+    """Supported at one pole, bent."""
     y = x * [0.025, 0.02, 0.055]
     return y - np.outer(6.0 * y[:, 2] ** 2, [1.0, 0.0, 0.0])
 
 
 def gall_bladder(x):
-    """A pear whose thin end is down, tilted."""
+    """A pear with its thin end down, tilted."""
     y = x * [0.018, 0.018, 0.045] * (1.0 + 0.6 * np.clip(x[:, 2:], -1.0, 0.0)) ** [1.0, 1.0, 0.0]
     return turned(y, 40.0)
 
@@ -55,7 +55,7 @@ def turned(x, degrees):
 
 
 def soft(mesh) -> float:
-    """Young's modulus that the command gives a body of unknown stuff."""
+    """The command's Young's modulus for a body of unknown material."""
     return 20.0 * DENSITY * 9.81 * float(np.ptp(mesh.points[:, 2]))
 
 
@@ -64,7 +64,7 @@ def held(mesh, young=None):
 
 
 def largest_displacement(mesh, nodes, young, seconds) -> float:
-    """Of any node at any of 40 times a second, over the height."""
+    """Largest displacement of any node, sampled 40 times a second, over the height."""
     body = wc.SoftBody(mesh, wc.Isotropic(young, 0.45, DENSITY), device="cpu")
     body.fix(nodes)
     sim = wc.Simulation(body, integrator=wc.SymplecticEuler(damping=2.0), gravity=GRAVITY)
@@ -77,7 +77,7 @@ def largest_displacement(mesh, nodes, young, seconds) -> float:
 
 @pytest.mark.parametrize("shape", [kidney, gall_bladder, liver])
 def test_organs_do_not_topple(shape):
-    """Within the time in which they turn over when their lowest tip holds them."""
+    """For the time in which they topple if their lowest tip is fixed."""
     mesh = shaped(shape)
     chosen = held(mesh)
     young = soft(mesh) * chosen.stiffer
@@ -88,7 +88,7 @@ def test_organs_do_not_topple(shape):
 
 
 def test_what_is_not_chosen_topples():
-    """The estimate has a reason: a pear held by its lower tip does fall over."""
+    """The estimate is needed: a pear fixed at its lower tip does topple."""
     mesh = shaped(gall_bladder)
     tip = mesh.points[:, 2] < mesh.points[:, 2].min() + 0.1 * np.ptp(mesh.points[:, 2])
     assert not held(mesh).pieces[0].stands
@@ -113,7 +113,7 @@ def test_a_slender_column_stands_only_if_it_is_stiff():
 
 
 def test_it_stands_only_with_its_centre_of_mass_over_the_patch():
-    """An inverted L whose arm is long; stiff, so that it is a matter of balance alone."""
+    """An inverted L with a long arm; stiff, so that only balance matters."""
     box = wc.TetForest.box((4, 1, 3), 0.1, 3)
     centroids = box.points[box.tets].mean(axis=1)
     kept = (centroids[:, 2] > 0.2) | (centroids[:, 0] < 0.1)
@@ -126,7 +126,7 @@ def test_it_stands_only_with_its_centre_of_mass_over_the_patch():
 
 
 def test_each_piece_is_held():
-    """Also one that meets another in one node only, about which it would swing."""
+    """Even one that meets another in only one node, about which it would swing."""
     one = shaped(functools.partial(np.multiply, 0.05), level=3)
     top = int(np.argmax(one.points[:, 2]))
     shift = one.points[top] - one.points[np.argmin(one.points[:, 2])]
@@ -160,7 +160,7 @@ def test_sag_is_that_of_a_beam(kind):
 
 
 def hairpin():
-    """Two arms 40 cm long a slit of 12.5 mm apart, joined at one end; nodes at the other end of the upper one."""
+    """Two arms of 40 cm with a slit of 12.5 mm, joined at one end; returns nodes at the other end of the upper one."""
     box = wc.TetForest.box((4, 1, 2), 0.1, 9)
     middle = box.points[box.tets].mean(axis=1)
     kept = (np.abs(middle[:, 2] - 0.1) > 0.00625) | (middle[:, 0] > 0.3)
@@ -170,7 +170,7 @@ def hairpin():
 
 
 def test_arms_next_to_one_another_are_not_one():
-    """Linear dynamics come to rest where the estimate says."""
+    """Linear dynamics comes to rest at the estimated place."""
     mesh, nodes = hairpin()
     own = MeshBody(mesh.points, mesh.tets, mesh.volumes, 1e6, DENSITY).sag(nodes, [GRAVITY])[0].largest
     body = wc.SoftBody(mesh, wc.Isotropic(1e6, 0.3, DENSITY), device="cpu")
@@ -182,7 +182,7 @@ def test_arms_next_to_one_another_are_not_one():
 
 
 def test_a_crumb_that_dangles_says_nothing_of_the_body():
-    """A tetrahedron on a face of next to nothing."""
+    """A nearly empty tetrahedron on a face."""
     cube = wc.TetForest.box((1, 1, 1), 0.1, 6)
     held = np.flatnonzero(cube.points[:, 2] == 0.0)
     base = cube.tets[np.argmax(cube.points[cube.tets].mean(axis=1)[:, 2])]
@@ -197,7 +197,7 @@ def test_a_crumb_that_dangles_says_nothing_of_the_body():
 
 
 def test_the_largest_flat_region_is_found():
-    """A bowl that is full to the brim."""
+    """A bowl that is filled to the brim."""
     mesh = shaped(lambda x: x * [0.05, 0.05, 0.04] * np.where(x[:, 2:] > 0.0, [1.0, 1.0, 0.1], 1.0))
     faces = boundary_faces(mesh.tets, mesh.points)[0]
     shape = Shape(mesh.points, np.arange(len(mesh.points)), mesh.points, faces, np.array([0.0, 0.0, 1.0]))
@@ -208,7 +208,7 @@ def test_the_largest_flat_region_is_found():
 
 
 def test_a_sheet_thinner_than_its_elements_is_held_to_its_corners():
-    """The nodes next to its flat side are a layer, and all of that is held."""
+    """The nodes next to its flat side are a layer, and the whole layer is fixed."""
     sheet = trimesh.creation.box((0.2, 0.2, 0.002))
     domain = wc.Domain.from_surface((sheet.vertices, sheet.faces), up_axis="Z")
     forest = wc.TetForest.from_domain(domain, target_elements=5000)
@@ -233,7 +233,7 @@ def test_a_thin_sheet_and_a_single_tetrahedron_keep_free_nodes():
 
 
 def test_loose_tetrahedra_are_held_each_and_all_move():
-    """Also where they meet in nodes."""
+    """Even if they share nodes."""
     corner = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]])
     points = np.concatenate([corner, np.add(corner[1:], [1.0, 0.0, 0.0]), -corner[1:]])
     mesh = wc.TetMesh(points, [[0, 1, 2, 3], [0, 4, 5, 6], [0, 8, 7, 9]], up_axis="Z")

@@ -1,4 +1,4 @@
-"""What Python users give by mistake: an InputError in one line that shows what would be right."""
+"""Mistakes of Python users: an InputError in one line that shows what would be right."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def body(mesh):
     ("make", "said"),
     [
         (lambda mesh: wc.SoftBody(mesh, 5.0), r"material is 5\.0; .* Isotropic\(young=5\.0, poisson=0\.45"),
-        (lambda mesh: wc.SoftBody(mesh, wc.Corotated()), r"material is Corotated\(.*such as Isotropic"),
+        (lambda mesh: wc.SoftBody(mesh, wc.Corotated()), r"material is Corotated\(.*for example Isotropic"),
         (lambda mesh: wc.SoftBody("x.msh", SOFT), r"mesh is 'x\.msh'; .*TetMesh\.load\('x\.msh'\).*from_surface"),
         (lambda mesh: wc.SoftBody(mesh.points, SOFT), r"mesh is array.*TetMesh\(points, tets\)"),
         (lambda mesh: wc.SoftBody(None, SOFT), "mesh is None"),
@@ -79,7 +79,7 @@ def test_what_a_simulation_does_not_take(body, use, said, folder):
 
 
 class TestNodesByPlace:
-    """``fix`` and its like take an expression or a function of the rest position, as materials do."""
+    """``fix`` and similar calls take an expression or a function of the rest position, like materials."""
 
     @pytest.mark.parametrize(
         "nodes", ["z < zmin + 0.01", lambda x: x[:, 2] < 0.01, [0, 1, 2, 3]], ids=["expression", "function", "indices"]
@@ -126,7 +126,7 @@ class TestNodesByPlace:
 
 
 class TestTape:
-    """A tape through a step would give gradients of zero."""
+    """A tape through a step would give zero gradients."""
 
     @pytest.mark.parametrize(
         "step",
@@ -144,7 +144,7 @@ class TestTape:
         assert sim.steps > 0
 
     def test_the_tape_goes_on(self, body):
-        """What is recorded around the refused step has its gradient."""
+        """Work recorded around the refused step has its gradient."""
         sim = wc.Simulation(body)
         x = wp.array([3.0], dtype=float, device="cpu", requires_grad=True)
         y = wp.empty_like(x)

@@ -1,4 +1,4 @@
-"""Nodes chosen by expressions: the same as NumPy's own answer, and nothing but arithmetic is ever evaluated."""
+"""Nodes chosen by expressions: equal to NumPy's own answer, and only arithmetic is ever evaluated."""
 
 import numpy as np
 import pytest
@@ -58,7 +58,7 @@ def test_given_bounds_are_used():
         ("z", "the result is a number"),
         ("z + 1", "the result is a number"),
         ("w < 1", "'w' is not known"),
-        ("foo(z) < 1", "'foo' is no function"),
+        ("foo(z) < 1", "'foo' is not a function"),
         ("sqrt(x, y) < 1", "takes 1 arguments, not 2"),
         ("hypot(x) < 1", "takes 2 or more"),
         ("x / (y - y) < 1", "division by zero) at 200 of 200"),

@@ -1,4 +1,4 @@
-"""Stepping: constraints, loads, prescribed motion, hooks, recording, the stable step, and what mistakes meet."""
+"""Stepping: constraints, loads, prescribed motion, hooks, recording, the stable step, and errors."""
 
 import warnings
 
@@ -60,7 +60,7 @@ def test_released_nodes_fall(device, dt):
     sim.advance(0.1)
     gained = sim.body.masses @ sim.body.velocities.numpy() - momentum
     expected = sim.body.masses.sum() * -9.81 * (sim.time - before)
-    # Velocities are half a step behind, of a step that may have become another.
+    # Velocities are half a step behind, and the step may have changed.
     late = 0.0 if dt else 0.5 * (sim.dt_range[1] - sim.dt_range[0]) / (sim.time - before)
     np.testing.assert_allclose(gained, [0, expected, 0], atol=(2e-4 + late) * abs(expected))
     assert np.abs(sim.body.reactions.numpy()).max() == 0
@@ -193,8 +193,8 @@ def test_a_step_beyond_stability_warns_and_stops_with_its_number(device):
         again = bar(device, wc.StVenantKirchhoff(), dt=3 * limit)
     sim.body.positions = sim.body.mesh.points
     sim.body.velocities = np.zeros((sim.body.node_count, 3))
-    sim.advance_steps(1)  # a good state may go on
-    # Long before that there is energy from nowhere.
+    sim.advance_steps(1)  # a good state may continue
+    # Energy from nowhere is detected long before that.
     with pytest.raises(wc.UnstableError, match="J of energy came from nowhere"):
         one_by_one(again, step)
     assert again.steps < step - 1
@@ -262,7 +262,7 @@ def test_a_hook_may_change_loads_and_constraints(device):
     assert after[0, 2] > before[0, 2] > 0
 
 
-def test_a_step_is_recorded_inside_somebody_elses_capture(device):
+def test_a_step_is_recorded_inside_another_programs_capture(device):
     alone, recorded = bar(device, dt=5e-4), bar(device, dt=5e-4)
     with wp.ScopedCapture(device=device) as capture:
         recorded.step()

@@ -1,4 +1,4 @@
-"""Many copies of a body: each does what it would do alone, whatever the others do."""
+"""Many copies of a body: each behaves as it would alone, independently of the others."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ ALL_MODELS = [
     wc.EdgeStVK(springs="quadratic"),
     wc.MassSpring(),
 ]
-#: Uniform forests are in adaptive ones, but for the grouping of subtrees.
+#: Uniform forests are covered by adaptive ones, except for the grouping of subtrees.
 CASES = [
     *(("uniform", model) for model in (FOREST_MODELS[0], ALL_MODELS[0], ALL_MODELS[4])),
     *(("adaptive", model) for model in FOREST_MODELS + ALL_MODELS),
@@ -58,7 +58,7 @@ def test_every_world_is_a_body_of_its_own(mesh, model, device, rng):
 
 @pytest.mark.parametrize("model", [wc.Corotated(), wc.Corotated(rotation_level=0), wc.MassSpring()], ids=repr)
 def test_a_number_for_each_world_is_as_a_number_for_a_body(model, device):
-    """Shared rotations of one material go by another kernel than those of several: the same but for rounding."""
+    """Shared rotations with one material use another kernel than with several: equal except for rounding."""
     young = [2e3, 5e3, 9e3]
     sim = simulated(beam(device, young=np.reshape(young, (3, 1))), model)
     sim.advance_steps(100)
@@ -71,7 +71,7 @@ def test_a_number_for_each_world_is_as_a_number_for_a_body(model, device):
 
 
 def test_subtrees_turned_inside_out_in_one_world_leave_the_others(device, rng):
-    """The fast kernels leave such subtrees out, and they are done again one by one."""
+    """The fast kernels leave these subtrees out, and they are computed one by one."""
     for model in (wc.Corotated(), wc.Corotated(rotation_level=0)):
         mesh = MESHES["uniform"]()
         start = np.stack([random_displacement(mesh, rng, amount) for amount in (0.1, 1.0, 0.1)])
@@ -95,7 +95,7 @@ MATERIALS = {
 @pytest.mark.parametrize("model", [wc.Corotated(), wc.MassSpring()], ids=repr)
 @pytest.mark.parametrize("form", MATERIALS)
 def test_material_of_worlds_and_elements(form, model, device, rng):
-    """All forms mean what they broadcast to; masses are a quarter of each element's at each of its nodes."""
+    """All forms broadcast as in NumPy; masses are a quarter of each element's at each of its nodes."""
     mesh = MESHES["adaptive"]()
     t, n = len(mesh.tets), len(mesh.points)
     share = MATERIALS[form](WORLDS, t)
@@ -188,7 +188,7 @@ def test_held_nodes_of_chosen_worlds(device):
 
 
 def test_masks_and_shapes_of_all_worlds_also_of_one_world(device):
-    """What is written for any number of worlds works for one."""
+    """Code for any number of worlds works for one."""
     body = beam(device, worlds=1)
     n = body.world_node_count
     body.fix(np.arange(n)[None] == 5)
@@ -258,7 +258,7 @@ MISTAKES = {
     "mask turned over": (lambda b: b.fix(np.ones((b.world_node_count, 3), bool)), "node mask has shape"),
     "mask of all worlds in one": (
         lambda b: b.fix(np.ones((3, b.world_node_count), bool), worlds=1),
-        "says which worlds are meant",
+        "chooses the worlds itself",
     ),
     "node of another world": (lambda b: b.fix([b.world_node_count]), "is out of range"),
     "loads of other worlds": (lambda b: b.load([0, 1], np.ones((2, 2, 3))), r"or \[3, 2, 3\]"),

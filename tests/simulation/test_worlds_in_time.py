@@ -1,4 +1,4 @@
-"""Worlds in time: keyframes, resets, worlds that come to grief, checkpoints and recordings."""
+"""Worlds in time: keyframes, resets, worlds that fail, checkpoints and recordings."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from warp_corot.io.write.animate import record
 @pytest.mark.parametrize("worlds", [1, 3])
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_keyframes_for_all_nodes_alike(count, worlds, device):
-    """[K, 3], also where as many nodes are named as a vector has components."""
+    """[K, 3], even if the number of nodes equals the number of vector components."""
     body = beam(device, worlds=worlds)
     end = np.array([0.001, 0.002, 0.003])
     top = np.flatnonzero(body.mesh.points[:, 2] > CUBE - 1e-9)[:count]
@@ -139,7 +139,7 @@ def test_a_world_that_is_reset_repeats_its_first_run(mesh, model, initial, devic
 
 
 def test_held_nodes_are_held_and_moved_ones_moved_after_a_reset(device):
-    """Without an initial state of its own, a world keeps what it was told about its nodes."""
+    """Without an initial state of its own, a world keeps the conditions of its nodes."""
     body = beam(device)
     top = np.flatnonzero(body.mesh.points[:, 2] > CUBE - 1e-9)
     body.prescribe(top, velocity=[0.01, 0, 0], worlds=[1])
@@ -153,7 +153,7 @@ def test_held_nodes_are_held_and_moved_ones_moved_after_a_reset(device):
 
 
 def test_resets_are_recorded_with_the_steps(device):
-    """A reset by an array on the device is launches alone: whoever records it may choose worlds at each replay."""
+    """A reset by an array on the device only launches kernels: a recording may choose worlds at each replay."""
     recorded, other = (simulated(beam(device)) for _ in range(2))
     chosen = wp.zeros(WORLDS, dtype=wp.int32, device=device)
     with wp.ScopedCapture(device=device) as capture:
@@ -206,14 +206,14 @@ def test_a_hook_may_reset_and_the_run_still_ends(device):
 
 
 def blow(body):
-    """Velocities at which nothing holds together, of the free nodes of a world."""
+    """Destructive velocities for the free nodes of a world."""
     n = body.world_node_count
     velocities = np.random.default_rng(0).normal(0, 1e4, (n, 3)) * ~body.constrained[:n, None]
     return velocities.astype(np.float32)
 
 
 def test_an_unstable_world_is_named_and_leaves_the_others(device):
-    """StVK turns inside out and runs away from a blow that is much too hard."""
+    """StVK inverts and diverges after a blow that is much too hard."""
     quiet, sim = (simulated(beam(device), wc.StVenantKirchhoff()) for _ in range(2))
     sim.body.world(1).velocities.assign(blow(sim.body))
     with pytest.raises(wc.UnstableError, match=r"not finite since step \d+ .* in world 1; dt is"):
@@ -235,7 +235,7 @@ def test_many_unstable_worlds_are_counted():
 
 
 def test_a_reset_before_anybody_looked_forgets_what_was_unstable(device):
-    """Recorded steps look at nothing; a world that has been put back since is no reason to stop."""
+    """Recorded steps are not checked; a world that has been reset since does not stop the run."""
     for worlds in (None, [1]):
         sim = simulated(beam(device), wc.StVenantKirchhoff())
         with wp.ScopedCapture(device=device) as capture:
@@ -288,7 +288,7 @@ def test_a_checkpoint_of_version_1_is_one_world(tmp_path, rng):
 def test_one_world_is_recorded(device, tmp_path):
     young = np.array([[2e3], [5e3], [9e3]])
     sim = simulated([beam(device, young=young), beam(device)], [wc.Corotated(), wc.Linear()])
-    with pytest.raises(wc.InputError, match=r"3 worlds; say which one to draw, as in world=0"):
+    with pytest.raises(wc.InputError, match=r"3 worlds; say which one to draw, for example world=0"):
         record(sim, tmp_path / "a.usd", duration=0.1)
     for wrong in (3, -1, 0.5, "first"):
         with pytest.raises(wc.InputError, match="must be a whole number from 0 to 2"):

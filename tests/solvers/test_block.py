@@ -1,7 +1,7 @@
 """Steps of small bodies in one thread block for each world, on CUDA, against the same steps launch by launch.
 
-Keyframes, even of one held node that are all zero, make every step a number of launches: that is the other way. Both
-are float32 and add up in different orders; damped, they stay as near as ``ONE`` step and ``MANY`` leave them.
+Keyframes, even of one held node and all zero, make every step several launches: that is the other path. Both
+are float32 and sum in different orders; damped, they agree within ``ONE`` after a step and ``MANY`` after many.
 """
 
 import warnings
@@ -21,9 +21,9 @@ pytestmark = pytest.mark.skipif(not DEVICES, reason="blocks are for CUDA")
 DAMPING, GRAVITY, DT = 10.0, (0.3, -9.8, 0.1), 1e-4
 ONE, MANY = 1e-5, 2e-5
 OWN = wc.Corotated()
-MANY_WORLDS = 300  # more than there are multiprocessors, with which a block is dealt out in another way
+MANY_WORLDS = 300  # more than there are multiprocessors, for which a block is divided differently
 
-#: A body of each type of subtree, with the level three above its leaves; the last is the paper's beam.
+#: A body for each type of subtree, with the level three above its leaves; the last is the paper's beam.
 BODIES = {
     "type 0": ((1, 1, 1), 3),
     "type 1": ((2, 1, 1), 4),
@@ -52,7 +52,7 @@ def model_of(mesh, up):
 
 
 def material(form, mesh, worlds):
-    """Of one number, of each world, of each element, or of each element in each world."""
+    """A material with one number, one for each world, each element, or each element in each world."""
     rng = np.random.default_rng(5)
     t = len(mesh.tets)
     size = {"uniform": (), "worlds": (worlds, 1), "elements": (t,), "both": (worlds, t)}[form]
@@ -60,7 +60,7 @@ def material(form, mesh, worlds):
 
 
 def made(device, mesh, up, *, launches, form="uniform", worlds=1, amount=0.1, dt=DT, start=None, loads=True):
-    """A block held at one end, pulled at the other, with loads all over, from a random start."""
+    """A block fixed at one end, pulled at the other, with loads everywhere, from a random start."""
     rng = np.random.default_rng(9)
     n = len(mesh.points)
     body = wc.SoftBody(mesh, material(form, mesh, worlds), worlds=worlds, device=device)
@@ -85,7 +85,7 @@ def made(device, mesh, up, *, launches, form="uniform", worlds=1, amount=0.1, dt
 
 
 def by_launches(body):
-    """Have the steps of a body launched, by keyframes of a held node that stays where it is in the first world."""
+    """Force launches by keyframes of a held node that does not move in the first world."""
     held = np.flatnonzero(body.constrained[: body.world_node_count])[:1]
     place = body.displacements.numpy()[held]
     body.prescribe(held, times=[0.0, 1.0], displacements=np.stack([place, place]), worlds=[0])
@@ -164,7 +164,7 @@ def test_a_step_is_that_of_float64(worlds, device):
 
 @pytest.mark.parametrize("worlds", [1, MANY_WORLDS])
 def test_crushed_and_mirrored_subtrees_are_repaired(worlds, up, device):
-    """Every second world is mirrored and squeezed, but not so that any rotation is in doubt."""
+    """Every second world is mirrored and squeezed, but all rotations stay defined."""
     mesh = forest("type 1")
     rng = np.random.default_rng(3)
     turn = oracle.polar(rng.standard_normal((3, 3)))
@@ -184,7 +184,7 @@ def test_crushed_and_mirrored_subtrees_are_repaired(worlds, up, device):
 
 
 def test_single_crushed_subtrees_are_repaired(device):
-    """A few elements of one subtree turned inside out: only some of a block's threads have it to do again."""
+    """A few elements of one subtree are inverted: only some of a block's threads repair it."""
     mesh = forest("beam")
     start = random_displacement(mesh, np.random.default_rng(1), 0.1)
     inside = np.linalg.norm(mesh.points - mesh.points.mean(axis=0), axis=1).argmin()
@@ -233,7 +233,7 @@ def test_keyframes_for_a_while(device):
 
 
 def test_recorded_steps(device):
-    """Inside somebody else's capture a step is a launch that is replayed."""
+    """In a capture a step is one launch that is replayed."""
     sims = [made(device, forest("type 1"), 0, launches=False) for _ in range(2)]
     with wp.ScopedCapture(device=device) as capture:
         sims[0].step()
@@ -250,7 +250,7 @@ def test_recorded_steps(device):
 
 
 def test_runs_are_the_same_bit_by_bit(up, device):
-    """Nothing is added atomically, so that it takes no ``deterministic``."""
+    """Nothing is added atomically, so ``deterministic`` is not needed."""
     ends = []
     for _ in range(2):
         sim = made(device, forest("beam"), up, launches=False, worlds=3, form="worlds")
@@ -277,7 +277,7 @@ def test_a_world_among_many_is_as_alone(up, device):
 
 @pytest.mark.parametrize("share", [1.15, 3.0])
 def test_an_unstable_step_is_named(share, up, device):
-    """Also in the midst of the steps of one launch: the step before left a finite state."""
+    """Even in the middle of the steps of one launch: the step before left a finite state."""
     mesh = forest("type 1")
     dt = share * made(device, mesh, up, launches=False).stable_dt
     sims = [made(device, mesh, up, launches=False, dt=dt) for _ in range(2)]
@@ -294,7 +294,7 @@ def test_an_unstable_step_is_named(share, up, device):
 
 def test_a_world_that_is_not_finite_leaves_the_others(device):
     mesh = forest("type 1")
-    dt = 0.8 * made(device, mesh, 0, launches=False).stable_dt  # of all worlds, whatever becomes of one
+    dt = 0.8 * made(device, mesh, 0, launches=False).stable_dt  # for all worlds, even if one fails
     sims = [made(device, mesh, 0, launches=False, worlds=3, dt=dt) for _ in range(2)]
     for sim in sims:
         sim.body.set_initial_state()
@@ -317,7 +317,8 @@ def test_a_world_that_is_not_finite_leaves_the_others(device):
 
 
 def test_bodies_that_are_not_for_blocks(device):
-    """Too large, of several kinds of work, of no subtrees, of another law, or with rotations from higher up."""
+    """Too large, with several kinds of subtrees, without subtrees, with another law, or with rotations from higher
+    up."""
     beam = wc.TetForest.box((1, 1, 3), CUBE, 6)
     large = wc.TetForest.box((5, 5, 1), CUBE, 6)
     small = wc.Isotropic(5e3, 0.4, 1e3)

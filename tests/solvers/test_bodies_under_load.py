@@ -1,6 +1,6 @@
-"""Soft bodies under their own weight, by defaults: no error, no nonsense, and no energy that gravity did not give.
+"""Soft bodies under their own weight with defaults: no error, no absurd state, and no energy beyond gravity's.
 
-The bodies stand in ``loaded``, the laws and their tolerances in ``falls``.
+The bodies are in ``loaded``, the checks and their tolerances in ``falls``.
 """
 
 import numpy as np
@@ -30,7 +30,7 @@ def test_all_shapes_laws_and_stiffnesses_are_among_them():
 
 
 def test_stvk_that_collapses_says_why(device):
-    """Its energy has no barrier against J = 0: crushed elements turn over, and the force grows as they go on."""
+    """Its energy has no barrier against J = 0: crushed elements invert, and the force grows as they move on."""
     found = fall(Loaded("sphere", 1, "stvk"), SHORT, FEW, device)
     assert not violations(found) or "barrier" in found.error
 
@@ -39,7 +39,7 @@ def test_stvk_that_collapses_says_why(device):
 
 
 def drop(**changed):
-    """A free fall of 2 kg over 1 s, some of its numbers changed."""
+    """A free fall of 2 kg over 1 s, with some of its numbers changed."""
     t = np.linspace(0.1, 1.0, 10)
     fallen = 0.5 * GRAVITY * t**2
     energy = 2 * GRAVITY * fallen
@@ -66,7 +66,7 @@ def test_violations_are_seen():
 
 @pytest.mark.parametrize("law", ["corotated", "neo-hookean", "mass-spring"])
 def test_a_small_step_holds_all_laws(law, device):
-    """They ask for nothing that the scheme cannot give: a tenth of the stable step at rest gives it."""
+    """The checks are feasible: a tenth of the stable step at rest satisfies them."""
     case = Loaded("sphere", 1, law)
     dt = 0.1 * case.simulation(FEW, device).stable_dt
     assert violations(fall(case, SHORT, FEW, device, dt)) == []

@@ -1,4 +1,4 @@
-"""A cube crushed flat, to a line, to a point, or with its nodes shuffled, let go: no NaN, and it comes to rest."""
+"""A cube crushed flat, to a line, to a point, or with shuffled nodes, released: no NaN, and it comes to rest."""
 
 import numpy as np
 import oracle
@@ -23,7 +23,7 @@ def crushed(points, case, rng):
 
 
 def strain(mesh, body):
-    """Largest |l - L| / L over the edges: zero for the rest shape wherever it lies."""
+    """Largest |l - L| / L over the edges: zero for the rest shape at any place."""
     reference = oracle_mesh(mesh)
     _, rest = oracle.edge_lengths(reference, reference.points)
     _, now = oracle.edge_lengths(reference, positions(mesh, body))
@@ -36,13 +36,14 @@ def strain(mesh, body):
     [*((case, 0) for case in CRUSHED), *(pytest.param(case, 3, marks=LONG.get(case, ())) for case in CRUSHED)],
 )
 def test_crushed_cube_comes_to_rest(case, level, rotation, device, rng):
-    """Energy never rises and ends in an equilibrium, not always the rest shape: inverted elements can hold others.
+    """Energy never rises, and the cube ends in an equilibrium, not always the rest shape: inverted elements allow
+    others.
 
-    Which come back, of ten that differ by noise of 1e-7 m (Byers-Xu, this step and damping, CPU):
+    How many recover, of ten that differ by noise of 1e-7 m (Byers-Xu, this step and damping, CPU):
     six elements: plane 10, skew plane 10, line 7, point 9, shuffled 7;
     48 elements: plane 4, skew plane 4, line 3, point 3, shuffled none (1 in 10 with the warm start);
     384 elements (of three, half the step): skew plane 1, none of the others.
-    Those that do not keep 0.2 to 5 % of the energy. Noise decides, so that the test says nothing on the shape.
+    The others keep 0.2 to 5 % of the energy. Noise decides, so the test does not check the shape.
     """
     mesh = wc.TetForest.box((1, 1, 1), CUBE, level)
     sim, body = simulation(mesh, wc.Corotated(rotation=rotation), device, dt=5e-5, damping=30.0)
@@ -62,7 +63,7 @@ def test_crushed_cube_comes_to_rest(case, level, rotation, device, rng):
 
 @pytest.mark.parametrize("level", [0, 3, 6])
 def test_flattened_cube_comes_back(level, device, rng):
-    """Well short of inversion the rest shape is where it ends: pressed to three quarters of its height, with noise."""
+    """Well before inversion it recovers the rest shape: pressed to three quarters of its height, with noise."""
     mesh = wc.TetForest.box((1, 1, 1), CUBE, level)
     sim, body = simulation(mesh, "corotated", device, dt=5e-5, damping=30.0)
     pressed = mesh.points * [1, 1, 0.75] + 1e-4 * rng.standard_normal(mesh.points.shape)
@@ -73,7 +74,7 @@ def test_flattened_cube_comes_back(level, device, rng):
 
 @pytest.mark.parametrize("stretch", [0.0, -0.2, -1.0, -3.0])
 def test_inverted_neo_hookean_pushes_back(stretch, device):
-    """One tetrahedron with its tip pushed through its base: the tip is pushed to its own side, and soon is there.
+    """One tetrahedron with its tip pushed through its base: the force pushes the tip back, and it soon returns.
 
     Strong damping, so that it stays there.
     """

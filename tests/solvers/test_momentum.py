@@ -1,4 +1,4 @@
-"""What the discrete dynamics conserves: momenta, rest, energy, free flight."""
+"""Conservation by the discrete dynamics: momenta, rest, energy, free flight."""
 
 import numpy as np
 import oracle
@@ -20,7 +20,7 @@ def momenta(mesh, body):
 @pytest.mark.parametrize("mesh", CUBE_MESHES)
 @pytest.mark.parametrize("model", MODELS)
 def test_rigid_motion_gives_no_force(model, mesh, device, rng):
-    """Turned and moved, an element feels only rounding: 1e-5 of the force of a strain of 1 (linear FEM: moved only)."""
+    """A rotated and moved element feels only rounding: 1e-5 of the force of a strain of 1 (linear FEM: moved only)."""
     mesh = MESHES[mesh]()
     sim, body = simulation(mesh, model, device)
     turn = np.eye(3) if model == "linear" else oracle.polar(rng.standard_normal((3, 3)))
@@ -38,7 +38,7 @@ def excite(mesh, model, device, rng, dt=1e-4):
 
 
 def exchanged(mesh, body, sim, steps):
-    """How much momentum the elements exchange in the run: the scale of what rounding may lose."""
+    """The momentum that the elements exchange in the run: the scale of losses by rounding."""
     return steps * sim.dt * np.abs(sim.forces().numpy()).sum()
 
 
@@ -70,7 +70,7 @@ def test_angular_momentum_is_kept(model, mesh, device, rng):
 @pytest.mark.parametrize("mesh", CUBE_MESHES)
 @pytest.mark.parametrize("model", MODELS)
 def test_rest_stays_at_rest(model, mesh, device):
-    """Nothing moves by more than 1e-6 of the cube in 20,000 undamped steps: rounding does not feed on itself."""
+    """Nothing moves by more than 1e-6 of the cube in 20,000 undamped steps: rounding does not amplify itself."""
     mesh = MESHES[mesh]()
     sim, body = simulation(mesh, model, device, dt=1e-4)
     sim.advance(2.0)
@@ -80,9 +80,9 @@ def test_rest_stays_at_rest(model, mesh, device):
 @pytest.mark.parametrize("mesh", CUBE_MESHES)
 @pytest.mark.parametrize("model", [model for model in MODELS if model != "linear"])
 def test_turned_rest_stays_at_rest(model, mesh, device, rng):
-    """Turned and moved as a rigid body, and then 20,000 undamped steps: only rounding strains it.
+    """A rigid body, rotated and moved, after 20,000 undamped steps: only rounding strains it.
 
-    Every step rounds displacements u to 2^-25 u, and nothing damps what comes of it: it adds up as the square root of
+    Every step rounds displacements u to 2^-25 u, and without damping the effect grows with the square root of
     the number of steps. Measured at 1e-5 to 3e-5.
     """
     mesh = MESHES[mesh]()
@@ -112,7 +112,7 @@ def test_free_flight(model, device):
 
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_shared_rotations_keep_linear_momentum_only(level, device, rng):
-    """What sharing rotations costs: linear momentum stays, angular momentum and energy drift (measured and printed)."""
+    """The cost of sharing rotations: linear momentum is conserved, angular momentum and energy drift (printed)."""
     mesh = MESHES["level 3"]()
     sim, body = excite(mesh, wc.Corotated(rotation_level=level), device, rng)
     scale = exchanged(mesh, body, sim, 500)
@@ -125,15 +125,15 @@ def test_shared_rotations_keep_linear_momentum_only(level, device, rng):
     print(f"energy from {energy:.3e} to {sim.energy().total:.3e} J")
     assert np.abs(after_linear - linear).max() < 1e-6 * scale
     assert np.isfinite(after_angular).all()
-    assert drift > 1e-6  # or it would be a conserved quantity, and this page wrong
+    assert drift > 1e-6  # or it would be a conserved quantity, and the documentation wrong
 
 
 @pytest.mark.parametrize("model", [model for model in MODELS if model != "mass_spring"])
 def test_undamped_energy_does_not_drift(model, device, rng):
-    """Symplectic: over some hundred periods the energy swings about a constant.
+    """Symplectic: over some hundred periods the energy oscillates about a constant.
 
-    The swing is of first order in the step (a few percent here); its mean over the second half of the run is that over
-    the first half to a tenth of that.
+    The amplitude is of first order in the step (a few percent here); its mean over the second half of the run equals
+    that over the first half within a tenth of the amplitude.
     """
     mesh = MESHES["level 3"]()
     sim, body = simulation(mesh, model, device, dt=5e-5)

@@ -1,4 +1,4 @@
-"""Steps by patches: what each block is dealt, on the host; on CUDA the same steps as launch by launch."""
+"""Steps by patches: each block's part, on the host; on CUDA the same steps as launch by launch."""
 
 import itertools
 import warnings
@@ -37,7 +37,7 @@ def parts(array, start):
 
 
 def nodes_of(patches, patch):
-    """The mesh's nodes in the order in which a patch numbers them."""
+    """The mesh's nodes in a patch's order."""
     own = parts(patches.own, patches.own_start)[patch]
     return np.concatenate([own, parts(patches.halo, patches.halo_start)[patch]])
 
@@ -67,7 +67,7 @@ def test_the_first_elements_need_no_halo(patches):
 
 
 def test_neighbours_wait_for_one_another(patches):
-    """A block may write over a buffer only because those who read it are those it has heard of since."""
+    """A block may overwrite a buffer only because its readers are among the blocks it has heard from since."""
     owner = np.empty(len(patches.own), int)
     owner[patches.own] = np.repeat(np.arange(patches.count), np.diff(patches.own_start))
     heard = {(k, int(owner[n])) for k, halo in enumerate(parts(patches.halo, patches.halo_start)) for n in halo}
@@ -75,7 +75,7 @@ def test_neighbours_wait_for_one_another(patches):
 
 
 def gathered(patches, per_corner):
-    """Sums of what each corner has, as a block makes them: float [N, 3].
+    """Sums of the corners' values, as a block makes them: float [N, 3].
 
     Args:
         per_corner: [T, 4, 3].
@@ -105,7 +105,7 @@ def test_sums_are_those_of_all_corners(mesh, patches):
 
 
 def test_rest_rows_are_inverse_edges_and_volume(mesh):
-    """To float32, of matrices of which none is nearly singular."""
+    """To float32; none of the matrices is nearly singular."""
     rows = rest_rows(mesh.points, mesh.tets)
     x = mesh.points[mesh.tets]
     edges = np.swapaxes(x[:, 1:] - x[:, :1], 1, 2)
@@ -173,7 +173,7 @@ def run(general, steps, by_patches, *, keyframes=False, loads=False):
 @pytest.mark.parametrize("controls", [{}, {"keyframes": True}, {"loads": True}], ids=["held", "keyframes", "loads"])
 @pytest.mark.parametrize("steps", [1, 300])
 def test_the_same_steps_as_launch_by_launch(general, controls, steps):
-    """Of float32 in another order: 2e-5 after some hundred damped steps, as blocks of small bodies."""
+    """In float32 with another order: within 2e-5 after some hundred damped steps, like blocks of small bodies."""
     found, expected = (run(general, steps, by_patches, **controls) for by_patches in (True, False))
     for of_patches, of_launches in zip(found[:3], expected[:3], strict=True):
         assert np.abs(of_patches - of_launches).max() < 2e-5 * np.abs(of_launches).max()

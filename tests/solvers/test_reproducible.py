@@ -1,7 +1,7 @@
-"""Runs that come out the same bit by bit, and on every device the same to rounding.
+"""Runs that are reproducible bit for bit, and equal on every device to rounding.
 
-On the CPU every run is reproducible; on CUDA those of ``Simulation(deterministic=True)``. Meshes are large enough there
-for threads to meet at nodes in another order every time.
+On the CPU every run is reproducible; on CUDA runs of ``Simulation(deterministic=True)`` are. Meshes are large enough
+there for threads to reach nodes in a different order every time.
 """
 
 from functools import cache
@@ -76,9 +76,9 @@ CASES = [
 
 
 def body_on(device, mesh, *, amount=0.0, worlds=1, followed=False):
-    """A block held at x = 0, its other nodes displaced by up to ``amount`` of the shortest edge.
+    """A block fixed at x = 0, its other nodes displaced by up to ``amount`` of the shortest edge.
 
-    ``followed``: one of the held nodes is told so by keyframes, with which steps on CUDA are always launches.
+    ``followed``: keyframes hold one of the nodes, so that steps on CUDA are always separate launches.
     """
     rng = np.random.default_rng(7)
     young = YOUNG * rng.uniform(0.5, 2.0, (worlds, len(mesh.tets))) if worlds > 1 else YOUNG
@@ -99,13 +99,13 @@ def simulated(bodies, model=None, *, dt=None, deterministic=False):
 
 
 def state(sim):
-    """All that a run leaves behind."""
+    """The complete final state of a run."""
     arrays = [getattr(b, name).numpy() for b in sim.bodies for name in ("displacements", "velocities", "reactions")]
     return np.concatenate(arrays + [sim.forces(b).numpy() for b in sim.bodies])
 
 
 def assert_repeats(make, steps=200):
-    """Two runs of the same leave the same, bit by bit, and have moved to finite places."""
+    """Two equal runs end in the same state, bit for bit, after finite motion."""
     ends = []
     for _ in range(2):
         sim = make()
@@ -123,7 +123,7 @@ def assert_repeats(make, steps=200):
 
 @pytest.mark.parametrize(("mesh", "model"), CASES, ids=repr)
 def test_runs_repeat_bit_by_bit(mesh, model, device):
-    """Steps are found anew each time, by the same forces."""
+    """Each run finds its steps again, from the same forces."""
     assert_repeats(lambda: simulated(body_on(device, MESHES[mesh](), amount=0.1), model, deterministic=True))
 
 
@@ -131,14 +131,14 @@ def test_runs_repeat_bit_by_bit(mesh, model, device):
 @pytest.mark.parametrize("model", [wc.Corotated(), wc.Corotated(rotation_level=3)], ids=repr)
 @pytest.mark.parametrize("mesh", ["level 6", "adaptive", "general"])
 def test_runs_from_crushed_and_inverted_elements_repeat(mesh, model, followed, device):
-    """Subtrees that the fast rotation leaves to be done again add their forces in one order, too."""
+    """Subtrees that the fast rotation leaves out add their forces in a fixed order, too."""
     if mesh == "general" and model.rotation_level is not None:
         pytest.skip("general meshes have no tree")
     started = body_on(device, MESHES[mesh](), amount=0.9)
     x = started.mesh.points + started.displacements.numpy().astype(float)
     F = oracle_mesh(started.mesh).deformation_gradients(x)
     assert (np.linalg.det(F) < -0.1).sum() > 20
-    dt = 0.2 * min_step(started.mesh)  # turning elements out again is stiffer work than what steps are found for
+    dt = 0.2 * min_step(started.mesh)  # recovering from inversion is stiffer than the state for which steps are found
 
     def make():
         body = body_on(device, started.mesh, amount=0.9, followed=followed)
@@ -158,7 +158,7 @@ def test_runs_of_worlds_and_of_several_bodies_repeat(device):
 
 def test_a_world_that_is_reset_repeats_bit_by_bit(device):
     for mesh in (uniform(5), adaptive()):
-        # Given: a step that follows the state follows that of the other worlds too.
+        # Given: a step that follows the state depends on the other worlds, too.
         dt = 0.5 * simulated(body_on(device, mesh, worlds=3)).stable_dt
         sim = simulated(body_on(device, mesh, worlds=3), dt=dt, deterministic=True)
         sim.advance_steps(100)
@@ -182,7 +182,7 @@ def test_a_resumed_run_is_the_uninterrupted_one_bit_by_bit(device, tmp_path):
 @pytest.mark.parametrize(("mesh", "model"), CASES, ids=repr)
 @pytest.mark.parametrize("amount", [0.1, 0.9])
 def test_sums_in_one_order_are_the_same_forces(mesh, model, amount, device):
-    """Of up to some fifty forces at a node, each rounded to 6e-8: 1e-6 of the largest times a few."""
+    """Up to some fifty forces at a node, each rounded to 6e-8: 1e-6 of the largest times a few."""
     if device == "cpu":
         pytest.skip("one thread, one order: nothing is done differently")
     body = body_on(device, MESHES[mesh](), amount=amount, worlds=2)
@@ -232,7 +232,7 @@ def settled(path, device):
 
 @cache
 def min_step(mesh):
-    """The stable step on the CPU: the same one on every device."""
+    """The stable step on the CPU: the same on every device."""
     return simulated(body_on("cpu", mesh)).stable_dt
 
 
@@ -245,7 +245,7 @@ AGAINST_FLOAT64 = ["own rotations", "own rotations, launches", "adaptive", "gene
 
 @pytest.mark.parametrize("path", AGAINST_FLOAT64)
 def test_a_thousand_steps_against_float64(path, device):
-    """The same scheme in float64 by the oracle: what float32 makes of 1000 steps on each path."""
+    """The same scheme in float64 with the oracle: the float32 error of 1000 steps on each path."""
     u, sim = settled(path, device)
     mesh, worlds = sim.body.mesh, sim.worlds
     reference = oracle_mesh(mesh)

@@ -1,8 +1,8 @@
-"""Small motions are not noise: an undamped beam keeps its energy, however little it moves.
+"""Small motions do not drown in rounding: an undamped beam keeps its energy at any amplitude.
 
-The paper's beam, 64 x 64 x 192 mm, of soft tissue (5 kPa, nu = 0.49, 1000 kg/m^3), is held at z = 0 and set off
-sideways with v = a (z / L)^2. Rounding does work of its own at every step; where the strain is a difference of numbers
-near one, it soon outweighs a small motion.
+The paper's beam, 64 x 64 x 192 mm, of soft tissue (5 kPa, nu = 0.49, 1000 kg/m^3), is fixed at z = 0 and starts
+sideways with v = a (z / L)^2. Rounding does work at every step; if strains are differences of numbers
+near one, it soon exceeds the energy of a small motion.
 """
 
 import numpy as np
@@ -55,7 +55,7 @@ def general():
 
 
 def adaptive():
-    """With leaves that are in no complete subtree."""
+    """A forest with leaves outside complete subtrees."""
     mesh = forest()
     return mesh.refine(mesh.points[mesh.tets].mean(axis=1)[:, 2] < 0.2 * CUBE)
 
@@ -68,7 +68,7 @@ CASES = [
 
 
 def energy_changes(mesh, material, model, speed, steps, device, parts=4):
-    """The energy after each part of the steps, over that at the start."""
+    """The energy after each part of the steps, over the initial one."""
     mesh = MESHES[mesh]()
     body = wc.SoftBody(mesh, material, device=device)
     body.fix(mesh.points[:, 2] < 1e-9)
@@ -78,7 +78,7 @@ def energy_changes(mesh, material, model, speed, steps, device, parts=4):
     body.velocities = velocities
 
     def energy():
-        # Velocities are half a step behind displacements; brought up to them, the energy is right to second order.
+        # Velocities are half a step behind displacements; correcting them gives the energy to second order.
         kick = 0.5 * DT * sim.forces().numpy().astype(float) / body.masses[:, None]
         kick[mesh.points[:, 2] < 1e-9] = 0
         v = body.velocities.numpy() + kick
@@ -93,7 +93,7 @@ def energy_changes(mesh, material, model, speed, steps, device, parts=4):
 
 @pytest.mark.parametrize(("mesh", "path"), [case for case in CASES if case.values[0] != "forest"])
 def test_energy_is_kept(mesh, path, device):
-    """Over 2,000 steps; without all digits, the slowest motion has hundreds of times its energy by then."""
+    """Over 2,000 steps; if digits were lost, the slowest motion would have hundreds of times its energy by then."""
     changes = energy_changes(mesh, *PATHS[path], 1e-6, 2000, device)
     print(f"{path}, {mesh}, {device}: {changes}")
     assert np.abs(changes - 1).max() < 0.01

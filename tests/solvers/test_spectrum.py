@@ -1,4 +1,4 @@
-"""The float64 spectrum against the step that simulations find at rest, its own definition, and steps themselves."""
+"""The float64 spectrum against the step that simulations find at rest, its own definition, and steps."""
 
 import cases
 import numpy as np
@@ -20,7 +20,7 @@ def held(mesh, model=None, device="cpu"):
 
 
 def bent(mesh, amount=0.5):
-    """Positions [N, 3] of a smooth large deformation: stretched, sheared and turned."""
+    """Positions [N, 3] of a smooth large deformation: stretched, sheared and rotated."""
     x, y, z = mesh.points.T / cases.CUBE
     turn = amount * y
     moved = [
@@ -83,7 +83,7 @@ def test_of_rotations_that_are_shared_the_own_level_gives_the_own():
 
 @pytest.mark.parametrize("law", ["corotated", "stvk", "neo_hookean"])
 def test_a_strained_state_leaves_its_rest_above_the_step_only(law):
-    """About equilibrium under load, steps just below 2 / omega stay, and steps just above grow exponentially."""
+    """About equilibrium under load, steps just below 2 / omega are stable, and just above they grow exponentially."""
     mesh = cases.oracle_mesh(wc.TetForest.box((1, 1, 2), cases.CUBE, 3))
     mu, lam = (float(value) for value in oracle.lame(5e3, 0.4))
     masses, fixed = mesh.masses(1000.0), mesh.points[:, 2] < 1e-9

@@ -1,4 +1,4 @@
-"""The paper's beam hanging from one end: damped dynamics ends where Newton's method on the oracle's energy ends."""
+"""The paper's beam hanging from one end: damped dynamics ends in the solution of Newton's method on the oracle."""
 
 import numpy as np
 import oracle
@@ -25,9 +25,9 @@ def static(mesh, fixed, model):
 
 
 def check_static_end(model, level, dt, duration, device):
-    """Ends of two runs, one twice as long as the other, and Newton's: 0.001 mm of the 60 to 80 mm the node sinks.
+    """Ends of two runs, one twice as long as the other, and Newton's: within 0.001 mm of the 60 to 80 mm of sag.
 
-    The static end does not depend on the step, so that agreement with it is convergence in step and time.
+    The static end does not depend on the step, so agreement with it is convergence in step and time.
     """
     mesh, fixed, node = beam(level)
     assert np.allclose(mesh.points[node], END)
@@ -64,7 +64,8 @@ def test_static_end_of_the_papers_mesh(model, dt, device):
 
 @pytest.mark.parametrize("level", [3, pytest.param(6, marks=pytest.mark.slow)])
 def test_linear_elasticity_grows_in_volume(level, device):
-    """Figure 6 in numbers: hanging, linear FEM gains volume (9 %; 18 % on the paper's mesh), others change by 1 %."""
+    """Figure 6 in numbers: the hanging linear beam gains volume (9 %; 18 % on the paper's mesh), others change by 1
+    %."""
     growth = {}
     for model in MODELS:
         mesh, fixed, _ = beam(level)
@@ -81,7 +82,7 @@ def test_linear_elasticity_grows_in_volume(level, device):
 def test_error_against_st_venant_kirchhoff_over_time(level, device):
     """The paper's figure 7: distance of the node from StVK's, from the release on, while the beam swings and settles.
 
-    On the paper's mesh the published 3.6 mm bound corotated FEM from above and 15 mm linear FEM from below.
+    On the paper's mesh the published 3.6 mm bound corotated FEM from above, and 15 mm bound linear FEM from below.
     """
     paths = {}
     for model in ("linear", "corotated", "stvk"):

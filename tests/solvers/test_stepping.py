@@ -1,5 +1,5 @@
-"""A step that follows the state: as long as the spectrum of the strained body allows, exact in time, and made again
-where it was too long; and a given step whose run ends where energy comes from nowhere."""
+"""A step that follows the state: as long as the strained body's spectrum allows, exact in time, and repeated if
+it was too long; and a given step, whose run ends if energy comes from nowhere."""
 
 import warnings
 
@@ -12,7 +12,7 @@ from warp_corot.solvers.steps.safe_step import INTERVAL
 
 
 def energy_range(sim, seconds, looks):
-    """The total energy at each of some looks [J]."""
+    """The total energy at each sample [J]."""
     found = [sim.energy().total]
     for _ in range(looks):
         sim.advance(seconds / looks)
@@ -53,9 +53,9 @@ def test_time_is_exact_with_hooks_that_make_steps_themselves(device):
 
 
 def test_frames_are_the_same_in_one_run_or_many():
-    """On the CPU bit by bit: measurements come at whole intervals, wherever calls begin and end.
+    """On the CPU bit for bit: measurements come at whole intervals, wherever calls begin and end.
 
-    Only a run that goes back is another: it goes back to where a call ended. A beam that bends under gravity does not.
+    Only a run that goes back differs: it goes back to where a call ended. A beam that bends under gravity does not.
     """
     whole, parted = (wc.Simulation(beam()) for _ in range(2))
     whole.advance_steps(4 * INTERVAL)
@@ -66,7 +66,7 @@ def test_frames_are_the_same_in_one_run_or_many():
 
 
 def test_single_steps_follow_the_state_too():
-    """As runs do where no check on energies changes the step, which single steps do not have."""
+    """Like runs in which no energy check changes the step, since single steps have no such check."""
     one, many = (wc.Simulation(beam()) for _ in range(2))
     one.advance_steps(3 * INTERVAL)
     for _ in range(3 * INTERVAL):
@@ -93,7 +93,7 @@ def test_a_simulation_that_is_reset_repeats_its_steps():
 
 @pytest.mark.parametrize("model", [wc.Corotated(), wc.NeoHookean(), wc.StVenantKirchhoff(), wc.Linear()], ids=repr)
 def test_a_body_that_hardly_deforms_takes_hardly_more_steps_than_a_fixed_one(device, model):
-    """Within 1.15 of those of the largest step that is stable by 0.98, which is known to be stable."""
+    """Within 1.15 of the steps of 0.98 times the largest stable step, which is known to be stable."""
     body = beam(device, young=2e6)
     sim = wc.Simulation(body, model=model)
     sim.advance(0.05)
@@ -103,10 +103,10 @@ def test_a_body_that_hardly_deforms_takes_hardly_more_steps_than_a_fixed_one(dev
 
 @pytest.mark.parametrize("model", [wc.Corotated(), wc.NeoHookean(), wc.StVenantKirchhoff(), wc.EdgeStVK()], ids=repr)
 def test_the_step_follows_the_spectrum_of_the_strained_body(device, model):
-    """The largest frequency of the state in float64 allows the step that is taken, with a margin as safe strains have.
+    """The largest frequency of the state in float64 allows the step, with the same margin as for safe strains.
 
-    The measured frequency lies within a fifth of the true one: the measure is a power iteration that goes on with the
-    motion, not a solved eigenvalue problem.
+    The measured frequency lies within a fifth of the true one: the measurement is a power iteration that continues
+    during the motion, not a solved eigenvalue problem.
     """
     spectrum = pytest.importorskip("spectrum", reason="the float64 spectrum of strained bodies")
     names = {
@@ -141,7 +141,7 @@ def test_worlds_share_the_smallest_step(device):
 
 
 def test_a_state_gone_wrong_is_made_again_with_half_the_step(device):
-    """A blow between two measurements: nothing at rest says that so short a step will be wanted."""
+    """A blow between two measurements: the state before does not show that the step must be so short."""
     sim = wc.Simulation(beam(device), gravity=(0, 0, 0))
     sim.advance_steps(INTERVAL + 1)
     velocities = np.zeros((sim.body.node_count, 3))
@@ -156,12 +156,12 @@ def test_a_state_gone_wrong_is_made_again_with_half_the_step(device):
     assert len(said) == 1
     assert sim.total_time == pytest.approx(until, rel=1e-12)
     assert sim.dt < sim.dt_range[1]
-    # Half of what was ever in motion is more than is tolerated before.
+    # Half of the largest kinetic energy exceeds the tolerance.
     assert sim.energy().total < 1.5 * start
 
 
 def test_a_given_step_ends_with_an_error_where_energy_comes_from_nowhere(device):
-    """Long before anything is not finite."""
+    """Long before a value is not finite."""
     limit = wc.Simulation(beam(device)).stable_dt
     with pytest.warns(wc.StabilityWarning, match="beyond the largest stable"):
         sim = wc.Simulation(beam(device), integrator=wc.SymplecticEuler(dt=1.02 * limit))
@@ -212,8 +212,8 @@ def test_work_that_is_put_in_is_not_taken_for_energy_from_nowhere(device, model,
 
 
 def test_the_balance_accounts_for_supports_to_the_digits_of_the_forces(device):
-    """Symplectic Euler keeps the energy of a linear body exactly, its own kinetic energy counted: so what supports put
-    in is there, to the rounding of the forces, whatever they do."""
+    """Symplectic Euler keeps the energy of a linear body exactly, with its own form of the kinetic energy: so the
+    supports' work appears in it, to the rounding of the forces, for any motion."""
     sim = wc.Simulation(beam(device), model=wc.Linear(), integrator=wc.SymplecticEuler(dt=2e-4))
     pulled(sim)
     sim.advance(0.01)
@@ -236,7 +236,7 @@ def test_states_written_from_outside_begin_a_new_balance(device):
 
 
 def test_long_runs_drift_far_less_than_is_tolerated(device):
-    """Undamped and swinging: thousands of steps, tens of checks."""
+    """Undamped oscillation: thousands of steps, tens of checks."""
     sim = wc.Simulation(beam(device, young=3e4))
     energies = energy_range(sim, 4.0, 8)
     fallen = sim.guard.state["scale"][0]

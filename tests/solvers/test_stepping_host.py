@@ -1,5 +1,5 @@
-"""What a call of ``advance`` asks of the host: one wait for the device and a launch or two, however short the call is;
-and that the device itself sees what users write in between."""
+"""The host's work in a call of ``advance``: one wait for the device and a launch or two, however short the call is;
+and that the device sees what users write in between."""
 
 from collections import Counter
 
@@ -14,7 +14,7 @@ from warp_corot.solvers.steps.safe_step import INTERVAL
 
 @pytest.fixture
 def calls(monkeypatch):
-    """How often Warp was called since the counter was cleared, by what it does."""
+    """Number of Warp's calls since the counter was cleared, by kind."""
     counted = Counter()
 
     def count(owner, name, what):
@@ -44,7 +44,7 @@ def simulation(device, dt=None, **options):
 @pytest.mark.parametrize("steps", [1, 3.3, 7])
 @pytest.mark.parametrize("given", [False, True], ids=["its own step", "given step"])
 def test_a_short_call_waits_once(device, calls, given, steps):
-    """Of a body that hardly deforms, measurements of the step included; twice where a check on elastic energies, which
+    """For a body that hardly deforms, with measurements of the step; twice if a check on elastic energies, which
     comes every so many steps, falls within the call."""
     dt = simulation(device).dt
     sim = simulation(device, dt=dt if given else None)
@@ -97,7 +97,7 @@ def freed(sim):
 @pytest.mark.parametrize("act", [written, pushed, freed])
 @pytest.mark.parametrize("dt", [None, 1e-4])
 def test_what_a_user_writes_in_place_is_seen(device, calls, act, dt):
-    """By the device: a call after it counts from other energies, for which the host waits once more."""
+    """The device sees it: the next call counts from other energies, for which the host waits once more."""
     sim = simulation(device, dt=dt)
     for _ in range(5):
         sim.advance(4e-4)
@@ -125,7 +125,7 @@ def test_a_hand_that_pushes_costs_nothing_more(device, calls):
 
 @pytest.mark.parametrize("dt", [None, 2e-4])
 def test_a_hand_that_shakes_held_nodes_is_no_fault(device, dt):
-    """Whatever velocities it gives them; the state is a user's each time."""
+    """At any velocities; the user sets the state each time."""
     sim = simulation(device, dt=dt)
     end = np.flatnonzero(sim.body.mesh.points[:, 2] > 0.192 - 1e-9)
     rng = np.random.default_rng(5)
@@ -137,7 +137,7 @@ def test_a_hand_that_shakes_held_nodes_is_no_fault(device, dt):
 
 @pytest.mark.parametrize("dt", [None, 5e-4])
 def test_loads_that_come_and_go_put_in_what_they_do(device, dt):
-    """Their work counts while they act: energy that they put in does not come from nowhere when they are gone."""
+    """Their work counts while they act: their energy does not come from nowhere when they are gone."""
     sim = wc.Simulation(beam(device), gravity=(0, 0, 0), integrator=wc.SymplecticEuler(dt=dt))
     end = np.flatnonzero(sim.body.mesh.points[:, 2] > 0.192 - 1e-9)
     for k in range(60):
@@ -147,7 +147,7 @@ def test_loads_that_come_and_go_put_in_what_they_do(device, dt):
 
 
 def test_after_a_failure_the_end_of_the_last_call_is_the_last_good_state(device):
-    """What a user writes to it included; calls before that are never made again."""
+    """With what a user wrote to it; earlier calls are never repeated."""
     sim = wc.Simulation(beam(device), gravity=(0, 0, 0))
     for _ in range(70):
         sim.advance(3e-3)
@@ -163,7 +163,7 @@ def test_after_a_failure_the_end_of_the_last_call_is_the_last_good_state(device)
 
 
 def test_short_calls_take_the_same_steps_as_one(device):
-    """Of the same length but for where calls end."""
+    """The steps have equal lengths except at the ends of calls."""
     short, long = (simulation(device) for _ in range(2))
     for _ in range(100):
         short.advance(0.5 * short.dt * INTERVAL)

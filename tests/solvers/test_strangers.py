@@ -1,12 +1,12 @@
-"""Bodies on which nothing of the stepping was tuned: no error, and no energy that nobody gave.
+"""Bodies on which no constant of the stepping was tuned: no error, and no energy from nowhere.
 
-They stand in ``strangers``.
+They are in ``strangers``.
 """
 
 import pytest
 from strangers import STRANGERS, Run, run, violations
 
-#: Those in which trouble came before, or comes early, and which take a second or two.
+#: Bodies with former or early trouble that take a second or two.
 FEW = {
     "liver, light": 0.5,
     "hollow sphere, nu 0.3": 0.6,

@@ -1,4 +1,4 @@
-"""Active stress: what muscle fibres pull with, whatever their length."""
+"""Active stress: the pull of muscle fibres, which does not depend on their length."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class Activation:
     """Active stress over time: keyframes, linear in between, constant before and after.
 
     Attributes:
-        times: Increasing times [s], [K], at least two, in the time of the simulation, from a world's last reset.
-        stress: Active stress at these times [Pa], [K] for all elements alike or [K, n] for n of them; positive
+        times: Increasing times [s], [K], at least two, in simulation time since the world's last reset.
+        stress: Active stress at these times [Pa], [K] for all elements or [K, n] for n of them; positive
             contracts.
 
     Raises:
@@ -40,7 +40,7 @@ class Activation:
         object.__setattr__(self, "stress", s)
 
     def repeated(self, worlds: int, count: int) -> Activation:
-        """The same for ``count`` elements in each of the worlds; one that is for all elements alike stays as it is."""
+        """The same for ``count`` elements in each world; keyframes for all elements do not change."""
         stress = np.asarray(self.stress)
         if stress.ndim == 2 and stress.shape[1] == count:
             return Activation(self.times, np.tile(stress, (1, worlds)))
@@ -52,9 +52,9 @@ class ElementActivation:
     """Keyframes that a set of elements follows, on the device.
 
     Attributes:
-        elements: int32 [n], among those of all worlds.
+        elements: int32 [n], indices into the elements of all worlds.
         times: float64 [K] [s].
-        stress: float32 [K, n], or [K, 1] for all elements alike [Pa].
+        stress: float32 [K, n], or [K, 1] for all elements [Pa].
     """
 
     elements: wp.array
@@ -63,10 +63,10 @@ class ElementActivation:
 
     @classmethod
     def of_keys(cls, elements: np.ndarray, activation: Activation, device: wp.Device) -> ElementActivation:
-        """From keyframes for these elements.
+        """Keyframes for these elements.
 
         Raises:
-            InputError: A number of columns that is not the number of elements.
+            InputError: The number of columns differs from the number of elements.
         """
         stress = np.asarray(activation.stress)
         if stress.ndim == 2 and stress.shape[1] not in (1, len(elements)):
@@ -89,10 +89,10 @@ class ElementActivation:
 
 
 def constant_stress(stress: float | npt.ArrayLike, worlds: int, count: int) -> npt.NDArray[np.float64]:
-    """Active stress [Pa], float64 [worlds, count], of a number or an array that broadcasts to that.
+    """Active stress [Pa], float64 [worlds, count], from a number or an array that broadcasts to that.
 
     Raises:
-        InputError: It does not, or is not finite.
+        InputError: It does not broadcast, or is not finite.
     """
     try:
         values = np.asarray(stress, dtype=np.float64)
@@ -103,5 +103,5 @@ def constant_stress(stress: float | npt.ArrayLike, worlds: int, count: int) -> n
             f"stress is {shape}; it must be a number, [{count}], [{worlds}, {count}] or an Activation"
         ) from None
     if not np.isfinite(values).all():
-        raise InputError("stress of an activation must be finite")
+        raise InputError("stress of an activation is not finite; it must be finite")
     return spread

@@ -1,4 +1,4 @@
-"""What is done to a body: which nodes are held, moved and loaded, and how fibres pull, on the device."""
+"""The conditions of a body on the device: held, moved and loaded nodes, and active fibres."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from warp_corot.kernels.stepping.activation import follow_activation
 from warp_corot.kernels.stepping.conditions import LOAD_NODES, free_nodes, hold_nodes, release_nodes
 
 from .activation import Activation, ElementActivation
+from .patch_arrays import PatchArrays
 from .state import State
-from .trajectory import Trajectory
+from .trajectory import NodeKeyframes, Trajectory
 
 
 class Conditions:
     """Supports, loads, keyframes and active stress.
 
-    Each change is launches as large as the patch that is meant, whatever the size of the body. Those that leave every
-    launch of a step as it was (other nodes held, other loads, other velocities, keyframes in place of as many others)
-    leave recorded steps as they are, too.
+    The cost of a change depends on the patch, not on the body. Changes that keep all launches of a step (other held
+    nodes, other loads, other velocities, keyframes in place of as many others) do not invalidate recorded steps.
 
     Args:
         discretization: The mesh.
         state: The state of the nodes.
-        mass: Of each node [kg], float32.
+        mass: Mass of each node [kg], float32.
 
     Attributes:
-        mass: As given; zero at nodes that no element names.
-        held: Not zero for nodes that are held or moved as told, uint8.
-        inverse_mass: Of nodes that are free to move [1/kg], float32; zero for others.
-        loads: External forces [N], vec4, or another program's array; one place until there are any.
-        has_loads: Whether there are any.
+        mass: The argument; zero at nodes of no element.
+        held: Nonzero for fixed and prescribed nodes, uint8.
+        inverse_mass: Inverse mass of free nodes [1/kg], float32; zero for others.
+        loads: External forces [N], vec4, or another program's array; one entry until there are loads.
+        has_loads: Whether there are loads.
         trajectories: Keyframes that nodes follow.
         activations: Keyframes that active stress follows.
         world_starts: The time when each world was last reset [s], float64 [worlds].
-        revision: Changes whenever the launches of a step do, so that steps must be recorded again.
-        rewritten: Changes whenever keyframes do that launches go on with.
+        revision: Changes whenever the launches of a step change, so that steps must be recorded again.
+        rewritten: Changes whenever keyframes change that existing launches read.
     """
 
     def __init__(self, discretization: Discretization, state: State, mass: wp.array):
@@ -55,10 +55,11 @@ class Conditions:
         self.activations: list[ElementActivation] = []
         self.world_starts = wp.zeros(self.sizes.worlds, dtype=wp.float64, device=self.device)
         self.revision = self.rewritten = 0
+        self.patches = PatchArrays(self.device)
         self.find_inverse_masses()
 
     def move_into(self, held: wp.array, mass: wp.array, inverse_mass: wp.array, loads: wp.array) -> None:
-        """Live in other arrays from now on, with as many places or more; ``mass`` is there already."""
+        """Use other arrays from now on, of at least the same size; ``mass`` already has its values."""
         count = self.sizes.nodes
         wp.copy(held, self.held, count=count)
         if self.has_loads:
@@ -73,51 +74,53 @@ class Conditions:
         return self.held[: self.sizes.nodes].numpy() != 0
 
     def find_inverse_masses(self) -> None:
-        """Give every node that is not held its inverse mass, and none to the others."""
+        """Set the inverse mass of every free node, and zero for held ones."""
         inputs, outputs = [self.mass, self.held], [self.inverse_mass]
         wp.launch(free_nodes, len(self.inverse_mass), inputs, outputs, device=self.device)
 
     def hold(self, nodes: wp.array, velocities: wp.array) -> None:
-        """Hold nodes that move at these velocities.
+        """Hold nodes and move them at these velocities.
 
         Args:
             nodes: int32 [k].
-            velocities: [m/s], vec3 [k], [1] for all alike, or [k / worlds] for each world alike.
+            velocities: [m/s], vec3 [k], [1] for all nodes, or [k / worlds] for each world.
         """
         outputs = [self.held, self.inverse_mass, self.state.velocities]
         wp.launch(hold_nodes, len(nodes), [nodes, velocities], outputs, device=self.device)
 
     def release(self, nodes: wp.array) -> None:
-        """Let nodes, int32 [k], go with the velocity they have."""
+        """Free nodes, int32 [k]; they keep their velocity."""
         outputs = [self.held, self.inverse_mass, self.state.reactions]
         wp.launch(release_nodes, len(nodes), [nodes, self.mass], outputs, device=self.device)
 
-    def follow(self, trajectory: Trajectory) -> None:
-        """Have nodes follow keyframes and no others, in the arrays of former ones where these fit."""
+    def follow(self, keys: NodeKeyframes) -> None:
+        """Hold nodes and let them follow these keyframes only, in the arrays of former ones if these fit."""
         for k, former in enumerate(self.trajectories):
-            there = trajectory.in_place_of(former)
+            there = former.rewritten(keys)
             if there is not None:
                 self.trajectories[k] = there
                 self.rewritten += 1
                 return
-        self.stop_following(trajectory.host_nodes)
+        self.stop_following(keys.nodes)
+        trajectory = keys.on(self.device)
+        self.hold(trajectory.nodes, self.patches.still)
         self.set_trajectories([*self.trajectories, trajectory])
 
     def stop_following(self, nodes: npt.NDArray[np.integer]) -> None:
-        """Take nodes, [k], out of the keyframes that they follow."""
+        """Remove nodes, [k], from the keyframes that they follow."""
         kept = [trajectory.without(nodes) for trajectory in self.trajectories]
         if any(now is not before for now, before in zip(kept, self.trajectories, strict=True)):
             self.set_trajectories([each for each in kept if each is not None])
 
     def set_trajectories(self, trajectories: Sequence[Trajectory]) -> None:
-        """Have nodes follow these keyframes and no others."""
+        """Let nodes follow these keyframes only."""
         self.trajectories = list(trajectories)
         self.revision += 1
 
     # --- loads -----------------------------------------------------------------------------------------------------
 
     def make_loads(self) -> None:
-        """See that there is an array of loads for every node."""
+        """Ensure that there is an array of loads for every node."""
         if not self.has_loads:
             if len(self.loads) < self.sizes.nodes:
                 self.loads = wp.zeros(self.sizes.nodes, dtype=wp.vec4, device=self.device)
@@ -129,7 +132,7 @@ class Conditions:
 
         Args:
             nodes: int32 [k].
-            forces: [N], vec3 [k], [1] for all alike, or [k / worlds] for each world alike.
+            forces: [N], vec3 [k], [1] for all nodes, or [k / worlds] for each world.
         """
         self.make_loads()
         kernel = LOAD_NODES[self.loads.dtype]
@@ -144,15 +147,15 @@ class Conditions:
     # --- fibres ----------------------------------------------------------------------------------------------------
 
     def make_activation(self) -> None:
-        """See that there is an active stress for every element."""
+        """Ensure that there is an active stress for every element."""
         self.revision += int(self.discretization.make_activation())
 
     def follow_activations(self, clock: Clock, offset: int) -> None:
-        """Launch what sets the active stress of elements that follow keyframes.
+        """Launch the kernel that sets the active stress of elements that follow keyframes.
 
         Args:
-            clock: The simulation's.
-            offset: How many steps are launched that it does not count yet.
+            clock: The simulation's clock.
+            offset: Number of launched steps that the clock does not count yet.
         """
         for each in self.activations:
             inputs = [each.elements, each.times, each.stress, clock.arrays, self.world_starts]
@@ -161,7 +164,7 @@ class Conditions:
             wp.launch(follow_activation, len(each.elements), inputs, outputs, device=self.device)
 
     def activate(self, elements: npt.NDArray[np.integer], stress: Activation | npt.NDArray[np.float64]) -> None:
-        """Have elements, [k], follow keyframes, or have these stresses [Pa], [k]; in place of former keyframes."""
+        """Set keyframes or stresses [Pa], [k], for elements, [k], in place of former keyframes."""
         added = []
         if not isinstance(stress, Activation):
             live = self.discretization.activation[: self.sizes.elements]
@@ -171,11 +174,11 @@ class Conditions:
         elif len(elements):
             added = [ElementActivation.of_keys(elements, stress, self.device)]
         kept = [left for each in self.activations if (left := each.without(elements))]
-        # Other numbers in the same array are no other launches.
+        # New values in the same array do not change the launches.
         if added or kept != self.activations:
             self.set_activations(kept + added)
 
     def set_activations(self, activations: Sequence[ElementActivation]) -> None:
-        """Have active stress follow these keyframes and no others."""
+        """Let active stress follow these keyframes only."""
         self.activations = list(activations)
         self.revision += 1

@@ -1,4 +1,4 @@
-"""What users do to a body: hold and move its nodes, load them, and let its fibres pull."""
+"""The user's controls of a body: holding, moving and loading nodes, and active stress of fibres."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from .activation import Activation, constant_stress
 from .conditions import Conditions
 from .places import ChosenNodes, Nodes, chosen_nodes, nodes_at
 from .state import State
-from .trajectory import Trajectory
+from .trajectory import NodeKeyframes
 from .views import Views
 
 
 class Controls:
-    """The part of ``SoftBody`` that is not its state: constraints, loads and activation.
+    """The part of ``SoftBody`` for constraints, loads and activation.
 
-    Nodes and elements are named within a world and meant in all of them, unless ``worlds`` says otherwise.
+    Indices of nodes and elements refer to one world and apply to all worlds, unless ``worlds`` chooses some.
     """
 
     device: wp.Device
@@ -45,47 +45,47 @@ class Controls:
     @property
     @abstractmethod
     def material(self) -> Material:
-        """What the body is made of."""
+        """The material of the body."""
 
     @property
     def node_count(self) -> int:
-        """Nodes of all worlds."""
+        """Number of nodes of all worlds."""
         return self.sizes.nodes
 
     @property
     def element_count(self) -> int:
-        """Elements of all worlds."""
+        """Number of elements of all worlds."""
         return self.sizes.elements
 
     @property
     def world_node_count(self) -> int:
-        """Nodes of one world."""
+        """Number of nodes of one world."""
         return self.sizes.world_nodes
 
     @property
     def world_element_count(self) -> int:
-        """Elements of one world."""
+        """Number of elements of one world."""
         return self.sizes.world_elements
 
     def fix(self, nodes: Nodes, *, worlds: npt.ArrayLike | None = None) -> None:
-        """Hold nodes where they are.
+        """Fix nodes at their current positions.
 
         Args:
-            nodes: Mask bool [N] or indices into one world's nodes; an expression in the rest position, as
+            nodes: Mask bool [N] or indices into one world's nodes; an expression in the rest position, for example
                 ``"z < zmin + 0.01"`` (``selection.select_nodes``), or a function of it, ``f(points [N, 3]) -> bool
                 [N]`` [m]; or a mask of all worlds' nodes, bool [worlds, N].
-            worlds: In which worlds: None for all, an index, indices or a mask bool [worlds].
+            worlds: None for all worlds, an index, indices or a mask bool [worlds].
 
         Raises:
-            InputError: Mask of the wrong length, index out of range, or not such an expression or function.
+            InputError: Mask of the wrong length, index out of range, or an invalid expression or function.
         """
-        self._hold(self.node_indices(nodes, worlds), np.zeros((1, 3)))
+        self._hold(self.node_indices(nodes, worlds), self.conditions.patches.still)
 
     def release(self, nodes: Nodes, *, worlds: npt.ArrayLike | None = None) -> None:
-        """Let fixed or prescribed nodes go, with the velocity they have. Nodes and worlds as in ``fix``."""
+        """Free fixed or prescribed nodes, which keep their velocity. Nodes and worlds as in ``fix``."""
         chosen = self.node_indices(nodes, worlds)
         self.conditions.stop_following(chosen)
-        self.conditions.release(self._on_device(chosen))
+        self.conditions.release(self.conditions.patches.nodes(chosen))
 
     def prescribe(
         self,
@@ -96,19 +96,20 @@ class Controls:
         displacements: npt.ArrayLike | None = None,
         worlds: npt.ArrayLike | None = None,
     ) -> None:
-        """Move nodes as told, whatever the forces: at a velocity, or along keyframes.
+        """Move nodes independently of forces: at a velocity, or along keyframes.
 
         Args:
             nodes: n nodes of each world, as in ``fix``.
             velocity: Constant velocity [m/s], [3], [n, 3] or [worlds, n, 3]; or an array on the device, as in ``load``.
-            times: Increasing times of keyframes [s], [K], at least two, in the time of the simulation, from a world's
-                last reset.
-            displacements: Displacements from rest at these times [m], [K, 3] for all nodes alike or [K, n, 3]; linear
+            times: Increasing times of keyframes [s], [K], at least two, in simulation time since the world's last
+                reset.
+            displacements: Displacements from rest at these times [m], [K, 3] for all nodes or [K, n, 3]; linear
                 in between, constant before and after.
             worlds: As in ``fix``.
 
         Raises:
-            InputError: Neither or both ways given, wrong shapes, times that do not increase, or non-finite values.
+            InputError: Neither or both of velocity and keyframes, wrong shapes, times that do not increase, or
+                non-finite values.
         """
         named = self._chosen_nodes(nodes, worlds)
         chosen = named.indices
@@ -122,11 +123,10 @@ class Controls:
     def follow(
         self, indices: npt.NDArray[np.integer], times: npt.ArrayLike | None, displacements: npt.ArrayLike | None
     ) -> None:
-        """``prescribe`` along keyframes for nodes by their indices among those of all worlds."""
-        trajectory = Trajectory.of_keys(indices, times, displacements, self.device)
+        """``prescribe`` along keyframes, for nodes by their indices among the nodes of all worlds."""
+        keys = NodeKeyframes.checked(indices, times, displacements)
         if len(indices):
-            self.conditions.hold(trajectory.nodes, self._vectors(np.zeros((1, 3))))
-            self.conditions.follow(trajectory)
+            self.conditions.follow(keys)
 
     def load(self, nodes: Nodes, force: npt.ArrayLike, *, worlds: npt.ArrayLike | None = None) -> None:
         """Set the external force on nodes, from the next step on.
@@ -135,7 +135,7 @@ class Controls:
             nodes: n nodes of each world, as in ``fix``.
             force: Force on each node [N], [3], [n, 3], [worlds, 1, 3] or [worlds, n, 3]. An array on the device is
                 read there without waiting, and its values are not checked: a ``wp.array`` of vec3 [n] or float32
-                [n, 3], or PyTorch's or JAX's float32 [n, 3].
+                [n, 3], or a float32 array [n, 3] of PyTorch or JAX.
             worlds: As in ``fix``.
 
         Raises:
@@ -144,7 +144,7 @@ class Controls:
         chosen = self._chosen_nodes(nodes, worlds)
         values = self._vectors(chosen.vectors(force, "force", self.device))
         if len(chosen.indices):
-            self.conditions.load(self._on_device(chosen.indices), values)
+            self.conditions.load(self.conditions.patches.nodes(chosen.indices), values)
         else:
             self.conditions.make_loads()
 
@@ -152,8 +152,8 @@ class Controls:
     def activation(self) -> wp.array:
         """Active stress along the fibres [Pa], float32 [worlds * T]: a view of the live array, made on first use.
 
-        Positive stress contracts. Write to it between steps; elements that follow an ``Activation`` have in it what
-        they had in the last step.
+        Positive stress contracts. You may write to it between steps; elements that follow an ``Activation`` hold the
+        value of the last step.
 
         Raises:
             InputError: The material has no fibres.
@@ -170,11 +170,11 @@ class Controls:
     ) -> None:
         """Set the active stress along the fibres, from the next step on: P = s (F d) d^T in an element of direction d.
 
-        It pulls whatever the fibre's length, so that it puts work in and has no energy. It stiffens the fibres: a
-        stress beyond Young's modulus along them can need a smaller step than was found without it.
+        The stress does not depend on the fibre's length, so it does work and has no energy. It stiffens the fibres: a
+        stress beyond Young's modulus along them can need a smaller step than the one found without it.
 
         Args:
-            stress: Positive contracts [Pa]: a number, [n], [worlds, n] or [worlds, 1], or keyframes that are followed
+            stress: Positive contracts [Pa]: a number, [n], [worlds, n] or [worlds, 1], or keyframes that it follows
                 over time.
             elements: n elements of each world, mask bool [T] or indices; None for all.
             worlds: As in ``fix``.
@@ -204,7 +204,7 @@ class Controls:
         return self._views.hand_out(vec3_view(self.conditions.loads[: self.node_count]))
 
     def node_indices(self, nodes: Nodes, worlds: npt.ArrayLike | None = None) -> npt.NDArray[np.intp]:
-        """Indices, among the nodes of all worlds, of those named as in ``fix``.
+        """Indices, among the nodes of all worlds, of nodes given as in ``fix``.
 
         Raises:
             InputError: Mask of the wrong length, index out of range, or neither.
@@ -217,7 +217,7 @@ class Controls:
         return chosen_nodes(nodes_at(nodes, lambda: self.mesh), self.world_node_count, self.worlds, worlds)
 
     def _make_activation(self) -> None:
-        """See that there is an active stress for every element."""
+        """Ensure that there is an active stress for every element."""
         conditions = self.conditions
         if not conditions.discretization.has_activation and not isinstance(self.material, Anisotropic):
             raise InputError(
@@ -227,15 +227,12 @@ class Controls:
         conditions.make_activation()
 
     def _hold(self, chosen: npt.NDArray[np.intp], velocities: npt.NDArray[np.float64] | wp.array) -> None:
-        """Hold nodes that move at these velocities, and follow nothing else."""
+        """Hold nodes that move at these velocities, and remove their keyframes."""
         if len(chosen):
             self.conditions.stop_following(chosen)
-            self.conditions.hold(self._on_device(chosen), self._vectors(velocities))
-
-    def _on_device(self, indices: npt.NDArray[np.intp]) -> wp.array:
-        return wp.array(indices, dtype=wp.int32, device=self.device)
+            self.conditions.hold(self.conditions.patches.nodes(chosen), self._vectors(velocities))
 
     def _vectors(self, given: npt.NDArray[np.float64] | wp.array) -> wp.array:
         if isinstance(given, wp.array):
             return given
-        return wp.array(given.reshape(-1, 3), dtype=wp.vec3, device=self.device)
+        return self.conditions.patches.vectors(given.reshape(-1, 3))

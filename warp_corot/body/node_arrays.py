@@ -1,4 +1,4 @@
-"""A body's nodal arrays by name, for launches of the user's own."""
+"""A body's nodal arrays by name, for the user's own launches."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from .state import State
 
 
 class NodeArrays:
-    """The part of ``SoftBody`` that hands out arrays as they lie in memory, one place a node, [worlds * N] or longer.
+    """The part of ``SoftBody`` that gives its arrays with their layout in memory, one entry a node, [worlds * N] or
+    longer.
 
-    They are the solver's own. Ask for them again after anything that changes them: a pass of remeshing, ``use_loads``,
-    ``use_positions``, or the first load.
+    They are the solver's own arrays. Get them again after anything that changes them: a pass of remeshing,
+    ``use_loads``, ``use_positions``, or the first load.
     """
 
     state: State
@@ -25,8 +26,8 @@ class NodeArrays:
 
     @property
     def node_positions(self) -> wp.array:
-        """``positions`` without gaps, vec4, for ``wp.to_jax``, which takes no strided view; or what ``use_positions``
-        was given."""
+        """``positions`` without gaps, vec4, for ``wp.to_jax``, which takes no strided views; or the array given to
+        ``use_positions``."""
         return self.state.positions
 
     @property
@@ -46,10 +47,10 @@ class NodeArrays:
 
     @property
     def node_inverse_mass(self) -> wp.array:
-        """Inverse masses [1/kg], float32; zero for nodes that are fixed or prescribed."""
+        """Inverse masses [1/kg], float32; zero for fixed and prescribed nodes."""
         return self.conditions.inverse_mass
 
     @property
     def node_loads(self) -> wp.array:
-        """External forces [N], vec4; or what ``use_loads`` was given."""
+        """External forces [N], vec4; or the array given to ``use_loads``."""
         return self.conditions.loads

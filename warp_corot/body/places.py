@@ -1,4 +1,4 @@
-"""Nodes as users name them: by where they are at rest, by a mask or by indices, in all copies of a body or in some."""
+"""The user's choice of nodes: by rest position, by a mask or by indices, in all copies of a body or in some."""
 
 from __future__ import annotations
 
@@ -19,18 +19,20 @@ from warp_corot.inputs.device_arrays import vectors_on_device
 from warp_corot.inputs.indices import checked_indices
 from warp_corot.inputs.selection import CONSTANTS, FUNCTIONS, REGIONS, select_nodes
 
-#: Names that expressions have of themselves.
+#: Names with a meaning of their own in expressions.
 TAKEN = {"x", "y", "z", *(f"{axis}{end}" for axis in "xyz" for end in ("min", "max"))}
 TAKEN |= {*CONSTANTS, *FUNCTIONS, *REGIONS}
-#: Nodes as users name them: a mask, indices, an expression (``select_nodes``), or a function of the rest positions [m],
+#: A choice of nodes: a mask, indices, an expression (``select_nodes``), or a function of the rest positions [m],
 #: float64 [N, 3], that gives a mask bool [N].
 Nodes = npt.ArrayLike | str | Callable[[npt.NDArray[np.float64]], npt.ArrayLike]
 
 
 def named_nodes(mesh: Mesh) -> dict[str, Callable[[], npt.NDArray[np.bool_]]]:
-    """What gives the nodes, bool [N], of each label and each set of nodes of a mesh, by names as expressions have them.
+    """Functions that give the nodes, bool [N], of each label and each node set of a mesh, by their names in
+    expressions.
 
-    All but letters, digits and underscores become underscores; names that expressions have already get a "_set" behind.
+    Characters other than letters, digits and underscores become underscores; names that expressions use get a suffix
+    "_set".
     """
     labels = {name: partial(mesh.nodes_of, name) for name in getattr(mesh, "label_names", ())}
     sets = {name: partial(np.array, nodes) for name, nodes in getattr(mesh, "node_sets", {}).items()}
@@ -43,17 +45,17 @@ def named_nodes(mesh: Mesh) -> dict[str, Callable[[], npt.NDArray[np.bool_]]]:
 
 
 def nodes_at(nodes: Nodes, mesh_of: Callable[[], Mesh]) -> Any:
-    """A mask bool [N] in place of an expression or a function; anything else as it is.
+    """A mask bool [N] in place of an expression or a function; any other value unchanged.
 
-    In expressions ``zmin`` and the like are bounds of the nodes that elements name; names of the mesh's labels and sets
-    of nodes are known, too (`named_nodes`).
+    In expressions ``zmin`` and the other bounds are those of nodes of elements; names of the mesh's labels and node
+    sets can be used, too (`named_nodes`).
 
     Args:
-        nodes: What a user gave.
-        mesh_of: Gives the mesh, which is asked for only if it is needed.
+        nodes: The user's argument.
+        mesh_of: Gives the mesh; it is called only if needed.
 
     Raises:
-        InputError: Not such an expression, or the function gives something else than a truth for each node.
+        InputError: An invalid expression, or a function that does not give true or false for each node.
     """
     if isinstance(nodes, wp.array):
         return nodes.numpy()
@@ -72,19 +74,19 @@ def nodes_at(nodes: Nodes, mesh_of: Callable[[], Mesh]) -> Any:
     if found.dtype != bool or found.shape != (count,):
         raise InputError(
             f"the function for nodes gives {found.dtype} of shape {list(found.shape)} at the rest positions "
-            f"[{count}, 3]; it must give true or false for each, bool [{count}], as lambda x: x[:, 2] < 0.01 does"
+            f"[{count}, 3]; it must give true or false for each, bool [{count}], like lambda x: x[:, 2] < 0.01"
         )
     return found
 
 
 @dataclass(frozen=True)
 class ChosenNodes:
-    """Nodes that a user names, in one or more worlds.
+    """The user's choice of nodes in one or more worlds.
 
     Attributes:
-        indices: Among the nodes of all worlds [k].
-        worlds: In how many worlds.
-        each: How many in each of the worlds, or None if not the same ones in each.
+        indices: Indices into the nodes of all worlds [k].
+        worlds: Number of worlds.
+        each: Number of nodes in each world, or None if the worlds have different ones.
     """
 
     indices: npt.NDArray[np.intp]
@@ -95,15 +97,15 @@ class ChosenNodes:
         """Vectors for the chosen nodes, one for all, one for each, or one for each in each world.
 
         Returns:
-            [3] or [k, 3]; or, if they were on a device already, vec3 [1], [k] or [k / worlds] there.
+            [3] or [k, 3]; or, for an array on a device, vec3 [1], [k] or [k / worlds] on it.
 
         Raises:
-            InputError: Another shape, or values that are not finite numbers, which those on a device may be.
+            InputError: Another shape, or values that are not finite numbers; values on a device are not checked.
         """
         there = vectors_on_device(given, name, (len(self.indices), self.each or len(self.indices)), device)
         if there is not None:
             return there
-        if isinstance(given, wp.array):  # of other numbers, as float64
+        if isinstance(given, wp.array):  # of another dtype; read as float64
             given = given.numpy()
         try:
             values = np.asarray(given, dtype=np.float64)
@@ -121,7 +123,7 @@ class ChosenNodes:
         return np.broadcast_to(values, (self.worlds, self.each, 3)).reshape(count, 3)
 
     def keyframes(self, given: npt.ArrayLike) -> npt.ArrayLike:
-        """Keyframes of the nodes of one world, [K, n, 3], once for each of the worlds; any others as they are."""
+        """Keyframes of the nodes of one world, [K, n, 3], repeated for each world; other keyframes unchanged."""
         shape = np.shape(given)
         if self.each is None or len(shape) != 3 or shape[1] != self.each:
             return given
@@ -129,13 +131,13 @@ class ChosenNodes:
 
 
 def chosen_nodes(nodes: npt.ArrayLike, count: int, worlds: int, chosen_worlds: Any = None) -> ChosenNodes:
-    """The nodes that a mask or a list of indices names, in all worlds or in the chosen ones.
+    """The nodes that a mask or a list of indices gives, in all worlds or in the chosen ones.
 
     Args:
         nodes: Mask bool [N] or indices into one world's nodes; or a mask of all worlds' nodes, [worlds, N] or
             [worlds * N].
         count: Nodes in one world, N.
-        worlds: How many worlds there are.
+        worlds: Number of worlds.
         chosen_worlds: None for all, one index, a mask bool [worlds], or indices.
 
     Raises:
@@ -147,7 +149,7 @@ def chosen_nodes(nodes: npt.ArrayLike, count: int, worlds: int, chosen_worlds: A
         given = np.empty(0, object)
     if given.dtype == bool and given.shape in ((worlds, count), (worlds * count,)) and given.shape != (count,):
         if chosen_worlds is not None:
-            raise InputError("a mask of all worlds' nodes says which worlds are meant; worlds cannot be given as well")
+            raise InputError("a mask of all worlds' nodes chooses the worlds itself; worlds must not be given as well")
         return ChosenNodes(np.flatnonzero(given), worlds, None)
     own = checked_indices(nodes, count, "node")
     which = np.arange(worlds) if chosen_worlds is None else checked_indices(chosen_worlds, worlds, "world")

@@ -1,4 +1,4 @@
-"""Arrays of other programs as a body's loads and positions: steps read and write them where they are."""
+"""Arrays of other programs as a body's loads and positions: steps read and write them in place."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from warp_corot.errors import InputError
 from .conditions import Conditions
 from .state import State
 
-#: What a vec4 array starts and strides at for kernels to read a node by one load [bytes].
+#: Alignment of start and stride with which kernels read a node of a vec4 array by one load [bytes].
 ALIGNMENT = 16
 
 
 class SharedArrays:
-    """The part of ``SoftBody`` that lets somebody else's arrays stand in for its own.
+    """The part of ``SoftBody`` that lets it use another program's arrays in place of its own.
 
-    An array is taken as it is: float32, of vec3, vec4 or rows of three or four numbers, one for each node in the mesh's
-    order, [worlds * N] with any stride between nodes, or [worlds, N] without gaps. A fourth number means nothing and is
-    left as it is. Whoever writes to the array sees to it that this is done before a step reads it, as it is on the same
-    CUDA stream. Steps that somebody has recorded go on with the arrays that they were recorded with.
+    An array is used in place: float32, of vec3, vec4 or rows of three or four numbers, one for each node in the mesh's
+    order, [worlds * N] with any stride between nodes, or [worlds, N] without gaps. A fourth number is ignored and not
+    changed. The program that writes to the array must finish before a step reads it; on the same CUDA stream it does.
+    Steps in the user's own captures continue to use the arrays with which they were recorded.
     """
 
     device: wp.Device
@@ -37,23 +37,23 @@ class SharedArrays:
     _own_positions: wp.array | None = None
 
     def use_loads(self, loads: wp.array | None) -> None:
-        """Have steps read the external nodal forces [N] from this array, in place of the body's own.
+        """Let steps read the external nodal forces [N] from this array, in place of the body's own.
 
-        ``loads`` and ``load`` then mean this array too. Changing its values costs nothing; another array has steps
-        recorded anew.
+        ``loads`` and ``load`` then refer to this array too. Changing its values costs nothing; for a different array,
+        steps are recorded again.
 
         Args:
             loads: See ``SharedArrays``; ``wp.from_torch``, ``wp.from_jax`` and ``wp.from_dlpack`` make one without a
-                copy. None for the body's own again, as they were.
+                copy. None restores the body's own array with its values.
 
         Raises:
-            InputError: Not such an array, the one positions are written to, on another device, or the body is
-                remeshed.
+            InputError: Not a valid array, the array that positions are written to, an array on another device, or the
+                body is remeshed.
         """
         given = None if loads is None else self._shared(loads, "loads")
         conditions = self.conditions
         if given is not None and given.ptr == self.state.positions.ptr:
-            raise InputError("loads is the array that positions are written to; it must be another")
+            raise InputError("loads is the array that positions are written to; it must be another array")
         if self._own_loads is None:
             self._own_loads = (conditions.loads, conditions.has_loads)
         conditions.use_loads(*(self._own_loads if given is None else (given, True)))
@@ -61,25 +61,25 @@ class SharedArrays:
             self._own_loads = None
 
     def use_positions(self, positions: wp.array | None) -> None:
-        """Have steps write the nodal positions [m] to this array, in place of the body's own, and take over from it
-        what is written there between steps.
+        """Let steps write the nodal positions [m] to this array, in place of the body's own, and start from the values
+        that are written there between steps.
 
-        The present positions are written to it at once. ``positions`` then is a view of this array.
+        The current positions are written to it at once. ``positions`` is then a view of this array.
 
         Args:
-            positions: As for ``use_loads``, no two nodes in one place. None for the body's own again.
+            positions: As for ``use_loads``; nodes must not overlap. None restores the body's own array.
 
         Raises:
             InputError: As for ``use_loads``, or nodes overlap.
         """
         given = None if positions is None else vec3_view(self._shared(positions, "positions"))
         if given is not None and abs(given.strides[0]) < wp.types.type_size_in_bytes(wp.vec3):
-            raise InputError(f"positions has {given.strides[0]} bytes from node to node; no two nodes may overlap")
+            raise InputError(f"positions has {given.strides[0]} bytes from node to node; nodes must not overlap")
         if given is not None and given.ptr == self.conditions.loads.ptr:
-            raise InputError("positions is the array that loads are read from; it must be another")
+            raise InputError("positions is the array that loads are read from; it must be another array")
         state = self.state
         if self._own_positions is None:
-            # Only here: an array that somebody takes back may be gone by now.
+            # Only now: the array in use so far may have been freed by its owner.
             state.adopt_positions()
             self._own_positions = state.positions
         state.use_positions(self._own_positions if given is None else given)
@@ -87,25 +87,26 @@ class SharedArrays:
             self._own_positions = None
 
     def check_own_arrays(self) -> None:
-        """See that the body can be remeshed as far as its arrays go.
+        """Check that the body's arrays allow remeshing.
 
         Raises:
-            InputError: Somebody else's array stands in for one of its own.
+            InputError: The body uses another program's array.
         """
         for name, own in (("loads", self._own_loads), ("positions", self._own_positions)):
             if own is not None:
                 raise InputError(
-                    f"{name} is somebody else's array; a body that is remeshed has its own: use_{name}(None)"
+                    f"{name} is another program's array; a remeshed body must have its own: call use_{name}(None)"
                 )
 
     def _shared(self, array: Any, name: str) -> wp.array:
-        """Somebody's array as steps take it: vec4 [worlds * N] if kernels can read it whole, or vec3 with a stride."""
+        """Another program's array in the form for steps: vec4 [worlds * N] if kernels can read it whole, or strided
+        vec3."""
         if self.changing is not None:
-            raise InputError(f"{name} cannot be somebody else's array: the body is remeshed, and its nodes change")
+            raise InputError(f"{name} cannot be another program's array: the body is remeshed, and its nodes change")
         if not isinstance(array, wp.array):
             raise InputError(
                 f"{name} is {type(array).__name__}; it must be a wp.array, "
-                "as wp.from_torch, wp.from_jax and wp.from_dlpack make one"
+                "made for instance by wp.from_torch, wp.from_jax or wp.from_dlpack"
             )
         n = self.sizes.nodes
         wanted = f"vec3 or vec4 [{n}] on {self.device}"
@@ -122,7 +123,7 @@ class SharedArrays:
 
 
 def _vectors(array: wp.array) -> wp.array | None:
-    """An array of vec3 or vec4 as it is, or rows of three or four floats as such; None for any other."""
+    """An array of vec3 or vec4 unchanged, or rows of three or four floats as vectors; None for any other."""
     if array.dtype in (wp.vec3, wp.vec4):
         return array
     size = wp.types.type_size_in_bytes(wp.float32)

@@ -19,6 +19,7 @@ from warp_corot.inputs.device import checked_device
 from warp_corot.kernels.stepping.integrate import RESET_NODES
 from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest
+from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 from .conditions import Conditions
 from .controls import Controls
@@ -36,32 +37,33 @@ if TYPE_CHECKING:
 class SoftBody(Controls, SharedArrays, NodeArrays):
     """The state of one body: displacements, velocities, masses, constraints and loads of its nodes.
 
-    What steps read and write are displacements from rest (``body.state.State`` says why). ``positions`` are published
-    after each run of steps, and positions that you write are taken over before the next.
+    The state variables are displacements from rest (``body.state.State`` says why). ``positions`` are published
+    after each run of steps, and positions that you write are adopted before the next one.
 
     With ``worlds`` there are that many copies of the body, each with its own state, material, loads and fixed nodes,
-    stepped together; they do not meet. Nodal arrays are [worlds * N], world after world, and ``world`` is one's view.
+    stepped together; they do not interact. Nodal arrays are [worlds * N], world after world; ``world`` gives a view of
+    one.
 
     Args:
         mesh: A ``TetForest`` or ``TetMesh``.
         material: Uniform, or with values that broadcast to [worlds, elements]: one per element, [T]; one per world,
             [worlds, 1]; or all, [worlds, T]. Functions of the rest position are evaluated at the elements' centroids.
-        worlds: How many copies.
+        worlds: Number of copies.
         device: "cpu", "cuda:0", …; None for Warp's default.
 
-    A body that is remeshed (``Simulation(…, remesh=…)``) has other nodes after a pass that changed something: ask for
-    ``node_count`` and arrays anew then; views from before raise ``StaleViewError``. Its ``node_`` arrays have as many
-    places as there may ever be nodes, and more; the first ``node_count`` of them count.
+    A body that is remeshed (``Simulation(…, remesh=…)``) has other nodes after a pass that changed the mesh: read
+    ``node_count`` and the arrays again; views from before raise ``StaleViewError``. Its ``node_`` arrays have room for
+    the largest number of nodes, and more; only the first ``node_count`` entries are nodes.
 
     Attributes:
-        worlds, device: As given.
+        worlds, device: The arguments.
         discretization: The mesh and the material on the device.
-        sizes: How many nodes and elements there are.
+        sizes: Numbers of nodes and elements.
         state: Displacements, velocities and forces of the nodes.
         conditions: Supports, loads and active stress.
 
     Raises:
-        InputError: The mesh or the material is something else, the device is not there, a material array does not have
+        InputError: The mesh or the material has another type, the device does not exist, a material array does not have
             one value per element, stiffness, mass or size are beyond the range of float32, or there are more than 2**31
             elements in all.
     """
@@ -72,51 +74,51 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
         self.device = checked_device(device)
         self.discretization: Discretization = FixedMesh(mesh, material, self.worlds, self.device)
         self.sizes = self.discretization.sizes
-        #: What changes the mesh, if anything does.
+        #: The remeshing that changes the mesh, or None.
         self.changing: MeshChanges | None = None
         self.state = State(self.sizes, self.rest_positions, self.device)
         mass = wp.array(self.masses, dtype=wp.float32, device=self.device)
         self.conditions = Conditions(self.discretization, self.state, mass)
         self._views = Views()
-        #: Points that go along with the body.
+        #: Points that follow the body.
         self.bindings: list[FollowingBinding] = []
 
-    # --- what it is made of ----------------------------------------------------------------------------------------
+    # --- parts -----------------------------------------------------------------------------------------------------
 
     @property
     def mesh(self) -> Mesh:
-        """The mesh; of a body that is remeshed the present one."""
+        """The mesh; for a body that is remeshed, the current one."""
         return self.discretization.mesh
 
     @property
     def material(self) -> Any:
-        """The material as given, with values in place of functions; of a body that is remeshed that of the present
+        """The material, with values in place of functions; for a body that is remeshed, that of the current
         elements."""
         return self.discretization.material
 
     @property
     def masses(self) -> npt.NDArray[np.float64]:
-        """Lumped nodal masses [kg], float64 [worlds * N]; zero at nodes that no element names."""
+        """Lumped nodal masses [kg], float64 [worlds * N]; zero at nodes of no element."""
         return self.discretization.masses
 
     def follow_mesh(self, changing: MeshChanges, discretization: Discretization) -> None:
-        """The mesh changes from now on, and is what these say."""
+        """Let the mesh be the one of these arguments, which changes from now on."""
         self.changing, self.discretization = changing, discretization
         self.conditions.discretization = discretization
         self.expire_views()
 
     def expire_views(self) -> None:
-        """Views of the nodes are of a mesh that was, from now on."""
+        """Make views handed out so far stale, because the mesh has changed."""
         self._views.expire()
 
     @property
     def launch_revision(self) -> int:
-        """Changes whenever the launches of a step do, so that steps must be recorded again."""
+        """Changes whenever the launches of a step change, so that steps must be recorded again."""
         return self.conditions.revision + self.state.revision + self.sizes.revision
 
     @property
     def version(self) -> int:
-        """Changes whenever the mesh does; views from before then say that they are stale."""
+        """Changes whenever the mesh does; views from before then raise ``StaleViewError``."""
         return self.sizes.version
 
     # --- state -----------------------------------------------------------------------------------------------------
@@ -130,7 +132,7 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
         """One world's part of the arrays below.
 
         Raises:
-            InputError: There is no such world.
+            InputError: There is no world with this index.
         """
         try:
             number = -1 if isinstance(index, bool) else int(index)
@@ -148,7 +150,7 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
 
     @positions.setter
     def positions(self, values: npt.ArrayLike) -> None:
-        # In float64 and by way of the displacement, so that no digit of what is given is lost.
+        # In float64 and through displacements, so that no digit is lost.
         self.state.set_displacements(self._checked_vectors(values, "positions") - self.rest_positions)
 
     @property
@@ -174,24 +176,59 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
     def reactions(self) -> wp.array:
         """Forces of the supports on fixed and prescribed nodes in the last step [N], vec3 [worlds * N]; zero elsewhere.
 
-        A support carries its node's own weight too. Inertia of a prescribed node is not included.
+        A support also carries the weight of its node. The inertia of a prescribed node is not included.
         """
         return self.nodal_view(self.state.reactions)
 
+    @property
+    def contact_forces(self) -> wp.array:
+        """Contact forces on the nodes in the last step [N], vec3 [worlds * N]: a view of the live array; zero for nodes
+        without contact.
+
+        Raises:
+            InputError: The body is in no simulation with contact.
+        """
+        self._check_touched()
+        return self.nodal_view(self.state.contact_forces)
+
+    @property
+    def contact_pressure(self) -> wp.array:
+        """Contact pressure on ``surface_triangles`` in the last step [Pa], float32 [worlds * F].
+
+        Pressure times area adds up to the force along the normals. The array is live until the mesh changes.
+
+        Raises:
+            InputError: The body is in no simulation with contact.
+        """
+        self._check_touched()
+        return self._views.hand_out(self.state.contact_pressures[:])
+
+    @property
+    def surface_triangles(self) -> npt.NDArray[np.int32]:
+        """The boundary faces of the tetrahedra, on which contact acts: nodes within a world, int32 [F, 3],
+        counter-clockwise seen from outside."""
+        return boundary_faces(self.mesh.tets, self.mesh.points)[0]
+
+    def _check_touched(self) -> None:
+        if not self.state.is_touched:
+            raise InputError(
+                "the body touches nothing; it must be in a Simulation with obstacles or with contact=Contact()"
+            )
+
     def nodal_view(self, array: wp.array) -> wp.array:
-        """One of the nodal arrays as vec3 [worlds * N], live, until the mesh changes."""
+        """A nodal array as a live view, vec3 [worlds * N], valid until the mesh changes."""
         return self._views.hand_out(vec3_view(array[: self.node_count]))
 
     def bind(self, points: npt.ArrayLike, triangles: npt.ArrayLike | None = None) -> DeviceBinding:
-        """Points, or with triangles [F, 3] a surface, that go along with the body, also while it is remeshed.
+        """Bind points, or with triangles [F, 3] a surface, to the body; they follow it, also through remeshing.
 
-        ``update(body.displacements)`` brings what is returned up to date, on the body's device.
+        ``update(body.displacements)`` of the result moves them to the current state, on the body's device.
 
         Args:
             points: Rest positions [m], [n, 3].
 
         Raises:
-            InputError: The mesh is not a forest, the body is in several worlds, or as ``TetForest.bind``.
+            InputError: The mesh is not a forest, the body has several worlds, or as in ``TetForest.bind``.
         """
         from warp_corot.discretization.changing.following import FollowingBinding
 
@@ -205,18 +242,18 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
         return binding
 
     def set_initial_state(self) -> None:
-        """Make the present state the one that ``Simulation.reset`` goes back to; at first that is rest."""
+        """Let ``Simulation.reset`` restore the current state; by default it restores rest."""
         if self.changing is not None:
             self.changing.remember()
         else:
             self.state.remember()
 
     def reset(self, chosen: wp.array, clock: Clock) -> None:
-        """Put chosen worlds back to their initial state; ``Simulation.reset`` does more and is what to call.
+        """Restore the initial state of chosen worlds; users call ``Simulation.reset``, which does more.
 
         Args:
-            chosen: Not zero for worlds to be reset, int32 [worlds].
-            clock: The simulation's.
+            chosen: Nonzero for worlds to be reset, int32 [worlds].
+            clock: The simulation's clock.
         """
         if self.changing is not None:
             self.changing.reset(chosen, clock)
@@ -245,10 +282,10 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
 
 
 def _check_made_of(mesh: Any, material: Any) -> None:
-    """See that a body is made of a mesh and a material.
+    """Check the types of a body's mesh and material.
 
     Raises:
-        InputError: One of them is something else.
+        InputError: One of them has another type.
     """
     if not isinstance(mesh, Mesh):
         cure = "TetMesh(points, tets) makes one of arrays"
@@ -258,4 +295,4 @@ def _check_made_of(mesh: Any, material: Any) -> None:
     if not isinstance(material, Material):
         young = f"{material!r}" if isinstance(material, int | float) else "5e3"
         cure = f"Isotropic(young={young}, poisson=0.45, density=1000.0)"
-        raise InputError(f"material is {shown(material)}; it must be a material such as {cure}")
+        raise InputError(f"material is {shown(material)}; it must be a material, for example {cure}")

@@ -1,4 +1,4 @@
-"""The state of a body's nodes on a device: where they are, how they move, and what acts on them."""
+"""The state of a body's nodes on a device: positions, velocities and forces."""
 
 from __future__ import annotations
 
@@ -14,22 +14,25 @@ from warp_corot.kernels.stepping.integrate import ADOPT_POSITIONS, PUBLISH_POSIT
 class State:
     """Displacements, velocities and forces of nodes, in 16-byte vec4 arrays whose fourth lane is unused.
 
-    A node so is one load and, where the card can, one reduction. The state proper is the displacement from rest, which
-    keeps the digits of small strains: the static end of a linear beam comes out to 1e-6 of its deflection, from float32
-    positions to 4e-6 with the beam at the origin and to 3e-5 with it one metre away.
+    With vec4, a node is one load and, where the GPU supports it, one reduction. The state variable is the displacement
+    from rest, which keeps the digits of small strains: the static end of a linear beam is exact to 1e-6 of its
+    deflection; with float32 positions, to 4e-6 with the beam at the origin and to 3e-5 one metre away.
 
     Args:
-        sizes: How many nodes there are.
+        sizes: Number of nodes.
         rest: Rest positions of the nodes of all worlds [m], [worlds * N, 3].
-        device: Where.
+        device: The device of the arrays.
 
     Attributes:
         rest, positions, displacements, velocities: [m], [m/s], vec4. ``positions`` may be another program's array, of
             vec3 or vec4.
-        forces: What a step adds up [N], zero between steps.
+        forces: The sum of forces within a step [N], zero between steps.
         reactions: Forces of the supports in the last step [N].
-        initial: Displacements and velocities that worlds are reset to; None for rest.
-        revision: Changes whenever ``positions`` is another array.
+        contact_forces: Contact forces in the last step [N]; one entry until the body may have contact.
+        contact_pressures: Contact pressures on the triangles of the surface [Pa], float32; empty until then.
+        is_touched: Whether the body may have contact.
+        initial: Displacements and velocities that a reset restores; None for rest.
+        revision: Changes whenever ``positions`` becomes another array.
     """
 
     def __init__(self, sizes: Sizes, rest: npt.NDArray[np.float64], device: wp.Device):
@@ -37,11 +40,13 @@ class State:
         self.rest = wp.array(padded(rest), dtype=wp.vec4, device=device)
         self.positions = wp.clone(self.rest)
         self.displacements, self.velocities, self.forces, self.reactions = (wp.zeros_like(self.rest) for _ in range(4))
+        self.contact_forces, self.is_touched = wp.zeros(1, dtype=wp.vec4, device=device), False
+        self.contact_pressures = wp.zeros(0, dtype=wp.float32, device=device)
         self.initial: tuple[wp.array, wp.array] | None = None
         self.revision = 0
 
     def move_into(self, rest: wp.array, displacements: wp.array, velocities: wp.array, reactions: wp.array) -> None:
-        """Live in other arrays from now on, vec4 with as many places or more; ``rest`` is there already."""
+        """Use other arrays from now on, vec4 of at least the same size; ``rest`` already has its values."""
         self.adopt_positions()
         for array, own in (
             (displacements, self.displacements),
@@ -52,8 +57,15 @@ class State:
         self.rest, self.displacements, self.velocities, self.reactions = rest, displacements, velocities, reactions
         self.positions, self.forces = wp.clone(rest), wp.zeros_like(displacements)
 
+    def make_contact_forces(self) -> None:
+        """Ensure that there is a contact force for every node of the current mesh."""
+        if len(self.contact_forces) != len(self.displacements):
+            self.contact_forces = wp.zeros_like(self.displacements)
+            self.revision += 1
+        self.is_touched = True
+
     def set_displacements(self, values: npt.NDArray[np.float64]) -> None:
-        """Put the nodes of all worlds where they are displaced by so much [m], [worlds * N, 3]."""
+        """Set the displacements of the nodes of all worlds [m], [worlds * N, 3]."""
         self.displacements[: self.sizes.nodes].assign(padded(values))
         self.publish_positions()
 
@@ -62,7 +74,7 @@ class State:
         self.velocities[: self.sizes.nodes].assign(padded(values))
 
     def adopt_positions(self) -> None:
-        """Take over positions that somebody wrote since they were last published."""
+        """Adopt positions that were written after they were last published."""
         kernel = ADOPT_POSITIONS[self.positions.dtype]
         self._launch(kernel, [self.rest, self.positions], [self.displacements])
 
@@ -79,7 +91,7 @@ class State:
             self.revision += 1
 
     def remember(self) -> None:
-        """Make the present state the one that worlds are reset to."""
+        """Make the current state the one that a reset restores."""
         self.adopt_positions()
         self.initial = (wp.clone(self.displacements), wp.clone(self.velocities))
 

@@ -1,4 +1,4 @@
-"""Motion that nodes are told to make: keyframes of their displacements."""
+"""Prescribed motion of nodes: keyframes of their displacements."""
 
 from __future__ import annotations
 
@@ -14,26 +14,24 @@ from warp_corot.inputs.keys import checked_times
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
-    """Keyframed displacements that a set of nodes follows, on the device.
+class NodeKeyframes:
+    """Keyframed displacements on the host.
 
     Attributes:
-        nodes: int32 [n].
+        nodes: int [n].
         times: float64 [K] [s].
-        displacements: vec3 [K, n], or [K, 1] for all nodes alike [m].
-        host_nodes: ``nodes`` as the host knows them.
+        displacements: float64 [K, n, 3], or [K, 1, 3] for all nodes [m].
     """
 
-    nodes: wp.array
-    times: wp.array
-    displacements: wp.array
-    host_nodes: npt.NDArray[np.int32]
+    nodes: npt.NDArray[np.integer]
+    times: npt.NDArray[np.float64]
+    displacements: npt.NDArray[np.float64]
 
     @classmethod
-    def of_keys(
-        cls, nodes: np.ndarray, times: npt.ArrayLike | None, displacements: npt.ArrayLike | None, device: wp.Device
-    ) -> Trajectory:
-        """From keyframes as ``SoftBody.prescribe`` takes them.
+    def checked(
+        cls, nodes: npt.NDArray[np.integer], times: npt.ArrayLike | None, displacements: npt.ArrayLike | None
+    ) -> NodeKeyframes:
+        """Make keyframes from the arguments of ``SoftBody.prescribe``.
 
         Raises:
             InputError: One of the two is missing, wrong shapes, times that do not increase, or non-finite values.
@@ -46,25 +44,46 @@ class Trajectory:
             raise InputError(
                 f"displacements has shape {d.shape}; it must be finite, [{len(t)}, 3] or [{len(t)}, {len(nodes)}, 3]"
             )
-        return cls(
-            wp.array(nodes, dtype=wp.int32, device=device),
-            wp.array(t, dtype=wp.float64, device=device),
-            wp.array(d.reshape(len(t), -1, 3), dtype=wp.vec3, device=device),
-            np.asarray(nodes, np.int32),
+        return cls(nodes, t, d.reshape(len(t), -1, 3))
+
+    def on(self, device: wp.Device) -> Trajectory:
+        """Copy the keyframes to a device."""
+        return Trajectory(
+            wp.array(self.nodes, dtype=wp.int32, device=device),
+            wp.array(self.times, dtype=wp.float64, device=device),
+            wp.array(self.displacements, dtype=wp.vec3, device=device),
+            np.asarray(self.nodes, np.int32),
         )
 
-    def in_place_of(self, former: Trajectory) -> Trajectory | None:
-        """The same keyframes in the arrays of former ones; None unless those are of the same nodes and as many."""
-        if self.displacements.shape != former.displacements.shape or len(self.times) != len(former.times):
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Keyframed displacements that a set of nodes follows, on the device.
+
+    Attributes:
+        nodes: int32 [n].
+        times: float64 [K] [s].
+        displacements: vec3 [K, n], or [K, 1] for all nodes [m].
+        host_nodes: A copy of ``nodes`` on the host.
+    """
+
+    nodes: wp.array
+    times: wp.array
+    displacements: wp.array
+    host_nodes: npt.NDArray[np.int32]
+
+    def rewritten(self, keys: NodeKeyframes) -> Trajectory | None:
+        """Write other keyframes into these arrays; None unless they have the same nodes and as many times."""
+        if self.displacements.shape != keys.displacements.shape[:2] or len(self.times) != len(keys.times):
             return None
-        if not np.array_equal(self.host_nodes, former.host_nodes):
+        if not np.array_equal(self.host_nodes, keys.nodes):
             return None
-        wp.copy(former.times, self.times)
-        wp.copy(former.displacements, self.displacements)
-        return replace(former)
+        self.times.assign(keys.times)
+        self.displacements.assign(keys.displacements.astype(np.float32))
+        return replace(self)
 
     def keys(self) -> tuple[np.ndarray, np.ndarray]:
-        """Times and displacements as ``of_keys`` takes them."""
+        """Times and displacements as arguments for ``NodeKeyframes.checked``."""
         d = self.displacements.numpy()
         return self.times.numpy(), d[:, 0] if d.shape[1] == 1 else d
 
@@ -79,4 +98,4 @@ class Trajectory:
         if not len(nodes):
             return None
         kept = d[:, 0] if d.shape[1] == 1 else d
-        return Trajectory.of_keys(nodes, self.times.numpy(), kept, self.nodes.device)
+        return NodeKeyframes.checked(nodes, self.times.numpy(), kept).on(self.nodes.device)

@@ -1,4 +1,4 @@
-"""Views of nodal arrays, which hold as long as the mesh stays the same and say so afterwards."""
+"""Views of nodal arrays, which are valid while the mesh stays the same and raise an error afterwards."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ class Views:
         self._arrays: weakref.WeakSet[wp.array] = weakref.WeakSet()
 
     def hand_out(self, view: wp.array) -> wp.array:
-        """The same view; ``expire`` will find it."""
+        """Return the same view, registered for ``expire``."""
         self._arrays.add(view)
         return view
 
     def expire(self) -> None:
-        """From now on, whatever is done with these views is an error."""
+        """Make every use of these views an error from now on."""
         for view in tuple(self._arrays):
             view.__class__ = _StaleView
         self._arrays.clear()
 
 
 class _StaleView(wp.array):
-    """What a view becomes when its nodes are no longer the body's."""
+    """A view whose nodes the body no longer has."""
 
     _PLAIN = frozenset({"__class__", "__dict__", "__del__", "__init__", "__repr__", "__str__", "__hash__", "_PLAIN"})
 
@@ -48,9 +48,9 @@ class _StaleView(wp.array):
         return len(self.shape)
 
     def __repr__(self) -> str:
-        return "<a view of a body's mesh as it was>"
+        return "<a view of a former mesh of a body>"
 
     __str__ = __repr__
 
     def __del__(self) -> None:
-        """A view owns no memory."""
+        """Do nothing: a view owns no memory."""

@@ -1,4 +1,4 @@
-"""One of several copies of a body side by side."""
+"""One of several copies of a body."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """One copy's part of a body's arrays: views, so that what is written to them is the body's state.
+    """One copy's part of a body's arrays, as views: writing to them changes the body's state.
 
     Attributes:
         body: The body.
-        index: Which copy, from 0.
+        index: Index of the copy, from 0.
     """
 
     body: SoftBody
@@ -25,13 +25,13 @@ class World:
 
     @property
     def nodes(self) -> slice:
-        """Where the copy's nodes are among the body's."""
+        """The range of the copy's nodes among the body's."""
         count = self.body.world_node_count
         return slice(self.index * count, (self.index + 1) * count)
 
     @property
     def elements(self) -> slice:
-        """Where the copy's elements are among the body's."""
+        """The range of the copy's elements among the body's."""
         count = self.body.world_element_count
         return slice(self.index * count, (self.index + 1) * count)
 
@@ -42,7 +42,7 @@ class World:
 
     @property
     def displacements(self) -> wp.array:
-        """As ``SoftBody.displacements`` [m], vec3 [N] of one copy: itself a copy, not a view."""
+        """As ``SoftBody.displacements`` [m], vec3 [N] of one copy: a copy of the values, not a view."""
         return self._own(self.body.displacements)
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -13,12 +13,13 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import check_float32
 from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial, vec9
+from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.materials.anisotropic import Anisotropic
 from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest
 
 from .clock import Clock
-from .elements import Mesh, device_elements, element_kind, in_worlds, parts, with_targets
+from .elements import ElementKind, Elements, Mesh, device_elements, element_kind, in_worlds, parts, with_targets
 from .levels import Levels, TreeNodes
 from .plan import ForcePlan, Plan, Units
 from .sizes import Sizes
@@ -48,8 +49,8 @@ class Discretization(ABC):
     worlds: int
     device: wp.Device
     sizes: Sizes
-    element_kind: Any
-    elements: Any
+    element_kind: ElementKind
+    elements: Elements
     fill: npt.NDArray[np.float64] | None
     lame: tuple[wp.array, wp.array, int]
     mu: wp.array
@@ -99,7 +100,7 @@ class Discretization(ABC):
             InputError: A general mesh, which has no tree.
         """
         if self._levels is None or self._levels.version != self.sizes.version:
-            self._levels = Levels(self._tree_nodes(), self.elements, self.sizes)
+            self._levels = Levels(self._tree_nodes(), cast("ForestElements", self.elements), self.sizes)
         return self._levels
 
     @abstractmethod

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import warp as wp
 
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements
-from warp_corot.kernels.tables.shapes import FRAME_SHIFT, MIRROR_BIT
+from warp_corot.kernels.tables.shapes import FRAME_SHIFT, GRADIENT, MIRROR_BIT, SQRT2
 from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.forest import LATTICE_BITS
 
 Mesh = TetForest | TetMesh
+#: Structs of elements, and their kinds.
+Elements: TypeAlias = "ForestElements | GeneralElements"
+ElementKind: TypeAlias = type
+
+E = TypeVar("E", bound="ForestElements | GeneralElements")
 
 PART = 1 << 16
 
@@ -23,19 +28,19 @@ def parts(count: int) -> Iterator[slice]:
     return (slice(start, min(start + PART, count)) for start in range(0, count, PART))
 
 
-def element_kind(mesh: Mesh) -> Any:
+def element_kind(mesh: Mesh) -> ElementKind:
     """The Warp struct that holds a mesh's elements: ``ForestElements`` or ``GeneralElements``."""
     return ForestElements if isinstance(mesh, TetForest) else GeneralElements
 
 
-def device_elements(mesh: Mesh, device: wp.Device, worlds: int = 1) -> Any:
+def device_elements(mesh: Mesh, device: wp.Device, worlds: int = 1) -> Elements:
     """The mesh's elements as an instance of its ``element_kind`` on ``device``, world after world."""
     if isinstance(mesh, TetForest):
         return _forest_elements(mesh, mesh.tets, mesh.levels, device, worlds)
     return general_elements(mesh, device, worlds)
 
 
-def forest_elements(forest: TetForest, chosen: np.ndarray, device: wp.Device, worlds: int = 1) -> Any:
+def forest_elements(forest: TetForest, chosen: np.ndarray, device: wp.Device, worlds: int = 1) -> ForestElements:
     """Any tetrahedra of the tree, leaves or ancestors, as forest elements.
 
     Args:
@@ -66,15 +71,17 @@ def repeated(values: np.ndarray, worlds: int) -> np.ndarray:
     return values if worlds == 1 else np.tile(values, (worlds, *[1] * (values.ndim - 1)))
 
 
-def with_targets(elements: Any, targets: np.ndarray) -> Any:
+def with_targets(elements: E, targets: np.ndarray) -> E:
     """The same elements with their forces added elsewhere, int32 [T, 4]."""
-    other = type(elements)()
+    other: Any = type(elements)()
     other.assign(elements)
     other.targets = wp.array(targets, dtype=wp.vec4i, device=elements.nodes.device)
     return other
 
 
-def _forest_elements(forest: TetForest, tets: np.ndarray, level: np.ndarray, device: wp.Device, worlds: int) -> Any:
+def _forest_elements(
+    forest: TetForest, tets: np.ndarray, level: np.ndarray, device: wp.Device, worlds: int
+) -> ForestElements:
     code, frames = shape_codes(forest.lattice, tets, level)
     elements = ForestElements()
     elements.nodes = wp.array(in_worlds(tets, worlds, len(forest.points)), dtype=wp.vec4i, device=device)
@@ -85,14 +92,10 @@ def _forest_elements(forest: TetForest, tets: np.ndarray, level: np.ndarray, dev
     return elements
 
 
-# The columns of an element's frame as sums of its nodes' positions over h, by type, and as powers of three by column.
-_COLUMNS = np.array(
-    [
-        [[-1, 1, 0, 0], [0, -1, 1, 0], [0, 0, -1, 1]],
-        [[-1, 1, 0, 0], [0, -1, 1, 0], [-1, 0, -1, 2]],
-        [[2, 0, -2, 0], [0, 2, -2, 0], [0, 0, -2, 2]],  # the two diagonals without their root: entries of -1, 0, 1
-    ]
-)
+# The columns of an element's frame as sums of its nodes' positions over h, by type. For type 2 the two diagonals are
+# without their root, so that all frames have entries of -1, 0 and 1.
+_COLUMNS = np.array(GRADIENT)
+_COLUMNS[2, :2] *= SQRT2
 _KEYS = 3**9
 
 
@@ -121,7 +124,7 @@ def frame_keys(lattice: np.ndarray, tets: np.ndarray, level: np.ndarray) -> np.n
     # A frame's nine entries of -1, 0, 1 are the digits of one number, a weighted sum of one number for each node. Those
     # wrap around in 32 bits, but their sum does not: it is at most 2**16 * 3**9 / 2.
     place = lattice @ np.array([1, 27, 729], np.int32)
-    weights = (np.array([1, 3, 9]) @ _COLUMNS).astype(np.int32)
+    weights = np.rint(np.array([1, 3, 9]) @ _COLUMNS).astype(np.int32)
     key = np.empty(len(tets), np.int32)
     for part in parts(len(tets)):
         kind, halvings = level[part] % 3, level[part] // 3
@@ -141,7 +144,7 @@ def frame_table(used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return bits, frames
 
 
-def general_elements(mesh: TetMesh, device: wp.Device, worlds: int = 1) -> Any:
+def general_elements(mesh: TetMesh, device: wp.Device, worlds: int = 1) -> GeneralElements:
     """Elements of a general mesh, with the inverse of their rest matrix."""
     x = mesh.points[mesh.tets]
     rest = np.swapaxes(x[:, 1:] - x[:, :1], 1, 2)

@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.errors import InputError
+from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.meshing.growth import gather_flagged
 from warp_corot.kernels.plan import levels as kernels
 from warp_corot.kernels.plan.transfer import average_ends, gather_midpoints
@@ -94,7 +95,7 @@ class Levels:
             [2 * (M - starts[1])].
     """
 
-    def __init__(self, tree: TreeNodes, elements: Any, sizes: Sizes):
+    def __init__(self, tree: TreeNodes, elements: ForestElements, sizes: Sizes):
         self.device, self.worlds, self.version = tree.lattice.device, sizes.worlds, sizes.version
         self.mesh_nodes = tree.mesh_nodes
         self.others, numbers = self._find_others(tree)

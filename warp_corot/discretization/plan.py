@@ -9,15 +9,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.mesh import TetForest
 
-from .elements import device_elements, forest_elements, in_worlds, with_targets
+from .elements import Elements, device_elements, forest_elements, in_worlds, with_targets
 from .slots import Slots
 from .subtrees import Batch, Sharing, chosen, in_batches
 
@@ -34,12 +35,12 @@ class Units:
         unit: Which of them each of the mesh's elements uses, int32 [T].
     """
 
-    elements: Any
+    elements: Elements
     count: int
     unit: wp.array
 
     @classmethod
-    def own(cls, elements: Any, count: int) -> Units:
+    def own(cls, elements: Elements, count: int) -> Units:
         """Each element by itself."""
         return cls(elements, count, wp.array(np.arange(count), dtype=wp.int32, device=elements.nodes.device))
 
@@ -67,9 +68,9 @@ class FlatLeaves:
     """
 
     leaves: wp.array
-    elements: Any
+    elements: Elements
     unit: wp.array | None = None
-    general: Any = None
+    general: GeneralElements | None = None
     material: tuple[wp.array, wp.array] | None = None
 
     def __len__(self) -> int:
@@ -107,7 +108,7 @@ class Plan(Protocol):
     """
 
     @property
-    def elements(self) -> Any: ...
+    def elements(self) -> Elements: ...
 
     @property
     def batches(self) -> tuple[Batch, ...]: ...
@@ -145,7 +146,7 @@ class ForcePlan:
         find_units: Makes ``all_units`` of a forest whose rotations are shared.
     """
 
-    elements: Any
+    elements: Elements
     batches: tuple[Batch, ...]
     flat: FlatLeaves
     units: Units | None = None
@@ -164,7 +165,7 @@ class ForcePlan:
 
     @classmethod
     def leaf_by_leaf(
-        cls, elements: Any, slots: Slots | None = None, find_units: Callable[[], Units] | None = None
+        cls, elements: Elements, slots: Slots | None = None, find_units: Callable[[], Units] | None = None
     ) -> ForcePlan:
         """The plan of a field that goes through the elements of a mesh one by one."""
         none = wp.empty(0, dtype=wp.int32, device=elements.nodes.device)
@@ -178,7 +179,7 @@ class ForcePlan:
         device: wp.Device,
         *,
         worlds: int = 1,
-        elements: Any = None,
+        elements: Elements | None = None,
         grouped: bool | None = None,
         deterministic: bool = False,
     ) -> ForcePlan:

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.kernels.elements.elements import Subtrees
+from warp_corot.kernels.elements.elements import ForestElements, Subtrees
 from warp_corot.kernels.tables.subtree import GROUP_NODES, LEAVES, group_leaves, group_nodes
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.tree import UniformTree
@@ -55,8 +54,8 @@ class Batch:
     grouped: bool
     count: int
     sharing: Sharing
-    subtrees: Any
-    roots: Any
+    subtrees: Subtrees
+    roots: ForestElements | None
     unit: wp.array | None
     flagged: wp.array
 

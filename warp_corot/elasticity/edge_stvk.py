@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from warp_corot.discretization.discretization import discretization_of
 from warp_corot.errors import InputError
-from warp_corot.kernels.elements.constitutive import stvk_cauchy
-from warp_corot.kernels.elements.forces import element_von_mises
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, stvk_cauchy
+from warp_corot.kernels.elements.forces import element_von_mises, law_value
 from warp_corot.kernels.elements.spring_stiffness import edge_stvk_differential
 from warp_corot.kernels.elements.springs import edge_stvk_energies, scatter_edge_stvk
 
@@ -40,7 +40,7 @@ class EdgeStVK(Model):
             discretization,
             forces=scatter_edge_stvk(kind, biquadratic),
             energies=edge_stvk_energies(kind, biquadratic),
-            von_mises=element_von_mises(kind, stvk_cauchy),
+            von_mises=element_von_mises(kind, IsotropicMaterial, law_value(stvk_cauchy)),
             differential=edge_stvk_differential(biquadratic),
             deterministic=deterministic,
         )

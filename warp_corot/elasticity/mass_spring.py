@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from warp_corot.discretization.discretization import Discretization, Discretized, discretization_of
+from warp_corot.discretization.clusters.single import isotropic_material
+from warp_corot.discretization.discretization import discretization_of
 from warp_corot.discretization.elements import in_worlds, repeated
 from warp_corot.discretization.plan import Plan
 from warp_corot.discretization.slots import Slots
-from warp_corot.kernels.elements.constitutive import stvk_cauchy
-from warp_corot.kernels.elements.forces import element_von_mises
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, stvk_cauchy
+from warp_corot.kernels.elements.forces import element_von_mises, law_value
 from warp_corot.kernels.elements.spring_stiffness import add_mass_spring_diagonal, add_mass_spring_product
 from warp_corot.kernels.elements.springs import mass_spring_energies, scatter_mass_spring
 from warp_corot.kernels.tables.shapes import EDGES
@@ -21,7 +22,8 @@ from warp_corot.kernels.tables.shapes import EDGES
 from .model import ForceField, Model
 
 if TYPE_CHECKING:
-    from warp_corot.discretization.discretization import Discretization, Discretized
+    from warp_corot.discretization.clusters.single import isotropic_material
+from warp_corot.discretization.discretization import Discretization, Discretized
 
 
 @dataclass(frozen=True)
@@ -79,9 +81,9 @@ class MassSpringField(ForceField):
         self._stiffness = wp.array(stiffness, dtype=wp.float32, device=self.device)
         # Lamé's parameters of E and nu = 1/4 are both 0.4 E.
         lame = 0.4 * (young if young.size == 1 else np.broadcast_to(young, (worlds, len(tets))))
-        self._lame = wp.array(lame.ravel(), dtype=wp.float32, device=self.device)
-        self._lame_stride = int(lame.size > 1)
-        self._von_mises = element_von_mises(discretization.element_kind, stvk_cauchy)
+        on_device = wp.array(lame.ravel(), dtype=wp.float32, device=self.device)
+        self._hooke = isotropic_material([on_device, on_device, int(lame.size > 1)])
+        self._von_mises = element_von_mises(discretization.element_kind, IsotropicMaterial, law_value(stvk_cauchy))
 
     @property
     def energy_count(self) -> int:
@@ -104,5 +106,4 @@ class MassSpringField(ForceField):
         self.launch(mass_spring_energies, len(self._edges), inputs, [energies])
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
-        inputs = [self.elements, self._lame, self._lame, self._lame_stride, u]
-        self.launch(self._von_mises, self.element_count, inputs, [stress])
+        self.launch(self._von_mises, self.element_count, [self.elements, self._hooke, u], [stress])

@@ -13,12 +13,21 @@ import warp as wp
 
 from warp_corot.discretization.clusters.single import isotropic_material
 from warp_corot.discretization.discretization import Discretization, Discretized, discretization_of
-from warp_corot.discretization.plan import Plan
+from warp_corot.discretization.plan import FlatLeaves, Plan
+from warp_corot.discretization.subtrees import chosen
 from warp_corot.errors import InputError
-from warp_corot.kernels.elements.forces import element_energies, element_von_mises, scatter_forces
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.forces import (
+    element_energies,
+    element_von_mises,
+    law_stress,
+    law_value,
+    scatter_forces,
+)
 from warp_corot.kernels.elements.stiffness_products import law_differential
 
 from .stiffness import ElementStiffness
+from .structs import Kept
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
@@ -53,6 +62,7 @@ class ForceField(ABC):
         self.device = discretization.device
         #: On the CPU there is one thread, and nothing to settle.
         self.deterministic = deterministic and discretization.device.is_cuda
+        self._isotropic = Kept(lambda *values: isotropic_material(list(values)))
         self.plan = self.plan_of(discretization)
         self.elements, self.slots = self.plan.elements, self.plan.slots
 
@@ -174,14 +184,24 @@ class ForceField(ABC):
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
     @property
-    def material_inputs(self) -> list:
-        """The kernel arguments mu, lam and stride for forces and energies: those of what elements hold of the body."""
-        return [self.discretization.mu, self.discretization.lam, self.discretization.material_stride]
+    def isotropic(self) -> IsotropicMaterial:
+        """Lamé's parameters for forces and energies: those of what elements hold of the body."""
+        discretization = self.discretization
+        return self._isotropic(discretization.mu, discretization.lam, discretization.material_stride)
 
     @property
-    def stress_inputs(self) -> list:
+    def isotropic_shown(self) -> IsotropicMaterial:
         """The same for stresses: those of the material."""
-        return list(self.discretization.lame)
+        return isotropic_material(list(self.discretization.lame))
+
+    def isotropic_of(self, flat: FlatLeaves) -> IsotropicMaterial:
+        """Lamé's parameters for the forces of leaves that are in no subtree."""
+        if flat.material is not None:
+            return isotropic_material([*flat.material, 1])
+        if self.discretization.material_stride == 0 or not len(flat):
+            return self.isotropic
+        own = [chosen(values, flat.leaves) for values in (self.discretization.mu, self.discretization.lam)]
+        return isotropic_material([*own, 1])
 
 
 class Model(ABC):
@@ -241,19 +261,19 @@ class ElementField(ForceField):
         self._von_mises = von_mises
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        self.launch(self._forces, self.element_count, [self.elements, *self.material_inputs, u], [f])
+        self.launch(self._forces, self.element_count, [self.elements, self.isotropic, u], [f])
 
     def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None:
-        self._stiffness.add_product(self.elements, isotropic_material(self.material_inputs), u, p, y)
+        self._stiffness.add_product(self.elements, self.isotropic, u, p, y)
 
     def add_diagonal(self, u: wp.array, blocks: wp.array) -> None:
-        self._stiffness.add_diagonal(self.elements, isotropic_material(self.material_inputs), u, blocks)
+        self._stiffness.add_diagonal(self.elements, self.isotropic, u, blocks)
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
-        self.launch(self._energies, self.element_count, [self.elements, *self.material_inputs, u], [energies])
+        self.launch(self._energies, self.element_count, [self.elements, self.isotropic, u], [energies])
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
-        self.launch(self._von_mises, self.element_count, [self.elements, *self.stress_inputs, u], [stress])
+        self.launch(self._von_mises, self.element_count, [self.elements, self.isotropic_shown, u], [stress])
 
 
 class LawField(ElementField):
@@ -278,8 +298,8 @@ class LawField(ElementField):
         super().__init__(
             body,
             deterministic=deterministic,
-            forces=scatter_forces(kind, stress),
-            energies=element_energies(kind, energy),
-            von_mises=element_von_mises(kind, cauchy),
+            forces=scatter_forces(kind, IsotropicMaterial, law_stress(stress)),
+            energies=element_energies(kind, IsotropicMaterial, law_value(energy)),
+            von_mises=element_von_mises(kind, IsotropicMaterial, law_value(cauchy)),
             differential=law_differential(differential),
         )

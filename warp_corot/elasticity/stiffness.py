@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeAlias
 
 import warp as wp
 
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.discretization.elements import Elements
+from warp_corot.kernels.corotated.anisotropic import FibreMaterial
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.stiffness_products import add_stiffness_diagonal, add_stiffness_product
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
+
+
+#: Structs of materials.
+ElementMaterial: TypeAlias = "IsotropicMaterial | RotatedMaterial | FibreMaterial"
 
 
 @dataclass(frozen=True)
@@ -26,14 +32,14 @@ class ElementStiffness:
 
     discretization: Discretization
     differential: wp.Function
-    Material: Any = IsotropicMaterial
+    Material: type = IsotropicMaterial
 
-    def add_product(self, elements: Any, material: Any, u: wp.array, p: wp.array, y: wp.array) -> None:
+    def add_product(self, elements: Elements, material: ElementMaterial, u: wp.array, p: wp.array, y: wp.array) -> None:
         """y += K(u) p."""
         kernel = add_stiffness_product(self.discretization.element_kind, self.Material, self.differential)
         self._launch(kernel, 1, [elements, material, u, p], y)
 
-    def add_diagonal(self, elements: Any, material: Any, u: wp.array, blocks: wp.array) -> None:
+    def add_diagonal(self, elements: Elements, material: ElementMaterial, u: wp.array, blocks: wp.array) -> None:
         """Add the diagonal blocks of K(u), mat33 a node."""
         kernel = add_stiffness_diagonal(self.discretization.element_kind, self.Material, self.differential)
         self._launch(kernel, 4, [elements, material, u], blocks)

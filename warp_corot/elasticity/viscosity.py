@@ -23,6 +23,9 @@ class Viscosity:
         seconds: Viscosities over Lamé's parameters [s].
     """
 
+    #: It takes energy out of the body and never puts any in.
+    is_dissipative = True
+
     def __init__(self, body: SoftBody, field: ForceField, seconds: float):
         self.body, self.field, self.seconds = body, field, seconds
         self._kernel = scatter_viscous(body.discretization.element_kind)
@@ -42,13 +45,6 @@ class Viscosity:
         slots.gather(f)
 
     def _launch(self, elements: object, f: wp.array) -> None:
-        body = self.body
-        inputs = [
-            elements,
-            self.seconds,
-            body.discretization.mu,
-            body.discretization.lam,
-            body.discretization.material_stride,
-        ]
-        inputs += [body.state.displacements, body.state.velocities]
-        wp.launch(self._kernel, self.field.element_count, inputs, [f], device=body.device)
+        state = self.body.state
+        inputs = [elements, self.seconds, self.field.isotropic, state.displacements, state.velocities]
+        wp.launch(self._kernel, self.field.element_count, inputs, [f], device=self.body.device)

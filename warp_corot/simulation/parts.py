@@ -9,10 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.options import Contact
+from warp_corot.contact.shapes import Shape
+from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.elasticity import Model
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_things
-from warp_corot.solvers import Integrator
+from warp_corot.inputs.checks import checked_things, shown
+from warp_corot.solvers import Integrator, Stepper
+from warp_corot.solvers.system import System
 
 
 def checked_bodies(given: SoftBody | Sequence[SoftBody]) -> tuple[SoftBody, ...]:
@@ -61,6 +65,32 @@ def checked_integrator(given: Any) -> Integrator:
     if not isinstance(given, Integrator):
         raise InputError(f"integrator is {given!r}; it must be an integrator such as SymplecticEuler()")
     return given
+
+
+def checked_contact(
+    obstacles: Obstacle | Sequence[Obstacle], contact: Contact | None
+) -> tuple[tuple[Obstacle, ...], Contact] | None:
+    """What bodies touch, and how; None if nothing touches.
+
+    Raises:
+        InputError: Something that is no obstacle, or no ``Contact``.
+    """
+    given = checked_things(obstacles, Shape | Tool, "an obstacle", "a shape such as Ground() or a Tool")
+    if contact is not None and not isinstance(contact, Contact):
+        raise InputError(f"contact is {shown(contact)}; it must be a Contact, such as Contact(friction=0.3)")
+    if not given and contact is None:
+        return None
+    return given, Contact() if contact is None else contact
+
+
+def check_constraints(system: System, stepper: Stepper, integrator: Integrator) -> None:
+    """See that steps answer to what the bodies touch.
+
+    Raises:
+        InputError: The integrator does not.
+    """
+    if system.constraints and not stepper.resolves_constraints:
+        raise InputError(f"{type(integrator).__name__} knows no contact; it must be SymplecticEuler")
 
 
 def checked_gravity(gravity: npt.ArrayLike | None, up_axis: str) -> tuple[float, float, float]:

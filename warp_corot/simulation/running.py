@@ -123,6 +123,8 @@ class Running:
     def _run(self, most: int, end: float | None) -> bool:
         """Make steps until something is due, and do it; whether the end is reached."""
         sim = self._sim
+        if not sim.guard.has_begun and sim.contact is not None:
+            sim.contact.check_start()
         if sim.guard.begin() and sim.safe_step is not None:
             sim.pace.take_given()
         done = sim.steps
@@ -269,6 +271,11 @@ class Running:
             UnstableError: The step was given, or no shorter one helps.
         """
         sim = self._sim
+        if fault.is_want_of_room:
+            sim.guard.go_back()
+            for constraint in sim.system.constraints:
+                constraint.grow()
+            return
         if sim.safe_step is None or self._returns >= MOST_RETURNS:
             self._returns = 0
             sim.guard.forget()

@@ -13,10 +13,14 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.contacts import Contacts
+from warp_corot.contact.options import Contact
+from warp_corot.contact.reading import ContactPoint, contact_points
+from warp_corot.contact.tool import Obstacle
 from warp_corot.discretization.nodal import vec3_view
 from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import InputError, StabilityWarning, depth_of_user
-from warp_corot.inputs.checks import checked_count, checked_number, refuse_tape
+from warp_corot.inputs.checks import checked_count, checked_number, refuse_tape, shown
 from warp_corot.inputs.indices import checked_indices
 from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.remesh.remeshing import Remeshing
@@ -25,10 +29,17 @@ from warp_corot.solvers.guarding.guard import Guard
 from warp_corot.solvers.recorded import RecordedSteps, Segment
 from warp_corot.solvers.steps.pace import Pace
 from warp_corot.solvers.steps.safe_step import ANY_STEP, SafeStep
-from warp_corot.solvers.system import NEVER, System
+from warp_corot.solvers.system import NEVER, Forces, System
 
 from .energy import Energy, WorldEnergies, find_energies
-from .parts import checked_bodies, checked_gravity, checked_integrator, checked_models
+from .parts import (
+    check_constraints,
+    checked_bodies,
+    checked_contact,
+    checked_gravity,
+    checked_integrator,
+    checked_models,
+)
 from .running import Running
 
 
@@ -42,7 +53,7 @@ class Simulation:
     """One or several soft bodies, stepped together.
 
     Args:
-        bodies: A ``SoftBody`` or several on one device; they do not touch one another.
+        bodies: A ``SoftBody`` or several on one device.
         model: Elastic model, or one for each body.
         integrator: Time integrator. With ``dt=None`` the step follows the state: it is measured again during the run,
             and a state that goes wrong all the same is made again with half the step. A step that is given stays, and a
@@ -52,6 +63,9 @@ class Simulation:
             forces are then added up in one order, which takes time and memory (``benchmarks/README.md``).
         remesh: How the bodies' meshes follow their motion; for several bodies also one each, None for those that stay
             as they are.
+        obstacles: Rigid things that bodies touch: shapes such as ``Ground`` and ``Box`` where they are, and tools,
+            which move.
+        contact: How things touch; None: as ``Contact()`` if there are obstacles, else nothing touches.
 
     Attributes:
         bodies: Tuple of the bodies.
@@ -63,7 +77,7 @@ class Simulation:
         InputError: No body, one given twice, bodies on different devices or of different numbers of worlds, a number of
             models that is not the number of bodies, a body of which no node is free to move, non-finite gravity, a
             model that does not go with its mesh, something that is none of these, or bodies that cannot be remeshed as
-            asked (see ``OnlineRemesh``).
+            asked (see ``OnlineRemesh``); obstacles that are none, or an integrator that knows no contact.
 
     Warns:
         StabilityWarning: The given step is larger than ``stable_dt``.
@@ -79,6 +93,8 @@ class Simulation:
         gravity: npt.ArrayLike | None = None,
         deterministic: bool = False,
         remesh: OnlineRemesh | Sequence[OnlineRemesh | None] | None = None,
+        obstacles: Obstacle | Sequence[Obstacle] = (),
+        contact: Contact | None = None,
     ):
         self.bodies = checked_bodies(bodies)
         self.device, self.worlds = self.bodies[0].device, self.bodies[0].worlds
@@ -94,14 +110,23 @@ class Simulation:
         self.time_before_reset = 0.0
         self.steps_before_reset = 0
         self._hooks: list[_Hook] = []
-        stable = self._find_stable_steps()
         given = self.integrator.dt
         self.pace = Pace(ANY_STEP if given is None else float(given), self.device)
         self.system = System(self.bodies, self.fields, self.pace, self.gravity)
+        stable = self._find_stable_steps()
+        touching = checked_contact(obstacles, contact)
+        #: What keeps bodies out of obstacles and of one another; None where nothing touches.
+        self.contact: Contacts | None = None
+        if touching is not None:
+            self.contact = Contacts(
+                self.system, *touching, stable_dt=self.stable_dt, dt=given, deterministic=self.deterministic
+            )
+            self.system.constraints.append(self.contact)
         #: What chooses the step, if none was given.
         self.safe_step = SafeStep(self.system, self.models, stable) if given is None else None
         self.guard = Guard(self.system)
         stepper = self.integrator.bind(self.system)
+        check_constraints(self.system, stepper, self.integrator)
         self.recorded = RecordedSteps(self.system, stepper, self.guard, self.safe_step)
         #: What is to be kept besides the states of bodies and fields for a run to go on as it would have.
         self.kept = self.pace.state | ({} if self.safe_step is None else self.safe_step.state)
@@ -257,6 +282,8 @@ class Simulation:
         for body, field in zip(self.bodies, self.fields, strict=True):
             body.reset(chosen, self.pace)
             field.reset(chosen)
+        for constraint in self.system.constraints:
+            constraint.reset(chosen)
         self._control_step()
 
     # --- looking ---------------------------------------------------------------------------------------------------
@@ -281,6 +308,10 @@ class Simulation:
         chosen = self._index(body)
         self.bodies[chosen].state.adopt_positions()
         return self.fields[chosen].von_mises(self.bodies[chosen].state.displacements)
+
+    def contacts(self) -> list[ContactPoint]:
+        """Where bodies were touched in the last step, with normals, gaps and forces; waits for the device."""
+        return [] if self.contact is None else contact_points(self.contact)
 
     # --- keeping ---------------------------------------------------------------------------------------------------
 
@@ -322,7 +353,8 @@ class Simulation:
     def _find_stable_steps(self) -> list[float]:
         """The largest stable step of each body at rest [s], of which ``stable_dt`` is the smallest."""
         frequencies = [largest_frequency(body, f) for body, f in zip(self.bodies, self.fields, strict=True)]
-        steps = [self.integrator.stable_step(frequency) for frequency in frequencies]
+        added = sum(getattr(each, "curvature", 0.0) for each in self.system.forces)
+        steps = [self.integrator.stable_step(math.sqrt(frequency**2 + added)) for frequency in frequencies]
         self.stable_dt = min(steps)
         given = self.integrator.dt
         if given is not None and float(given) > self.stable_dt:
@@ -332,6 +364,33 @@ class Simulation:
                 stacklevel=depth_of_user(),
             )
         return steps
+
+    def add_forces(self, forces: Forces) -> None:
+        """Have something besides elasticity push the nodes from the next step on, as a part of every recorded step.
+
+        Its work counts in the balance of energy. If it has a number ``curvature``, the most that its stiffness over
+        a node's mass can be [1/s^2], the stable step is found again with it.
+
+        Args:
+            forces: Something with a method ``add_forces``; see ``solvers.system.Forces``.
+
+        Raises:
+            InputError: Something else, or a curvature that is negative or not finite.
+
+        Warns:
+            StabilityWarning: The given step is larger than the stable one now.
+        """
+        if not callable(getattr(forces, "add_forces", None)):
+            raise InputError(f"forces is {shown(forces)}; it must have a method add_forces that launches them")
+        curvature = getattr(forces, "curvature", 0.0)
+        if not 0.0 <= checked_number(curvature, "curvature", "1/s^2") < math.inf:
+            raise InputError(f"curvature is {curvature}; it must be zero or a positive number [1/s^2]")
+        self.system.forces.append(forces)
+        self.system.changes += 1
+        if curvature > 0.0:
+            stable = self._find_stable_steps()
+            if self.safe_step is not None:
+                self.safe_step.find_rest(stable)
 
     def follow_motion(self) -> None:
         """Let the meshes follow the motion, and the step the meshes, where that is due."""

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 class Stepper(ABC):
     """Time steps of all bodies of a system as launches that can be recorded."""
 
+    #: Whether steps launch the forces of the system's constraints.
+    resolves_constraints = False
+
     @property
     def many_a_launch(self) -> bool:
         """Whether many steps are one launch, for every body."""

@@ -165,6 +165,7 @@ class RecordedSteps:
 
     def _follow_bodies(self) -> None:
         """Forget recordings where the bodies' launches have changed."""
+        self._system.prepare()
         revision = self._system.launch_revision
         if (self._guard.revision, revision) == self._revisions:
             if self._system.rewritten != self._rewritten:

@@ -11,6 +11,8 @@ import warp as wp
 from warp_corot.elasticity import ForceField
 from warp_corot.solvers.steps.pace import Pace
 
+from .forces_work import ForcesWork
+
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
 
@@ -19,10 +21,76 @@ NEVER = np.iinfo(np.int64).max
 
 
 class Forces(Protocol):
-    """Something besides elasticity that pushes nodes of one body or of several, such as damping."""
+    """Something besides elasticity that pushes nodes of one body or of several, such as damping or springs.
+
+    What it puts in and takes out counts in the balance of energy. Two kinds of forces see to that themselves. Forces
+    that only ever take energy out say ``is_dissipative = True``. Others add what they put in to ``support_work`` of the
+    system and have a method ``complete_work``, which launches what brings that up to the present state.
+
+    Forces whose launches may change have an attribute ``revision`` that changes with them. ``curvature`` may say how
+    stiff a force is; see ``Simulation.add_forces``.
+    """
 
     def add_forces(self) -> None:
         """Launch what adds the forces in the present state to ``state.forces`` of the bodies concerned [N]."""
+        ...
+
+
+class Constraint(Protocol):
+    """Something that answers to the motion that all other forces would lead to in a step, such as contact.
+
+    Attributes:
+        launch_revision: Changes whenever its launches do, so that steps must be recorded again.
+        accounts: The work that its forces have done on the free nodes of each body, and the sum of its absolute
+            values [J]: float64 [2, n] each, world after world.
+        state: Other arrays from which it goes on, by name; they are kept and put back with the state of the bodies.
+    """
+
+    @property
+    def launch_revision(self) -> int: ...
+
+    @property
+    def accounts(self) -> list[wp.array]: ...
+
+    @property
+    def state(self) -> dict[str, wp.array]: ...
+
+    def prepare(self) -> None:
+        """Follow changes of the bodies' meshes; called before steps are launched, never while they are recorded."""
+        ...
+
+    def launch(self, offset: int, damping: float) -> None:
+        """Launch what adds its forces to ``state.forces`` of the bodies, after all other forces.
+
+        Args:
+            offset: How many steps are launched that the clock does not count yet.
+            damping: Rate of mass-proportional damping of the step [1/s].
+        """
+        ...
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the run that was just made needed more room than there is, so that forces are missing."""
+        ...
+
+    def grow(self) -> None:
+        """Make room for what the last run needed."""
+        ...
+
+    def forget(self) -> None:
+        """Forget what the last steps have left: they are taken back."""
+        ...
+
+    def measure(self) -> None:
+        """Launch what finds how fast things move for their size, as ``System.motion_rates`` says."""
+        ...
+
+    def publish(self) -> None:
+        """Launch what users read after a run of steps."""
+        ...
+
+    def reset(self, chosen: wp.array) -> None:
+        """Forget what belongs to the worlds that are put back to their beginning, not zero in int32 [worlds]."""
         ...
 
 
@@ -37,22 +105,91 @@ class System:
 
     Attributes:
         forces: What pushes nodes besides elasticity.
+        constraints: What answers to the motion that all these forces lead to, in this order.
+        changes: To be counted up by who adds to these lists or takes from them after the first step.
+        motion_rates: How often in a second things pass the thinnest of what they may touch, as it was known before the
+            run and as it was measured [1/s], float32 [2]. A step lasts a small share of that time.
         device, worlds: Of all bodies.
-        support_work: What moving supports have put in, and the sum of its absolute values [J], float64 [2].
+        support_work: What moving supports, and forces that say so, have put in, and the sum of its absolute values [J],
+            float64 [2].
+        offset: Which step since the clock was last advanced is being launched.
         bad_step: The first step after which something was not finite, int64 [1] on the device.
     """
 
     def __init__(self, bodies: Sequence[SoftBody], fields: Sequence[ForceField], pace: Pace, gravity: Sequence[float]):
         self.bodies, self.fields, self.pace, self.gravity = tuple(bodies), tuple(fields), pace, wp.vec3(*gravity)
         self.forces: list[Forces] = []
+        self.constraints: list[Constraint] = []
+        self.changes = self.offset = 0
+        self._work = ForcesWork(self.bodies, pace, self.gravity)
         self.device, self.worlds = bodies[0].device, bodies[0].worlds
+        self.motion_rates = wp.zeros(2, dtype=wp.float32, device=self.device)
         self.support_work = pace.support_work
         self.bad_step = wp.array([NEVER], dtype=wp.int64, device=self.device)
 
     @property
     def launch_revision(self) -> int:
         """Changes whenever the launches of a step do, so that steps must be recorded again."""
-        return sum(body.launch_revision for body in self.bodies)
+        others = sum(each.launch_revision for each in self.constraints) + self.changes + len(self.forces)
+        others += sum(getattr(each, "revision", 0) for each in self.forces)
+        return sum(body.launch_revision for body in self.bodies) + others
+
+    @property
+    def accounts(self) -> list[wp.array]:
+        """The work of forces and of constraints on each body; see ``Constraint``."""
+        of_forces = self._work.accounts if self._counted else []
+        return of_forces + [account for each in self.constraints for account in each.accounts]
+
+    @property
+    def state(self) -> list[wp.array]:
+        """All arrays of constraints from which they go on, accounts among them."""
+        others = [array for each in self.constraints for array in each.state.values()]
+        return self.accounts + others
+
+    def prepare(self) -> None:
+        """Bring up to date what constraints know of the bodies; not while launches are recorded."""
+        if self._counted:
+            self._work.prepare()
+        for each in self.constraints:
+            each.prepare()
+
+    @property
+    def _counted(self) -> list[Forces]:
+        """The forces whose work is counted for them."""
+        return [each for each in self.forces if not _counts_itself(each)]
+
+    def add_other_forces(self, offset: int, damping: float) -> None:
+        """Launch all that acts besides elasticity: forces, and then constraints; see ``Constraint.launch``."""
+        self.offset = offset
+        for forces in self.forces:
+            if _counts_itself(forces):
+                forces.add_forces()
+        counted = self._counted
+        if counted:
+            self._work.launch_begin()
+            for forces in counted:
+                forces.add_forces()
+            self._work.launch_separation()
+        for each in self.constraints:
+            each.launch(offset, damping)
+        if counted:
+            self._work.launch_count(offset, damping)
+
+    def pushing(self, k: int) -> wp.array | None:
+        """What acted on a body besides elasticity in the last step [N], vec4, as the balance of energy must know it.
+
+        None for nothing.
+        """
+        if self._counted:
+            return self._work.others[k]
+        state = self.bodies[k].state
+        return state.contact_forces if state.is_touched else None
+
+    def restart_work(self) -> None:
+        """Count the work of supports and constraints from here on."""
+        self.pace.restart_work()
+        for account in self.accounts:
+            account.zero_()
 
     @property
     def rewritten(self) -> int:
@@ -65,12 +202,26 @@ class System:
         body.conditions.follow_activations(self.pace, offset)
         field.add_forces(state.displacements, state.forces)
 
+    def complete_work(self) -> None:
+        """Launch that ``support_work`` is that of the present state."""
+        for each in self.forces:
+            complete = getattr(each, "complete_work", None)
+            if complete is not None:
+                complete()
+
     def adopt_positions(self) -> None:
         """Take over what somebody wrote to positions since they were published."""
         for body in self.bodies:
             body.state.adopt_positions()
 
     def publish_positions(self) -> None:
-        """Write positions from displacements."""
+        """Write positions from displacements, and what users read of constraints."""
         for body in self.bodies:
             body.state.publish_positions()
+        for each in self.constraints:
+            each.publish()
+
+
+def _counts_itself(forces: Forces) -> bool:
+    """Whether forces see to the balance of energy themselves."""
+    return getattr(forces, "is_dissipative", False) or hasattr(forces, "complete_work")

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from warp_corot.kernels.remesh.follow import bind_points
+from warp_corot.kernels.remesh.pools import Pools
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.surfaces.bound import BoundPoints, DeviceBinding
 
@@ -38,7 +37,7 @@ class FollowingBinding(DeviceBinding):
         self._inside = wp.array(_coordinates(corners, inside), dtype=wp.vec4d, device=device)
         self._points = wp.array(_coordinates(corners, bound.points), dtype=wp.vec4d, device=device)
 
-    def rebind(self, pools: Any) -> None:
+    def rebind(self, pools: Pools) -> None:
         """Bind the points to what the leaves are now, in ``kernels.remesh.pools.Pools``."""
         inputs = [self._roots, self._inside, self._points, pools]
         wp.launch(bind_points, len(self.rest), inputs, [self.nodes, self.weights], device=self.device)

@@ -164,7 +164,7 @@ class RemeshPass:
         threads = self.forest.threads
         wp.launch(kernel, dim=threads, inputs=[threads, *arguments], device=self.device)
 
-    def _make_contents(self, lame: tuple[float, float] | tuple[str, str]) -> Any:
+    def _make_contents(self, lame: tuple[float, float] | tuple[str, str]) -> Contents:
         names = self.forest.carriage.names
 
         def column(name: float | str) -> int:
@@ -177,7 +177,7 @@ class RemeshPass:
         contents.fill_column = column("fill")
         return contents
 
-    def _make_edges(self) -> Any:
+    def _make_edges(self) -> remesh_edges.WantedEdges:
         size = 1 << (2 * (self.forest.node_capacity + self.forest.threads)).bit_length()
         edges = remesh_edges.WantedEdges()
         edges.keys = wp.full(size, wp.int64(-1), dtype=wp.int64, device=self.device)
@@ -189,7 +189,7 @@ class RemeshPass:
         edges.wanted = wp.empty(size, dtype=wp.int32, device=self.device)
         return edges
 
-    def _make_blocks(self) -> Any:
+    def _make_blocks(self) -> remesh_blocks.Blocks:
         blocks = remesh_blocks.Blocks()
         shape = (self.forest.node_capacity, remesh_blocks.KEPT)
         blocks.of_node = wp.full(shape, int(remesh_blocks.NONE), dtype=wp.int32, device=self.device)
@@ -198,7 +198,7 @@ class RemeshPass:
         blocks.all_hot = wp.zeros(1, dtype=wp.int32, device=self.device)
         return blocks
 
-    def _make_removal(self) -> Any:
+    def _make_removal(self) -> remesh_simplify.Removal:
         count = self.forest.node_capacity
         removal = remesh_simplify.Removal()
         removal.willing = wp.zeros(count, dtype=wp.int32, device=self.device)
@@ -206,7 +206,7 @@ class RemeshPass:
         removal.candidates = wp.empty(count, dtype=wp.int32, device=self.device)
         return removal
 
-    def _make_moves(self) -> Any:
+    def _make_moves(self) -> remesh_dense.Moves:
         moves = remesh_dense.Moves()
         nodes, threads = self.forest.node_capacity, self.forest.threads
         moves.sums, moves.ends = (wp.zeros(2 * threads, dtype=wp.int32, device=self.device) for _ in range(2))

@@ -132,7 +132,7 @@ class DevicePlan:
         return names.index(name) if name in names else -1
 
     @property
-    def arrays(self) -> Any:
+    def arrays(self) -> remesh_plan.Plan:
         """``kernels.plan.plan.Plan``, for launches that derive more from it."""
         return self._plan
 
@@ -203,7 +203,7 @@ class DevicePlan:
             material=(_first(leaves.mu, count), _first(leaves.lam, count)) if leaves.mu_row >= 0 else None,
         )
 
-    def _elements(self, nodes: wp.array, code: wp.array) -> Any:
+    def _elements(self, nodes: wp.array, code: wp.array) -> ForestElements:
         elements = ForestElements()
         elements.nodes = elements.targets = nodes
         elements.code = code

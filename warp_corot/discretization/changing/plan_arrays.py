@@ -51,7 +51,7 @@ class PlanArrays:
         self.batches = self._make_batches()
         self.leaves = self._make_leaves(self._most_leaves if subtrees else 1)
 
-    def _make_plan(self, rotation_level: int, subtrees: bool) -> Any:
+    def _make_plan(self, rotation_level: int, subtrees: bool) -> Plan:
         leaves = self._most_leaves
         units = leaves if self._shared else 0
         plan = Plan()
@@ -70,7 +70,7 @@ class PlanArrays:
         plan.unit_code = self._codes(units)
         return plan
 
-    def _make_batches(self) -> Any:
+    def _make_batches(self) -> Batches:
         most, kinds, plan = self.most_subtrees, len(self.kinds), self.plan
         sinks = self._sinks(most)
         nodes = np.broadcast_to(sinks, (kinds, 10, most))
@@ -89,7 +89,7 @@ class PlanArrays:
         batches.root_nodes = wp.array(roots if self._shared else roots[:0], dtype=wp.vec4i, device=self.device, ndim=2)
         return batches
 
-    def _make_leaves(self, count: int) -> Any:
+    def _make_leaves(self, count: int) -> FlatLeaves:
         names = self._forest.carriage.names
         varies = "mu" in names
         leaves = FlatLeaves()

@@ -205,7 +205,7 @@ class DeviceForest:
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
-    def _make_pools(self, tree: Tree) -> Any:
+    def _make_pools(self, tree: Tree) -> kernels.Pools:
         forest, device = self.source, self.device
         leaves, elements = tree.leaves, len(tree.level)
         number = self._numbers()

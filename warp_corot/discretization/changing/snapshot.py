@@ -44,7 +44,7 @@ class Snapshot:
     pieces: tuple[Piece, ...]
 
     @classmethod
-    def of(cls, pools: Any, carried: Any) -> Snapshot:
+    def of(cls, pools: kernels.Pools, carried: Any) -> Snapshot:
         """The present state of ``kernels.remesh.pools.Pools`` and ``kernels.remesh.state.Carried``."""
         counts = pools.counts.numpy().copy()
         stretches = ((name, start, count) for name, start, count in _in_use(pools, carried, counts) if count)
@@ -54,7 +54,7 @@ class Snapshot:
         )
         return cls(counts, tuple(pieces))
 
-    def restore(self, pools: Any, carried: Any) -> None:
+    def restore(self, pools: kernels.Pools, carried: Any) -> None:
         """Write it back into the same arrays."""
         present = pools.counts.numpy()
         leaves, known = int(present[kernels.LEAVES]), int(self.counts[kernels.LEAVES])
@@ -70,7 +70,9 @@ class Snapshot:
         pools.counts.assign(counts)
 
 
-def check_places(pools: Any, carried: Any, counts: npt.NDArray[np.int32], pieces: dict[str, npt.NDArray[Any]]) -> None:
+def check_places(
+    pools: kernels.Pools, carried: Any, counts: npt.NDArray[np.int32], pieces: dict[str, npt.NDArray[Any]]
+) -> None:
     """See that kernels that are given stretches of arrays stay within these.
 
     Args:
@@ -100,12 +102,12 @@ def check_places(pools: Any, carried: Any, counts: npt.NDArray[np.int32], pieces
         raise ValueError(f"{counts[kernels.NODE_TOP]} nodes are counted, and there are {pools.node_limit}")
 
 
-def array_of(pools: Any, carried: Any, name: str) -> wp.array:
+def array_of(pools: kernels.Pools, carried: Any, name: str) -> wp.array:
     """An array of the pools or of what is carried."""
     return getattr(carried if name in _CARRIED else pools, name)
 
 
-def _in_use(pools: Any, carried: Any, counts: npt.NDArray[np.int32]) -> Iterator[tuple[str, int, int]]:
+def _in_use(pools: kernels.Pools, carried: Any, counts: npt.NDArray[np.int32]) -> Iterator[tuple[str, int, int]]:
     """Names of arrays, where stretches of them that are in use begin, and how long these are."""
     used = int(np.flatnonzero(pools.level.numpy() != kernels.UNUSED)[-1]) + 1
     for name in (*OF_TETRAHEDRA, *CARRIED_BY_TETRAHEDRA):

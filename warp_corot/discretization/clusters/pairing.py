@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 import warp as wp
@@ -112,7 +110,7 @@ def device_pairs(
     volumes: npt.NDArray[np.float32],
     cell: float | None,
     device: wp.Device,
-) -> Any:
+) -> LatticePairs | GeneralPairs:
     """Pairs as the kernels read them.
 
     Args:
@@ -126,7 +124,7 @@ def device_pairs(
     halves = records.view("<u2")
     halves[:, :5] = corners
     if cell is None:
-        pairs = GeneralPairs()
+        pairs: LatticePairs | GeneralPairs = GeneralPairs()
         records[:, FIRST_MATRIX : FIRST_MATRIX + 18] = gradients.reshape(count, 18).astype("<f4").view("<u4")
         records[:, GENERAL_VOLUMES : GENERAL_VOLUMES + 2] = volumes.astype("<f4").view("<u4")
     else:

@@ -8,9 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.kernels.clusters.pair_elements import vec4u
+from warp_corot.kernels.clusters.pair_elements import GeneralPairs, LatticePairs, vec4u
 from warp_corot.kernels.clusters.pair_tables import cut_clusters, pack_slots
 from warp_corot.kernels.clusters.pairs import PAIR_TASK_SLOTS, TASK_WORDS, PairClusters
+from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.tables.cluster_layout import BANK_GROUPS, QUAD_BYTES, PairLayout
 
 from .pairing import device_pairs, gradients_of, paired, roles_of
@@ -22,10 +23,10 @@ CORNERS = 5
 def pairs_in_clusters(
     chosen: npt.NDArray[np.int32],
     nodes: npt.NDArray[np.int32],
-    general: Any,
+    general: GeneralElements,
     cell: float | None,
     layout: PairLayout,
-) -> tuple[Any, Any, int]:
+) -> tuple[PairClusters, LatticePairs | GeneralPairs, int]:
     """Clusters of some of a mesh's elements in pairs, which follow one another as they are given.
 
     Args:
@@ -80,7 +81,7 @@ def _tasks(
     count: int,
     layout: PairLayout,
     device: wp.Device,
-) -> tuple[Any, npt.NDArray[np.int64]]:
+) -> tuple[PairClusters, npt.NDArray[np.int64]]:
     """Tasks of clusters, and the places of pairs' nodes in theirs, [pairs, 5].
 
     Args:

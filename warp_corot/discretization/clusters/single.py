@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 import warp as wp
@@ -16,7 +14,7 @@ from warp_corot.kernels.tables.cluster_layout import DEFAULT_LAYOUT, ClusterLayo
 from warp_corot.kernels.tables.shapes import SQRT2
 
 
-def changing_clusters(most: int, count: wp.array, layout: ClusterLayout = DEFAULT_LAYOUT) -> tuple[Any, int]:
+def changing_clusters(most: int, count: wp.array, layout: ClusterLayout = DEFAULT_LAYOUT) -> tuple[Clusters, int]:
     """Room for clusters of all elements of a mesh that changes, for ``find_tables`` to fill in.
 
     Args:
@@ -42,7 +40,7 @@ def changing_clusters(most: int, count: wp.array, layout: ClusterLayout = DEFAUL
 
 
 def find_tables(
-    clusters: Any, places: int, nodes: wp.array, goes: wp.array, layout: ClusterLayout = DEFAULT_LAYOUT
+    clusters: Clusters, places: int, nodes: wp.array, goes: wp.array, layout: ClusterLayout = DEFAULT_LAYOUT
 ) -> None:
     """Launch what finds the tables of elements of these nodes, vec4i, if ``goes`` says so, int32 [1]."""
     lanes = layout.threads if goes.device.is_cuda else 1
@@ -96,7 +94,7 @@ def _node_count(tets: npt.NDArray[np.int32], layout: ClusterLayout) -> int:
     return int((np.diff(nodes, axis=1) != 0).sum())
 
 
-def isotropic_material(given: list) -> Any:
+def isotropic_material(given: list) -> IsotropicMaterial:
     """``kernels.elements.constitutive.IsotropicMaterial`` of mu, lambda and their stride."""
     material = IsotropicMaterial()
     material.mu, material.lam, material.stride = given

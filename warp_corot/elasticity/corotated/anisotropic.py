@@ -6,17 +6,22 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import warp as wp
 
+from warp_corot.discretization.elements import E
 from warp_corot.elasticity.model import ForceField
 from warp_corot.elasticity.paths.lanes import Lanes, as_general
 from warp_corot.elasticity.stiffness import ElementStiffness
-from warp_corot.kernels.corotated.anisotropic import anisotropic_energies, anisotropic_von_mises, scatter_anisotropic
-from warp_corot.kernels.corotated.anisotropic_cpu import (
-    repair_anisotropic,
-    scatter_anisotropic_lanes,
-    turn_changed,
-    turn_elements,
+from warp_corot.elasticity.structs import Kept
+from warp_corot.kernels.corotated.anisotropic import (
+    FibreMaterial,
+    OrthotropicMaterial,
+    fibre_cauchy,
+    fibre_density,
+    fibre_stress,
 )
-from warp_corot.kernels.corotated.anisotropic_tangent import FibreMaterial, anisotropic_differential
+from warp_corot.kernels.corotated.anisotropic_cpu import scatter_anisotropic_lanes, turn_changed, turn_elements
+from warp_corot.kernels.corotated.anisotropic_tangent import anisotropic_differential
+from warp_corot.kernels.elements.forces import element_energies, element_von_mises, repair_forces, scatter_forces
+from warp_corot.kernels.math.rotation import byers_xu
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
@@ -47,38 +52,43 @@ class AnisotropicField(ForceField):
     def __init__(self, discretization: Discretization, rotation: wp.Function, deterministic: bool):
         super().__init__(discretization, deterministic)
         kind = discretization.element_kind
-        self._forces = scatter_anisotropic(kind, rotation)
-        self._energies = anisotropic_energies(kind, rotation)
-        self._von_mises = anisotropic_von_mises(kind, rotation)
+        self._forces = scatter_forces(kind, FibreMaterial, fibre_stress(rotation))
+        self._energies = element_energies(kind, FibreMaterial, fibre_density(rotation))
+        self._von_mises = element_von_mises(kind, FibreMaterial, fibre_cauchy(rotation))
         self._stiffness = ElementStiffness(discretization, anisotropic_differential(rotation), FibreMaterial)
         self.material = discretization.anisotropic_material()
+        self._fibres = Kept(fibre_material)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        self.launch(self._forces, self.element_count, [self.elements, self.material, *self._activation, u], [f])
+        self.launch(self._forces, self.element_count, [self.elements, self.fibres, u], [f])
 
     def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None:
-        self._stiffness.add_product(self.elements, self._fibres, u, p, y)
+        self._stiffness.add_product(self.elements, self.fibres, u, p, y)
 
     def add_diagonal(self, u: wp.array, blocks: wp.array) -> None:
-        self._stiffness.add_diagonal(self.elements, self._fibres, u, blocks)
+        self._stiffness.add_diagonal(self.elements, self.fibres, u, blocks)
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
-        self.launch(self._energies, self.element_count, [self.elements, self.material, u], [energies])
+        self.launch(self._energies, self.element_count, [self.elements, self.fibres, u], [energies])
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
-        inputs = [self.elements, self.material, *self._activation, u]
-        self.launch(self._von_mises, self.element_count, inputs, [stress])
+        self.launch(self._von_mises, self.element_count, [self.elements, self.fibres, u], [stress])
 
     @property
-    def _fibres(self) -> Any:
-        """``kernels.corotated.anisotropic_tangent.FibreMaterial`` with the present active stress."""
-        fibres = FibreMaterial()
-        fibres.passive, (fibres.is_active, fibres.activation) = self.material, self._activation
-        return fibres
+    def fibres(self) -> FibreMaterial:
+        """The material with the present active stress."""
+        return self._fibres(self.material, *self._activation)
 
     @property
     def _activation(self) -> list:
         return [int(self.discretization.has_activation), self.discretization.activation]
+
+
+def fibre_material(passive: OrthotropicMaterial, is_active: int, activation: wp.array) -> FibreMaterial:
+    """An orthotropic material with an active stress."""
+    material = FibreMaterial()
+    material.passive, material.is_active, material.activation = passive, is_active, activation
+    return material
 
 
 class AnisotropicLanesField(AnisotropicField):
@@ -92,7 +102,8 @@ class AnisotropicLanesField(AnisotropicField):
         self.follow()
 
     def follow(self) -> None:
-        count, repair = self.element_count, repair_anisotropic(self.discretization.element_kind)
+        count, stress = self.element_count, fibre_stress(byers_xu)
+        repair = repair_forces(self.discretization.element_kind, FibreMaterial, stress)
         elements, general = _first(self.elements, count), _first(self._general, count)
         self._lanes = Lanes(elements, general, scatter=scatter_anisotropic_lanes, repair=repair)
 
@@ -103,12 +114,12 @@ class AnisotropicLanesField(AnisotropicField):
         self.launch(turn_changed, counts.threads, inputs, [self._general.rest_inverse, self._general.volume])
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        self._lanes.scatter_forces([self.material, *self._activation], u, f)
+        self._lanes.scatter_forces(self.fibres, u, f)
 
 
-def _first(elements: Any, count: int) -> Any:
+def _first(elements: E, count: int) -> E:
     """The first elements of either kind."""
-    some = type(elements)()
+    some: Any = type(elements)()
     some.assign(elements)
     some.nodes = some.targets = elements.nodes[:count]
     return some

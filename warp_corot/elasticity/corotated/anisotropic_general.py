@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import warp as wp
 
 from warp_corot.elasticity.paths.clusters import ClusterScatter
 from warp_corot.elasticity.paths.general import clustered
 from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law
+from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial
 from warp_corot.kernels.corotated.definite import quaternions_of
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.tables.cluster_layout import ANISOTROPIC
@@ -41,12 +42,14 @@ class GeneralAnisotropicField(AnisotropicField):
         self.scatter(self.active_material, u, f)
 
     @property
-    def active_material(self) -> Any:
+    def active_material(self) -> ActiveMaterial:
         """The material with the present active stress, as the kernel takes it."""
         return active_material(self.material, self._quaternions, *self._activation)
 
 
-def active_material(passive: Any, axes: wp.array, is_active: int, activation: wp.array) -> Any:
+def active_material(
+    passive: OrthotropicMaterial, axes: wp.array, is_active: int, activation: wp.array
+) -> ActiveMaterial:
     """``kernels.clusters.laws.ActiveMaterial`` of its parts."""
     material = ActiveMaterial()
     material.passive, material.axes = passive, axes

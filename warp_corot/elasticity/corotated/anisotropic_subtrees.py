@@ -51,15 +51,15 @@ class AnisotropicSubtreeField(AnisotropicField):
         self.launch(quaternions_of, len(self._quaternions), [self.material.axes], [self._quaternions])
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        material, flat = [self.material, *self._activation], self._flat
+        fibres, flat = self.fibres, self._flat
         for batch, kernel, flags in zip(self._batches, self._kernels, self._flags, strict=True):
             inputs = [batch.subtrees, self.material, self._quaternions, *self._activation, u]
             outputs = [f, as_bytes(flags)]
             wp.launch(kernel, batch.count, inputs=inputs, outputs=outputs, device=self.device, block_dim=BLOCK)
-            inputs = [flags, batch.subtrees.first, self.elements, *material, u]
+            inputs = [flags, batch.subtrees.first, self.elements, fibres, u]
             self.launch(repair_leaves, 8 * len(flags), inputs, [f])
         if flat is not None:
-            self.launch(scatter_flat, len(flat), [flat.elements, flat.leaves, *material, u], [f])
+            self.launch(scatter_flat, len(flat), [flat.elements, flat.leaves, fibres, u], [f])
         if self._clusters is not None:
             self._clusters(active_material(self.material, self._quaternions, *self._activation), u, f)
 

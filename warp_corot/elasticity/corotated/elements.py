@@ -3,34 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import warp as wp
 
-from warp_corot.discretization.clusters.single import isotropic_material
 from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.elements import Elements
 from warp_corot.discretization.plan import Plan, Units
 from warp_corot.elasticity.model import ForceField
 from warp_corot.elasticity.paths.lanes import Lanes
 from warp_corot.elasticity.stiffness import ElementStiffness
+from warp_corot.elasticity.structs import Kept
 from warp_corot.errors import InputError
 from warp_corot.kernels.corotated.corotated import (
-    corotated_energies,
-    corotated_von_mises,
     extract_rotations,
     extract_warm_rotations,
+    given_cauchy,
+    given_density,
+    given_stress,
+    own_stress,
     reset_quaternions,
     scatter_matrix_product,
-    scatter_own_rotation,
-    scatter_with_rotations,
 )
-from warp_corot.kernels.corotated.tangent import (
-    RotatedMaterial,
-    exact_differential,
-    given_differential,
-    own_differential,
-)
-from warp_corot.kernels.elements.general_cpu import repair_elements, scatter_elements
+from warp_corot.kernels.corotated.tangent import exact_differential, given_differential, own_differential
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
+from warp_corot.kernels.elements.elements import GeneralElements
+from warp_corot.kernels.elements.forces import element_energies, element_von_mises, repair_forces, scatter_forces
+from warp_corot.kernels.elements.general_cpu import scatter_law_elements
 from warp_corot.kernels.math.rotation import byers_xu
 
 if TYPE_CHECKING:
@@ -71,6 +70,23 @@ class Rotations:
         return cls(units, wp.empty(units.count, dtype=wp.mat33, device=units.unit.device))
 
 
+def rotated_material(isotropic: IsotropicMaterial, rotations: wp.array, unit: wp.array) -> RotatedMaterial:
+    """Lamé's parameters with given rotations."""
+    material = RotatedMaterial()
+    material.isotropic, material.rotations, material.unit = isotropic, rotations, unit
+    return material
+
+
+def general_lanes(elements: Elements) -> Lanes:
+    """Launches over general elements on the CPU, each with its own rotation."""
+    return Lanes(elements, elements, scatter=scatter_law_elements("corotated"), repair=repair_elements())
+
+
+def repair_elements() -> wp.Kernel:
+    """The kernel that does the general elements that those launches leave out."""
+    return repair_forces(GeneralElements, IsotropicMaterial, own_stress(byers_xu))
+
+
 class CorotatedField(ForceField):
     """Rotations and forces as one kernel where each element uses its own, as two stages otherwise."""
 
@@ -84,19 +100,20 @@ class CorotatedField(ForceField):
         self._shared: Rotations | None = None
         self._fused = model.level is None and model.rotation != "warm" and model.stiffness == "factored"
         self._state: dict[str, wp.array] = {}
+        self._rotated = Kept(rotated_material)
         if model.rotation == "warm":
             self._state["quaternions"] = wp.empty(self.unit_count, dtype=wp.quat, device=self.device)
             self.reset(wp.ones(discretization.worlds, dtype=wp.int32, device=self.device))
             self._extract = extract_warm_rotations(kind)
         else:
             self._extract = extract_rotations(kind, model.own_rotation)
-            self._own = scatter_own_rotation(kind, model.own_rotation)
+            self._own = scatter_forces(kind, IsotropicMaterial, own_stress(model.own_rotation))
         if model.stiffness == "factored":
-            self._forces = scatter_with_rotations(kind)
+            self._forces = scatter_forces(kind, RotatedMaterial, given_stress)
         else:
             self._forces = scatter_matrix_product(model.stiffness == "sparse")
-        self._energies = corotated_energies(kind)
-        self._von_mises = corotated_von_mises(kind)
+        self._energies = element_energies(kind, RotatedMaterial, given_density)
+        self._von_mises = element_von_mises(kind, RotatedMaterial, given_cauchy)
 
     @property
     def state(self) -> dict[str, wp.array]:
@@ -132,11 +149,11 @@ class CorotatedField(ForceField):
 
     def add_rotated_forces(self, u: wp.array, f: wp.array) -> None:
         """Forces with the rotations that were extracted last."""
-        self._launch_with_rotations(self._forces, self.material_inputs, u, f)
+        self._launch_with_rotations(self._forces, self.isotropic, u, f)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         if self._fused:
-            self.launch(self._own, self.element_count, [self.elements, *self.material_inputs, u], [f])
+            self.launch(self._own, self.element_count, [self.elements, self.isotropic, u], [f])
         else:
             self.extract_rotations(u)
             self.add_rotated_forces(u, f)
@@ -168,9 +185,9 @@ class CorotatedField(ForceField):
         with self.state_kept():
             return self.extract_rotations(u)
 
-    def _tangent(self, u: wp.array, exact: bool) -> tuple[ElementStiffness, Any]:
+    def _tangent(self, u: wp.array, exact: bool) -> tuple[ElementStiffness, IsotropicMaterial | RotatedMaterial]:
         """The stiffness at displacements u, and the material that it reads."""
-        isotropic, is_warm = isotropic_material(self.material_inputs), self.model.rotation == "warm"
+        isotropic, is_warm = self.isotropic, self.model.rotation == "warm"
         if exact:
             if self.model.rotation_level is not None:
                 level = self.model.rotation_level
@@ -179,18 +196,16 @@ class CorotatedField(ForceField):
             return ElementStiffness(self.discretization, exact_differential(rotation)), isotropic
         if self.model.rotation_level is None and not is_warm:
             return ElementStiffness(self.discretization, own_differential(self.model.own_rotation)), isotropic
-        material = RotatedMaterial()
-        material.isotropic, material.rotations = isotropic, self.used_rotations(u)
-        material.unit = self._sharing().units.unit
+        material = rotated_material(isotropic, self.used_rotations(u), self._sharing().units.unit)
         return ElementStiffness(self.discretization, given_differential, RotatedMaterial), material
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         self.extract_rotations(u)
-        self._launch_with_rotations(self._energies, self.material_inputs, u, energies)
+        self._launch_with_rotations(self._energies, self.isotropic, u, energies)
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
         self.extract_rotations(u)
-        self._launch_with_rotations(self._von_mises, self.stress_inputs, u, stress)
+        self._launch_with_rotations(self._von_mises, self.isotropic_shown, u, stress)
 
     def _sharing(self) -> Rotations:
         """Who uses whose rotation; made on first use, since own rotations need none of it for their forces."""
@@ -203,10 +218,12 @@ class CorotatedField(ForceField):
             return Units.own(self.elements, self.element_count)
         return self.plan.all_units
 
-    def _launch_with_rotations(self, kernel: wp.Kernel, material: list, u: wp.array, output: wp.array) -> None:
+    def _launch_with_rotations(
+        self, kernel: wp.Kernel, isotropic: IsotropicMaterial, u: wp.array, output: wp.array
+    ) -> None:
         shared = self._sharing()
-        inputs = [self.elements, *material, u, shared.rotations, shared.units.unit]
-        self.launch(kernel, self.element_count, inputs, [output])
+        material = self._rotated(isotropic, shared.rotations, shared.units.unit)
+        self.launch(kernel, self.element_count, [self.elements, material, u], [output])
 
 
 class LeafField(CorotatedField):
@@ -228,7 +245,7 @@ class LanesField(CorotatedField):
 
     def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
         super().__init__(discretization, model, deterministic)
-        self._lanes = Lanes(self.elements, self.elements, scatter=scatter_elements, repair=repair_elements)
+        self._lanes = general_lanes(self.elements)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        self._lanes.scatter_forces(self.material_inputs, u, f)
+        self._lanes.scatter_forces(self.isotropic, u, f)

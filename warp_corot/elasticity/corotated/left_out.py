@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import warp as wp
 
+from warp_corot.discretization.elements import Elements
 from warp_corot.discretization.plan import Plan
 from warp_corot.discretization.subtrees import Batch, Sharing
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.subtrees.cuda import BLOCK
 from warp_corot.kernels.subtrees.repair import (
     COUNT_STRIDE,
@@ -31,7 +33,7 @@ class LeftOutLeaves:
     """
 
     #: What a kernel gets that makes no list.
-    NONE: ClassVar[Any] = LeftOut()
+    NONE: ClassVar[LeftOut] = LeftOut()
 
     def __init__(self, own: list[int], shared: list[Batch], device: wp.Device):
         self.own = _empty_lists(own, device)
@@ -50,15 +52,15 @@ class LeftOutLeaves:
         """Compile now what launches will need."""
         wp.load_module(repair_listed_own.module, device, block_dim=LIST_BLOCK)
 
-    def list_of(self, batch: Batch) -> Any:
+    def list_of(self, batch: Batch) -> LeftOut:
         """The list that a batch's kernel appends to."""
         if batch.sharing is Sharing.OWN:
             return self.own
         return next((listed for other, listed in self._shared if other is batch), self.NONE)
 
-    def repair(self, elements: Any, material: list, u: wp.array, f: wp.array) -> None:
+    def repair(self, elements: Elements, material: IsotropicMaterial, u: wp.array, f: wp.array) -> None:
         """Add the forces of the leaves on the lists to f, and empty them."""
-        inputs = [elements, *material, u]
+        inputs = [elements, material, u]
         if self._has_own:
             self._launch(repair_listed_own, [*inputs, self.own], f)
         for batch, listed in self._shared:
@@ -75,7 +77,7 @@ class LeftOutLeaves:
         )
 
 
-def _empty_lists(launches: list[int], device: wp.Device) -> Any:
+def _empty_lists(launches: list[int], device: wp.Device) -> LeftOut:
     """With room for all subtrees of these launches, whose thread blocks take the lists in turn."""
     listed = LeftOut()
     listed.counts = wp.zeros((LISTS + 1) * COUNT_STRIDE, dtype=wp.int32, device=device)

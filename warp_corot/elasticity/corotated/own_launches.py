@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import warp as wp
 
-from warp_corot.discretization.clusters.single import isotropic_material
 from warp_corot.discretization.plan import FlatLeaves, Plan
 from warp_corot.discretization.subtrees import GROUPED_LEAVES, Batch
 from warp_corot.elasticity.paths.clusters import ChangingClusterScatter, ClusterScatter, grouped_and_others
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.subtrees.cuda import BLOCK, FLAT, Stretch, scatter_stretches
+from warp_corot.kernels.subtrees.repair import LeftOut
 
 #: Leaves of a uniform forest from which subtrees have a launch: fewer are sooner done in clusters, above all where some
 #: are turned over (H200: 73,728 take 6.0 us at rest and 6.3 under their weight, by subtrees 9.6 and 14.4).
@@ -29,7 +29,7 @@ class OwnLaunches:
 
     Args:
         plan: What launches go through.
-        material: mu, lambda and their stride.
+        material: Lamé's parameters.
         tolerance: How near a subtree root's rotation must be to be used in place of own ones [rad]; None: never.
         changing: What adds the forces of all leaves in clusters where the mesh changes.
 
@@ -40,14 +40,14 @@ class OwnLaunches:
     def __init__(
         self,
         plan: Plan,
-        material: list,
+        material: IsotropicMaterial,
         tolerance: float | None = None,
         changing: ChangingClusterScatter | None = None,
     ):
         self._device = plan.elements.nodes.device
         self._material, self._tolerance = material, tolerance
         batches, self._flat = list(plan.batches), plan.flat
-        self._clusters: Callable[[Any, wp.array, wp.array], None] | None = None
+        self._clusters: Callable[[IsotropicMaterial, wp.array, wp.array], None] | None = None
         if plan.counts is None:
             batches, leaves = grouped_and_others(plan, _fewest_grouped(plan))
             if len(leaves):
@@ -73,20 +73,20 @@ class OwnLaunches:
         """Compile now what launches over a mesh that changes will need."""
         wp.load_module(scatter_stretches(uniform, tolerance).module, device, block_dim=BLOCK)
 
-    def scatter_forces(self, u: wp.array, f: wp.array, left_out: Any) -> None:
+    def scatter_forces(self, u: wp.array, f: wp.array, left_out: LeftOut) -> None:
         """Add the forces of displacements u to f, both vec4, and put subtrees with leaves left out on a list."""
-        mu, lam, stride = self._material
+        material = self._material
         if self._stretches is not None:
             wp.launch(
-                scatter_stretches(stride == 0, self._tolerance),
+                scatter_stretches(material.stride == 0, self._tolerance),
                 dim=self._blocks * BLOCK,
-                inputs=[self._stretches, self._flat.elements, self._flat.leaves, mu, lam, u],
+                inputs=[self._stretches, self._flat.elements, self._flat.leaves, material.mu, material.lam, u],
                 outputs=[f, left_out],
                 device=self._device,
                 block_dim=BLOCK,
             )
         if self._clusters is not None:
-            self._clusters(isotropic_material(self._material), u, f)
+            self._clusters(material, u, f)
 
 
 def _fewest_grouped(plan: Plan) -> int:
@@ -94,7 +94,7 @@ def _fewest_grouped(plan: Plan) -> int:
     return UNIFORM_LEAVES if len(plan.batches) == 1 and len(plan.flat) == 0 else GROUPED_LEAVES
 
 
-def _stretches(batches: list[Batch], flat: FlatLeaves | None) -> tuple[list[Any], int]:
+def _stretches(batches: list[Batch], flat: FlatLeaves | None) -> tuple[list[Stretch], int]:
     """What neighbouring thread blocks go through, and how many blocks there are."""
     rows, begin = [], 0
     for batch in batches:

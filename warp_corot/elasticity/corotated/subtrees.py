@@ -6,7 +6,8 @@ left out.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeAlias
 
 import warp as wp
 
@@ -14,22 +15,35 @@ from warp_corot.discretization.plan import FlatLeaves
 from warp_corot.discretization.subtrees import Batch, Sharing
 from warp_corot.elasticity.paths.clusters import ChangingClusterScatter
 from warp_corot.elasticity.paths.lanes import Lanes, as_general
+from warp_corot.elasticity.structs import Kept
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
 from warp_corot.kernels.corotated.near_rotations import share_near_rotations
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.elements import ForestElements
-from warp_corot.kernels.elements.general_cpu import repair_elements, rest_matrices, scatter_elements
+from warp_corot.kernels.elements.general_cpu import rest_matrices, scatter_law_elements
 from warp_corot.kernels.elements.lanes import LANES
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
 from warp_corot.kernels.subtrees.repair import repair_own, repair_shared
 
-from .elements import CorotatedField, CorotatedOptions, Rotations
+from .elements import (
+    CorotatedField,
+    CorotatedOptions,
+    Rotations,
+    general_lanes,
+    repair_elements,
+    rotated_material,
+)
 from .left_out import LeftOutLeaves
 from .own_launches import OwnLaunches
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
+
+
+#: What kernels of lanes read.
+LanesMaterial: TypeAlias = "IsotropicMaterial | RotatedMaterial | subtree_cpu.NearMaterial"
 
 
 class SubtreeField(CorotatedField):
@@ -45,6 +59,7 @@ class SubtreeField(CorotatedField):
         if self._listed and self.rotation_level is None:
             self._clusters = ChangingClusterScatter.of(discretization, self.plan, isotropic_law(corotated_stress))
         self.follow()
+        self.derive()
 
     def derive(self) -> None:
         if self._clusters is not None:
@@ -57,7 +72,7 @@ class SubtreeField(CorotatedField):
             wp.load_module(kernel.module, self.device, block_dim=self._block)
         single = [self._forces, self._own, self._extract, repair_own]
         if self.device.is_cpu:
-            single += [scatter_elements, repair_elements]
+            single += [scatter_law_elements("corotated"), repair_elements()]
         for kernel in single:
             wp.load_module(kernel.module, self.device)
         if self._listed:
@@ -83,26 +98,22 @@ class SubtreeField(CorotatedField):
         self._own_launches: OwnLaunches | None = None
         if self._listed:
             if self.rotation_level is None and OwnLaunches.suit(plan):
-                self._own_launches = OwnLaunches(plan, self.material_inputs, self.model.tolerance, self._clusters)
+                self._own_launches = OwnLaunches(plan, self.isotropic, self.model.tolerance, self._clusters)
                 self._left_out = LeftOutLeaves([self._own_launches.places], [], self.device)
                 return
             self._left_out = LeftOutLeaves.of(plan, self.device)
         self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]
-        self._flat_material = self.material_inputs
+        self._materials = [self._material(batch) for batch in plan.batches]
+        self._flat_rotated = Kept(rotated_material)
         self._flat_lanes: Lanes | None = None
         if len(plan.flat):
             self._prepare_flat(plan.flat)
 
     def _prepare_flat(self, flat: FlatLeaves) -> None:
-        if flat.material is not None:
-            self._flat_material = [*flat.material, 1]
-        elif not self._uniform:
-            leaves = flat.leaves.numpy()
-            chosen = [a.numpy()[leaves] for a in (self.discretization.mu, self.discretization.lam)]
-            self._flat_material = [*(wp.array(a, dtype=wp.float32, device=self.device) for a in chosen), 1]
+        self._flat_material = self.isotropic_of(flat)
         if self.device.is_cpu and flat.unit is None:
             general = flat.general or as_general(flat.elements, rest_matrices, [flat.elements])
-            self._flat_lanes = Lanes(general, general, scatter=scatter_elements, repair=repair_elements)
+            self._flat_lanes = general_lanes(general)
 
     @property
     def _listed(self) -> bool:
@@ -113,23 +124,24 @@ class SubtreeField(CorotatedField):
         if self._own_launches is not None:
             assert self._left_out is not None
             self._own_launches.scatter_forces(u, f, self._left_out.own)
-            self._left_out.repair(self.elements, self.material_inputs, u, f)
+            self._left_out.repair(self.elements, self.isotropic, u, f)
             return
         if self.plan.units is not None:
             self.extract_rotations(u)
-        for batch, kernel in zip(self.plan.batches, self._kernels, strict=True):
-            self._launch_batch(batch, kernel, u, f)
+        for batch, kernel, material in zip(self.plan.batches, self._kernels, self._materials, strict=True):
+            self._launch_batch(batch, kernel, material, u, f)
         flat = self.plan.flat
         if len(flat):
-            inputs = [flat.elements, *self._flat_material, u]
+            isotropic = self._flat_material
             if self._flat_lanes is not None:
-                self._flat_lanes.scatter_forces(self._flat_material, u, f)
+                self._flat_lanes.scatter_forces(isotropic, u, f)
             elif flat.unit is not None:
-                self.launch(self._forces, len(flat), [*inputs, self._rotations, flat.unit], [f])
+                rotated = self._flat_rotated(isotropic, self._rotations, flat.unit)
+                self.launch(self._forces, len(flat), [flat.elements, rotated, u], [f])
             else:
-                self.launch(self._own, len(flat), inputs, [f])
+                self.launch(self._own, len(flat), [flat.elements, isotropic, u], [f])
         if self._left_out is not None:
-            self._left_out.repair(self.elements, self.material_inputs, u, f)
+            self._left_out.repair(self.elements, self.isotropic, u, f)
 
     def used_rotations(self, u: wp.array) -> wp.array:
         rotations = super().used_rotations(u)
@@ -152,30 +164,48 @@ class SubtreeField(CorotatedField):
             return subtree_cuda.scatter_subtrees_shared(shape, grouped, self._uniform, given, self._listed)
         if sharing is Sharing.OWN:
             near = self.model.tolerance is not None
-            return subtree_cpu.scatter_subtrees_near(shape) if near else subtree_cpu.scatter_subtrees_own(shape)
+            return subtree_cpu.scatter_subtrees_near(shape) if near else subtree_cpu.scatter_law_subtrees(shape)
         return subtree_cpu.scatter_subtrees_shared(shape, given)
 
-    def _launch_batch(self, batch: Batch, kernel: wp.Kernel, u: wp.array, f: wp.array) -> None:
+    def _material(self, batch: Batch) -> Callable[[], LanesMaterial]:
+        """What gives the struct that a kernel of lanes reads."""
+        if batch.sharing is not Sharing.OWN:
+            rotated, unit = Kept(rotated_material), self._no_unit if batch.unit is None else batch.unit
+            return lambda: rotated(self.isotropic, self._rotations, unit)
+        if self.model.tolerance is not None:
+            near, tolerance = Kept(near_material), self.model.tolerance
+            return lambda: near(self.isotropic, tolerance)
+        return lambda: self.isotropic
+
+    def _launch_batch(
+        self, batch: Batch, kernel: wp.Kernel, material: Callable[[], LanesMaterial], u: wp.array, f: wp.array
+    ) -> None:
         discretization = self.discretization
         own = batch.sharing is Sharing.OWN
         outputs = [f, batch.flagged]
         if self.device.is_cuda:
             threads = batch.count
-            inputs = [batch.subtrees, discretization.mu, discretization.lam, u]
+            if own:
+                inputs = [self.elements, batch.subtrees, self.isotropic, u]
+            else:
+                unit = self._no_unit if batch.unit is None else batch.unit
+                inputs = [batch.subtrees, discretization.mu, discretization.lam, u, self._rotations, unit]
             outputs.append(LeftOutLeaves.NONE if self._left_out is None else self._left_out.list_of(batch))
         else:
             threads = -(-batch.count // LANES)
-            inputs = [batch.subtrees, batch.count, *self.material_inputs, u]
-            if own and self.model.tolerance is not None:
-                inputs.append(self.model.tolerance)
-        if not own:
-            inputs += [self._rotations, self._no_unit if batch.unit is None else batch.unit]
+            inputs = [batch.subtrees, batch.count, material(), u]
         wp.launch(kernel, dim=threads, inputs=inputs, outputs=outputs, device=self.device, block_dim=self._block)
         if self._left_out is not None:
             return
         flags = batch.flags_by_eights
-        inputs = [self.elements, *self.material_inputs, u]
+        inputs = [self.elements, self.isotropic, u]
         if own:
             self.launch(repair_own, len(flags), [flags, batch.subtrees.first, *inputs], [f])
         elif batch.sharing is Sharing.ROOT:
             self.launch(repair_shared, len(flags), [flags, batch.subtrees.first, batch.roots, *inputs], [f])
+
+
+def near_material(isotropic: IsotropicMaterial, tolerance: float) -> subtree_cpu.NearMaterial:
+    material = subtree_cpu.NearMaterial()
+    material.isotropic, material.tolerance = isotropic, tolerance
+    return material

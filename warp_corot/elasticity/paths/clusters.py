@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -11,13 +11,16 @@ import warp as wp
 
 from warp_corot.discretization.clusters.pairs import pairs_in_clusters
 from warp_corot.discretization.clusters.single import axis_words, changing_clusters, find_tables
+from warp_corot.discretization.elements import Elements
 from warp_corot.discretization.plan import FlatLeaves, LeafCounts, Plan
 from warp_corot.discretization.subtrees import GROUPED_LEAVES, Batch
 from warp_corot.kernels.clusters.elements import AlignedElements, align_elements
+from warp_corot.kernels.clusters.laws import ActiveMaterial
 from warp_corot.kernels.clusters.pair_elements import GeneralPairs, LatticePairs
 from warp_corot.kernels.clusters.pairs import scatter_pairs
 from warp_corot.kernels.clusters.single import scatter_clusters
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.elements import ForestElements, GeneralElements
 from warp_corot.kernels.elements.general_cpu import rest_matrices
 from warp_corot.kernels.tables.cluster_layout import (
     AHEAD,
@@ -53,7 +56,10 @@ def grouped_and_others(plan: Plan, fewest: int = GROUPED_LEAVES) -> tuple[list[B
 
 
 def others_in_clusters(
-    plan: Plan, law: wp.Function, Material: Any = IsotropicMaterial, layout: PairLayout | None = None
+    plan: Plan,
+    law: wp.Function,
+    Material: type = IsotropicMaterial,
+    layout: PairLayout | None = None,
 ) -> tuple[list[Batch], FlatLeaves | None, ClusterScatter | None]:
     """Which batches of a plan go as subtrees, which leaves one by one, and what adds the forces of all others.
 
@@ -87,9 +93,9 @@ class ClusterScatter:
 
     def __init__(
         self,
-        elements: Any,
+        elements: Elements,
         law: wp.Function,
-        Material: Any = IsotropicMaterial,
+        Material: type = IsotropicMaterial,
         *,
         chosen: npt.NDArray[np.int32] | None = None,
         layout: PairLayout | None = None,
@@ -97,8 +103,10 @@ class ClusterScatter:
         self._device, self.law, self.Material = elements.nodes.device, law, Material
         is_general = hasattr(elements, "rest_inverse")
         layout = layout or (GENERAL if is_general else LATTICE)
-        general = elements if is_general else as_general(elements, rest_matrices, [elements])
-        cell = None if is_general else float(elements.size.numpy()[0])
+        general, cell = cast("GeneralElements", elements), None
+        if not is_general:
+            general = as_general(elements, rest_matrices, [elements])
+            cell = float(cast("ForestElements", elements).size.numpy()[0])
         nodes = elements.nodes.numpy()
         if chosen is None:
             chosen = np.arange(len(nodes), dtype=np.int32)
@@ -109,7 +117,7 @@ class ClusterScatter:
         self.layout = replace(layout, ahead=AHEAD) if is_large else layout
         self._kernel = scatter_pairs(self.Pairs, Material, law, self.layout)
 
-    def __call__(self, material: Any, u: wp.array, f: wp.array) -> None:
+    def __call__(self, material: IsotropicMaterial | ActiveMaterial, u: wp.array, f: wp.array) -> None:
         """Add the forces [N] of displacements u to f, both vec4 [N]; ``material`` is what the law takes."""
         threads = self.layout.threads
         wp.launch(
@@ -139,7 +147,7 @@ class ChangingClusterScatter:
     def __init__(
         self,
         discretization: Discretization,
-        elements: Any,
+        elements: ForestElements,
         counts: LeafCounts,
         law: wp.Function,
         layout: ClusterLayout = DEFAULT_LAYOUT,
@@ -158,7 +166,11 @@ class ChangingClusterScatter:
     @classmethod
     def of(cls, discretization: Discretization, plan: Plan, law: wp.Function) -> ChangingClusterScatter | None:
         """The clusters of all leaves of a plan whose leaves change, None where they do not."""
-        return None if plan.counts is None else cls(discretization, plan.elements, plan.counts, law)
+        return (
+            None
+            if plan.counts is None
+            else cls(discretization, cast("ForestElements", plan.elements), plan.counts, law)
+        )
 
     def derive(self) -> None:
         """Launch what finds the clusters, if the plan has just been derived; may be recorded."""
@@ -167,7 +179,7 @@ class ChangingClusterScatter:
         inputs = [counts.goes, counts.now, leaves.code, self._words]
         wp.launch(align_elements, dim=counts.most, inputs=inputs, outputs=[self.elements.shape], device=self._device)
 
-    def __call__(self, material: Any, u: wp.array, f: wp.array) -> None:
+    def __call__(self, material: IsotropicMaterial | ActiveMaterial, u: wp.array, f: wp.array) -> None:
         """As ``ClusterScatter`` does."""
         threads, count = self._layout.threads, -(-self._discretization.sizes.launch_elements // self._layout.elements)
         wp.launch(

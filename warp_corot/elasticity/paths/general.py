@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from warp_corot.discretization.clusters.single import isotropic_material, order_in_clusters
+from warp_corot.discretization.clusters.single import order_in_clusters
 from warp_corot.discretization.elements import in_worlds
 from warp_corot.elasticity.corotated.elements import CorotatedOptions, LeafField
 from warp_corot.elasticity.model import LawField
@@ -50,7 +50,7 @@ class LawGeneralField(LawField):
         self._scatter = ClusterScatter(self.elements, isotropic_law(stress), chosen=clustered(discretization))
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        self._scatter(isotropic_material(self.material_inputs), u, f)
+        self._scatter(self.isotropic, u, f)
 
 
 class CorotatedGeneralField(LeafField):
@@ -62,4 +62,4 @@ class CorotatedGeneralField(LeafField):
         self._scatter = ClusterScatter(self.elements, law, chosen=clustered(discretization))
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        self._scatter(isotropic_material(self.material_inputs), u, f)
+        self._scatter(self.isotropic, u, f)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import warp as wp
 
+from warp_corot.discretization.elements import Elements
+from warp_corot.kernels.corotated.anisotropic import FibreMaterial
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.lanes import LANES
 
@@ -20,25 +21,24 @@ class Lanes:
         repair: Kernel that does the listed ones among ``elements``; None where none are left out or listed.
     """
 
-    def __init__(self, elements: Any, general: GeneralElements, *, scatter: wp.Kernel, repair: wp.Kernel | None = None):
+    def __init__(self, elements: Elements, general: Elements, *, scatter: wp.Kernel, repair: wp.Kernel | None = None):
         self.count = len(elements.nodes)
         self._elements = elements
         self._general = general
         self._scatter = scatter
         self._repair = repair
         #: How many, then which.
-        self._left_out = wp.zeros(self.count + 1, dtype=wp.int32, device="cpu")
+        self._left_out = wp.zeros(self.count + 1 if repair else 0, dtype=wp.int32, device="cpu")
 
-    def scatter_forces(self, material: list, u: wp.array, f: wp.array) -> None:
-        """Add the forces of displacements u to f, both vec4 [N]; ``material`` are kernel arguments."""
-        inputs = [self._general, *material, self.count, u]
-        outputs = [f] if self._repair is None else [f, self._left_out]
-        wp.launch(self._scatter, -(-self.count // LANES), inputs, outputs, device="cpu")
+    def scatter_forces(self, material: IsotropicMaterial | FibreMaterial, u: wp.array, f: wp.array) -> None:
+        """Add the forces of displacements u to f, both vec4 [N]; ``material`` is the struct that kernels read."""
+        inputs = [self._general, self.count, material, u]
+        wp.launch(self._scatter, -(-self.count // LANES), inputs, [f, self._left_out], device="cpu")
         if self._repair is not None:
-            wp.launch(self._repair, 1, [self._elements, *material, u], [self._left_out, f], device="cpu")
+            wp.launch(self._repair, 1, [self._elements, material, u], [self._left_out, f], device="cpu")
 
 
-def as_general(elements: Any, kernel: wp.Kernel, inputs: list) -> GeneralElements:
+def as_general(elements: Elements, kernel: wp.Kernel, inputs: list) -> GeneralElements:
     """Elements of either kind as general ones; ``kernel`` finds their rest matrices and volumes from ``inputs``."""
     count, device, general = len(elements.nodes), elements.nodes.device, GeneralElements()
     general.nodes = general.targets = elements.nodes

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
-from warp_corot.discretization.plan import FlatLeaves, Plan
+from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.model import LawField
 from warp_corot.kernels.elements.general_cpu import rest_matrices, scatter_law_elements
 from warp_corot.kernels.elements.lanes import LANES
@@ -33,7 +33,7 @@ class LawLanesField(LawField):
         super().__init__(discretization, **functions)
         self._law = law
         self._lanes: Lanes | None = None
-        self._lanes_material = self.material_inputs
+        self._lanes_material = self.isotropic
         if not isinstance(discretization.mesh, TetForest):
             self._lanes = Lanes(self.elements, self.elements, scatter=scatter_law_elements(law))
         else:
@@ -49,8 +49,8 @@ class LawLanesField(LawField):
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         for batch in self.plan.batches:
-            inputs = [batch.subtrees, *self.material_inputs, batch.count, u]
-            self.launch(scatter_law_subtrees(batch.shape, self._law), -(-batch.count // LANES), inputs, [f])
+            inputs, threads = [batch.subtrees, batch.count, self.isotropic, u], -(-batch.count // LANES)
+            self.launch(scatter_law_subtrees(batch.shape, self._law), threads, inputs, [f, batch.flagged])
         if self._lanes is not None:
             self._lanes.scatter_forces(self._lanes_material, u, f)
 
@@ -58,16 +58,6 @@ class LawLanesField(LawField):
         flat = self.plan.flat
         self._lanes = None
         if len(flat):
-            self._lanes_material = self._material_of(flat)
+            self._lanes_material = self.isotropic_of(flat)
             general = flat.general or as_general(flat.elements, rest_matrices, [flat.elements])
             self._lanes = Lanes(general, general, scatter=scatter_law_elements(self._law))
-
-    def _material_of(self, flat: FlatLeaves) -> list:
-        """The kernel arguments mu, lam and stride of leaves that are in no subtree."""
-        if flat.material is not None:
-            return [*flat.material, 1]
-        if self.discretization.material_stride == 0:
-            return self.material_inputs
-        leaves = flat.leaves.numpy()
-        chosen = [array.numpy()[leaves] for array in (self.discretization.mu, self.discretization.lam)]
-        return [*(wp.array(values, dtype=wp.float32, device=self.device) for values in chosen), 1]

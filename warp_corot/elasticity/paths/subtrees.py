@@ -6,10 +6,8 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warp_corot.discretization.clusters.single import isotropic_material
 from warp_corot.discretization.discretization import Discretization
-from warp_corot.discretization.plan import FlatLeaves, Plan
-from warp_corot.discretization.subtrees import chosen
+from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.model import LawField
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
@@ -55,14 +53,7 @@ class LawSubtreeField(LawField):
     def follow(self) -> None:
         self._batches, self._flat, self._clusters = others_in_clusters(self.plan, isotropic_law(self._stress))
         self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in self._batches]
-        self._flat_material = self._material_of(self.plan.flat)
-
-    def _material_of(self, flat: FlatLeaves) -> list:
-        if flat.material is not None:
-            return [*flat.material, 1]
-        if self._uniform or not len(flat):
-            return self.material_inputs
-        return [*(chosen(values, flat.leaves) for values in (self.discretization.mu, self.discretization.lam)), 1]
+        self._flat_material = self.isotropic_of(self.plan.flat)
 
     def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
         return scatter_subtrees(shape, grouped, self._uniform, self._stress)
@@ -73,6 +64,6 @@ class LawSubtreeField(LawField):
             inputs = [batch.subtrees, discretization.mu, discretization.lam, u]
             wp.launch(kernel, batch.count, inputs=inputs, outputs=[f], device=self.device, block_dim=subtree_cuda.BLOCK)
         if flat is not None:
-            self.launch(self._forces, len(flat), [flat.elements, *self._flat_material, u], [f])
+            self.launch(self._forces, len(flat), [flat.elements, self._flat_material, u], [f])
         if self._clusters is not None:
-            self._clusters(isotropic_material(self.material_inputs), u, f)
+            self._clusters(self.isotropic, u, f)

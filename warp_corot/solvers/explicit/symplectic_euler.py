@@ -69,6 +69,8 @@ class SymplecticEuler(Integrator):
 
 
 class SymplecticEulerStepper(Stepper):
+    resolves_constraints = True
+
     def __init__(self, system: System, damping: float, viscosity: float = 0.0):
         self.system = system
         self.damping = damping
@@ -85,7 +87,7 @@ class SymplecticEulerStepper(Stepper):
         """What makes many steps of a body in one launch, if anything does."""
         many = self._many[k]
         follows = isinstance(many, BlockSteps) and self.system.bodies[k].conditions.trajectories
-        return None if follows or self.system.forces else many
+        return None if follows or self.system.forces or self.system.constraints else many
 
     def prepare(self) -> None:
         for many in self._many:
@@ -112,8 +114,7 @@ class SymplecticEulerStepper(Stepper):
             if offset > 0 or not forces_known:
                 for k in one_by_one:
                     self.system.add_elastic_forces(k, offset)
-            for forces in self.system.forces:
-                forces.add_forces()
+            self.system.add_other_forces(offset, self.damping)
             for k in one_by_one:
                 self._move(self.system.bodies[k], offset)
 

@@ -41,7 +41,7 @@ class Energies:
             what a linear body keeps to rounding [J]; means nothing if elastic energies were not asked for.
         untimely: What the kinetic energy at the time of the displacements has more than that of ``exact`` [J].
         loads: Work of loads since the last good state [J].
-        supports: Work of all moving supports since the beginning [J].
+        supports: Work of all moving supports, and of the world's constraints, since the beginning [J].
         supports_absolute: The sum of its absolute values [J].
         reach: The largest displacement [m].
     """
@@ -53,7 +53,7 @@ class Energies:
     untimely: Floats
     loads: Floats
     supports: Floats
-    supports_absolute: float
+    supports_absolute: Floats
     reach: Floats
 
 
@@ -116,6 +116,7 @@ class Balance:
         keeps: bool = False,
         at: Sequence[tuple[wp.array, wp.array]] | None = None,
         seconds: Sequence[float] | None = None,
+        accounts: Sequence[wp.array] | None = None,
     ) -> None:
         """Launch sums and their report; may be recorded.
 
@@ -124,9 +125,12 @@ class Balance:
             keeps: Whether the state is kept in passing.
             at: Displacements and velocities of each body in place of the present ones.
             seconds: Of the clock, in place of the present ones [3].
+            accounts: Of the work of constraints, in place of the present ones.
         """
         system, copies = self.system, self._copies
         pace = system.pace.arrays
+        if at is None:
+            system.complete_work()
         if seconds is not None:
             pace = Pace()
             pace.counts = system.pace.arrays.counts
@@ -138,6 +142,9 @@ class Balance:
             self._add_nodal(body, u, v, pace, (copies.u[k], copies.v[k]), keeps)
             if whole:
                 body.state.forces.zero_()
+        for account in system.accounts if accounts is None else accounts:
+            inputs = [account, account.shape[1] // self.worlds, self._threads, self._lanes]
+            wp.launch(kernels.sum_work, (self.worlds, self._threads), inputs, [self._sums], device=self.device)
         inputs = [self._lanes, system.pace.orders, system.support_work, system.bad_step, copies.changed]
         inputs += [system.pace.control, system.pace.arrays, self._sums]
         dim = (self.worlds, kernels.COLUMNS, self._lanes)
@@ -150,7 +157,7 @@ class Balance:
         total = self._mapped.values[: self.worlds * kernels.COLUMNS].reshape(self.worlds, kernels.COLUMNS).copy()
         self.system.pace.saw(numbers)
         kinetic, ahead, elastic = (total[:, int(c)] for c in (kernels.KINETIC, kernels.AHEAD, kernels.ELASTIC))
-        done = np.full(self.worlds, numbers[int(kernels.WORK)] + total[:, int(kernels.SUPPORTS)].sum())
+        done = numbers[int(kernels.WORK)] + total[:, int(kernels.SUPPORTS)].sum() + total[:, int(kernels.WORKED)]
         energies = Energies(
             kinetic=kinetic,
             gravitational=total[:, int(kernels.GRAVITATIONAL)],
@@ -159,7 +166,7 @@ class Balance:
             untimely=total[:, int(kernels.UNTIMELY)],
             loads=total[:, int(kernels.LOADS)],
             supports=done,
-            supports_absolute=float(numbers[int(kernels.WORK_ABSOLUTE)]),
+            supports_absolute=numbers[int(kernels.WORK_ABSOLUTE)] + total[:, int(kernels.WORKED_ABSOLUTE)],
             reach=total[:, int(kernels.REACH)],
         )
         bad_step = numbers[int(kernels.BAD_STEP)]
@@ -202,6 +209,7 @@ class Balance:
         keeps: bool,
     ) -> None:
         system = self.system
+        pushing = system.pushing(system.bodies.index(body))
         inputs = [
             pace,
             system.gravity,
@@ -215,6 +223,8 @@ class Balance:
             body.state.forces,
             u,
             v,
+            int(pushing is not None),
+            u if pushing is None else pushing,
             system.pace.orders,
             int(keeps),
         ]

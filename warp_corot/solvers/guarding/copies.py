@@ -9,7 +9,7 @@ from warp_corot.solvers.system import System
 
 
 class Copies:
-    """Displacements, velocities and what fields keep, twice.
+    """Displacements, velocities and what fields and constraints keep, twice.
 
     Args:
         system: The simulation's; the orders of its clock name the last good copy.
@@ -22,6 +22,7 @@ class Copies:
 
     def __init__(self, system: System):
         self._bodies, self._fields, self._pace, self.device = system.bodies, system.fields, system.pace, system.device
+        self._system = system
         self.slot, self.revision = 0, 0
         self.changed = wp.zeros(1, dtype=wp.int32, device=self.device)
         self.u: list[wp.array] = []
@@ -33,7 +34,8 @@ class Copies:
 
     def prepare(self) -> None:
         """Make room for what there is now; not while launches are recorded."""
-        words = [_words(array) for field in self._fields for array in field.state.values()]
+        arrays = [array for field in self._fields for array in field.state.values()] + self._system.state
+        words = [_words(array) for array in arrays]
         places = [(array.ptr, len(array)) for array in words]
         shapes = [(2, len(body.state.displacements)) for body in self._bodies]
         if places == self._places and shapes == [array.shape for array in self.u]:
@@ -67,6 +69,16 @@ class Copies:
     def good(self) -> list[tuple[wp.array, wp.array]]:
         """Displacements and velocities of the last good state, of each body."""
         return [(u[self.slot], v[self.slot]) for u, v in zip(self.u, self.v, strict=True)]
+
+    @property
+    def good_accounts(self) -> list[wp.array]:
+        """The accounts of constraints' work in the last good state."""
+        places = [place for place, _ in self._places]
+        found = []
+        for account in self._system.accounts:
+            kept = self._kept_words[places.index(account.ptr)][self.slot]
+            found.append(wp.array(ptr=kept.ptr, shape=account.shape, dtype=wp.float64, device=self.device))
+        return found
 
     def flip(self) -> None:
         """The other copy, which the last run has written, is the last good one from here on."""

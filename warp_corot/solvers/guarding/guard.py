@@ -54,12 +54,14 @@ class Fault:
         worlds: In which worlds.
         step: The first step after which it was seen, if that is known.
         is_slight: Whether the state may still be true, roughly.
+        is_want_of_room: Whether nothing is wrong but that forces were left out for want of room.
     """
 
     what: str
     worlds: npt.NDArray[np.intp]
     step: int | None = None
     is_slight: bool = False
+    is_want_of_room: bool = False
 
 
 class Guard:
@@ -95,7 +97,7 @@ class Guard:
         self._counted_at = self._window_at = self.system.pace.time
         self._lately_before = np.zeros(self.worlds)
         self._height, self._loads_since = np.zeros(self.worlds), np.zeros(self.worlds)
-        self._absolute_base = 0.0
+        self._absolute_base = np.zeros(self.worlds)
         self._counted: Floats | None = None
         self.gain = self.surplus = self.untimely = np.inf
         self._floor: Floats | None = None
@@ -113,6 +115,7 @@ class Guard:
 
     def prepare(self) -> None:
         """Bring up to date what launches use; not while they are recorded."""
+        self.system.prepare()
         self._copies.prepare()
         self._balance.prepare()
 
@@ -130,6 +133,11 @@ class Guard:
         self._copies.launch_keep()
         self._balance.launch(whole=whole, keeps=True)
 
+    @property
+    def has_begun(self) -> bool:
+        """Whether there is a good state to which others are compared."""
+        return self._reference is not None
+
     # --- on the host -----------------------------------------------------------------------------------------------
 
     def begin(self) -> bool:
@@ -137,8 +145,8 @@ class Guard:
         given = False
         if self._reference is None:
             given = self._counted is None
-            self._absolute_base = 0.0
-            self.system.pace.restart_work()
+            self._absolute_base = np.zeros(self.worlds)
+            self.system.restart_work()
             self._copies.take()
             self._begin_from(self._find(whole=True))
         self._good = self.system.pace.known
@@ -157,6 +165,8 @@ class Guard:
         """
         report = self._balance.wait()
         self.was_given = report.has_changed
+        if any(each.is_full for each in self.system.constraints):
+            return Fault("more contacts than there is room for", np.arange(self.worlds), is_want_of_room=True)
         if report.has_changed:
             self._begin_before()
         fault = self._not_finite(report.bad_step)
@@ -181,7 +191,10 @@ class Guard:
         self.system.pace.put_back(self._good)
         for body in self.bodies:
             body.state.forces.zero_()
+            body.state.contact_forces.zero_()
             body.state.publish_positions()
+        for each in self.system.constraints:
+            each.forget()
         self.system.bad_step.fill_(NEVER)
         # What came from nowhere before that state is not forgotten with what came after it.
         self._count(self._find(whole=True), whole=True)
@@ -245,9 +258,10 @@ class Guard:
         # A user's velocities belong to no step.
         self._good = replace(self._good, seconds=(*self._good.seconds[:2], 0.0))
         now = pace.known
-        found = self._find(whole=True, at=self._copies.good, seconds=self._good.seconds)
+        copies = self._copies
+        found = self._find(whole=True, at=copies.good, seconds=self._good.seconds, accounts=copies.good_accounts)
         since = now.work[0] - self._good.work[0]
-        self._absolute_base = self._good.work[1]
+        self._absolute_base = found.supports_absolute - (now.work[1] - self._good.work[1])
         self._begin_from(replace(found, supports=found.supports - since))
 
     def _find(
@@ -256,12 +270,13 @@ class Guard:
         whole: bool,
         at: Sequence[tuple[wp.array, wp.array]] | None = None,
         seconds: Sequence[float] | None = None,
+        accounts: Sequence[wp.array] | None = None,
     ) -> Energies:
         """The energies of the present state or another; waits for the device."""
         self.prepare()
         self.order()
         self.system.pace.launch_orders(self._copies.changed)
-        self._balance.launch(whole=whole, at=at, seconds=seconds)
+        self._balance.launch(whole=whole, at=at, seconds=seconds, accounts=accounts)
         return self._balance.wait().energies
 
     def _has_changed(self) -> bool:

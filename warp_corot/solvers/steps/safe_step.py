@@ -69,7 +69,7 @@ class SafeStep:
         count = len(system.bodies)
         self._found = wp.zeros((count, 2), dtype=wp.float32, device=self.device)
         self._at_rest = wp.zeros((count, 4), dtype=wp.float64, device=self.device)
-        self._control = system.pace.control
+        self._control, self._system = system.pace.control, system
         bound = zip(system.bodies, system.fields, strict=True)
         self.gauges = [Gauge(body, field, self._found[k]) for k, (body, field) in enumerate(bound)]
         self.find_rest(stable)
@@ -138,7 +138,9 @@ class SafeStep:
         """
         for gauge in self.gauges:
             gauge.launch(self.pace, ahead)
-        inputs = [self._at_rest, self._found, self._control, self.pace.arrays]
+        for each in self._system.constraints:
+            each.measure()
+        inputs = [self._at_rest, self._found, self._system.motion_rates, self._control, self.pace.arrays]
         wp.launch(kernels.take_safe_step, dim=1, inputs=inputs, device=self.device)
 
     def resume(self) -> None:

@@ -1,0 +1,24 @@
+"""Structs that kernels read, kept from launch to launch: to make one takes longer than a launch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+
+class Kept:
+    """The struct of some values, made again where one of these is another object.
+
+    Args:
+        make: Makes the struct of the values.
+    """
+
+    def __init__(self, make: Callable[..., Any]):
+        self._make = make
+        self._values: tuple = ()
+        self._struct: Any = None
+
+    def __call__(self, *values: Any) -> Any:
+        if self._struct is None or any(a is not b for a, b in zip(values, self._values, strict=True)):
+            self._values, self._struct = values, self._make(*values)
+        return self._struct

@@ -1,0 +1,61 @@
+"""What forces besides elasticity put in and take out, node by node."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from warp_corot.kernels.stepping.work import COUNT_WORK, separate_forces
+from warp_corot.solvers.steps.pace import Pace
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+
+
+class ForcesWork:
+    """Counts the work of the forces of a system, constraints left out, which count their own.
+
+    Args:
+        bodies, pace, gravity: The system's.
+
+    Attributes:
+        accounts: As ``Constraint`` has them, one for each body.
+        others: All that acted besides elasticity in the last step [N], vec4, for each body.
+    """
+
+    def __init__(self, bodies: Sequence[SoftBody], pace: Pace, gravity: wp.vec3):
+        self._bodies, self._pace, self._gravity = bodies, pace, gravity
+        self.accounts: list[wp.array] = []
+        self.others: list[wp.array] = []
+        self._elastic: list[wp.array] = []
+
+    def prepare(self) -> None:
+        """Make room for the present arrays of nodes; not while launches are recorded."""
+        lengths = [len(body.state.displacements) for body in self._bodies]
+        if lengths == [len(array) for array in self.others]:
+            return
+        device = self._bodies[0].device
+        self.others, self._elastic = ([wp.zeros(n, dtype=wp.vec4, device=device) for n in lengths] for _ in range(2))
+        self.accounts = [wp.zeros((2, n), dtype=wp.float64, device=device) for n in lengths]
+
+    def launch_begin(self) -> None:
+        """Launch that the forces so far are elastic ones."""
+        for body, elastic in zip(self._bodies, self._elastic, strict=True):
+            wp.copy(elastic, body.state.forces)
+
+    def launch_separation(self) -> None:
+        """Launch that those since then are others."""
+        for body, elastic, others in zip(self._bodies, self._elastic, self.others, strict=True):
+            inputs = [elastic, body.state.forces]
+            wp.launch(separate_forces, body.sizes.launch_nodes, inputs, [others], device=body.device)
+
+    def launch_count(self, offset: int, damping: float) -> None:
+        """Launch their work, after the forces of constraints, which change the motion."""
+        for k, body in enumerate(self._bodies):
+            state, conditions = body.state, body.conditions
+            inputs = [damping, self._gravity, conditions.inverse_mass, int(conditions.has_loads), conditions.loads]
+            inputs += [self._pace.arrays, offset, self._elastic[k], state.forces, state.velocities]
+            outputs = [self.others[k], self.accounts[k]]
+            wp.launch(COUNT_WORK[conditions.loads.dtype], body.sizes.launch_nodes, inputs, outputs, device=body.device)
