@@ -1,4 +1,4 @@
-"""Signed functions of bodies: against closed forms, set theory and the laws that meshing rests on."""
+"""Signed functions of bodies: against closed forms, set theory and the laws that meshing relies on."""
 
 import numpy as np
 import pytest
@@ -118,7 +118,7 @@ def test_labels_of_sets(device, rng):
     cut = both - Domain.box((-2, -2, -2), (2, 2, 0), device=device)
     assert np.array_equal(cut.labels_at(points), np.where(points[:, 2] > 0, expected, 0))
     assert np.array_equal(cut.part("liver").phi(points) < 0, (expected == 2) & (points[:, 2] > 0))
-    # A body without labels leaves the other's where they meet, and has none elsewhere.
+    # Where they meet, a body without labels keeps the other's label, and has none elsewhere.
     plain = tumour | liver
     assert np.array_equal(plain.labels_at(points), np.where(in_liver, 1, 0))
     with pytest.raises(InputError, match=r"no label 'spleen'.*tumour, liver"):
@@ -165,7 +165,7 @@ def test_bad_arguments_are_refused_in_one_line(tmp_path):
 
 
 def test_a_domain_has_what_its_kind_has():
-    """A domain of voxels has their numbers and where they lie, one of a surface the surface as it was closed."""
+    """A domain of voxels has their numbers and positions, one of a surface the closed surface."""
     voxels = Domain.from_labels(np.ones((2, 3, 4), np.int16), (0.01, 0.01, 0.01), device="cpu")
     assert np.count_nonzero(voxels.numbers) == 24
     assert np.allclose(voxels.affine[:3, :3], 0.01 * np.eye(3))

@@ -1,4 +1,4 @@
-"""Domains that triangle surfaces enclose: against brute force in float64, in disorder, with holes, and refused."""
+"""Domains enclosed by triangle surfaces: against brute force in float64, disordered, with holes, and refused ones."""
 
 import numpy as np
 import pytest
@@ -46,13 +46,13 @@ def test_disorder_makes_no_difference(device, rng):
     one = Domain.from_surface((points, one), device=device)
     same(one, right, rng)
     assert "1 triangles wound against their neighbours turned round" in one.report()
-    # Triangles that share no points, as in .stl files, their corners off by less than the weld, one there twice.
+    # Triangles without common points, as in .stl files, with corners off by less than the weld, and one duplicate.
     soup = points[triangles].reshape(-1, 3) + 1e-8 * rng.standard_normal((3 * len(triangles), 3))
     rows = np.arange(len(soup)).reshape(-1, 3)
     loose = Domain.from_surface((soup, np.concatenate([rows, rows[:1]])), device=device)
     same(loose, right, rng)
     assert "closed" in loose.report()
-    # Every triangle there twice, facing both ways.
+    # Every triangle twice, with both orientations.
     same(Domain.from_surface((points, np.concatenate([triangles, triangles[:, ::-1]])), device=device), right, rng)
 
 
@@ -75,7 +75,7 @@ def test_a_cavity_stays_hollow(inward, device):
 
 
 def test_many_parts_each_turned_as_it_should(device):
-    """Balls inside a ball are cavities, balls beside it bodies that were inside out; all are wound inwards."""
+    """Balls inside a ball are cavities, balls beside it are bodies; the input has all wound inwards."""
     ball = trimesh.creation.icosphere(1, radius=0.3)
     ball.invert()
     places = [np.array(k) - 1.0 for k in np.ndindex(3, 3, 3)]
@@ -121,7 +121,7 @@ def test_a_sphere_with_a_tenth_of_its_triangles_gone(device, rng):
 
 
 def open_boxes_at_an_edge() -> tuple[np.ndarray, np.ndarray]:
-    """Three cubes that share an edge, each without a face at it: their rims all walk that edge the same way."""
+    """Three cubes that share an edge, each without a face at it: their rims pass that edge in the same direction."""
     points, triangles = arrays(trimesh.creation.box((1.0, 1.0, 1.0)))
     points += 0.5
     kept = triangles[(points[triangles][:, :, 0] > 0).any(axis=1)]
@@ -150,7 +150,7 @@ def half(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def bow_tie() -> tuple[np.ndarray, np.ndarray]:
-    """A prism over a polygon that crosses itself: a third of it is wound the other way."""
+    """A prism over a polygon that crosses itself: a third of it has the other orientation."""
     corners = np.array([[0, 0], [2, 2], [2, 0], [1, 0.6], [0, 1.2]], float)
     n = len(corners)
     points = np.concatenate([np.pad(corners, ((0, 0), (0, 1)), constant_values=z) for z in (0.0, 1.0)])
@@ -250,7 +250,7 @@ def test_usd_meshes_come_in_metres_placed_and_wound_as_the_stage_says(tmp_path, 
 
 
 def test_the_bunny_is_closed():
-    """And as large as the real one, of which the file's is ten times the size."""
+    """The closed bunny has the size of the real one; the file's is ten times as large."""
     bunny = Domain.from_surface("warp:bunny")
     assert "closed" in bunny.report()
     assert bunny.up_axis == "Y"
@@ -258,5 +258,5 @@ def test_the_bunny_is_closed():
     (mesh,) = (UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh))
     size = np.ptp(np.array(mesh.GetPointsAttr().Get()), axis=0)
     assert np.allclose(np.ptp(bunny.bounds, axis=0), 0.1 * size, atol=ROUNDING)
-    with pytest.raises(InputError, match="warp:lion: no such asset, should be warp:bunny"):
+    with pytest.raises(InputError, match="warp:lion: no such asset; it must be warp:bunny"):
         Domain.from_surface("warp:lion")

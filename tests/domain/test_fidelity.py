@@ -1,4 +1,4 @@
-"""How true a mesh is to its body, measured where the answer is known."""
+"""Fidelity of meshes to their bodies, measured for known answers."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import trimesh
 
 from warp_corot.domain import Domain
 from warp_corot.domain.fidelity import fidelity, smallest_dihedral
-from warp_corot.domain.reference import reference_of
+from warp_corot.domain.reference import reference_of, volume_along_lines
 from warp_corot.holding.choice import holds_of
 from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.pieces import pieces_of
@@ -65,7 +65,7 @@ def test_a_cavity_is_no_piece_and_what_lies_in_it_is() -> None:
 
 
 def test_shells_within_one_another_are_pieces_of_their_own() -> None:
-    """And a cavity belongs to the shell that it is in alone, or to all parts that are solid around it."""
+    """A cavity belongs to the shell that contains it, or to all solid parts around it."""
     shells = [ball(r) for r in (1.0, 0.9, 0.7, 0.6, 0.3)]
     for cavity in shells[1::2]:
         cavity.invert()
@@ -76,7 +76,7 @@ def test_shells_within_one_another_are_pieces_of_their_own() -> None:
 
 
 def test_pieces_of_a_mesh_share_faces() -> None:
-    """Three tetrahedra: two share a face, the third meets them in an edge. All who count say the same."""
+    """Three tetrahedra: two share a face, the third meets them in an edge. All counts agree."""
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1], [-1, -1, 0], [-1, 1, 0]], float)
     tets = np.array([[0, 1, 2, 3], [0, 2, 1, 4], [0, 3, 6, 5]])
     assert pieces_of(tets).tolist() == [0, 0, 1]
@@ -94,7 +94,7 @@ def test_voxels_that_touch_are_one_piece() -> None:
 
 
 def test_a_body_that_no_node_lies_in_has_a_surface() -> None:
-    """Twenty pins in a few tetrahedra: what these hold is known, and what is drawn is their boundary."""
+    """Twenty pins in a few tetrahedra: their volume is known, and their boundary is drawn."""
     w, places = 0.0003, np.stack(np.mgrid[:10, :2], axis=-1).reshape(-1, 2) * [0.002, 0.0021] + [0.003, 0.004]
     domain = surface_of(*(trimesh.creation.box((w, w, 0.01)).apply_translation((*at, 0.0)) for at in places))
     mesh = TetForest.from_domain(domain, target_elements=100)
@@ -136,5 +136,35 @@ def test_voxels_and_their_labels() -> None:
 
 def test_the_sharpest_angle_of_any_tetrahedra() -> None:
     flat = TetMesh(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, 0.01]]), np.array([[0, 1, 2, 3]]))
-    # Over a base of this size, at the edge that is nearest to the top.
+    # Above a base of this size, at the edge closest to the top.
     assert smallest_dihedral(flat) == pytest.approx(np.degrees(np.arctan2(0.01, 0.3)), rel=1e-6)
+
+
+def test_a_tube_that_runs_through_itself_counts_once(device):
+    """One and a half times round a circle: a single part, half of which lies in the other half."""
+    along, around = np.linspace(0.0, 3.0 * np.pi, 145), np.arange(24) * np.pi / 12.0
+    radius = 1.0 + 0.2 * np.cos(around)
+    up = np.outer(np.ones(145), 0.2 * np.sin(around))
+    rings = np.stack([np.outer(np.cos(along), radius), np.outer(np.sin(along), radius), up], axis=-1)
+    points = np.concatenate([rings.reshape(-1, 3), rings[[0, -1]].mean(axis=1)])
+    one = np.arange(144)[:, None] * 24 + np.arange(24)
+    two = np.arange(144)[:, None] * 24 + (np.arange(24) + 1) % 24
+    sides = [np.stack(corners, axis=-1).reshape(-1, 3) for corners in ((one, one + 24, two), (two, one + 24, two + 24))]
+    start = np.stack([one[0], two[0], np.full(24, len(points) - 2)], axis=1)
+    end = np.stack([two[-1] + 24, one[-1] + 24, np.full(24, len(points) - 1)], axis=1)
+    domain = Domain.from_surface((points, np.concatenate([*sides, start, end])), device=device)
+    found = reference_of(domain, 2000)
+    once = domain.closed.volume / 1.5
+    assert found.volume == pytest.approx(once, rel=2e-3)
+    assert found.pieces == 1
+    # Caps and what lies behind them are within the body: they are no part of its surface.
+    assert np.abs(np.hypot(np.hypot(*found.points[:, :2].T) - 1.0, found.points[:, 2]) - 0.2).max() < 0.01
+
+
+def test_volumes_along_lines_are_those_of_boxes_that_overlap(device):
+    boxes = [trimesh.creation.box(bounds=b) for b in (((0, 0, 0), (1, 1, 1)), ((0.5, 0.25, 0.25), (2, 0.75, 0.75)))]
+    whole = trimesh.util.concatenate(boxes)
+    turn = trimesh.transformations.rotation_matrix(0.7, (1.0, 2.0, 0.5))
+    for points in (whole.vertices, trimesh.transform_points(whole.vertices, turn)):
+        domain = Domain.from_surface((points, whole.faces), device=device)
+        assert volume_along_lines(domain.kind) == pytest.approx(1.25, rel=1e-3)

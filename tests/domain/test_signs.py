@@ -1,9 +1,11 @@
-"""Inside or outside where surfaces cross, overlap or lie on one another, against winding numbers in float64."""
+"""Inside and outside of surfaces that cross, overlap or coincide, against winding numbers in float64."""
 
 import numpy as np
 import trimesh
+import warp as wp
 
 import warp_corot as wc
+from warp_corot.domain.surface import lines_through, surface_mesh, windings_of
 from warp_corot.domain.winding import winding_number
 
 
@@ -12,7 +14,7 @@ def box(low, high) -> trimesh.Trimesh:
 
 
 def test_signs_are_those_of_winding_numbers(device):
-    """Boxes that cross, share a wall, and a hollow whose wall is another's: half of the walls lie on others."""
+    """Boxes that cross, boxes with a common wall, and a cavity with another's wall: half of the walls coincide."""
     hollow = box((0.0, 0.2, 0.2), (0.5, 0.8, 0.8))
     hollow.invert()
     parts = [
@@ -29,3 +31,38 @@ def test_signs_are_those_of_winding_numbers(device):
     exact = np.array([winding_number(corners, point) for point in points]) > 0.5
     assert 0.2 < exact.mean() < 0.8
     assert np.array_equal(domain.phi(points) < 0.0, exact)
+
+
+def test_lines_that_are_parallel_to_faces_and_through_corners_count_right(device):
+    """Winding numbers of stacked and crossing boxes at points straight above and below their corners and edges."""
+    steps = [box((0, 0, 0), (1, 1, 1)), box((0, 0, 1), (0.5, 0.5, 1.5)), box((0.25, 0.25, 0.25), (0.75, 1.25, 2))]
+    whole = trimesh.util.concatenate(steps)
+    triangles = np.asarray(whole.faces)
+    mesh = surface_mesh(whole.vertices, triangles, wp.get_device(device))
+    eighths = np.arange(-1, 18, dtype=float) / 8.0
+    points = np.stack(np.meshgrid(eighths, eighths, eighths, indexing="ij"), axis=-1).reshape(-1, 3)
+    on = np.zeros(len(points), bool)
+    for part in steps:
+        low, high = part.bounds
+        on |= ((points >= low) & (points <= high)).all(axis=1) & ((points == low) | (points == high)).any(axis=1)
+    points = points[~on][::7]
+    exact = np.array([winding_number(whole.triangles, point) for point in points])
+    placed = wp.array(points, dtype=wp.vec3, device=device)
+    for axis in range(3):
+        lines = lines_through(whole.bounds)
+        lines.axis, lines.low, lines.high = axis, whole.bounds[0, axis] - 0.1, whole.bounds[1, axis] + 0.1
+        assert np.array_equal(windings_of(mesh, lines, placed), np.round(exact))
+
+
+def test_lines_through_points_in_which_many_triangles_meet_count_right(device):
+    ball = trimesh.creation.icosphere(3)
+    points = ball.vertices.astype(np.float32).astype(float)
+    mesh = surface_mesh(points, ball.faces, wp.get_device(device))
+    for axis in range(3):
+        lines = lines_through(ball.bounds)
+        lines.axis = axis
+        for share, expected in ((0.5, 1), (-0.5, 1), (1.5, 0), (-1.5, 0)):
+            scale = np.ones(3)
+            scale[axis] = share
+            off = points[np.abs(points[:, axis]) > 0.1]
+            assert (windings_of(mesh, lines, wp.array(off * scale, dtype=wp.vec3, device=device)) == expected).all()

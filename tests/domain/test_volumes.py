@@ -1,4 +1,4 @@
-"""Label volumes: against closed forms, brute force, and the same volume placed otherwise."""
+"""Label volumes: against closed forms, brute force, and the same volume in other placements."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ ROUNDING = 3e-6
 def test_a_flat_face_lies_halfway_between_voxel_centres(axis, device, rng):
     volume = np.zeros((12, 12, 12), int)
     volume[(slice(None),) * axis + (slice(0, 7),)] = 3
-    volume = np.pad(volume, 20, mode="edge")  # far from the volume's ends, where the body is cut off
+    volume = np.pad(volume, 20, mode="edge")  # far from the volume's ends, where the body is truncated
     domain = Domain.from_labels(volume, SPACING, origin=-20 * SPACING, device=device)
     points = SPACING * rng.uniform(3.0, 7.9, (500, 3))
     assert np.allclose(domain.phi(points), points[:, axis] - 6.5 * SPACING[axis], atol=ROUNDING)
@@ -41,7 +41,7 @@ def test_a_block_of_voxels_is_a_box_inside_and_straight_out_of_its_faces(device,
 
 
 def test_distances_are_exact(rng):
-    """Against all pairs of voxels: the distance, less half of one of the n steps to a nearest voxel."""
+    """Against all pairs of voxels: the distance, less half of one of the n steps to the nearest voxel."""
     inside = rng.random((8, 7, 6)) < 0.3
     phi, nearest = signed_distance(inside, SPACING)
     index = np.argwhere(np.ones_like(inside))
@@ -65,10 +65,10 @@ def test_a_ball_converges_with_the_voxels(device, rng):
         domain = Domain.from_labels(volume, SPACING / fine, origin=origin, device=device)
         near = ((points > domain.bounds[0]) & (points < domain.bounds[1])).all(axis=1)
         error = np.abs(domain.phi(points) - exact)[near]
-        # A centre on the other side is never further beyond the sphere than the diagonal of a voxel.
+        # A centre on the other side is never farther from the sphere than the diagonal of a voxel.
         assert error.max() < np.linalg.norm(SPACING) / fine
         errors.append(error.mean())
-        # Further out a lower bound, by no more than the root of two.
+        # Farther out it is a lower bound, within a factor of the root of two.
         phi, far = domain.phi(points)[~near], exact[~near]
         slack = np.linalg.norm(SPACING) / fine
         assert ((phi > np.sqrt(0.5) * far - slack) & (phi < far + slack)).all()
@@ -91,7 +91,7 @@ def test_phi_is_no_steeper_than_said_and_the_bounds_hold_the_inside(how, device,
     apart = np.linalg.norm(a - b, axis=1)
     change = np.abs(domain.phi(a) - domain.phi(b))
     assert (change <= domain.lipschitz * apart + ROUNDING).all()
-    # The bound is not far from what happens.
+    # The bound is close to the true value.
     far = apart > 1e-3
     assert (change / apart)[far].max() > 0.4 * domain.lipschitz
     inside = domain.phi(a) < 0
@@ -100,7 +100,7 @@ def test_phi_is_no_steeper_than_said_and_the_bounds_hold_the_inside(how, device,
 
 
 def test_steepest_slope_of_a_linear_function_is_its_gradient(rng):
-    """By hand: on a linear function the bound is the gradient's length, on one raised voxel the root of three."""
+    """By hand: for a linear function the bound is the gradient's length, for one raised voxel the root of three."""
     gradient = rng.standard_normal(3)
     x = np.stack(np.meshgrid(*[np.arange(70) * s for s in SPACING], indexing="ij"), axis=-1)
     assert np.isclose(steepest_slope((x @ gradient).astype(np.float32), SPACING), np.linalg.norm(gradient), rtol=1e-3)
@@ -110,7 +110,7 @@ def test_steepest_slope_of_a_linear_function_is_its_gradient(rng):
 
 
 def test_no_gradient_is_steeper_than_the_steepest_slope(rng):
-    """Against SciPy's own trilinear interpolation of noise, and of one raised voxel at every place of a cell."""
+    """Against SciPy's trilinear interpolation of noise, and of one raised voxel at every corner of a cell."""
     for place in (None, *np.ndindex(2, 2, 2)):
         values = np.zeros((2, 2, 2)) if place else rng.standard_normal((5, 4, 4))
         if place:
@@ -123,8 +123,8 @@ def test_no_gradient_is_steeper_than_the_steepest_slope(rng):
 
 
 def test_a_sheared_volume_is_as_steep_as_said(device):
-    """Planes of voxels 25 degrees apart: across them phi changes by the distance along the axis, 1/sin(25 degrees) as
-    long as the distance of the planes."""
+    """Planes of voxels at 25 degrees: across them phi changes by the distance along the axis, 1/sin(25 degrees) times
+    the distance of the planes."""
     lean = np.radians(25.0)
     directions = np.array([[np.cos(lean), 1.0, 0.0], [np.sin(lean), 0.0, 0.0], [0.0, 0.0, 1.0]])
     volume = np.zeros((12, 60, 60), int)
@@ -146,8 +146,8 @@ def test_a_turned_volume_is_the_same_body_turned(device, rng):
     points = straight.bounds[0] + rng.uniform(-0.5, 1.5, (2000, 3)) * np.ptp(straight.bounds, axis=0)
     assert np.allclose(other.phi(points @ rotation.T), straight.phi(points), atol=ROUNDING)
     agree = other.labels_at(points @ rotation.T) == straight.labels_at(points)
-    assert agree.mean() > 0.999  # but for points halfway between two voxels
-    # Axes in another order and one the other way round, as scanners write them.
+    assert agree.mean() > 0.999  # except points halfway between two voxels
+    # Axes in another order and one reversed, as scanners write them.
     mixed = np.ascontiguousarray(np.moveaxis(volume, (1, 2, 0), (0, 1, 2))[::-1])
     flipped = affine_of(np.eye(3), origin=(0.1, -0.2, 0.3)) @ np.array(
         [[0, 0, 1, 0], [-1, 0, 0, volume.shape[1] - 1], [0, 1, 0, 0], [0, 0, 0, 1]]
@@ -171,7 +171,7 @@ def test_labels_are_those_of_the_voxels(device, rng):
     for row, label in zip(distance, labels, strict=True):
         nearest = inside[np.isclose(row, row.min())]
         assert label in np.where(volume[tuple(nearest.T)] == 7, 1, 2)
-    # Each label by itself is what a volume of it alone gives.
+    # Each label alone gives the same result as a volume with only this label.
     alone = Domain.from_labels(volume == 7, SPACING, device=device)
     points = domain.bounds[0] + rng.random((2000, 3)) * np.ptp(domain.bounds, axis=0)
     assert np.allclose(domain.part("wall").phi(points), alone.phi(points), atol=ROUNDING)
@@ -191,7 +191,7 @@ def test_smoothing_takes_the_steps_off(device):
     assert smooth.phi(points).std() < 0.5 * rough.phi(points).std()
     assert 1.0 <= smooth.lipschitz < 1.1 < rough.lipschitz <= np.sqrt(3.0) * (1 + 1e-5)
     assert any("smoothed by 10 mm, which changes the volume by" in line for line in smooth.report())
-    # What it is to be, with so much space around that its end does not matter.
+    # The expected result, with enough space around that its end does not matter.
     wide, _ = signed_distance(np.pad(volume, 20) > 0, np.full(3, 0.01))
     centres = np.argwhere(volume)
     assert np.allclose(

@@ -1,4 +1,4 @@
-"""Recording: whole steps to a frame, several bodies in one stage, and signals that wait for a frame to be whole."""
+"""Recording: whole steps in a frame, several bodies in one stage, and signals that wait for a complete frame."""
 
 import os
 import signal
@@ -23,7 +23,7 @@ def test_least_whole_number_of_steps(rng):
         n = steps_per_frame(fps, dt)
         assert 1.0 / (fps * n) <= dt * (1 + 1e-6)
         assert n == 1 or 1.0 / (fps * (n - 1)) > dt
-    assert steps_per_frame(25.0, 2e-4) == 200  # exact where it goes in exactly
+    assert steps_per_frame(25.0, 2e-4) == 200  # exact if it divides exactly
     assert steps_per_frame(30.0, 1.0 / 3000.0) == 100
     with pytest.raises(wc.InputError, match=r"a frame of 0\.04 s would take 4e\+28 steps"):
         steps_per_frame(25.0, 1e-30)

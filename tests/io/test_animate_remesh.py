@@ -1,4 +1,4 @@
-"""Recordings of bodies whose meshes follow the motion: each frame shows the present mesh, whole and on time."""
+"""Recordings of bodies whose meshes follow the motion: each frame shows the current mesh, complete and on time."""
 
 import itertools
 
@@ -34,7 +34,7 @@ def core(device):
 
 
 def pulled_ball(domain, device):
-    """Pulled out of shape so fast that its mesh follows."""
+    """A ball deformed so fast that its mesh follows."""
     mesh = wc.TetForest.from_domain(domain, 0.05, max_level=5)
     body = wc.SoftBody(mesh, wc.Isotropic(1e4, 0.4, 1e3), device=device)
     body.velocities = mesh.points * [40.0, 0.0, 0.0]
@@ -57,7 +57,7 @@ def test_each_frame_shows_the_present_mesh(device, tmp_path):
     assert done.elements == [len(mesh.tets) for mesh, *_ in states]
     assert len(set(done.elements)) > 4
     steps = [dt for *_, dt in states]
-    assert max(steps) > 1.2 * min(steps)  # frames are on time whatever the step
+    assert max(steps) > 1.2 * min(steps)  # frames are on time at any step
     np.testing.assert_allclose(times, np.arange(10) / 30, atol=0.51 * max(steps))
     stage = Usd.Stage.Open(str(tmp_path / "a.usd"))
     primvars = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(TETS))
@@ -66,7 +66,7 @@ def test_each_frame_shows_the_present_mesh(device, tmp_path):
         np.testing.assert_array_equal(points, x)
         np.testing.assert_array_equal(rest, mesh.points.astype(np.float32))
         np.testing.assert_array_equal(np.sort(indices, axis=1), np.sort(mesh.tets, axis=1))
-        # On CUDA a node's forces are added in another order each time.
+        # On CUDA a node's forces are added in a different order each time.
         np.testing.assert_allclose(primvars.GetPrimvar("vonMises").Get(k), stress, rtol=1e-5)
         held = np.array(primvars.GetPrimvar("fixed").Get(k)) == 1
         np.testing.assert_array_equal(held, mesh.points[:, 0] < 1e-9)
@@ -99,7 +99,7 @@ def test_goes_on_after_the_mesh_has_changed(tmp_path):
     done = record(sim, tmp_path / "a.usd", duration=0.1, fps=20)
     assert done.elements[0] == count
     assert done.steps == sim.steps - steps
-    # A surface that was bound to the mesh as it was is bound to what it is.
+    # A surface that was bound to a former mesh is bound to the current one.
     record(sim, tmp_path / "b.usd", duration=0.05, fps=20, surface=surface)
     stage = Usd.Stage.Open(str(tmp_path / "b.usd"))
     drawn = UsdGeom.Mesh.Get(stage, SURFACE)
@@ -130,7 +130,7 @@ def test_smooth_surfaces_stay_whole(device, tmp_path, labels):
         assert {len(x) for x in frames} == {triangles.max() + 1}
         for x in frames:
             assert np.isfinite(x).all()
-        # No point leaps when the mesh changes: none goes much faster than the fastest end at first, 2 m/s.
+        # No point jumps when the mesh changes: none moves much faster than the fastest end at first, 2 m/s.
         for before, after in itertools.pairwise(frames):
             assert np.linalg.norm(after - before, axis=1).max() < 1.2 * 2.0 / 400
         volumes = [np.linalg.det(x[triangles]).sum() / 6.0 for x in frames]

@@ -1,4 +1,4 @@
-"""A resumed run whose mesh changes is the run that was never interrupted."""
+"""A resumed run whose mesh changes equals the uninterrupted run."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def box(device, **material):
 
 
 def loaded_and_moved(device):
-    """Of a material that varies, loaded, with one end on keyframes that differ from node to node."""
+    """A body with varying material and loads, one end on keyframes that differ from node to node."""
     body = box(device, young=lambda x: 2e4 + 4e5 * x[:, 0], density=lambda x: 900.0 + 2e3 * x[:, 1])
     end = body.mesh.points[:, 0] > END - 1e-9
     keys = np.zeros((2, int(end.sum()), 3))
@@ -42,7 +42,7 @@ def loaded_and_moved(device):
 
 
 def ball(device):
-    """Cut out of a domain, with void beside it and labels within."""
+    """A ball cut out of a domain, with void beside it and labels within."""
     core, whole = (wc.Domain.sphere(radius, device=device) for radius in (0.03, 0.05))
     mesh = wc.TetForest.from_domain(core.named("core") | whole.named("shell"), 0.05, max_level=4)
     body = wc.SoftBody(mesh, wc.Isotropic(1e4, 0.4, 1000.0), device=device)
@@ -73,7 +73,7 @@ def values(array):
 
 
 def assert_same(a, b):
-    """The same leaves, and the same at all nodes bit by bit, whatever their numbers are."""
+    """The same leaves and the same nodal data bit for bit, with any numbers."""
     assert sorted(leaf_list(a.mesh)) == sorted(leaf_list(b.mesh))
     order = [np.lexsort(body.mesh.lattice[: body.node_count].T) for body in (a, b)]
     for name in ("positions", "displacements", "velocities", "reactions", "constrained", "masses"):
@@ -109,7 +109,7 @@ def test_a_resumed_run_is_the_uninterrupted_one(device, tmp_path, case):
     assert_same(parted.body, resumed.body)
     counts = set()
     for x in (0.15, 0.02):
-        for sim in (whole, parted, resumed):  # having been saved changes nothing either
+        for sim in (whole, parted, resumed):  # saving changes nothing either
             move(sim, x)
             sim.advance_steps(37)
         assert_conforming(resumed.body.mesh)
@@ -159,7 +159,7 @@ def test_criteria_of_ones_own_are_asked_for(tmp_path):
     sim = wc.Simulation(box("cpu"), remesh=nearness(0.1, "cpu"))
     sim.advance_steps(5)
     sim.save(tmp_path / "a.npz")
-    with pytest.raises(wc.InputError, match="the criterion 'beside' is a function of yours"):
+    with pytest.raises(wc.InputError, match="the criterion 'beside' is your own function"):
         wc.Simulation.load(tmp_path / "a.npz")
     given = nearness(0.15, "cpu")
     resumed = load_checkpoint(tmp_path / "a.npz", remesh=given)
@@ -200,7 +200,7 @@ def test_a_part_left_out_is_found(tmp_path, rng):
     kept = [name for name in parts if name.startswith("body0.remesh.")]
     for missing in rng.choice(kept, 8, replace=False):
         np.savez(tmp_path / "b.npz", **{name: part for name, part in parts.items() if name != missing})
-        with pytest.raises(wc.InputError, match="not a whole checkpoint"):
+        with pytest.raises(wc.InputError, match="not a complete checkpoint"):
             wc.Simulation.load(tmp_path / "b.npz")
 
 

@@ -1,4 +1,4 @@
-"""Checkpoints of older versions go on as they would have."""
+"""Checkpoints of older versions resume as they would have then."""
 
 import json
 
@@ -19,7 +19,7 @@ def beam(worlds=2):
 
 @pytest.mark.parametrize("version", [2, 3, 4])
 def test_versions_of_one_step_go_on_with_it(tmp_path, version):
-    """2 knew one material and no domains, 3 no mesh that changes, 4 no step that follows the state."""
+    """Version 2 had one material and no domains, 3 no changing mesh, 4 no step that follows the state."""
     sim = wc.Simulation(beam(), integrator=wc.SymplecticEuler(dt=1e-3))
     sim.advance_steps(10)
     sim.reset(worlds=1)
@@ -35,8 +35,8 @@ def test_versions_of_one_step_go_on_with_it(tmp_path, version):
 
 
 def test_version_5_goes_on_with_the_step_that_it_had(tmp_path):
-    """It knew neither what the state allowed at the last check nor how long the last step was; it noted how the step
-    had changed, and whether a user had written velocities, among the rest."""
+    """It stored neither the state's step at the last check nor the length of the last step, but how the step
+    had changed, and whether a user had written velocities."""
     sim = wc.Simulation(beam(worlds=1))
     sim.advance(0.2)
     sim.save(tmp_path / "now.npz")

@@ -1,4 +1,4 @@
-"""What damaged files do to other libraries, and numbers in them that do not fit: one line each."""
+"""Effects of damaged files on other libraries, and inconsistent numbers in them: one line each."""
 
 import json
 
@@ -17,7 +17,7 @@ from warp_corot.io.read.volumes import load_volume
 
 
 def test_a_binary_stage_is_tried_elsewhere_first(tmp_path, monkeypatch):
-    """Once for each file as it is; one on which OpenUSD crashes is not opened here. Text is not tried."""
+    """Once for each version of a file; one that crashes OpenUSD is not opened here. Text is not tried."""
     path, tried = SEEDS["usdc-tets"](tmp_path), []
     real = usd_files.read_isolated
     monkeypatch.setattr(usd_files, "read_isolated", lambda *given: tried.append(given) or real(*given))
@@ -84,12 +84,12 @@ def test_two_dashes_are_no_value(tmp_path, capsys):
     [("leaf_tets.0", 1 << 30), ("leaves.0", -1), ("code.0", 1 << 30), ("level.0", 99), ("counts", 999)],
 )
 def test_places_beyond_the_ends_of_a_changing_mesh(tmp_path, name, value):
-    """Kernels do not look whether there are such."""
+    """Kernels do not check indices."""
     path = SEEDS["checkpoint-remesh"](tmp_path)
     with np.load(path) as archive:
         arrays = dict(archive)
     assert json.loads(arrays["header"].tobytes())["bodies"][0]["remesh"]
     arrays[f"body0.remesh.present.{name}"].reshape(-1)[0] = value
     np.savez(path, **arrays)
-    with pytest.raises(InputError, match="is not a whole checkpoint"):
+    with pytest.raises(InputError, match="is not a complete checkpoint"):
         wc.Simulation.load(path, device="cpu")

@@ -1,4 +1,4 @@
-"""Files as other programs write them: every cell, its volume and its region, and the reader's reason for refusing."""
+"""Files of other programs: every cell, its volume and its region, and the reader's reason for refusing."""
 
 import gzip
 
@@ -40,7 +40,7 @@ def halves(points, cells) -> np.ndarray:
 
 
 def check(path, names=None, count=None, **options) -> wc.TetMesh:
-    """The mesh of a file fills the grid, and its two regions are where they were put."""
+    """The mesh of a file fills the grid, and its two regions are in their places."""
     mesh = wc.TetMesh.load(path, **options)
     assert np.abs(mesh.volumes).sum() == pytest.approx(VOLUME, rel=1e-6)
     if count is not None:
@@ -139,19 +139,20 @@ def test_polygons_and_strips_are_surfaces(tmp_path, suffix):
 
 
 def test_gmsh_1(tmp_path, mixed):
-    """Numbers of nodes begin at 11; physical groups are regions; triangles and points are not in the way."""
+    """Numbers of nodes begin at 11; physical groups are regions; triangles and points do no harm."""
     points, cells = mixed
     rows = [(GMSH_KINDS[kind], int(n), row) for (kind, row), n in zip(cells, halves(points, cells), strict=True)]
     path = write_gmsh_1(tmp_path / "a.msh", points, [(15, 0, [0]), (2, 1, [0, 1, 2]), *rows])
     check(path, ("7", "9"), len(points))
     cut = tmp_path / "cut.msh"
     cut.write_text(path.read_text(encoding="utf-8")[:-200])
-    with pytest.raises(InputError, match=r"cut\.msh: is not a \.msh file that can be read .*element \d+ is not whole"):
+    with pytest.raises(InputError, match=r"cut\.msh: is not a \.msh file that can be read .*element \d+ is incomplete"):
         load_tets(cut)
 
 
 def test_gmsh_through_its_library(tmp_path, mixed):
-    """What meshio cannot read: all entities saved with some physical groups, in format 4.1; a script is not run."""
+    """Files that meshio cannot read: all entities saved with some physical groups, in format 4.1; scripts do not
+    run."""
     gmsh = loadable_gmsh()
     gmsh.initialize(["-v", "0"], interruptible=False)
     try:
@@ -185,7 +186,7 @@ def test_gmsh_through_its_library(tmp_path, mixed):
 
 
 def loadable_gmsh():
-    """Gmsh's module, where its wheel and the graphics libraries that it wants are there: CI machines have none."""
+    """Gmsh's module, if its wheel and its graphics libraries exist; CI machines have none."""
     pytest.importorskip("gmsh", exc_type=ImportError)
     try:
         import gmsh
@@ -200,7 +201,7 @@ def test_tetgen(tmp_path):
     path = write_tetgen(tmp_path / "a.node", points, block.nodes, halves(points, cells))
     for suffix in (".node", ".ele"):
         check(path.with_suffix(suffix), ("7", "9"), len(points))
-    with pytest.raises(InputError, match=r"lone\.ele is not beside it"):
+    with pytest.raises(InputError, match=r"lone\.ele is missing"):
         load_tets(path.with_suffix(".node").rename(tmp_path / "lone.node"))
 
 
@@ -217,7 +218,7 @@ def test_netgen(tmp_path, mixed):
 
 
 def test_abaqus_parts_and_instances(tmp_path):
-    """Placed as the assembly says: moved, then turned about an axis; sections make the regions."""
+    """Instances are placed as in the assembly: translated, then rotated about an axis; sections define the regions."""
     path = tmp_path / "a.inp"
     path.write_text(ABAQUS)
     mesh = wc.TetMesh.load(path)
@@ -229,9 +230,9 @@ def test_abaqus_parts_and_instances(tmp_path):
     assert np.allclose(mesh.points[12:], [[0, 0, 1], [0, 0, 0], [0, 1, 1], [1, 0, 1]])
     for old, new, said in (
         ("6,\n 7, 8", "6,\n 7", "elements of type C3D8R have 8 numbers"),
-        ("40, 0, 0, 1", "41, 0, 0, 1", "element 1 names node 40, which is not there"),
-        ("part=Block\n*End I", "part=Brick\n*End I", "of part 'BRICK', which is not there"),
-        ("10, 0, 0, 0", "10, 0, zero, 0", "'zero' is no number"),
+        ("40, 0, 0, 1", "41, 0, 0, 1", "element 1 names node 40, which does not exist"),
+        ("part=Block\n*End I", "part=Brick\n*End I", "of part 'BRICK', which does not exist"),
+        ("10, 0, 0, 0", "10, 0, zero, 0", "'zero' is not a number"),
     ):
         path.write_text(ABAQUS.replace(old, new))
         with pytest.raises(InputError, match=said):
@@ -262,14 +263,14 @@ def test_garbage_is_refused_with_the_readers_own_reason(tmp_path, suffix):
 
 
 def test_a_reader_that_crashes_hangs_or_eats_memory_is_told_of(tmp_path, monkeypatch):
-    """Each in a process of its own, whose end does not reach this one."""
+    """Each runs in a separate process, whose end does not affect this one."""
     bodies = {
         "crash": "import ctypes; ctypes.string_at(0)",
         "leave": "import os; os._exit(7)",
         "greedy": "import numpy; numpy.ones(10**10)",
         "slow": "while True: pass",
     }
-    said = {"crash": r"it crashed \(SIG", "leave": "status 7", "greedy": "more memory", "slow": "not come to an end"}
+    said = {"crash": r"it crashed \(SIG", "leave": "status 7", "greedy": "more memory", "slow": "did not finish"}
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(files, "__package__", "odd_readers")
     folder = tmp_path / "odd_readers"

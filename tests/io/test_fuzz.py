@@ -1,6 +1,6 @@
 """Damaged files and random option lists: a body, or one line and status 2; no traceback, crash, hang or touched file.
 
-Some of each in a short run, ten thousand with ``-m slow``. Each case is known by its format and number:
+A short run has some of each; ``-m slow`` has ten thousand. Each case is identified by its format and number:
 ``python tests/support/fuzzing.py FOLDER FORMAT NUMBER NUMBER+1`` makes it again.
 """
 
@@ -17,19 +17,19 @@ import pytest
 
 SCRIPT = Path(fuzzing.__file__)
 FEW, MANY = 100, 10_000
-#: In whose place another format stands in the short run: it has the same reader.
+#: Formats whose reader is tested by another format in the short run.
 LONG_ONLY = {
     *("ply-text", "off", "stl-text", "usdz", "usda-tets", "scene", "nii", "mgh", "nrrd-gz", "mhd", "checkpoint"),
     *("msh-2", "msh-2-binary", "meshb", "vol", "med", "avs", "f3grid", "su2"),
     *("vtk", "vtk-text", "vtk-image", "vtu-text", "vtu-meshio", "vts", "vtr"),
 }
 SHORT = [form for form in fuzzing.SEEDS if form not in LONG_ONLY]
-#: Tests of the short run, which run side by side; each takes seconds to begin.
+#: Tests of the short run, which run in parallel; each takes seconds to begin.
 PARTS = 2
 
 
 def cases(folder: Path, forms: list[str], count: int) -> list[dict]:
-    """What was said of so many cases of each format."""
+    """The results of this many cases of each format."""
     path = os.pathsep.join([str(SCRIPT.parent), *filter(None, sys.path)])
     command = [sys.executable, str(SCRIPT), str(folder), ",".join(forms), "0", str(count)]
     environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -39,7 +39,7 @@ def cases(folder: Path, forms: list[str], count: int) -> list[dict]:
 
 
 def check(folder: Path, forms: list[str], count: int) -> None:
-    """All went well; many were refused, and some taken."""
+    """No case failed; many were refused, and some accepted."""
     said = cases(folder, forms, count)
     wrong = [f"{each['form']} {each['case']}: {each['wrong']}" for each in said if "wrong" in each]
     assert not wrong, "\n".join(wrong[:5])
@@ -63,7 +63,7 @@ def test_a_body_or_one_line_of_many(form, tmp_path):
 
 @pytest.mark.parametrize("form", ["ply", "usdc", "nii", "checkpoint"])
 def test_damage_is_damage(form, tmp_path):
-    """Few of the damaged files are as they were, and the same number gives the same file."""
+    """Few of the damaged files equal the originals, and the same number gives the same file."""
     good = fuzzing.SEEDS[form](tmp_path).read_bytes()
     made = [fuzz_damage.damaged(good, np.random.default_rng(k)) for k in range(40)]
     assert sum(data == good for data in made) < 8

@@ -1,4 +1,4 @@
-"""Tetrahedra from files, what is said of bad ones, and the surface of a mesh."""
+"""Tetrahedra from files, messages about bad ones, and the surface of a mesh."""
 
 import importlib.util
 import logging
@@ -113,7 +113,7 @@ def test_files_that_are_none_are_refused_in_one_line(tmp_path):
         assert name in refused(path, "is not a")
     path = tmp_path / "text.docx"
     path.write_text("words")
-    refused(path, r"unknown format .docx, should be .usd, .*\.msh")
+    refused(path, r"unknown format .docx; it must be .usd, .*\.msh")
 
 
 def test_truncated_files_are_refused(tmp_path):
@@ -173,7 +173,7 @@ def test_a_missing_reader_is_named(tmp_path, monkeypatch):
 
 
 def cube_tets(n: int, rng) -> tuple[np.ndarray, np.ndarray]:
-    """Six path tetrahedra to each of n³ cubes, half of them mirrored, in random order."""
+    """Six path tetrahedra in each of n³ cubes, half of them mirrored, in random order."""
     grid = np.arange((n + 1) ** 3).reshape(n + 1, n + 1, n + 1)
     points = np.stack(np.meshgrid(*[np.arange(n + 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     tets = []
@@ -204,7 +204,7 @@ def test_boundary_faces_close_the_volume(rng):
 
 
 def test_boundary_faces_with_large_node_numbers(rng):
-    """Node numbers beyond what three fit into one 64-bit key give the same faces."""
+    """Node numbers too large for three in one 64-bit key give the same faces."""
     _, tets = cube_tets(2, rng)
     faces, parents = boundary_faces(tets)
     moved = tets + np.int32(2**31 - 1 - tets.max())

@@ -1,4 +1,4 @@
-"""Bodies from surfaces and scans, recorded: what is drawn is the body's surface."""
+"""Bodies from surfaces and scans, recorded: the drawing is the body's surface."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def rotation() -> np.ndarray:
 
 
 def test_the_smooth_surface_follows_the_body(device, tmp_path):
-    """An affine motion moves every point by itself, a rotation turns the normals, a uniform strain is one stress."""
+    """An affine motion moves every point exactly, a rotation rotates the normals, a uniform strain is one stress."""
     mesh = ball(device)
     sim = simulated(mesh, device)
     rest = mesh.surface()
@@ -128,12 +128,12 @@ def test_labels_are_closed_surfaces_that_fill_the_body(tmp_path):
     assert inner.volume == pytest.approx(4 / 3 * np.pi * CORE**3, rel=0.1)
     whole = drawn(still(simulated(mesh), tmp_path / "b.usd"))
     assert inner.volume + shell.volume == pytest.approx(whole.volume, rel=1e-5)
-    with pytest.raises(wc.InputError, match="labels is True, but there are none"):
+    with pytest.raises(wc.InputError, match="labels is True, but the mesh has none"):
         still(simulated(ball()), tmp_path / "c.usd", labels=True)
 
 
 def test_a_users_surface_goes_along(device, tmp_path):
-    """Finer than the mesh's own, partly outside of its tetrahedra; an affine motion is exact on it."""
+    """It is finer than the mesh's own, partly outside its tetrahedra; an affine motion is exact on it."""
     mesh = ball(device)
     sim = simulated(mesh, device)
     motion = rotation() @ np.diag([1.1, 0.9, 1.0])

@@ -1,4 +1,4 @@
-"""The user's own surface on top of a body: bound to any mesh, drawn with what its file gives."""
+"""The user's own surface on a body: bound to any mesh, drawn with its file's data."""
 
 import numpy as np
 import pytest
@@ -94,14 +94,14 @@ def test_remeshed_bodies_carry_it(folder):
     first, last = (np.array(mesh.GetPointsAttr().Get(frame)) for frame in (0, 2))
     assert first.shape == last.shape
     assert np.isfinite(last).all()
-    # Bound well, edges change little: nothing juts out.
+    # With a good binding edges change little: nothing protrudes.
     faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
     before, after = (np.linalg.norm(x[faces[:, 0]] - x[faces[:, 1]], axis=1) for x in (first, last))
     assert np.abs(after / before - 1).max() < 0.5
 
 
 def test_points_in_tetrahedra_of_any_shape():
-    """Linear functions are what they are at bound points, inside and out, and affine motions carry them exactly."""
+    """Linear functions are exact at bound points, inside and outside, and affine motions move them exactly."""
     forest = wc.TetForest.box((2, 2, 2), 0.5, 6)
     rng = np.random.default_rng(0)
     inner = ((forest.points > 0) & (forest.points < 1)).all(axis=1)

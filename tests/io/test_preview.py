@@ -1,4 +1,4 @@
-"""Pictures: what is seen is where it should be, in the colour that it should have."""
+"""Pictures: visible parts are in the right place and colour."""
 
 import builtins
 import sys
@@ -17,7 +17,7 @@ from warp_corot.io.pictures.preview import Camera, Picture, draw_body, render_pr
 
 
 def body_pixels(path) -> np.ndarray:
-    """Where the picture is neither white nor a grey of shadow or silhouette."""
+    """Pixels that are neither white nor a grey of shadow or silhouette."""
     pixels = picture_of(path)
     return np.ptp(pixels, axis=2) > 25
 
@@ -31,7 +31,7 @@ def test_the_camera_sees_up_as_up_and_near_as_large(up_axis):
     flat, depth = camera.project(np.stack([-up, 0.0 * up, up]) * 0.5)
     assert np.allclose(flat[:, 0], 0.0)
     assert flat[0, 1] < flat[1, 1] < flat[2, 1]
-    # Two rods of one length, one nearer: the nearer looks longer, mildly.
+    # Two rods of one length: the nearer one looks slightly longer.
     towards = camera.axes[2]
     rod = np.stack([-up, up]) * 0.1
     near, far = (np.ptp(camera.project(rod + s * towards)[0], axis=0)[1] for s in (0.5, -0.5))
@@ -54,7 +54,7 @@ def test_each_picture_shows_the_body_in_its_middle(tmp_path):
 
 
 def test_only_faces_that_look_outward_are_seen(tmp_path):
-    """A cube turned inside out shows its far walls from within: less light falls on them than on the outer top."""
+    """An inside-out cube shows its far walls from within: less light falls on them than on the outer top."""
     render_preview(tmp_path / "out.png", CUBE, FACES, size=SIZE, ground=False)
     render_preview(tmp_path / "in.png", CUBE, FACES[:, ::-1], size=SIZE, ground=False)
     outside, inside = picture_of(tmp_path / "out.png"), picture_of(tmp_path / "in.png")
@@ -154,13 +154,13 @@ def test_bad_input_is_refused_and_keeps_the_picture(tmp_path, monkeypatch):
     nan[2, 1] = np.nan
     for arguments, options, match in [
         ((path, nan, FACES), {}, "not finite"),
-        ((path, CUBE[:, :2], FACES), {}, r"shape \[8, 2\], should be \[N, 3\]"),
+        ((path, CUBE[:, :2], FACES), {}, r"shape \[8, 2\]; it must be \[N, 3\]"),
         ((path, CUBE, FACES[:0]), {}, "at least one face"),
         ((path, CUBE[:5], FACES), {}, "nodes 0 to 4"),
         ((path, CUBE, FACES), {"scalars": np.zeros(3)}, r"scalars has shape \[3\]"),
-        ((path, CUBE, FACES), {"up_axis": "up"}, "should be X, Y or Z"),
-        ((tmp_path / "picture.gif", CUBE, FACES), {}, "should be .png"),
-        ((tmp_path / "none" / "a.png", CUBE, FACES), {}, "is not there"),
+        ((path, CUBE, FACES), {"up_axis": "up"}, "must be X, Y or Z"),
+        ((tmp_path / "picture.gif", CUBE, FACES), {}, "must be .png"),
+        ((tmp_path / "none" / "a.png", CUBE, FACES), {}, "does not exist"),
     ]:
         with pytest.raises(InputError, match=match):
             render_preview(*arguments, size=SIZE, **options)
@@ -180,7 +180,7 @@ def test_bad_input_is_refused_and_keeps_the_picture(tmp_path, monkeypatch):
 
 
 def test_held_nodes_are_marked_where_they_can_be_seen(tmp_path):
-    """The near corner, and not the one behind the body."""
+    """The near corner is marked, and not the one behind the body."""
     pictures = {}
     near, far = (int(np.argmax(CUBE @ [1.0, 1.0, 2.0] * sign)) for sign in (1.0, -1.0))
     for name, node in (("none", None), ("near", near), ("far", far)):
@@ -192,7 +192,7 @@ def test_held_nodes_are_marked_where_they_can_be_seen(tmp_path):
 
 
 def test_dots_are_hidden_by_what_is_before_them(tmp_path):
-    """The near corner of a second cube behind the first is hidden, however coarse the first one is drawn."""
+    """The near corner of a second cube behind the first is hidden, however coarsely the first one is drawn."""
     towards = np.array([1.0, 1.0, 2.0])
     both = np.concatenate([CUBE, CUBE - 1.5 * (CUBE.max() - CUBE.min()) * towards / 2.0])
     faces = np.concatenate([FACES, FACES + len(CUBE)])

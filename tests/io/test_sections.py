@@ -1,4 +1,4 @@
-"""Cuts through bodies: areas, and how they go along with the mesh."""
+"""Cuts through bodies: areas, and their motion with the mesh."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def areas(section, right, above):
 
 @pytest.mark.parametrize("height", [0.0, 0.02])
 def test_labels_take_their_discs(ball, height):
-    """As finely as the domain has them, whatever the tetrahedra: squares of 0.5 mm, tetrahedra of 10."""
+    """Labels have the domain's resolution with any tetrahedra: squares of 0.5 mm, tetrahedra of 10."""
     section = Section(*ball, [0.0, height, 0.0], ACROSS, UP, REACH, 5e-4)
     core, whole = np.pi * (CORE**2 - height**2), np.pi * (RADIUS**2 - height**2)
     assert areas(section, *section.moved()) == pytest.approx([core, whole - core], rel=5e-3)
@@ -47,7 +47,7 @@ def test_an_affine_deformation_carries_it_along(ball):
 
 
 def test_it_is_drawn_in_the_labels_colours(ball, tmp_path):
-    """Of a picture of the square that holds the disc, the share of each colour."""
+    """The fraction of each colour in a picture of the square that contains the disc."""
     figure = Figure(figsize=(2, 2), dpi=200)
     section = Section(*ball, [0.0, 0.0, 0.0], ACROSS, UP, REACH, 5e-4)
     section.draw(figure.add_axes((0, 0, 1, 1)), None, {"core": (1, 0, 0), "shell": (0, 0, 1)})

@@ -1,4 +1,4 @@
-"""Stages of bodies whose meshes change: at every frame, and between frames, what belongs together fits together."""
+"""Stages of bodies whose meshes change: at every frame, and between frames, data that belong together match."""
 
 import itertools
 from pathlib import Path
@@ -17,7 +17,7 @@ from warp_corot.io.write.usd.writer import UsdWriter
 BOX = wc.TetForest.box((2, 1, 1), 0.1, 2)
 VOLUME = 2 * 0.1**3
 FINER = BOX.refine([0, 5])
-#: Another leaf of the same kind refined: as many nodes and tetrahedra, but others.
+#: Another leaf of the same kind refined: the same numbers of nodes and tetrahedra, but others.
 OTHER = BOX.refine([len(BOX.tets) - 1])
 TWIN = next(
     mesh
@@ -26,13 +26,13 @@ TWIN = next(
     and mesh.tets.shape == OTHER.tets.shape
     and not np.array_equal(mesh.points, OTHER.points)
 )
-#: Which mesh each frame shows.
+#: The mesh of each frame.
 SHOWN = [BOX, BOX, FINER, FINER, FINER.refine([3]), OTHER, OTHER, TWIN, TWIN, BOX]
 CHANGES = [0.0, 2.0, 4.0, 5.0, 7.0, 9.0]
 
 
 class Material:
-    """A modulus that is another in each tetrahedron."""
+    """A modulus that differs in each tetrahedron."""
 
     poisson, density = 0.4, 1000.0
 
@@ -203,9 +203,9 @@ def test_wrong_use_is_named(tmp_path):
     with pytest.raises(wc.InputError, match="must be made with changing=True"):
         writer.change_mesh(FINER)
     writer = UsdWriter(tmp_path / "b.usd", BOX, fps=25, changing=True)
-    with pytest.raises(wc.InputError, match="1 skins now, should be 0"):
+    with pytest.raises(wc.InputError, match="1 skins now; there must be 0"):
         writer.change_mesh(FINER, skins=BoundSkins([FINER]).on([FINER]))
     writer.write(BOX.points)
     writer.change_mesh(FINER)
-    with pytest.raises(wc.InputError, match=rf"positions has shape .*, should be \[{len(FINER.points)}, 3\]"):
+    with pytest.raises(wc.InputError, match=rf"positions has shape .*; it must be \[{len(FINER.points)}, 3\]"):
         writer.write(BOX.points)

@@ -1,4 +1,4 @@
-"""A user's USD prims go along with a body and keep what they look like."""
+"""A user's USD prims follow a body and keep their appearance."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ def simulated(mesh, device="cpu", young=1e4) -> wc.Simulation:
 
 
 def textured_cube(path: Path, mirrored: bool) -> np.ndarray:
-    """A cube of quads in centimetres, moved and perhaps mirrored by its parent, with UVs, a texture, a subset."""
+    """A cube of quads in centimetres, moved and optionally mirrored by its parent, with UVs, a texture, a subset."""
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageMetersPerUnit(stage, 0.01)
     UsdGeom.SetStageUpAxis(stage, "Y")

@@ -1,4 +1,4 @@
-"""USD output: what stands in the stage, and that a stage that opens is there whatever ends the run."""
+"""USD output: the content of the stage, and that a valid stage exists whatever ends the run."""
 
 import errno
 import os
@@ -57,7 +57,7 @@ def validation_errors(path: Path) -> list[str]:
 
 
 def assert_frames(path: Path, count: int, mesh=Cube) -> None:
-    """The stage plays exactly these frames, values bit by bit."""
+    """The stage plays exactly these frames, with values bit for bit."""
     stage, tets, surface = prims_of(path)
     times = [float(index) for index in range(count)]
     assert tets.GetPointsAttr().GetTimeSamples() == times
@@ -114,7 +114,7 @@ def test_tetrahedra_are_right_handed_and_the_surface_looks_outward(tmp_path):
     assert np.isclose(np.linalg.det(rest[faces]).sum() / 6.0, volumes.sum())
     compact = np.asarray(surface.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
     assert np.array_equal(np.unique(Cube.tets)[compact], faces)
-    assert compact.max() + 1 == len(surface.GetPointsAttr().Get(0.0)) == 5  # the node that none uses is left out
+    assert compact.max() + 1 == len(surface.GetPointsAttr().Get(0.0)) == 5  # the unused node is left out
 
 
 @pytest.mark.parametrize("flush_every", [0, 1, 3], ids=["at once", "a piece a frame", "pieces"])
@@ -238,7 +238,7 @@ def test_pieces_of_a_killed_run_are_replaced_and_foreign_files_kept(tmp_path):
     path = tmp_path / "out.usd"
     killed = UsdWriter(path, Cube, fps=25)
     write_frames(killed, frames_of(Cube, 3), flush_every=1)
-    killed._store._release()  # as a kill does: the lock is gone, the files stay
+    killed._store._release()  # like a kill: the lock is gone, the files stay
     assert_frames(path, 3)
     (tmp_path / "out.usd.pieces" / "notes.txt").write_text("mine")
     (stale,) = (tmp_path / "out.usd.pieces").glob("run-*")
@@ -287,7 +287,7 @@ def start_run(out: Path, flush_every: int) -> subprocess.Popen:
 
 @pytest.mark.skipif(os.name == "nt", reason="needs SIGKILL")
 def test_kill_at_any_moment_leaves_a_stage_that_opens(tmp_path):
-    """Ten runs killed at random moments, mostly while they are writing; each goes over what the one before left."""
+    """Ten runs are killed at random moments, mostly while writing; each overwrites the one before."""
     moments = random.Random(7)
     out = tmp_path / "out.usd"
     out.write_text("a good file")
@@ -295,7 +295,7 @@ def test_kill_at_any_moment_leaves_a_stage_that_opens(tmp_path):
         before = out.read_bytes()
         process = start_run(out, flush_every=1 if attempt % 2 else 5)
         time.sleep(moments.uniform(0.0, 0.25))
-        # On a machine with much else to do none of them may have come so far; the last one does.
+        # On a busy machine none of them may have come so far; the last one does.
         latest = time.monotonic() + 60.0
         while attempt == 9 and out.read_bytes() == b"a good file" and time.monotonic() < latest:
             time.sleep(0.01)
@@ -314,7 +314,7 @@ def test_kill_at_any_moment_leaves_a_stage_that_opens(tmp_path):
 @pytest.mark.skipif(os.name == "nt", reason="needs resource limits")
 @pytest.mark.parametrize(("limit", "what"), [(30_000, "join"), (1_000, "first piece")])
 def test_a_full_disk_is_one_clear_line_and_keeps_what_is_there(tmp_path, limit, what):
-    """No file of the process may grow beyond a limit: the joined file cannot be written, or not even a first piece."""
+    """A limit on file size: the joined file cannot be written, or not even a first piece."""
     out = tmp_path / "out.usd"
     out.write_text("a good file")
     limits = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))\n"
@@ -335,7 +335,7 @@ def test_a_full_disk_is_one_clear_line_and_keeps_what_is_there(tmp_path, limit, 
 
 
 def fill_disk(monkeypatch, folder: Path, room: int) -> None:
-    """Leave room for so many bytes in all files that are there at once."""
+    """Leave room for this many bytes in all files that exist at once."""
     sync = usd_pieces.sync
 
     def synced(path: Path) -> None:
@@ -349,7 +349,7 @@ def fill_disk(monkeypatch, folder: Path, room: int) -> None:
 @pytest.mark.parametrize("flush_every", [0, 60])
 @pytest.mark.parametrize("room", [25_000, 40_000, 60_000])
 def test_a_full_disk_keeps_the_frames_that_fit(tmp_path, monkeypatch, room, flush_every):
-    """All wait when it fills, or some have been written; many frames go with one another, and not all of them fit."""
+    """All frames wait when it fills, or some have been written; several wait together, and not all of them fit."""
     out = tmp_path / "out.usd"
     fill_disk(monkeypatch, tmp_path, room)
     with pytest.raises(OSError, match=r"No space left on device; the frames up to \d+ are kept in .*out.usd plays"):
@@ -391,7 +391,7 @@ def test_bad_outputs_are_refused_before_the_run(tmp_path):
     for name, word in [
         ("out.obj", "extension .obj"),
         ("out", "extension"),
-        ("missing/out.usd", "is not there"),
+        ("missing/out.usd", "does not exist"),
         ("file/out.usd", "is a file"),
         ("folder.usd", "is a folder"),
         ("/proc/out.usd", "cannot be written to"),

@@ -1,4 +1,4 @@
-"""Scans from files: the same volume in every format, and what is refused or warned of."""
+"""Scans from files: the same volume in every format, errors and warnings."""
 
 import os
 
@@ -22,7 +22,7 @@ def test_nifti_in_its_own_unit_and_place(tmp_path, device, rng):
     points = expected.bounds[0] + rng.uniform(-0.5, 1.5, (1000, 3)) * np.ptp(expected.bounds, axis=0)
     for name in ("a.nii", "b.nii.gz"):
         domain = Domain.from_labels(tmp_path / name, device=device)
-        # The format keeps its matrix in float32.
+        # The format stores its matrix in float32.
         assert np.allclose(domain.phi(points), expected.phi(points), atol=1e-5)
         assert any("as the file says" in line for line in domain.report())
     with pytest.raises(InputError, match=r"c\.nii: the file names no unit of length; say unit='mm'"):
@@ -32,7 +32,7 @@ def test_nifti_in_its_own_unit_and_place(tmp_path, device, rng):
 
 
 def test_the_same_scan_in_four_formats(tmp_path, rng):
-    """Written by ITK, which turns its left-posterior-superior into NIfTI's directions itself."""
+    """ITK writes them, and itself converts its left-posterior-superior to NIfTI's directions."""
     sitk = pytest.importorskip("SimpleITK")
     pytest.importorskip("nibabel")
     volume = blobs(rng)
@@ -158,13 +158,13 @@ def test_bad_files_are_refused_in_one_line(tmp_path):
         assert "\n" not in str(raised.value)
     with pytest.raises(InputError, match="is a folder"):
         Domain.from_labels(tmp_path)
-    with pytest.raises(InputError, match=r"unknown format \.py, should be \.nii\.gz"):
+    with pytest.raises(InputError, match=r"unknown format \.py; it must be \.nii\.gz"):
         Domain.from_labels(__file__)
 
 
 @pytest.mark.slow
 def test_the_brain_of_nilearn():
-    """MNI ICBM 152: 1 mm voxels, a brain of about 1.7 l, its middle plane at x = 0 and mirror-like there."""
+    """MNI ICBM 152: 1 mm voxels, a brain of about 1.7 l, nearly symmetric about its middle plane x = 0."""
     nilearn = pytest.importorskip("nilearn")
     maps = os.path.join(os.path.dirname(nilearn.__file__), "datasets/data/mni_icbm152_%s_tal_nlin_sym_09a_converted")
     files = {"grey": (maps % "gm") + ".nii.gz", "white": (maps % "wm") + ".nii.gz"}

@@ -1,4 +1,4 @@
-"""Meshes of a number of elements: of any shape, as many as asked for, all of the body in them, in one piece."""
+"""Meshes with a given number of elements: any shape, the requested number, the whole body, in one piece."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def turned(mesh: trimesh.Trimesh) -> wc.Domain:
 
 
 def coil() -> wc.Domain:
-    """A wire of 2 mm, 60 cm of it, wound in a space of 10 cm."""
+    """A wire of 2 mm, 60 cm of it, coiled in a space of 10 cm."""
     t = np.linspace(0.0, 4.0 * np.pi, 80)
     path = np.stack([0.05 * np.cos(t), 0.05 * np.sin(t), 0.1 * t / t[-1]], axis=1)
     parts = [
@@ -50,7 +50,7 @@ def test_all_of_a_body_is_in_as_many_elements_as_asked_for(shape):
 
 
 def test_thin_parts_get_layers_where_the_number_allows():
-    """A slab on a block: with two layers asked for, its elements are half as thick as it is or less."""
+    """A slab on a block: with two layers requested, its elements are at most half as thick as it is."""
     block = trimesh.creation.box((0.06, 0.06, 0.06))
     slab = trimesh.creation.box((0.12, 0.06, 0.006)).apply_translation((0.08, 0.0, 0.0))
     whole = trimesh.util.concatenate([block, slab])
@@ -97,7 +97,7 @@ def test_the_same_mesh_comes_out_twice():
 
 
 def test_slivers_that_connect_stay():
-    """A row of cubes' elements, all but the ends' next to empty: none is given up, or the ends would come apart."""
+    """A row of cubes' elements, nearly empty except at the ends: all are kept, or the ends would separate."""
     row = wc.TetForest.box((6, 1, 1))
     volume = row.volumes
     middle = row.points[row.tets].mean(axis=1)[:, 0]
@@ -115,7 +115,12 @@ def test_slivers_that_connect_stay():
 
 
 def test_a_cube_takes_what_it_is_given(tmp_path):
-    """So many of its elements are equally needy that none of them has room, and nothing is left to look at."""
+    """Many of its elements have the same need, so none of them fits the number, and nothing is left to evaluate."""
     trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "cube.stl")
     mesh = wc.TetForest.from_domain(wc.Domain.from_surface(tmp_path / "cube.stl"), target_elements=20000)
     assert 18000 <= len(mesh.tets) <= 20000
+
+
+def test_cubes_far_too_many_for_the_elements_are_refused_before_they_are_made() -> None:
+    with pytest.raises(wc.InputError, match=r"cell_size is 0\.001 m, .* 1e\+09 cubes; target_elements=50"):
+        wc.TetForest.from_domain(wc.Domain.box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), 0.001, target_elements=50)

@@ -1,4 +1,4 @@
-"""Meshes out of a finer forest: conforming, no finer than asked for, and as many elements as foretold."""
+"""Coarser meshes from a forest: conforming, no finer than requested, with the predicted number of elements."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def resolved(request):
 
 
 def bisected(resolved: Resolved, needs: np.ndarray, least: float) -> np.ndarray:
-    """What is bisected, round by round as a person would do it: what needs it, and what has a node on an edge."""
+    """Reference bisection, round by round: elements that need it, and those with a node on an edge."""
     tree, ends = resolved.grown.tree, resolved.grown.ends
     between = {(int(a), int(b)): node for node, (a, b) in enumerate(ends) if a >= 0}
     holds = resolved.held > 0.0
@@ -65,7 +65,7 @@ def test_one_sweep_finds_what_rounds_find(resolved, seed):
 
 def test_no_threshold_gives_more_elements_of_those_allowed(resolved):
     rng = np.random.default_rng(3)
-    # Leaves need it, too, which have no children.
+    # Leaves, which have no children, need it, too.
     needs = np.zeros(len(resolved.held))
     chosen = rng.choice(resolved.leaves, len(resolved.leaves) // 30, replace=False)
     needs[chosen] = rng.random(len(chosen))

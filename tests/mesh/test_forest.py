@@ -79,7 +79,7 @@ def test_uniform_leaves_are_those_of_the_sequential_bisection(cells, level):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_refined_leaves_are_those_of_the_sequential_bisection(seed):
-    """Random leaves bisected, three times over: neither more nor fewer others follow than conformity asks for."""
+    """Random leaves are bisected, three times: conformity adds exactly the required bisections."""
     rng = np.random.default_rng(seed)
     forest, sequential = wc.TetForest.box((2, 1, 1), CUBE, seed % 3), Bisection((2, 1, 1), seed % 3)
     for _ in range(3):
@@ -93,7 +93,7 @@ def test_refined_leaves_are_those_of_the_sequential_bisection(seed):
         assert set(leaf_set(forest)) == sequential.leaves
         assert set(leaf_set(before.refine(np.flatnonzero(chosen)))) == sequential.leaves
         assert np.array_equal(forest.points[: len(before.points)], before.points)
-        assert leaf_set(before) == leaves  # the old forest is as it was
+        assert leaf_set(before) == leaves  # the old forest is unchanged
     assert len(set(forest.levels)) > 2
 
 
@@ -204,7 +204,7 @@ def test_children_are_the_bisections_of_their_parent(forest):
 
 
 def test_leaves_are_in_tree_order(forest):
-    """A walk down the tree, first children first, meets the leaves one after the other, so siblings are neighbours."""
+    """A walk down the tree, first children first, visits the leaves in order, so siblings are neighbours."""
     tree = forest.tree
     walked, stack = [], list(np.flatnonzero(tree.parent < 0)[::-1])
     while stack:
@@ -219,7 +219,7 @@ def test_leaves_are_in_tree_order(forest):
 
 
 def test_rows_and_what_is_above(forest):
-    """Rows are those of the whole tree; so many steps up is so many times the parent, and above a root is nothing."""
+    """Rows are those of the whole tree; k steps up are k parents, and above a root there is nothing."""
     tree = forest.tree
     everything = np.arange(len(tree.level))
     for chosen in (tree.leaves, everything[tree.level == 3], everything[::-3], everything[:0]):
@@ -234,7 +234,7 @@ def test_rows_and_what_is_above(forest):
 
 @pytest.mark.parametrize("level", range(9))
 def test_ancestors(forest, level):
-    """The ancestor at a level has that level and the leaf's centroid inside; a leaf above that level is its own."""
+    """The ancestor at a level contains the leaf's centroid; a leaf above that level is its own ancestor."""
     tree, found = forest.tree, forest.ancestors(level)
     assert np.array_equal(tree.level[found], np.minimum(forest.levels, level))
     above = forest.levels <= level
@@ -278,7 +278,7 @@ def test_nodes_are_numbered_as_the_leaves_name_them(level):
 
 @pytest.mark.parametrize("level", range(14))
 def test_a_uniform_forest_is_the_level_above_refined(level):
-    """Patch by patch from the roots, or leaf by leaf from the level above: the same tetrahedra in the same order."""
+    """Patch by patch from the roots, or leaf by leaf from the level above: same tetrahedra in the same order."""
     at_once = wc.TetForest.box((1, 2, 1), CUBE, level + 1)
     above = wc.TetForest.box((1, 2, 1), CUBE, level)
     refined = above.refine(np.ones(len(above.tets), bool))
@@ -291,7 +291,7 @@ def test_a_uniform_forest_is_the_level_above_refined(level):
 
 
 def test_frames_down_to_the_deepest_level(device):
-    """One corner bisected until the lattice is used up: local frames on the device are the table's at every level."""
+    """One corner is bisected to the end of the lattice: local frames on the device equal the table's at every level."""
     forest = wc.TetForest.box((1, 1, 1), CUBE, 0)
     while forest.levels.max() < 48:
         at_corner = (forest.points[forest.tets] == 0).all(2).any(1)
@@ -307,7 +307,7 @@ def test_frames_down_to_the_deepest_level(device):
 
 
 def test_neighbours_in_memory_are_neighbours_in_space():
-    """Eight leaves in a row are a subtree of three levels: their nodes are ten, and close together."""
+    """Eight consecutive leaves are a subtree of three levels: they have ten nodes, close together."""
     forest = wc.TetForest.box((1, 1, 1), 1.0, 9)
     groups = forest.tets.reshape(-1, 8 * 4)
     assert {len(np.unique(group)) for group in groups} == {10}

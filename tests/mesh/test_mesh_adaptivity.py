@@ -1,4 +1,4 @@
-"""Meshes made from domains: conforming, well shaped, and fine only where something asks for it."""
+"""Meshes made from domains: conforming, well shaped, and fine only where a criterion requires it."""
 
 import numpy as np
 import oracle
@@ -26,7 +26,7 @@ def test_every_mesh_is_conforming_and_well_shaped(shape, error, device):
 
 
 def test_counts_on_a_ball_fall_against_uniform_ones():
-    """Surface elements go with 1/h^2, all of them with 1/h^3: the ratio halves every three levels."""
+    """Surface elements scale with 1/h^2, all elements with 1/h^3: the ratio halves every three levels."""
     count = {level: len(wc.TetForest.from_domain(ball(), 1.0, max_level=level).tets) for level in (12, 15, 18)}
     ratio = {level: n / (6 * 2**level * 4 / 3 * np.pi * 0.064) for level, n in count.items()}
     assert ratio[15] < 0.6
@@ -35,7 +35,7 @@ def test_counts_on_a_ball_fall_against_uniform_ones():
 
 
 def test_fine_local_features_need_a_tenth():
-    """A ball with a needle: the error asks for the finest level at the needle only."""
+    """A ball with a needle: the error requires the finest level only at the needle."""
     body = united(ball(0.4), ball(0.012, (0.41, 0, 0)))
     forest = wc.TetForest.from_domain(body, 1.0, max_level=18, surface_error=1e-3)
     assert forest.levels.max() == 18
@@ -44,7 +44,7 @@ def test_fine_local_features_need_a_tenth():
 
 
 def test_each_point_is_looked_at_once():
-    """But for the last look at a few elements, whose middle may be a node elsewhere."""
+    """Except for the last evaluation of a few elements, whose middle may be another's node."""
     body = ball()
     forest = wc.TetForest.from_domain(body, 1.0, max_level=15, surface_error=1e-3)
     asked = np.concatenate(body.asked)
@@ -87,8 +87,8 @@ def test_a_number_of_elements_can_be_asked_for(target):
 
 @pytest.mark.parametrize(("scale", "shift"), [(1e-3, 0.0), (1e3, 0.0), (1.0, 30.0)])
 def test_size_and_place_do_not_matter(scale, shift):
-    """The same ring in millimetres, in kilometres and far from the origin: as many elements within one in a hundred,
-    where float32 coordinates decide otherwise."""
+    """The same ring in millimetres, in kilometres and far from the origin: equal numbers of elements within 1 %,
+    where float32 coordinates decide differently."""
     body, other = ring(), ring()
     other.function = lambda x: scale * body.function((x - shift) / scale)
     other.bounds = scale * body.bounds + shift
@@ -111,7 +111,7 @@ def test_a_million():
 
 
 def test_the_same_mesh_comes_out_twice(device):
-    """Also where threads race for the numbers of new nodes."""
+    """Even though threads race for the numbers of new nodes."""
     one, two = (
         wc.TetForest.from_domain(ring(), 0.3, max_level=12, surface_error=2e-3, device=device) for _ in range(2)
     )

@@ -1,4 +1,4 @@
-"""Elements that a surface cuts: what they hold, and what becomes of those that hold next to nothing."""
+"""Elements that a surface cuts: their contents, and the treatment of nearly empty ones."""
 
 import numpy as np
 import pytest
@@ -52,7 +52,7 @@ def test_slivers_without_other_neighbours_go_to_the_fullest():
     assert np.array_equal(gone, small)
     assert after.sum() == pytest.approx(volumes.sum())
     assert (after[~gone] >= volumes[~gone]).all()
-    # What a single one holds goes to the neighbour across a face that holds most.
+    # The contents of a single one go to the fullest neighbour across a face.
     alone = np.arange(len(volumes)) == 17
     after, gone = merged(pairs, volumes, alone)
     shared = (box.tets[:, :, None] == box.tets[17]).any(axis=2).sum(axis=1)
@@ -68,6 +68,6 @@ def test_label_shares_fill_what_is_inside():
     assert (shares >= 0).all()
     pure = np.ptp(labels, axis=1) == 0
     assert np.allclose(shares[pure, labels[pure, 0]], inside_shares(values[pure]))
-    # Two labels, all inside: one node's corner is an eighth, two nodes' wedge a half.
+    # Two labels, all inside: the corner at one node is an eighth, the wedge at two nodes a half.
     shares = label_shares(-np.ones((2, 4)), np.array([[1, 2, 2, 2], [1, 2, 1, 2]]), 2)
     assert np.allclose(shares, [[0, 1 / 8, 7 / 8], [0, 1 / 2, 1 / 2]])

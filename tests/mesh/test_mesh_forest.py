@@ -30,7 +30,7 @@ def test_void_is_not_part_of_the_mesh(forest):
 
 @pytest.mark.parametrize("level", [0, 3, 6, 8, 9, 12])
 def test_ancestors_stand_on_nodes(forest, level):
-    """The highest one, not above the level, whose corners are nodes: none between it and the level has that."""
+    """It is the highest one, not above the level, whose corners are nodes: no other up to the level qualifies."""
     tree, found = forest.tree, forest.ancestors(level)
     assert (tree.tets[found] < len(forest.points)).all()
     assert (tree.level[found] >= np.minimum(forest.levels, level)).all()

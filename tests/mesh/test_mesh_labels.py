@@ -11,7 +11,7 @@ from warp_corot.mesh.surfaces.separating import separated
 
 
 def layered():
-    """A ball of three labels: below a slanted plane, and above it left and right."""
+    """A ball with three labels: below a slanted plane, and above it left and right."""
 
     def labels(x):
         upper = np.where(x[:, 0] > 0.05, 3, 2)
@@ -66,7 +66,7 @@ def test_surfaces_between_labels_are_closed_and_fit(labelled):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_random_labels_have_closed_surfaces_that_fill_the_box(seed):
-    """Labels at random: elements of two, three and four labels in all arrangements, without gaps or overlaps."""
+    """Random labels give elements with two, three and four labels in all arrangements, without gaps or overlaps."""
     rng = np.random.default_rng(seed)
     box = wc.TetForest.box((2, 2, 2), 1.0, 4)
     values = np.full(len(box.points), -1.0)

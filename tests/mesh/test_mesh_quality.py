@@ -1,4 +1,4 @@
-"""Meshes of scans, sets and surfaces: conforming and well shaped like those of formulas; what adaptivity saves."""
+"""Meshes of scans, sets and surfaces: as conforming and well shaped as those of formulas; savings by adaptivity."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from warp_corot.experiments.meshes import draw, ratios_by_error, ratios_by_level
 
 
 def scan():
-    """Blobs of two labels at random, on an oblique lattice."""
+    """Random blobs of two labels on an oblique lattice."""
     noise = gaussian_filter(np.random.default_rng(7).standard_normal((2, 24, 28, 20)), (0, 3, 3, 3))
     voxels = np.where(noise[0] > 0.01, np.where(noise[1] > 0, 2, 1), 0)
     affine = np.eye(4)
@@ -20,7 +20,7 @@ def scan():
 
 
 def knobs():
-    """A torus less a capsule, with a ball on it."""
+    """A torus minus a capsule, with a ball on it."""
     ring = wc.Domain.torus(0.03, 0.01) - wc.Domain.capsule((-0.06, 0, 0), (0.06, 0, 0), 0.004)
     return ring | wc.Domain.sphere(0.006, (0.0, 0.04, 0.0))
 
@@ -48,7 +48,7 @@ def points():
 
 
 def test_adaptive_meshes_are_as_near_as_uniform_ones(points):
-    """Of the ball, at the same level: to the Hausdorff distance, a quarter for edges halved."""
+    """For the ball at the same level: the Hausdorff distance falls to a quarter if edges are halved."""
     error = {(p.kind, p.level): p.error for p in points if p.name == "ball"}
     for level in (9, 12, 15, 18):
         assert error["adaptive", level] == pytest.approx(error["uniform", level], rel=0.05)
@@ -56,7 +56,7 @@ def test_adaptive_meshes_are_as_near_as_uniform_ones(points):
 
 
 def test_adaptive_meshes_need_fewer_tetrahedra(points):
-    """A surface has tetrahedra by 1/h^2, a volume by 1/h^3: the ratio halves every three levels, in the end."""
+    """Tetrahedra of a surface scale with 1/h^2, of a volume with 1/h^3: the ratio halves every three levels."""
     ratio = ratios_by_level(points)
     assert 0.4 < ratio[15] < 0.5
     assert ratio[18] / ratio[15] == pytest.approx(0.55, abs=0.06)

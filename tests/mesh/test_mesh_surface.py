@@ -1,4 +1,4 @@
-"""Surfaces of meshes made from domains: how near they are to the body's, closed, and of its topology."""
+"""Surfaces of meshes made from domains: their distance to the body's, closedness, and topology."""
 
 import numpy as np
 import pytest
@@ -14,8 +14,8 @@ LEVELS = (9, 12, 15)
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_surface_converges(shape):
-    """Volume, area and Hausdorff distance of smooth bodies go with the edge length squared; a box loses its edges,
-    which are cut by a share of the edge length: area and distance go with its first power."""
+    """Volume, area and Hausdorff distance of smooth bodies converge with the square of the edge length; a box loses its
+    edges, cut by a fraction of the edge length: area and distance converge with the first power."""
     make, volume, area, sample, _ = SHAPES[shape]
     errors = []
     for level in LEVELS:
@@ -66,7 +66,7 @@ def test_surface_error_is_kept_by_smooth_bodies(shape, error, device):
 
 @pytest.mark.parametrize("error", [2e-2, 5e-3])
 def test_surface_error_at_creases(error):
-    """Also sharp edges and corners, which samples do not hit, are kept."""
+    """Sharp edges and corners, which samples miss, are kept, too."""
     body = turned_box(HALF, TURN)
     surface = wc.TetForest.from_domain(body, 0.3, max_level=30, surface_error=error).surface()
     assert off_surface(body, surface) < error
@@ -74,7 +74,7 @@ def test_surface_error_at_creases(error):
 
 
 def test_a_function_that_is_no_distance():
-    """x^2/a + y^2/b + z^2/c - 1 changes by 1/0.1 to 2/0.2 per metre: the error is in metres all the same."""
+    """x^2/a + y^2/b + z^2/c - 1 changes by 1/0.1 to 2/0.2 per metre: the error is still in metres."""
     axes = np.array([0.4, 0.3, 0.2])
     body = Body(lambda x: ((x / axes) ** 2).sum(axis=1) - 1, [-axes, axes], lipschitz=2 / 0.2 * np.sqrt(3) * 1.5)
     surface = wc.TetForest.from_domain(body, 0.25, max_level=24, surface_error=2e-3).surface()
@@ -97,8 +97,8 @@ def test_a_small_ball_in_one_root_cube_is_found(seed):
 
 @pytest.mark.parametrize(("scale", "shift"), [(1.0, 0.0), (0.3, 0.1), (0.007, -0.23)])
 def test_a_body_on_the_lattice_is_exact(scale, shift):
-    """A box whose faces are faces of cubes, also where float32 cannot hold their coordinates: no cut elements, no flat
-    triangles, nothing outside."""
+    """A box whose faces are faces of cubes, even where float32 cannot represent their coordinates: no cut elements, no
+    flat triangles, nothing outside."""
     half = scale * np.array([0.5, 0.25, 0.25])
     body = turned_box(half, np.eye(3))
     body.function = lambda x: box_distance(x - shift, half)
@@ -115,7 +115,7 @@ def test_a_body_on_the_lattice_is_exact(scale, shift):
 
 
 def test_a_body_that_sticks_out_of_its_bounds_ends_there(device):
-    """And is closed there. Beyond z = 0.3 a cap is gone: of pi h^2 (3 r - h) / 3, with h = 0.1."""
+    """And it is closed there. Beyond z = 0.3 a cap is missing, with volume pi h^2 (3 r - h) / 3, h = 0.1."""
     body = ball(0.4)
     body.bounds[1, 2] = 0.3
     surface = wc.TetForest.from_domain(body, 0.1, max_level=6, device=device).surface()
@@ -126,8 +126,8 @@ def test_a_body_that_sticks_out_of_its_bounds_ends_there(device):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_marching_any_values(seed):
-    """Random values: closed around what is inside. Many of them zero: no flat triangles, none twice, and every edge
-    is gone along as often one way as the other."""
+    """Random values give a closed surface. With many zeros there are no flat or duplicate triangles, and every edge
+    is passed equally often in both directions."""
     rng = np.random.default_rng(seed)
     box = wc.TetForest.box((3, 3, 3), 1.0, 4)
     rim = ((box.points == 0) | (box.points == 3)).any(axis=1)

@@ -29,14 +29,14 @@ def test_cells_of_any_kind_and_numbering_fit(kinds, seed):
     assert warped == 0
     assert volumes.sum() == pytest.approx(VOLUME, rel=1e-12) or kinds == ["tetra"]
     assert np.abs(volumes).sum() == pytest.approx(VOLUME, rel=1e-12)
-    # Every inner face is in two tetrahedra, and those in one are on the six sides.
+    # Every inner face is in two tetrahedra; faces in one tetrahedron are on the six sides.
     counts = faces_by_count(tets)
     assert set(counts) == {1, 2}
     assert counts[1] == 6 * 3 * 3 * 2
     boundary, _ = boundary_faces(tets, points)
     corners = np.linalg.det(points[boundary]).sum() / 6.0
     assert corners == pytest.approx(VOLUME, rel=1e-12)
-    # Each tetrahedron lies in the cell it is said to come from: its nodes are among the cell's.
+    # Each tetrahedron lies in its cell: its nodes are among the cell's.
     rows = [set(row) for block in blocks for row in block.nodes.tolist()]
     assert all(set(tet) <= rows[cell] for tet, cell in zip(tets.tolist(), cells.tolist(), strict=True))
     made = np.bincount(cells)
@@ -45,7 +45,7 @@ def test_cells_of_any_kind_and_numbering_fit(kinds, seed):
 
 
 def test_every_numbering_of_one_hexahedron_fills_it():
-    """All 40,320 orders of eight corners' numbers would take long; those of a random hundred do not."""
+    """All 40,320 orders of eight corners' numbers would take long; a random hundred do not."""
     rng = np.random.default_rng(0)
     corners = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)], float)
     for _ in range(100):
@@ -69,7 +69,7 @@ def test_mirrored_cells_are_turned_and_warped_ones_counted():
 
 
 def test_cells_with_merged_corners_lose_the_flat_tetrahedra():
-    """A hexahedron of which an edge has become a point is a wedge."""
+    """A hexahedron with an edge collapsed to a point is a wedge."""
     points = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1)], float)
     tets, _, _ = split_solids([Block("hexahedron", np.array([[0, 1, 2, 2, 3, 4, 5, 5]]))], points)
     assert len(tets) == 3
@@ -77,7 +77,7 @@ def test_cells_with_merged_corners_lose_the_flat_tetrahedra():
 
 
 def test_polyhedra_go_by_the_same_rule():
-    """The cube given by its faces is split as the cube given by its corners is."""
+    """The cube given by its faces is split like the cube given by its corners."""
     rng = np.random.default_rng(3)
     cube = np.array(list(itertools.product((0.0, 1.0), repeat=3)))[[0, 4, 6, 2, 1, 5, 7, 3]]
     numbers = rng.permutation(8)

@@ -1,4 +1,4 @@
-"""Surfaces and points that go along with a mesh: where they are bound, where they go."""
+"""Surfaces and points bound to a mesh: their binding and their motion."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def forest():
 
 
 def barycentric(forest, elements, points):
-    """Weights by Cramer's rule: volumes of the four tetrahedra that a point makes with the faces."""
+    """Weights by Cramer's rule: volumes of the four tetrahedra between a point and the faces."""
     x = forest.points[forest.tets[elements]]
     whole = np.linalg.det(x[:, 1:] - x[:, :1])
     found = []
@@ -45,7 +45,7 @@ def test_points_sit_on_edges_between_inside_and_outside(forest):
 
 @pytest.mark.parametrize("make", ["marched", "boundary", "points", "user's"])
 def test_an_affine_motion_is_followed_exactly(make, forest, device, rng):
-    """Weights sum to one and give the point itself, inside an element or beyond it: then affine motions are kept."""
+    """Weights sum to one and reproduce the point, inside an element or outside: so affine motions are exact."""
     if make == "marched":
         bound = forest.surface()
     elif make == "boundary":

@@ -1,4 +1,4 @@
-"""General tetrahedral meshes: what is repaired, what is refused, and how it is said."""
+"""General tetrahedral meshes: repairs, refusals, and their messages."""
 
 import numpy as np
 import oracle
@@ -37,7 +37,7 @@ def test_wound_wrongly_is_repaired_and_counted(rng):
     assert repaired.repaired == wrong.sum() > 0
     assert (signed_volumes(repaired) > 0).all()
     assert np.array_equal(np.sort(repaired.tets, axis=1), np.sort(mesh.tets, axis=1))
-    assert np.array_equal(tets, given)  # the caller's array is left alone
+    assert np.array_equal(tets, given)  # the caller's array is unchanged
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -97,7 +97,7 @@ def test_up_axis():
 
 @pytest.mark.parametrize("model", MODELS)
 def test_unreferenced_nodes_stay_where_they_are(model, device):
-    """A node no tetrahedron has: no mass, no motion, and the others move as they do without it."""
+    """A node of no tetrahedron has no mass and does not move, and the others move as without it."""
     lone = np.insert(POINTS, [0, 2, 5], [[9.0, 9, 9], [0.3, 0.3, 0.3], [-9, 0, 0]], axis=0)
     kept = np.array([1, 2, 4, 5, 6])
     assert np.array_equal(lone[kept], POINTS)

@@ -1,4 +1,4 @@
-"""Bodies given by formulas, as the mesher sees domains."""
+"""Bodies given by formulas, in the form for the mesher."""
 
 import numpy as np
 import warp as wp
@@ -42,7 +42,7 @@ def box_distance(x, half):
 
 
 def turned_box(half, turn):
-    """A box about the origin, turned by a rotation matrix."""
+    """A box about the origin, rotated by a matrix."""
     half = np.array(half)
     reach = np.abs(turn) @ half
     return Body(lambda x: box_distance(x @ turn, half), [-reach, reach])

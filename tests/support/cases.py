@@ -1,4 +1,4 @@
-"""Meshes, models and states the law tests share."""
+"""Meshes, models and states that the tests of laws share."""
 
 import numpy as np
 import oracle
@@ -31,7 +31,7 @@ def mixed_forest(seed=1, cells=(1, 1, 1), level=3, passes=2, share=0.1):
 
 
 def jittered(seed=2, cells=(2, 1, 1), level=4, amount=0.15):
-    """A general mesh: a forest's nodes moved by up to a share of the shortest edge; half is wound wrongly."""
+    """A general mesh: a forest's nodes moved by up to a fraction of the shortest edge; half is wrongly wound."""
     rng = np.random.default_rng(seed)
     forest = wc.TetForest.box(cells=cells, cell_size=CUBE, level=level)
     shortest = oracle.edge_lengths(oracle.Mesh(forest.points, forest.tets), forest.points)[1].min()
@@ -48,7 +48,7 @@ def oracle_mesh(mesh):
 
 
 def edge_scale(mesh):
-    """Shortest rest edge at every node [N, 1] (m), so that random displacements strain every level alike."""
+    """Shortest rest edge at every node [N, 1] (m), so that random displacements strain all levels alike."""
     reference = oracle_mesh(mesh)
     _, lengths = oracle.edge_lengths(reference, reference.points)
     shortest = np.full(len(mesh.points), np.inf)
@@ -57,7 +57,7 @@ def edge_scale(mesh):
 
 
 def random_displacement(mesh, rng, amount):
-    """Random nodal displacements of ``amount`` of the shortest edge, in float32, which is how the solver keeps them."""
+    """Random nodal displacements of ``amount`` of the shortest edge, in float32 like the solver's."""
     return (amount * edge_scale(mesh) * rng.uniform(-1, 1, mesh.points.shape)).astype(np.float32)
 
 

@@ -10,7 +10,7 @@ SHORT = ["--duration", "0.05", "--fps", "40", "--device", "cpu"]
 
 
 def run(*args: object) -> int:
-    """The exit status of a command; Warp's settings stay."""
+    """The exit status of a command; Warp's settings are restored."""
     before = wp.config.log_level
     try:
         return main([*map(str, args)])
@@ -25,12 +25,12 @@ def simulate(*args: object) -> int:
 
 
 def assert_refused(folder: Path, capsys, said: str, *args: object) -> None:
-    """It is one line on stderr and status 2, and no file is touched."""
+    """The error is one line on stderr and status 2, and no file is touched."""
     before = {file.name: file.read_bytes() for file in folder.iterdir()}
     assert simulate(*args) == 2
     out, err = capsys.readouterr()
     assert out == ""
-    # Whether kernels are compiled, and that is said, depends on what ran before.
+    # The message about compiling depends on what ran before.
     (error,) = [line for line in err.splitlines() if "compiling kernels" not in line]
     assert error.startswith("warp-corot: error: ")
     assert said in error

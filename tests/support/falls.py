@@ -1,4 +1,4 @@
-"""What must hold while soft bodies fall and swing: energy from gravity only, and no place that is out of reach.
+"""Checks of falling and swinging soft bodies: energy only from gravity, and no position out of reach.
 
 ``python tests/support/falls.py`` runs all bodies of ``loaded`` for 2 s each and prints a line for each.
 """
@@ -13,22 +13,22 @@ from loaded import DENSITY, DOZEN, FEW, GRAVITY, LONG, MANY, SHORT, THIRTY
 
 import warp_corot as wc
 
-#: How often the laws are checked [s].
+#: Interval of the checks [s].
 EVERY = 0.05
 
 
 @dataclass
 class Fall:
-    """A run, looked at every EVERY seconds.
+    """A run, sampled every EVERY seconds.
 
     Attributes:
-        elements: How many.
+        elements: Number of elements.
         length: The body's largest extent [m]; softness: its weight's pressure over Young's modulus, rho g length / E.
-        lengthens: Whether turning alone makes it longer, as linear elasticity has it.
-        times: [s].
+        lengthens: Whether rotation alone makes it longer, as in linear elasticity.
+        times: Times [s].
         kinetic, elastic: Energies; dropped: potential energy lost since the start [J].
         farthest: Largest displacement of any node [m].
-        error: What ended the run early, if anything did.
+        error: The error that ended the run early, if any.
         steps: Time steps done.
         seconds: Wall time of the steps.
     """
@@ -48,13 +48,13 @@ class Fall:
 
     @property
     def reach(self):
-        """Displacements that a falling body cannot exceed [m], at each time.
+        """Maximum displacements of a falling body [m], at each time.
 
         The tip of a rod that turns about its end falls with 3/2 g, of a cone that turns about its base with 5/2 g;
-        waves that meet may push it ahead by a little. A body may come to hang below its support, which moves its far
-        end by twice the length, and stretch: statically by at most rho g L^2 / (2 E / 3) (neo-Hookean bodies have E / 3
-        once they are long), and twice that as it swings. Linear ones lengthen as they turn: they have the first bound
-        only.
+        waves that meet may push it ahead slightly. A body may come to hang below its support, which moves its far
+        end by twice the length, and stretch: statically by at most rho g L^2 / (2 E / 3) (the stiffness of long
+        neo-Hookean bodies falls to E / 3), and twice that during the swing. Linear bodies lengthen as they turn: only
+        the first bound applies to them.
         """
         t = np.array(self.times)
         falling = 2.5 * 0.5 * GRAVITY * t**2 + AHEAD * self.length
@@ -62,8 +62,8 @@ class Fall:
         return falling if self.lengthens else np.minimum(falling, hanging)
 
     def look(self, sim, start):
-        """Note the present state; ``start`` is the potential energy at first [J]."""
-        with np.errstate(all="ignore"):  # squares of what is out of all bounds
+        """Sample the current state; ``start`` is the initial potential energy [J]."""
+        with np.errstate(all="ignore"):  # squares of diverged values
             energy = sim.energy()
             moved = sim.body.displacements.numpy().astype(float)
             self.times.append(sim.time)
@@ -73,12 +73,12 @@ class Fall:
             self.farthest.append(float(np.linalg.norm(moved, axis=1).max()))
 
 
-#: How far waves may push part of a body ahead of a fall, as a share of its length.
+#: How far waves may push part of a body ahead of a fall, as a fraction of its length.
 AHEAD = 0.1
 
 
 def kinetic_energy(sim):
-    """Kinetic energy [J] at the time of the positions; velocities belong to half a step, as the last was, before."""
+    """Kinetic energy [J] at the time of the positions; velocities belong to half a step before."""
     body = sim.body
     masses, forces = body.masses[:, None], sim.forces().numpy().astype(float)
     later = body.velocities.numpy() + 0.5 * sim.pace.dt * (forces / np.maximum(masses, 1e-30) + np.array(sim.gravity))
@@ -86,7 +86,7 @@ def kinetic_energy(sim):
 
 
 def fall(case, seconds, count, device="cpu", dt=None):
-    """Run a case; errors are kept, not raised."""
+    """Run a case; errors are recorded, not raised."""
     sim = case.simulation(count, device, dt)
     points = sim.body.mesh.points
     length = float(np.ptp(points[np.unique(sim.body.mesh.tets)], axis=0).max())
@@ -104,14 +104,14 @@ def fall(case, seconds, count, device="cpu", dt=None):
     return found
 
 
-#: E_kin + E_el may exceed the drop by this share of the largest drop so far. The scheme keeps the energy of a mode
+#: E_kin + E_el may exceed the drop by this fraction of the largest drop so far. The scheme keeps the energy of a mode
 #: omega to (omega dt)^2 / 4, and fast modes hold little of it: runs with a fifth of the stable step at rest stay below
 #: 0.008, and those that hardly deform below 0.004 with four fifths of it.
 SURPLUS = 0.01
 
 
 def violations(found):
-    """What did not hold, one line each; nothing if all did."""
+    """The violated checks, one line each; empty if there are none."""
     said = []
     numbers = np.array([found.kinetic, found.elastic, found.dropped, found.farthest])
     finite = np.isfinite(numbers).all(axis=0)

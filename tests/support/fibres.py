@@ -1,4 +1,4 @@
-"""Materials with directions that the tests of anisotropy and of activation share."""
+"""Materials with directions that the tests of anisotropy and activation share."""
 
 import numpy as np
 import oracle
@@ -53,27 +53,27 @@ def simulated(mesh, material, device, *, model=None, worlds=1, dt=1e-5, **option
 
 
 class Bar:
-    """A bar of 1 x 1 x 2 cubes along z, free in space: statics by damped steps, in small strains."""
+    """A free bar of 1 x 1 x 2 cubes along z: statics by damped steps, at small strains."""
 
     EDGE = 0.1
 
     def __init__(self, material, device):
         self.mesh = wc.TetForest.box((1, 1, 2), self.EDGE, 3)
         self.body = wc.SoftBody(self.mesh, material, device=device)
-        # Close to critical for the slowest mode, of wave speed (E / rho)^1/2 along a bar of 0.2 m.
+        # Nearly critical for the slowest mode, with wave speed (E / rho)^1/2 along a bar of 0.2 m.
         self.sim = wc.Simulation(self.body, integrator=wc.SymplecticEuler(damping=60.0), gravity=(0, 0, 0))
 
     def pull(self, stress):
-        """Tension sigma_zz = ``stress`` on both ends, consistently spread to their nodes."""
+        """Tension sigma_zz = ``stress`` on both ends, distributed consistently to their nodes."""
         reference = oracle.Mesh(self.mesh.points, self.mesh.tets)
         traction = np.zeros((3, 3))
         traction[2, 2] = stress
-        # Whatever is in balance with a constant stress is loaded by its tractions on the surface, and nowhere else.
+        # A body in equilibrium with a constant stress is loaded only by its surface tractions.
         nodal = reference.assemble(np.einsum("t,ij,taj->tai", reference.volumes, traction, reference.gradients))
         self.body.load(np.arange(len(nodal)), nodal)
 
     def strain(self, seconds=0.6):
-        """Mean of sym(du/dX) at rest [3, 3], and how far single elements are off it."""
+        """Mean of sym(du/dX) at rest [3, 3], and the largest deviation of single elements."""
         self.sim.advance(seconds)
         reference = oracle.Mesh(self.mesh.points, self.mesh.tets)
         gradients = reference.deformation_gradients(self.body.displacements.numpy().astype(float))

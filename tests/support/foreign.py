@@ -1,4 +1,4 @@
-"""What tests of other people's arrays and programs share: a body, arrays of every form that it takes, slow work."""
+"""Shared helpers for other programs' arrays: a body, arrays of every form, slow work."""
 
 import io
 
@@ -9,11 +9,11 @@ import warp_corot as wc
 
 RUBBER = wc.Isotropic(young=2e4, poisson=0.4, density=1000.0)
 DT = 2e-4
-SIDE = np.array([0.25, -0.5, 0.125])  # a way that float32 holds exactly [m]
+SIDE = np.array([0.25, -0.5, 0.125])  # a direction that float32 represents exactly [m]
 
 
 def bar(device, *, level=3, worlds=1, gravity=(0.0, 0.0, 0.0), fixed=True, model=None, damping=5.0):
-    """A simulation of a small bar whose results are the same bit by bit every time."""
+    """A simulation of a small bar whose results are reproducible bit for bit."""
     mesh = wc.TetForest.box(cells=(1, 1, 2), cell_size=0.1, level=level)
     body = wc.SoftBody(mesh, RUBBER, worlds=worlds, device=device)
     if fixed:
@@ -24,7 +24,7 @@ def bar(device, *, level=3, worlds=1, gravity=(0.0, 0.0, 0.0), fixed=True, model
 
 @wp.kernel(enable_backward=False)
 def dawdle(rounds: int, done: wp.array[wp.float32]):
-    """One thread that takes a while, and whose outcome cannot be known without."""
+    """One thread that takes a while, and whose result cannot be predicted."""
     x = done[0]
     for _ in range(rounds):
         x = wp.sin(x) + 1.0
@@ -68,7 +68,7 @@ def three_of(array):
 
 
 def write(array, vectors):
-    """Write vectors [n, 3] into an array of any form, and leave all else in it as it is."""
+    """Write vectors [n, 3] into an array of any form, and leave everything else in it unchanged."""
     whole = array.numpy().copy()
     whole[..., :3] = np.reshape(vectors, (*whole.shape[:-1], 3))
     array.assign(whole)
@@ -80,7 +80,7 @@ def read(array):
 
 
 def allocates(work):
-    """Whether memory is taken through Warp, on any device, while some work is done."""
+    """Whether work allocates memory through Warp, on any device."""
     with wp.ScopedMemoryTracker(print=False) as tracker:
         before = _totals(tracker)
         work()
@@ -88,7 +88,7 @@ def allocates(work):
 
 
 def _totals(tracker):
-    """How often memory has been taken so far, and how much: a line for each device."""
+    """Number and amount of allocations so far: one line for each device."""
     text = io.StringIO()
     tracker.report(file=text)
     lines = text.getvalue().splitlines()

@@ -1,4 +1,4 @@
-"""Meshes of all kinds of cells, as other programs write them."""
+"""Meshes with all kinds of cells, as other programs write them."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 
 from warp_corot.io.read.filemesh import Block
 
-#: Corners of one cube that its cells name, by kind.
+#: Corners of one cube in its cells, by kind.
 CUBE = {
     "hexahedron": [(0, 1, 2, 3, 4, 5, 6, 7)],
     "wedge": [(0, 1, 2, 4, 5, 6), (0, 2, 3, 4, 6, 7)],
     "pyramid": [(0, 1, 2, 3, 8), (4, 7, 6, 5, 8), (0, 4, 5, 1, 8), (1, 5, 6, 2, 8), (2, 6, 7, 3, 8), (3, 7, 4, 0, 8)],
     "tetra": [(0, 1, 2, 5), (0, 2, 3, 7), (0, 5, 2, 7), (0, 5, 7, 4), (2, 7, 5, 6)],
 }
-#: Turns of a cell's corners that leave it the same cell.
+#: Permutations of a cell's corners that leave it the same cell.
 TURNS = {
     "hexahedron": [
         (0, 1, 2, 3, 4, 5, 6, 7),
@@ -31,11 +31,11 @@ TURNS = {
 
 
 def grid(n: int, rng: np.random.Generator, kinds: list[str]) -> tuple[np.ndarray, list[Block]]:
-    """n x n x n cubes, each filled with cells of one of the kinds, whose nodes are numbered at random, and whose sides
-    are slightly skew. Cells begin at any corner that leaves them the same, and some are mirrored.
+    """n x n x n cubes, each filled with cells of one of the kinds, with randomly numbered nodes and slightly skew
+    sides. Cells begin at any corner that leaves them the same, and some are mirrored.
 
-    Tetrahedra fill a cube by five, whose diagonals do not fit other cubes': they must be the only kind. With wedges all
-    cubes of a column along z are of one kind.
+    Five tetrahedra fill a cube, and their diagonals do not fit other cubes': they must be the only kind. With wedges
+    all cubes of a column along z are of one kind.
     """
     lattice = np.array(list(itertools.product(range(n + 1), repeat=3)), float)
     numbers = {tuple(p): k for k, p in enumerate(lattice.astype(int).tolist())}
@@ -59,7 +59,7 @@ def grid(n: int, rng: np.random.Generator, kinds: list[str]) -> tuple[np.ndarray
     return placed, [Block(kind, order[np.array(cells, int)]) for kind, cells in rows.items() if cells]
 
 
-#: Volume of such a grid.
+#: Volume of this grid.
 VOLUME = float(np.linalg.det([[1.0, 0.1, 0.0], [0.0, 1.2, 0.2], [0.1, 0.0, 0.9]]))
 
 
@@ -96,7 +96,7 @@ def write_netgen(path: Path, points, cells: list[tuple[int, list[int]]], names: 
 
 
 def write_with_vtk(path: Path, data, binary: bool = True, version: int = 51) -> Path:
-    """Any data set of VTK's by the writer of its extension."""
+    """Any data set of VTK's by the writer for its extension."""
     from vtkmodules import vtkIOLegacy, vtkIOXML
 
     kinds = {".vtk": "vtkGenericDataObjectWriter", ".vtu": "vtkXMLUnstructuredGridWriter"}
@@ -119,7 +119,7 @@ def write_with_vtk(path: Path, data, binary: bool = True, version: int = 51) -> 
 
 
 def vtk_grid(points, cells: list[tuple[int, list[int]]], arrays: dict[str, list] | None = None):
-    """An unstructured grid; cells are VTK's number of a kind and corners."""
+    """An unstructured grid; cells are VTK's cell type and corners."""
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonCore import vtkPoints
     from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid

@@ -1,4 +1,4 @@
-"""Bytes flipped, cut, swapped, doubled, blanked, words exchanged, huge counts; what is compressed is damaged inside."""
+"""Bytes flipped, cut, swapped, doubled, blanked, words exchanged, huge counts; compressed files are damaged inside."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def _damaged_archive(data: bytes, rng: np.random.Generator) -> bytes:
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         for each, content in entries.items():
-            entry = zipfile.ZipInfo(each)  # of no time, so that it is the same each time
-            entry.extra = bytes(-(out.tell() + 30 + len(each)) % 64)  # contents begin where USD wants them
+            entry = zipfile.ZipInfo(each)  # without a date, so that it is the same each time
+            entry.extra = bytes(-(out.tell() + 30 + len(each)) % 64)  # contents begin where USD requires
             archive.writestr(entry, content)
     return out.getvalue()
 
@@ -85,7 +85,7 @@ def _blanked(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _huge(data: bytes, rng: np.random.Generator) -> bytes:
-    """A number in the text or somewhere among the first bytes that counts something."""
+    """A huge number in place of a count in the text or among the first bytes."""
     found = list(re.finditer(rb"-?\d+(\.\d+)?", data[:4000]))
     if found and rng.random() < 0.6:
         which = found[rng.integers(len(found))]
@@ -96,7 +96,7 @@ def _huge(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _exchanged(data: bytes, rng: np.random.Generator) -> bytes:
-    """A word or a number in place of another, so that a text stays one."""
+    """A word or a number in place of another, so that a text remains text."""
     found = list(re.finditer(rb"[\w.+-]+", data[:4000]))
     if not found:
         return data

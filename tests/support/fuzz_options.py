@@ -1,4 +1,4 @@
-"""Random option lists: commands as nobody would type them, or nearly."""
+"""Random option lists: commands that nobody would type, or nearly."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 
-#: What is typed in full length comes back in the complaint about it.
+#: Text that is typed in full length is repeated in the error message.
 LONG_WORD = "x" * 2000
 _WORDS = """0 1 -1 2 12 300 1e-3 nan inf -inf 1e400 2147483648 99999999999999999999 x mm cm m inch 5kPa 5furlong 1e-300m
 3mm 500ms 1.06g/cm3 0.2:0.4 200 -200:300 200: 9:1 linear corotated warp:bunny warp: box no.stl seed.ply seed.nii
@@ -17,7 +17,7 @@ NAME=z<0 a=bottom a=a b=nearest(0,0,0,9) 0,0,0 5kPa:0.45 5kPa:0.6 5kPa:0.45:1000
 2=3kPa:0.45,7=1e4:.3 liver@2=3kPa,bone@7=1GPa:.3 = ,, x=y=z material region tissue nodes,stress hypot(x,y)<1
 ball(0,0,0,1) box(0,0,0,1,1,1) nearest(0,0,0,5)"""
 WORDS = [*_WORDS.split(), "", "z < 0", "z <", "0 0 0", "0.01 0 0", "not x", "\u00e4", LONG_WORD, "x > 0 and y > 0"]
-#: Files that lists name: they must be there.
+#: Files that lists name: they must exist.
 FILES = ("ply", "nii", "vtk", "usda", "run")
 INPUTS = ["box", "run.toml", "none.stl", "none.toml", "warp:nobody", ""]
 INPUTS += ["seed.ply", "seed.nii", "seed.vtk", "seed.usda"]

@@ -1,4 +1,4 @@
-"""A small good file of each format that the package reads, one line for each, to be damaged."""
+"""A small valid file of each format that the package reads, one line for each, to be damaged."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _ball(suffix: str, level: int = 1, **options) -> Callable[[Path], Path]:
 
 
 def _objects(folder: Path) -> Path:
-    """Two balls, one of them turned and moved, in a file with texture coordinates and a material beside it."""
+    """Two balls, one of them rotated and moved, in a file with texture coordinates and a material beside it."""
     ball = _ball(".obj", 0)(folder)
     lines = [line for line in ball.read_text().splitlines() if line.startswith(("v ", "f "))]
     places = [line for line in lines if line.startswith("v ")]
@@ -90,7 +90,7 @@ def _objects(folder: Path) -> Path:
 
 
 def _gltf(folder: Path) -> Path:
-    """A scene of two nodes, its numbers in a file beside it."""
+    """A scene with two nodes and its numbers in a file beside it."""
     import trimesh
 
     ball = trimesh.creation.icosphere(1, 0.05)
@@ -161,7 +161,7 @@ def _tetgen(folder: Path) -> Path:
 
 
 def _vtk(suffix: str, binary: bool = True, version: int = 51) -> Callable[[Path], Path]:
-    """Cells of all kinds, as VTK's own writers write them."""
+    """Cells of all kinds, written by VTK's own writers."""
 
     def make(folder: Path) -> Path:
         from foreign_meshes import grid, vtk_grid, write_with_vtk
@@ -366,7 +366,7 @@ def _checkpoint(remeshed: bool) -> Callable[[Path], Path]:
     return make
 
 
-#: What makes a good input in an empty folder, by the name of its format. A new format is one line.
+#: Functions that write a valid input into an empty folder, by format. A new format is one line.
 SEEDS: dict[str, Callable[[Path], Path]] = {
     "stl": _ball(".stl"),
     "stl-text": _ball(".stl", 0, file_type="stl_ascii"),

@@ -1,9 +1,9 @@
-"""Damaged files and random option lists for the command line, in processes of their own.
+"""Damaged files and random option lists for the command line, in separate processes.
 
-``python fuzzing.py FOLDER FORMATS FIRST COUNT`` damages the seed of each format (their names with commas), as the
-number of each case from FIRST up to COUNT says, and has ``warp-corot simulate`` read it. A line of JSON a case goes to
-the file ``cases``: before it begins, so that a crash is known by its number, and again with what was wrong. A case ends
-well in a body or in one line and status 2. FORMAT ``options`` makes random option lists in place of files.
+``python fuzzing.py FOLDER FORMATS FIRST COUNT`` damages the seed of each format (names separated by commas) for
+each case number from FIRST up to COUNT, and lets ``warp-corot simulate`` read it. A line of JSON for each case goes to
+the file ``cases``: before it begins, so that a crash is identified by its number, and again with the error. A good case
+ends with a body or with one line and status 2. FORMAT ``options`` makes random option lists in place of files.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from fuzz_damage import damaged
 from fuzz_options import FILES, LONG_WORD, random_options
 from fuzz_seeds import SEEDS
 
-#: The most that a case may take: processor time and time [s], memory beyond that of the process at its start [bytes].
+#: Limits of a case: processor time and time [s], memory beyond that of the process at its start [bytes].
 SECONDS, WALL, MEMORY = 30.0, 900.0, 6 << 30
 #: More memory than this in use [bytes] is noted.
 MUCH = 500 << 20
-#: In most cases a domain is enough, since its mesh takes a hundred times as long, or a mesh without what holds it; so,
-#: too, a body without its options.
+#: Most cases stop at a domain, since its mesh takes a hundred times as long, or at a mesh without its supports, or at a
+#: body without its options.
 MESHED_EVERY, HELD_EVERY, MADE_EVERY = 100, 4, 10
-#: Formats whose seed is tetrahedra: nothing is said of their number.
+#: Formats whose seed is tetrahedra: their number is not reported.
 TETRAHEDRA = {
     "usda-tets",
     "usdc-tets",
@@ -68,10 +68,10 @@ TETRAHEDRA |= {form for form in SEEDS if form.startswith(("msh", "vtu"))}
 
 
 class Reached(BaseException):
-    """The input was taken: a body is about to be made, or its motion to be written."""
+    """The input was accepted: a body is about to be made, or its motion to be written."""
 
 
-#: The case that runs; the file where its words go; whether bodies and meshes are to be made.
+#: The current case; the file for its output; whether bodies and meshes are made.
 case: dict = {}
 cases: list = []
 making: set[str] = set()
@@ -85,14 +85,14 @@ def say(words: dict) -> None:
 
 
 def read_here(module: str, path: Path):
-    """What a reader in a process of its own finds, found in this one, which takes a hundredth of the time.
+    """The result of a reader in a separate process, found in this one, which takes a hundredth of the time.
 
-    One that crashes ends this process; it has said before that it reads, and in its own process it may.
+    A reader that crashes ends this process; it has reported its start, and in a separate process it may crash.
     """
     from warp_corot.io.files.quiet import bounded, quietly
 
     say({"reads": module})
-    if module.endswith("usd_trial"):  # which is to leave nothing behind in the process that then reads
+    if module.endswith("usd_trial"):  # which must leave nothing behind in the process that then reads
         return _tried(module, path)
     try:
         with quietly(), bounded(path):
@@ -126,14 +126,14 @@ def _tried(module: str, path: Path):
 
 
 def prepared() -> None:
-    """Nothing is simulated, readers read here, the parser is made once, nothing warns."""
+    """Nothing is simulated, readers run here, the parser is made once, no warnings."""
     import warnings
 
     import warp as wp
 
     from warp_corot import cli
     from warp_corot.body.soft_body import SoftBody
-    from warp_corot.cli import bodies, scene, simulate  # noqa: F401 (all that reads files)
+    from warp_corot.cli import bodies, scene, simulate  # noqa: F401 (all modules that read files)
     from warp_corot.experiments import paper
     from warp_corot.io.write import animate
     from warp_corot.mesh import TetForest
@@ -170,8 +170,8 @@ def prepared() -> None:
     animate.record = stop
     paper.beam = stop
     cli.make_parser = functools.cache(cli.make_parser)
-    for module in list(sys.modules.values()):
-        if module.__name__.startswith("warp_corot") and hasattr(module, "read_isolated"):
+    for name, module in list(sys.modules.items()):
+        if name.startswith("warp_corot") and hasattr(module, "read_isolated"):
             module.read_isolated = read_here
     warnings.simplefilter("ignore")
     wp.config.log_level = wp.LOG_ERROR
@@ -197,7 +197,7 @@ def _see(mesh) -> None:
 
 @contextmanager
 def said_by_all():
-    """What is written to stdout and stderr, by libraries too."""
+    """Output to stdout and stderr, by libraries too."""
     sys.stdout.flush()
     sys.stderr.flush()
     kept = [os.dup(1), os.dup(2)]
@@ -218,7 +218,7 @@ def said_by_all():
 
 
 def files_in(folder: Path) -> dict[str, tuple[int, int]]:
-    """All files, with their size and when they were written."""
+    """All files, with their sizes and times."""
     found = {}
     for below, _, names in os.walk(folder):
         for name in names:
@@ -229,7 +229,7 @@ def files_in(folder: Path) -> dict[str, tuple[int, int]]:
 
 
 def outputs(command: list[str]) -> set[str]:
-    """The files that a command is to write before the first frame."""
+    """The files that a command writes before the first frame."""
     found = {"out.csv"}
     for word, value in zip(command, [*command[1:], ""], strict=True):
         for option in ("--csv", "--write-run"):
@@ -238,7 +238,7 @@ def outputs(command: list[str]) -> set[str]:
 
 
 def wrong_with(command: list[str], folder: Path) -> str | None:
-    """What is wrong with how a command ends, if anything: neither a body nor one line, or a file is touched."""
+    """An error in the end of a command, if any: neither a body nor one line, or a file is touched."""
     from warp_corot.cli import main
 
     before = files_in(folder)
@@ -284,7 +284,7 @@ def wrong_with_checkpoint(path: Path) -> str | None:
 
 
 def wrong_with_run(command: list[str], folder: Path) -> str | None:
-    """What is wrong with the file of a run that was just written down: it makes no body, as the command did."""
+    """An error in a run file that was just written: it does not make the command's body."""
     written = [name for name in outputs(command) if name.endswith(".toml") and (folder / name).is_file()]
     return next((wrong for name in written if (wrong := wrong_with(["simulate", name], folder))), None)
 
@@ -299,8 +299,8 @@ class Cases:
     """The cases of a format.
 
     Args:
-        form: Its name, or "options".
-        folder: An empty one.
+        form: Name of the format, or "options".
+        folder: An empty folder.
     """
 
     def __init__(self, form: str, folder: Path):
@@ -317,7 +317,7 @@ class Cases:
         self.good = {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
     def run(self, number: int, broken: bool = True) -> str | None:
-        """What is wrong with one of them."""
+        """Run a case; returns its error, if any."""
         rng = np.random.default_rng([number, *self.form.encode()])
         if self.seed is None:
             command = random_options(rng)
@@ -350,12 +350,12 @@ class Cases:
         for path, content in self.good.items():
             if not path.exists() or path.read_bytes() != content:
                 path.write_bytes(content)
-        if self.form == "scene":  # a stage that is left alive would be taken for that of the next file
+        if self.form == "scene":  # a stage that stays open would be taken for that of the next file
             gc.collect()
 
 
 def run(found: Cases, first: int, count: int, stderr) -> None:
-    """Cases from a number on, in this process, which a case may end."""
+    """Run cases from a number on, in this process, which a case may end."""
     import resource
 
     faulthandler.enable(stderr)
@@ -381,17 +381,17 @@ def run(found: Cases, first: int, count: int, stderr) -> None:
 
 
 def _memory(name: str) -> int:
-    """What Linux says of this process's memory [bytes]."""
+    """Linux's count of this process's memory [bytes]."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) << 10 for line in lines if line.startswith(f"{name}:"))
 
 
 def run_all(folder: Path, form: str, first: int, count: int) -> None:
-    """All cases of a format, in another process after each that ended one."""
+    """Run all cases of a format, in a new process after each that ended one."""
     own = folder / form
     own.mkdir()
     os.chdir(own)
-    os.environ["TMPDIR"] = tempfile.tempdir = str(own)  # what is left there is a file too many
+    os.environ["TMPDIR"] = tempfile.tempdir = str(own)  # any file left there is an error
     found = Cases(form, own)
     case.clear()
     case.update(form=form, case=-1, taken=False)
@@ -419,7 +419,7 @@ def run_all(folder: Path, form: str, first: int, count: int) -> None:
         last = json.loads((folder / "cases").read_text(encoding="utf-8").splitlines()[-1])
         case.clear()
         case.update(form=form, case=last["case"], taken=False)
-        # A reader that is to have a process of its own may end it.
+        # A reader for a separate process may end this one.
         say({"ended": status, "reads": last["reads"]} if "reads" in last else {"wrong": f"ended with status {status}"})
         found._restore()
         first = last["case"] + 1

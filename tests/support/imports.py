@@ -1,6 +1,6 @@
 """The graph of imports within ``warp_corot``, lazy ones and those for type checkers included.
 
-``python tests/support/imports.py`` prints its circles and the imports that go from a lower floor to a higher one.
+``python tests/support/imports.py`` prints its circles and the imports from a lower floor to a higher one.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 ROOT = Path(__file__).parents[2]
 PACKAGE = "warp_corot"
 
-#: Floors from the ground up, and what belongs to each: a module with all that is below it. The longest name counts.
+#: Floors from the ground up, with their modules: each stands for everything below it. The longest name is used.
 FLOORS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("inputs, kernels", ("kernels", "errors", "inputs", "io.files")),
     ("materials", ("materials",)),
@@ -27,21 +27,23 @@ FLOORS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("body", ("body",)),
     ("elasticity, holding", ("elasticity", "holding")),
     ("solvers", ("solvers",)),
+    ("contact", ("contact",)),
     ("remesh", ("remesh",)),
     ("simulation", ("simulation",)),
-    ("io, newton, experiments", ("io", "newton", "experiments")),
+    ("io, newton, experiments, haptics", ("io", "newton", "experiments", "haptics")),
+    ("viewing", ("viewing",)),
     ("cli", ("cli", "api", "__init__", "__main__")),
 )
 
 
 @dataclass(frozen=True)
 class Import:
-    """That one module imports another.
+    """An import of one module by another.
 
     Attributes:
         source, target: Names below ``warp_corot``, as "mesh.forest"; a package's own module is "mesh.__init__".
         kind: "load", "lazy" within a function, or "type" for type checkers alone.
-        line: Where.
+        line: Line of the import.
     """
 
     source: str
@@ -69,7 +71,7 @@ def imports(root: Path = ROOT) -> tuple[Import, ...]:
 
 
 def circles(edges: Iterable[Import]) -> list[list[str]]:
-    """Modules that import one another, directly or by way of others: strongly connected components, largest first."""
+    """Modules that import one another, directly or through others: strongly connected components, largest first."""
     pairs = {(edge.source, edge.target) for edge in edges}
     names = sorted({name for pair in pairs for name in pair})
     if not names:
@@ -87,7 +89,7 @@ def floor_of(module: str) -> int:
     """The number of a module's floor from the ground up.
 
     Raises:
-        KeyError: The module has none.
+        KeyError: The module is on no floor.
     """
     name = module.removesuffix(".__init__")
     named = [(each, floor) for floor, (_, names) in enumerate(FLOORS) for each in names]
@@ -105,7 +107,7 @@ def against_the_floors(edges: Iterable[Import]) -> list[Import]:
 
 def _imports_of(name: str, path: Path, files: dict[str, Path]) -> Iterator[Import]:
     package = name.split(".")[:-1]
-    for node, kind in _statements(ast.parse(path.read_text()), "load"):
+    for node, kind in _statements(ast.parse(path.read_text(encoding="utf-8")), "load"):
         for target in _targets(node, package, files):
             if target != name:
                 yield Import(name, target, kind, node.lineno)
@@ -132,7 +134,7 @@ def _names_type_checking(test: ast.expr) -> bool:
 
 
 def _targets(node: ast.Import | ast.ImportFrom, package: list[str], files: dict[str, Path]) -> Iterator[str]:
-    """The modules that a statement names, the most particular ones: a package only where a name in it is meant."""
+    """The modules that a statement names, as specific as possible: a package only if a name in it is meant."""
     if isinstance(node, ast.Import):
         bases = [(alias.name.split("."), [""]) for alias in node.names]
     else:

@@ -3,6 +3,7 @@
 import numpy as np
 import warp as wp
 
+from warp_corot.discretization.clusters.single import isotropic_material
 from warp_corot.discretization.plan import ForcePlan
 from warp_corot.elasticity.corotated.left_out import LeftOutLeaves
 from warp_corot.kernels.subtrees.cuda import BLOCK, FLAT, Stretch, scatter_stretches
@@ -52,6 +53,7 @@ class Launches:
             block_dim=BLOCK,
         )
         self.count = int(self.listed.own.counts.numpy().sum())
-        material = [body.discretization.mu, body.discretization.lam, body.discretization.material_stride]
+        own = body.discretization
+        material = isotropic_material([own.mu, own.lam, own.material_stride])
         self.listed.repair(body.discretization.elements, material, body.state.displacements, f)
         return f.numpy()[:, :3]

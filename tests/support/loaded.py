@@ -1,4 +1,4 @@
-"""Soft bodies that hang and stand under their own weight, made by defaults."""
+"""Soft bodies that hang and stand under their own weight, made with defaults."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -26,19 +26,19 @@ LAWS = {
 
 
 def _adaptive(domain, count):
-    """As the command line meshes organs."""
+    """A mesh made like the command line's meshes of organs."""
     size = float(np.ptp(domain.bounds, axis=0).max()) * 1.001 / max(1, round((count / 30) ** (1 / 3)))
     return wc.TetForest.from_domain(domain, size, max_level=7, target_elements=count, device="cpu")
 
 
 def _capsule(count):
-    """112 mm long, of radius 15 mm, leaning by 25 degrees."""
+    """A capsule 112 mm long, of radius 15 mm, leaning by 25 degrees."""
     along = 0.082 * np.array([np.sin(np.radians(25)), np.cos(np.radians(25)), 0.0])
     return _adaptive(wc.Domain.capsule((0.0, 0.0, 0.0), along, 0.015, device="cpu"), count)
 
 
 def _plate(count):
-    """60 x 5 x 60 mm, one cube thick."""
+    """A plate of 60 x 5 x 60 mm, one cube thick."""
     return wc.TetForest.box((12, 1, 12), 0.005, level=int(np.log2(count / (6 * 144))))
 
 
@@ -69,13 +69,13 @@ def _mesh(shape, count, general):
 
 @dataclass(frozen=True)
 class Loaded:
-    """A body with the lowest tenth of its height held (of a plate one edge), at rest, under gravity from then on.
+    """A body with the lowest tenth of its height fixed (for a plate one edge), released from rest under gravity.
 
     Attributes:
         shape, law: Names in SHAPES and LAWS.
         kilopascals: Young's modulus [kPa].
-        general: Whether the elements go as a general mesh.
-        damping: [1/s].
+        general: Whether the elements are a general mesh.
+        damping: Rate of mass-proportional damping [1/s].
         poisson: Poisson's ratio.
     """
 
@@ -114,11 +114,11 @@ class Loaded:
 
 # --- thirty bodies ----------------------------------------------------------------------------------------------------
 
-#: About how many elements, and how long they move [s].
+#: Approximate number of elements, and duration of the motion [s].
 MANY, LONG = 5000, 2.0
 FEW, SHORT = 1500, 0.5
 
-#: All shapes at 1, 3, 5, 10 and 30 kPa. StVK stands only where it is hardly compressed: its energy has no barrier.
+#: All shapes at 1, 3, 5, 10 and 30 kPa. StVK only under light compression: its energy has no barrier.
 THIRTY = [
     Loaded("sphere", 1, "corotated"),
     Loaded("sphere", 3, "neo-hookean"),
@@ -159,7 +159,7 @@ THIRTY = [
     Loaded("core", 30, "neo-hookean", damping=2.0),
 ]
 
-#: The shapes and laws again, those in which trouble comes early.
+#: The shapes and laws again, for which trouble comes early.
 DOZEN = [
     Loaded("sphere", 1, "corotated"),
     Loaded("sphere", 1, "neo-hookean", general=True),

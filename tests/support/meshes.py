@@ -1,4 +1,4 @@
-"""Laws that meshes and surfaces keep, and bodies with samples of their exact surface."""
+"""Laws of meshes and surfaces, and bodies with samples of their exact surface."""
 
 import itertools
 
@@ -42,14 +42,14 @@ def assert_well_shaped(forest):
 
 
 def assert_balanced(surface):
-    """Every edge is gone along as often one way as the other, also where more than two triangles share it."""
+    """Every edge is passed equally often in both directions, even if more than two triangles share it."""
     edges = np.concatenate([surface.triangles[:, [i, j]] for i, j in ((0, 1), (1, 2), (2, 0))]).astype(np.int64)
     count = len(surface.points)
     assert np.array_equal(np.sort(edges @ [count, 1]), np.sort(edges @ [1, count]))
 
 
 def assert_bound(surface, forest):
-    """Each point is the mean of the nodes it is bound to, by weights that sum to one, and so moves along with them."""
+    """Each point is the mean of the nodes to which it is bound, with weights that sum to one, and moves with them."""
     assert surface.nodes.max() < len(forest.points)
     assert np.allclose(surface.weights.sum(axis=1), 1)
     at = np.einsum("vn,vnc->vc", surface.weights, forest.points[surface.nodes])
@@ -65,8 +65,8 @@ def held(forest):
 
 
 def farthest(surface, points, near=16):
-    """The largest distance of points from a surface, by trimesh's formula: of each from the triangle that Warp finds,
-    which in float32 may be the one beside the nearest, and from those whose middles are nearest; so none is too small.
+    """The largest distance of points from a surface, by trimesh's formula: from the triangle that Warp finds,
+    which in float32 may be next to the nearest, and from those with the nearest centres; so no distance is too small.
     """
     corners = surface.points[surface.triangles]
     mesh = wp.Mesh(
@@ -103,7 +103,7 @@ def on_ring(n=20000, major=0.35, minor=0.12):
 
 
 def on_box(n=300):
-    """Faces, edges and corners of the turned box."""
+    """Faces, edges and corners of the rotated box."""
     solid = trimesh.creation.box(2 * np.array(HALF))
     faces = trimesh.sample.sample_surface(solid, 20000, seed=5)[0]
     t = np.linspace(-1, 1, n)

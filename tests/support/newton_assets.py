@@ -1,4 +1,5 @@
-"""Stand-ins for what Newton's example with a Franka arm downloads: an arm of its measures in boxes, a soft block."""
+"""Replacements for the downloads of Newton's example with a Franka arm: an arm of boxes with its measures, a soft
+block."""
 
 from math import pi
 from pathlib import Path
@@ -7,7 +8,7 @@ import numpy as np
 from newton_scenes import add_grid, builder
 from pxr import Usd, UsdGeom, Vt
 
-#: Origins [m], rolls and limits [rad] of the arm's joints, as its Denavit-Hartenberg parameters have them.
+#: Origins [m], rolls and limits [rad] of the arm's joints, from its Denavit-Hartenberg parameters.
 JOINTS = (
     ("0 0 0.333", 0.0, (-2.74, 2.74)),
     ("0 0 0", -pi / 2, (-1.78, 1.78)),
@@ -64,7 +65,7 @@ def write_block(path: Path) -> None:
 
 
 def stand_in(folder: Path, name: str) -> Path:
-    """A folder with what is in the download of a name."""
+    """A folder with the content of the download of this name."""
     place = folder / name
     if name == "franka_emika_panda":
         (place / "urdf").mkdir(parents=True)

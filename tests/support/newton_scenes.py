@@ -1,4 +1,4 @@
-"""Scenes of Newton for the tests of its solver, and what one step does to them."""
+"""Scenes of Newton for the tests of its solver, and the effect of one step on them."""
 
 import numpy as np
 import pytest
@@ -62,19 +62,19 @@ def impulse(solver, model, q=None, qd=None, control=None, contacts=None, dt=1e-5
 
 
 def semi_implicit(model):
-    """Newton's own explicit solver, with nothing but tetrahedra and contact with shapes."""
+    """Newton's own explicit solver, with only tetrahedra and contact with shapes."""
     model.particle_grid = None
     return newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False)
 
 
 def checked_step(solver, before, after, contacts=None, dt=1e-4):
-    """A step, and what is wrong with it said on every device."""
+    """Make a step, and report its errors on every device."""
     solver.step(before, after, None, contacts, dt)
     solver.check()
 
 
 def run(solver, model, steps, dt, control=None, pipeline=None, each=None):
-    """An even number of steps from a model's initial state, two of them recorded and replayed; the last state.
+    """Make an even number of steps from a model's initial state, two of them recorded and replayed; the last state.
 
     With ``each``, a function of the state, they are launched one by one.
     """
@@ -137,7 +137,7 @@ KE = 2e4
 
 
 def contact_parameters(model, ke=KE, kd=20.0, kf=100.0, mu=0.5):
-    """The same for particles and shapes."""
+    """The same contact parameters for particles and shapes."""
     model.soft_contact_ke, model.soft_contact_kd = ke, kd
     model.soft_contact_kf, model.soft_contact_mu = kf, mu
     for array, value in (

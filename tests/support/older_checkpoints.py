@@ -1,4 +1,4 @@
-"""Checkpoints as older versions wrote them, made of those of today."""
+"""Checkpoints in the form of older versions, made from current ones."""
 
 import json
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def as_version(path, older, version):
-    """Write the checkpoint at ``path``, of a run with a given step, to ``older`` as ``version`` 1 to 4 had it."""
+    """Write the checkpoint at ``path``, of a run with a given step, to ``older`` in the form of ``version`` 1 to 4."""
     with np.load(path) as archive:
         arrays = dict(archive)
     header = json.loads(arrays["header"].tobytes()) | {"version": version}

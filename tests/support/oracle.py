@@ -1,6 +1,6 @@
-"""The mathematics the solver is checked against: float64 NumPy, from points [N, 3] and tetrahedra [T, 4] alone.
+"""The reference mathematics of the solver: float64 NumPy, from points [N, 3] and tetrahedra [T, 4] alone.
 
-Nothing here knows of types, levels, frames or Warp. Material parameters ``mu`` and ``lam`` [Pa] are scalars or
+Nothing here knows types, levels, frames or Warp. Material parameters ``mu`` and ``lam`` [Pa] are scalars or
 arrays [T]. A density is a function ``(F, mu, lam) -> psi [T] (J/m^3), P [T, 3, 3] (Pa)`` of the deformation
 gradients F [T, 3, 3].
 """
@@ -295,7 +295,7 @@ def equilibrium(model, mesh, mu, lam, fixed, loads, increments=4, tolerance=1e-1
     """Positions [N, 3] at rest under nodal loads [N, 3] (N), fixed nodes (mask [N]) at their rest positions.
 
     Newton's method on the total potential, with a backtracking line search, the load applied in increments.
-    Raises RuntimeError when the residual does not fall below ``tolerance`` times the norm of the loads.
+    Raises RuntimeError if the residual does not fall below ``tolerance`` times the norm of the loads.
     """
     free = np.repeat(~np.asarray(fixed), 3)
     x = np.array(mesh.points if start is None else start, float)
@@ -375,7 +375,7 @@ def nearest_isotropic(C):
 
 
 def anisotropic_energy(F, C):
-    """psi = 1/2 e:C:e, e = sym(R^T F) - I; near F without a definite rotation it goes over to the nearest isotropic.
+    """psi = 1/2 e:C:e, e = sym(R^T F) - I; near F without a definite rotation it blends into the nearest isotropic law.
 
     With principal stretches s (the last negative in an inverted F) and x = (s1 + s2)(s2 + s3)(s3 + s1) / |s|^3, below
     x = 0.4 it is psi_iso + b (psi - psi_iso), b = 3 y^2 - 2 y^3 of y = x / 0.4.

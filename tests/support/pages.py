@@ -1,4 +1,4 @@
-"""README and docs as tests read them: their blocks of code, run in the order in which a reader meets them."""
+"""README and docs for tests: their blocks of code, run in a reader's order."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS = PROJECT["optional-dependencies"]
-#: Languages of blocks; a text is nothing to run.
+#: Languages of blocks; a text does not run.
 LANGUAGES = ("python", "sh", "text")
 
 
@@ -39,7 +39,7 @@ def blocks_of(page: Path) -> list[Block]:
     """The blocks of a page, in order.
 
     Raises:
-        ValueError: A fence that is not closed, or a block that does not say its language.
+        ValueError: A fence that is not closed, or a block without a language.
     """
     found, start, language = [], 0, ""
     lines = page.read_text(encoding="utf-8").splitlines()
@@ -59,11 +59,11 @@ def blocks_of(page: Path) -> list[Block]:
 
 
 class Session:
-    """The Python of one page: all blocks share their names, and kernels find their source.
+    """The Python of one page: all blocks share their names, and Warp finds the source of kernels.
 
     Args:
         page: The page.
-        folder: Where its source is kept, each block on the lines that it has in the page.
+        folder: Folder for its source, with each block on its lines in the page.
     """
 
     def __init__(self, page: Path, folder: Path):
@@ -84,7 +84,7 @@ class Session:
 
 
 def run_python(page: Path, folder: Path) -> dict[str, Any]:
-    """What the Python blocks of a page have made, by name."""
+    """The names that the Python blocks of a page define."""
     session = Session(page, folder)
     for block in blocks_of(page):
         if block.language == "python":
@@ -93,7 +93,7 @@ def run_python(page: Path, folder: Path) -> dict[str, Any]:
 
 
 def missing_extras(code: str) -> list[str]:
-    """Packages that some code imports at its top, that an extra of the project installs, and that are not there."""
+    """Packages that some code imports at its top, that an extra of the project installs, and that are missing."""
     imported = set()
     for node in ast.parse(code).body:
         if isinstance(node, ast.Import):

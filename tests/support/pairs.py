@@ -1,4 +1,4 @@
-"""What clusters of pairs add up, on devices that have no shared memory too."""
+"""The sums of clusters of pairs, on devices without shared memory, too."""
 
 import functools
 
@@ -12,7 +12,7 @@ from warp_corot.kernels.tables.cluster_layout import QUAD_BYTES
 
 
 def add_forces(scatter, material, u, f):
-    """As a ``ClusterScatter`` does; on a CPU pair by pair, without the sums in shared memory."""
+    """Like a ``ClusterScatter``; on a CPU pair by pair, without the sums in shared memory."""
     if u.device.is_cuda:
         scatter(material, u, f)
         return

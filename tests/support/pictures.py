@@ -1,4 +1,4 @@
-"""A cube that tests have drawn, and what is in the picture."""
+"""A cube for tests of pictures, and the content of a picture."""
 
 import numpy as np
 from PIL import Image

@@ -1,4 +1,4 @@
-"""Changing forests for tests, and what must hold of them after every pass."""
+"""Changing forests for tests, and what must hold for them after every pass."""
 
 import itertools
 
@@ -35,7 +35,7 @@ def assert_conforming(forest):
 
 
 def assert_tree(forest):
-    """Children are the halves of their parent: by position, not by the rule that made them."""
+    """Children are the halves of their parent: by position, independently of the rule that made them."""
     tree = forest.tree
     inner = np.flatnonzero(tree.first_child >= 0)
     assert len(tree.level) == np.count_nonzero(tree.parent < 0) + 2 * len(inner)
@@ -52,13 +52,13 @@ def assert_tree(forest):
 
 
 def assert_sound(device):
-    """What must hold after every pass, whatever happened; returns the mesh."""
+    """Check what must hold after every pass; returns the mesh."""
     forest = device.to_forest()
     source = device.source
     assert_conforming(forest)
     assert_tree(forest)
     assert forest.volumes.sum() == pytest.approx(source.volumes.sum(), rel=1e-12)
-    # Leaves are in tree order, and export keeps them and the numbers of nodes so.
+    # Leaves are in tree order, and export keeps them and the numbers of nodes.
     assert np.array_equal(device.leaf_tets, device.pools.tets.numpy()[device.leaf_elements])
     assert np.array_equal(forest.tets, device.leaf_tets)
     assert_balanced(device)
@@ -69,7 +69,7 @@ def assert_sound(device):
 
 
 def assert_balanced(device):
-    """Nodes of leaves are the first ones; nobody is an orphan, and nothing is lost from the pools."""
+    """Nodes of leaves are the first ones; no element is without its parent, and nothing is lost from the pools."""
     tree, used = device.tree()
     count, limit = device.node_count, device.node_capacity - device.virtual_count
     assert np.array_equal(np.unique(device.leaf_tets), np.arange(count))
@@ -88,7 +88,7 @@ def assert_balanced(device):
 
 
 def assert_padding(device):
-    """Beyond the counts there is nothing that has a mass or moves."""
+    """Beyond the counts nothing has a mass or moves."""
     tets, count = device.pools.leaf_tets.numpy(), device.leaf_count
     assert len(tets) == device.capacity + 1024
     sinks = device.node_capacity + np.arange(count, len(tets)) % 1024
@@ -100,7 +100,7 @@ def assert_padding(device):
 
 
 def assert_codes(device):
-    """Every tetrahedron's code says what is found from its nodes' places: level, handedness and frame."""
+    """Every tetrahedron's code equals that from its nodes' positions: level, handedness and frame."""
     tree, used = device.tree()
     expected, frames = shape_codes(device.pools.lattice.numpy(), tree.tets, tree.level)
     code = device.pools.code.numpy()[used]
@@ -130,7 +130,7 @@ def assert_carriage(device, forest):
 
 
 def momentum(device):
-    """Linear momentum, and the sum of its terms' sizes."""
+    """Linear momentum, and the sum of the magnitudes of its terms."""
     arrays = device.carriage.arrays
     p = arrays.mass.numpy()[:, None] * arrays.v.numpy()[:, :3].astype(float)
     return p.sum(axis=0), np.abs(p).sum()
@@ -146,9 +146,9 @@ def moving(forest, device, rng, **options):
 
 
 def random_marks(device, rng, refine, simplify):
-    """That share of the leaves, those nearest to a random point, to be given up, and scattered ones to be bisected.
+    """Random fractions of the leaves: those nearest to a random point may be merged, scattered ones are bisected.
 
-    All leaves around a node must agree on giving it up, which scattered ones hardly ever do.
+    All leaves around a node must be marked for its removal, which scattered ones hardly ever are.
     """
     mesh = device.to_forest()
     centre = mesh.points[mesh.tets].mean(axis=1)

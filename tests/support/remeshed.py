@@ -1,4 +1,4 @@
-"""Bodies whose meshes follow the motion, and what they are compared with."""
+"""Bodies whose meshes follow the motion, and their references."""
 
 import warp as wp
 

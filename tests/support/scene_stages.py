@@ -1,4 +1,4 @@
-"""Small stages to be stepped: a soft block, a ground, rigid boxes, in any units and with any axis up."""
+"""Small stages for simulation: a soft block, a ground, rigid boxes, in any units and with any axis up."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ SIM = "/World/Soft/sim"
 
 
 class StageMaker:
-    """A stage whose world is z-up and in metres to who makes it, and in other units and another axis in the file."""
+    """A stage whose world is z-up and in metres for its maker, and in other units and with another axis in the file."""
 
     def __init__(self, path: Path, metres: float = 1.0, up: str = "Z", kilograms: float = 1.0, scene: bool = True):
         self.path, self.metres, self.up, self.kilograms = path, metres, up, kilograms
@@ -39,7 +39,7 @@ class StageMaker:
     def block(
         self, body="/World/Soft", cells=(2, 2, 3), at=(0.0, 0.0, 0.0), offset=(0.3, -0.2, 0.5), name="sim", marked=True
     ):
-        """A block of cubes of CELL, its lowest corner at ``at``, under a prim with a transform of its own."""
+        """A block of cubes of CELL, with its lowest corner at ``at``, under a prim with its own transform."""
         forest = wc.TetForest.box(cells, CELL, 0)
         points = self.put(forest.points + at - np.array(offset))
         tets = forest.tets.copy()
@@ -96,7 +96,7 @@ def standing(path: Path, height=0.0, **options) -> Path:
 
 
 def crowd(path, **options) -> StageMaker:
-    """A block with a visual material, a box that falls on it, and things that have nothing to do with physics."""
+    """A block with a visual material, a box that falls on it, and prims without physics."""
     made = StageMaker(path, **options)
     mesh = made.block(at=(-0.1, -0.1, 0.02))
     made.material(mesh)
@@ -116,7 +116,7 @@ def simulated(path: Path, frames: int, device="cpu", **options) -> StageSimulati
 
 
 def written(path: Path, out: Path, frames: int, shown=None, **options) -> StageSimulation:
-    """The simulation, and its frames in a stage; ``shown`` gets all that was to be in them."""
+    """The simulation, and its frames in a stage; ``shown`` gets the data of all frames."""
     sim = StageSimulation(path, device="cpu")
     writer = sim.writer(out, **options)
     for frame in range(frames + 1):

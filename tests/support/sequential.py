@@ -1,4 +1,4 @@
-"""Bisection one tetrahedron at a time, by recursion, with the geometry alone: what the forest is compared with."""
+"""Bisection one tetrahedron at a time, by recursion, with geometry alone: the reference of the forest."""
 
 from itertools import combinations, permutations, product
 
@@ -57,7 +57,7 @@ class Bisection:
             self._insert(child)
 
     def refine(self, leaf):
-        """Bisect a leaf (none any more: nothing to do) and, first, whatever stands in the way of conformity."""
+        """Bisect a leaf (if it still is one) and, first, the leaves that conformity requires."""
         if leaf not in self.leaves:
             return
         edge = self.refinement_edge(leaf)

@@ -1,12 +1,12 @@
-"""Refinement and simplification one vertex at a time, by geometry and dictionaries: what passes must equal."""
+"""Refinement and simplification one vertex at a time, by geometry and dictionaries: the reference of passes."""
 
 from sequential import Bisection
 
 
 class SequentialRemesh(Bisection):
-    """A mesh that refines by recursion and gives up vertices around which all leaves agree.
+    """A mesh that refines by recursion and removes vertices if all leaves around them are marked.
 
-    A leaf is (level, four lattice points in Maubach order), as in ``Bisection``; ``parents`` tells what it came from.
+    A leaf is (level, four lattice points in Maubach order), as in ``Bisection``; ``parents`` has its parent.
     """
 
     def __init__(self, cells, level):
@@ -32,12 +32,12 @@ class SequentialRemesh(Bisection):
             self._around[edge].remove(leaf)
 
     def newest(self, leaf):
-        """The vertex that a leaf was made with; None for roots."""
+        """The vertex with which a leaf was made; None for roots."""
         parent = self.parents.get(leaf)
         return None if parent is None else next(iter(set(leaf[1:]) - set(parent[1:])))
 
     def remesh(self, marks, min_level=0, max_level=48):
-        """One pass. ``marks``: leaf -> 1 to be bisected, -1 to be given up."""
+        """One pass. ``marks``: leaf -> 1 for bisection, -1 for merging."""
         for leaf, mark in marks.items():
             if mark == 1 and leaf[0] < max_level:
                 self.refine(leaf)

@@ -1,4 +1,4 @@
-"""The largest frequency of a strained body in float64, and with it the largest step that is stable about that state.
+"""The largest frequency of a strained body in float64, and with it the largest stable step about that state.
 
 Small motions d about a state x obey M d'' = -K(x) d, where K is the derivative of the elastic forces. Central
 differences in time stay bounded while dt < 2 / omega, with omega^2 the largest eigenvalue of M^-1 K. K comes from the
@@ -13,14 +13,14 @@ import oracle
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import eigs, eigsh
 
-#: Central differences move nodes by this share of the size of their element. They are off by about its square, 1e-8;
+#: Central differences move nodes by this fraction of the size of their element. Their error is about its square, 1e-8;
 #: rounding adds 1e-12, and 1e-6 where the forces are differences themselves (anisotropic).
 STEP = 1e-4
 
 
 @dataclass
 class Exploded:
-    """Each element with nodes of its own, so that one evaluation moves the same node of all elements at once."""
+    """Each element with separate nodes, so that one evaluation moves the same node of all elements at once."""
 
     mesh: oracle.Mesh
 
@@ -83,7 +83,7 @@ def shared_stiffness(ancestors, mesh, x, mu, lam):
 def largest_frequency(K, masses, free=None):
     """The largest omega [rad/s] of M d'' = -K d with lumped masses [N] (kg) and free nodes (mask [N]; None for all).
 
-    Of a K that is not symmetric the eigenvalue with the largest real part counts.
+    If K is not symmetric, the eigenvalue with the largest real part is used.
     """
     free = np.ones(len(masses), bool) if free is None else np.asarray(free)
     free = np.repeat(free & (np.asarray(masses) > 0), 3)
@@ -100,15 +100,15 @@ def largest_frequency(K, masses, free=None):
 
 
 def stable_step(law, body, ancestors=None):
-    """The largest stable step [s] of a body (one world) about its present displacements, 2 / omega.
+    """The largest stable step [s] of a body (one world) about its current displacements, 2 / omega.
 
     Args:
-        law: As for ``stiffness``.
-        ancestors: Nodes of each element's ancestor [T, 4] where rotations are shared.
+        law: As in ``stiffness``.
+        ancestors: Nodes of each element's ancestor [T, 4] if rotations are shared.
     """
     mesh = oracle.Mesh(body.mesh.points, body.mesh.tets)
     x = mesh.points + body.displacements.numpy().astype(float)
-    # The solver's own mu and lambda: with the share of each element that the body fills.
+    # The solver's own mu and lambda: with the filled fraction of each element.
     mu, lam = (
         a.numpy().astype(float) if body.discretization.material_stride else float(a.numpy()[0])
         for a in (body.discretization.mu, body.discretization.lam)

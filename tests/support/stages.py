@@ -1,4 +1,4 @@
-"""What there is in recorded stages."""
+"""The content of recorded stages."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ def frames(path: Path) -> list[np.ndarray]:
 
 
 def still(sim, path, **options) -> Usd.Stage:
-    """The stage of one frame of the present state, and one of the next step."""
+    """The stage of one frame of the current state, and one of the next step."""
     wc.record(sim, path, duration=sim.dt, fps=1.0 / sim.dt, **options)
     return Usd.Stage.Open(str(path))
 
@@ -37,7 +37,7 @@ def drawn(stage: Usd.Stage, path: str = SURFACE, frame: float = 0.0) -> trimesh.
 
 
 def prims(stage: Usd.Stage) -> list[str]:
-    """Paths of what is drawn or could be."""
+    """Paths of visible and guide prims."""
     return [str(prim.GetPath()) for prim in stage.Traverse() if prim.IsA(UsdGeom.PointBased)]
 
 
@@ -48,7 +48,7 @@ def faults(path: Path) -> list[str]:
 
 
 def edges_meet_in_pairs(triangles: np.ndarray) -> bool:
-    """Whether a surface is closed, each edge once there and once back."""
+    """Whether a surface is closed, with each edge once in each direction."""
     edges = np.concatenate([triangles[:, [i, j]] for i, j in ((0, 1), (1, 2), (2, 0))])
     ahead, back = {tuple(edge) for edge in edges}, {tuple(edge[::-1]) for edge in edges}
     return len(ahead) == len(edges) and ahead == back

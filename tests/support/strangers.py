@@ -1,6 +1,6 @@
-"""Bodies, materials and motions on which no constant of the stepping was chosen: what must hold for them all the same.
+"""Bodies, materials and motions that were not used to choose any constant of the stepping: they must pass, too.
 
-``python tests/support/strangers.py [NAME ...]`` runs them, or those named, and prints a line for each.
+``python tests/support/strangers.py [NAME ...]`` runs all, or those named, and prints a line for each.
 """
 
 import sys
@@ -15,17 +15,17 @@ import warp as wp
 
 import warp_corot as wc
 
-#: How often a run is looked at [s], and from when on: before, hardly anything has moved that could be compared with.
+#: Sampling interval of a run [s], and its start: before, hardly anything has moved for comparison.
 EVERY, FIRST = 0.04, 0.1
-#: Energy may exceed what there was at the beginning, or when supports came to rest, by this share of the most that
-#: gravity, loads or the beginning gave.
+#: Energy may exceed the initial one, or that when supports came to rest, by this fraction of the largest energy from
+#: gravity, loads or the beginning.
 SURPLUS = 0.01
 
 # --- shapes -----------------------------------------------------------------------------------------------------------
 
 
 def smooth_union(*distances, width=0.01):
-    """Signed distances joined with a fillet of about that width [m]."""
+    """Signed distances joined with a fillet of about this width [m]."""
     joined = -width * np.log(sum(np.exp(-np.asarray(d) / width) for d in distances))
     return joined
 
@@ -74,13 +74,13 @@ def hand(x):
 
 @cache
 def organ(function, elements):
-    """An adaptive mesh of about so many elements."""
+    """An adaptive mesh with about this many elements."""
     domain = wc.Domain.from_function(function, [[-0.1] * 3, [0.1] * 3], device="cpu")
     return wc.TetForest.from_domain(domain, 0.05, max_level=9, target_elements=elements, device="cpu")
 
 
 def disk():
-    """80 mm across, 4 mm thick: three cubes of the thickness hold a path from one face to the other."""
+    """A disk 80 mm across, 4 mm thick: three cubes of the thickness contain a path from one face to the other."""
     x = np.linspace(-0.04, 0.04, 21)
     centres = np.stack(np.meshgrid(x, x, [0.0], indexing="ij"), -1).reshape(-1, 3)
     inside = (np.linalg.norm(centres, axis=1) < 0.04).reshape(21, 21, 1)
@@ -99,13 +99,13 @@ def cube_of(mesh, size, counts):
 
 @dataclass(frozen=True)
 class Stranger:
-    """A body and what becomes of it.
+    """A body and its motion.
 
     Attributes:
-        name: Short.
-        make: Gives the simulation.
-        seconds: How long it runs.
-        rests: When its supports come to rest [s].
+        name: Short name.
+        make: Makes the simulation.
+        seconds: Duration of the run.
+        rests: Time when its supports come to rest [s].
     """
 
     name: str
@@ -153,7 +153,7 @@ def thrown(speed):
 
 
 def shaken(body):
-    """The top goes to and fro by 2 cm five times in half a second."""
+    """The top moves back and forth by 2 cm five times in half a second."""
     times = np.linspace(0.0, 0.5, 41)
     moved = np.zeros((41, 3))
     moved[:, 0] = 0.02 * np.sin(2 * np.pi * 10 * times)
@@ -234,7 +234,7 @@ STRANGERS = [
 
 @dataclass
 class Run:
-    """What came of it: the worst surplus of energy as a share of what was given, steps, and what ended it."""
+    """The result of a run: the largest surplus of energy as a fraction of the supplied one, steps, and the error."""
 
     surplus: float = -np.inf
     given: float = 0.0
@@ -245,7 +245,7 @@ class Run:
 
 
 def energy(sim):
-    """Of free nodes, at the time of the positions: velocities belong to half a step before [J]."""
+    """Energy of free nodes, at the time of the positions: velocities belong to half a step before [J]."""
     body = sim.body
     free, masses = ~body.constrained, body.masses
     gravity = np.array(sim.gravity)
@@ -283,7 +283,7 @@ def run(stranger, device="cpu", seconds=None):
 
 
 def violations(found):
-    """What did not hold, one line each."""
+    """The violated checks, one line each."""
     said = [f"ended: {found.error}"] if found.error else []
     if not found.surplus <= SURPLUS:
         said.append(f"energy {found.surplus:.2%} of {found.given:.3g} J more than was given")

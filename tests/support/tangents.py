@@ -1,8 +1,8 @@
-"""What the tests of stiffness products share: products and diagonal blocks of a field, and float64 references.
+"""Shared helpers for tests of stiffness products: products and diagonal blocks of a field, and float64 references.
 
 K p is a sum of float32 terms: derivatives of the stress times differences of p, some ten roundings of 6e-8 each. The
-largest error found is 1.1e-6 of the largest value, of nearly incompressible neo-Hookean elements in a large rotation,
-where lambda is 49 mu and a rounding of J weighs accordingly; a wrong weight, sign or index is 1e-2 or more.
+largest error found is 1.1e-6 of the largest value, for nearly incompressible neo-Hookean elements in a large rotation,
+where lambda is 49 mu and amplifies a rounding of J; a wrong weight, sign or index is 1e-2 or more.
 """
 
 import numpy as np
@@ -64,7 +64,7 @@ def assert_equal(found, expected, nodes=slice(None), tolerance=TOLERANCE):
 
 
 def assert_symmetric(field, mesh, u, rng, **options):
-    """p . K q = q . K p, as far as the terms of these sums have digits."""
+    """p . K q = q . K p, to the digits of the terms of these sums."""
     p, q = (random_displacement(mesh, rng, 1.0) for _ in range(2))
     pairs = [(a.astype(float) * product(field, u, b, **options)).ravel() for a, b in ((p, q), (q, p))]
     scale = max(np.linalg.norm(pair) for pair in pairs)
@@ -74,13 +74,13 @@ def assert_symmetric(field, mesh, u, rng, **options):
 
 
 def assert_keeps_translations(field, u, rng, **options):
-    """Whatever a body's state, a translation changes no force: not by a rounding, as differences of p are zero."""
+    """In any state, a translation changes no force, exactly, because differences of p are zero."""
     p = np.broadcast_to(rng.standard_normal(3), u.shape).astype(np.float32)
     assert not product(field, u, p, **options).any()
 
 
 def assert_diagonal(field, u, nodes, **options):
-    """The blocks are what K makes of unit vectors, at their own nodes."""
+    """The blocks are the products of K with unit vectors, at their own nodes."""
     blocks = diagonal(field, u, **options)
     assert np.isfinite(blocks).all()
     for node in nodes:

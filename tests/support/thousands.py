@@ -32,7 +32,7 @@ def meshed(name):
 
 
 def materials(count, uniform, rng):
-    """What a body is made of, and mu and lambda."""
+    """A body's material, and mu and lambda."""
     given = dict(MATERIAL)
     if not uniform:
         given |= {"young": rng.uniform(5e3, 2e4, count), "poisson": rng.uniform(0.0, 0.45, count)}
@@ -40,13 +40,13 @@ def materials(count, uniform, rng):
 
 
 def turned(mesh, rng, amount):
-    """Strains of some three times ``amount``, turned by a large rotation."""
+    """Strains of some three times ``amount``, with a large rotation."""
     strained = mesh.points + random_displacement(mesh, rng, amount)
     return (strained @ oracle.polar(rng.standard_normal((3, 3))).T - mesh.points).astype(np.float32)
 
 
 def shared_rotations(forest, x, level):
-    """The rotation of each leaf's ancestor at ``level``, its own where it lies above [T, 3, 3]."""
+    """The rotation of each leaf's ancestor at ``level``, or its own if it lies above [T, 3, 3]."""
     ancestors, unit = np.unique(forest.ancestors(level), return_inverse=True)
     units = oracle.Mesh(forest.points, forest.tree.tets[ancestors])
     return oracle.polar(units.deformation_gradients(x))[unit.ravel()]

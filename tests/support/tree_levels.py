@@ -42,10 +42,10 @@ class TreeLevels:
 
     def prolongation(self, places: np.ndarray, coarse: int, fine: int) -> np.ndarray:
         """From the nodes up to a level to those up to a finer one, dense, float64: rows and columns are numbers, those
-        of nodes that are not in it zero.
+        of other nodes are zero.
 
         Args:
-            places: Where the node of each number stands.
+            places: Place of the node with each number.
         """
         count = len(places)
         number = np.full(len(self.level), -1)

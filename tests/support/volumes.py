@@ -1,14 +1,14 @@
-"""Label volumes in arrays, as scans have them."""
+"""Label volumes in arrays, like scans."""
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-#: In no simple ratio, so that few voxels are equally near.
+#: In no simple ratio, so that few voxels have equal distances.
 SPACING = np.array([0.0100, 0.0143, 0.0237])
 
 
 def ball(radius: float, spacing=SPACING, half: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
-    """Voxels whose centres are in a ball about the middle, and the place of the first voxel's."""
+    """Voxels whose centres are in a ball about the middle, and the position of the first voxel's."""
     count = (2 * half / np.asarray(spacing)).astype(int)
     axes = [(np.arange(n) - (n - 1) / 2) * s for n, s in zip(count, spacing, strict=True)]
     x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)

@@ -1,7 +1,7 @@
-"""What the tests of many copies of a body share: scenes in which they differ, and when two states are the same.
+"""Shared helpers for many copies of a body: scenes in which they differ, and comparison of states.
 
-On the CPU each does bit for bit what it would do alone: a world's elements come in the same order as a body's of its
-own. On CUDA forces are added in any order; ``TOLERANCE`` of the largest value is what some ten steps make of that.
+On the CPU each gives bit for bit the result that it gives alone: a world's elements have the same order as a single
+body's. On CUDA forces are summed in any order; ``TOLERANCE`` of the largest value is the effect after some ten steps.
 """
 
 import numpy as np
@@ -64,7 +64,7 @@ class Scene:
         self.keys = CUBE * rng.uniform(-0.05, 0.05, (2, len(self.keyed), 3))
 
     def constrain(self, body, world, in_body):
-        """What one world is held, moved and loaded by; ``in_body`` names it among the body's worlds."""
+        """The supports, motion and loads of one world; ``in_body`` is its index among the body's worlds."""
         if world != 1:
             body.fix(self.fixed, worlds=in_body)
         if world != 2:

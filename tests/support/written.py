@@ -4,7 +4,7 @@ import numpy as np
 
 
 class Cube:
-    """Two of the six path tetrahedra of a cube, one of them mirrored, and a node that none uses."""
+    """Two of the six path tetrahedra of a cube, one of them mirrored, and an unused node."""
 
     points = np.array(
         [[0, 0, 0], [1, 0, 0], [1, 1, 0], [1, 1, 1], [0, 1, 0], [0.5, 0.5, 0.5]], dtype=np.float64

@@ -210,9 +210,9 @@ def _distances(surface: SurfaceMesh, points: np.ndarray, device: wp.Device) -> n
 
 def _lost_pieces(mesh: Any, points: np.ndarray, piece: np.ndarray, distances: np.ndarray) -> int:
     """Pieces of the body of which no point is in an element."""
-    if not hasattr(mesh, "embed"):
-        return 0
     near = np.unique(piece, return_index=True)[1]
+    if not hasattr(mesh, "embed") or len(near) == 1:
+        return 0
     _, weights = mesh.embed(points)
     held = weights.min(axis=1) > -1.0e-6
     return len(near) - len(np.unique(piece[held]))

@@ -9,8 +9,9 @@ import warp as wp
 
 from warp_corot.kernels.meshing import domain as kernels
 from warp_corot.kernels.meshing import measuring
+from warp_corot.kernels.meshing.windings import Lines
 
-from .winding import linked, winding_number
+from .winding import linked
 
 #: How far off a triangle winding numbers are looked at, over its own size and, at least, over the surface's.
 ASIDE, LEAST_ASIDE = 1.0e-3, 2.0e-6
@@ -20,8 +21,6 @@ MESSY = 2.0e-3
 FOLDED = 0.05
 #: Patches of which winding numbers are looked at; more are not worth it.
 MOST_PATCHES = 20_000
-#: Signs that may differ from those by the device's winding numbers, if those are wrong.
-MOST_DIFFERENT = 32
 #: Points near the surface at which what was found is tried.
 TRIED = 4096
 
@@ -50,7 +49,7 @@ class Sides:
         ]
 
 
-def sides_of(points: np.ndarray, triangles: np.ndarray, mesh: wp.Mesh) -> Sides:
+def sides_of(points: np.ndarray, triangles: np.ndarray, mesh: wp.Mesh, lines: Lines) -> Sides:
     """What is on the two sides of each triangle.
 
     Where no triangle crosses or touches another but along common edges, all of a patch is alike, and two winding
@@ -61,7 +60,8 @@ def sides_of(points: np.ndarray, triangles: np.ndarray, mesh: wp.Mesh) -> Sides:
     Args:
         points: float64 [N, 3].
         triangles: Closed, int32 [T, 3].
-        mesh: The same, with winding numbers.
+        mesh: The same.
+        lines: Along which winding numbers are found.
     """
     triangles = triangles.astype(np.int64)
     count = len(triangles)
@@ -112,22 +112,17 @@ def sides_of(points: np.ndarray, triangles: np.ndarray, mesh: wp.Mesh) -> Sides:
     chosen = largest[sure]
     aside = np.maximum(ASIDE * np.sqrt(double_area[chosen]), LEAST_ASIDE * np.ptp(points, axis=0).max())
     middle = corners[chosen].mean(axis=1)
-    outside, inside = (
-        _signed(mesh, middle + way * aside[:, None] * normal[chosen], with_sides(unknown)) < 0.0 for way in (1.0, -1.0)
-    )
+    off = aside[:, None] * normal[chosen]
+    outside, inside = (_signed(mesh, lines, x, with_sides(unknown)) < 0.0 for x in (middle + off, middle - off))
     of_patch = np.full(patches, kernels.UNSURE, np.uint8)
     of_patch[sure[~outside & inside]] = kernels.BOUNDARY
     of_patch[sure[outside & inside]] = kernels.BURIED
     known = np.where(doubtful, np.uint8(kernels.UNSURE), of_patch[patch])
     points_near = _near(corners, double_area)
-    quick, slow = (_signed(mesh, points_near, with_sides(one)) for one in (known, unknown))
+    quick, slow = (_signed(mesh, lines, points_near, with_sides(one)) for one in (known, unknown))
     noise = 1e-6 * float(np.ptp(points, axis=0).max())
-    differ = np.flatnonzero(((quick < 0.0) != (slow < 0.0)) & (np.abs(slow) >= noise))
-    if len(differ) > MOST_DIFFERENT:
-        return with_sides(unknown)
-    # Winding numbers on the device take groups of triangles together; which of the two is right?
-    exact = np.array([winding_number(corners, points_near[i]) for i in differ]) > 0.5
-    return with_sides(known if (exact == (quick[differ] < 0.0)).all() else unknown)
+    differ = ((quick < 0.0) != (slow < 0.0)) & (np.abs(slow) >= noise)
+    return with_sides(unknown if differ.any() else known)
 
 
 def _corner_normals(corners: np.ndarray, triangles: np.ndarray, normal: np.ndarray, count: int) -> np.ndarray:
@@ -166,10 +161,10 @@ def _touched(edges: np.ndarray, mesh: wp.Mesh) -> np.ndarray:
     return touched.numpy()
 
 
-def _signed(mesh: wp.Mesh, points: np.ndarray, sides: Sides) -> np.ndarray:
+def _signed(mesh: wp.Mesh, lines: Lines, points: np.ndarray, sides: Sides) -> np.ndarray:
     given = wp.array(points, dtype=wp.vec3, device=mesh.device)
     phi = wp.empty(len(points), dtype=wp.float32, device=mesh.device)
-    inputs = [given, mesh.id, mesh.indices, *sides.arrays(mesh.device)]
+    inputs = [given, mesh.id, mesh.indices, lines, *sides.arrays(mesh.device)]
     wp.launch(kernels.evaluate_surface, len(points), inputs, [phi], device=mesh.device)
     return phi.numpy()
 

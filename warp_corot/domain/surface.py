@@ -14,6 +14,7 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.io.read.surfaces import UP_AXES, LoadedSurface, load_surface
 from warp_corot.kernels.meshing import domain as kernels
+from warp_corot.kernels.meshing import windings
 from warp_corot.mesh.side_by_side import in_parts
 
 from .sides import sides_of
@@ -54,20 +55,21 @@ class SurfaceDomain(SignedFunction):
         self.notes = list(notes)
         self._on: dict[str, wp.Mesh] = {}
         self._sides: dict[str, list[wp.array]] = {}
+        self.lines = lines_through(bounds)
         self.reversed, self.overlapping, self.undecided = self._windings()
         if self.reversed > LARGEST_REVERSED:
             raise InputError(
                 f"the surface crosses itself so that {self.reversed:.0%} of what it encloses is inside out; it must be "
                 f"wound outwards throughout (at most {LARGEST_REVERSED:.0%})"
             )
-        self.sides = sides_of(closed.points, closed.triangles, self._mesh(self.device))
+        self.sides = sides_of(closed.points, closed.triangles, self._mesh(self.device), self.lines)
 
     def _phi(self, points: wp.array) -> wp.array:
         phi = wp.empty(points.size, wp.float32, device=points.device)
         mesh, key = self._mesh(points.device), str(points.device)
         if key not in self._sides:
             self._sides[key] = self.sides.arrays(points.device)
-        inputs = [mesh.id, mesh.indices, *self._sides[key]]
+        inputs = [mesh.id, mesh.indices, self.lines, *self._sides[key]]
 
         def evaluate(start: int, stop: int) -> None:
             part = [points[start:stop], *inputs]
@@ -93,6 +95,18 @@ class SurfaceDomain(SignedFunction):
         in_parts(points.device, points.size, evaluate)
         return np.minimum(found.numpy() + START * reach, reach)
 
+    def lengths_inside(self, starts: np.ndarray) -> np.ndarray:
+        """What length of the lines from points below the body, see `lines`, is inside [m], float64 [n]."""
+        placed, mesh = self._on_device(starts), self._mesh(self.device)
+        lengths = wp.empty(placed.size, wp.float64, device=self.device)
+
+        def measure(start: int, stop: int) -> None:
+            inputs = [placed[start:stop], mesh.id, mesh.indices, self.lines]
+            wp.launch(windings.measure_lines, stop - start, inputs, [lengths[start:stop]], device=self.device)
+
+        in_parts(self.device, placed.size, measure)
+        return lengths.numpy()
+
     def _mesh(self, device: wp.Device) -> wp.Mesh:
         key = str(device)
         if key not in self._on:
@@ -106,12 +120,12 @@ class SurfaceDomain(SignedFunction):
         cells = np.stack(np.meshgrid(*[np.arange(SAMPLES)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         places = (cells + rng.random(cells.shape)) / SAMPLES
         points = self._on_device(self.bounds[0] + places * np.ptp(self.bounds, axis=0))
-        above = count_windings(self._mesh(self.device), points, [-0.5, 0.5, 1.5])
-        enclosed = max(int(np.count_nonzero(above != 1)), 1)
-        backward, twice = np.count_nonzero(above == 0) / enclosed, np.count_nonzero(above == 3) / enclosed
+        winding = windings_of(self._mesh(self.device), self.lines, points)
+        enclosed = max(int(np.count_nonzero(winding)), 1)
+        backward, twice = np.count_nonzero(winding < 0) / enclosed, np.count_nonzero(winding > 1) / enclosed
         if not self.closed.caps:
             return backward, twice, 0.0
-        given = surface_mesh(self.closed.points, self.closed.triangles[: -self.closed.caps], self.device)
+        given = surface_mesh(self.closed.points, self.closed.triangles[: -self.closed.caps], self.device, is_open=True)
         # Between 0.1 and 0.9: neither nearly 0 nor nearly 1.
         return backward, twice, float(np.mean(count_windings(given, points, [0.1, 0.9]) == 1))
 
@@ -179,17 +193,34 @@ def checked_triangles(
     return x.astype(np.float64), t.astype(np.int64)
 
 
-def surface_mesh(points: np.ndarray, triangles: np.ndarray, device: wp.Device) -> wp.Mesh:
-    """A Warp mesh that can tell winding numbers."""
+def surface_mesh(points: np.ndarray, triangles: np.ndarray, device: wp.Device, *, is_open: bool = False) -> wp.Mesh:
+    """A Warp mesh, of an open surface one that can tell winding numbers."""
     return wp.Mesh(
         wp.array(np.ascontiguousarray(points, dtype=np.float32), dtype=wp.vec3, device=device),
         wp.array(np.ascontiguousarray(triangles, dtype=np.int32).ravel(), dtype=wp.int32, device=device),
-        support_winding_number=True,
+        support_winding_number=is_open,
     )
 
 
+def lines_through(bounds: np.ndarray) -> windings.Lines:
+    """The lines along which winding numbers of a surface are found: along its shortest side, where it is met least."""
+    lines = windings.Lines()
+    lines.axis = int(np.argmin(np.ptp(bounds, axis=0)))
+    margin = 1e-3 * float(np.ptp(bounds, axis=0).max())
+    lines.low, lines.high = bounds[0, lines.axis] - margin, bounds[1, lines.axis] + margin
+    return lines
+
+
+def windings_of(mesh: wp.Mesh, lines: windings.Lines, points: wp.array) -> np.ndarray:
+    """Winding numbers of a closed surface around points, int32 [n]."""
+    found = wp.empty(points.size, wp.int32, device=points.device)
+    inputs = [points, mesh.id, mesh.indices, lines]
+    wp.launch(windings.find_windings, points.size, inputs, [found], device=points.device)
+    return found.numpy()
+
+
 def count_windings(mesh: wp.Mesh, points: wp.array, thresholds: Sequence[float]) -> np.ndarray:
-    """How many of the thresholds the winding number at each point exceeds, int32 [n]."""
+    """How many of the thresholds the winding number of an open surface at each point exceeds, int32 [n]."""
     above = wp.empty(points.size, wp.int32, device=points.device)
     limits = wp.array(thresholds, dtype=wp.float32, device=points.device)
     wp.launch(kernels.count_windings, points.size, [points, mesh.id, limits], [above], device=points.device)

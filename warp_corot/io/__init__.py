@@ -1,4 +1,4 @@
-"""Files in and out: meshes, USD animations, pictures, checkpoints.
+"""Input and output: meshes, USD animations, pictures, checkpoints.
 
-Nothing is imported here, so that a simulation that writes no file pays for no file library.
+This module imports nothing, so that a simulation without files loads no file library.
 """

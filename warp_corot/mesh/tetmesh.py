@@ -9,6 +9,7 @@ from os import PathLike
 import numpy as np
 import numpy.typing as npt
 
+from warp_corot.domain.units import check_float32
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_numbers
 from warp_corot.inputs.indices import checked_indices
@@ -85,6 +86,8 @@ class TetMesh:
             raise InputError(f"tetrahedron {bad[0]} names the nodes {given[bad[0]].tolist()}; there are {len(points)}")
         self.points = points * scale
         self.tets = np.array(given, dtype=np.int32)
+        used = self.points[np.unique(self.tets)]
+        check_float32(np.stack([used.min(axis=0), used.max(axis=0)]))
         self.up_axis = up_axis
         volumes = signed_volumes(self.points, self.tets)
         bad = np.flatnonzero(np.abs(volumes) <= FLAT * _longest_edges(self.points, self.tets) ** 3)

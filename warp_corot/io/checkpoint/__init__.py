@@ -1,1 +1,1 @@
-"""Checkpoints: everything that a simulation needs to go on."""
+"""Checkpoints: everything that a simulation needs to resume."""

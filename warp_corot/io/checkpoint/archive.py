@@ -1,4 +1,4 @@
-"""Checkpoints: everything that a simulation needs to go on, in one NumPy archive without pickles."""
+"""Checkpoints: everything that a simulation needs to resume, in one NumPy archive without pickles."""
 
 from __future__ import annotations
 
@@ -44,16 +44,18 @@ MATERIALS = {kind.__name__: kind for kind in (Isotropic, TransverselyIsotropic, 
 
 
 def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
-    """Write the simulation's state to ``path``, whole or not at all: aside, to the disk, and then renamed.
+    """Write the simulation's state to ``path``, completely or not at all: to a temporary file, synced, then renamed.
 
     Raises:
-        InputError: The folder is not there, the path is a folder, or it cannot be written to.
+        InputError: The folder does not exist, the path is a folder, it cannot be written to, or bodies touch something.
     """
     target = checked_path(path, "path")
     if not target.parent.is_dir():
-        raise InputError(f"cannot save {target}: the folder {target.parent} is not there")
+        raise InputError(f"cannot save {target}: the folder {target.parent} does not exist")
     if target.is_dir():
         raise InputError(f"cannot save {target}: it is a folder")
+    if sim.system.constraints:
+        raise InputError(f"cannot save {target}: checkpoints do not hold contact yet")
     arrays: dict[str, np.ndarray] = {}
     header: dict[str, Any] = {
         "format": FORMAT,
@@ -88,7 +90,7 @@ def _pack_body(
     prefix: str,
     arrays: dict[str, np.ndarray],
 ) -> dict[str, Any]:
-    """Put a body into arrays whose names begin with ``prefix``; returns what else there is, for JSON."""
+    """Put a body into arrays whose names begin with ``prefix``; returns the remaining data for JSON."""
     body.state.adopt_positions()
     mesh, material = body.mesh, body.material
     if changing is not None:
@@ -144,23 +146,23 @@ def load_checkpoint(
     source = checked_path(path, "path")
     if not source.is_file():
         raise InputError(f"there is no checkpoint {source}")
-    what = f"{source} is not a whole checkpoint of warp_corot"
+    what = f"{source} is not a complete checkpoint of warp_corot"
     try:
         with bounded(source), np.load(source, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         for name, array in arrays.items():
             if not isinstance(array, np.ndarray):
-                raise InputError(f"{what}: {name} is no array")
+                raise InputError(f"{what}: {name} is not an array")
         header = json.loads(arrays["header"].tobytes())
         newer = header["version"] > VERSION
         if header["format"] != FORMAT:
             raise InputError(what)
     except InputError:
         raise
-    except Exception as error:  # whatever NumPy, zip files or JSON make of it
+    except Exception as error:  # any error of NumPy, zip files or JSON
         raise InputError(what) from error
     if newer:
-        raise InputError(f"{source} is of version {header['version']}; this warp_corot reads up to version {VERSION}")
+        raise InputError(f"{source} has version {header['version']}; this warp_corot reads versions up to {VERSION}")
     try:
         if header["version"] < VERSION:
             _upgrade(header, arrays)
@@ -174,7 +176,7 @@ def load_checkpoint(
 
 
 def _upgrade(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
-    """Add what an older version did not know, each in the only form that there was."""
+    """Add what an older version did not store, with the only value that it had then."""
     if header["version"] < 2:
         header |= {"worlds": 1, "deterministic": False}
         for number in range(len(header["bodies"])):
@@ -191,7 +193,7 @@ def _upgrade(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
         _upgrade_steps(header, arrays)
     if header["version"] < 6:
         if "kept.control" in arrays:
-            # Without by how much the step was shortened last, and whether velocities were a user's; a place is new.
+            # Drops the last shortening of the step and whether velocities were the user's; adds one entry.
             arrays["kept.control"] = np.append(np.delete(arrays["kept.control"], (5, 7)), 0.0)
         arrays["kept.seconds"] = np.append(arrays["kept.seconds"], 0.0)
         arrays["guard.lately"] = np.zeros((4, header["worlds"]))
@@ -199,11 +201,11 @@ def _upgrade(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
 
 
 def _upgrade_steps(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
-    """Steps were of one length, found or given, and the starts of worlds counted in such steps."""
+    """Convert steps of constant length, found or given, and starts of worlds that were counted in steps."""
     dt, epoch = header["dt"], header["epoch"]
     header["integrator"]["values"]["dt"] = dt
     header["kept"] = ["counts", "seconds"]
-    # Whole steps since the epoch give the same time as before, digit by digit.
+    # Whole steps since the epoch give the same time as before, digit for digit.
     arrays["kept.counts"] = np.array([header["steps"], 0], np.int64)
     arrays["kept.seconds"] = np.array([dt, -epoch * dt])
     for name in ("scale", "drift"):
@@ -224,7 +226,7 @@ def _rebuilt_simulation(
         models.append(_rebuilt(described["model"], MODELS))
     integrator = _rebuilt(header["integrator"], INTEGRATORS)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", StabilityWarning)  # it was given when the simulation was made
+        warnings.simplefilter("ignore", StabilityWarning)  # the warning was shown when the simulation was made
         sim = Simulation(
             bodies,
             model=models,
@@ -292,7 +294,7 @@ def _unpack_state(body: SoftBody, described: dict[str, Any], prefix: str, arrays
 
 
 def _described(thing: Any, names: dict[str, Any]) -> dict[str, Any]:
-    """A listed dataclass of plain values as JSON: its name in the list and its values."""
+    """A listed dataclass of plain values for JSON: its name in the list and its values."""
     return {"name": _name_of(thing, names), "values": dataclasses.asdict(thing)}
 
 

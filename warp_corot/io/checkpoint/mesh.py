@@ -10,14 +10,14 @@ import numpy as np
 from warp_corot.mesh import TetForest, TetMesh, Tree
 from warp_corot.mesh.growing.detail import Detail
 
-#: What surfaces that are finer than their mesh have.
+#: Fields of surfaces that are finer than their mesh.
 DETAIL = ("points", "tets", "phi", "labels", "sharp_points", "sharp_triangles")
-#: What forests have that were made from a domain.
+#: Fields of forests that were made from a domain.
 OF_DOMAIN = ("phi", "fill", "labels", "node_labels")
 
 
 def pack_mesh(mesh: TetForest | TetMesh, prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Put a mesh into arrays whose names begin with ``prefix``; returns what else there is, for JSON."""
+    """Put a mesh into arrays whose names begin with ``prefix``; returns the remaining data for JSON."""
     if isinstance(mesh, TetMesh):
         arrays[prefix + "points"], arrays[prefix + "tets"] = mesh.points, mesh.tets
         if mesh.labels is not None:
@@ -45,7 +45,7 @@ def pack_mesh(mesh: TetForest | TetMesh, prefix: str, arrays: dict[str, np.ndarr
 
 
 def unpack_mesh(described: dict[str, Any], prefix: str, arrays: dict[str, np.ndarray]) -> TetForest | TetMesh:
-    """The mesh that ``pack_mesh`` put there."""
+    """Return the mesh that ``pack_mesh`` stored."""
     if described["kind"] == "general":
         mesh = TetMesh(
             arrays[prefix + "points"],
@@ -72,10 +72,10 @@ def unpack_mesh(described: dict[str, Any], prefix: str, arrays: dict[str, np.nda
 
 
 def _check_tree(tree: Tree, lattice: np.ndarray, ends: np.ndarray) -> None:
-    """See that what indices name is there, since kernels do not look.
+    """Check that all indices are in range, since kernels do not check.
 
     Raises:
-        ValueError: It is not.
+        ValueError: An index or a shape is wrong.
     """
     count, nodes = len(tree.tets), len(lattice)
     shapes = [tree.tets.shape, lattice.shape, ends.shape, tree.level.shape, tree.parent.shape, tree.first_child.shape]
@@ -84,4 +84,4 @@ def _check_tree(tree: Tree, lattice: np.ndarray, ends: np.ndarray) -> None:
     bounds = ((tree.tets, 0, nodes), (ends, -1, nodes), (tree.parent, -1, count), (tree.first_child, -2, count - 1))
     for array, least, most in (*bounds, (tree.level, 0, 64)):
         if array.dtype.kind != "i" or (array.size and not (array.min() >= least and array.max() < most)):
-            raise ValueError("the tree names what is not there")
+            raise ValueError("an index of the tree is out of range")

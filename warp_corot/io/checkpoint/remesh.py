@@ -1,6 +1,6 @@
-"""Checkpoints of bodies whose meshes change: the pools as they are and as ``reset`` finds them, and what was asked for.
+"""Checkpoints of bodies whose meshes change: the current pools, those that ``reset`` restores, and the options.
 
-Pools are kept place by place, not as a mesh, so that what comes next is numbered as if the run had never stopped.
+Pools are stored entry by entry, not as a mesh, so that a resumed run numbers new nodes like an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 Arrays = dict[str, np.ndarray]
 
-#: Of `OnlineRemesh`, what JSON takes as it is.
+#: Fields of `OnlineRemesh` that JSON can store directly.
 PLAIN = ("refine_above", "simplify_below", "min_level", "max_level", "every", "capacity")
-#: Where criteria are that can be found again by their names.
+#: Modules in which criteria can be found by their names.
 CRITERIA = "warp_corot.kernels."
 
 
 def pack_changing(changing: Changing, prefix: str, arrays: Arrays) -> dict[str, Any]:
-    """Put what remeshes a body into arrays whose names begin with ``prefix``; returns what else there is, for JSON."""
+    """Put a body's remeshing into arrays whose names begin with ``prefix``; returns the remaining data for JSON."""
     changing.body.state.adopt_positions()
     conditions, forest, options = changing.conditions, changing.forest, changing.options
     conditions.note()
@@ -67,7 +67,7 @@ def pack_changing(changing: Changing, prefix: str, arrays: Arrays) -> dict[str, 
 
 
 def unpack_changing(changing: Changing, described: dict[str, Any], prefix: str, arrays: Arrays) -> None:
-    """Have a body that was made as it began be remeshed as it was when ``pack_changing`` kept it."""
+    """Restore the remeshing that ``pack_changing`` stored, for a body with its initial mesh."""
     forest, keyframes, body = changing.forest, changing.conditions.keyframes, changing.body
     kept_in = forest.pools, forest.carriage.arrays
     _unpacked_snapshot(kept_in, described["initial"], f"{prefix}initial.", arrays).restore(*kept_in)
@@ -104,16 +104,16 @@ def remesh_options(
     device: str | wp.Device,
     given: OnlineRemesh | Sequence[OnlineRemesh | None] | None,
 ) -> OnlineRemesh | Sequence[OnlineRemesh | None] | None:
-    """How the bodies of a checkpoint are to be remeshed.
+    """The options with which the bodies of a checkpoint are remeshed.
 
     Args:
-        described: The bodies.
-        arrays: Of the checkpoint.
-        device: Where the simulation goes on.
-        given: In place of what was kept, but for the capacity, which stays.
+        described: The bodies' data.
+        arrays: The checkpoint's arrays.
+        device: The device of the resumed simulation.
+        given: Options in place of the stored ones, except the capacity, which stays.
 
     Raises:
-        InputError: A criterion that is not known, and nothing is given in its place.
+        InputError: The criterion is not known, and no options replace it.
     """
     kept = [
         None if each["remesh"] is None else _options(each["remesh"], f"body{number}.remesh.", arrays, device, given)
@@ -123,7 +123,7 @@ def remesh_options(
         return kept if any(kept) else None
     several = list(given) if isinstance(given, Sequence) else [given] * len(described)
     if len(several) != len(kept) or not all(isinstance(each, OnlineRemesh | None) for each in several):
-        return given  # the simulation says what is wrong
+        return given  # the simulation reports what is wrong
     found: list[OnlineRemesh | None] = []
     for number, (own, before) in enumerate(zip(several, kept, strict=True)):
         if before is not None and own is None:
@@ -137,8 +137,8 @@ def _options(described: dict[str, Any], prefix: str, arrays: Arrays, device: Any
     criterion = None if name is None else _criterion(name)
     if name is not None and criterion is None and given is None:
         raise InputError(
-            f"the criterion {name.rpartition('.')[2]!r} is a function of yours, which a checkpoint does not hold; load "
-            "with remesh=OnlineRemesh(criterion=...) as the simulation was made"
+            f"the criterion {name.rpartition('.')[2]!r} is your own function, which a checkpoint cannot hold; load "
+            "with remesh=OnlineRemesh(criterion=...) as for the original simulation"
         )
     parameters = None
     if described["parameters"]:
@@ -151,7 +151,7 @@ def _name_of(criterion: Any) -> str:
 
 
 def _criterion(name: str) -> Any:
-    """The package's own criterion of a name; None if it is none of these."""
+    """The package's own criterion with this name; None if there is none."""
     module, _, function = name.rpartition(".")
     if not module.startswith(CRITERIA):
         return None
@@ -163,7 +163,7 @@ def _criterion(name: str) -> Any:
 
 
 def _pack_snapshot(snapshot: Snapshot, prefix: str, arrays: Arrays) -> list[list[Any]]:
-    """Put a snapshot's values into arrays; returns their names and the places where they start."""
+    """Put a snapshot's values into arrays; returns their names and start positions."""
     arrays[prefix + "counts"] = snapshot.counts
     for name, start, values in snapshot.pieces:
         arrays[f"{prefix}{name}.{start}"] = values.numpy()

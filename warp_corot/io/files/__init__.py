@@ -1,1 +1,1 @@
-"""Files that are written whole, named as OpenUSD names them, and read quietly."""
+"""Files: writing them completely, naming them for OpenUSD, and reading them quietly."""

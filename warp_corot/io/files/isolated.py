@@ -1,7 +1,7 @@
-"""Readers in a process of their own: what a broken file does to a library, it does there.
+"""Readers in a separate process, which contains the effects of broken files on libraries.
 
-Libraries that read meshes crash, leave the interpreter, never end, ask for all memory or write to the terminal on files
-that are cut or garbled. The process gets bounds of memory and time by the file's size, and hands over arrays.
+On truncated or damaged files, libraries that read meshes crash, exit the interpreter, never return, exhaust memory or
+write to the terminal. The process has limits on memory and time that depend on the file's size, and returns arrays.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 
 
 def read_isolated(module: str, path: Path) -> tuple[dict[str, NDArray[Any]] | None, str | None]:
-    """Has a reader read a file in another process.
+    """Let a reader read a file in another process.
 
     Args:
-        module: Full name of a module with a function ``read(path)`` that returns something with ``to_arrays()``, or
-            arrays by name; None if the file is none of its own.
+        module: Full name of a module with a function ``read(path)`` that returns an object with ``to_arrays()``, or
+            arrays by name; None if the file has another format.
         path: The file.
 
     Returns:
-        The arrays, or None; and the reason for None, which is missing too if the file is none of the reader's.
+        The arrays, or None; and the reason for None, which is None, too, if the file has another format.
     """
     with tempfile.TemporaryDirectory(prefix="warp-corot-") as folder:
         out = Path(folder) / "arrays.npz"
@@ -62,9 +62,9 @@ def read_isolated(module: str, path: Path) -> tuple[dict[str, NDArray[Any]] | No
 
 
 def _death(status: int, stderr: bytes) -> str:
-    """Why a reader has ended without a word."""
+    """Why a reader ended without a report."""
     if status == -getattr(signal, "SIGXCPU", 0):
-        return "it did not come to an end"
+        return "it did not finish"
     said = stderr.decode(errors="replace")
     if "bad_alloc" in said or "Unable to allocate" in said:
         return "it asks for more memory than such a file can need"

@@ -1,4 +1,4 @@
-"""Files that are broken read by other libraries: nothing on the terminal, no more memory than they can need."""
+"""Reading broken files with other libraries: no output on the terminal, and limited memory."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from pathlib import Path
 
 @contextmanager
 def quietly() -> Iterator[list[str]]:
-    """Nothing that is written to stdout and stderr inside is seen, libraries' own writing included.
+    """Hide everything that is written to stdout and stderr inside, also by libraries.
 
     Yields:
-        What was written, a line each, once the block is left.
+        The hidden output, a list of lines, after the block.
     """
     said: list[str] = []
     with tempfile.TemporaryFile() as file:
         kept = []
         _flush()
         for number in (1, 2):
-            with suppress(OSError):  # closed, and so seen by nobody
+            with suppress(OSError):  # closed, so that nobody sees the output
                 kept.append((number, os.dup(number)))
                 os.dup2(file.fileno(), number)
         try:
@@ -42,21 +42,21 @@ def _flush() -> None:
             stream.flush()
 
 
-#: Memory that reading a file may take [bytes]: at least, and more for each byte of the file.
+#: Memory that reading a file may take [bytes]: a minimum, and more for each byte of the file.
 MEMORY, MEMORY_PER_BYTE = 4 << 30, 200
-#: The least for USD stages, whose arrays are hardly compressed: OpenUSD fills what it asks for, which takes time.
+#: The minimum for USD stages, whose arrays are hardly compressed: OpenUSD fills what it allocates, which takes time.
 USD_MEMORY = 1 << 30
 
 
 @contextmanager
 def bounded(path: Path, memory: int = MEMORY) -> Iterator[None]:
-    """Inside no more memory can be had than such a file can need, whatever a broken one says that it holds.
+    """Limit memory inside the block to what the file can need, whatever sizes a broken file claims.
 
-    Libraries then say that there is not enough. Only where the system has such bounds, as Linux has.
+    Libraries then report that memory is short. The limit exists only on systems that support it, for example Linux.
 
     Args:
         path: The file.
-        memory: What it may take at least [bytes].
+        memory: Minimum of the limit [bytes].
     """
     used = _data_in_use()
     if used is None:
@@ -76,7 +76,7 @@ def bounded(path: Path, memory: int = MEMORY) -> Iterator[None]:
 
 
 def _data_in_use() -> int | None:
-    """What Linux counts as this process's data [bytes]; None elsewhere."""
+    """Linux's count of this process's data [bytes]; None elsewhere."""
     try:
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmData:"):

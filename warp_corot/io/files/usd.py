@@ -1,4 +1,4 @@
-"""Files as OpenUSD takes them: their names, whether one may be written, who is writing it, and what went wrong."""
+"""Rules of OpenUSD for files: names, permission to write, locks, and error messages."""
 
 import functools
 import math
@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
+import numpy as np
 from pxr import Tf, Usd, UsdGeom
 
 from warp_corot.errors import InputError
@@ -18,14 +19,14 @@ from .quiet import USD_MEMORY, bounded, quietly
 
 try:
     import fcntl
-except ImportError:  # Windows: two runs on one output are not told apart there
+except ImportError:  # Windows: two runs with the same output are not detected there
     fcntl = None  # type: ignore[assignment]
 
 STAGE_SUFFIXES = (".usd", ".usda", ".usdc")
 
 
 def usd_name(path: Path) -> str:
-    """A path for OpenUSD, which takes names as UTF-8 whatever the locale is.
+    """A path for OpenUSD, which takes names in UTF-8 in every locale.
 
     Raises:
         InputError: Its bytes are not UTF-8.
@@ -33,14 +34,14 @@ def usd_name(path: Path) -> str:
     try:
         return os.fsencode(path).decode("utf-8")
     except UnicodeDecodeError:
-        raise InputError(f"{path}: its name is not UTF-8, which OpenUSD files must have") from None
+        raise InputError(f"{path}: its name is not UTF-8; names of OpenUSD files must be") from None
 
 
 def open_stage(path: Path) -> Any:
-    """The stage of a file.
+    """Open the stage of a file.
 
     Raises:
-        InputError: Not one, or a binary one on which OpenUSD crashes or does not come to an end.
+        InputError: It is not a stage, or a binary one on which OpenUSD crashes or does not finish.
     """
     if _is_binary(path):
         about = path.stat()
@@ -48,23 +49,60 @@ def open_stage(path: Path) -> Any:
         if reason:
             raise InputError(f"{path}: is not a USD file that OpenUSD can open ({reason})")
     try:
-        return Usd.Stage.Open(usd_name(path))
+        stage = Usd.Stage.Open(usd_name(path))
     except Tf.ErrorException as error:
         text = _text(error)
         where = re.search(rf"{re.escape(path.name)}:(\d+):\d+: ([^\n]+)", text)
         why = f": line {where[1]}: {_short(where[2].rstrip(chr(39)))}" if where else f" ({first_message(text)})"
         raise InputError(f"{path}: is not a USD file that OpenUSD can open{why}") from None
+    _check_types(stage, path)
+    return stage
+
+
+#: Attributes that are read here. OpenUSD returns the type in the file, not that of the schema.
+_READ = (
+    *("points", "faceVertexCounts", "faceVertexIndices", "holeIndices", "tetVertexIndices"),
+    *("orientation", "subdivisionScheme", "physics:gravityMagnitude", "physics:gravityDirection"),
+)
+
+
+def _check_types(stage: Any, path: Path) -> None:
+    """Refuse a stage if points, faces or other attributes in use have a type other than their schema's.
+
+    Another precision is allowed: points may be double.
+    """
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+        for name in _READ:
+            attribute, definition = prim.GetAttribute(name), prim.GetPrimDefinition().GetAttributeDefinition(name)
+            if not definition or not attribute.HasAuthoredValue():
+                continue
+            value = attribute.Get()
+            value = attribute.Get(Usd.TimeCode.EarliestTime()) if value is None else value
+            due = definition.GetTypeName()
+            if value is not None and not _is_of(value, due):
+                raise InputError(f"{path}: {attribute.GetPath()} must be of type {due}; its values are of another type")
+
+
+def _is_of(value: Any, due: Any) -> bool:
+    """Whether a value is of a type's kind (numbers, whole numbers, text), dimension and rank."""
+    wanted = np.asarray(due.scalarType.defaultValue)
+    found = np.asarray(value)
+    kinds = {"f": "fiu", "i": "iu"}.get(wanted.dtype.kind, wanted.dtype.kind)
+    if due.isArray and not found.size:
+        return found.ndim > 0
+    rank = wanted.ndim + int(due.isArray)
+    return found.ndim == rank and found.shape[rank - wanted.ndim :] == wanted.shape and found.dtype.kind in kinds
 
 
 def _is_binary(path: Path) -> bool:
-    """Whether a file is a crate or a package, by its beginning."""
+    """Whether a file is a crate or a package, judged by its first bytes."""
     with path.open("rb") as file:
         return file.read(8).startswith((b"PXR-USDC", b"PK"))
 
 
 @functools.lru_cache(maxsize=64)
 def _trial(path: Path, size: int, written: int) -> str | None:
-    """Why a stage is not to be opened in this process, if so; files are told apart by size and time, too."""
+    """Why a stage must not be opened in this process, or None; the cache distinguishes files by size and time, too."""
     return read_isolated(f"{__package__}.usd_trial", path)[1]
 
 
@@ -73,7 +111,7 @@ R = TypeVar("R")
 
 
 def reads_stage(read: Callable[Concatenate[Path, P], R]) -> Callable[Concatenate[Path, P], R]:
-    """Have a function that reads a file, its first argument, end in one line if OpenUSD finds it damaged on the way."""
+    """Make a function that reads a file, its first argument, raise one line if OpenUSD finds the file damaged."""
 
     @functools.wraps(read)
     def reading(path: Path, *args: P.args, **kwargs: P.kwargs) -> R:
@@ -91,12 +129,12 @@ def reads_stage(read: Callable[Concatenate[Path, P], R]) -> Callable[Concatenate
 def _text(error: Tf.ErrorException) -> str:
     try:
         return str(error)
-    except UnicodeDecodeError:  # OpenUSD quotes the file as it is
+    except UnicodeDecodeError:  # OpenUSD quotes the file's bytes
         return " : 'it has text that is not UTF-8'"
 
 
 def first_message(text: str) -> str:
-    """What went wrong first by OpenUSD's many lines, without where in its code."""
+    """The first error in OpenUSD's many lines, without the place in its code."""
     found = re.search(r" : '([^\n]*)'", text)
     return _short(found[1] if found else " ".join(text.split()) or "unknown reason")
 
@@ -113,25 +151,25 @@ def metres_per_unit(stage: Any, path: Path) -> float:
     """
     metres = float(UsdGeom.GetStageMetersPerUnit(stage))
     if not (math.isfinite(metres) and metres > 0.0):
-        raise InputError(f"{path}: metersPerUnit is {metres}, should be a positive number")
+        raise InputError(f"{path}: metersPerUnit is {metres}; it must be a positive number")
     return metres
 
 
 def check_stage_path(path: Path) -> None:
-    """Says before the simulation begins what would stop its result from being written.
+    """Check, before a simulation, that its result can be written.
 
     Raises:
-        InputError: Another extension or a name that OpenUSD cannot take, a folder in the way, an output folder that is
-            not there or not writable, or a write-protected file.
+        InputError: Another extension or a name that OpenUSD cannot take, a folder with this name, an output folder that
+            does not exist or is not writable, or a write-protected file.
     """
     if path.suffix.lower() not in STAGE_SUFFIXES:
-        raise InputError(f"{path}: extension {path.suffix or '(none)'}, should be {', '.join(STAGE_SUFFIXES)}")
+        raise InputError(f"{path}: extension {path.suffix or '(none)'}; it must be {', '.join(STAGE_SUFFIXES)}")
     usd_name(path)
     if path.is_dir():
-        raise InputError(f"{path}: is a folder, should be a file name")
+        raise InputError(f"{path}: is a folder; it must be a file name")
     folder = path.parent
     if not folder.is_dir():
-        raise InputError(f"{path}: output folder {folder} {'is a file' if folder.exists() else 'is not there'}")
+        raise InputError(f"{path}: output folder {folder} {'is a file' if folder.exists() else 'does not exist'}")
     if path.exists() and not os.access(path, os.W_OK):
         raise InputError(f"{path}: is write-protected")
     try:
@@ -145,7 +183,7 @@ def take_lock(lock: int) -> None:
     """Lock an open file until it is closed or the process ends.
 
     Raises:
-        OSError: Somebody else has it, or the file system (some network ones) has no locks.
+        OSError: Another process has the lock, or the file system has no locks (some network ones).
     """
     if fcntl:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -164,7 +202,7 @@ def is_locked(lock: Path) -> bool:
 
 
 def reason(error: Tf.ErrorException) -> str:
-    """The operating system's own words out of OpenUSD's many lines."""
+    """The operating system's message from OpenUSD's many lines."""
     found = re.search(r"Error occurred (?:writing|opening) file: ([^'\n]+)", str(error))
     if found:
         return found.group(1).strip()

@@ -1,4 +1,4 @@
-"""OpenUSD put to the test: a binary stage that is damaged can hang it or end its process."""
+"""A trial reading with OpenUSD: a damaged binary stage can hang it or end its process."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from pxr import Tf, Usd
 from .quiet import USD_MEMORY, bounded
 from .usd import usd_name
 
-#: Where memory is overwritten a first reading may end well, and the next one not.
+#: If memory is overwritten, a first reading may succeed and the next one fail.
 READINGS = 2
 
 
 def read(path: Path) -> dict[str, NDArray[Any]]:
-    """Reads all that the first frame of a stage shows, and tells nothing: what OpenUSD complains of, it will complain
-    of again to the process that asked."""
+    """Read everything that the first frame of a stage shows, and return nothing: OpenUSD will repeat its complaints in
+    the calling process."""
     with bounded(path, USD_MEMORY), suppress(Tf.ErrorException, UnicodeDecodeError):
         for _ in range(READINGS):
             stage = Usd.Stage.Open(usd_name(path))

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Files that are written completely or not at all."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from pathlib import Path
 
 @contextmanager
 def written_whole(target: Path) -> Iterator[Path]:
-    """A path beside ``target`` to write to: at the end of the block it is on the disk and renamed over ``target``.
+    """A path beside ``target`` to write to: at the end of the block it is synced and renamed over ``target``.
 
-    If anything is raised, it is removed and ``target`` is what it was before.
+    If an exception is raised, it is removed and ``target`` stays unchanged.
     """
     part = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
     try:
@@ -26,10 +26,10 @@ def written_whole(target: Path) -> Iterator[Path]:
 
 
 def sync(path: Path) -> None:
-    """Has the operating system put a file, or a folder's entries where it can, on the disk.
+    """Sync a file, or a folder's entries where the system can, to the disk.
 
     Raises:
-        OSError: The file could not be written, as when the disk is full.
+        OSError: The file could not be written, for example because the disk is full.
     """
     try:
         descriptor = os.open(path, os.O_RDWR if os.name == "nt" and path.is_file() else os.O_RDONLY)

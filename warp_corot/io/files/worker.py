@@ -1,4 +1,4 @@
-"""What runs in the process of a reader; see `warp_corot.io.files.isolated`."""
+"""The main function of a reader's process; see `warp_corot.io.files.isolated`."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-#: Memory [bytes] and processor time [s] that a reader may use: at least, and more for each byte of the file.
+#: Memory [bytes] and processor time [s] that a reader may use: a minimum, and more for each byte of the file.
 MEMORY, MEMORY_PER_BYTE = 3 * 2**30, 100
 SECONDS, SECONDS_PER_BYTE = 30, 5e-6
 
 
 def _bound_resources(size: int) -> None:
-    """Bounds for this process where the system has them (not on Windows)."""
+    """Set this process's limits, where the system has them (not on Windows)."""
     try:
         import resource
     except ImportError:
@@ -32,13 +32,13 @@ def _bound_resources(size: int) -> None:
 
 
 def _size(path: Path) -> int:
-    """Of a file, or of all files in a folder [bytes]."""
+    """Size of a file, or of all files in a folder [bytes]."""
     files = path.rglob("*") if path.is_dir() else [path]
     return sum(file.stat().st_size for file in files if file.is_file())
 
 
 def main(module: str, path: str, out: str, report: str) -> int:
-    """What the other process does."""
+    """Run a reader in the other process."""
     _bound_resources(_size(Path(path)))
     said: dict[str, Any] = {}
     try:
@@ -56,12 +56,12 @@ def main(module: str, path: str, out: str, report: str) -> int:
         said = {"reason": words if words and _speaks(error) else f"{type(error).__name__} {words}".strip()}
     Path(report).write_text(json.dumps(said))
     sys.stdout.flush()
-    # Libraries that crash while they are taken down have done their work by now.
+    # Libraries that crash during shutdown have finished their work by now.
     os._exit(1 if "reason" in said else 0)
 
 
 def _speaks(error: BaseException) -> bool:
-    """Whether an error's text is a sentence without its type's name, as those of `KeyError` are not."""
+    """Whether an error's text is a sentence without its type's name; the text of `KeyError` is not."""
     return not isinstance(error, KeyError | IndexError | AttributeError | TypeError | StopIteration | AssertionError)
 
 

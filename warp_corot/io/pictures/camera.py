@@ -1,4 +1,4 @@
-"""Where a picture is seen from."""
+"""The camera of a picture."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Camera:
-    """A mild perspective view. Points are seen along ``axes[2]``; picture coordinates are right and up.
+    """A mild perspective view. The viewer looks along ``-axes[2]``; picture coordinates are right and up.
 
     Attributes:
         center: Point in the middle of the picture [m], [3].
@@ -66,6 +66,6 @@ class Camera:
 def _world_axes(up_axis: str) -> tuple[Array, Array, Array]:
     """Right, up and front (towards a viewer at azimuth 0), a right-handed triple."""
     if up_axis not in ("X", "Y", "Z"):
-        raise InputError(f"up_axis is {up_axis!r}, should be X, Y or Z")
+        raise InputError(f"up_axis is {up_axis!r}; it must be X, Y or Z")
     x, y, z = np.eye(3)
     return {"Y": (x, y, z), "Z": (x, z, -y), "X": (z, x, y)}[up_axis]

@@ -1,10 +1,10 @@
-"""The colour map of stresses: light for none, dark for much, even steps to the eye."""
+"""The colour map of stresses: light for none, dark for much, perceptually uniform."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# Seventeen evenly spaced colours of Matplotlib's "magma" (CC0) from 0.97 down to 0.25, sRGB. Near-black is left out
-# at one end and near-white at the other, so that a shaded body keeps its shape in every colour.
+# Seventeen evenly spaced colours of Matplotlib's "magma" (CC0) from 0.97 down to 0.25, sRGB. The ends, near-black and
+# near-white, are left out, so that a shaded body keeps its shape in every colour.
 _MAGMA = (
     "fcf0b2 fdda9c fec68a feb078 fd9b6b fb8560 f7705c ee5b5e e24d66 "
     "d0416f bf3a77 ab337c 992d80 862781 752181 621980 51127c"
@@ -12,24 +12,26 @@ _MAGMA = (
 COLORMAP_NAME = "magma, reversed"
 TISSUE = (0.94, 0.74, 0.64)
 """Colour of a body without stresses, sRGB."""
+STEEL = (0.62, 0.67, 0.74)
+"""Colour of rigid obstacles, sRGB."""
 
 
 def stress_colors(count: int = 256) -> NDArray[np.float64]:
-    """The colour map as a table, sRGB in 0..1, float64 [count, 3]; row 0 is no stress."""
+    """The colour map as a table, sRGB in 0..1, float64 [count, 3]; row 0 stands for no stress."""
     knots = np.array([[int(word[i : i + 2], 16) / 255.0 for i in (0, 2, 4)] for word in _MAGMA.split()])
     at = np.linspace(0.0, len(knots) - 1.0, count)
     return np.stack([np.interp(at, np.arange(len(knots)), channel) for channel in knots.T], axis=1)
 
 
 def color_index(values: ArrayLike, lowest: float, highest: float, count: int = 256) -> NDArray[np.int32]:
-    """Rows of a table of ``count`` colours: ``lowest`` → 0, ``highest`` → last, clamped; not a number → last."""
+    """Rows of a table of ``count`` colours: ``lowest`` → 0, ``highest`` → last, clamped; NaN → last."""
     scaled = (np.asarray(values, dtype=np.float64) - lowest) * (1.0 / max(highest - lowest, 1e-30))
     scaled = np.where(np.isfinite(scaled), scaled, 1.0)
     return np.rint(np.clip(scaled, 0.0, 1.0) * (count - 1)).astype(np.int32)
 
 
 def srgb_to_linear(color: ArrayLike) -> NDArray[np.float64]:
-    """Linear light from sRGB values in 0..1 (IEC 61966-2-1), as OpenUSD's ``displayColor`` wants it."""
+    """Linear light from sRGB values in 0..1 (IEC 61966-2-1), the encoding of OpenUSD's ``displayColor``."""
     c = np.asarray(color, dtype=np.float64)
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
 

@@ -1,7 +1,7 @@
 """Shaded surfaces drawn into Matplotlib axes.
 
-A surface is drawn as many small polygons, back to front (painter's algorithm): faces turned away are left out, the
-others cut into pieces small enough for smooth shading, and each piece filled with one colour.
+A surface is drawn as many small polygons, back to front (painter's algorithm): faces that face away are left out, the
+others are cut into pieces small enough for smooth shading, and each piece is filled with one colour.
 """
 
 import math
@@ -13,17 +13,17 @@ from numpy.typing import ArrayLike, NDArray
 from warp_corot.errors import InputError
 
 from .camera import Array, Camera
-from .colors import TISSUE, color_index, round_limit, srgb_to_linear, stress_colors
+from .colors import STEEL, TISSUE, color_index, round_limit, srgb_to_linear, stress_colors
 from .shadow import draw_shadow
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 INK = "#3b3640"
-_PIECES = 60_000  # about how many polygons a body is cut into
+_PIECES = 60_000  # approximate number of polygons of a body
 _CREASE = math.cos(math.radians(40.0))  # edges sharper than this stay sharp
-_DOTS_ACROSS = 160  # as many dots at most from the body to the viewer, at their spacing
-_BEFORE = 5e-3  # of the body's size: a surface that much nearer than a dot hides it
+_DOTS_ACROSS = 160  # dots are at least the distance to the viewer over this apart
+_BEFORE = 5e-3  # fraction of the body's size: a surface that much nearer than a dot hides it
 _GHOST, _GHOST_LINE = (0.90, 0.91, 0.93), (0.74, 0.76, 0.80)
 
 
@@ -40,27 +40,29 @@ def draw_body(
     color: tuple[float, float, float] = TISSUE,
     edges: bool = False,
     ground: float | bool = True,
+    square: ArrayLike | None = None,
     held: ArrayLike | None = None,
     pieces: int = _PIECES,
     seams: float = 0.2,
 ) -> Camera:
-    """Draws a shaded surface into a Matplotlib Axes.
+    """Draw a shaded surface into Matplotlib axes.
 
     Args:
-        ax: Where to draw; its frame is switched off and its limits widened to what is drawn.
-        positions: Nodes [N, 3] [m]. Nodes that no face names do not matter.
+        ax: The axes; their frame is switched off and their limits widened to the drawing.
+        positions: Nodes [N, 3] [m]. Nodes of no face do not matter.
         faces: Triangles [F, 3], wound counter-clockwise seen from outside (`mesh.surface.boundary_faces`).
-        scalars: Values to colour by, one a node [N] or one a face [F].
+        scalars: Values to colour by, one a node [N] or one a face [F]; NaN for what is rigid, which is grey.
         value_range: Values at the two ends of the colour map; None: 0 to the 99th percentile, rounded up.
-        rest: Nodes at rest [N, 3] [m], drawn as a faint silhouette behind.
-        camera: None: one that sees ``positions`` and ``rest``.
+        rest: Nodes at rest [N, 3] [m], drawn as a faint silhouette in the background.
+        camera: The camera; None: one that sees ``positions`` and ``rest``.
         up_axis: "X", "Y" or "Z".
-        color: Of the body where there are no scalars, sRGB.
-        edges: Draw the edges of the faces.
-        ground: Height [m] of a ground that takes the shadow; True: below the lowest node; False: none.
-        held: Nodes to be marked with dots, mask [N].
-        pieces: About how many polygons the surface is cut into.
-        seams: Width of the polygons' edges [pt]; those thinner than a pixel leave the seams between polygons visible.
+        color: Colour of a body without scalars, sRGB.
+        edges: Whether to draw the edges of the faces.
+        ground: Height [m] of a ground that shows the shadow; True: below the lowest node; False: none.
+        square: Corners of a ground that is outlined [4, 3] [m].
+        held: Nodes marked with dots, mask [N].
+        pieces: Approximate number of polygons of the surface.
+        seams: Width of the polygons' edges [pt]; edges thinner than a pixel leave visible seams between polygons.
 
     Returns:
         The camera used, for the next body.
@@ -77,6 +79,10 @@ def draw_body(
         height = min(float((s @ camera.world_up).min()) for s in seen) if ground is True else float(ground)
         shadow = draw_shadow(ax, x[tri], camera, height)
         ax.update_datalim(shadow)
+    if square is not None:
+        outline = camera.project(np.asarray(square, dtype=np.float64))[0]
+        _fill(ax, outline[None], "none", _GHOST_LINE, width=1.0, order=1)
+        ax.update_datalim(outline)
     if x_rest is not None:
         _draw_silhouette(ax, x_rest[tri], camera)
 
@@ -91,8 +97,9 @@ def draw_body(
     else:
         lowest, highest = value_range or value_limits(scalars)
         base = srgb_to_linear(stress_colors())[color_index(values[front], lowest, highest)]
+        base = np.where(np.isnan(values[front])[:, None], srgb_to_linear(STEEL), base)
     shaded = _shade(base, normals, camera.rays(cut.mean(axis=1)), camera)[order]
-    # The edge of each polygon, in its own colour, closes the seams that antialiasing leaves between neighbours.
+    # Each polygon's edge, in its own colour, closes the seams that antialiasing leaves between neighbours.
     _fill(ax, flat[order], shaded, shaded, width=seams, order=4)
     if edges:
         _draw_edges(ax, x[tri], camera)
@@ -117,18 +124,18 @@ def checked_surface(positions: ArrayLike, faces: ArrayLike, name: str) -> tuple[
     """Positions as float64 [N, 3] and faces as int64 [F, 3].
 
     Raises:
-        InputError: Other shapes, nodes that are not there, or coordinates of the surface that are not finite.
+        InputError: Other shapes, nodes out of range, or coordinates of the surface that are not finite.
     """
     x = np.asarray(positions, dtype=np.float64)
     tri = np.asarray(faces, dtype=np.int64)
     if x.ndim != 2 or x.shape[1] != 3:
-        raise InputError(f"{name} has shape {list(x.shape)}, should be [N, 3]")
+        raise InputError(f"{name} has shape {list(x.shape)}; it must be [N, 3]")
     if tri.ndim != 2 or tri.shape[1] != 3 or len(tri) == 0:
-        raise InputError(f"faces has shape {list(tri.shape)}, should be [F, 3] with at least one face")
+        raise InputError(f"faces has shape {list(tri.shape)}; it must be [F, 3] with at least one face")
     if tri.min() < 0 or tri.max() >= len(x):
         raise InputError(f"faces names nodes {tri.min()} to {tri.max()} but {name} has nodes 0 to {len(x) - 1}")
     if not np.isfinite(x[tri]).all():
-        raise InputError(f"{name} has coordinates that are not finite")
+        raise InputError(f"{name} has coordinates that are not finite; all must be finite")
     return x, tri
 
 
@@ -141,11 +148,11 @@ def _values(scalars: ArrayLike | None, nodes: int, tri: NDArray[np.int64]) -> Ar
         return values[tri]
     if values.shape == (len(tri),):
         return np.repeat(values[:, None], 3, axis=1)
-    raise InputError(f"scalars has shape {list(values.shape)}, should be [{nodes}] (nodes) or [{len(tri)}] (faces)")
+    raise InputError(f"scalars has shape {list(values.shape)}; it must be [{nodes}] (nodes) or [{len(tri)}] (faces)")
 
 
 def _corner_normals(x: Array, tri: NDArray[np.int64]) -> Array:
-    """Unit normals at the corners of faces [F, 3, 3]: averages over the node's faces within a crease."""
+    """Unit normals at the corners of faces [F, 3, 3]: averages over the node's faces within the crease angle."""
     corners = x[tri]
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     unit = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-300)
@@ -154,9 +161,9 @@ def _corner_normals(x: Array, tri: NDArray[np.int64]) -> Array:
     place = np.searchsorted(nodes, tri.ravel())
     total = np.zeros((tri.size, 3))
     own = np.repeat(unit, 3, axis=0)
-    for turn in range(int(count.max())):
-        there = turn < count[place]
-        neighbour = order[np.where(there, first[place] + turn, 0)] // 3
+    for corner in range(int(count.max())):
+        there = corner < count[place]
+        neighbour = order[np.where(there, first[place] + corner, 0)] // 3
         near = there & (np.einsum("ij,ij->i", unit[neighbour], own) > _CREASE)
         total += np.where(near[:, None], area[neighbour], 0.0)
     total += 1e-12 * own * np.abs(area).max()
@@ -164,7 +171,7 @@ def _corner_normals(x: Array, tri: NDArray[np.int64]) -> Array:
 
 
 def _cut(x: Array, tri: NDArray[np.int64], values: Array | None, count: int) -> tuple[Array, Array, Array | None]:
-    """Cuts each face into n² triangles: their corners [m, 3, 3], and normals [m, 3] and values [m] at their centres."""
+    """Cut each face into n² triangles: their corners [m, 3, 3], and normals [m, 3] and values [m] at their centres."""
     n = int(np.clip(math.sqrt(count / len(tri)), 1, 24))
     weights = []
     for i in range(n):
@@ -189,7 +196,7 @@ def _shade(base: Array, normals: Array, rays: Array, camera: Camera) -> Array:
     fill = _unit(0.9 * right + 0.1 * camera.world_up + 0.5 * front)
     lambert = np.clip((normals @ key + 0.2) / 1.2, 0.0, None)
     sky = 0.5 + 0.5 * normals @ camera.world_up
-    # Ambient light a little towards rose: dimmed by grey light alone the map's yellows would turn olive.
+    # Ambient light is slightly rose: grey light would turn the colour map's yellows olive.
     ambient = (0.13 + 0.24 * sky + 0.30 * np.clip(normals @ fill, 0.0, None))[:, None] * np.array([1.06, 0.96, 1.0])
     light = ambient + 0.74 * lambert[:, None]
     halfway = key + rays
@@ -220,13 +227,13 @@ def _fill(ax: "Axes", polygons: Array, face: Any, edge: Any, *, width: float, or
 
 
 def _draw_dots(ax: "Axes", x: Array, tri: NDArray[np.int64], held: NDArray[np.bool_], camera: Camera) -> None:
-    """Dots on the held nodes that can be seen, so few that they do not run together."""
+    """Draw dots on visible held nodes, far enough apart to stay separate."""
     faces = tri[camera.sees_outside(x[tri])]
     marked = np.unique(faces[held[faces]])
     if not len(marked):
         return
     flat, _ = camera.project(x[marked])
-    # Cells of the picture, not of the body, lest the dots of a film change with what moves.
+    # Cells of the picture, not of the body, so that the dots of a film do not change with the motion.
     cells = np.floor(flat / (camera.distance / _DOTS_ACROSS)).astype(int)
     _, first = np.unique(cells, axis=0, return_index=True)
     seen = first[_visible(x[marked[first]], x[faces], camera)]
@@ -234,7 +241,7 @@ def _draw_dots(ax: "Axes", x: Array, tri: NDArray[np.int64], held: NDArray[np.bo
 
 
 def _visible(points: Array, triangles: Array, camera: Camera) -> NDArray[np.bool_]:
-    """Which points [n, 3] have none of the triangles [F, 3, 3] before them."""
+    """Which points [n, 3] are not hidden by any of the triangles [F, 3, 3]."""
     flat, depth = camera.project(points)
     corners, corner_depth = camera.project(triangles)
     low, high = corners.min(axis=1), corners.max(axis=1)
@@ -246,7 +253,7 @@ def _visible(points: Array, triangles: Array, camera: Camera) -> NDArray[np.bool
         weights = np.stack([_cross(ends[:, (k + 1) % 3], ends[:, (k + 2) % 3]) for k in range(3)], axis=1)
         inside = (weights >= 0.0).all(axis=1) & (weights.sum(axis=1) > 0.0)
         weights = weights[inside] / weights[inside].sum(axis=1, keepdims=True)
-        # Along a line of the picture, one over the distance from the viewer is linear.
+        # Along a line of the picture, the inverse distance to the viewer is linear.
         away = 1.0 / (weights / (camera.distance - corner_depth[near][inside])).sum(axis=1)
         found[index] = not (away < camera.distance - own - _BEFORE * size).any()
     return found

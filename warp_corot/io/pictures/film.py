@@ -1,4 +1,4 @@
-"""Pictures one after the other: a GIF by Pillow, or an MP4 by imageio."""
+"""Films: a GIF by Pillow, or an MP4 by imageio."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 FILMS = (".gif", ".mp4")
-#: Viewers show no more frames of a GIF a second; those between are left out.
+#: Viewers show at most this many frames of a GIF a second; frames in between are left out.
 GIF_FPS = 25.0
-#: Of about so many frames the colours of a GIF are found.
+#: About this many frames determine the colours of a GIF.
 PALETTE_FRAMES = 16
 
 
 def check_film(path: Path) -> None:
-    """See that what a film needs is installed.
+    """Check that the package for a film is installed.
 
     Raises:
         InputError: It is not.
     """
     if path.suffix.lower() == ".mp4" and not (find_spec("imageio") and find_spec("imageio_ffmpeg")):
-        raise InputError(f'{path}: films as .mp4 need: pip install "warp-corot[film]"; a .gif needs nothing more')
+        raise InputError(f'{path}: films as .mp4 need: pip install "warp-corot[film]"; a .gif needs no package')
 
 
 def frames_shown(path: Path, frames: list[int], fps: float) -> tuple[list[int], float]:
-    """Which of the frames a film has, and how many of them a second."""
+    """The frames that a film shows, and their number per second."""
     every = max(int(np.ceil(fps / GIF_FPS - 1e-9)), 1) if path.suffix.lower() == ".gif" else 1
     return frames[::every], fps / every
 
 
 def write_film(path: Path, images: Iterator[Image], fps: float) -> None:
-    """Write a film, whole or not at all.
+    """Write a film, completely or not at all.
 
     Args:
         path: A .gif or .mp4 file.
-        images: Of one size.
-        fps: How many a second.
+        images: Images of equal size.
+        fps: Images per second.
 
     Raises:
-        OSError: It cannot be written; a film that was there stays.
+        OSError: It cannot be written; a former film stays.
     """
     try:
         with written_whole(path) as part:
@@ -62,7 +62,7 @@ def write_film(path: Path, images: Iterator[Image], fps: float) -> None:
 def _write_gif(path: Path, images: Iterator[Image], fps: float) -> None:
     from PIL import Image
 
-    # One palette for all, or they would flicker; of pictures from the whole film, whose colours differ.
+    # One palette for all, to avoid flicker; from pictures of the whole film, since their colours differ.
     frames = list(images)
     some = frames[:: -(-len(frames) // PALETTE_FRAMES)]
     together = Image.new("RGB", (some[0].width, some[0].height * len(some)))
@@ -80,7 +80,7 @@ def _write_mp4(path: Path, images: Iterator[Image], fps: float) -> None:
     from imageio.v2 import get_writer
 
     options = {"codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-    named = path.with_name(f"{path.name}.mp4")  # FFmpeg goes by the name
+    named = path.with_name(f"{path.name}.mp4")  # FFmpeg chooses the format by the name
     try:
         writer: Any
         with get_writer(named, format="FFMPEG", mode="I", fps=fps, **options) as writer:

@@ -1,4 +1,4 @@
-"""What is written into pictures: the colour bar with its numbers, and titles that fit."""
+"""Text in pictures: the colour bar with its numbers, and titles that fit."""
 
 import re
 from typing import TYPE_CHECKING, Any
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Pixels from side to side of the colour bar.
+#: Width of the colour bar in pixels.
 BAR = 16
 
 
@@ -29,7 +29,7 @@ def draw_color_bar(figure: "Figure", limits: tuple[float, float], label: str) ->
 
 
 def needed_width(legend: "Axes", width: int) -> float:
-    """Pixels that the colour bar takes with all that is written beside it; what is too high is written smaller."""
+    """Pixels that the colour bar and its text need; text that is too high is made smaller."""
     renderer = legend.figure.canvas.get_renderer()  # type: ignore[attr-defined]
     height = legend.figure.bbox.height
     label = legend.yaxis.label
@@ -43,9 +43,9 @@ def needed_width(legend: "Axes", width: int) -> float:
 
 
 def fit_line(text: Any, width: float) -> None:
-    """Write a line smaller, and in the end shorter, until it is no wider than so many pixels.
+    """Make a line smaller, and if necessary shorter, until it is no wider than a number of pixels.
 
-    A few letters after its last semicolon stay.
+    A short text after its last semicolon is kept.
     """
     renderer = text.figure.canvas.get_renderer()
 

@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 
 __all__ = ["Camera", "Picture", "check_picture_path", "draw_body", "render_preview", "render_strip", "value_limits"]
 
-#: Width of polygons' edges [pt] where pixels are drawn once, about a pixel; and room around what a film shows.
+#: Width of polygons' edges [pt] if each pixel is drawn once, about a pixel; and the margin of a film's window.
 SEAMS, ROOM = 0.4, 0.06
 
 
 @dataclass
 class Picture:
-    """One body in a strip: see `draw_body` for what the fields mean; ``view`` is azimuth and elevation [°]."""
+    """One body in a strip: `draw_body` explains the fields; ``view`` is azimuth and elevation [°]."""
 
     positions: ArrayLike
     faces: ArrayLike
@@ -57,11 +57,12 @@ def render_preview(
     size: tuple[int, int] = (1200, 900),
     **options: Any,
 ) -> None:
-    """Renders one body to a PNG file of ``size`` pixels, with a colour bar where it has scalars; see `draw_body`.
+    """Render one body to a PNG file of ``size`` pixels, with a colour bar if it has scalars; see `draw_body`.
 
     Raises:
-        InputError: Not a .png path in a folder that is there, Matplotlib is not installed, or as `draw_body`.
-        OSError: Could not be written; a picture that was there before stays.
+        InputError: The path does not end in .png, its folder does not exist, Matplotlib is not installed, or as in
+            `draw_body`.
+        OSError: The file could not be written; a former picture stays.
     """
     picture = Picture(positions, faces, scalars, rest, title or "", options=options)
     render_strip(
@@ -88,25 +89,25 @@ def render_strip(
     title: str | None = None,
     size: tuple[int, int] | None = None,
 ) -> None:
-    """Renders several bodies, or one at several times, side by side: same view, same scale, same colours.
+    """Render several bodies, or one at several times, side by side with the same view, scale and colours.
 
     Args:
         path: A .png file.
         pictures: From left to right; each may have its own title.
-        scalar_label: What the colour bar says.
+        scalar_label: Label of the colour bar.
         value_range: Values at the ends of the colour map; None: 0 to the highest 99th percentile, rounded up.
         up_axis: "X", "Y" or "Z".
-        azimuth: View round the up axis [°], see `Camera.fit`.
+        azimuth: View around the up axis [°], see `Camera.fit`.
         elevation: View from above [°].
-        title: Above all.
-        size: Pixels; None: 600 a picture, as high as they need.
+        title: Title above all pictures.
+        size: Pixels; None: 600 a picture, with the height that they need.
 
     Raises:
-        InputError, OSError: as `render_preview`.
+        InputError, OSError: As in `render_preview`.
     """
     target = check_picture_path(path)
     if not pictures:
-        raise InputError("pictures is empty, should name at least one body")
+        raise InputError("pictures is empty; it must have at least one body")
     save_picture(
         draw_strip(
             pictures,
@@ -123,13 +124,13 @@ def render_strip(
 def cameras_of(
     pictures: Sequence[Picture], up_axis: str, azimuth: float, elevation: float, box: Array | None = None
 ) -> list[Camera]:
-    """A camera for each picture, all at one distance from one place.
+    """A camera for each picture, all at the same distance from one point.
 
     Args:
-        pictures: Those without a view of their own are seen from ``azimuth`` and ``elevation`` [°].
+        pictures: Those without their own view are seen from ``azimuth`` and ``elevation`` [°].
         up_axis: "X", "Y" or "Z".
         azimuth, elevation: See `Camera.fit`.
-        box: Lowest and highest coordinates of all that is to be seen [2, 3]; None: the pictures'.
+        box: Lowest and highest coordinates to be seen [2, 3]; None: those of the pictures.
     """
     if box is None:
         box = bounds_of(pictures)
@@ -138,10 +139,10 @@ def cameras_of(
 
 
 def bounds_of(pictures: Sequence[Picture]) -> Array:
-    """Lowest and highest coordinates of what is seen of bodies [2, 3].
+    """Lowest and highest visible coordinates of bodies [2, 3].
 
     Raises:
-        InputError: Positions or faces that are none.
+        InputError: Invalid positions or faces.
     """
     given = [(x, p.faces) for p in pictures for x in (p.positions, p.rest) if x is not None]
     seen = [x[tri].reshape(-1, 3) for x, tri in (checked_surface(*each, "positions") for each in given)]
@@ -161,15 +162,15 @@ def draw_strip(
     fineness: int = 2,
     columns: int | None = None,
 ) -> "Image":
-    """Draws pictures side by side, with one colour bar; see `render_strip`.
+    """Draw pictures side by side, with one colour bar; see `render_strip`.
 
     Args:
         pictures: From left to right, and row after row.
-        cameras: One for each.
+        cameras: One for each picture.
         scalar_label, value_range, title, size: As in `render_strip`.
-        window: Lowest and highest picture coordinates that panels show, see `window_of`; None: what there is to see.
-        ground: Its height; None: below the lowest node.
-        fineness: Times as many pixels are drawn along each side, and averaged.
+        window: Lowest and highest picture coordinates of the panels, see `window_of`; None: those of the pictures.
+        ground: Height of the ground; None: below the lowest node.
+        fineness: Factor on the pixels drawn along each side, which are then averaged.
         columns: Pictures in a row; None: all.
     """
     try:
@@ -244,36 +245,37 @@ def draw_strip(
 
 
 def check_picture_path(path: str | Path, suffixes: Sequence[str] = (".png",)) -> Path:
-    """Says before a long run whether a picture can be written there.
+    """Check, before a long run, that a picture can be written there.
 
     Raises:
-        InputError: Another extension, a folder in the way, or no folder to write to.
+        InputError: Another extension, a folder with this name, or no folder to write to.
     """
     target = Path(path)
     if target.suffix.lower() not in suffixes:
-        raise InputError(f"{target}: extension {target.suffix or '(none)'}, should be {' or '.join(suffixes)}")
+        raise InputError(f"{target}: extension {target.suffix or '(none)'}; it must be {' or '.join(suffixes)}")
     if target.is_dir():
-        raise InputError(f"{target}: is a folder, should be a file name")
+        raise InputError(f"{target}: is a folder; it must be a file name")
     if not target.parent.is_dir():
-        raise InputError(f"{target}: output folder {target.parent} is not there")
+        raise InputError(f"{target}: output folder {target.parent} does not exist")
     if not os.access(target if target.exists() else target.parent, os.W_OK):
         raise InputError(f"{target}: cannot be written to")
     return target
 
 
 def window_of(pictures: Iterable[Sequence[Picture]], cameras: Sequence[Camera], ground: float) -> tuple[Array, Array]:
-    """What panels show in all frames of a film: lowest and highest picture coordinates, with some room, [2] and [2].
+    """Lowest and highest picture coordinates of the panels in all frames of a film, with a margin, [2] and [2].
 
     Args:
-        pictures: Of each frame, one for each camera.
-        cameras: Of the panels.
-        ground: Its height, with the shadows on it.
+        pictures: Pictures of each frame, one for each camera.
+        cameras: Cameras of the panels.
+        ground: Height of the ground, with the shadows on it.
     """
     ends = []
     for frame in pictures:
         for picture, camera in zip(frame, cameras, strict=True):
             used = np.unique(picture.faces)
             given = [np.asarray(x, dtype=np.float64)[used] for x in (picture.positions, picture.rest) if x is not None]
+            given += [np.asarray(picture.options["square"])] if "square" in picture.options else []
             for points in (*given, dropped_shadow(given[0], camera, ground)):
                 flat, _ = camera.project(points)
                 ends += [flat.min(axis=0), flat.max(axis=0)]
@@ -283,7 +285,7 @@ def window_of(pictures: Iterable[Sequence[Picture]], cameras: Sequence[Camera], 
 
 
 def _same_window(all_axes: Sequence["Axes"], low: Array, high: Array, aspect: float) -> None:
-    """One window for all, round ``low`` to ``high``, of the axes' aspect (width to height)."""
+    """Set one window for all axes, around ``low`` to ``high``, with the axes' aspect (width to height)."""
     center, half = (low + high) / 2.0, (high - low) / 2.0
     half_height = max(half[1], half[0] / aspect)
     for ax in all_axes:
@@ -292,7 +294,7 @@ def _same_window(all_axes: Sequence["Axes"], low: Array, high: Array, aspect: fl
 
 
 def save_picture(picture: "Image", target: Path) -> None:
-    """Writes aside and renames, so that a good picture is not lost to a failed one."""
+    """Write to a temporary file and rename it, so that a failure does not destroy a good picture."""
     try:
         with written_whole(target) as part:
             picture.save(part, format="PNG")

@@ -1,4 +1,4 @@
-"""Cuts through bodies: a plane of the rest shape, coloured by labels as finely as the domain has them."""
+"""Cuts through bodies: a plane of the rest shape, coloured by labels at the resolution of the domain."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ if TYPE_CHECKING:
     from warp_corot.domain import Domain
     from warp_corot.mesh import TetForest
 
-#: At most so many squares a side.
+#: Maximum number of squares along a side.
 MOST_SQUARES = 2000
 
 
 class Section:
-    """A rectangle out of the rest shape, in squares that are bound to the mesh.
+    """A rectangle in the rest shape, divided into squares that are bound to the mesh.
 
     Args:
-        mesh: What moves; of a body that is remeshed the present mesh, see `rebind`.
-        domain: What the mesh was made from; says which squares are of which label. They may be far smaller than the
-            tetrahedra.
+        mesh: The mesh that moves; for a body that is remeshed the current one, see `rebind`.
+        domain: The domain from which the mesh was made; it gives the squares' labels. Squares may be far smaller than
+            the tetrahedra.
         centre: A point of the plane [m], [3]: the origin of its coordinates.
-        across, up: The picture's directions to the right and upwards, unit vectors [3] at right angles.
+        across, up: Directions to the right and upwards in the picture, perpendicular unit vectors [3].
         reach: Lowest and highest coordinate along both [m], [2, 2].
         step: Edge of a square [m].
 
     Attributes:
         right, above: Coordinates of the squares' corners in the plane at rest [m], float64 [rows, columns].
         points: The corners in space [m], float64 [rows * columns, 3].
-        numbers: Labels of the squares, 0 outside the body; 1 inside where there are no labels; int32
+        numbers: Labels of the squares, 0 outside the body; 1 inside if there are no labels; int32
             [rows - 1, columns - 1].
 
     Raises:
-        InputError: Numbers that are not finite or of another shape, directions that are not unit vectors at right
-            angles, an empty rectangle, or too many squares.
+        InputError: Numbers that are not finite or have another shape, directions that are not perpendicular unit
+            vectors, an empty rectangle, or too many squares.
     """
 
     def __init__(
@@ -75,14 +75,14 @@ class Section:
         self.numbers = np.asarray(found, np.int32).reshape(len(lines[1]) - 1, -1)
 
     def rebind(self, mesh: TetForest) -> None:
-        """Bind the squares to what the mesh has become; displacements are of its nodes from now on.
+        """Bind the squares to the changed mesh; displacements are those of its nodes from now on.
 
-        Squares stay where they are in the rest shape, and of the label that they are of.
+        Squares keep their places in the rest shape and their labels.
         """
         self._bound = mesh.bind(self.points)
 
     def moved(self, displacements: npt.ArrayLike | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Where the corners are when nodes are displaced by [N, 3] [m]: their coordinates in the plane [m]."""
+        """Coordinates of the corners in the plane [m] for displacements of the nodes [N, 3] [m]."""
         x = self.points if displacements is None else self._bound.moved(displacements)
         right, above = ((x - self.centre) @ self.directions.T).T
         return right.reshape(self.right.shape), above.reshape(self.right.shape)
@@ -90,11 +90,11 @@ class Section:
     def draw(
         self, ax: Axes, displacements: npt.ArrayLike | None = None, colors: Mapping[str, Any] | Sequence[Any] = ()
     ) -> None:
-        """Draws it into Matplotlib axes in metres of the plane.
+        """Draw the section into Matplotlib axes, in metres of the plane.
 
         Args:
-            ax: Where to; its frame is switched off.
-            displacements: Of the mesh's nodes [N, 3] [m]; None: at rest.
+            ax: The axes; their frame is switched off.
+            displacements: Displacements of the mesh's nodes [N, 3] [m]; None: at rest.
             colors: Matplotlib colours by label, or in the labels' order.
 
         Raises:
@@ -109,7 +109,7 @@ class Section:
         table = ListedColormap([by_name[name] for name in self.names])
         right, above = self.moved(displacements)
         shown = np.ma.masked_equal(self.numbers, 0)
-        # Far outside the mesh points are carried anywhere; their squares are not drawn, but limits would follow them.
+        # Points far outside the mesh can move anywhere; their squares are not drawn, and limits must ignore them.
         ax.pcolormesh(right, above, shown, cmap=table, vmin=0.5, vmax=len(self.names) + 0.5)
         ax.set_xlim(self.right.min(), self.right.max())
         ax.set_ylim(self.above.min(), self.above.max())

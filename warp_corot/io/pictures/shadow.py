@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def draw_shadow(ax: "Axes", triangles: Array, camera: Camera, height: float, cells: int = 220) -> Array:
-    """A soft shadow on the ground: the body's points dropped along the light, counted in cells and blurred.
+    """Draw a soft shadow on the ground: the body's points projected along the light, counted in cells and blurred.
 
     Returns the picture coordinates [n, 2] of the cells that are visibly dark.
     """
@@ -35,7 +35,7 @@ def draw_shadow(ax: "Axes", triangles: Array, camera: Camera, height: float, cel
     u, v = np.meshgrid(middle_u, middle_v, indexing="ij")
     ground = u[..., None] * right + v[..., None] * back + height * up
     picture, _ = camera.project(ground)
-    # Opaque on white: where cells overlap by part of a pixel, transparent ones would show their seams.
+    # Opaque on white: transparent cells that overlap by part of a pixel would show their seams.
     tint = 1.0 - 0.26 * dark[..., None] * (1.0 - np.array([0.20, 0.20, 0.27]))
     mesh = QuadMesh(picture, facecolor=tint[:-1, :-1].reshape(-1, 3), antialiased=False, zorder=0)
     ax.add_collection(mesh, autolim=False)
@@ -43,7 +43,7 @@ def draw_shadow(ax: "Axes", triangles: Array, camera: Camera, height: float, cel
 
 
 def dropped_shadow(points: Array, camera: Camera, height: float) -> Array:
-    """Where the light drops points [n, 3] on the ground [n, 3]."""
+    """Projections of points [n, 3] along the light onto the ground [n, 3]."""
     up, right = camera.world_up, camera.axes[0]
     light = -0.30 * right + 1.0 * up - 0.12 * np.cross(up, right)
     lift = np.maximum(points @ up - height, 0.0)

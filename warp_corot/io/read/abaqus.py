@@ -1,4 +1,4 @@
-"""Abaqus input files (.inp), as Abaqus, CalculiX, FreeCAD and Gmsh write them."""
+"""Abaqus input files (.inp) of Abaqus, CalculiX, FreeCAD and Gmsh."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ from numpy.typing import NDArray
 
 from .filemesh import CORNERS, Block, FileMesh, Unreadable, corners_note, real, whole
 
-#: Kinds by the number of nodes that an element type's name gives.
+#: Kinds by the number of nodes in an element type's name.
 SOLIDS = {4: "tetra", 10: "tetra", 5: "pyramid", 13: "pyramid", 6: "wedge", 15: "wedge"}
 SOLIDS |= {8: "hexahedron", 20: "hexahedron", 27: "hexahedron"}
 SHELLS = {3: "triangle", 6: "triangle", 4: "quad", 8: "quad", 9: "quad"}
 SOLID = re.compile(r"(?:[DA]?C3D|SC)(\d+)")
 SHELL = re.compile(r"(?:STRI|SFM3D|R3D|M3D|F3D|DS|CPS|CPE|S)(\d+)")
-#: Files may include files so deep.
+#: Maximum depth of included files.
 DEEPEST = 8
-#: The array of numbers of sets and of instances.
+#: Names of the arrays with the numbers of sets and of instances.
 SETS, INSTANCES = "element set", "instance"
 
 
 @dataclass
 class Card:
-    """A keyword with its parameters and the lines of data after it."""
+    """A keyword with its parameters and the data lines after it."""
 
     keyword: str
     given: dict[str, str]
     lines: list[str]
 
     def numbers(self) -> list[list[str]]:
-        """The data, words by line; a comma at a line's end says nothing."""
+        """The data as words by line; a comma at the end of a line has no meaning."""
         return [[word.strip() for word in line.rstrip(", \t").split(",")] for line in self.lines]
 
 
 @dataclass
 class Part:
-    """Nodes, elements and sets of a part; those of a file without parts are one."""
+    """Nodes, elements and sets of a part; a file without parts is one part."""
 
     nodes: dict[int, list[float]] = field(default_factory=dict)
     elements: dict[str, list[list[int]]] = field(default_factory=dict)  # kind -> rows of number and corners
@@ -50,13 +50,13 @@ class Part:
 
 
 def read(path: Path) -> FileMesh:
-    """The elements of all instances, with sets as arrays of numbers, and sets of nodes, those of sets of elements too.
+    """The elements of all instances, with sets as arrays of numbers, and node sets, including those of element sets.
 
-    Regions are the sets that sections give a material; without sections those that elements are listed in; without
-    those the others, where several hold an element the smallest.
+    Regions are the sets to which sections give a material; without sections, those in which elements are listed;
+    without these, the other sets, the smallest one if several contain an element.
 
     Raises:
-        Unreadable: Nodes or elements that do not fit, or an included file that is not there.
+        Unreadable: Inconsistent nodes or elements, or an included file that does not exist.
     """
     parts: dict[str, Part] = {"": Part()}
     instances: list[tuple[str, str, NDArray[np.float64]]] = []
@@ -73,7 +73,7 @@ def read(path: Path) -> FileMesh:
         elif word == "INSTANCE":
             name, part = given.get("NAME", ""), given.get("PART", "").upper()
             if part not in parts:
-                raise Unreadable(f"the instance {name!r} is of part {part!r}, which is not there")
+                raise Unreadable(f"the instance {name!r} is of part {part!r}, which does not exist")
             instances.append((name, part, _placed(card)))
             here = parts[part]
         elif word == "ENDINSTANCE":
@@ -106,7 +106,7 @@ def read(path: Path) -> FileMesh:
 
 
 def _cards(path: Path, depth: int) -> Iterator[Card]:
-    """The keywords of a file and of those that it includes."""
+    """The keywords of a file and of its included files."""
     card: Card | None = None
     unfinished = False
     for line in path.read_text("utf-8", "replace").splitlines():
@@ -124,7 +124,7 @@ def _cards(path: Path, depth: int) -> Iterator[Card]:
             if card.keyword == "INCLUDE" and not unfinished:
                 other = path.parent / card.given.get("INPUT", "")
                 if depth >= DEEPEST or not other.is_file():
-                    raise Unreadable(f"it includes {card.given.get('INPUT', '')!r}, which is not there")
+                    raise Unreadable(f"it includes {card.given.get('INPUT', '')!r}, which does not exist")
                 yield from _cards(other, depth + 1)
                 card = None
         elif card:
@@ -143,7 +143,7 @@ def _parameters(text: str) -> dict[str, str]:
 
 
 def _known(names: dict[str, str], name: str) -> str:
-    """A set's name as it was written first: case does not count."""
+    """A set's name in its first spelling: case does not matter."""
     return names.setdefault(name.upper(), name)
 
 
@@ -152,7 +152,7 @@ def _part_of(instances: list[tuple[str, str, NDArray[np.float64]]], instance: st
 
 
 def _placed(card: Card) -> NDArray[np.float64]:
-    """An instance's affine [4, 4]: moved, then turned about the axis between two points by an angle."""
+    """An instance's affine [4, 4]: a translation, then a rotation about the axis between two points."""
     rows = [[(real(word) if word else 0.0) for word in row] for row in card.numbers()]
     affine = np.eye(4)
     if rows:
@@ -161,10 +161,10 @@ def _placed(card: Card) -> NDArray[np.float64]:
         start, axis, angle = np.array(rows[1][:3]), np.subtract(rows[1][3:6], rows[1][:3]), np.deg2rad(rows[1][6])
         x, y, z = axis / (np.linalg.norm(axis) or 1.0)
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        turn = np.eye(4)
-        turn[:3, :3] += np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
-        turn[:3, 3] = start - turn[:3, :3] @ start
-        affine = turn @ affine
+        rotation = np.eye(4)
+        rotation[:3, :3] += np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+        rotation[:3, 3] = start - rotation[:3, :3] @ start
+        affine = rotation @ affine
     return affine
 
 
@@ -191,7 +191,7 @@ def _elements(card: Card, part: Part, ignored: dict[str, int], notes: list[str])
 
 
 def _members(card: Card, sets: dict[str, list[int]], names: dict[str, str]) -> list[int]:
-    """Numbers of the elements or nodes of a set: listed, in ranges, or by other sets."""
+    """Numbers of the elements or nodes in a set: listed, in ranges, or by other sets."""
     rows = card.numbers()
     if "GENERATE" in card.given:
         found: list[int] = []
@@ -233,7 +233,7 @@ def _joined(
             index = np.searchsorted(tags, table[:, 1:]).clip(0, max(len(tags) - 1, 0))
             if not len(tags) or (tags[index] != table[:, 1:]).any():
                 row, column = np.argwhere(tags[index] != table[:, 1:])[0] if len(tags) else (0, 0)
-                raise Unreadable(f"element {table[row, 0]} names node {table[row, 1 + column]}, which is not there")
+                raise Unreadable(f"element {table[row, 0]} names node {table[row, 1 + column]}, which does not exist")
             data = {SETS: np.array([set_of.get(tag, 0) for tag in table[:, 0].tolist()], np.int64)}
             if len(instances) > 1:
                 data[INSTANCES] = np.full(len(table), place)
@@ -254,7 +254,7 @@ def _joined(
 
 
 def _nodes_of_sets(part: Part) -> dict[str, list[int]]:
-    """The nodes of the elements of each set of elements."""
+    """The nodes of the elements in each element set."""
     corners = {row[0]: row[1:] for rows in part.elements.values() for row in rows}
     sets = part.of_lines | part.sets
     return {name: [node for tag in members for node in corners.get(tag, ())] for name, members in sets.items()}

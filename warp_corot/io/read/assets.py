@@ -1,4 +1,4 @@
-"""Meshes that come with Warp's wheel, each with a scale and a material under which it moves well."""
+"""Meshes in Warp's wheel, each with a suitable scale and material."""
 
 import importlib.util
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from warp_corot.errors import InputError
 
 @dataclass(frozen=True)
 class Asset:
-    """A mesh at hand, and defaults for it.
+    """A mesh with default values.
 
     Attributes:
         name: Short name, after ``warp:``.
@@ -19,10 +19,10 @@ class Asset:
         young: Young's modulus [Pa].
         poisson: Poisson's ratio.
         density: Mass density [kg/m³].
-        fix_below: Nodes lower than this are held: the scaled rest coordinate along y [m].
+        fix_below: Nodes below this height are fixed: the scaled rest coordinate along y [m].
         damping: Mass-proportional damping [1/s].
-        duration: Simulated time [s] after which it is about at rest.
-        note: Why these numbers.
+        duration: Simulated time [s] after which it is nearly at rest.
+        note: Explanation of the values.
         is_surface: Whether it is a closed surface; tetrahedra otherwise.
     """
 
@@ -40,10 +40,10 @@ class Asset:
 
     @property
     def path(self) -> Path:
-        """Where the file is.
+        """The path of the file.
 
         Raises:
-            InputError: Warp is not installed, or without its examples.
+            InputError: Warp is not installed, or lacks its examples.
         """
         spec = importlib.util.find_spec("warp")
         folders = list(spec.submodule_search_locations or ()) if spec else []
@@ -88,15 +88,15 @@ ASSETS: dict[str, Asset] = {
 
 
 def find_asset(name: str | PathLike[str]) -> Asset | None:
-    """The asset that ``warp:NAME`` names, or None for a name without ``warp:``.
+    """The asset with the name ``warp:NAME``, or None for a name without ``warp:``.
 
     Raises:
-        InputError: ``warp:`` and no such asset.
+        InputError: There is no such asset.
     """
     prefix, colon, rest = str(name).partition(":")
     if prefix != "warp" or not colon:
         return None
     if rest not in ASSETS:
         known = ", ".join(f"warp:{known}" for known in ASSETS)
-        raise InputError(f"warp:{rest}: no such asset, should be {known}")
+        raise InputError(f"warp:{rest}: no such asset; it must be {known}")
     return ASSETS[rest]

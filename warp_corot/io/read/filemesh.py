@@ -1,4 +1,4 @@
-"""What a reader finds in a file: points, blocks of cells, and numbers that tell regions apart."""
+"""The content of a mesh file: points, blocks of cells, and numbers that distinguish regions."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: Corners of the kinds of cells that make bodies.
+#: Numbers of corners of cells with volume, by kind.
 SOLIDS = {"tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8}
-#: Corners of the kinds of cells that make surfaces.
+#: Numbers of corners of cells of surfaces, by kind.
 FACES = {"triangle": 3, "quad": 4}
 CORNERS = {**SOLIDS, **FACES}
-#: Arrays of more different numbers than these name no sets of nodes.
+#: Arrays with more distinct numbers than this do not define node sets.
 MOST_SETS = 32
 
 
 class Unreadable(Exception):
-    """A reader's own reason for not reading a file."""
+    """A reader's reason for not reading a file."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Block:
     Attributes:
         kind: A key of `SOLIDS` or `FACES`.
         nodes: Their corners in VTK's order, int64 [n, corners].
-        data: Numbers of cells by the name of their array, int64 [n].
+        data: Numbers of cells by array name, int64 [n].
     """
 
     kind: str
@@ -45,15 +45,15 @@ class Block:
 
 @dataclass(frozen=True)
 class FileMesh:
-    """Everything in a file that bodies and surfaces are made of.
+    """The parts of a file from which bodies and surfaces are made.
 
     Attributes:
-        points: In the file's unit, float64 [N, 3].
-        blocks: Cells with volume and cells of surfaces; higher-order ones by their corners.
-        names: What the numbers of an array stand for, by array and number.
-        ignored: How many cells of other kinds (lines, vertices) the file has, by kind.
-        notes: What the user should know, a line each.
-        node_sets: Nodes that the file gives a name, indices int64 [n].
+        points: Points in the file's unit, float64 [N, 3].
+        blocks: Cells with volume and cells of surfaces; cells of higher order only with their corners.
+        names: Meanings of the numbers in an array, by array and number.
+        ignored: Number of the file's cells of other kinds (lines, vertices), by kind.
+        notes: Notes for the user, one line each.
+        node_sets: Named sets of nodes in the file, indices int64 [n].
     """
 
     points: NDArray[np.float64]
@@ -65,7 +65,7 @@ class FileMesh:
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3:
-            raise Unreadable(f"its points have the shape {list(self.points.shape)}, should be [N, 3]")
+            raise Unreadable(f"its points have the shape {list(self.points.shape)}; it must be [N, 3]")
 
     @property
     def solids(self) -> list[Block]:
@@ -83,7 +83,7 @@ class FileMesh:
         return ", ".join(sorted(found)) or "none"
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """All of it as arrays of plain numbers, to be handed from one process to another."""
+        """All data as arrays of plain numbers, for transfer between processes."""
         described = {
             "kinds": [block.kind for block in self.blocks],
             "names": {array: {str(n): name for n, name in names.items()} for array, names in self.names.items()},
@@ -103,7 +103,7 @@ class FileMesh:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> FileMesh:
-        """The mesh of such arrays."""
+        """The mesh from the arrays of ``to_arrays``."""
         described = from_bytes(arrays["mesh"])
         blocks = [
             Block(kind, arrays[f"nodes{place}"], {name: arrays[f"data{place}_{k}"] for k, name in enumerate(data)})
@@ -115,10 +115,10 @@ class FileMesh:
 
 
 def sets_of_numbers(name: str, values: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
-    """The sets of nodes that an array of whole numbers, one a node, tells apart.
+    """The node sets that an array of whole numbers, one a node, defines.
 
-    Of an array of zeros and ones there is one set, called as the array is; of one with a few other numbers a set each,
-    ``NAME_NUMBER``; zero is none. Of an array of many numbers, as those that count nodes are, there is no set.
+    An array of zeros and ones is one set with the array's name. An array with a few distinct numbers is one set for
+    each number but zero, ``NAME_NUMBER``. An array of many numbers, for instance one that counts nodes, defines no set.
     """
     numbers = np.unique(values)
     numbers = numbers[numbers != 0]
@@ -130,31 +130,31 @@ def sets_of_numbers(name: str, values: NDArray[np.int64]) -> dict[str, NDArray[n
 
 
 def whole(word: str) -> int:
-    """A whole number in a text.
+    """Convert a text to a whole number.
 
     Raises:
-        Unreadable: It is none.
+        Unreadable: It is not a whole number.
     """
     try:
         return int(word)
     except ValueError:
-        raise Unreadable(f"{word[:40]!r} is no whole number") from None
+        raise Unreadable(f"{word[:40]!r} is not a whole number") from None
 
 
 def real(word: str) -> float:
-    """A number in a text, with Fortran's letter D for the exponent too.
+    """Convert a text to a number; the exponent may have Fortran's letter D.
 
     Raises:
-        Unreadable: It is none.
+        Unreadable: It is not a number.
     """
     try:
         return float(word.replace("D", "e").replace("d", "e"))
     except ValueError:
-        raise Unreadable(f"{word[:40]!r} is no number") from None
+        raise Unreadable(f"{word[:40]!r} is not a number") from None
 
 
 def corners_note(kind: str, order: int | None = 2) -> str:
-    """What to say of cells of higher order, of which only the corners are taken."""
+    """The note about cells of higher order, of which only the corners are used."""
     word = {2: "second-order", 3: "third-order"}.get(order or 0, "higher-order")
     return f"{word} cells ({kind}) are taken by their corners, with straight edges"
 
@@ -165,12 +165,12 @@ def as_bytes(thing: Any) -> NDArray[np.uint8]:
 
 
 def from_bytes(array: NDArray[np.uint8]) -> Any:
-    """What `as_bytes` was given."""
+    """The object that was given to `as_bytes`."""
     return json.loads(array.tobytes())
 
 
 def whole_numbers(values: Any) -> NDArray[np.int64] | None:
-    """Values as int64 [n], None if they are not whole numbers, one a cell."""
+    """Values as int64 [n]; None unless they are whole numbers, one a cell."""
     array = np.asarray(values)
     if array.ndim == 2 and array.shape[1] == 1:
         array = array[:, 0]

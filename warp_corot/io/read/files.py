@@ -1,4 +1,4 @@
-"""Which reader takes which file, and what is said when none can."""
+"""The readers for each file format, and the message if none can read a file."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class Reader:
     """A module of this folder with a function ``read(path)``.
 
     Attributes:
-        name: What messages call it.
-        module: Its name in this folder.
+        name: Its name in messages.
+        module: The module's name in this folder.
         package: The Python package that it needs, if any.
-        extra: What installs that package, as in ``pip install "warp-corot[EXTRA]"``.
+        extra: The extra that installs this package, as in ``pip install "warp-corot[EXTRA]"``.
     """
 
     name: str
@@ -41,7 +41,7 @@ ABAQUS = Reader("the reader of Abaqus input files", "abaqus")
 NETGEN = Reader("the reader of NetGen's files", "netgen")
 TETGEN = Reader("the reader of TetGen's files", "tetgen")
 
-#: Readers by extension, the one that knows most of a format first.
+#: Readers by extension, starting with the most complete one.
 READERS: dict[str, tuple[Reader, ...]] = {
     ".msh": (GMSH_1, GMSH, MESHIO),
     ".mesh": (NETGEN, GMSH, MESHIO),
@@ -85,33 +85,33 @@ READERS: dict[str, tuple[Reader, ...]] = {
 }
 #: The extensions of mesh files.
 SUFFIXES = tuple(READERS)
-#: A reason longer than this is cut.
+#: Longer reasons are truncated.
 LONGEST_REASON = 200
 
 
 def suffix_of(path: Path) -> str | None:
-    """The extension by which a file is a mesh file, None if it is none."""
+    """The file's extension if it is that of a mesh file, else None."""
     name = path.name.lower()
     return next((suffix for suffix in sorted(SUFFIXES, key=len, reverse=True) if name.endswith(suffix)), None)
 
 
 def read_mesh_file(path: Path) -> FileMesh | dict[str, NDArray[Any]]:
-    """What is in a mesh file.
+    """Read a mesh file.
 
-    Readers run one after the other, each in a process of its own, until one can read the file.
+    Readers are tried one after the other, each in a separate process, until one can read the file.
 
     Args:
         path: A file with one of the extensions `SUFFIXES`.
 
     Returns:
-        Points and cells; or of a VTK file that holds an image the arrays ``values`` [nx, ny, nz] and ``affine`` [4, 4].
+        Points and cells; or for a VTK file with an image the arrays ``values`` [nx, ny, nz] and ``affine`` [4, 4].
 
     Raises:
-        InputError: No reader that is installed can read it; in one line with the readers' own reasons.
+        InputError: No installed reader can read it; one line with the readers' own reasons.
     """
     suffix = suffix_of(path)
     if suffix is None:
-        raise InputError(f"{path}: unknown format {path.suffix or '(no extension)'}, should be {', '.join(SUFFIXES)}")
+        raise InputError(f"{path}: unknown format {path.suffix or '(no extension)'}; it must be {', '.join(SUFFIXES)}")
     reasons, missing = [], []
     for reader in READERS[suffix]:
         if reader.package and importlib.util.find_spec(reader.package) is None:
@@ -138,15 +138,15 @@ def shortened(reason: object) -> str:
 
 
 def _checked(mesh: FileMesh, path: Path) -> FileMesh:
-    """The mesh, if its cells name points that there are.
+    """The mesh, after a check that its cells only name existing points.
 
     Raises:
-        InputError: They do not.
+        InputError: A cell or a set names a point that does not exist.
     """
     points = mesh.points
     for name, nodes in mesh.node_sets.items():
         if len(nodes) and not 0 <= nodes.min() <= nodes.max() < len(points):
-            raise InputError(f"{path}: the set {name!r} names points that are not there")
+            raise InputError(f"{path}: the set {name!r} names points that do not exist")
     for block in mesh.blocks:
         bad = np.argwhere((block.nodes < 0) | (block.nodes >= len(points)))
         if len(bad):

@@ -8,7 +8,7 @@ import numpy as np
 
 from .filemesh import Block, FileMesh, Unreadable, corners_note, real, whole
 
-#: Kinds and their corners, and the number of nodes, by the format's numbers of element types.
+#: Kinds and their corners, and the number of nodes, by the format's element types.
 KINDS = {
     2: ("triangle", 3, 3),
     3: ("quad", 4, 4),
@@ -30,10 +30,10 @@ KINDS = {
 
 
 def read(path: Path) -> FileMesh | None:
-    """Nodes and elements; None of a file of another version.
+    """Nodes and elements; None for a file of another version.
 
     Raises:
-        Unreadable: The file is cut off or its numbers do not fit.
+        Unreadable: The file is truncated or its numbers are inconsistent.
     """
     with path.open("rb") as file:
         if not file.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").startswith((b"$NOD", b"$NOE")):
@@ -47,14 +47,14 @@ def read(path: Path) -> FileMesh | None:
             for number in range(_count(lines, "nodes")):
                 words = next(lines, "").split()
                 if len(words) < 4:
-                    raise Unreadable(f"node {number} has no three coordinates: {' '.join(words)!r}")
+                    raise Unreadable(f"node {number} must have three coordinates: {' '.join(words)!r}")
                 tags.append(whole(words[0]))
                 places.append([real(word) for word in words[1:4]])
         elif line.strip() == "$ELM":
             for number in range(_count(lines, "elements")):
                 row = [whole(word) for word in next(lines, "").split()]
                 if len(row) < 5 or len(row) < 5 + row[4]:
-                    raise Unreadable(f"element {number} is not whole: {' '.join(map(str, row[:12]))!r}")
+                    raise Unreadable(f"element {number} is incomplete: {' '.join(map(str, row[:12]))!r}")
                 cells.setdefault(row[1], []).append((row[2], row[3], row[5 : 5 + row[4]]))
     if not tags:
         raise Unreadable("it has no nodes")
@@ -67,13 +67,13 @@ def read(path: Path) -> FileMesh | None:
             continue
         name, corners, count = KINDS[kind]
         if any(len(nodes) != count for _, _, nodes in found):
-            raise Unreadable(f"an element of type {kind} has not {count} nodes")
+            raise Unreadable(f"an element of type {kind} must have {count} nodes")
         if count > corners:
             notes.append(corners_note(name))
         named = np.array([nodes[:corners] for _, _, nodes in found])
         index = np.searchsorted(numbers, named).clip(0, len(numbers) - 1)
         if (numbers[index] != named).any():
-            raise Unreadable(f"an element names node {named[numbers[index] != named][0]}, which is not there")
+            raise Unreadable(f"an element names node {named[numbers[index] != named][0]}, which does not exist")
         groups, entities = (np.array([row[k] for row in found]) for k in (0, 1))
         blocks.append(Block(name, index, {"physical group": groups, "entity": entities}))
     return FileMesh(points, blocks, {}, ignored, notes)

@@ -1,4 +1,4 @@
-"""Gmsh's library: .msh of every version, Medit's .mesh, I-deas' .unv and Nastran's .bdf."""
+"""Formats of Gmsh's library: .msh of every version, Medit's .mesh, I-deas' .unv and Nastran's .bdf."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ KINDS = {
     "Triangle": "triangle",
     "Quadrilateral": "quad",
 }
-#: What groups without a name are called, by their dimension.
+#: Names of groups that have none, by their dimension.
 DIMENSIONS = ("point", "curve", "surface")
-#: How files of .msh begin. Gmsh takes others for scripts, and runs them.
+#: First words of .msh files. Gmsh takes other files for scripts and runs them.
 BEGINNINGS = (b"$MeshFormat", b"$NOD", b"$Comments", b"$PhysicalNames")
 
 
 def read(path: Path) -> FileMesh:
-    """All elements of a file, with its physical groups, or without any with its entities, as arrays of numbers.
+    """All elements of a file, with its physical groups, or else its entities, as arrays of numbers.
 
     Raises:
-        Unreadable: Gmsh's own words.
+        Unreadable: With Gmsh's own message.
     """
     with path.open("rb") as file:
         start = file.read(512).lstrip(b"\xef\xbb\xbf \t\r\n")

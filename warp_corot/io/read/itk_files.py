@@ -1,4 +1,4 @@
-"""SimpleITK's files: MetaImage, NRRD, single DICOM files, and folders with DICOM series."""
+"""Formats of SimpleITK: MetaImage, NRRD, single DICOM files, and folders with DICOM series."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from numpy.typing import NDArray
 
 from .filemesh import Unreadable, as_bytes
 
-#: ITK's directions are left-posterior-superior; turned half round z they are NIfTI's right-anterior-superior.
+#: ITK uses left-posterior-superior; half a turn about z gives NIfTI's right-anterior-superior.
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 TURNED = "positions are turned from left-posterior-superior to right-anterior-superior"
-#: Folders below the one that is named that are looked into at most.
+#: Maximum depth of subfolders that are searched.
 MOST_FOLDERS = 1000
-#: Slices whose distances differ by more than this share of the usual one [1] are unevenly spaced.
+#: Slices are unevenly spaced if distances differ by more than this fraction of the usual distance [1].
 UNEVEN = 1.0e-3
 DESCRIPTION, MODALITY, POSITION = "0008|103e", "0008|0060", "0020|0032"
 
 
 def read(path: Path) -> dict[str, NDArray[Any]] | None:
-    """The values [nx, ny, nz] of an image with their places, see `warp_corot.io.read.volumes`; of a folder those of the
-    largest series in it and in the folders below, None if it has none.
+    """Values [nx, ny, nz] and positions of an image, see `warp_corot.io.read.volumes`. For a folder, those of the
+    largest series in it and its subfolders, or None if there is none.
 
     Raises:
-        Unreadable: ITK's own words; or an image of other than three dimensions, or of several numbers a voxel.
+        Unreadable: With ITK's own message; or the image does not have three dimensions and one number a voxel.
     """
     try:
         if path.is_dir():
             return _series(path)
         return _arrays(SimpleITK.ReadImage(str(path)), [])
     except RuntimeError as error:
-        # ITK names itself and its source files first; what went wrong comes last.
+        # ITK names itself and its source files first; the reason comes last.
         raise Unreadable(re.split(r"(?:sitk::|ITK )ERROR:", str(error))[-1]) from None
 
 
 def _arrays(image: Any, notes: list[str]) -> dict[str, NDArray[Any]]:
     dimensions, numbers = image.GetDimension(), image.GetNumberOfComponentsPerPixel()
     if (dimensions, numbers) != (3, 1):
-        raise Unreadable(f"it has {dimensions} dimensions and {numbers} numbers a voxel, should have 3 and 1")
+        raise Unreadable(f"it has {dimensions} dimensions and {numbers} numbers a voxel; it must have 3 and 1")
     affine = np.eye(4)
     affine[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
     affine[:3, 3] = image.GetOrigin()
@@ -60,7 +60,7 @@ def _series(folder: Path) -> dict[str, NDArray[Any]] | None:
     image = reader.Execute()
     notes = [f"{len(files)} slices{_described(files[0])}"]
     if len(series) > 1:
-        notes.append(f"the largest of {len(series)} series in {folder} is taken; for another name its own folder")
+        notes.append(f"the largest of {len(series)} series in {folder} is used; for another, name its own folder")
     uneven = _unevenness(files)
     if uneven is not None:
         notes.append(f"slices are missing or unevenly spaced, by up to {uneven:.3g} mm")
@@ -68,7 +68,7 @@ def _series(folder: Path) -> dict[str, NDArray[Any]] | None:
 
 
 def _may_be_slice(path: Path) -> bool:
-    """Whether a file may be DICOM, by its mark or its extension. GDCM takes long for files that are something else."""
+    """Whether a file may be DICOM, by its mark or its extension. GDCM is slow for other files."""
     if path.suffix.lower() in ("", ".dcm", ".dicom", ".ima") or path.suffix[1:].isdecimal():
         return True
     try:
@@ -104,7 +104,7 @@ def _described(file: str) -> str:
 
 
 def _unevenness(files: tuple[str, ...]) -> float | None:
-    """How much the distances of neighbouring slices differ [mm] from the usual one; None if they do not, or if the
+    """How much the distances of neighbouring slices differ from the usual one [mm]; None if they do not, or if the
     files give no positions."""
     places = []
     for header in map(_header, files):

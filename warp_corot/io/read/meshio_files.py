@@ -1,4 +1,4 @@
-"""meshio's readers: NetGen .vol, XDMF, Exodus, MED, and what VTK and Gmsh read where they are not installed."""
+"""Formats of meshio: NetGen .vol, XDMF, Exodus, MED, and those of VTK and Gmsh if these are not installed."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from .filemesh import CORNERS, Block, FileMesh, Unreadable, corners_note, sets_of_numbers, whole_numbers
 
-#: Names of arrays elsewhere.
+#: Names of arrays in the other readers.
 RENAMED = {"gmsh:physical": "physical group", "gmsh:geometrical": "entity", "netgen:index": "material"}
 RENAMED |= {"medit:ref": "entity"}
 
-#: Orders of cells by meshio's names, where they are not two.
+#: Orders of cells by meshio's names, if not two.
 ORDERS = {"tetra20": 3, "tetra35": 4, "hexahedron64": 3, "triangle10": 3, "quad16": 3}
 
 
@@ -22,7 +22,7 @@ def read(path: Path) -> FileMesh:
     """All cells of a file, with the arrays of whole numbers and the sets of its cells.
 
     Raises:
-        Unreadable: meshio's own words.
+        Unreadable: With meshio's own message.
     """
     import meshio
     from meshio._helpers import _filetypes_from_path, reader_map
@@ -32,7 +32,7 @@ def read(path: Path) -> FileMesh:
         try:
             return _mesh(reader_map[kind](str(path)))
         except meshio.ReadError as error:
-            reasons.append(str(error) or f"it is no {kind} file")
+            reasons.append(str(error) or f"it is not a {kind} file")
     raise Unreadable("; ".join(dict.fromkeys(reasons)))
 
 
@@ -59,7 +59,7 @@ def _mesh(mesh: Any) -> FileMesh:
 
 
 def _node_sets(mesh: Any) -> dict[str, NDArray[np.int64]]:
-    """Sets of points, point data of few whole numbers, and the points of groups of a dimension below 3."""
+    """Sets of points, point data with few distinct whole numbers, and the points of groups of dimension below 3."""
     found: dict[str, NDArray[np.int64]] = {}
     for name, values in mesh.point_data.items():
         numbers = whole_numbers(values)

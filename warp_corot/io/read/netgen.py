@@ -19,10 +19,10 @@ MATERIAL = "material"
 
 
 def read(path: Path) -> FileMesh | None:
-    """Elements with the numbers and names of their materials; None of a .mesh file of another program.
+    """Elements with the numbers and names of their materials; None for a .mesh file of another program.
 
     Raises:
-        Unreadable: The file is cut off or its numbers do not fit.
+        Unreadable: The file is truncated or its numbers are inconsistent.
     """
     with (
         gzip.open(path, "rt", errors="replace") if path.suffix.lower() == ".gz" else path.open(errors="replace") as file
@@ -33,7 +33,7 @@ def read(path: Path) -> FileMesh | None:
             return _volume(lines)
         if path.suffix.lower() == ".mesh":
             return _neutral(first, lines) if first.isdecimal() else None
-        raise Unreadable(f"it begins with {first[:20]!r}, should be mesh3d")
+        raise Unreadable(f"it begins with {first[:20]!r}; it must begin with mesh3d")
 
 
 def _volume(lines: Iterator[str]) -> FileMesh:
@@ -91,7 +91,7 @@ def _mesh(
 
 
 def _rows(lines: Iterator[str], what: str, count: str | None = None) -> list[str]:
-    """The lines of a section, as many as its first one says."""
+    """The lines of a section, whose first line says their number."""
     said = next(lines, "") if count is None else count
     if not said.isdecimal():
         raise Unreadable(f"the number of {what} is {said[:20]!r}")
@@ -103,7 +103,7 @@ def _rows(lines: Iterator[str], what: str, count: str | None = None) -> list[str
 
 def _counted(row: list[int]) -> list[int]:
     if len(row) < 2 or len(row) != 2 + row[1]:
-        raise Unreadable(f"a volume element is not whole: {' '.join(map(str, row[:14]))!r}")
+        raise Unreadable(f"a volume element is incomplete: {' '.join(map(str, row[:14]))!r}")
     return row
 
 
@@ -113,7 +113,7 @@ def _wholes(row: str, least: int = 1) -> list[int]:
     except ValueError:
         numbers = []
     if len(numbers) < least:
-        raise Unreadable(f"{row[:60]!r} should be whole numbers")
+        raise Unreadable(f"{row[:60]!r} must be whole numbers")
     return numbers
 
 
@@ -123,5 +123,5 @@ def _reals(row: str) -> list[float]:
     except ValueError:
         numbers = []
     if len(numbers) != 3:
-        raise Unreadable(f"{row[:60]!r} should be three coordinates")
+        raise Unreadable(f"{row[:60]!r} must be three coordinates")
     return numbers

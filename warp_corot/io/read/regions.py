@@ -1,4 +1,4 @@
-"""Which of a file's arrays tells the regions of a body apart, and what the regions are called."""
+"""The choice of the array that numbers a file's regions, and the names of the regions."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from warp_corot.errors import InputError
 
 from .filemesh import FileMesh
 
-#: Names of arrays that number regions, the likelier first; of others, those of few different numbers.
+#: Usual names of arrays of region numbers, likeliest first; other arrays qualify if they have few distinct numbers.
 USUAL = ("physical group", "material", "element set", "region", "label", "tissue", "attribute", "part", "block")
-#: More different numbers than these are no regions.
+#: Arrays with more distinct numbers do not number regions.
 MOST = 1000
 
 
@@ -22,10 +22,10 @@ class Regions:
     """Regions of tetrahedra.
 
     Attributes:
-        array: The array of the file that they come from.
+        array: The file's array of region numbers.
         names: Their names.
         numbers: Their numbers in the file.
-        of_tet: Each tetrahedron's region, its place in ``names`` plus one, 0 for none, int32 [T].
+        of_tet: Each tetrahedron's region, its index in ``names`` plus one, 0 for none, int32 [T].
     """
 
     array: str
@@ -38,15 +38,15 @@ def find_regions(mesh: FileMesh, cells: NDArray[np.int64], wanted: str | None = 
     """The regions of the tetrahedra of a file.
 
     Args:
-        mesh: What is in the file.
+        mesh: The content of the file.
         cells: The cell of each tetrahedron, int64 [T], see `split_solids`.
-        wanted: The array to take; None: the likeliest that tells cells apart or gives them a name.
+        wanted: The array to use; None: the likeliest that distinguishes cells or gives them a name.
 
     Returns:
-        The regions; None where no array numbers any.
+        The regions; None if no array numbers any.
 
     Raises:
-        InputError: The array that is wanted is not there; the message lists those there are.
+        InputError: The requested array does not exist; the message lists the arrays.
     """
     blocks = mesh.solids
     known = dict.fromkeys(name for block in blocks for name in block.data)
@@ -71,7 +71,7 @@ def _regions(mesh: FileMesh, name: str, cells: NDArray[np.int64]) -> Regions:
     values = np.concatenate([block.data.get(name, np.zeros(len(block.nodes), np.int64)) for block in mesh.solids])
     there = np.unique(values)
     said = mesh.names.get(name, {})
-    # Zero without a name is none: a cell of no physical group or set.
+    # Zero without a name means none: a cell of no physical group or set.
     numbers = [int(number) for number in there if number != 0 or number in said]
     names: list[str] = []
     for number in numbers:

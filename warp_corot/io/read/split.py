@@ -1,9 +1,9 @@
-"""Hexahedra, wedges and pyramids as tetrahedra, and quadrilaterals as triangles, such that neighbours fit.
+"""Hexahedra, wedges and pyramids split into tetrahedra, and quadrilaterals into triangles, that fit their neighbours.
 
-Every quadrilateral is cut by the diagonal through its corner of smallest number (Dompierre, Labbé, Vallet and Camarero,
-*How to subdivide pyramids, prisms, and hexahedra into tetrahedra*, 1999), so that two cells cut the face between them
-alike without knowing of one another. A cell becomes the cone from its own corner of smallest number over the triangles
-of the faces that do not have it: two tetrahedra for a pyramid, three for a wedge, six for a hexahedron.
+Every quadrilateral is cut by the diagonal through its corner with the smallest number (Dompierre, Labbé, Vallet and
+Camarero, *How to subdivide pyramids, prisms, and hexahedra into tetrahedra*, 1999), so that two cells cut their common
+face alike independently. A cell becomes the cone from its own corner with the smallest number over the triangles
+of the faces without that corner: two tetrahedra for a pyramid, three for a wedge, six for a hexahedron.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from .filemesh import Block
 
-#: Faces of each kind of cell by its corners in VTK's order, seen from outside counter-clockwise.
+#: Faces of each kind of cell by its corners in VTK's order, counter-clockwise seen from outside.
 OUTSIDES: dict[str, tuple[tuple[int, ...], ...]] = {
     "pyramid": ((0, 3, 2, 1), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)),
     "wedge": ((0, 2, 1), (3, 4, 5), (0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)),
@@ -29,16 +29,16 @@ def split_solids(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
     """The tetrahedra of cells with volume.
 
-    Tetrahedra stay as they are. Those of one other cell are all wound as the cell is, positively if that has a positive
-    volume. Tetrahedra that name a corner twice, of cells with merged corners, are left out.
+    Tetrahedra do not change. Those of any other cell have the orientation of the cell, positive if its volume is
+    positive. Tetrahedra with a repeated corner, from cells with merged corners, are left out.
 
     Args:
         blocks: Cells with volume, whose corners are all in ``points``.
         points: [N, 3].
 
     Returns:
-        Tetrahedra int64 [T, 4]; the cell that each comes from, numbered block after block, int64 [T]; and how many
-        cells are so warped that some of their tetrahedra lie outside them.
+        Tetrahedra int64 [T, 4]; the cell that contains each, numbered block after block, int64 [T]; and the number of
+        cells so warped that some of their tetrahedra lie outside them.
     """
     tets, cells, first, warped = [np.empty((0, 4), np.int64)], [np.empty(0, np.int64)], 0, 0
     for block in blocks:
@@ -57,7 +57,7 @@ def split_solids(
 
 
 def triangles_of(blocks: Iterable[Block]) -> NDArray[np.int64]:
-    """The triangles of cells of surfaces, int64 [T, 3]."""
+    """The triangles of surface cells, int64 [T, 3]."""
     found = [np.empty((0, 3), np.int64)]
     for block in blocks:
         found.append(block.nodes if block.kind == "triangle" else _halves(block.nodes).reshape(-1, 3))
@@ -71,7 +71,7 @@ def split_polyhedron(faces: Sequence[Sequence[int]]) -> list[tuple[int, int, int
 
 
 def fan(polygon: Sequence[int]) -> list[tuple[int, int, int]]:
-    """The triangles of a convex polygon around its corner of smallest number."""
+    """The triangles of a convex polygon around its corner with the smallest number."""
     start = min(range(len(polygon)), key=polygon.__getitem__)
     turned = [*polygon[start:], *polygon[:start]]
     return [(turned[0], b, c) for b, c in pairwise(turned[1:])]
@@ -98,7 +98,7 @@ def _cones(block: Block) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def _halves(quads: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Two triangles for each quadrilateral, wound alike, [n, 2, 3]."""
+    """Two triangles for each quadrilateral, with the same orientation, [n, 2, 3]."""
     start = np.argmin(quads, axis=1)
     turned = np.take_along_axis(quads, (start[:, None] + np.arange(4)) % 4, axis=1)
     return turned[:, [[0, 1, 2], [0, 2, 3]]]
@@ -107,7 +107,7 @@ def _halves(quads: NDArray[np.int64]) -> NDArray[np.int64]:
 def _wound_alike(
     tets: NDArray[np.int64], whose: NDArray[np.int64], count: int, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], int]:
-    """The tetrahedra wound so that their cells' volumes are positive, and how many cells hold both signs."""
+    """The tetrahedra oriented so that their cells' volumes are positive, and the number of cells with both signs."""
     x = points[tets]
     volumes = np.linalg.det(x[:, 1:] - x[:, :1]) if len(tets) else np.empty(0)
     total = np.bincount(whose, volumes, count)

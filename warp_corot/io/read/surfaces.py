@@ -20,24 +20,24 @@ from .files import read_mesh_file, suffix_of
 from .split import triangles_of
 from .tetrahedra import USD_SUFFIXES, check_file, check_finite
 
-#: What trimesh reads here, and the up axis by habit where the format names none; glTF's is its standard's.
+#: Formats read with trimesh, and the usual up axis if the format names none; glTF's is in its standard.
 UP_AXES = {".obj": "Y", ".stl": "Z", ".ply": "Z", ".off": "Z", ".glb": "Y", ".gltf": "Y"}
 GLTF = (".glb", ".gltf")
 
 
 @dataclass(frozen=True)
 class LoadedSurface:
-    """A triangle surface as it came from a file.
+    """A triangle surface from a file.
 
     Attributes:
-        points: float64 [N, 3] in the file's unit; an asset's scaled to a likely size.
+        points: float64 [N, 3] in the file's unit; an asset is scaled to a likely size.
         triangles: int32 [T, 3], wound as in the file.
         metres: Metres in that unit, None if the file does not say.
         up_axis: "X", "Y" or "Z"; None if the file does not say.
-        name: Short name, fit for a title.
-        source: The file it was read from.
-        notes: What the user should know, a line each.
-        objects: Names of the file's objects and how many of the triangles each has, in their order.
+        name: Short name for a title.
+        source: The file.
+        notes: Notes for the user, one line each.
+        objects: Names of the file's objects and the number of triangles of each, in order.
     """
 
     points: NDArray[np.float64]
@@ -51,14 +51,15 @@ class LoadedSurface:
 
 
 def load_surface(path: str | PathLike[str], *, found: FileMesh | None = None) -> LoadedSurface:
-    """Reads all triangles of a file, placed as its scene places them; polygons are cut into fans.
+    """Read all triangles of a file, placed by its scene; polygons are cut into fans.
 
     Args:
         path: A file, or ``warp:NAME`` for one in Warp's wheel.
-        found: What `read_mesh_file` has found in the file, if it has been read before.
+        found: The result of `read_mesh_file`, if the file was read before.
 
     Raises:
-        InputError: No such file, another format, not readable, or no triangles in it; one line that says which.
+        InputError: The file does not exist, has another format, cannot be read, or has no triangles; one line says
+            which.
     """
     asset = find_asset(path)
     source = asset.path if asset else Path(path)
@@ -80,7 +81,7 @@ def load_surface(path: str | PathLike[str], *, found: FileMesh | None = None) ->
         metres = up_axis = None
     else:
         known = ", ".join((*UP_AXES, *USD_SUFFIXES))
-        raise InputError(f"{source}: unknown format {suffix or '(no extension)'}, should be {known}")
+        raise InputError(f"{source}: unknown format {suffix or '(no extension)'}; it must be {known}")
     if not len(triangles):
         raise InputError(f"{source}: has no triangles")
     outside = triangles[(triangles < 0) | (triangles >= len(points))]
@@ -102,7 +103,7 @@ def _of_mesh_file(path: Path, found: FileMesh | None) -> Read:
     if not isinstance(mesh, FileMesh):
         raise InputError(f"{path}: has no triangles (it holds an image)")
     if mesh.solids:
-        raise InputError(f"{path}: has cells with volume, which TetMesh.load reads, should have triangles alone")
+        raise InputError(f"{path}: has cells with volume, which TetMesh.load reads; it must have only triangles")
     check_finite(mesh.points, path)
     blocks = sorted(mesh.faces, key=lambda block: int(block.data.get("block", np.zeros(1))[0]))
     triangles = triangles_of(blocks)

@@ -11,20 +11,20 @@ from .filemesh import Block, FileMesh, Unreadable, corners_note
 
 
 def read(path: Path) -> FileMesh:
-    """The tetrahedra of the pair that a file is one of, with their first attribute as regions.
+    """The tetrahedra of the pair to which a file belongs, with their first attribute as regions.
 
     Raises:
-        Unreadable: The other file is not there, or numbers are missing or do not fit.
+        Unreadable: The other file does not exist, or numbers are missing or inconsistent.
     """
     node, ele = (_partner(path, suffix) for suffix in (".node", ".ele"))
     count, (dimension, attributes, markers), numbers = _table(node, 3)
     if dimension != 3:
-        raise Unreadable(f"{node.name} has {dimension} dimensions, should have 3")
+        raise Unreadable(f"{node.name} has {dimension} dimensions; it must have 3")
     rows = _rows(numbers, count, 4 + attributes + markers, node)
     index = _whole(rows[:, 0], node)
     tets, (corners, regions), numbers = _table(ele, 2)
     if corners not in (4, 10):
-        raise Unreadable(f"{ele.name} has {corners} nodes a tetrahedron, should have 4 or 10")
+        raise Unreadable(f"{ele.name} has {corners} nodes a tetrahedron; it must have 4 or 10")
     cells = _rows(numbers, tets, 1 + corners + regions, ele)
     named = _whole(cells[:, 1:5], ele)
     order = np.argsort(index, kind="stable")
@@ -39,13 +39,13 @@ def read(path: Path) -> FileMesh:
 
 
 def _partner(path: Path, suffix: str) -> Path:
-    """The file of the pair with an extension, in whatever case it is written."""
+    """The file of the pair with this extension, in upper or lower case."""
     if path.suffix.lower() == suffix:
         return path
     for candidate in (path.with_suffix(suffix), path.with_suffix(suffix.upper())):
         if candidate.is_file():
             return candidate
-    raise Unreadable(f"{path.with_suffix(suffix).name} is not beside it, and the two belong together")
+    raise Unreadable(f"{path.with_suffix(suffix).name} is missing; the two files must be in one folder")
 
 
 def _table(path: Path, words: int) -> tuple[int, list[int], NDArray[np.float64]]:
@@ -58,7 +58,7 @@ def _table(path: Path, words: int) -> tuple[int, list[int], NDArray[np.float64]]
     except ValueError:
         head = []
     if len(head) < 2 or min(head) < 0:
-        raise Unreadable(f"{path.name} begins with {' '.join(first)!r}, should be counts")
+        raise Unreadable(f"{path.name} begins with {' '.join(first)!r}; it must begin with counts")
     try:
         numbers = np.array(" ".join(lines[1:]).split(), dtype=np.float64)
     except ValueError as error:
@@ -68,7 +68,7 @@ def _table(path: Path, words: int) -> tuple[int, list[int], NDArray[np.float64]]
 
 def _rows(numbers: NDArray[np.float64], count: int, width: int, path: Path) -> NDArray[np.float64]:
     if len(numbers) != count * width:
-        raise Unreadable(f"{path.name} has {len(numbers)} numbers, should have {count} rows of {width}")
+        raise Unreadable(f"{path.name} has {len(numbers)} numbers; it must have {count} rows of {width}")
     return numbers.reshape(count, width)
 
 

@@ -1,4 +1,4 @@
-"""Tetrahedral meshes from files: USD, and whatever the readers in ``warp_corot.io.read`` know."""
+"""Tetrahedral meshes from files: USD and the formats of ``warp_corot.io.read``."""
 
 import logging
 import os
@@ -19,13 +19,13 @@ from .regions import Regions, find_regions
 from .split import split_solids
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
-#: Formats of surfaces alone, see `warp_corot.io.read.surfaces`.
+#: Formats that only hold surfaces, see `warp_corot.io.read.surfaces`.
 SURFACE_SUFFIXES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf")
-#: The formats of meshes that messages name.
+#: The mesh formats that messages name.
 USUAL = (".msh", ".vtk", ".vtu", ".inp", ".mesh", ".node")
-#: How the note of cells that have been split ends.
+#: End of the note about split cells.
 SPLIT = "split into tetrahedra"
-#: Arrays that number parts of a file that share no nodes.
+#: Arrays that number the parts of a file that share no nodes.
 OBJECTS = ("block", "instance")
 
 log = logging.getLogger(__name__)
@@ -33,21 +33,21 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class LoadedMesh:
-    """A tetrahedral mesh as it came from a file.
+    """A tetrahedral mesh from a file.
 
     Attributes:
         points: Rest positions, float64 [N, 3] [m].
         tets: Vertex indices, int32 [T, 4]; orientation as in the file.
-        up_axis: "X", "Y" or "Z". Formats that name none get "Z", the habit of the meshers that write them.
+        up_axis: "X", "Y" or "Z"; for formats without one, "Z", the convention of the mesh generators that write them.
         metres_per_unit: Length of the file's unit [m], before ``scale``.
-        name: Short name, fit for a title.
-        source: The file it was read from.
+        name: Short name for a title.
+        source: The file.
         regions: Its regions, if the file numbers any.
         says_unit: Whether the file says its unit.
-        notes: What the user should know, a line each.
-        node_sets: Nodes that the file gives a name, indices int64 [n].
-        objects: Names of the file's parts that share no nodes (prims, blocks, instances), and how many of the
-            tetrahedra each has, in their order; empty where the file has no parts.
+        notes: Notes for the user, one line each.
+        node_sets: Named sets of nodes in the file, indices int64 [n].
+        objects: Names of the file's parts that share no nodes (prims, blocks, instances), and the number of tetrahedra
+            of each, in order; empty if the file has no parts.
     """
 
     points: NDArray[np.float64]
@@ -71,30 +71,30 @@ def load_tets(
     regions: str | None = None,
     found: FileMesh | None = None,
 ) -> LoadedMesh:
-    """Loads the tetrahedra of a file, in metres.
+    """Load the tetrahedra of a file, in metres.
 
-    USD stages are read with OpenUSD (unit, up axis and world transforms applied, several prims joined); other files
-    with VTK, Gmsh, meshio or readers of this package, see `warp_corot.io.read`. Hexahedra, wedges and pyramids are
-    split into tetrahedra that fit those of their neighbours; cells of higher order are taken by their corners.
+    OpenUSD reads USD stages (unit, up axis and world transforms applied, several prims joined); VTK, Gmsh, meshio or
+    readers of this package read other files, see `warp_corot.io.read`. Hexahedra, wedges and pyramids are
+    split into tetrahedra that fit those of their neighbours; cells of higher order become linear ones on their corners.
     ``warp:NAME`` names an asset in Warp's wheel, see `warp_corot.io.read.assets`.
 
     Args:
         path: File, or asset name.
         scale: Factor on all coordinates, after the unit.
-        unit: Of the coordinates, any length such as "mm" or "3.2cm", or metres as a number. None: what the file says,
-            metres if it says nothing.
-        regions: Name of the file's array that numbers regions; None: the likeliest.
-        found: What `read_mesh_file` has found in the file, if it has been read before.
+        unit: Unit of the coordinates, any length such as "mm" or "3.2cm", or metres as a number. None: the file's unit,
+            or metres if it has none.
+        regions: Name of the file's array of region numbers; None: the likeliest.
+        found: The result of `read_mesh_file`, if the file was read before.
 
     Returns:
-        The mesh. Elements are not judged here (orientation, volume): `TetMesh` does that.
+        The mesh. Elements are not checked here (orientation, volume): `TetMesh` does that.
 
     Raises:
-        InputError: No such file, not a mesh, no tetrahedra, coordinates that are not finite, indices out of range,
-            a scale that is not positive, no such array or unit; one line that says which.
+        InputError: The file does not exist, is not a mesh, has no tetrahedra, coordinates that are not finite or
+            indices out of range, the scale is not positive, or there is no such array or unit; one line says which.
     """
     if not (np.isfinite(scale) and scale > 0.0):
-        raise InputError(f"scale is {scale}, should be a positive number")
+        raise InputError(f"scale is {scale}; it must be a positive number")
     asset = find_asset(path)
     source = asset.path if asset else checked_path(path, "path")
     check_file(source, "mesh")
@@ -119,17 +119,17 @@ def load_tets(
 
 
 def check_file(source: Path, kind: str) -> None:
-    """See that there is a file with something in it.
+    """Check that a file exists and is not empty.
 
     Args:
         source: The file.
-        kind: What it should be, for the message.
+        kind: The expected kind of file, for the message.
 
     Raises:
         InputError: A folder, no such file, an empty one, or one that cannot be read.
     """
     if source.is_dir():
-        raise InputError(f"{source}: is a folder, should be a {kind} file")
+        raise InputError(f"{source}: is a folder; it must be a {kind} file")
     if not source.exists():
         raise InputError(f"{source}: no such file")
     try:
@@ -141,21 +141,21 @@ def check_file(source: Path, kind: str) -> None:
 
 
 def check_finite(points: NDArray[np.float64], source: Path) -> None:
-    """See that all coordinates are finite.
+    """Check that all coordinates are finite.
 
     Raises:
-        InputError: A point's are not; the message names the first.
+        InputError: A point's coordinates are not finite; the message names the first such point.
     """
     finite = np.isfinite(points).all(axis=1)
     if not finite.all():
         bad = int(np.argmin(finite))
-        raise InputError(f"{source}: point {bad} has coordinates {points[bad].tolist()}, should be finite")
+        raise InputError(f"{source}: point {bad} has coordinates {points[bad].tolist()}; they must be finite")
 
 
 def unknown_format(source: Path) -> InputError:
-    """What to say of an extension that no reader takes."""
+    """The error for an extension that no reader takes."""
     return InputError(
-        f"{source}: unknown format {source.suffix or '(no extension)'}, should be {', '.join(USD_SUFFIXES)}, "
+        f"{source}: unknown format {source.suffix or '(no extension)'}; it must be {', '.join(USD_SUFFIXES)}, "
         f"{', '.join(USUAL)}, another mesh file, a surface such as .stl or a scan such as .nii.gz"
     )
 
@@ -181,7 +181,7 @@ def _of_stage(path: Path, regions: str | None) -> LoadedMesh:
 
 
 def _short_name(path: Path) -> str:
-    # As UTF-8 whatever the locale is; what cannot be shown becomes a question mark.
+    # UTF-8 in every locale; characters that cannot be shown become question marks.
     return os.fsencode(path.stem).decode("utf-8", "replace")
 
 
@@ -227,11 +227,11 @@ def _of_file(path: Path, regions: str | None, found: FileMesh | None) -> LoadedM
 
 
 def _objects(mesh: FileMesh, cells: NDArray[np.int64]) -> list[tuple[str, int]]:
-    """The blocks or instances of a file, and how many of the tetrahedra each has; empty if there are not several."""
+    """The blocks or instances of a file, with the number of tetrahedra of each; empty unless there are several."""
     for array in OBJECTS:
         if mesh.names.get(array) and all(array in block.data for block in mesh.solids):
             of_tet = np.concatenate([block.data[array] for block in mesh.solids])[cells]
-            # Readers give the cells of one after those of the other.
+            # Readers give the cells part by part.
             starts = np.flatnonzero(np.diff(of_tet, prepend=of_tet[:1] - 1))
             numbers = of_tet[starts].tolist()
             if len(numbers) == len(set(numbers)) > 1:

@@ -22,16 +22,16 @@ from .filemesh import from_bytes
 
 @dataclass(frozen=True)
 class LoadedVolume:
-    """A volume as it came from a file.
+    """A volume from a file.
 
     Attributes:
-        values: [nx, ny, nz], of the file's own number type.
-        affine: From voxel indices to positions in ``unit``, float64 [4, 4]; right-anterior-superior where the format
-            names directions.
+        values: [nx, ny, nz], with the file's own number type.
+        affine: Matrix from voxel indices to positions in ``unit``, float64 [4, 4]; right-anterior-superior if the
+            format names directions.
         unit: "m", "cm", "mm", or None if the file does not say.
-        name: Short name, fit for a title.
-        source: The file it was read from.
-        notes: What the user should know, a line each.
+        name: Short name for a title.
+        source: The file.
+        notes: Notes for the user, one line each.
     """
 
     values: NDArray[Any]
@@ -43,17 +43,17 @@ class LoadedVolume:
 
 
 def is_volume(path: Path) -> bool:
-    """Whether a file is a scan by its extension."""
+    """Whether a file is a scan, by its extension."""
     return any(path.name.lower().endswith(suffix) for suffix in READERS)
 
 
 def load_volume(path: str | PathLike[str]) -> LoadedVolume:
-    """Reads a scan: .nii, .nii.gz, .mgz, .mgh, .mha, .mhd, .nrrd, .nhdr, .vti, an image in a .vtk, or DICOM: a .dcm
-    with several slices or a folder with a series, of which the largest is taken.
+    """Read a scan: .nii, .nii.gz, .mgz, .mgh, .mha, .mhd, .nrrd, .nhdr, .vti, an image in a .vtk, or DICOM: a .dcm
+    with several slices, or the largest series in a folder.
 
     Raises:
-        InputError: No such file, another format, not readable, not three-dimensional, more than one number a voxel, or
-            the library that reads the format is not installed; one line that says which.
+        InputError: The file does not exist, has another format, cannot be read, is not three-dimensional, has more than
+            one number a voxel, or the library for the format is not installed; one line says which.
     """
     source = Path(path)
     if not source.exists():
@@ -61,7 +61,7 @@ def load_volume(path: str | PathLike[str]) -> LoadedVolume:
     suffix = next((known for known in READERS if source.name.lower().endswith(known)), None)
     if suffix is None and not source.is_dir():
         raise InputError(
-            f"{source}: unknown format {source.suffix or '(no extension)'}, should be {', '.join(READERS)}"
+            f"{source}: unknown format {source.suffix or '(no extension)'}; it must be {', '.join(READERS)}"
         )
     try:
         values, affine, unit, notes = _read_dicom(source) if source.is_dir() else READERS[suffix or ""](source)
@@ -74,7 +74,7 @@ def load_volume(path: str | PathLike[str]) -> LoadedVolume:
 
 
 def volume_of_image(path: Path, arrays: dict[str, NDArray[Any]]) -> LoadedVolume:
-    """The volume of an image that was found in a VTK file.
+    """The volume of an image in a VTK file.
 
     Raises:
         InputError: See `load_volume`.
@@ -89,7 +89,7 @@ def _checked(
     while values.ndim > 3 and values.shape[-1] == 1:
         values = values[..., 0]
     if values.ndim != 3:
-        raise InputError(f"{source}: has shape {values.shape}, should be a volume [nx, ny, nz] of single numbers")
+        raise InputError(f"{source}: has shape {values.shape}; it must be a volume [nx, ny, nz] of single numbers")
     if not values.size:
         raise InputError(f"{source}: has no voxels, its shape is {values.shape}")
     return LoadedVolume(values, affine, unit, name, source, notes)
@@ -108,7 +108,7 @@ def _read_nifti(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | No
     unit = {"meter": "m", "mm": "mm"}.get(said)
     spacing = np.asarray(image.header.get_zooms(), dtype=np.float64)[:3]
     affine = np.array(image.affine, dtype=np.float64)
-    # The format's fallback for a header without spacing is the unit matrix.
+    # For a header without spacing, the format prescribes the unit matrix.
     if not (spacing > 0.0).all():
         affine[:3, :3] = 0.0
     notes = []
@@ -122,7 +122,7 @@ def _read_nifti(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | No
 def _nifti_unit(header: Any) -> str:
     try:
         return header.get_xyzt_units()[0]
-    except KeyError:  # a number that the format does not know
+    except KeyError:  # a number that the format does not define
         return "unknown"
 
 
@@ -155,12 +155,12 @@ def _read_vti(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None
 
 
 def _isolated(package: str, module: str, path: Path, kind: str) -> dict[str, NDArray[Any]]:
-    """The arrays of an image, which a reader that needs a package reads in a process of its own."""
+    """The arrays of an image, from a reader that needs a package and runs in a separate process."""
     if importlib.util.find_spec(package) is None:
         raise ImportError(package)
     arrays, reason = read_isolated(f"warp_corot.io.read.{module}", path)
     if arrays is None and reason is None:
-        raise InputError(f"{path}: is a folder without a DICOM series, should be a file or such a folder")
+        raise InputError(f"{path}: is a folder without a DICOM series; it must be a file or a folder with one")
     if arrays is None or "image" not in arrays:
         raise _unreadable(path, kind, reason or "it holds a mesh, not an image")
     return arrays
@@ -177,7 +177,7 @@ def _unreadable(path: Path, kind: str, why: object) -> InputError:
     return InputError(f"{path}: is not a {kind} file that can be read{f' ({words[:160]})' if words else ''}")
 
 
-#: What reads which extension.
+#: The reader of each extension.
 READERS: dict[str, Callable[[Path], tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]]] = {
     ".nii.gz": _read_nifti,
     ".nii": _read_nifti,
@@ -196,7 +196,7 @@ def affine_of(spacing: Any, origin: Any) -> NDArray[np.float64]:
     """The matrix [4, 4] from voxel indices to positions.
 
     Raises:
-        InputError: Spacing that is not three positive numbers, origin that is not three finite ones.
+        InputError: Spacing is not three positive numbers, or origin is not three finite ones.
     """
     steps = np.asarray(spacing, dtype=np.float64)
     if steps.shape != (3,) or not all(math.isfinite(s) and s > 0.0 for s in steps):

@@ -23,7 +23,7 @@ from vtkmodules.vtkFiltersCore import vtkAppendFilter, vtkTriangleFilter
 from .filemesh import CORNERS, Block, FileMesh, Unreadable, as_bytes, corners_note, sets_of_numbers, whole_numbers
 from .split import fan, split_polyhedron
 
-#: VTK's numbers of cells by the kind that their corners make; corners come first in cells of any order.
+#: VTK's cell types by the kind that their corners make; corners come first in cells of any order.
 KINDS = {
     "tetra": (10, 24, 71, 78, 82),
     "hexahedron": (12, 25, 29, 33, 72, 79),
@@ -34,7 +34,7 @@ KINDS = {
 }
 LINEAR = {10, 12, 13, 14, 5, 9}
 VOXEL, PIXEL, STRIP, POLYGON, PENTAPRISM, HEXAPRISM, POLYHEDRON = 11, 8, 6, 7, 15, 16, 42
-#: Arrays that tell nothing of regions.
+#: Arrays that do not number regions.
 INTERNAL = (
     *("vtkGhostType", "vtkOriginalCellIds", "vtkOriginalPointIds"),
     *("GlobalCellIds", "GlobalElementId", "GlobalPointIds", "GlobalNodeId"),
@@ -45,7 +45,7 @@ def read(path: Path) -> FileMesh | dict[str, NDArray[Any]]:
     """The cells of a file, or the arrays of an image.
 
     Raises:
-        Unreadable: VTK's own words.
+        Unreadable: With VTK's own message.
     """
     window = vtkStringOutputWindow()
     vtkOutputWindow.SetInstance(window)
@@ -62,7 +62,7 @@ def read(path: Path) -> FileMesh | dict[str, NDArray[Any]]:
         return _image(data)
     leaves = list(_leaves(data, ""))
     if not leaves:
-        raise Unreadable(f"it holds {data.GetClassName()}, which is empty or no mesh")
+        raise Unreadable(f"it holds {data.GetClassName()}, which is empty or not a mesh")
     return _joined(leaves)
 
 
@@ -91,7 +91,7 @@ def _reader(path: Path) -> Any:
 
 
 def _errors(said: str) -> str:
-    """The messages among what VTK has written, less where in its code they come from."""
+    """The messages in VTK's output, without the places in its code."""
     found = []
     for part in said.split("ERROR: ")[1:]:
         text = part.split("\n\n")[0]
@@ -99,7 +99,7 @@ def _errors(said: str) -> str:
         words = " ".join(lines)
         _, address, message = words.partition("): ")
         said_of_itself = message if address else words
-        if not said_of_itself.startswith("Algorithm "):  # which only repeats that something has failed
+        if not said_of_itself.startswith("Algorithm "):  # a message that only repeats the failure
             found.append(said_of_itself)
     return "; ".join(dict.fromkeys(filter(None, found)))
 
@@ -107,12 +107,12 @@ def _errors(said: str) -> str:
 def _first_look(path: Path) -> str:
     start = path.read_bytes()[:64]
     if not start.lstrip().startswith(b"<"):
-        return "it does not begin as XML does"
-    return f"its root element is no VTKFile of this kind (it begins {start[:40].decode(errors='replace')!r})"
+        return "it does not begin like XML"
+    return f"its root element is not a VTKFile of this kind (it begins {start[:40].decode(errors='replace')!r})"
 
 
 def _leaves(data: Any, name: str) -> Iterator[tuple[str, Any]]:
-    """The data sets of a file with their names, those of a composite one by one."""
+    """The data sets of a file with their names; those in a composite one by one."""
     if isinstance(data, vtkCompositeDataSet):
         iterator = data.NewIterator()
         iterator.SkipEmptyNodesOn()
@@ -162,7 +162,7 @@ def _points(data: Any) -> NDArray[np.float64]:
 
 def _cells(data: Any, ignored: dict[str, int], notes: list[str]) -> Iterator[Block]:
     if isinstance(data, vtkPolyData):
-        # Strips and polygons of any shape, by VTK's own triangulation.
+        # VTK itself triangulates strips and general polygons.
         filtered = vtkTriangleFilter()
         filtered.SetInputData(data)
         filtered.PassLinesOff()
@@ -205,7 +205,7 @@ def _corners(kind: str, number: int, cells: NDArray, offsets: NDArray, nodes: ND
 
 
 def _by_faces(number: int, cells: NDArray, data: Any) -> Block:
-    """Cells of many corners one by one, as tetrahedra; strips and polygons as triangles."""
+    """Cells with many corners one by one, as tetrahedra; strips and polygons as triangles."""
     made: list[tuple[int, ...]] = []
     whose: list[int] = []
     for index in cells.tolist():
@@ -215,7 +215,7 @@ def _by_faces(number: int, cells: NDArray, data: Any) -> Block:
             strip = [(ids[k + k % 2], ids[k + 1 - k % 2], ids[k + 2]) for k in range(len(ids) - 2)]
             parts: list[tuple[int, ...]] = list(strip if number == STRIP else fan(ids))
         else:
-            # A cell hands out one face object again and again: its corners are taken at once.
+            # A cell returns the same face object every time, so its corners are copied at once.
             faces = [_corners_of(cell.GetFace(k)) for k in range(cell.GetNumberOfFaces())]
             parts = list(split_polyhedron(faces))
         made += parts
@@ -236,7 +236,7 @@ def _data(data: Any, cells: NDArray) -> dict[str, NDArray[np.int64]]:
 
 
 def _node_sets(data: Any) -> dict[str, NDArray[np.int64]]:
-    """The sets of nodes that point data tell apart."""
+    """The node sets that point data define."""
     found: dict[str, NDArray[np.int64]] = {}
     for name, values in _whole_arrays(data.GetPointData(), data.GetNumberOfPoints()).items():
         found |= sets_of_numbers(name, values)
@@ -263,7 +263,7 @@ def _types(data: Any) -> NDArray[np.int64]:
 
 
 def _ints(array: Any) -> NDArray[np.int64]:
-    """Whole numbers, those of VTK's implicit arrays too."""
+    """Whole numbers, also from VTK's implicit arrays."""
     try:
         return np.array(vtk_to_numpy(array), dtype=np.int64)
     except (AttributeError, TypeError, ValueError, AssertionError):
@@ -271,7 +271,7 @@ def _ints(array: Any) -> NDArray[np.int64]:
 
 
 def _image(grid: Any) -> dict[str, NDArray[Any]]:
-    """Values [nx, ny, nz] and the affine of their places; see `warp_corot.io.read.volumes`."""
+    """Values [nx, ny, nz] and the affine of their positions; see `warp_corot.io.read.volumes`."""
     extent = np.array(grid.GetExtent()).reshape(3, 2)
     at_points = grid.GetPointData().GetNumberOfArrays() > 0
     data = grid.GetPointData() if at_points else grid.GetCellData()
@@ -283,10 +283,10 @@ def _image(grid: Any) -> dict[str, NDArray[Any]]:
         names = ", ".join(str(data.GetArrayName(k)) for k in range(data.GetNumberOfArrays())) or "none"
         raise Unreadable(f"no whole array of scalars chosen; its arrays: {names}")
     if array.GetNumberOfComponents() != 1:
-        raise Unreadable(f"it has {array.GetNumberOfComponents()} numbers a voxel, should be one")
+        raise Unreadable(f"it has {array.GetNumberOfComponents()} numbers a voxel; it must have one")
     matrix = grid.GetIndexToPhysicalMatrix()
     affine = np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
     affine[:3, 3] += affine[:3, :3] @ (extent[:, 0] + (0.0 if at_points else 0.5))
-    notes = [] if at_points else ["the numbers are those of cells: voxel centres lie between the grid's points"]
+    notes = [] if at_points else ["values belong to cells: voxel centres lie between the grid's points"]
     values = np.array(vtk_to_numpy(array).reshape(tuple(shape), order="F"), order="F")
     return {"image": as_bytes(notes), "values": values, "affine": affine}

@@ -1,4 +1,4 @@
-"""A simulation recorded frame by frame as a USD animation."""
+"""Recording of a simulation, frame by frame, as a USD animation."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ if TYPE_CHECKING:
 
 Progress = Callable[[int, int], None]
 
-#: A frame of more steps would take years.
+#: A frame with more steps would take years.
 MOST_STEPS = 1e12
 
 
 @dataclass
 class Recording:
-    """What has been recorded so far.
+    """The progress of a recording.
 
     Attributes:
         path: The stage.
-        frames: Frames written, the one at the beginning included.
-        steps: Time steps done.
+        frames: Number of written frames, the first one included.
+        steps: Number of time steps.
         simulated: Simulated time [s].
-        elements: Tetrahedra of the bodies drawn, one world of them, in each frame; they change with remeshing only.
+        elements: Tetrahedra of the drawn bodies in one world, for each frame; they change only with remeshing.
         stepping: Wall time of stepping [s], without writing.
-        writing: Wall time of reading the state back and writing it [s].
+        writing: Wall time of reading the state and writing it [s].
         largest_displacement: Largest displacement from rest of any node in any frame [m].
         final_displacement: The same in the last frame [m].
     """
@@ -64,7 +64,7 @@ class Recording:
 
 
 class _Joined:
-    """The bodies of a simulation, one world of them, as one mesh and one material, body after body."""
+    """The bodies of a simulation in one world as one mesh and one material, body after body."""
 
     def __init__(self, sim: Simulation, world: int):
         self.worlds = [body.world(world) for body in sim.bodies]
@@ -73,7 +73,7 @@ class _Joined:
         self._join()
 
     def has_changed(self) -> bool:
-        """Whether the mesh has become another one since this was last asked; then all is that of the present one."""
+        """Whether the mesh has changed since the last call; if so, everything is updated to the current mesh."""
         if self._revisions == [world.body.version for world in self.worlds]:
             return False
         self._join()
@@ -86,7 +86,7 @@ class _Joined:
     def skins(
         self, surface: Surface | Sequence[Surface | None] | None, tets: bool | None, labels: bool
     ) -> BoundSkins | None:
-        """What is drawn in place of the boundary of the tetrahedra; none where nothing but tetrahedra is known."""
+        """Surfaces that are drawn in place of the boundary of the tetrahedra; None if there are only tetrahedra."""
         if surface is None and not labels and tets is not False and not any(map(has_domain, self.meshes)):
             return None
         return BoundSkins(self.meshes, surface, labels, self.changing)
@@ -113,10 +113,10 @@ class _Joined:
 
 
 def steps_per_frame(fps: float, dt: float) -> int:
-    """The least whole number of steps, none longer than ``dt`` [s], that makes a frame.
+    """The smallest number of steps, none longer than ``dt`` [s], that makes a frame.
 
     Raises:
-        InputError: More steps than can be counted.
+        InputError: There would be too many steps to count.
     """
     count = 1.0 / fps / dt
     if count > MOST_STEPS:
@@ -125,10 +125,10 @@ def steps_per_frame(fps: float, dt: float) -> int:
 
 
 def frame_count(duration: float, fps: float) -> int:
-    """How many frames follow the first one, nearest to ``duration`` [s].
+    """The number of frames after the first one, nearest to ``duration`` [s].
 
     Raises:
-        InputError: Not positive and finite, or shorter than half a frame.
+        InputError: A value is not positive and finite, or the duration is shorter than half a frame.
     """
     for name, value, unit in (("fps", fps, ""), ("duration", duration, " s")):
         if not 0 < checked_number(value, name) < math.inf:
@@ -154,54 +154,55 @@ def record(
     recording: Recording | None = None,
     about: Mapping[str, Any] | None = None,
 ) -> Recording:
-    """Advance a simulation and write a frame of it as often as ``fps`` asks, the present state first.
+    """Advance a simulation and write ``fps`` frames a second, the current state first.
 
-    Several bodies become one mesh, body after body. Of a mesh made from a domain the smooth marched surface is written
-    and not the tetrahedra; of any other mesh the tetrahedra and their boundary. Of a body that is remeshed each frame
-    shows the present mesh; smooth surfaces stay the same and are bound to it. Frame k shows the state at k / fps, or,
-    of a simulation with a given step, after the whole number of steps that comes nearest. Whatever ends the run, the
-    frames written stay: Ctrl-C and SIGTERM wait while one is being written.
+    Several bodies become one mesh, body after body. For a mesh made from a domain, the smooth marched surface is
+    written instead of the tetrahedra; for any other mesh, the tetrahedra and their boundary. For a body that is
+    remeshed, each frame shows the current mesh; smooth surfaces stay the same and are bound to it. Obstacles and tools
+    are drawn, too, with the forces on tools. Frame k shows the state at k / fps, or, for a simulation with a given
+    step, after the nearest whole number of steps. If the run is interrupted, the written frames stay: Ctrl-C and
+    SIGTERM wait while a frame is being written.
 
     Args:
-        sim: Goes on from where it is.
-        path: A .usd, .usdc or .usda file; what was there stays until the first frames are safe.
+        sim: The simulation; it continues from its current state.
+        path: A .usd, .usdc or .usda file; a former file stays until the first frames are complete.
         duration: Simulated time [s], rounded to whole frames.
         fps: Frames per second of simulated time.
-        world: Which of the bodies' copies is drawn; must be given where there are several.
-        surface: Drawn in place of the mesh's own surface, for several bodies one each (None for the mesh's own): a
-            surface from ``mesh.bind(points, triangles)``; or a USD file with Mesh prims, or another surface file, in
-            the mesh's coordinates, whose parts are bound to it and keep their names, faces, texture coordinates,
-            subsets and materials. Parts without materials and colours show the stress.
-        tets: Whether the TetMesh prim is written; None: unless a smooth surface is.
-        labels: Draw each label of the mesh as a closed surface of its own, in place of one around all.
-        also: Files for ParaView with displacement, velocity, strain and stress: .pvd or .xdmf of all frames, .vtu of
-            the last.
-        progress: Called with the frames done and their number, after each; None: terminals show a bar from two
-            seconds on.
-        recording: Filled while running, for who wants to look at it when the run has been ended early.
-        about: What the stage shall say of itself, besides what is known of every simulation: texts, numbers and
+        world: The world that is drawn; must be given if there are several.
+        surface: A surface in place of the mesh's own, for several bodies one each (None for the mesh's own): from
+            ``mesh.bind(points, triangles)``; or a USD file with Mesh prims, or another surface file, in the mesh's
+            coordinates. Its parts are bound to the mesh and keep their names, faces, texture coordinates, subsets and
+            materials; parts without materials and colours show the stress.
+        tets: Whether to write the TetMesh prim; None: only without a smooth surface.
+        labels: Draw each label of the mesh as a separate closed surface, in place of one around all.
+        also: Files for ParaView with displacement, velocity, strain and stress: .pvd or .xdmf with all frames, .vtu
+            with the last one.
+        progress: Called with the number of finished frames and of all frames after each; None: terminals show a bar
+            after two seconds.
+        recording: Filled during the run, so that it is available if the run ends early.
+        about: More data about the run, besides those that are recorded for every simulation: texts, numbers and
             dictionaries of them, under "warp_corot" in the layer's custom data.
 
     Returns:
-        What was recorded.
+        The progress at the end.
 
     Raises:
-        InputError: A path that cannot be written to, a duration or frame rate out of its range, no such world, or a
-            surface that does not fit; nothing has been simulated or written then.
-        UnstableError: The state is not finite any more; the frames before are kept.
-        OSError: The file cannot be written, as when the disk is full; the frames up to seconds before are kept.
+        InputError: A path that cannot be written to, a duration or frame rate out of range, no such world, or a
+            surface that does not fit; nothing was simulated or written.
+        UnstableError: The state is no longer finite; the frames before are kept.
+        OSError: The file cannot be written, for example because the disk is full; all but the last seconds are kept.
     """
     from warp_corot.io.write.usd.writer import UsdWriter
 
     from . import also_writer, fields_of
 
     if not isinstance(sim, Simulation):
-        raise InputError(f"sim is {shown(sim)}; it must be a Simulation, as Simulation(body) makes one")
+        raise InputError(f"sim is {shown(sim)}; it must be a Simulation, for example Simulation(body)")
     checked_path(path, "path")
     count = frame_count(duration, fps)
     others = [also_writer(Path(other)) for other in also]
     if world is None and sim.worlds > 1:
-        raise InputError(f"the simulation has {sim.worlds} worlds; say which one to draw, as in world=0")
+        raise InputError(f"the simulation has {sim.worlds} worlds; say which one to draw, for example world=0")
     joined = _Joined(sim, world or 0)
     skins = joined.skins(surface, tets, labels)
     writer = UsdWriter(
@@ -214,6 +215,8 @@ def record(
         tets=tets,
         changing=any(joined.changing),
         gravity=sim.gravity,
+        obstacles=() if sim.contact is None else sim.contact.obstacles.given,
+        world=world or 0,
     )
     told = {**provenance(sim, joined.fixed), **(about or {})}
     done = Recording(writer.path) if recording is None else recording
@@ -243,7 +246,7 @@ def record(
 
 @contextmanager
 def _bar(count: int, *, wanted: bool) -> Iterator[Progress]:
-    """A bar on a terminal for runs that take a while."""
+    """A bar on a terminal for long runs."""
     from tqdm import tqdm
 
     form = "{desc}  {percentage:3.0f} % |{bar}| frame {n_fmt} of {total_fmt}, {remaining} left"
@@ -259,7 +262,7 @@ def _write_frame(writer: UsdWriter, sim: Simulation, joined: _Joined, done: Reco
     writer.write(np.concatenate(positions), velocities=np.concatenate(velocities), von_mises=np.concatenate(stresses))
     done.frames = writer.frames
     done.elements.append(len(joined.tets))
-    # In float64: on the way to an end that is not finite, squares leave float32 first.
+    # In float64: before a state becomes infinite, squares overflow float32.
     lengths = [np.linalg.norm(w.displacements.numpy().astype(np.float64), axis=1).max() for w in joined.worlds]
     done.final_displacement = float(max(lengths))
     done.largest_displacement = max(done.largest_displacement, done.final_displacement)
@@ -267,13 +270,13 @@ def _write_frame(writer: UsdWriter, sim: Simulation, joined: _Joined, done: Reco
 
 @contextmanager
 def _closed_whole(writer: UsdWriter, done: Recording, others: Sequence[Writer] = ()) -> Iterator[None]:
-    """The writers are closed at the end, whatever the end is, with signals held back and the time taken."""
+    """Close the writers at the end in any case, with signals delayed and the time measured."""
     try:
         yield
     except BaseException as error:
         with signals_held_back():
             writer.__exit__(type(error), error, error.__traceback__)
-            with suppress(OSError):  # the first error is the one to be told
+            with suppress(OSError):  # the first error is the one to report
                 for other in others:
                     other.close()
         raise
@@ -287,7 +290,7 @@ def _closed_whole(writer: UsdWriter, done: Recording, others: Sequence[Writer] =
 
 @contextmanager
 def signals_held_back() -> Iterator[None]:
-    """SIGINT and SIGTERM that come inside are delivered at its end (in the main thread; elsewhere there are none)."""
+    """Deliver SIGINT and SIGTERM only at the end of the block (in the main thread; other threads get none)."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

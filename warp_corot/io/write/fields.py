@@ -1,4 +1,4 @@
-"""What a frame holds for who looks into it: displacements and velocities of nodes, strain and stress of elements."""
+"""The fields of a frame: displacements and velocities of nodes, strain and stress of elements."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Fields:
     """A frame.
 
     Attributes:
-        time: [s].
-        points: At rest [m], float64 [N, 3].
+        time: Time [s].
+        points: Rest positions [m], float64 [N, 3].
         tets: int32 [T, 4].
         nodal: Fields of nodes by name, [N] or [N, 3].
         elemental: Fields of elements by name, [T] or [T, 9], tensors row by row.
@@ -35,15 +35,15 @@ class Fields:
 
 
 def fields_of(sim: Simulation, worlds: Sequence[Any], time: float) -> Fields:
-    """The present state of bodies, one world of them, one body after the other.
+    """The current state of bodies in one world, body after body.
 
     Nodes have ``displacement`` [m], ``velocity`` [m/s] and ``fixed``; elements ``strain`` (Green-Lagrange), ``stress``
-    [Pa] where the elastic law is local and isotropic, ``von_mises`` [Pa], and ``region`` where meshes have labels.
+    [Pa] if the elastic law is local and isotropic, ``von_mises`` [Pa], and ``region`` if meshes have labels.
 
     Args:
         sim: The simulation.
-        worlds: A view of a world of each of its bodies.
-        time: What the frame's time is called [s].
+        worlds: A view of one world of each body.
+        time: Time of the frame [s].
     """
     meshes = [world.body.mesh for world in worlds]
     offsets = np.cumsum([0, *(len(mesh.points) for mesh in meshes)])

@@ -1,6 +1,6 @@
 """Frames for ParaView: one .vtu, a .pvd with a .vtu for each frame, or an .xdmf with its numbers in HDF5.
 
-Points are those at rest; *Warp By Vector* with ``displacement`` shows the body as it moves.
+Points are rest positions; *Warp By Vector* with ``displacement`` shows the moving body.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from warp_corot.io.files.whole import written_whole
 
 from .fields import Fields
 
-#: What each format needs.
+#: The packages that each format needs.
 PACKAGES = {".vtu": "meshio", ".pvd": "meshio", ".xdmf": "h5py"}
 
 
 class Writer(Protocol):
-    """Takes frames one after the other."""
+    """Takes one frame after the other."""
 
     def write(self, fields: Fields) -> None:
         """Write a frame, or keep it.
@@ -41,27 +41,27 @@ class Writer(Protocol):
 
 
 def check_also(path: Path) -> None:
-    """Says before a simulation begins what would stop its result from being written.
+    """Check, before a simulation, that its result can be written.
 
     Raises:
-        InputError: Another extension, a library that is not installed, a folder in the way, or an output folder that is
-            not there or cannot be written to.
+        InputError: Another extension, a library that is not installed, a folder with this name, or an output folder
+            that does not exist or cannot be written to.
     """
     package = PACKAGES.get(path.suffix.lower())
     if package is None:
-        raise InputError(f"{path}: extension {path.suffix or '(none)'}, should be {', '.join(PACKAGES)}")
+        raise InputError(f"{path}: extension {path.suffix or '(none)'}; it must be {', '.join(PACKAGES)}")
     if importlib.util.find_spec(package) is None:
         raise InputError(f'{path}: writing {path.suffix} files needs: pip install "warp-corot[paraview]"')
     if path.is_dir():
-        raise InputError(f"{path}: is a folder, should be a file name")
+        raise InputError(f"{path}: is a folder; it must be a file name")
     folder = path.parent
     if not folder.is_dir():
-        raise InputError(f"{path}: output folder {folder} {'is a file' if folder.exists() else 'is not there'}")
+        raise InputError(f"{path}: output folder {folder} {'is a file' if folder.exists() else 'does not exist'}")
     if path.exists() and not os.access(path, os.W_OK):
         raise InputError(f"{path}: is write-protected")
     frames = _frames_folder(path)
     if path.suffix.lower() == ".pvd" and frames.exists() and not frames.is_dir():
-        raise InputError(f"{frames}: is a file, should be a folder for the frames of {path.name}")
+        raise InputError(f"{frames}: is a file; it must be a folder for the frames of {path.name}")
     try:
         with tempfile.TemporaryFile(dir=folder):
             pass
@@ -124,7 +124,7 @@ class VtuWriter:
 
 
 class PvdWriter:
-    """All frames: files in a folder beside, and one that lists them with their times, whole after every frame."""
+    """All frames: files in a folder beside a list with their times, which is complete after every frame."""
 
     def __init__(self, path: Path):
         self._path = path
@@ -148,7 +148,7 @@ class PvdWriter:
 
 
 def write_vtu(path: Path, fields: Fields) -> None:
-    """Write a frame as a .vtu, whole or not at all.
+    """Write a frame as a .vtu, completely or not at all.
 
     Raises:
         OSError: It could not be written.

@@ -1,4 +1,4 @@
-"""What a stage says of the simulation that made it, in its layer's custom data."""
+"""The description of a simulation in the custom data of its stage's layer."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import warp as wp
 if TYPE_CHECKING:
     from warp_corot.simulation.simulation import Simulation
 
-#: Of the layer's custom data.
+#: Key in the layer's custom data.
 KEY = "warp_corot"
 
 
@@ -22,7 +22,7 @@ def provenance(sim: Simulation, held: npt.NDArray[np.bool_]) -> dict[str, Any]:
 
     Args:
         sim: The simulation.
-        held: Which nodes of what is drawn are held.
+        held: Which nodes of the drawn body are held.
     """
     models = {}
     for number, model in enumerate(sim.models, start=1):
@@ -41,7 +41,7 @@ def provenance(sim: Simulation, held: npt.NDArray[np.bool_]) -> dict[str, Any]:
 
 
 def steps_made(sim: Simulation) -> dict[str, Any]:
-    """How many steps there were, and how long [s]."""
+    """The number of steps, and their lengths [s]."""
     shortest, longest = sim.dt_range
     return {"steps": sim.total_steps, "shortestStep": float(shortest), "longestStep": float(longest)}
 

@@ -1,4 +1,4 @@
-"""What is drawn of a body in place of the boundary of its tetrahedra: surfaces bound to its nodes."""
+"""Surfaces, bound to a body's nodes, that are drawn in place of the boundary of its tetrahedra."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 
     Surface: TypeAlias = "SurfaceMesh | OwnSurface | str | PathLike[str]"
 
-#: A surface this many times longer or shorter than its body is in another unit, most likely.
+#: A surface this many times longer or shorter than its body is probably in another unit.
 UNLIKELY = 3.0
-#: Bounds that differ by less than this share of the length are the same.
+#: Bounds that differ by less than this fraction of the length are equal.
 SAME = 1.0e-3
 
 
 @dataclass(frozen=True, eq=False)
 class OwnSurface:
-    """A user's own surface, in the coordinates of the body's mesh.
+    """A user's surface, in the coordinates of the body's mesh.
 
     Attributes:
         looks: Its parts, each with its faces, texture coordinates, subsets and materials.
@@ -46,17 +46,17 @@ class OwnSurface:
         bounds: npt.ArrayLike,
         offset: npt.ArrayLike = (0.0, 0.0, 0.0),
     ) -> OwnSurface | None:
-        """The surface that a domain of these bounds [2, 3] [m] was made from; its unit is whatever makes the two
-        equally large. None if they are not the same but for that.
+        """The surface from which a domain with these bounds [2, 3] [m] was made; its unit is the one that makes both
+        equally large. None if they differ in more than size.
 
         Args:
-            path: Of the file.
-            loaded: Its triangles, for files of which more than these is not known.
-            bounds: Of the domain.
-            offset: How far the domain was moved [m], [3].
+            path: Path of the file.
+            loaded: Its triangles, for files that hold nothing more.
+            bounds: Bounds of the domain.
+            offset: Translation of the domain [m], [3].
 
         Raises:
-            InputError: See `usd_look.read_looks`.
+            InputError: See `look.read_looks`.
         """
         from warp_corot.io.read.usd.look import has_looks, look_of_triangles, read_looks
 
@@ -64,7 +64,7 @@ class OwnSurface:
         moved = np.asarray(offset, dtype=np.float64)
         given = np.asarray(bounds, dtype=np.float64) - moved
         length = float(np.ptp(given, axis=0).max())
-        # All of the file, or where it has several bodies one part of it.
+        # The whole file, or one part of it if it has several bodies.
         for some in (looks, *([look] for look in looks)):
             used = np.concatenate([look.points[look.triangles].reshape(-1, 3) for look in some])
             own = np.stack([used.min(axis=0), used.max(axis=0)])
@@ -76,13 +76,13 @@ class OwnSurface:
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A surface to be drawn.
+    """A surface to draw.
 
     Attributes:
-        name: What it is called: "surface", or a label's name.
-        surface: Bound to the nodes of the mesh that is drawn.
+        name: "surface", or a label's name.
+        surface: Bound to the nodes of the drawn mesh.
         look: The USD prim whose faces, texture coordinates and materials it keeps.
-        is_boundary: Whether some of it is the boundary of the mesh itself, which is another one when the mesh is.
+        is_boundary: Whether it contains the boundary of the mesh, which changes with the mesh.
     """
 
     name: str
@@ -108,29 +108,29 @@ def has_labels(mesh: Any) -> bool:
 def skins_of(
     meshes: Sequence[Any], surface: Surface | Sequence[Surface | None] | None = None, labels: bool = False
 ) -> list[Skin]:
-    """The skins of meshes whose nodes are numbered one mesh after the other; those of one name are joined.
+    """The skins of meshes whose nodes are numbered one mesh after the other; skins with the same name are joined.
 
     Args:
         meshes: Forests or tetrahedral meshes.
         surface: Drawn instead of the mesh's own: a bound surface, or a surface file whose parts are bound; for several
             meshes one each, None for the mesh's own.
-        labels: Draw each label of a mesh by itself, closed all round.
+        labels: Draw each label of a mesh as a separate closed surface.
 
     Raises:
-        InputError: Surfaces that do not fit, or labels where no mesh has any.
+        InputError: Surfaces that do not fit, or no mesh has labels.
     """
     return BoundSkins(meshes, surface, labels).on(meshes)
 
 
 class BoundSkins:
-    """The skins of bodies, bound anew where a body's mesh has become another one.
+    """The skins of bodies, bound again when a body's mesh has changed.
 
-    Surfaces stay as they are, whatever the mesh: only what their points are bound to changes. The boundary of a mesh
-    itself becomes that of the present one.
+    Surfaces stay the same when the mesh changes: only the elements to which their points are bound change. The
+    boundary of a mesh becomes that of the current one.
 
     Args:
         meshes, surface, labels: See `skins_of`.
-        changing: Which meshes may become others: surfaces given for them may be bound to what they were earlier.
+        changing: Which meshes may change: surfaces given for them may be bound to an earlier mesh.
     """
 
     def __init__(
@@ -142,7 +142,7 @@ class BoundSkins:
     ):
         given = _one_each(surface, len(meshes))
         if labels and not any(map(has_labels, meshes)):
-            raise InputError("labels is True, but there are none in the mesh; they come from a domain that has")
+            raise InputError("labels is True, but the mesh has none; it must be made from a domain with labels")
         self._meshes = list(meshes)
         may_change = [False] * len(meshes) if changing is None else changing
         self._skins = [
@@ -151,7 +151,7 @@ class BoundSkins:
         ]
 
     def on(self, meshes: Sequence[Any]) -> list[Skin]:
-        """The skins, bound to the nodes of what the meshes are now, numbered one mesh after the other."""
+        """The skins, bound to the nodes of the current meshes, numbered one mesh after the other."""
         found, offset = [], 0
         for index, mesh in enumerate(meshes):
             if mesh is not self._meshes[index]:
@@ -204,7 +204,7 @@ def _skins_of_one(mesh: Any, surface: Any, labels: bool) -> list[Skin]:
 
 
 def _rebound(surface: SurfaceMesh, mesh: Any) -> SurfaceMesh:
-    """The same points, bound to what holds them in a forest."""
+    """The same points, bound to the elements of a forest that contain them."""
     bound = mesh.bind(surface.points)
     return replace(surface, nodes=bound.nodes, weights=bound.weights)
 
@@ -249,19 +249,20 @@ def _shifted(skin: Skin, offset: int) -> Skin:
 
 
 def _joined(skins: Sequence[Skin]) -> list[Skin]:
-    """Skins of one name as one, those that keep a prim's look by themselves."""
+    """Join skins with the same name, except those that keep a prim's look."""
     plain: dict[str, list[Skin]] = {}
     for skin in skins:
         if skin.look is None:
             plain.setdefault(skin.name, []).append(skin)
-    whole = [
-        Skin(name, _one_surface([part.surface for part in parts]), is_boundary=any(part.is_boundary for part in parts))
-        for name, parts in plain.items()
-    ]
+    whole = []
+    for name, parts in plain.items():
+        surface = joined_surfaces([part.surface for part in parts])
+        whole.append(Skin(name, surface, is_boundary=any(part.is_boundary for part in parts)))
     return whole + [skin for skin in skins if skin.look is not None]
 
 
-def _one_surface(parts: Sequence[SurfaceMesh]) -> SurfaceMesh:
+def joined_surfaces(parts: Sequence[SurfaceMesh]) -> SurfaceMesh:
+    """Surfaces bound to the nodes of one mesh as one."""
     if len(parts) == 1:
         return parts[0]
     firsts = np.cumsum([0, *(len(part.points) for part in parts[:-1])])

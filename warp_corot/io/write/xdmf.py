@@ -1,4 +1,4 @@
-"""XDMF: a text that says where each frame's arrays are in an HDF5 file beside it."""
+"""XDMF: an XML file that refers to each frame's arrays in an HDF5 file beside it."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ KINDS = {1: "Scalar", 3: "Vector", 9: "Tensor"}
 
 
 class XdmfWriter:
-    """All frames. The text is whole after every frame; a mesh is stored once for all frames that have it.
+    """All frames. The XML file is complete after every frame; a mesh is stored once for all frames with it.
 
     Args:
-        path: The .xdmf; its numbers go to the .h5 of the same name.
+        path: The .xdmf; its arrays go to the .h5 file of the same name.
     """
 
     def __init__(self, path: Path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -47,12 +47,10 @@ class Enough:
     Attributes:
         elements: So many leaves that hold something.
         first_error: The surface error to begin with [m].
-        finer: The surface error is then lowered once more, to this share of the one that gives so many.
     """
 
     elements: int
     first_error: float
-    finer: float
 
 
 @dataclass(frozen=True)
@@ -100,7 +98,6 @@ def grow(
     wishes: Wishes,
     device: wp.Device,
     closer: Closer | None = None,
-    enough: Enough | None = None,
 ) -> Grown:
     """Bisect the grid around a domain as wished, and as conformity asks for; then, if asked, look at it closely.
 
@@ -110,35 +107,36 @@ def grow(
         wishes: How fine it is to be at most.
         device: Where to work.
         closer: How closely to look at it then.
-        enough: When it is fine enough before it is as fine as wished.
     """
-    cells, origin = grid_around(domain.bounds, cell_size)
-    growing = _Growing(domain, cells, origin, cell_size, wishes, device)
-    growth, judge = growing.growth, growing.judge
-    if enough is None:
-        growing.run()
-    else:
-        growing.run_until(enough)
-    wished = growth.first_child[: growth.element_count].numpy().copy()
+    growing = Growing(domain, cell_size, wishes, device)
+    growing.run()
+    wished = growing.growth.first_child[: growing.growth.element_count].numpy().copy()
     if closer is not None:
         growing.look_closer(closer)
-    lattice, ends = growth.nodes()
-    phi, need = judge.phi[: growth.node_count].numpy(), judge.need[: growth.element_count].numpy()
-    return Grown(cells, origin, lattice, ends, growth.tree(), phi, need, wished, growth)
+    return growing.grown(wished)
 
 
-class _Growing:
-    """A forest that grows after a domain."""
+class Growing:
+    """A forest that grows after a domain.
 
-    def __init__(self, domain: Domain, cells: Any, origin: Any, cell_size: float, wishes: Wishes, device: wp.Device):
-        points = tuple(n + 1 for n in cells)
+    Args:
+        domain: The body.
+        cell_size: Edge of a root cube [m].
+        wishes: How fine it is to be at most.
+        device: Where to work.
+    """
+
+    def __init__(self, domain: Domain, cell_size: float, wishes: Wishes, device: wp.Device):
+        self.cells, self.origin = grid_around(domain.bounds, cell_size)
+        a, b, c = self.cells
+        points = (a + 1, b + 1, c + 1)
         lattice = np.indices(points, dtype=np.int32).reshape(3, -1).T << LATTICE_BITS
-        tets = path_tetrahedra(cells, points)
+        tets = path_tetrahedra(self.cells, points)
         roots = len(tets)
         leaf = np.full(roots, LIVE, np.int32)
         tree = Tree(tets, np.zeros(roots, np.int32), np.full(roots, -1, np.int32), leaf)
         self.growth = Growth(lattice, np.full((len(lattice), 2), -1, np.int32), tree, device)
-        self.judge = Judge(domain, self.growth, cells, origin, cell_size, wishes)
+        self.judge = Judge(domain, self.growth, self.cells, self.origin, cell_size, wishes)
         self.room: int | None = None
 
     def run(self, first: int = 0) -> None:
@@ -166,7 +164,7 @@ class _Growing:
         growth.close(self.judge.wished, start)
 
     def run_until(self, enough: Enough) -> None:
-        """Lower the surface error until there are enough elements, and once more for the surface's sake."""
+        """Lower the surface error until there are enough elements."""
         judge = self.judge
         least = float(judge.closest[0])
         error, judge.limited = max(enough.first_error, least), True
@@ -175,8 +173,12 @@ class _Growing:
         while error > least and (share := judge.holding() / enough.elements) < 1.0:
             error = max(error * min(max(share, STEEPEST), FLATTEST), least)
             self.lower(error)
-        if error > least and enough.finer < 1.0:
-            self.lower(max(enough.finer * error, least))
+
+    def run_finer(self, share: float) -> None:
+        """Lower the surface error once more, for the surface's sake, to a share of itself."""
+        error, least = float(self.judge.tolerances.max()), float(self.judge.closest[0])
+        if error > least and share < 1.0:
+            self.lower(max(share * error, least))
 
     def lower(self, error: float) -> None:
         """Bisect what is off by more than a smaller error than before, and what comes of it."""
@@ -192,6 +194,19 @@ class _Growing:
         first = growth.element_count
         growth.bisect(self.chosen(judge.unresolved(closer.levels, closer.error)))
         self.run(first)
+
+    def grown(self, wished: np.ndarray | None = None) -> Grown:
+        """The forest as it is now.
+
+        Args:
+            wished: See `Grown`; None: all of it.
+        """
+        growth, judge = self.growth, self.judge
+        lattice, ends = growth.nodes()
+        phi, need = judge.phi[: growth.node_count].numpy(), judge.need[: growth.element_count].numpy()
+        tree = growth.tree()
+        wished = tree.first_child if wished is None else wished
+        return Grown(self.cells, self.origin, lattice, ends, tree, phi, need, wished, growth)
 
     def chosen(self, wished: wp.array) -> wp.array:
         """Those of the elements that are to be bisected for which there is room, the neediest."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .adapt import Closer, Enough, grow
+from .adapt import Closer, Enough, Growing
 from .judging import GAP_ELEMENTS, THIN_NEED, Wishes
 from .resolved import Coarsening, Resolved
 
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 #: What share of the number asked for is aimed at and is enough; after how many sizes of cubes any is.
 NEAR, NEAR_ENOUGH = 0.985, 0.92
 MOST_CUBES = 4
+#: With between so many elements a size of cubes is given up early that comes to between these shares of them.
+SEEN, MISSED = (5_000, 300_000), (0.6, 0.85)
 #: What an element counts as being off by between such pieces, as a share of its edge.
 GAP_NEED = 0.5
 #: The surface that is drawn is this much closer to the body's than the mesh's threshold, for which the forest must be
@@ -74,10 +76,11 @@ class Meshes:
         resolved: The forest.
         count: Elements of the present mesh that hold something worth counting.
         child: The present mesh, see `Coarsening`.
+        looked_closely: Whether what elements hold is known closely.
     """
 
-    def __init__(self, resolved: Resolved, needs: np.ndarray, least: float, sliver: float):
-        self.resolved = resolved
+    def __init__(self, resolved: Resolved, needs: np.ndarray, least: float, sliver: float, *, looked_closely: bool):
+        self.resolved, self.looked_closely = resolved, looked_closely
         self._needs, self._least, self._sliver = needs, least, sliver
         self._coarsening = Coarsening(resolved, needs, sliver)
         self.count, self.threshold = 0, 0.0
@@ -88,6 +91,11 @@ class Meshes:
         self.threshold = self._coarsening.threshold(target, self._least)
         self.count, self.child = self._coarsening.mesh(self.threshold)
         return self.count
+
+    @property
+    def has_more(self) -> bool:
+        """Whether there are meshes of more elements than the present one."""
+        return self.threshold > self._least
 
     def surface(self, threshold: float) -> np.ndarray:
         """A mesh of the same forest, finer than that of a threshold, whose surface is to be drawn; as `child`."""
@@ -104,11 +112,12 @@ def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Devi
     best: Meshes | None = None
     largest = 1.001 * float(np.ptp(domain.bounds, axis=0).max())
     suits = min(predicted_cell_size(domain, budget.target), largest)
-    size = budget.cell_size or suits
+    size, given_up = budget.cell_size or suits, False
     for trial in range(MOST_CUBES):
-        meshes = _of_cubes(domain, budget, size, suits, sliver, device, spread=trial == MOST_CUBES - 1)
-        count = meshes.choose(int(NEAR * budget.target))
-        if count <= budget.target and (best is None or count > best.count):
+        last = trial == MOST_CUBES - 1
+        meshes = _of_cubes(domain, budget, size, suits, sliver, device, first=trial == 0, spread=last)
+        count, given_up = meshes.count, given_up or not meshes.looked_closely
+        if count <= budget.target and meshes.looked_closely and (best is None or count > best.count):
             best = meshes
         if budget.cell_size or NEAR_ENOUGH * budget.target <= count <= budget.target:
             break
@@ -117,6 +126,8 @@ def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Devi
         ratio = count / (NEAR * budget.target)
         # Cubes larger than the body would be the whole of it.
         size = min(size * float(np.clip(ratio ** (1.0 / 2.5), 0.5, 2.0)), largest)
+    if best is None and given_up:
+        best = _of_cubes(domain, budget, suits, suits, sliver, device)
     return best
 
 
@@ -138,9 +149,22 @@ def predicted_cell_size(domain: Domain, target: int) -> float:
 
 
 def _of_cubes(
-    domain: Domain, budget: Budget, size: float, suits: float, sliver: float, device: wp.Device, *, spread: bool
+    domain: Domain,
+    budget: Budget,
+    size: float,
+    suits: float,
+    sliver: float,
+    device: wp.Device,
+    *,
+    first: bool = False,
+    spread: bool = False,
 ) -> Meshes:
-    """The meshes of one size of cubes; where they are larger than what suits the number, of so many levels more."""
+    """The meshes of one size of cubes, and of them the one of as many elements as there may be; where cubes are larger
+    than what suits the number, of so many levels more.
+
+    Thin parts are bisected all at once, and then no mesh may have nearly so many elements. With the ``first`` size that
+    is seen before the body is looked at closely.
+    """
     target, wishes = budget.target, budget.wishes
     more = max(math.ceil(3.0 * math.log2(size / suits) - 0.5), 0)
     most = more + MAX_LEVEL + (target > MANY) if budget.max_level is None else budget.max_level
@@ -157,15 +181,25 @@ def _of_cubes(
         budget.min_layers,
         min(deepest, looked + CLOSER_LEVELS),
     )
+    growing = Growing(domain, size, looking, device)
+    growing.run_until(Enough(target, FIRST_ERROR * min(size, suits)))
+
+    def meshes(asked: Domain | None, spread: bool) -> Meshes:
+        resolved = Resolved(growing.grown(), size, asked)
+        needs = needs_of(resolved, domain, budget.min_layers, most, deepest)
+        needs = _told_apart(resolved, needs) if spread else needs
+        found = Meshes(resolved, needs, budget.surface_error, sliver, looked_closely=asked is not None)
+        found.choose(int(NEAR * target))
+        return found
+
+    if first and not budget.cell_size and SEEN[0] <= target <= SEEN[1]:
+        found = meshes(None, False)
+        if found.has_more and MISSED[0] * target <= found.count <= MISSED[1] * target:
+            return found
+    growing.run_finer(FINER_FOREST if target <= MANY else 1.0)
     room = (CLOSE_ELEMENTS if target <= MANY else CLOSE_ELEMENTS_OF_MANY) * target + 40_000
-    closer = Closer(CLOSER_LEVELS, CLOSER_ERROR, room)
-    enough = Enough(target, FIRST_ERROR * min(size, suits), FINER_FOREST if target <= MANY else 1.0)
-    grown = grow(domain, size, looking, device, closer, enough)
-    resolved = Resolved(grown, size, domain)
-    needs = needs_of(resolved, domain, budget.min_layers, most, deepest)
-    if spread:
-        needs = _told_apart(resolved, needs)
-    return Meshes(resolved, needs, budget.surface_error, sliver)
+    growing.look_closer(Closer(CLOSER_LEVELS, CLOSER_ERROR, room))
+    return meshes(domain, spread)
 
 
 def needs_of(resolved: Resolved, domain: Domain, layers: float, most: int, deepest: int) -> np.ndarray:

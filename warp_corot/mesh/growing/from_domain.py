@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 #: How often a cube is bisected where nothing is said.
 MAX_LEVEL_BY_DEFAULT = 12
+#: With more root cubes in the body's box for each element that is allowed, no body fits.
+CUBES_PER_ELEMENT = 1000
 #: After how many meshes one of nearly so many elements is good enough.
 MOST_MESHES = 4
 #: In how many points of an element its labels are looked at, where few elements have several.
@@ -60,6 +62,7 @@ def mesh_domain(
     wishes = Wishes(error, min_level, MAX_LEVEL, refine_where, field, float(field_tolerance))
     if target_elements is not None:
         size = None if cell_size is None else float(cell_size)
+        _check_cubes(domain, size, target_elements)
         budget = Budget(target_elements, size, min_level, max_level, error, float(min_layers), wishes)
         return _of_size(domain, budget, sliver, where)
     if cell_size is None:
@@ -118,6 +121,20 @@ def _check(cell_size, min_level, max_level, surface_error, field_tolerance, targ
         checked_count(target, "target_elements", 1)
     if not 0 <= sliver < 1:
         raise InputError(f"sliver is {sliver}; it must be a share of an element's volume, from 0 to below 1")
+
+
+def _check_cubes(domain: Domain, size: float | None, target: int) -> None:
+    """Check that cubes of a size [m] are not hopelessly many for a number of elements.
+
+    Raises:
+        InputError: They are.
+    """
+    cubes = 0.0 if size is None else float(np.prod(np.ceil(np.ptp(domain.bounds, axis=0) / size)))
+    if cubes > CUBES_PER_ELEMENT * target:
+        raise InputError(
+            f"cell_size is {size:g} m, of which the body's box has {cubes:.3g} cubes; target_elements={target} is too "
+            "few for them: it must be more, or cell_size larger"
+        )
 
 
 def _finished(resolved: Resolved, child: np.ndarray, domain: Domain, sliver: float) -> TetForest:

@@ -17,6 +17,7 @@ from warp_corot.mesh.side_by_side import in_parts
 from warp_corot.mesh.tree import LIVE
 
 from .growth import Growth, lattice_spacing, with_room
+from .surface_points import surface_points
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
@@ -219,7 +220,7 @@ class Judge:
         chosen, tets, known = chosen[crossed], tets[crossed], known[crossed]
         if not len(chosen):
             return
-        x, inward = surface_points(growth.lattice.numpy(), self.phi.numpy(), tets, self.origin, self.spacing)
+        x, inward = surface_points(growth.lattice, self.phi, tets, self.origin, self.spacing)
         # By volume: a cube's edge halves in three levels.
         length = self.lengths[0] * 0.5 ** (level[chosen] / 3.0)
         reach = FARTHER * wishes.layers * float(length.max())
@@ -278,22 +279,6 @@ class Judge:
 
     def _on_device(self, tolerances: np.ndarray) -> wp.array:
         return wp.array(tolerances, dtype=wp.float32, device=self.device)
-
-
-def surface_points(
-    lattice: np.ndarray, phi: np.ndarray, tets: np.ndarray, origin: Any, spacing: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """A point on the surface, or nearly, in each element that it cuts, and the direction inwards there [n, 3]."""
-    x = np.asarray(origin, dtype=np.float64) + lattice[tets] * float(spacing)
-    values = phi[tets].astype(np.float64)
-    edges = x[:, 1:] - x[:, :1]
-    gradient = np.linalg.solve(edges, (values[:, 1:] - values[:, :1])[..., None])[..., 0]
-    slope = np.linalg.norm(gradient, axis=1)
-    inward = -gradient / np.maximum(slope, 1e-30)[:, None]
-    # From the middle along the gradient to where the interpolant is zero, but no farther than the element is long.
-    size = np.linalg.norm(edges, axis=2).max(axis=1)
-    step = np.divide(values.mean(axis=1), slope, out=np.zeros(len(x)), where=slope > 0)
-    return x.mean(axis=1) + np.clip(step, -size, size)[:, None] * inward, inward
 
 
 def _checked(function: Callable[[np.ndarray], Any], points: np.ndarray) -> np.ndarray:

@@ -15,7 +15,8 @@ from warp_corot.mesh.tree import LIVE, VOID, Tree
 
 from .cut import connected, inside_shares
 from .growth import lattice_spacing
-from .judging import FARTHER, GAP_ELEMENTS, ROUGH, surface_points
+from .judging import FARTHER, GAP_ELEMENTS, ROUGH
+from .surface_points import surface_points
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
@@ -125,7 +126,8 @@ class Resolved:
         cut = self.leaves[self.shares < 1.0]
         if len(cut):
             tets, spacing = grown.tree.tets[cut], lattice_spacing(self.cell_size)
-            x, inward = surface_points(grown.lattice, grown.phi, tets, grown.origin, spacing)
+            phi = wp.array(grown.phi, dtype=wp.float32, device=grown.growth.device)
+            x, inward = surface_points(grown.growth.lattice, phi, tets, grown.origin, spacing)
             found[cut] = domain.thickness(x, inward, FARTHER * layers * self.cell_size)
         return self.smallest(found)
 
@@ -145,8 +147,11 @@ class Resolved:
         x = grown.lattice[tets].mean(axis=1) * lattice_spacing(self.cell_size)
         found, reach = np.full(len(self.held), np.inf), GAP_ELEMENTS * self.cell_size
         for number in real:
-            own, other = at_surface & (piece == number), at_surface & (piece != number) & np.isin(piece, real)
-            found[self.leaves[own]], _ = cKDTree(x[other]).query(x[own], distance_upper_bound=reach)
+            own = np.flatnonzero(at_surface & (piece == number))
+            other = np.flatnonzero(at_surface & (piece != number) & np.isin(piece, real))
+            own, other = own[_near(x[own], x[other], reach)], other[_near(x[other], x[own], reach)]
+            if len(own) and len(other):
+                found[self.leaves[own]], _ = cKDTree(x[other]).query(x[own], distance_upper_bound=reach)
         return self.smallest(found)
 
     def _upwards(self, values: np.ndarray, ufunc: np.ufunc) -> np.ndarray:
@@ -213,6 +218,13 @@ class Coarsening:
         wp.launch(kernels.cut_off, len(child), inputs, [child], device=self.device)
         found = child.numpy()
         return int(np.count_nonzero(self._counted & (found == LIVE))), found
+
+
+def _near(points: np.ndarray, others: np.ndarray, reach: float) -> np.ndarray:
+    """Which points are within a reach of the box around others, bool [n]."""
+    if not len(others):
+        return np.zeros(len(points), bool)
+    return ((points >= others.min(axis=0) - reach) & (points <= others.max(axis=0) + reach)).all(axis=1)
 
 
 #: Corners of the eight tetrahedra of one size that a tetrahedron is made of, as barycentric coordinates [8, 4, 4].

@@ -23,8 +23,9 @@ Array = np.ndarray
 ANGLE = 30.0
 #: Polygons whose middle is nearer to the surface than this share of their size have no crease.
 NEAR = 5.0e-3
-#: Crossings of edges are sought in so many steps; normals come from differences over this share of a polygon's size.
-STEPS, APART = 6, 0.02
+#: Crossings of edges are sought in so many steps, or until they are off by less than this share of the edge; normals
+#: come from differences over this share of a polygon's size.
+STEPS, OFF, APART = 6, 5.0e-5, 0.02
 #: Directions in which planes that meet hardly differ are left alone: singular values below this share of the largest.
 RANK = 0.15
 #: How far outside its element a vertex may be, as a barycentric coordinate, and how much nearer to the surface than the
@@ -66,7 +67,7 @@ def _crossings(points: Array, ends: Array, values: Array, domain: Domain) -> Arr
     a, along = points[ends[:, 0]], points[ends[:, 1]] - points[ends[:, 0]]
     low, high = np.zeros(len(ends)), np.ones(len(ends))
     below, above = values[ends[:, 0]].astype(np.float64), values[ends[:, 1]].astype(np.float64)
-    share = np.zeros(len(ends))
+    share, close = np.zeros(len(ends)), OFF * np.linalg.norm(along, axis=1)
     going = np.flatnonzero(ends[:, 0] != ends[:, 1])
     for _ in range(STEPS):
         b, c = below[going], above[going]
@@ -78,6 +79,7 @@ def _crossings(points: Array, ends: Array, values: Array, domain: Domain) -> Arr
         above[inner] *= 0.5
         high[outer], above[outer] = share[outer], found[~inside]
         below[outer] *= 0.5
+        going = going[np.abs(found) > close[going]]
     return a + share[:, None] * along
 
 
@@ -90,19 +92,29 @@ def _apexes(x: Array, polygons: Array, whole: Array, corners: Array, domain: Dom
     chosen = np.flatnonzero(whole & (off > NEAR * size))
     if not len(chosen):
         return chosen, np.empty((0, 3))
+    normals = _normals(x, polygons[chosen], size[chosen], domain)
+    bent = np.einsum("pic,pjc->pij", normals, normals).min(axis=(1, 2)) < np.cos(np.radians(ANGLE))
+    chosen, normals = chosen[bent], normals[bent]
     at, middle, size, off = at[chosen], middle[chosen], size[chosen], off[chosen]
-    around = at[:, :, None] + APART * size[:, None, None, None] * _AROUND
-    normals = _phi(domain, around) @ _AROUND
-    normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-300)
-    cosines = np.einsum("pic,pjc->pij", normals, normals).min(axis=(1, 2))
     heights = np.einsum("pic,pic->pi", normals, at - middle[:, None])
     u, s, v = np.linalg.svd(normals, full_matrices=False)
     inverse = np.where(s > RANK * s[:, :1], 1.0 / np.maximum(s, 1e-300), 0.0)
     apexes = middle + np.einsum("pkc,pk,pik,pi->pc", v, inverse, u, heights)
     straight = s[:, 2] <= RANK * s[:, 0]
     apexes, inside = _slid(apexes, np.where(straight, size, 0.0)[:, None] * v[:, 2], corners[chosen])
-    good = (inside > OUTSIDE) & (cosines < np.cos(np.radians(ANGLE))) & (np.abs(_phi(domain, apexes)) < NEARER * off)
+    good = (inside > OUTSIDE) & (np.abs(_phi(domain, apexes)) < NEARER * off)
     return chosen[good], apexes[good]
+
+
+def _normals(x: Array, polygons: Array, size: Array, domain: Domain) -> Array:
+    """The surface's unit normals at the vertices of polygons [P, 4, 3], from differences over a share of the size of
+    the largest polygon at each vertex."""
+    used, vertices = np.unique(polygons, return_inverse=True)
+    apart = np.zeros(len(used))
+    np.maximum.at(apart, vertices.ravel(), np.repeat(APART * size, polygons.shape[1]))
+    normals = _phi(domain, x[used][:, None] + apart[:, None, None] * _AROUND) @ _AROUND
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    return normals[vertices.reshape(polygons.shape)]
 
 
 def _slid(points: Array, along: Array, corners: Array) -> tuple[Array, Array]:

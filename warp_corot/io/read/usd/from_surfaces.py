@@ -1,4 +1,4 @@
-"""Surface files that trimesh reads as USD stages in memory: a Mesh prim for each of their parts, with its look."""
+"""Surface files read by trimesh as USD stages in memory: a Mesh prim for each part, with its look."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 
 from warp_corot.errors import InputError
+from warp_corot.io.files.quiet import bounded, quietly
 
-#: Where the prims are.
+#: Path of the prims.
 ROOT = "/scene"
 
 
 def stage_of_file(path: Path) -> Any:
-    """A stage in metres of the file's parts, placed as its scene places them, in its own coordinates.
+    """A stage, in metres, of the file's parts, placed by its scene, in the file's coordinates.
 
-    Parts keep their names, texture coordinates (``st``), and colours where the file gives them; a part that has
-    a colour or a texture in a file of its own is bound to a `UsdPreviewSurface`.
+    Parts keep their names, texture coordinates (``st``) and colours; a part with a colour or with a texture in a
+    separate file is bound to a `UsdPreviewSurface`.
 
     Raises:
         InputError: trimesh cannot read it.
@@ -26,7 +27,8 @@ def stage_of_file(path: Path) -> Any:
     try:
         import trimesh
 
-        scene = trimesh.load_scene(path, process=False, maintain_order=True)
+        with quietly(), bounded(path):
+            scene = trimesh.load_scene(path, process=False, maintain_order=True)
         nodes = [(scene.geometry[name], matrix, name) for matrix, name in map(scene.graph.get, _drawn(scene))]
     except ImportError:
         raise InputError(f'{path}: reading {path.suffix} files needs: pip install "warp-corot[surface]"') from None
@@ -130,7 +132,7 @@ def _bind_material(stage: Any, mesh: Any, material: Any, source: Path) -> None:
 
 
 def _texture_file(material: Any, source: Path) -> Path | None:
-    """The picture of a material, where it is a file beside the surface's."""
+    """The picture of a material, if it is a file beside the surface's."""
     named = (getattr(material, "kwargs", None) or {}).get("map_kd")
     image = getattr(material, "image", None)
     for name in (named, getattr(image, "filename", None)):

@@ -1,4 +1,4 @@
-"""Mesh prims of USD stages with what they look like: faces, texture coordinates, materials."""
+"""Mesh prims of USD stages with their appearance: faces, texture coordinates, materials."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ from warp_corot.io.read.tetrahedra import USD_SUFFIXES
 
 from .surfaces import DrawnMesh, drawn_meshes
 
-#: What frames give anew, or what no longer holds of a prim once its points are in the world's coordinates.
+#: Properties that frames give, or that become invalid when a prim's points are in world coordinates.
 STALE = ("points", "extent", "normals", "velocities", "accelerations", "primvars:normals", "tetraIndices")
-#: Of a prim that a simulation wrote: its stress, which its colours show.
+#: Properties that a simulation wrote: the stress, which the colours show.
 STRESS = "primvars:vonMises"
 COLORS = (STRESS, "primvars:displayColor", "primvars:displayColor:indices")
-#: Bindings are made anew; where there are several the first of these purposes counts.
+#: Bindings are made again; if there are several, the first of these purposes is used.
 PURPOSES = (UsdShade.Tokens.allPurpose, UsdShade.Tokens.preview, UsdShade.Tokens.full)
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """A Mesh prim as it stands in its stage.
+    """A Mesh prim of a stage.
 
     Attributes:
-        name: The prim's.
-        path: Of the prim.
+        name: Name of the prim.
+        path: Path of the prim.
         source: The file.
-        points: In the world [m], float64 [V, 3].
-        triangles: The fans of its faces, int32 [F, 3], wound as its outside is seen.
-        left_handed: Whether the faces as they are listed are wound the other way, in the world.
+        points: Points in the world [m], float64 [V, 3].
+        triangles: Fans of its faces, int32 [F, 3], counter-clockwise seen from outside.
+        left_handed: Whether the listed faces have the other orientation in the world.
         had_normals: Whether the prim gives normals.
-        smooth: Whether it is a subdivision surface, which needs none.
-        is_plain: Whether it has neither a material nor colours of its own, so that stress may colour it.
+        smooth: Whether it is a subdivision surface, which needs no normals.
+        is_plain: Whether it has neither a material nor its own colours, so that stress may colour it.
     """
 
     name: str
@@ -55,14 +55,14 @@ class Look:
     _stage: Any
 
     def placed(self, scale: float, offset: NDArray[np.float64]) -> Look:
-        """The same, its points times a factor and then moved."""
+        """The same look with its points scaled by a factor and then moved."""
         return replace(self, points=scale * self.points + offset)
 
     def copy_to(self, layer: Sdf.Layer, target: str, materials: str) -> None:
-        """Copy the prim, without points, normals and transform, to a path of a layer, and the materials that it and
-        its subsets are bound to under another.
+        """Copy the prim, without points, normals and transform, to a path of a layer, and the materials of the prim and
+        its subsets to another path.
 
-        Textures are named by absolute paths, so that they are found from the layer's file.
+        Textures get absolute paths, so that they are found from the layer's file.
         """
         flat = self._stage.GetRootLayer()
         Sdf.CreatePrimInLayer(layer, Sdf.Path(target).GetParentPath())
@@ -78,7 +78,7 @@ class Look:
             self._bind_material(layer, here, there, materials)
 
     def _bind_material(self, layer: Sdf.Layer, here: str, there: str, materials: str) -> None:
-        """Have a prim of the layer bound to a copy of the material that the prim it comes from is bound to."""
+        """Bind a prim of the layer to a copy of its original's material."""
         spec = layer.GetPrimAtPath(there)
         for name in [p.name for p in spec.properties if p.name.startswith("material:binding")]:
             spec.RemoveProperty(spec.properties[name])
@@ -113,12 +113,12 @@ def has_mesh(path: Path) -> bool:
 
 
 def has_looks(path: str | PathLike[str]) -> bool:
-    """Whether more than triangles is known of the surfaces in files of this name."""
+    """Whether files with this extension describe the appearance of surfaces."""
     return Path(path).suffix.lower() in (*USD_SUFFIXES, *UP_AXES)
 
 
 def look_of_triangles(path: str | PathLike[str], points: NDArray[Any], triangles: NDArray[Any]) -> Look:
-    """Triangles of a file as a prim of its name."""
+    """The triangles of a file as a prim with the file's name."""
     from .from_surfaces import stage_of_triangles
 
     source = Path(path)
@@ -128,15 +128,15 @@ def look_of_triangles(path: str | PathLike[str], points: NDArray[Any], triangles
 
 
 def read_looks(path: str | PathLike[str]) -> list[Look]:
-    """All Mesh prims of a stage that are drawn, at its first time, or the parts of another surface file as such.
+    """All visible Mesh prims of a stage, at its first time, or the parts of another surface file in the same form.
 
     Raises:
-        InputError: No such file, not a USD stage or another surface file, one that is wrong, or no faces in it.
+        InputError: The file does not exist, is not a USD stage or another surface file, is damaged, or has no faces.
     """
     source = Path(path)
     if source.suffix.lower() not in (*USD_SUFFIXES, *UP_AXES):
         known = ", ".join((*USD_SUFFIXES, *UP_AXES))
-        raise InputError(f"{source}: extension {source.suffix or '(none)'}, should be {known}")
+        raise InputError(f"{source}: extension {source.suffix or '(none)'}; it must be {known}")
     if not source.is_file():
         raise InputError(f"{source}: no such file")
     if source.suffix.lower() in UP_AXES:
@@ -188,7 +188,7 @@ def _flattened(stage: Any) -> Any:
 
 
 def _without_stale(spec: Any) -> None:
-    """Take from a Mesh prim what frames will give, what moves, and transforms; of the rest keep the first values."""
+    """Remove from a Mesh prim what frames will give, what moves, and transforms; keep the first values of the rest."""
     stale = (*STALE, *(COLORS if STRESS in spec.attributes else ()))
     for attribute in list(spec.attributes):
         samples = spec.layer.ListTimeSamplesForPath(attribute.path)

@@ -1,4 +1,5 @@
-"""What a stage says of physics that Newton's importer leaves open: which values it gives, and what gravity means."""
+"""Physics data of a stage that Newton's importer does not report: which values the file gives, and what gravity
+means."""
 
 from __future__ import annotations
 
@@ -12,22 +13,22 @@ from warp_corot.errors import InputError
 from warp_corot.io.files.quiet import quietly
 
 EARTH = 9.81
-#: What Newton takes for a Poisson's ratio of a half.
+#: Newton's substitute for a Poisson's ratio of one half.
 NEARLY_INCOMPRESSIBLE = 0.499
-#: Namespaces of the values of deformable bodies, as Newton's importer takes them.
+#: Namespaces of the attributes of deformable bodies that Newton's importer reads.
 _NAMESPACES = ("physics", "omniphysics", "physxDeformableBody")
 _BODY = "PhysicsDeformableBodyAPI"
 
 
 def material_said(prim: Any) -> dict[str, float]:
-    """What a stage gives of "young", "poisson", "density" and "friction" for a TetMesh prim, in its units.
+    """The values of "young", "poisson", "density" and "friction" that a stage gives for a TetMesh prim, in its units.
 
-    It is what Newton takes, but for the dynamic friction, which it passes over. It is of the physics material that is
-    bound to the prim; density also by a mass or a density of the deformable body, or by the masses of points or
-    elements: then it is there, but infinite. Zero density, by UsdPhysics, is none.
+    They are the values that Newton uses, except the dynamic friction, which it ignores. They come from the physics
+    material bound to the prim. A density may also come from a mass or a density of the deformable body, or from masses
+    of points or elements; it is then reported as infinite. In UsdPhysics, a zero density means none.
     """
     found: dict[str, float] = {}
-    with quietly():  # of bindings without their schema, which count all the same
+    with quietly():  # about bindings without their schema, which are valid all the same
         material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0].GetPrim()
     if material:
         young, poisson = _number(material, "youngsModulus"), _number(material, "poissonsRatio")
@@ -48,24 +49,24 @@ def material_said(prim: Any) -> dict[str, float]:
 
 
 def settle_gravity(stage: Any, source: Path) -> list[str]:
-    """Have physics scenes whose gravity is negative, which by UsdPhysics is the Earth's, say so in numbers.
+    """Replace negative gravity in physics scenes, which in UsdPhysics means the Earth's, by its value.
 
-    Newton takes infinite ones so and others as they are. It changes the layer that is edited.
+    Newton does so for infinite values only. This changes the edited layer.
 
     Returns:
-        Paths of the physics scenes, the first of which counts.
+        Paths of the physics scenes; the first one is used.
 
     Raises:
-        InputError: Gravity is not a number, or has a direction that is none.
+        InputError: Gravity is not a number, or its direction is invalid.
     """
     scenes = [prim for prim in stage.Traverse() if prim.IsA(UsdPhysics.Scene)]
     for prim in scenes:
         scene = UsdPhysics.Scene(prim)
         magnitude, direction = scene.GetGravityMagnitudeAttr().Get(), scene.GetGravityDirectionAttr().Get()
         if magnitude is not None and (math.isnan(magnitude) or magnitude == math.inf):
-            raise InputError(f"{source}: {prim.GetPath()}: physics:gravityMagnitude is {magnitude:g}, should be finite")
+            raise InputError(f"{source}: {prim.GetPath()}: gravityMagnitude is {magnitude:g}; it must be finite")
         if direction is not None and not all(map(math.isfinite, direction)):
-            raise InputError(f"{source}: {prim.GetPath()}: physics:gravityDirection is {direction}, should be finite")
+            raise InputError(f"{source}: {prim.GetPath()}: gravityDirection is {direction}; it must be finite")
         if magnitude is not None and magnitude < 0.0:
             scene.GetGravityMagnitudeAttr().Set(EARTH / UsdGeom.GetStageMetersPerUnit(stage))
     return [str(prim.GetPath()) for prim in scenes]
@@ -81,7 +82,7 @@ def is_physical(prim: Any) -> bool:
 
 def _deformable_body(prim: Any) -> Any:
     while prim and not prim.IsPseudoRoot():
-        listed = prim.GetMetadata("apiSchemas")  # has schemas, too, that OpenUSD does not know
+        listed = prim.GetMetadata("apiSchemas")  # includes schemas that OpenUSD does not know
         if _BODY in prim.GetAppliedSchemas() or (listed and _BODY in listed.GetAddedOrExplicitItems()):
             return prim
         prim = prim.GetParent()

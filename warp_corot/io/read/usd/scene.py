@@ -1,4 +1,4 @@
-"""Stages with tetrahedra as scenes to be simulated: opened, checked, and repaired in memory, never in their files."""
+"""Stages with tetrahedra as scenes to simulate: opened, checked, and repaired in memory, never in their files."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from .physics import is_physical, material_said, settle_gravity
 
 
 class Units(NamedTuple):
-    """What a stage's numbers are in: lengths in ``metres``, masses in ``kilograms``, time in seconds.
+    """Units of a stage's numbers: lengths in ``metres``, masses in ``kilograms``, time in seconds.
 
-    Everything else follows, as UsdPhysics has it: density in mass over length cubed, and so on.
+    All other units follow by the rules of UsdPhysics: density in mass over length cubed, and so on.
     """
 
     metres: float
@@ -45,11 +45,11 @@ class TetPrim(NamedTuple):
     """A TetMesh prim.
 
     Attributes:
-        path: Of the prim.
-        points: In its own space, float64 [N, 3].
-        tets: As the prim's orientation has them, after repair, int32 [T, 4].
-        repaired: How many were wound wrongly.
-        left_handed: What its orientation is.
+        path: Path of the prim.
+        points: Points in its own space, float64 [N, 3].
+        tets: Tetrahedra in the prim's orientation, after repair, int32 [T, 4].
+        repaired: Number of wrongly wound tetrahedra.
+        left_handed: Whether its orientation is left-handed.
     """
 
     path: str
@@ -61,20 +61,20 @@ class TetPrim(NamedTuple):
 
 @dataclass(eq=False)
 class Scene:
-    """A stage that has been opened to be simulated; what is changed in it is in its session layer.
+    """A stage opened for simulation; changes are in its session layer.
 
     Attributes:
         path: The file.
         stage: ``Usd.Stage``, without instances around what can move, and with animation stopped at its first time.
-        units: Of its numbers.
+        units: Units of its numbers.
         up_axis: "X", "Y" or "Z".
-        frame_rate: Time codes per second if the file says so.
+        frame_rate: Time codes per second if the file gives them.
         tets: Its TetMesh prims.
         animated: Paths of prims with transforms that change over time in the file.
         uninstanced: Paths of prims that were instances.
-        stopped: Paths of prims that the file animates, and whose animation physics does not follow.
-        skipped: Paths of TetMesh prims that are only patterns, of a point instancer.
-        physics_scenes: Paths of the prims that gravity comes from; the first of them counts.
+        stopped: Paths of prims with animation in the file that physics does not follow.
+        skipped: Paths of TetMesh prims that are only prototypes of a point instancer.
+        physics_scenes: Paths of the prims with gravity; the first one is used.
     """
 
     path: Path
@@ -91,15 +91,15 @@ class Scene:
 
     @property
     def says_metres(self) -> bool:
-        """Whether the file says how long its unit is."""
+        """Whether the file gives the length of its unit."""
         return bool(UsdGeom.StageHasAuthoredMetersPerUnit(self.stage))
 
     def says(self, path: str) -> dict[str, float]:
-        """What the file says of what a TetMesh prim is made of; see ``material_said``."""
+        """The material values that the file gives for a TetMesh prim; see ``material_said``."""
         return material_said(self.stage.GetPrimAtPath(path))
 
     def uses(self, file: Path) -> bool:
-        """Whether a file is one of the layers that the stage is made of."""
+        """Whether a file is one of the stage's layers."""
         used = (layer.realPath for layer in self.stage.GetUsedLayers())
         return any(name and file.exists() and file.samefile(name) for name in used if Path(name).exists())
 
@@ -115,7 +115,7 @@ class Scene:
         return np.asarray(given, dtype=np.float64).reshape(-1, 3) @ matrix[:3, :3] + matrix[3, :3]
 
     def bounds(self, path: str) -> NDArray[np.float64] | None:
-        """Corners of a box in the world around a prim and what is under it, float64 [2, 3]; None: it is empty."""
+        """Corners of the world's bounding box of a prim and its descendants, float64 [2, 3]; None: it is empty."""
         tokens = UsdGeom.Tokens
         purposes = [tokens.default_, tokens.render, tokens.proxy, tokens.guide]
         found = UsdGeom.BBoxCache(Usd.TimeCode.Default(), purposes).ComputeWorldBound(self.stage.GetPrimAtPath(path))
@@ -123,13 +123,13 @@ class Scene:
         return None if box.IsEmpty() else np.array([box.GetMin(), box.GetMax()], dtype=np.float64)
 
     def lowest(self, paths: Iterable[str]) -> float:
-        """How low prims and what is under them reach along the up axis, by their bounds; infinite if there are none."""
+        """The lowest coordinate of prims and their descendants along the up axis, by their bounds; infinite if none."""
         axis = "XYZ".index(self.up_axis)
         found = [self.bounds(path) for path in paths]
         return min((float(box[0, axis]) for box in found if box is not None), default=math.inf)
 
     def held(self, path: str) -> NDArray[np.intp]:
-        """Points of a TetMesh prim that the file says are held, by the primvar ``fixed`` of `UsdWriter`, indices."""
+        """Indices of a TetMesh prim's points that the file marks as fixed, by the primvar ``fixed`` of `UsdWriter`."""
         primvar = UsdGeom.PrimvarsAPI(self.stage.GetPrimAtPath(path)).GetPrimvar("fixed")
         given = primvar.Get(Usd.TimeCode.EarliestTime()) if primvar and primvar.HasAuthoredValue() else None
         return np.flatnonzero(np.asarray(() if given is None else given) == 1)
@@ -147,14 +147,15 @@ class Scene:
 def open_scene(path: str | PathLike[str]) -> Scene:
     """Open a stage with TetMesh prims.
 
-    Wrongly wound tetrahedra are turned round, which is counted; Newton would leave them out.
+    Wrongly wound tetrahedra are repaired and counted; Newton would leave them out.
 
     Raises:
-        InputError: No such file, no stage, units that are none, no TetMesh prim, or one that cannot be simulated.
+        InputError: The file does not exist, is not a stage, has invalid units, no TetMesh prim, or one that cannot be
+            simulated.
     """
     source = Path(path)
     if source.suffix.lower() not in USD_SUFFIXES:
-        raise InputError(f"{source}: extension {source.suffix or '(none)'}, should be {', '.join(USD_SUFFIXES)}")
+        raise InputError(f"{source}: extension {source.suffix or '(none)'}; it must be {', '.join(USD_SUFFIXES)}")
     if not source.is_file():
         raise InputError(f"{source}: no such file")
     return _scene_of(source)
@@ -169,12 +170,12 @@ def _scene_of(source: Path) -> Scene:
     stage.SetEditTarget(stage.GetSessionLayer())
     kilograms = float(UsdPhysics.GetStageKilogramsPerUnit(stage))
     if not (math.isfinite(kilograms) and kilograms > 0.0):
-        raise InputError(f"{source}: kilogramsPerUnit is {kilograms}, should be a positive number")
+        raise InputError(f"{source}: kilogramsPerUnit is {kilograms}; it must be a positive number")
     given = stage.GetRootLayer().timeCodesPerSecond if stage.HasAuthoredMetadata("timeCodesPerSecond") else None
     units = Units(metres_per_unit(stage, source), kilograms)
     up_axis = str(UsdGeom.GetStageUpAxis(stage))
     if up_axis not in ("X", "Y", "Z"):
-        raise InputError(f"{source}: upAxis is {up_axis!r}, should be 'Y' or 'Z'")
+        raise InputError(f"{source}: upAxis is {up_axis!r}; it must be 'Y' or 'Z'")
     scene = Scene(source, stage, units, up_axis, given)
     scene.uninstanced = _without_instances(stage)
     scene.animated, scene.stopped = _stop_animation(stage)
@@ -185,7 +186,7 @@ def _scene_of(source: Path) -> Scene:
         elif prim.IsA(UsdGeom.TetMesh):
             scene.tets.append(_tet_prim(prim, source))
     if not scene.tets and scene.skipped:
-        raise InputError(f"{source}: its only TetMesh prims are patterns of a point instancer: {scene.skipped[0]}")
+        raise InputError(f"{source}: its only TetMesh prims are prototypes of a point instancer: {scene.skipped[0]}")
     if not scene.tets:
         raise InputError(
             f"{source}: has no TetMesh prim; meshes of other kinds go into `warp-corot simulate`, "
@@ -195,7 +196,7 @@ def _scene_of(source: Path) -> Scene:
 
 
 def _without_instances(stage: Any) -> list[str]:
-    """Open up the instances that hold what can move by itself; of an instance only the whole can."""
+    """Break up the instances that contain prims that can move by themselves; an instance can only move as a whole."""
     opened: list[str] = []
     while moving := [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if _moves_in_instance(prim)]:
         instance = moving[0]
@@ -217,10 +218,10 @@ def _is_pattern(prim: Any) -> bool:
 
 
 def _stop_animation(stage: Any) -> tuple[list[str], list[str]]:
-    """Have transforms and points be what they are at their first time.
+    """Keep transforms and points at their values of the first time.
 
     Returns:
-        Paths of what has animated transforms, and of what of that, or of its points, physics would have to follow.
+        Paths of prims with animated transforms, and of those whose animation physics would have to follow.
     """
     animated, stopped = [], []
     for prim in stage.Traverse():
@@ -273,7 +274,7 @@ def _tet_prim(prim: Any, source: Path) -> TetPrim:
 
 
 def _check_in_world(prim: Any, points: NDArray[np.float64], tets: NDArray[np.int32], name: str) -> None:
-    """Refuse tetrahedra that lose their volume on their way into the world, where positions are float32."""
+    """Refuse tetrahedra that lose their volume in world coordinates, where positions are float32."""
     matrix = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim), dtype=np.float64)
     there = (points @ matrix[:3, :3] + matrix[3, :3]).astype(np.float32).astype(np.float64)
     before, after = signed_volumes(points, tets), signed_volumes(there, tets)

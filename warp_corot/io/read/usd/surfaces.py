@@ -15,13 +15,13 @@ from warp_corot.io.files.usd import metres_per_unit, open_stage, reads_stage
 
 
 class DrawnMesh(NamedTuple):
-    """A Mesh prim that is drawn, at its first time.
+    """A visible Mesh prim at its first time.
 
     Attributes:
         mesh: The prim, a `UsdGeom.Mesh`.
-        points: In the world, in the stage's unit, float64 [N, 3].
-        triangles: The fans of its faces less its holes, int64 [T, 3], wound as its outside is seen.
-        left_handed: Whether the faces as they are listed are wound the other way, in the world.
+        points: Points in the world, in the stage's unit, float64 [N, 3].
+        triangles: Fans of its faces without holes, int64 [T, 3], counter-clockwise seen from outside.
+        left_handed: Whether the listed faces have the other orientation in the world.
         smooth: Whether it is a subdivision surface.
     """
 
@@ -33,10 +33,10 @@ class DrawnMesh(NamedTuple):
 
 
 def drawn_meshes(stage: Any, path: Path) -> Iterator[DrawnMesh]:
-    """The Mesh prims with faces that are drawn, instances included.
+    """The visible Mesh prims with faces, instances included.
 
     Raises:
-        InputError: Faces that do not fit their points.
+        InputError: Faces that do not match their points.
     """
     time = Usd.TimeCode.EarliestTime()
     cache = UsdGeom.XformCache(time)
@@ -63,14 +63,14 @@ def drawn_meshes(stage: Any, path: Path) -> Iterator[DrawnMesh]:
 def read_usd_surface(
     path: Path,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], float, str, list[str], list[tuple[str, int]]]:
-    """All drawn Mesh prims of a stage as one surface.
+    """All visible Mesh prims of a stage as one surface.
 
     Returns:
         Points [N, 3] in the stage's unit, triangles [T, 3], metres in that unit, the up axis, notes for the user,
-        and the names of the prims with how many triangles each has.
+        and the names of the prims with the number of triangles of each.
 
     Raises:
-        InputError: Not a stage, or one that is wrong.
+        InputError: The file is not a stage, or a damaged one.
     """
     stage = open_stage(path)
     metres = metres_per_unit(stage, path)
@@ -78,7 +78,7 @@ def read_usd_surface(
     objects = []
     for drawn in drawn_meshes(stage, path):
         if drawn.smooth:
-            notes.append(f"{drawn.mesh.GetPath()} is a subdivision surface, taken as its control mesh")
+            notes.append(f"{drawn.mesh.GetPath()} is a subdivision surface; its control mesh is used")
         points.append(drawn.points)
         triangles.append(drawn.triangles + offset)
         objects.append((drawn.mesh.GetPrim().GetName(), len(drawn.triangles)))
@@ -88,12 +88,12 @@ def read_usd_surface(
 
 
 def _triangles(mesh: UsdGeom.Mesh, path: Path, time: Usd.TimeCode) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points and the fans of a mesh's polygons, less its holes."""
+    """Points and the fans of a mesh's polygons, without holes."""
     points = np.asarray(_earliest(mesh.GetPointsAttr(), time), dtype=np.float64).reshape(-1, 3)
     counts = np.asarray(_earliest(mesh.GetFaceVertexCountsAttr(), time), dtype=np.int64)
     indices = np.asarray(_earliest(mesh.GetFaceVertexIndicesAttr(), time), dtype=np.int64)
     if (counts < 3).any() or counts.sum() != len(indices):
-        raise InputError(f"{mesh.GetPath()} in {path}: its faces name {len(indices)} corners, should be {counts.sum()}")
+        raise InputError(f"{path}: {mesh.GetPath()}: faces name {len(indices)} corners; they must name {counts.sum()}")
     bad = indices[(indices < 0) | (indices >= len(points))]
     if len(bad):
         raise InputError(f"{path}: prim {mesh.GetPath()} names point {bad[0]} but has points 0 to {len(points) - 1}")
@@ -108,7 +108,7 @@ def _triangles(mesh: UsdGeom.Mesh, path: Path, time: Usd.TimeCode) -> tuple[NDAr
 
 
 def _earliest(attribute: Usd.Attribute, time: Usd.TimeCode) -> Any:
-    """An attribute's value by default, or at the first time there is; empty without one."""
+    """An attribute's default value, or its first time sample; empty without one."""
     value = attribute.Get()
     if value is None:
         value = attribute.Get(time)

@@ -17,15 +17,15 @@ from warp_corot.io.read.filemesh import sets_of_numbers
 
 @dataclass(frozen=True)
 class StageTets:
-    """The tetrahedra of a stage, all its prims joined, in world space.
+    """The tetrahedra of all prims of a stage, joined, in world space.
 
     Attributes:
-        points: At rest [m], float64 [N, 3].
+        points: Rest positions [m], float64 [N, 3].
         tets: int32 [T, 4].
-        up_axis: The stage's.
-        metres: Its metres per unit.
-        prims: Names of the prims, and how many of the tetrahedra each has, in their order.
-        node_sets: Nodes that primvars of whole numbers tell apart, indices int64 [n].
+        up_axis: The stage's up axis.
+        metres: The stage's metres per unit.
+        prims: Names of the prims, and the number of tetrahedra of each, in order.
+        node_sets: Node sets from primvars of whole numbers, indices int64 [n].
     """
 
     points: NDArray[np.float64]
@@ -38,17 +38,17 @@ class StageTets:
 
 @reads_stage
 def read_usd_tets(path: Path) -> StageTets:
-    """Reads every tetrahedral prim of a stage.
+    """Read every tetrahedral prim of a stage.
 
-    The rest shape is the primvar ``rest`` where there is one (as in files written by `UsdWriter`), else ``points`` at
-    the default time, else at the first time sample; so too where the mesh changes over time. Inactive and abstract
+    The rest shape is the primvar ``rest`` if there is one (as in files of `UsdWriter`), else ``points`` at
+    the default time, else at the first time sample, also if the mesh changes over time. Inactive and abstract
     prims are left out; instances are read.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
 
     Raises:
-        InputError: The file is no USD stage, or has no tetrahedra, or their indices are not four to a tetrahedron.
+        InputError: The file is not a USD stage, has no tetrahedra, or their indices are not a multiple of four.
     """
     stage = open_stage(path)
     metres = metres_per_unit(stage, path)
@@ -90,7 +90,7 @@ def read_usd_tets(path: Path) -> StageTets:
 
 
 def _node_sets(prim: Any, count: int) -> dict[str, NDArray[np.int64]]:
-    """The sets of a prim's points that its primvars of whole numbers tell apart."""
+    """The node sets that a prim's primvars of whole numbers define."""
     found: dict[str, NDArray[np.int64]] = {}
     for primvar in UsdGeom.PrimvarsAPI(prim).GetPrimvars():
         if primvar.GetInterpolation() != UsdGeom.Tokens.vertex or primvar.IsIndexed():
@@ -103,7 +103,7 @@ def _node_sets(prim: Any, count: int) -> dict[str, NDArray[np.int64]]:
 
 
 def _tet_indices(prim, path: Path) -> NDArray[np.int64] | None:
-    """Tetrahedra [T, 4] of a prim, or None where it has none."""
+    """Tetrahedra [T, 4] of a prim, or None if it has none."""
     if prim.IsA(UsdGeom.TetMesh):
         attribute = UsdGeom.TetMesh(prim).GetTetVertexIndicesAttr()
     elif prim.IsA(UsdGeom.PointBased) and prim.HasAttribute("tetraIndices"):
@@ -117,7 +117,7 @@ def _tet_indices(prim, path: Path) -> NDArray[np.int64] | None:
         return None
     flat = np.asarray(value).reshape(-1)
     if flat.dtype.kind not in "iu":
-        raise InputError(f"{path}: {attribute.GetPath()} is of type {attribute.GetTypeName()}, should be integers")
+        raise InputError(f"{path}: {attribute.GetPath()} is of type {attribute.GetTypeName()}; it must be integers")
     if len(flat) % 4:
         raise InputError(f"{path}: {attribute.GetPath()} has {len(flat)} indices, not a multiple of four")
     return flat.astype(np.int64).reshape(-1, 4)

@@ -1,4 +1,5 @@
-"""Layers of an animation that is played from pieces by value clips: what varies, and the root that plays the pieces."""
+"""Layers of an animation that value clips play in pieces: the attributes that vary, and the root that plays the
+pieces."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ _CLIP_SET = "default"
 
 
 def varying_attributes(static: Sdf.Layer) -> dict[str, Sdf.ValueTypeName]:
-    """Paths and types of a layer's attributes that have no value, the ones that frames give."""
+    """Paths and types of a layer's attributes without a value, which frames give."""
     found: dict[str, Sdf.ValueTypeName] = {}
 
     def visit(path: Sdf.Path) -> None:
@@ -23,7 +24,7 @@ def varying_attributes(static: Sdf.Layer) -> dict[str, Sdf.ValueTypeName]:
 
 
 def declare_attributes(layer: Sdf.Layer, static: Sdf.Layer, attributes: Mapping[str, Sdf.ValueTypeName]) -> None:
-    """Make attributes in a layer, without values, at the frame rate of another one."""
+    """Declare attributes in a layer, without values, at the frame rate of another layer."""
     layer.timeCodesPerSecond = static.timeCodesPerSecond
     layer.framesPerSecond = static.framesPerSecond
     for path, type_name in attributes.items():
@@ -32,12 +33,12 @@ def declare_attributes(layer: Sdf.Layer, static: Sdf.Layer, attributes: Mapping[
 
 
 def new_root(suffix: str, static: Sdf.Layer, folder: str, start: float) -> Sdf.Layer:
-    """The small stage on top of what does not change.
+    """The small stage on top of the static layer.
 
     Args:
-        suffix: Of the stage's file.
-        static: What does not change, ``static.usdc`` in the folder.
-        folder: Of the pieces, relative to the stage, so that both move together.
+        suffix: Extension of the stage's file.
+        static: The static layer, ``static.usdc`` in the folder.
+        folder: Folder of the pieces, relative to the stage, so that both can be moved together.
         start: First time code.
     """
     root = Sdf.Layer.CreateAnonymous(suffix)
@@ -50,7 +51,7 @@ def new_root(suffix: str, static: Sdf.Layer, folder: str, start: float) -> Sdf.L
 
 
 def play_pieces(root: Sdf.Layer, folder: str, pieces: Sequence[tuple[float, float]]) -> None:
-    """Have a stage play the pieces of a folder, given the first and last time code of each."""
+    """Let a stage play the pieces of a folder, given the first and last time code of each."""
     root.endTimeCode = pieces[-1][1]
     prim = Sdf.CreatePrimInLayer(root, f"/{root.defaultPrim}")
     files = [Sdf.AssetPath(f"{folder}/piece-{index:06d}.usdc") for index in range(len(pieces))]
@@ -65,7 +66,7 @@ def play_pieces(root: Sdf.Layer, folder: str, pieces: Sequence[tuple[float, floa
 
 
 def set_time_range(layer: Sdf.Layer, time_code: float) -> None:
-    """Have a layer's time codes reach up to one more."""
+    """Extend a layer's range of time codes up to this one."""
     if not layer.HasStartTimeCode():
         layer.startTimeCode = time_code
     layer.endTimeCode = time_code

@@ -1,4 +1,4 @@
-"""The physics of a written body: its materials, gravity, and what makes it a deformable body to physics programs."""
+"""The physics of a written body: its materials, gravity, and the schemas of a deformable body."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pxr import Gf, Sdf, UsdGeom, UsdPhysics, UsdShade, Vt
 
 from .prims import PHYSICS, ROOT, TETS, Present
 
-#: Elements of more different materials than this have theirs in primvars alone.
+#: With more distinct materials than this, only primvars describe the elements' materials.
 MOST_MATERIALS = 64
-#: What a deformable material says, after Newton's importer, and what it is here.
+#: Attributes of a deformable material, named as in Newton's importer, and their sources here.
 _NAMES = {"youngsModulus": "young", "poissonsRatio": "poisson", "density": "density"}
 
 
@@ -21,18 +21,18 @@ def declare_physics(
 ) -> None:
     """Declare a body's materials, in SI units.
 
-    Under ``/SoftBody/physics`` there is a `UsdShade.Material` for each material that elements have, with
+    Under ``/SoftBody/physics`` there is a `UsdShade.Material` for each material of the elements, with
     ``PhysicsMaterialAPI`` (its density) and ``PhysicsVolumeDeformableMaterialAPI`` (``physics:youngsModulus`` [Pa],
     ``physics:poissonsRatio``), bound for physics to the TetMesh, or to subsets of its tetrahedra if there are several;
-    to the body itself where the TetMesh is not written. The body is a deformable body whose simulation mesh is the
-    TetMesh, and whose surface goes along. A physics scene has the gravity.
+    to the body if the TetMesh is not written. The body is a deformable body whose simulation mesh is the
+    TetMesh, and whose surface follows. A physics scene has the gravity.
 
     Args:
-        stage: With the body's prims.
+        stage: Stage with the body's prims.
         present: The body.
-        with_tets: Whether its TetMesh is there.
-        changing: Whether the mesh may become another one: then subsets would not stay true.
-        gravity: [m/s^2].
+        with_tets: Whether its TetMesh is written.
+        changing: Whether the mesh may change, which would invalidate subsets.
+        gravity: Acceleration [m/s^2].
     """
     UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
     UsdGeom.Scope.Define(stage, PHYSICS)

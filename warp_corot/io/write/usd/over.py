@@ -1,4 +1,4 @@
-"""The motion of a scene as a layer over the stage that it came from, which keeps its looks and everything else."""
+"""The motion of a scene as a layer over its input stage, which keeps its looks and everything else."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from warp_corot.io.read.usd.scene import Scene, TetPrim
 from .over_prims import BodyOver, PointsOver, TetsOver, bind_look, draw_ground
 from .pieces import PieceStore, Samples
 
-#: Metadata of the stage below that the stage on top has of its own.
+#: Metadata that the stage on top copies from the stage below.
 _OWN = ("subLayers", "subLayerOffsets", "startTimeCode", "endTimeCode", "timeCodesPerSecond", "framesPerSecond")
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Points of a Mesh prim that go along with a body.
+    """Points of a Mesh prim that follow a body.
 
     Attributes:
-        path: Of the prim.
-        points: In the world at the beginning, float64 [V, 3].
+        path: Path of the prim.
+        points: Initial points in the world, float64 [V, 3].
     """
 
     path: str
@@ -40,13 +40,13 @@ class Surface:
 
 @dataclass(frozen=True)
 class State:
-    """What a frame shows, in the stage's units and in the world.
+    """The content of a frame, in the stage's units and in the world.
 
     Attributes:
-        positions, velocities: Of each TetMesh's points, in the order they were given, float32 [N, 3].
-        von_mises: Of each TetMesh's tetrahedra [Pa], float32 [T].
+        positions, velocities: Of the points of each TetMesh, in the given order, float32 [N, 3].
+        von_mises: Of the tetrahedra of each TetMesh [Pa], float32 [T].
         bodies: Poses of the rigid bodies, for row vectors, float64 [B, 4, 4].
-        surfaces: Of each surface's points, float32 [V, 3].
+        surfaces: Points of each surface, float32 [V, 3].
     """
 
     positions: Sequence[NDArray[np.float32]]
@@ -57,28 +57,28 @@ class State:
 
 
 class SceneWriter:
-    """Writes frames of a scene to a stage that has the scene's own as a sublayer; it opens at any moment.
+    """Write frames of a scene to a stage with the scene's own stage as a sublayer; it is valid at any moment.
 
-    The units, axis, materials, cameras and all else are those of the stage below, which must stay where it is, seen
-    from the output, unless ``flatten`` is set. Frame i is time code i. Of each TetMesh: ``points``, ``velocities``,
-    ``extent``, the primvar ``vonMises`` (uniform, one a tetrahedron [Pa]) and, where the stage gives no
-    ``displayColor`` or ``show_stress`` is set, that: averages of the stress at nodes in the 256 colours of
-    `colors.stress_colors`; custom data of the default prim name the map and its range, which is found as `UsdWriter`
-    has it. Of rigid bodies: ``xformOp:transform:simulated``. Of surfaces that go along: ``points`` and ``extent``.
+    Units, axis, materials, cameras and everything else come from the stage below, which must keep its place relative to
+    the output, unless ``flatten`` is set. Frame i is time code i. Each TetMesh has ``points``, ``velocities``,
+    ``extent`` and the primvar ``vonMises`` (uniform, one a tetrahedron [Pa]). If the stage gives no ``displayColor``,
+    or ``show_stress`` is set, that shows nodal averages of the stress in the 256 colours of `colors.stress_colors`;
+    custom data of the default prim name the map and its range, which is found as in `UsdWriter`. Rigid bodies have
+    ``xformOp:transform:simulated``; surfaces that follow have ``points`` and ``extent``.
 
     Args:
-        path: Where to: .usd, .usdc or .usda.
+        path: The output: .usd, .usdc or .usda.
         scene: The stage below.
-        tets: Which of its TetMesh prims move.
-        bodies: Paths of the rigid bodies, with their poses at the beginning, float64 [4, 4] each.
-        surfaces: What else goes along.
+        tets: Its TetMesh prims that move.
+        bodies: Paths of the rigid bodies, with their initial poses, float64 [4, 4] each.
+        surfaces: Surfaces that follow.
         fps: Frames per second of simulated time.
-        ground: Three points of a plane that is to be drawn, [4, 3] corners in the world; None: nothing.
-        show_stress: Whether the stress takes the place of the prims' own look.
-        flatten: Whether everything is joined into one file at the end.
+        ground: Corners of a plane to draw, [4, 3] in the world; None: no plane.
+        show_stress: Whether the stress replaces the prims' own look.
+        flatten: Whether to join everything into one file at the end.
 
     Raises:
-        InputError: A path that cannot be written to, or a file that the scene is made of.
+        InputError: A path that cannot be written to, or a file that is part of the scene.
     """
 
     def __init__(
@@ -97,9 +97,9 @@ class SceneWriter:
         self._store = _Store(path, scene.path)
         self.path = self._store.path
         if self.path.exists() and self.path.samefile(scene.path):
-            raise InputError(f"{self.path}: is the input, should be another file")
+            raise InputError(f"{self.path}: is the input; it must be another file")
         if scene.uses(self.path):
-            raise InputError(f"{self.path}: is part of the input {scene.path}, should be another file")
+            raise InputError(f"{self.path}: is part of the input {scene.path}; it must be another file")
         self.frames = 0
         self._scene, self._flatten, self._show_stress = scene, flatten, show_stress
         self._layer = _base_layer(scene, fps)
@@ -119,17 +119,17 @@ class SceneWriter:
 
     @property
     def stress_range(self) -> tuple[float, float]:
-        """Stresses [Pa] at the two ends of the colour map, so far."""
+        """Stresses [Pa] at the two ends of the colour map so far."""
         return 0.0, self._top
 
     def write(self, state: State) -> None:
         """Add a frame.
 
         Raises:
-            OSError: Could not be written, as when the disk is full; the frames before stay and play.
+            OSError: It could not be written, for example because the disk is full; former frames stay and play.
         """
         if self._closed:
-            raise InputError(f"{self.path}: is closed, no frame can be added")
+            raise InputError(f"{self.path}: is closed; frames must be added before")
         if not self.frames:
             self._store.declare(self._layer)
         samples: Samples = {}
@@ -148,10 +148,10 @@ class SceneWriter:
         self.frames += 1
 
     def close(self) -> None:
-        """Join all frames into one file; called again it does nothing.
+        """Join all frames into one file; further calls do nothing.
 
         Raises:
-            OSError: It could not be written; what was written before stays, and plays.
+            OSError: It could not be written; former frames stay and play.
         """
         if self._closed:
             return
@@ -172,7 +172,7 @@ class SceneWriter:
 
 
 class _Store(PieceStore):
-    """Frames over a stage: it lies beneath all that is written, and the pieces give values to all its root prims."""
+    """Frames over a stage, which lies beneath all layers; the pieces give values to all its root prims."""
 
     def __init__(self, path: str | Path, below: Path):
         super().__init__(path)
@@ -210,7 +210,7 @@ def _base_layer(scene: Scene, fps: float) -> Sdf.Layer:
 
 
 def _way(path: Path, below: Path) -> str:
-    """How a layer finds the one below: relative to its own folder, so that both can be moved together."""
+    """The path of the layer below: relative to this layer's folder, so that both can be moved together."""
     try:
         found = Path(os.path.relpath(below, path.parent.resolve())).as_posix()
     except ValueError:  # another drive

@@ -1,4 +1,4 @@
-"""The prims of a scene that move, as specs of a layer over their stage."""
+"""The moving prims of a scene, as specs of a layer over their stage."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LOOK = "simulated_look"
 
 
 class PointsOver:
-    """A prim with points that frames give. Where something above it moves, they are in the world's coordinates."""
+    """A prim whose points are given by frames; in world coordinates if an ancestor moves."""
 
     def __init__(self, layer: Sdf.Layer, scene: Scene, path: str, moving: set[str]):
         self.path, self._scene = path, scene
@@ -40,7 +40,7 @@ class PointsOver:
         return {f"{self.path}.points": Vt.Vec3fArray.FromNumpy(x), f"{self.path}.extent": extent(x)}
 
     def refresh_normals(self) -> None:
-        """Block normals of the beginning; who draws the prim finds those of its points."""
+        """Block the initial normals; renderers compute normals from the points."""
         for name in ("normals", "primvars:normals"):
             if self._scene.has(self.path, name):
                 Sdf.AttributeSpec(self._prim, name, Sdf.ValueTypeNames.Normal3fArray).default = Sdf.ValueBlock()
@@ -83,7 +83,7 @@ class TetsOver(PointsOver):
         }
 
     def colors(self, samples: Samples, top: float) -> Samples:
-        """Colours out of the stresses of a frame, for a range from 0 to ``top`` [Pa]."""
+        """Colours for the stresses of a frame, for a range from 0 to ``top`` [Pa]."""
         if not self._colored:
             return {}
         nodal = self._average(np.asarray(samples[f"{self.path}.primvars:vonMises"]))
@@ -91,13 +91,13 @@ class TetsOver(PointsOver):
 
 
 class BodyOver:
-    """A rigid body's prim: all that it is made of goes along."""
+    """A rigid body's prim, with all its descendants."""
 
     def __init__(self, layer: Sdf.Layer, scene: Scene, path: str, pose: NDArray[np.float64], moving: set[str]):
         spec = Sdf.CreatePrimInLayer(layer, path)
         Sdf.AttributeSpec(spec, _MOTION, Sdf.ValueTypeNames.Matrix4d)
         self._attribute = f"{path}.{_MOTION}"
-        # What the prim's transform has besides the pose of the body: scale, above all.
+        # The part of the prim's transform besides the body's pose, mostly scale.
         self._own = scene.matrix(path) @ np.linalg.inv(pose)
         self._inverse = np.linalg.inv(scene.matrix(scene.parent(path)))
         below = _is_below(scene.parent(path), moving)
@@ -132,7 +132,7 @@ def draw_ground(layer: Sdf.Layer, corners: NDArray[np.float64]) -> None:
 
 
 def bind_look(layer: Sdf.Layer, paths: Sequence[str]) -> None:
-    """Have prims drawn in their ``displayColor``, whatever material they have, by a stronger binding of their own."""
+    """Let prims be drawn in their ``displayColor``, with any material, by a stronger binding."""
     stage = Usd.Stage.Open(layer)
     material = UsdShade.Material.Define(stage, f"/{_LOOK}")
     reader = UsdShade.Shader.Define(stage, f"/{_LOOK}/color")
@@ -147,7 +147,7 @@ def bind_look(layer: Sdf.Layer, paths: Sequence[str]) -> None:
     for path in paths:
         spec = layer.GetPrimAtPath(path)
         spec.SetInfo("apiSchemas", Sdf.TokenListOp.Create(prependedItems=["MaterialBindingAPI"]))
-        # Not the binding of all purposes, which may be what physics is read from.
+        # Not the binding for all purposes, which may define the physics.
         for purpose in (UsdShade.Tokens.full, UsdShade.Tokens.preview):
             name = f"material:binding:{purpose}"
             relationship = Sdf.RelationshipSpec(spec, name, False)

@@ -1,15 +1,15 @@
-"""A growing USD animation on disk that opens at every moment, whatever ends the process that writes it.
+"""A growing USD animation on disk that is valid at every moment, even if the writing process is killed.
 
-A USD file saved again and again in place does not open when the process dies while saving. So frames are collected and
-written aside as *pieces*, complete binary files in a folder ``NAME.usd.pieces`` beside the stage, each written under a
+If a process dies while it saves a USD file in place, the file does not open. So frames are collected and
+written as *pieces*, complete binary files in a folder ``NAME.usd.pieces`` beside the stage, each written under a
 temporary name, synced to disk and renamed. After each piece a small root stage that plays all of them (value clips)
-replaces the file at the final path in one rename. At the end everything is joined into one file, again written aside
-and renamed over the final path, and the pieces are removed.
+replaces the file at the final path in one rename. At the end everything is joined into one file, again written
+under a temporary name and renamed over the final path, and the pieces are removed.
 
-Attributes that only change now and then, as the topology of a mesh does, have a sample where they change. A clip plays
-nothing from the one before, so that each piece begins with what holds then. Between two samples of one length OpenUSD
-interpolates floating-point arrays, and it cannot know that their points are others; so where that would be, what was
-holds until just before the change.
+Attributes that change only now and then, like the topology of a mesh, have a sample where they change. A clip does not
+play samples of former clips, so each piece begins with the current values. Between two samples of equal length OpenUSD
+interpolates floating-point arrays, even if their points differ; in that case, the former values
+are repeated just before the change.
 """
 
 import contextlib
@@ -29,9 +29,9 @@ from warp_corot.io.files.whole import sync
 
 from .clips import declare_attributes, new_root, play_pieces, set_time_range, varying_attributes
 
-# All that a run's folder ever holds; \w{6} is what OpenUSD's own temporary files end in.
+# All files that a run's folder ever holds; \w{6} is the ending of OpenUSD's own temporary files.
 _OURS = re.compile(r"(piece|part)-\d{6}\.usdc|(part-)?(static|manifest|root|joined)\.usd[ac]?|part-\w+\.\w{6}|lock")
-#: How long before a frame [time codes] what is not to be interpolated still holds.
+#: How long before a frame [time codes] values that must not be interpolated are repeated.
 JUST_BEFORE = 2.0**-10
 
 Samples = dict[str, Any]
@@ -42,14 +42,14 @@ class PieceStore:
     """Keeps the frames of one stage: `add` each, then `finish`.
 
     Args:
-        path: The stage, .usd, .usda or .usdc. A file there stays as it is until the first piece is complete.
-        flush_seconds: About the most wall time [s] of frames that a sudden end may lose. Doubled and more where
-            writing is so slow that it would take more than a fifth of the time.
+        path: The stage, .usd, .usda or .usdc. A former file stays until the first piece is complete.
+        flush_seconds: Approximate wall time [s] of frames that a sudden end may lose. It is doubled, and more, if
+            writing would otherwise take more than a fifth of the time.
         flush_bytes: A piece is also written when this much data waits.
 
     Raises:
-        InputError: Another extension, a folder in the way, an output folder that is not there or not writable,
-            a write-protected file, or another process that is writing this very stage.
+        InputError: Another extension, a folder with this name, an output folder that does not exist or is not writable,
+            a write-protected file, or another process is writing this stage.
     """
 
     def __init__(self, path: str | Path, *, flush_seconds: float = 2.0, flush_bytes: int = 256 << 20):
@@ -62,17 +62,17 @@ class PieceStore:
         self._refuse_second_writer(InputError)
 
         self.custom_data: dict[str, Any] = {}
-        """Custom data of the default prim as of the last frame added."""
+        """Custom data of the default prim at the last frame."""
         self.layer_data: dict[str, Any] = {}
-        """The same of the layer."""
+        """Custom data of the layer at the last frame."""
         self._static: Sdf.Layer | None = None
         self._varying: dict[str, Sdf.ValueTypeName] = {}
         self._root: Sdf.Layer | None = None
         self._follows: dict[str, str] = {}
         self._last: Samples = {}  # the latest value of each attribute
-        self._carried: Samples = {}  # as they were when the last piece was written
+        self._carried: Samples = {}  # the values at the time of the last written piece
         self._pieces: list[tuple[float, float]] = []  # first and last time code of each
-        self._repeated: list[frozenset[str]] = []  # what each piece begins with that is no sample of its own
+        self._repeated: list[frozenset[str]] = []  # the initial values of each piece that are not its own samples
         self._pending: list[tuple[float, Samples]] = []
         self._pending_bytes = 0
         self._flush_seconds = flush_seconds
@@ -82,33 +82,33 @@ class PieceStore:
         self._broken = False
 
     def declare(self, static: Sdf.Layer, follows: Mapping[str, str] | None = None) -> None:
-        """Takes the layer with all that does not change; its attributes without a value are the ones that frames give.
+        """Set the layer with everything that does not change; frames give its attributes without a value.
 
         Its stage metadata (units, axis, frame rate) become those of the stage; it must name a default prim. The first
-        frame gives all attributes; later ones may leave out what stays as it is.
+        frame gives all attributes; later ones may omit those that do not change.
 
         Args:
             static: The layer.
-            follows: For attributes [n] of things that are other ones after a change, the attribute that a frame gives
-                if they are: values before and after are not interpolated.
+            follows: For attributes [n] whose things differ after a change, the attribute that a frame gives at that
+                change: values before and after it are not interpolated.
         """
         self._static = static
         self._follows = dict(follows or {})
         self._varying = varying_attributes(static)
 
     def add(self, time_code: float, samples: Samples, nbytes: int) -> None:
-        """Takes the values of one frame, ``nbytes`` of them, and writes a piece when it is time to.
+        """Add the values of one frame, of size ``nbytes``, and write a piece when it is due.
 
         Raises:
-            OSError: Could not be written, as when the disk is full; the frames for which there is room, from the first
-                on, stay and play.
+            OSError: It could not be written, for example because the disk is full; the frames that fit, from the first
+                one on, are kept and play.
         """
         if self._broken:
             raise OSError(f"{self.path}: could not be written further, see the error before")
         unknown = samples.keys() - self._varying.keys()
         assert not unknown, f"not declared as varying: {unknown}"
         now = time.monotonic()
-        if not self._pieces and not self._pending:  # what came before the first frame is no frame to lose
+        if not self._pieces and not self._pending:  # time before the first frame cannot lose a frame
             self._last_flush = self._last_add = now
         held = self._held_over(samples)
         if held:
@@ -118,15 +118,15 @@ class PieceStore:
         self._last |= samples
         gap, self._last_add = now - self._last_add, now
         interval = max(self._flush_seconds, 4.0 * self._flush_cost)
-        # The next frame comes after another such gap: waiting for it must not outlast the interval.
+        # The next frame comes after another gap of this length, which must not exceed the interval.
         if now - self._last_flush + gap > interval or self._pending_bytes >= self._flush_bytes:
             self.flush()
 
     def flush(self) -> None:
-        """Writes the frames that wait as a piece and lets the stage play it.
+        """Write the waiting frames as a piece and let the stage play it.
 
         Raises:
-            OSError: as `add`.
+            OSError: As in `add`.
         """
         if not self._pending:
             return
@@ -141,15 +141,15 @@ class PieceStore:
         self._flush_cost = self._last_flush - started
 
     def finish(self, transform: Callable[[Samples], Mapping[str, Any]] | None = None) -> None:
-        """Joins all frames into one file at the final path and removes the pieces.
+        """Join all frames into one file at the final path and remove the pieces.
 
         Args:
-            transform: Called with the values of each frame; returns those that change.
+            transform: Called with the values of each frame; returns the changed ones.
 
         Raises:
             OSError: The joined file could not be written. The pieces stay, and the stage plays them.
         """
-        if self._broken:  # the error has been raised before; the root stage plays what there is
+        if self._broken:  # the error was raised before; the root stage plays the written pieces
             self._release()
             return
         if self._static is None or not (self._pieces or self._pending):
@@ -157,7 +157,7 @@ class PieceStore:
             return
         joined = Sdf.Layer.CreateAnonymous(self.path.suffix)
         joined.TransferContent(self._static)
-        opened: list[Sdf.Layer] = []  # kept open: the joined layer's arrays lie in their mapped files
+        opened: list[Sdf.Layer] = []  # kept open, because the joined layer uses arrays in their mapped files
         try:
             for time_code, samples in self._with_bar(opened):
                 if transform:
@@ -180,10 +180,10 @@ class PieceStore:
         self._remove_stale_runs()
 
     def _write_piece(self, count: int) -> None:
-        """Write the first ``count`` frames that wait as a piece, and let the stage play it.
+        """Write the first ``count`` waiting frames as a piece, and let the stage play it.
 
         Raises:
-            OSError: It cannot be written; all frames wait as before.
+            OSError: It cannot be written; all frames still wait.
         """
         if not self._is_open:
             self._open_run()
@@ -207,11 +207,11 @@ class PieceStore:
             self._remove_stale_runs()
 
     def _keep_what_fits(self, count: int) -> None:
-        """Write as many of the frames that wait as there is room for, from the first on, in ever smaller pieces."""
+        """Write as many of the waiting frames as fit, from the first on, in ever smaller pieces."""
         while self._pending and count:
             times = [time_code for time_code, _ in self._pending]
             if count < len(times) and times[count] - times[count - 1] == JUST_BEFORE:
-                count -= 1  # what holds until just before a frame goes with it
+                count -= 1  # the values repeated just before a frame are written with it
                 continue
             try:
                 self._write_piece(count)
@@ -223,7 +223,7 @@ class PieceStore:
             self._remove_run(self._run)
 
     def _kept(self) -> str:
-        """After a failure: what is left, in words."""
+        """The result after a failure, in words."""
         if not self._pieces:
             return "no frame could be kept"
         return (
@@ -249,7 +249,7 @@ class PieceStore:
         yield from self._pending
 
     def _with_bar(self, opened: list[Sdf.Layer]) -> Iterator[tuple[float, Samples]]:
-        """The same; joining them takes as long as the disk does, and terminals show how far it is."""
+        """All frames; joining them takes as long as the disk needs, and terminals show a bar."""
         from tqdm import tqdm
 
         count = len(self._pending) + round(sum(last - first + 1.0 for first, last in self._pieces))
@@ -262,7 +262,8 @@ class PieceStore:
                 bar.update()
 
     def _held_over(self, samples: Samples) -> Samples:
-        """What must be said to hold until just before a frame, lest it is interpolated with what the frame gives."""
+        """Values that must be repeated just before a frame, so that they are not interpolated with those of the
+        frame."""
         changed = (path for path, what in self._follows.items() if what in samples and path in self._last)
         return {path: self._last[path] for path in changed if len(self._last[path]) == len(samples[path])}
 
@@ -297,7 +298,7 @@ class PieceStore:
             layer.customLayerData = {**layer.customLayerData, **self.layer_data}
 
     def _open_run(self) -> None:
-        """Makes the folder of this run with what all its pieces share."""
+        """Make the folder of this run with the files that all its pieces share."""
         assert self._static is not None
         self._refuse_second_writer(OSError)
         try:
@@ -314,7 +315,7 @@ class PieceStore:
         self._is_open = True
 
     def _write(self, layer: Sdf.Layer, target: Path, aside: str | None = None) -> None:
-        """Writes a layer wholly or not at all: aside in the run's folder, synced, then renamed over the target."""
+        """Write a layer completely or not at all: in the run's folder, synced, then renamed over the target."""
         part = self._run / (aside or (f"part-root{target.suffix}" if target == self.path else f"part-{target.name}"))
         if part.name.startswith("part-piece-"):
             part = part.with_name(part.name.replace("part-piece-", "part-"))
@@ -343,13 +344,13 @@ class PieceStore:
         return [run for run in self.pieces_folder.glob("run-*") if run.is_dir() and run != self._run]
 
     def _remove_stale_runs(self) -> None:
-        """Removes what killed runs on this path left: nothing plays it any more."""
+        """Remove the files that killed runs on this path left, which no stage plays any more."""
         for run in self._other_runs():
             if not is_locked(run / "lock"):
                 self._remove_run(run)
 
     def _remove_run(self, run: Path) -> None:
-        """Removes the files that are ours from a run's folder, and the folders if nothing else is in them."""
+        """Remove our files from a run's folder, and the folders if they are then empty."""
         if run == self._run:
             self._release()
         with contextlib.suppress(OSError):

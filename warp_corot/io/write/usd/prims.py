@@ -1,4 +1,4 @@
-"""What the prims of an animated body are made of, and the prims of surfaces that are bound to it."""
+"""Data of the prims of an animated body, and the prims of surfaces that are bound to it."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from .pieces import Samples
 ROOT, TETS, SURFACE = "/SoftBody", "/SoftBody/tetrahedra", "/SoftBody/surface"
 MATERIALS = "/SoftBody/materials"
 PHYSICS = "/SoftBody/physics"
+OBSTACLES = "/SoftBody/obstacles"
 
 Limits = tuple[float, float]
 
@@ -34,7 +35,7 @@ class Frame(NamedTuple):
 
 
 class Present(NamedTuple):
-    """A body's mesh: points at rest [N, 3] [m], tetrahedra, all right-handed, int32 [T, 4], the average from
+    """A body's mesh: rest positions [N, 3] [m], right-handed tetrahedra, int32 [T, 4], the average from
     tetrahedra to nodes, held nodes (a mask or indices) or None, and the material or None."""
 
     points: NDArray[np.float64]
@@ -46,7 +47,7 @@ class Present(NamedTuple):
 
 @dataclass(frozen=True)
 class Statics:
-    """What holds for all frames: whether they give velocities and stress."""
+    """Properties of all frames: whether they have velocities and stress."""
 
     velocities: bool
     stress: bool
@@ -57,9 +58,9 @@ class SkinPrim:
 
     Args:
         skin: The surface.
-        path: Of the prim.
+        path: Path of the prim.
         rest: Points of the body's mesh at rest [m], [N, 3].
-        changing: Whether the mesh may become another one, and the surface with it if it is the mesh's boundary.
+        changing: Whether the mesh may change, and with it the surface if that is the mesh's boundary.
     """
 
     def __init__(self, skin: Skin, path: str, rest: NDArray[np.float64], *, changing: bool):
@@ -72,7 +73,7 @@ class SkinPrim:
         self.follow(skin, rest)
 
     def follow(self, skin: Skin, rest: NDArray[np.float64]) -> None:
-        """Draw the surface as it is bound to a mesh of these points from the next frame on."""
+        """Draw the surface bound to another mesh with these rest positions from the next frame on."""
         self._skin, self._rest = skin, np.asarray(rest, dtype=np.float64)
 
     @property
@@ -82,7 +83,7 @@ class SkinPrim:
         return {f"{self._path}.{name}": f"{self._path}.faceVertexIndices" for name in own}
 
     def declare(self, stage: Any, statics: Statics) -> None:
-        """As `TetPrims.declare`."""
+        """As in `TetPrims.declare`."""
         look, surface = self._skin.look, self._skin.surface
         if look is not None:
             look.copy_to(stage.GetRootLayer(), self._path, MATERIALS)
@@ -108,7 +109,7 @@ class SkinPrim:
         declare_moving(mesh, statics.stress, colored=self._with_colors)
 
     def samples(self, frame: Frame) -> Samples:
-        """As `TetPrims.samples`."""
+        """As in `TetPrims.samples`."""
         surface = self._skin.surface
         x = surface.moved(frame.positions - self._rest).astype(np.float32)
         samples: Samples = {
@@ -130,7 +131,7 @@ class SkinPrim:
         return samples
 
     def colors(self, samples: Samples, limits: Limits, _: Any = None) -> Samples:
-        """As `TetPrims.colors`."""
+        """As in `TetPrims.colors`."""
         stress = samples.get(f"{self._path}.primvars:vonMises")
         if not self._with_colors or stress is None:
             return {}
@@ -143,8 +144,8 @@ def _are_same(one: SurfaceMesh, other: SurfaceMesh) -> bool:
 
 
 def skin_paths(skins: Sequence[Skin]) -> list[str]:
-    """A path for each, all different, after their names."""
-    taken = {TETS, MATERIALS, PHYSICS}
+    """A distinct path for each skin, after its name."""
+    taken = {TETS, MATERIALS, PHYSICS, OBSTACLES}
     paths = []
     for skin in skins:
         name = path = f"{ROOT}/{Tf.MakeValidIdentifier(skin.name)}"
@@ -166,7 +167,7 @@ def declare_triangles(mesh: Any) -> None:
 
 
 def triangle_samples(path: str, triangles: NDArray[np.int32]) -> Samples:
-    """Values of the faces of a Mesh prim of this path."""
+    """Values of the faces of the Mesh prim at this path."""
     return {
         f"{path}.faceVertexCounts": Vt.IntArray(len(triangles), 3),
         f"{path}.faceVertexIndices": Vt.IntArray.FromNumpy(np.ascontiguousarray(triangles).reshape(-1)),
@@ -174,7 +175,7 @@ def triangle_samples(path: str, triangles: NDArray[np.int32]) -> Samples:
 
 
 def declare_moving(body: Any, with_stress: bool, colored: bool = True) -> None:
-    """Points, extent and, if it has any, colours: of stress, or of tissue where none is given."""
+    """Declare points, extent and, if it has any, colours: of the stress, or else of tissue."""
     body.CreatePointsAttr()
     body.CreateExtentAttr()
     if colored and with_stress:
@@ -187,14 +188,14 @@ def declare_moving(body: Any, with_stress: bool, colored: bool = True) -> None:
 
 
 def floats(values: Any, shape: tuple[int, ...], name: str) -> NDArray[np.float32]:
-    """As float32 of a shape.
+    """An array as float32 with this shape.
 
     Raises:
         InputError: Another shape.
     """
     array = np.ascontiguousarray(values.numpy() if hasattr(values, "numpy") else values, dtype=np.float32)
     if array.shape != shape:
-        raise InputError(f"{name} has shape {list(array.shape)}, should be {list(shape)}")
+        raise InputError(f"{name} has shape {list(array.shape)}; it must be {list(shape)}")
     return array
 
 

@@ -1,4 +1,4 @@
-"""The prims of an animated body's tetrahedra and of their boundary, also while the mesh changes."""
+"""The prims of an animated body's tetrahedra and of their boundary, also for meshes that change."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ UNITS = {"young": " [Pa]", "poisson": "", "density": " [kg/m³]"}
 
 
 class TetPrims:
-    """The TetMesh prim and, if it is to be drawn, the Mesh of the boundary.
+    """The TetMesh prim and, if it is drawn, the Mesh of the boundary.
 
     Args:
         present: The body at rest.
         boundary: Whether the boundary is drawn.
-        changing: Whether the mesh may become another one.
+        changing: Whether the mesh may change.
     """
 
     def __init__(self, present: Present, *, boundary: bool, changing: bool):
@@ -50,7 +50,7 @@ class TetPrims:
         self.follow(present)
 
     def follow(self, present: Present) -> None:
-        """Draw the body as it is from the next frame on."""
+        """Draw this mesh from the next frame on."""
         self._present = present
         self._surface = SurfaceTriangles(boundary_faces(present.tets)[0])
 
@@ -62,12 +62,12 @@ class TetPrims:
         return found | {f"{SURFACE}.{name}": f"{SURFACE}.faceVertexIndices" for name in ("points", "velocities")}
 
     def declare(self, stage: Any, statics: Statics) -> None:
-        """Everything that does not change, and the attributes that do, without values."""
+        """Declare everything that does not change, and the attributes that do, without values."""
         tets = UsdGeom.TetMesh.Define(stage, TETS)
         tets.CreateTetVertexIndicesAttr()
         tets.CreateSurfaceFaceVertexIndicesAttr()
         tets.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
-        # Drawn beside its surface it would show twice, and Hydra takes its uniform primvars for values per face.
+        # Beside its surface it would be drawn twice, and Hydra takes its uniform primvars for values per face.
         tets.CreatePurposeAttr(UsdGeom.Tokens.guide)
         if statics.velocities:
             tets.CreateVelocitiesAttr()
@@ -84,7 +84,7 @@ class TetPrims:
                 stage.GetAttributeAtPath(path).Set(value)
 
     def samples(self, frame: Frame) -> Samples:
-        """Values of a frame, but for colours."""
+        """Values of a frame without colours."""
         x, v = frame.positions, frame.velocities
         samples: Samples = {f"{TETS}.points": Vt.Vec3fArray.FromNumpy(x), f"{TETS}.extent": extent(x)}
         if v is not None:
@@ -99,7 +99,7 @@ class TetPrims:
         return samples | self._changes() if self._changing else samples
 
     def colors(self, samples: Samples, limits: Limits, nodal: NDArray[np.float64] | None = None) -> Samples:
-        """Colours of a frame out of its stresses, and of what it says of the mesh if that has become another one."""
+        """Colours for the stresses of a frame, and the data of the mesh if it has changed."""
         if STRESS not in samples:
             return {}
         if nodal is None:
@@ -121,7 +121,7 @@ class TetPrims:
         return self._present.average(stress)
 
     def _changes(self) -> Samples:
-        """What has become another since the last frame of that which does not change in every one."""
+        """Changed values among those that do not change in every frame."""
         before, self._said = self._said, (self._present, self._surface)
         if before is not None and before[0] is self._present:
             return {}
@@ -181,7 +181,7 @@ class TetPrims:
 
 
 class SurfaceTriangles:
-    """The boundary of tetrahedra: its faces [F, 3] by the mesh's nodes, and its nodes and triangles by themselves."""
+    """The boundary of tetrahedra: its faces [F, 3] in the mesh's nodes, and its own nodes and triangles."""
 
     def __init__(self, faces: NDArray[np.int32]):
         self.faces = faces

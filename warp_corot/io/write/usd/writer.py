@@ -1,4 +1,4 @@
-"""Simulated frames as a USD stage: the tetrahedra and their surface, or smooth surfaces in place of it."""
+"""Simulated frames as a USD stage: the tetrahedra and their boundary, or smooth surfaces in place of it."""
 
 import logging
 import math
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pxr import Kind, Sdf, Usd, UsdGeom
 
+from warp_corot.contact.tool import Obstacle
 from warp_corot.errors import InputError
 from warp_corot.io.pictures.colors import COLORMAP_NAME, VertexAverage, round_limit
 from warp_corot.io.write.provenance import KEY
@@ -17,6 +18,7 @@ from warp_corot.io.write.skins import Skin
 from warp_corot.mesh.surfaces.boundary import signed_volumes
 
 from .materials import declare_physics
+from .obstacles import ObstaclePrim, obstacle_prims
 from .pieces import PieceStore, Samples
 from .prims import ROOT, SURFACE, TETS, Frame, Present, SkinPrim, Statics, floats, skin_paths
 from .tets import TetPrims
@@ -25,7 +27,7 @@ __all__ = ["ROOT", "SURFACE", "TETS", "Mesh", "UsdWriter"]
 
 
 class Mesh(Protocol):
-    """What the writer needs of a mesh: ``points`` [N, 3] [m] and ``tets`` [T, 4]."""
+    """The part of a mesh that the writer needs: ``points`` [N, 3] [m] and ``tets`` [T, 4]."""
 
     @property
     def points(self) -> NDArray[np.float64]: ...
@@ -35,53 +37,60 @@ class Mesh(Protocol):
 
 
 class UsdWriter:
-    """Writes one body's frames to a USD stage that opens at any moment, whatever ends the run (see `usd_pieces`).
+    """Write one body's frames to a USD stage that is valid at any moment, even if the run is killed (see `usd.pieces`).
 
-    The stage, in metres: ``/SoftBody`` (the default prim) with ``tetrahedra``, a `UsdGeom.TetMesh` of purpose *guide*,
-    and ``surface``, a `UsdGeom.Mesh` of the surface nodes only, which viewers draw. Frame i is time code i. Of the
-    TetMesh: ``points``, ``velocities`` [m/s] and ``extent`` a frame, as of surfaces; primvars ``rest`` (vertex),
-    ``fixed`` (vertex, 1 where held), ``young`` [Pa], ``poisson``, ``density`` [kg/m³] (constant, or uniform: one a
-    tetrahedron) and ``vonMises`` [Pa] (uniform, a frame). Both prims show the stress as ``displayColor``: averages over
-    the tetrahedra around each node, as indices into the 256 colours of `colors.stress_colors`; custom data of
-    ``/SoftBody`` name the map and its range. ``/SoftBody/physics`` has the physics materials, and with ``gravity`` a
-    physics scene, as `usd_materials.declare_physics` says.
+    The stage, in metres, has ``/SoftBody`` (the default prim) with ``tetrahedra``, a `UsdGeom.TetMesh` of purpose
+    *guide*, and ``surface``, a `UsdGeom.Mesh` of only the surface nodes, which viewers draw. Frame i is time code i.
+    Both have ``points``, ``velocities`` [m/s] and ``extent`` in each frame. The TetMesh has primvars ``rest`` (vertex),
+    ``fixed`` (vertex, 1 if held), ``young`` [Pa], ``poisson``, ``density`` [kg/m³] (constant, or uniform: one a
+    tetrahedron) and ``vonMises`` [Pa] (uniform, in each frame). Both prims show the stress as ``displayColor``:
+    averages over the tetrahedra around each node, as indices into the 256 colours of `colors.stress_colors`; custom
+    data of ``/SoftBody`` name the map and its range. ``/SoftBody/physics`` has the physics materials, and with
+    ``gravity`` a physics scene, see `usd.materials.declare_physics`.
 
     The colour range, unless given, starts at 0 and ends at the 99th percentile of the highest frame so far, rounded
-    up to few digits (`colors.round_limit`); on closing, earlier frames are coloured again with the last range, so that
-    one range holds for all.
+    up to few digits (`colors.round_limit`). On closing, earlier frames are coloured again with the last range, so that
+    all frames share it.
 
-    Mirrored tetrahedra are written with two indices swapped, so that all are right-handed as the schema wants.
+    Mirrored tetrahedra are written with two indices swapped, so that all are right-handed as the schema requires.
 
-    With ``skins`` these surfaces take the place of ``surface``, and the TetMesh is left out unless ``tets`` is set.
+    With ``skins`` these surfaces replace ``surface``, and the TetMesh is only written if ``tets`` is set.
     Each is a Mesh under its own name with ``points``, ``normals``, ``extent`` and the primvar ``vonMises`` (vertex
-    [Pa]) a frame, and coloured likewise. One that keeps a prim's look has that prim's faces, primvars, subsets and
-    materials (copied to ``/SoftBody/materials``) and colours instead, and normals, now of its vertices, if it had any.
+    [Pa]) in each frame, coloured in the same way. A skin with a prim's look has that prim's faces, primvars, subsets
+    and materials (copied to ``/SoftBody/materials``) and colours instead, and vertex normals if the prim had normals.
 
-    Of a body whose mesh changes, ``tetVertexIndices`` and all that goes by tetrahedra, nodes or faces are time samples
-    too, those that are not given a frame only where the mesh is another one. They hold until then: OpenUSD interpolates
-    no integers, and no arrays of two lengths; where lengths agree by chance, a sample just before the frame (by
-    `usd_pieces.JUST_BEFORE`) keeps points of different nodes from being interpolated. Between frames points go along
-    their ``velocities``, as the schema has it for meshes that change.
+    For a body whose mesh changes, ``tetVertexIndices`` and all attributes per tetrahedron, node or face are time
+    samples too; those that are not given in each frame are given when the mesh changes, and hold until then. OpenUSD
+    interpolates neither integers nor arrays of different lengths; if lengths agree by chance, a sample just before the
+    frame (by `usd.pieces.JUST_BEFORE`) prevents the interpolation of different nodes. Between frames points move with
+    their ``velocities``, as the schema defines it for meshes that change.
+
+    Obstacles are prims below ``/SoftBody/obstacles``: a Sphere, Capsule, Cylinder, Cube or Plane each; a tool has its
+    place, its turn and the force and torque on it in each frame (`usd.obstacles.ObstaclePrim`).
 
     Args:
-        path: Where to: .usd or .usdc (binary) or .usda (text). A file there stays until the first frames are safe.
+        path: The output: .usd or .usdc (binary) or .usda (text). A former file stays until the first frames are
+            complete.
         mesh: The body's mesh at rest.
         fps: Frames per second of simulated time.
-        fixed: Held nodes, mask [N] or indices.
-        material: Has ``young`` [Pa], ``poisson``, ``density`` [kg/m³], each a number or an array [T].
+        fixed: Fixed nodes, mask [N] or indices.
+        material: An object with ``young`` [Pa], ``poisson``, ``density`` [kg/m³], each a number or an array [T].
         up_axis: "X", "Y" or "Z"; None: the mesh's own, else "Y".
         stress_range: Lowest and highest stress of the colour map [Pa].
-        flush_seconds: About the most wall time [s] whose frames a sudden end may lose.
+        flush_seconds: Approximate wall time [s] whose frames a sudden end may lose.
         skins: Surfaces bound to the mesh's nodes.
-        tets: Whether the TetMesh is written; None: if there are no skins.
-        changing: Whether the mesh may become another one between frames (`change_mesh`).
-        gravity: [m/s^2], for a physics scene.
+        tets: Whether to write the TetMesh; None: only without skins.
+        changing: Whether the mesh may change between frames (`change_mesh`).
+        gravity: Acceleration [m/s^2], for a physics scene.
+        obstacles: What the body touches in a simulation.
+        world: The world in which tools are drawn.
 
     Attributes:
-        about: What the layer's custom data say of the run under "warp_corot"; may become more until it is closed.
+        about: Data about the run for the layer's custom data, under "warp_corot"; entries may be added until it is
+            closed.
 
     Raises:
-        InputError: A path that cannot be written to (said now, not after the simulation), or arguments that do not fit.
+        InputError: A path that cannot be written to (checked before the simulation), or arguments that do not fit.
     """
 
     def __init__(
@@ -99,14 +108,16 @@ class UsdWriter:
         tets: bool | None = None,
         changing: bool = False,
         gravity: Sequence[float] | None = None,
+        obstacles: Sequence[Obstacle] = (),
+        world: int = 0,
     ):
         up_axis = up_axis or getattr(mesh, "up_axis", "Y")
         if up_axis not in ("X", "Y", "Z"):
-            raise InputError(f"up_axis is {up_axis!r}, should be X, Y or Z")
+            raise InputError(f"up_axis is {up_axis!r}; it must be X, Y or Z")
         if not (np.isfinite(fps) and fps > 0.0):
-            raise InputError(f"fps is {fps}, should be a positive number")
+            raise InputError(f"fps is {fps}; it must be a positive number")
         if stress_range is not None and not 0.0 <= stress_range[0] < stress_range[1] < math.inf:
-            raise InputError(f"stress_range is {stress_range}, should be two rising stresses in Pa")
+            raise InputError(f"stress_range is {stress_range}; it must be two rising stresses in Pa")
         self._store = PieceStore(path, flush_seconds=flush_seconds)
         self.path = self._store.path
         self.frames = 0
@@ -119,7 +130,8 @@ class UsdWriter:
         self._tets = TetPrims(self._present, boundary=not skins, changing=changing) if tets or not skins else None
         named = zip(skins, skin_paths(skins), strict=True)
         self._skins = [SkinPrim(skin, path, mesh.points, changing=changing) for skin, path in named]
-        self._prims: list[TetPrims | SkinPrim] = [*([self._tets] if self._tets else []), *self._skins]
+        self._prims: list[TetPrims | SkinPrim | ObstaclePrim] = [*([self._tets] if self._tets else []), *self._skins]
+        self._prims += obstacle_prims(obstacles, self._present.points, world)
         self._range_given = stress_range is not None
         self._stress_range = stress_range or (0.0, 0.0)
         self._ranges_used: set[tuple[float, float]] = set()
@@ -128,26 +140,26 @@ class UsdWriter:
 
     @property
     def stress_range(self) -> tuple[float, float]:
-        """Stresses [Pa] at the two ends of the colour map, so far."""
+        """Stresses [Pa] at the two ends of the colour map so far."""
         return self._stress_range
 
     def change_mesh(
         self, mesh: Mesh, *, fixed: ArrayLike | None = None, material: Any = None, skins: Sequence[Skin] = ()
     ) -> None:
-        """From the next frame on the body has another mesh, of the same region.
+        """Give the body another mesh of the same region, from the next frame on.
 
         Args:
-            mesh: At rest.
-            fixed, material: As when this was made.
+            mesh: The mesh at rest.
+            fixed, material: As in the constructor.
             skins: The same surfaces, bound to the mesh.
 
         Raises:
-            InputError: The writer was not told that the mesh may change, or another number of skins.
+            InputError: The writer was made without ``changing``, or the number of skins differs.
         """
         if not self._changing:
             raise InputError(f"{self.path}: the mesh cannot change; the writer must be made with changing=True")
         if len(skins) != len(self._skins):
-            raise InputError(f"there are {len(skins)} skins now, should be {len(self._skins)} as before")
+            raise InputError(f"there are {len(skins)} skins now; there must be {len(self._skins)} as before")
         self._present = _present(mesh, fixed, material)
         if self._tets:
             self._tets.follow(self._present)
@@ -157,7 +169,7 @@ class UsdWriter:
     def write(
         self, positions: ArrayLike, *, velocities: ArrayLike | None = None, von_mises: ArrayLike | None = None
     ) -> None:
-        """Adds a frame; all frames give the same of the optional arguments.
+        """Add a frame; all frames must have the same optional arguments.
 
         Args:
             positions: [N, 3] [m], in the mesh's node order.
@@ -165,11 +177,11 @@ class UsdWriter:
             von_mises: [T] [Pa].
 
         Raises:
-            InputError: A shape that does not fit the mesh, or another choice of arguments than in the first frame.
-            OSError: Could not be written, as when the disk is full; the frames of the pieces before stay and play.
+            InputError: A shape that does not fit the mesh, or other optional arguments than in the first frame.
+            OSError: It could not be written, for example because the disk is full; former frames stay and play.
         """
         if self._closed:
-            raise InputError(f"{self.path}: is closed, no frame can be added")
+            raise InputError(f"{self.path}: is closed; frames must be added before")
         given = (velocities is not None, von_mises is not None)
         if self._given is None:
             self._given = given
@@ -198,15 +210,15 @@ class UsdWriter:
         self.frames += 1
 
     def flush(self) -> None:
-        """Makes the frames so far safe now, instead of when it is time to; the stage plays them.
+        """Write the frames so far to disk now; the stage plays them.
 
         Raises:
-            OSError: as `write`.
+            OSError: As in `write`.
         """
         self._store.flush()
 
     def close(self) -> None:
-        """Joins all frames into one file and removes the pieces; called again it does nothing.
+        """Join all frames into one file and remove the pieces; further calls do nothing.
 
         Raises:
             OSError: The joined file could not be written; the pieces stay, and the stage plays them.
@@ -259,7 +271,7 @@ class UsdWriter:
         return found if self._changing else {}
 
     def _static_layer(self) -> Sdf.Layer:
-        """Everything that does not change, and the attributes that do, without values."""
+        """The layer with everything that does not change, and the attributes that do, without values."""
         assert self._given is not None
         layer = Sdf.Layer.CreateAnonymous(".usdc")
         stage = Usd.Stage.Open(layer)
@@ -297,4 +309,7 @@ def _right_handed(tets: NDArray[np.int32], mirrored: NDArray[np.bool_]) -> NDArr
 
 
 def _nbytes(values: Any) -> int:
-    return memoryview(values).nbytes
+    try:
+        return memoryview(values).nbytes
+    except TypeError:  # a quaternion
+        return 16
