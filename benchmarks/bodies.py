@@ -1,19 +1,19 @@
-"""How true meshes are to their bodies: every triangle mesh and scan that installs with Warp, PyVista, nilearn, Newton
-and MuJoCo (``body_files.py``), and shapes made for trouble (``body_shapes.py``).
+"""Fidelity of meshes to their bodies: every triangle mesh and scan that comes with Warp, PyVista, nilearn, Newton
+and MuJoCo (``body_files.py``), and deliberately difficult shapes (``body_shapes.py``).
 
-Each body goes the way of the command line, ``warp-corot simulate BODY --tets N``, in a process of its own with limits
-of time and memory, so that one that hangs or bursts does not end the table:
+Each body is processed like by the command line, ``warp-corot simulate BODY --tets N``, in a separate process with
+limits on time and memory, so that one that hangs or exhausts memory does not end the table:
 
     python benchmarks/bodies.py                           all of them, at 20,000 elements
-    python benchmarks/bodies.py knot sheet pyvista/       those whose names hold one of these words
-    python benchmarks/bodies.py --fall                    and each by defaults for 2 s: does it topple?
+    python benchmarks/bodies.py knot sheet pyvista/       those whose names contain one of these words
+    python benchmarks/bodies.py --fall                    and each with defaults for 2 s: does it topple?
     python benchmarks/bodies.py -o after.md --json after.json --before before.json
 
-Falls are of 5,000 elements (``--fall-tets``). Numbers that ``--json`` has already stay there where a run does not
-find them again, so that ``--no-mesh --fall`` adds the falls and ``--no-mesh -o table.md`` writes the table alone.
+Falls have 5,000 elements (``--fall-tets``). Numbers already in the ``--json`` file stay there unless a run
+finds them again, so ``--no-mesh --fall`` adds the falls and ``--no-mesh -o table.md`` only writes the table.
 
-It needs ``pip install "warp-corot[surface,scans,vti,mesh]" pyvista nilearn newton mujoco``; of what is not there
-nothing is in the table. Columns are explained above the table.
+It needs ``pip install "warp-corot[surface,scans,vti,mesh]" pyvista nilearn newton mujoco``; the table leaves out
+bodies of packages that are missing. A legend above the table explains the columns.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from body_files import Body, all_bodies, as_input
 
 TETS, FALL_TETS = 20_000, 5_000
 SECONDS, GIGABYTES = 300.0, 8.0
-#: What a fall finds; all else is of the mesh.
+#: Results of a fall; all others belong to the mesh.
 FALL = ("fall", "fall_failed", "free", "held", "fall_notes")
 
 
 def limited(gigabytes: float) -> None:
-    """Let this process have no more memory."""
+    """Limit the memory of this process."""
     import resource
 
     size = int(gigabytes * 2**30)
@@ -48,7 +48,7 @@ def limited(gigabytes: float) -> None:
 
 
 def run_one(options: argparse.Namespace) -> int:
-    """Measure one body in this process and print what was found, a line of JSON for the mesh and one for the fall."""
+    """Measure one body in this process and print the results, a line of JSON for the mesh and one for the fall."""
     from body_runs import fallen, measured
 
     limited(options.gigabytes)
@@ -66,7 +66,7 @@ def run_one(options: argparse.Namespace) -> int:
 
 
 def in_process(body: Body, options: argparse.Namespace) -> dict[str, Any]:
-    """What a process of its own found of a body, and how it ended if it ended badly."""
+    """The results for a body from a separate process, and how it ended if it failed."""
     command = [sys.executable, __file__, "--one", body.name, "--tets", str(options.tets), "--device", options.device]
     command += ["--gigabytes", str(options.gigabytes), "--fall-tets", str(options.fall_tets)]
     for name in ("path", "previews"):
@@ -90,7 +90,7 @@ def in_process(body: Body, options: argparse.Namespace) -> dict[str, Any]:
 
 
 def found_of(body: Body, earlier: dict[str, Any], options: argparse.Namespace) -> dict[str, Any]:
-    """What is found of a body now, and what was before where it is not looked for."""
+    """The new results for a body, with the earlier ones that were not measured again."""
     kept = {name: value for name, value in earlier.items() if (not options.fall if name in FALL else options.no_mesh)}
     if options.no_mesh and not (options.fall and {"elements", "tets"} & earlier.keys()):
         return kept
@@ -99,18 +99,18 @@ def found_of(body: Body, earlier: dict[str, Any], options: argparse.Namespace) -
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("words", nargs="*", help="only bodies whose names hold one of these")
-    parser.add_argument("--tets", type=int, default=TETS, help=f"elements asked for (default: {TETS})")
-    parser.add_argument("--fall", action="store_true", help="also let each fall by defaults for 2 s")
+    parser.add_argument("words", nargs="*", help="only bodies whose names contain one of these")
+    parser.add_argument("--tets", type=int, default=TETS, help=f"number of elements (default: {TETS})")
+    parser.add_argument("--fall", action="store_true", help="also let each fall with defaults for 2 s")
     parser.add_argument("--fall-tets", type=int, default=FALL_TETS, help=f"elements of falls (default: {FALL_TETS})")
-    parser.add_argument("--no-mesh", action="store_true", help="keep what --json has of meshes")
-    parser.add_argument("--previews", type=Path, help="a folder for a picture of each fall's ends")
+    parser.add_argument("--no-mesh", action="store_true", help="keep the results of meshes in --json")
+    parser.add_argument("--previews", type=Path, help="a folder for pictures of the first and last frame of each fall")
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="most a body may take (default: 300)")
-    parser.add_argument("--gigabytes", type=float, default=GIGABYTES, help="most memory it may take (default: 8)")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="time limit for a body (default: 300)")
+    parser.add_argument("--gigabytes", type=float, default=GIGABYTES, help="memory limit for a body (default: 8)")
     parser.add_argument("-o", "--output", type=Path, help="Markdown file for the table (default: printed at the end)")
     parser.add_argument("--json", type=Path, help="also write the numbers")
-    parser.add_argument("--before", type=Path, help="numbers of an earlier run, to stand beside")
+    parser.add_argument("--before", type=Path, help="numbers of an earlier run for comparison")
     parser.add_argument("--list", action="store_true", help="name the bodies and stop")
     parser.add_argument("--new", action="store_true", help="only bodies that --json does not have")
     parser.add_argument("--one", help=argparse.SUPPRESS)

@@ -1,4 +1,4 @@
-"""The table of ``bodies.py``: a line a body, and what all of them come to."""
+"""The table of ``bodies.py``: one line for each body, and totals."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ from dataclasses import dataclass
 from typing import Any
 
 LEGEND = """\
-Elements are made and, in brackets, a share of those asked for; volume is the mesh's over the input's. Distances are
-mean and 95 % of the mesh's surface from the input's and back, in thousandths of the body's longest side (‰). Pieces
-are the mesh's of the input's: elements that share a face are one piece, and so are parts of a surface, or voxels, that
-touch; labels are those that no element has. "angle" is the smallest dihedral angle. "s" is processor time from the file
-to mesh, surface and this measuring, kernels loaded, and in brackets the time that passed while others used the machine.
-"said" is whether the command warns: **no** where it should (volume off by more than 3 %, a piece or label lost or
-broken off) and does not. "fall" is the largest displacement in 2 s by defaults over the height. Of several bodies in
-one file elements, volumes and pieces are summed, and distances are the largest."""
+Elements are those made and, in brackets, over those requested; volume is the mesh's over the input's. Distances are
+mean and 95 % of the mesh's surface from the input's and back, in thousandths of the body's longest side (‰). Pieces are
+those of the mesh and of the input: elements that share a face, parts of a surface that touch, or voxels that touch, are
+one piece; labels are listed if no element has them. "angle" is the smallest dihedral angle. "s" is processor time from
+the file to mesh, surface and these measurements, without loading kernels; the brackets have the wall time on a shared
+machine. "said" is whether the command warns: **no** where it should (volume off by more than 3 %, a piece or label lost
+or broken off) and does not. "fall" is the largest displacement in 2 s with defaults, over the height. For several
+bodies in one file, elements, volumes and pieces are summed, and distances are the largest."""
 
 GOOD_VOLUME, BAD_VOLUME = 0.01, 0.03
 
 
 @dataclass(frozen=True)
 class Row:
-    """What was found of a body: numbers by name, or why there are none."""
+    """The results for a body: numbers by name, or the reason why there are none."""
 
     name: str
     found: dict[str, Any]
@@ -35,8 +35,8 @@ class Row:
         f = self.found
         warnings = [note for note in f["notes"] if "would help" in note]
         pieces = f["lost_pieces"] > 0 or f["pieces"] > f["input_pieces"] - f["lost_pieces"]
-        wanted = {"volume": abs(f["volume"] - 1.0) > BAD_VOLUME, "piece": pieces, "label": f["lost_labels"] > 0}
-        return any(want and not any(word in line for line in warnings) for word, want in wanted.items())
+        expected = {"volume": abs(f["volume"] - 1.0) > BAD_VOLUME, "piece": pieces, "label": f["lost_labels"] > 0}
+        return any(is_expected and not any(word in line for line in warnings) for word, is_expected in expected.items())
 
     @property
     def topples(self) -> bool:
@@ -78,11 +78,11 @@ HEAD = ["body", "elements", "volume", "mean ‰", "95 % ‰", "pieces", "waterti
 
 
 def table(rows: list[Row], before: dict[str, Any] | None = None) -> str:
-    """Markdown.
+    """The table in Markdown.
 
     Args:
-        rows: In their order.
-        before: Numbers of an earlier run by body; its volumes stand beside.
+        rows: The rows in order.
+        before: Numbers of an earlier run by body, whose volumes are shown for comparison.
     """
     fall = any("fall" in row.found for row in rows)
     head = HEAD + (["fall"] if fall else [])
@@ -99,7 +99,7 @@ def table(rows: list[Row], before: dict[str, Any] | None = None) -> str:
 
 
 def totals(rows: list[Row], tets: int) -> str:
-    """All of them in some lines."""
+    """Totals in a few lines."""
     made = [row for row in rows if row.is_meshed]
     if not made:
         return f"{len(rows)} bodies, none of them meshed."

@@ -1,5 +1,5 @@
-"""The bodies of ``bodies.py``: files that come with packages, and shapes made for trouble, each as the command line
-takes it."""
+"""The bodies of ``bodies.py``: files from packages, and difficult shapes, each as input of the command
+line."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-#: Where packages keep bodies, and what is a triangle mesh or a scan there. The wheel of trimesh has none.
+#: Folders of packages with bodies, and patterns of their meshes and scans. The wheel of trimesh has none.
 PACKAGES = ("warp", "pyvista", "trimesh", "nilearn", "newton", "mujoco")
 SUFFIXES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".usd", ".usda", ".usdc", ".msh", ".gii.gz")
 SUFFIXES += (".vtk", ".vtp", ".vtu", ".vti", ".nii.gz", ".nii", ".nrrd", ".mha")
-#: Values at vertices, pictures of functions, surfaces without an inside.
+#: Files to leave out: values at vertices, pictures of functions, surfaces without an inside.
 NO_BODIES = ("area_", "curv_", "sulc", "thick_", "flat_", "_t1_", "image_10426", "spm_dmtx")
 
 
 @dataclass(frozen=True)
 class Body:
-    """Something to be meshed.
+    """A body to mesh.
 
     Attributes:
-        name: In the table.
-        path: The file; None for a shape, which is written to one.
+        name: Name in the table.
+        path: The file; None for a shape, which is written to a file first.
     """
 
     name: str
@@ -30,14 +30,14 @@ class Body:
 
 
 def all_bodies() -> list[Body]:
-    """Those of packages, then shapes."""
+    """Bodies from packages, then shapes."""
     from body_shapes import SHAPES
 
     return [*packaged(), *(Body(name) for name in SHAPES)]
 
 
 def packaged() -> list[Body]:
-    """The files with triangles or voxels that come with packages, each once."""
+    """The files with triangles or voxels in packages, each once."""
     found, seen = [], set()
     for package in PACKAGES:
         spec = find_spec(package)
@@ -54,7 +54,7 @@ def packaged() -> list[Body]:
 
 
 def has_faces(path: Path) -> bool:
-    """Whether a stage has a Mesh prim of its own, so that it is about a shape and not about joints."""
+    """Whether a stage has a Mesh prim of its own, so that it holds a shape and not only joints."""
     from pxr import Usd, UsdGeom
 
     try:
@@ -66,7 +66,7 @@ def has_faces(path: Path) -> bool:
 
 
 def as_input(body: Body, folder: Path) -> tuple[Path, list[str]]:
-    """The file that the command line is given, and the options that a person would give with it."""
+    """The input file for the command line, and the options that a person would give with it."""
     name, path = body.name, body.path
     if path is None:
         from body_shapes import SHAPES

@@ -1,4 +1,4 @@
-"""What ``bodies.py`` finds of one body, in a process of its own: how true its mesh is, and how it falls."""
+"""Measurements of one body for ``bodies.py``, in a separate process: the fidelity of its mesh, and its fall."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ FALL_SECONDS = 2.0
 
 
 def measured(path: Path, options: list[str], tets: int, device: str) -> dict[str, Any]:
-    """What ``bodies_table.Row`` says of a body, as far as meshing goes.
+    """The results of meshing for ``bodies_table.Row``.
 
     Args:
         path: Its file.
-        options: Of the command line.
-        tets: Elements asked for.
-        device: Where it is meshed.
+        options: Options of the command line.
+        tets: Number of elements.
+        device: The device for meshing.
     """
     import warp as wp
 
@@ -65,7 +65,7 @@ def measured(path: Path, options: list[str], tets: int, device: str) -> dict[str
 
 
 def together(found: list[Fidelity], size: float, tets: int) -> dict[str, Any]:
-    """Several bodies of one file as one: sums, and of distances the largest, over the size [m]."""
+    """Several bodies of one file as one: sums, and the largest distances, relative to the size [m]."""
     return {
         "elements": (elements := sum(f.elements for f in found)),
         "share": elements / tets,
@@ -82,7 +82,7 @@ def together(found: list[Fidelity], size: float, tets: int) -> dict[str, Any]:
 
 
 def _load_kernels(device: str) -> None:
-    """Mesh a small ball the same way, so that kernels and libraries are loaded."""
+    """Mesh a small ball in the same way, to load kernels and libraries."""
     import trimesh
 
     from warp_corot.cli import make_parser
@@ -98,14 +98,14 @@ def _load_kernels(device: str) -> None:
 
 
 def fallen(path: Path, options: list[str], tets: int, device: str, previews: Path | None = None) -> dict[str, Any]:
-    """What becomes of a body by defaults: how far it goes, over its height, and whether it was said to be free.
+    """The fall of a body with defaults: its displacement over its height, and whether the command called it free.
 
     Args:
         path: Its file.
-        options: Of the command line.
-        tets: Elements asked for.
-        device: Where it is simulated.
-        previews: A folder for a picture of its two ends; None: no picture.
+        options: Options of the command line.
+        tets: Number of elements.
+        device: The device of the simulation.
+        previews: A folder for a picture of the first and last frame; None: no picture.
     """
     from warp_corot.cli import main
 
@@ -130,7 +130,7 @@ def fallen(path: Path, options: list[str], tets: int, device: str, previews: Pat
 
 
 def largest_displacement(path: Path) -> float:
-    """The largest distance of any drawn point from where it was at first, over the height of all that is drawn."""
+    """The largest displacement of any drawn point, over the height of the whole drawing."""
     from pxr import Usd, UsdGeom
 
     stage = Usd.Stage.Open(str(path))

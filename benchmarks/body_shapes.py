@@ -1,7 +1,7 @@
-"""Bodies made for trouble: thin, long, sharp, branching, nested, slit, open, overlapping, in millions of triangles.
+"""Difficult bodies: thin, long, sharp, branching, nested, slit, open, overlapping, with millions of triangles.
 
 Each is a function without arguments that gives points [N, 3] [m] and triangles [F, 3]; ``SHAPES`` has them by name. All
-are about as large as organs, 5 to 25 cm, unless their trouble is their size. Those like organs and the thin ones are in
+are about the size of organs, 5 to 25 cm, unless size is the difficulty. Organ-like and thin shapes are in
 ``thin_shapes.py``.
 """
 
@@ -168,7 +168,7 @@ def overlapping() -> Surface:
 
 @shape
 def open_bowl() -> Surface:
-    """Half a ball, its round opening to be closed by a cap."""
+    """Half a ball with a round opening that a cap must close."""
     points, triangles = ball(0.07)
     return points, triangles[(points[triangles][:, :, 2] < 1e-9).all(axis=1)]
 

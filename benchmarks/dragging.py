@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""What it costs to hold, move, load and let go a patch of a body between steps, as a hand does that drags tissue.
+"""Cost of holding, moving, loading and releasing a patch of a body between steps, like a hand that drags tissue.
 
     python benchmarks/dragging.py [--device cuda:0] [--level 21] [--json FILE]
 
-One root cube, bisected uniformly to several levels up to the one given, and a patch of its top: about a thousand nodes
-of a body of any size. The time is the host's, until the call returns, which on CUDA may be before the device is done;
-``with a step`` is the change, one step and the wait for it, beside the same without the change. What is checked is that
-the patch is where it was told to be, and that no step had to be recorded again.
+One root cube, bisected uniformly to several levels up to the given one, and a patch of its top: about a thousand nodes
+of a body of any size. The time is the host's, until the call returns; on CUDA the device may still be working then.
+``with a step`` is the change, one step and the wait for it, beside the same without the change. The script checks that
+the patch is in the prescribed place, and that no step was recorded again.
 """
 
 from __future__ import annotations
@@ -77,12 +77,12 @@ def measured(level: int, device: wp.Device, wrong: list[str]) -> list[tuple]:
         if body.launch_revision != revision:
             wrong.append(f"{name} at level {level} had steps recorded again")
         if body.constrained[patch].all() != (name != "release"):
-            wrong.append(f"{name} at level {level} left the patch otherwise than told")
+            wrong.append(f"{name} at level {level} left the patch in a wrong place")
     return rows
 
 
 def median(then: Callable[[int], None], change: Callable[[int], None], device: wp.Device) -> tuple[float, float]:
-    """Seconds until a change returns, and until the device is done with it and what comes then: medians."""
+    """Median times [s]: until a change returns, and until the device has finished it and the following work."""
     returned, done = [], []
     for k in range(1, ROUNDS + 1):
         wp.synchronize_device(device)

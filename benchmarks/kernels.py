@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""What each stage of a time step costs, and what it would have to cost at the least.
+"""Cost of each stage of a time step, and its lower bound.
 
     python benchmarks/kernels.py [--device cuda:0] [--level 21] [--json FILE]
 

@@ -1,7 +1,7 @@
 """Timing and reporting shared by the benchmark scripts.
 
-Every case is recorded in a graph of its own and replayed. All cases are timed in turn, round after round, so that
-whatever else the machine does meets all alike; the median and the spread (interquartile range over median) are over the
+Every case is recorded in a separate graph and replayed. All cases are timed in turn, round after round, so that
+other load on the machine affects all alike; the median and the spread (interquartile range over median) are over the
 rounds. On CUDA the clock is a pair of events around the replay, on the CPU the wall clock.
 """
 
@@ -30,28 +30,28 @@ from warp_corot.inputs.device import checked_device
 SAMPLE_SECONDS = {"cuda": 3e-3, "cpu": 3e-2}
 MAX_LAUNCHES = 256
 
-#: The two arrays of the bandwidth test [bytes each]; far larger than any cache.
+#: Size of each of the two arrays of the bandwidth test [bytes]; far larger than any cache.
 COPY_BYTES = {"cuda": 1 << 30, "cpu": 1 << 28}
 
-#: A relative error above this is not rounding.
+#: A larger relative error is not rounding.
 WRONG = 1e-3
 
 
 @dataclass
 class Case:
-    """One row to be timed.
+    """One row of the table.
 
     Attributes:
-        stage, variant: What it is.
-        run: Launches the work once (``repeats`` times what is reported).
+        stage, variant: Names of the row.
+        run: Launches the work once (``repeats`` times the reported work).
         error: Runs the work once and returns its error against the float64 reference.
-        tets: Tetrahedra that one repeat works on.
-        bytes: What one tetrahedron must move at the least [B]; None where nobody can say.
-        flops: Additions, multiplications, divisions and roots one tetrahedron needs at the least; or None.
-        repeats: How often ``run`` does the thing.
-        recorded: Whether ``run`` is recorded in a graph here; False where it replays graphs of its own, None where
-            that is somebody else's code and it has to be seen whether it can be.
-        reset: Puts the state back before each sample, outside the measured time.
+        tets: Number of tetrahedra in one repeat.
+        bytes: Minimum memory traffic of one tetrahedron [B]; None if unknown.
+        flops: Minimum number of additions, multiplications, divisions and roots of one tetrahedron; or None.
+        repeats: Number of repeats in ``run``.
+        recorded: Whether ``run`` is recorded in a graph here; False if it replays its own graphs, None if
+            that is another program's code and recording must be tried.
+        reset: Restores the state before each sample, outside the measured time.
         wrong: Errors above this are failures; None where ``error`` measures something else.
         extra: More figures for the table and the JSON.
     """
@@ -113,7 +113,7 @@ class Result:
 
 
 class Stopwatch:
-    """Seconds that launches take: events on CUDA, wall clock on the CPU."""
+    """Wall time of launches [s]: events on CUDA, wall clock on the CPU."""
 
     def __init__(self, device: wp.Device):
         self.device = device
@@ -139,7 +139,7 @@ def kind(device: wp.Device) -> str:
 
 
 def copy_bandwidth(device: wp.Device, byte_count: int | None = None) -> float:
-    """GB/s of a plain copy between two large arrays, bytes read and bytes written both counted."""
+    """Rate of a plain copy between two large arrays [GB/s]; bytes read and bytes written both count."""
     count = (COPY_BYTES[kind(device)] if byte_count is None else byte_count) // 16
     source, target = (wp.zeros(count, dtype=wp.vec4, device=device) for _ in range(2))
     watch = Stopwatch(device)
@@ -156,17 +156,17 @@ def measure(cases: Sequence[Case], device: wp.Device, rounds: int, tell: Callabl
         errors.append(float(case.error()))
         samplers.append(_sampler(case, device, watch))
     taken = np.zeros((len(cases), rounds))
-    for turn in range(rounds):
-        tell(f"timing, round {turn + 1} of {rounds}")
+    for k in range(rounds):
+        tell(f"timing, round {k + 1} of {rounds}")
         for index, (case, (launch, launches)) in enumerate(zip(cases, samplers, strict=True)):
             if case.reset is not None:
                 case.reset()
-            taken[index, turn] = watch.seconds(launch) / (launches * case.repeats * case.tets)
+            taken[index, k] = watch.seconds(launch) / (launches * case.repeats * case.tets)
     return [Result(c, e, s) for c, e, s in zip(cases, errors, 1e9 * taken, strict=True)]
 
 
 def _sampler(case: Case, device: wp.Device, watch: Stopwatch) -> tuple[Callable[[], object], int]:
-    """What one sample launches, and how many runs that is."""
+    """The launches of one sample, and the number of runs in it."""
     if case.reset is not None:
         case.reset()
     once = min(watch.seconds(case.run) for _ in range(2))
@@ -191,7 +191,7 @@ def _sampler(case: Case, device: wp.Device, watch: Stopwatch) -> tuple[Callable[
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line."""
+    """Reports errors in one line."""
 
     def error(self, message: str) -> Any:
         self.exit(2, f"{self.prog}: error: {' '.join(message.split())}\n")
@@ -207,8 +207,8 @@ def parser(description: str, prog: str) -> Parser:
 
 
 def checked(options: argparse.Namespace, of: Parser, levels: range) -> wp.Device:
-    """Fill in defaults and say in one line what cannot be; the device."""
-    wp.config.log_level = wp.LOG_ERROR  # before Warp starts, so that it says nothing about itself
+    """Fill in defaults and report invalid options in one line; returns the device."""
+    wp.config.log_level = wp.LOG_ERROR  # before Warp starts, so that it prints no banner
     try:
         device = checked_device(options.device)
     except InputError as error:
@@ -224,14 +224,14 @@ def checked(options: argparse.Namespace, of: Parser, levels: range) -> wp.Device
     if options.json is not None:
         folder = options.json.resolve().parent
         if not folder.is_dir() or not os.access(folder, os.W_OK):
-            of.error(f"--json: the folder {folder} is not there or cannot be written to")
+            of.error(f"--json: the folder {folder} does not exist or cannot be written to")
         if options.json.is_dir():
-            of.error(f"--json: {options.json} is a folder; name a file")
+            of.error(f"--json: {options.json} is a folder; it must be a file name")
     return device
 
 
 def tell(message: str) -> None:
-    """Progress, on stderr: one line that is written over on a terminal."""
+    """Print progress on stderr: one line that is overwritten on a terminal."""
     if sys.stderr.isatty():
         print(f"\r\033[K{message}", end="", file=sys.stderr, flush=True)
 
@@ -270,7 +270,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> st
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A figure to some digits; a dash for none."""
+    """A figure with some digits; a dash for none."""
     if value is None:
         return "-"
     if not math.isfinite(value):
@@ -288,7 +288,7 @@ def percent(value: float | None) -> str:
 
 
 def finish(options: argparse.Namespace, report: dict[str, Any], results: Sequence[Result]) -> int:
-    """Write the JSON, name what came out wrong; the exit status."""
+    """Write the JSON and name wrong results; returns the exit status."""
     if sys.stderr.isatty():
         print("\r\033[K", end="", file=sys.stderr)
     if options.json is not None:
@@ -300,7 +300,7 @@ def finish(options: argparse.Namespace, report: dict[str, Any], results: Sequenc
 
 
 def save(path: Path, report: dict[str, Any]) -> None:
-    """Write a report, whole or not at all."""
+    """Write a report, completely or not at all."""
     draft = path.with_name(path.name + ".part")
     draft.write_text(json.dumps(report, indent=1) + "\n")
     draft.replace(path)

@@ -1,6 +1,6 @@
-"""MuJoCo's flex on the problem's mesh, on one CPU core. Imports fail where MuJoCo is not installed.
+"""MuJoCo's flex on the problem's mesh, on one CPU core. The import fails if MuJoCo is not installed.
 
-Its solid elasticity is St. Venant-Kirchhoff on edges, as the library's ``EdgeStVK``; contacts and edge equalities off.
+Its solid elasticity is St. Venant-Kirchhoff on edges, like ``EdgeStVK``; contacts and edge equalities are off.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ NAME = f"MuJoCo {mujoco.__version__}"
 #: Its model is a text, and it steps on one core.
 MOST_TETS = 50_000
 
-# It would write warnings to a file where one stands; a state that has blown up is looked for below.
+# It would write warnings to a file in the current folder; a diverged state is detected below.
 mujoco.set_mju_user_warning(lambda message: None)
 
 XML = """
@@ -71,14 +71,14 @@ class MujocoSteps(Steppable):
             mujoco.mj_step(self.model, self.data)
 
     def largest_displacement(self) -> float:
-        # MuJoCo sets a state that has blown up back to the beginning, and counts that.
+        # MuJoCo resets a diverged state to the initial one, and counts that.
         kinds = mujoco.mjtWarning
         kinds = (kinds.mjWARN_BADQACC, kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL)
         blown_up = any(self.data.warning[kind].number for kind in kinds)
         return float("inf") if blown_up else float(np.abs(self.data.qpos).max())
 
     def error(self) -> float:
-        """Of the elastic forces."""
+        """Error of the elastic forces."""
         problem = self.problem
         self.reset()
         mujoco.mj_forward(self.model, self.data)

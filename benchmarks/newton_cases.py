@@ -1,7 +1,7 @@
-"""This package's solver for Newton, and Newton's own (``newton_peer``). Imports fail where Newton is not installed.
+"""This package's solver for Newton, and Newton's own (``newton_peer``). The import fails if Newton is not installed.
 
-Forces include what Newton's force kernel has in it, damping and activation; both are zero. They are of positions as a
-step has gathered them: padded to 16 bytes, or displacements of forests. Whole steps are what ``step`` does, all of it.
+Forces include those of Newton's force kernel, damping and activation; both are zero. They use gathered positions as
+in a step: padded to 16 bytes, or displacements of forests. Whole steps are complete calls of ``step``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import warp_corot as wc
 import warp_corot.newton as wn
 from warp_corot.newton.state import ForestName
 
-#: Newton's own solvers are left out of larger ones.
+#: Newton's own solvers are left out above this size.
 MOST_TETS = sys.maxsize
 
 
@@ -44,10 +44,10 @@ def _name(as_forest: bool) -> str:
 
 
 def _model(problem: Problem, as_forest: bool) -> newton.Model:
-    """What ``add_forest`` or ``add_mesh`` and ``finalize`` make of the problem.
+    """The problem's model as ``add_forest`` or ``add_mesh`` and ``finalize`` make it.
 
-    Builders keep Python lists, which take half an hour of 12.6 million tetrahedra, so one cube is added and the
-    model's arrays are put in its place.
+    Builders keep Python lists, which take half an hour for 12.6 million tetrahedra, so one cube is added and the
+    model's arrays are replaced.
     """
     builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=tuple(newton_peer.GRAVITY))
     cube = wc.TetForest.box()
@@ -83,7 +83,7 @@ def _model(problem: Problem, as_forest: bool) -> newton.Model:
 
 
 def _solver(model: newton.Model) -> wn.SolverCorotated:
-    """One that takes any step, stable or not, as the search for the largest does."""
+    """A solver that takes any step, stable or not, for the search for the largest one."""
     return wn.SolverCorotated(model, stable_dt=1.0)
 
 
@@ -108,7 +108,7 @@ def _force_case(problem: Problem, as_forest: bool) -> Case:
 
 
 class OurNewtonSteps(NewtonSteps):
-    """Steps of ``SolverCorotated``; what is not finite any more has moved infinitely far."""
+    """Steps of ``SolverCorotated``; a state that is not finite counts as infinitely far."""
 
     def __init__(self, problem: Problem, as_forest: bool):
         model = _model(problem, as_forest)

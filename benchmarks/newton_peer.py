@@ -1,7 +1,7 @@
-"""Newton on the problem's mesh: its force kernel, and its solvers' steps. Imports fail where Newton is not installed.
+"""Newton on the problem's mesh: its force kernel, and its solvers' steps. The import fails if Newton is not installed.
 
-Particle contacts and triangles are off, so that nothing but elasticity and integration is left. Newton keeps positions,
-not displacements, and stores a rest matrix, activation and three material parameters for each tetrahedron.
+Particle contacts and triangles are off, so that only elasticity and integration are left. Newton stores positions,
+not displacements, and a rest matrix, activation and three material parameters for each tetrahedron.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ WRONG_POSITIONS = 1e-2
 
 
 def semi_implicit_density(F: np.ndarray, mu: float, lam: float) -> tuple[np.ndarray, np.ndarray]:
-    """Stable neo-Hookean of Smith et al. (2018) as ``eval_tetrahedra`` has it; energies left out."""
+    """Stable neo-Hookean of Smith et al. (2018) as in ``eval_tetrahedra``; without energies."""
     alpha = 1.0 + mu / lam - mu / (4.0 * lam)
     squares = np.sum(F**2, axis=(1, 2))
     P = (mu * (1.0 - 1.0 / (squares + 1.0)))[:, None, None] * F
@@ -115,7 +115,7 @@ def _model(problem: Problem) -> newton.Model:
     masses[problem.held] = 0.0
     n, count = problem.node_count, problem.tet_count
     builder.add_particles(problem.mesh.points.tolist(), [(0.0, 0.0, 0.0)] * n, masses.tolist(), [0.0] * n)
-    # As ``add_tetrahedron`` does one by one.
+    # The same as ``add_tetrahedron`` does one by one.
     builder.tet_indices.extend(map(tuple, elements.tets.tolist()))
     builder.tet_poses.extend(elements.poses.tolist())
     builder.tet_activations.extend([0.0] * count)
@@ -160,7 +160,7 @@ class NewtonSteps(Steppable):
         return float(np.abs(moved).max()) if np.isfinite(moved).all() else float("inf")
 
     def error(self) -> float:
-        """Of an explicit solver: of one step. Of the others: how much of the implicit step's residual is left."""
+        """For an explicit solver: error of one step. For the others: remaining residual of the implicit step."""
         problem, dt = self.problem, self.dt
         nodes = problem.sample.nodes[~problem.held[problem.sample.nodes]]
         free = ~problem.held[problem.sample.nodes]
@@ -182,7 +182,7 @@ def steps(problem: Problem) -> list[Steppable]:
     try:
         model = _model(problem)
     except AttributeError as error:
-        # Newton prepares a model with kernels on the CPU, for which not every Warp has a compiler.
+        # Newton prepares a model with kernels on the CPU, for which some builds of Warp have no compiler.
         print(f"Newton's solvers: left out ({type(error).__name__}: {error})", file=sys.stderr)
         return []
     solvers = newton.solvers

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""This package's solver for Newton next to Newton's own: forces, and whole steps with the largest step that stands.
+"""This package's solver for Newton next to Newton's own: forces, and whole steps with the largest stable step.
 
     python benchmarks/newton_steps.py [--device cuda:0] [--level 21] [--step-level 18] [--json FILE]
 
-The rows of ``peers.py`` that are in Newton, and no others: the same tetrahedra under gravity, held at the floor.
+These are the rows of ``peers.py`` in Newton: the same tetrahedra under gravity, fixed at the floor.
 Newton must be installed.
 """
 

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Other programs on the same mesh in the same process, and how many times as long they take.
+"""Other programs on the same mesh in the same process, and their times relative to this package.
 
     python benchmarks/peers.py [--device cuda:0] [--level 21] [--step-level 18] [--json FILE]
 
-Rotations, whole forces, and whole time steps with the largest step that stands. Peers that are not installed are left
-out, with a word. Every timed result is checked against float64 in the same run.
+Rotations, whole forces, and whole time steps with the largest stable step. Peers that are not installed are left
+out, with a note. Every timed result is checked against float64 in the same run.
 """
 
 from __future__ import annotations
@@ -63,11 +63,11 @@ NOTES = """\
 x ours: time over that of the stage's first row, round by round, median. Newton: particle contacts and triangles off.
 error: largest error over largest value against float64, of the rotation, the force, or one step's displacement; of
 MuJoCo's step, of its elastic force; of VBD and XPBD, how much of the implicit step's residual their iterations leave.
-largest dt: found by trying, 100 steps from the jittered state under gravity, up to 1/60 s; simulated s/s with it."""
+largest dt: found by trial, 100 steps from the jittered state under gravity, up to 1/60 s; simulated s/s with it."""
 
 
 def peer(package: str) -> ModuleType | None:
-    """The module for a peer; None, said in a word, where it is not installed."""
+    """The module for a peer; None, with a note, if it is not installed."""
     try:
         return importlib.import_module(PEERS[package])
     except ImportError as error:
@@ -162,7 +162,7 @@ class OurSteps(Steppable):
         try:
             self.sim.advance_steps(count)
         except wc.UnstableError:
-            # It is not to be asked again, and its state shows what happened.
+            # It must not be asked again, and its state shows what happened.
             self.sim = self._simulation(self.sim.dt)
 
     def largest_displacement(self) -> float:
@@ -187,7 +187,7 @@ def our_steps(problem: Problem) -> list[Steppable]:
 
 
 def step_cases(problem: Problem, peers: Sequence[ModuleType], ours: bool = True) -> list[Case]:
-    """Steps at four fifths of the largest that stands."""
+    """Steps at four fifths of the largest stable one."""
     solvers = our_steps(problem)
     guess = solvers[0].dt
     solvers = solvers if ours else []
@@ -274,7 +274,7 @@ def check_step_level(options: argparse.Namespace, of: argparse.ArgumentParser, d
 
 
 def problems(options: argparse.Namespace, device: wp.Device) -> tuple[Problem, Problem]:
-    """The one that forces are timed on, and the one that steps are."""
+    """The problem for forces, and the one for steps."""
     tell(f"building level {options.level}")
     problem = Problem(options.level, device)
     return problem, problem if options.step_level == options.level else Problem(options.step_level, device)

@@ -1,7 +1,7 @@
 """The mesh and state that are timed, and float64 references for a random sample of it.
 
-A node's exact force needs only the elements around it. So a thousand nodes are drawn, their elements made a mesh of
-their own, and the oracle of the test suite evaluated on that: as strict as the whole mesh, and as cheap at 12.6 million
+A node's exact force needs only the elements around it. So the test suite's oracle is evaluated on a mesh of the
+elements around a thousand random nodes: as strict as the whole mesh, and as cheap at 12.6 million
 tetrahedra as at a hundred.
 """
 
@@ -26,12 +26,12 @@ except ImportError as error:
         f"which needs {error.name}: pip install {error.name}"
     )
 
-#: Nodal displacements are uniform in this share of the edge length, to either side along each axis.
+#: Nodal displacements are uniform up to this fraction of the edge length, in both directions along each axis.
 JITTER = 0.05
 SAMPLE_NODES = 1000
 MATERIAL = {"young": 1e6, "poisson": 0.45, "density": 1000.0}
 
-#: Levels of the subtrees that are units of work, and of groups of eight of them.
+#: Levels of the subtrees that are computed together, and of groups of eight of them.
 SUBTREE_LEVELS = 3
 GROUP_LEVELS = 6
 
@@ -44,12 +44,12 @@ def relative_error(found: np.ndarray, reference: np.ndarray) -> float:
 
 
 def padded(vectors: np.ndarray) -> np.ndarray:
-    """Nodal vectors [N, 3] as the float32 [N, 4] that the device keeps."""
+    """Nodal vectors [N, 3] as the float32 [N, 4] of the device."""
     return np.concatenate([vectors, np.zeros((len(vectors), 1), np.float32)], axis=1)
 
 
 def drawn_nodes(count: int, wanted: int, seed: int = 1) -> np.ndarray:
-    """About so many of ``count`` nodes, or all."""
+    """About ``wanted`` of ``count`` nodes, or all."""
     drawn = np.random.default_rng(seed).integers(0, count, wanted)
     return np.unique(drawn) if count > wanted else np.arange(count)
 
@@ -58,11 +58,11 @@ class Sample:
     """Some nodes with all the elements around them.
 
     Attributes:
-        nodes: Nodes of the whole mesh drawn [n].
-        elements: Elements of the whole mesh that have one of them [m].
-        used: Nodes of the whole mesh that these elements name.
+        nodes: Drawn nodes of the whole mesh [n].
+        elements: Elements of the whole mesh with at least one of them [m].
+        used: Nodes of the whole mesh in these elements.
         mesh: These elements in float64, as a mesh of the used nodes.
-        rows: Where in ``used`` the drawn nodes are [n].
+        rows: Positions of the drawn nodes in ``used`` [n].
     """
 
     def __init__(self, points: np.ndarray, tets: np.ndarray, seed: int = 1, nodes: np.ndarray | None = None):
@@ -85,7 +85,7 @@ class Sample:
 
 
 class Problem:
-    """One root cube bisected to a level, its nodes moved at random.
+    """One root cube bisected to a level, with its nodes moved at random.
 
     Attributes:
         mesh: The forest.
@@ -113,7 +113,7 @@ class Problem:
 
     @cached_property
     def held(self) -> np.ndarray:
-        """Nodes that steps hold fixed, those on the floor; bool [N]."""
+        """Nodes that steps keep fixed, those on the floor; bool [N]."""
         return self.mesh.points[:, 2] < 1e-9
 
     @property
@@ -138,15 +138,16 @@ class Problem:
         return self.new_body(wc.TetMesh(self.mesh.points, self.mesh.tets))
 
     def subtree_nodes(self, levels: int) -> np.ndarray:
-        """The nodes of each complete subtree of so many levels, int32 [T / 2**levels, 10 or 35 or 37]."""
-        # Leaves are in tree order, so those of a subtree follow one another.
+        """The nodes of each complete subtree of this many levels, int32 [T / 2**levels, 10 or 35 or 37]."""
+        # Leaves are in tree order, so those of a subtree are contiguous.
         nodes = np.sort(self.mesh.tets.reshape(-1, 4 << levels), axis=1)
         first = np.ones(nodes.shape, bool)
         first[:, 1:] = nodes[:, 1:] != nodes[:, :-1]
         return nodes[first].reshape(len(nodes), -1)
 
     def units(self, levels_up: int) -> tuple[np.ndarray, np.ndarray]:
-        """The ancestors so many levels up: indices into the tree [n], and each element's among them, int32 [T]."""
+        """The ancestors this many levels up: indices into the tree [n], and each element's index among them, int32
+        [T]."""
         if levels_up == 0:
             return self.mesh.tree.leaves, np.arange(self.tet_count, dtype=np.int32)
         units, unit = np.unique(self.mesh.ancestors(self.level - levels_up), return_inverse=True)

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""What a remeshing pass costs: one that changes nothing, one that changes 1 %, one that doubles the mesh.
+"""Cost of a remeshing pass: one that changes nothing, one that changes 1 %, one that doubles the mesh.
 
     python benchmarks/remesh.py [--device cuda:0] [--level 21] [--json FILE]
 
-One root cube, bisected uniformly to several levels up to the one given. Each pass begins with the same mesh; putting it
-back is not timed. What is checked is that the leaves fill the cube and that as many were bisected as must be.
+One root cube, bisected uniformly to several levels up to the given one. Each pass begins with the same mesh; restoring
+it is not timed. The script checks that the leaves fill the cube and that the expected number was bisected.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from warp_corot.simulation.simulation import Simulation
 LEVELS = (7, 10, 14, 17)
 HEADER = ("what", "of it", "leaves", "ms", "spread", "ns/leaf", "bisected", "ns/bisected")
 PASS, WHOLE = "pass", "with plan and readback"
-#: Numbers of the criterion: a radius round the cube's corner, or a share of all.
+#: Parameters of the criterion: a radius around the cube's corner, or a fraction of all leaves.
 CHANGES = {"nothing": (0.0, 0.0), "1 %, in one place": (1.0, 0.0), "1 %, scattered": (0.0, 0.01), "doubled": (0.0, 2.0)}
 
 
 @wp.func
 def choice(element: ElementState, parameters: wp.array[wp.float32]):
-    """1 for leaves near the corner, or for a share of them at random."""
+    """1 for leaves near the corner, or for a random fraction of them."""
     x = element.corner + 0.25 * (element.rest[1] + element.rest[2] + element.rest[3])
     seed = wp.rand_init(int(4096.0 * x[0]) * 4099 + int(4096.0 * x[1]), int(4096.0 * x[2]))
     chosen = wp.length(x) < parameters[0] or wp.randf(seed) < parameters[1]
@@ -41,7 +41,7 @@ def choice(element: ElementState, parameters: wp.array[wp.float32]):
 
 
 class Scene:
-    """A cube and its pass, alone or as a simulation has it."""
+    """A cube and its pass, alone or within a simulation."""
 
     def __init__(self, level: int, device: wp.Device):
         mesh = wc.TetForest.box((1, 1, 1), 1.0, level)
@@ -57,7 +57,7 @@ class Scene:
             criterion=choice,
             parameters=self.numbers,
         )
-        # With gravity, for a CPU is slow where numbers are next to nothing.
+        # With gravity, because a CPU is slow with subnormal numbers.
         self.sim = Simulation(self.body, integrator=wc.SymplecticEuler(dt=1e-6), remesh=options)
         self.changing = self.sim.remeshing.changing[0]
         assert self.changing is not None
@@ -71,7 +71,7 @@ class Scene:
         extra: dict[str, object] = {}
 
         def error() -> float:
-            """Missing volume, or far from as many bisections as were asked for."""
+            """Missing volume, or a number of bisections far from the expected one."""
             self.reset(what)
             run()
             counts = np.bincount(self.forest.pools.level.numpy()[self.forest.leaf_elements])
@@ -98,7 +98,7 @@ class Scene:
         """One time step of the same mesh, for comparison."""
 
         def prepare() -> None:
-            # Other rows leave meshes of other sizes behind: it is recorded anew.
+            # Other rows leave meshes of other sizes: the step is recorded again.
             self.reset("nothing")
             self.sim.step()
 
@@ -126,7 +126,7 @@ class Scene:
 
 
 def rows(results: Sequence[Result]) -> list[list[str]]:
-    """A line a result; what a bisection costs on top of a pass that changes nothing."""
+    """One line for each result; the cost of a bisection on top of a pass that changes nothing."""
     nothing = {r.case.variant: r.ns * r.case.tets for r in results if r.case.stage == "nothing"}
     lines = []
     for r in results:

@@ -1,4 +1,4 @@
-"""What bodies made for trouble are made of: simple closed surfaces, put together, moved, bent, extruded."""
+"""Building blocks of difficult bodies: simple closed surfaces, joined, moved, bent, extruded."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ def capsule(radius: float, start, end) -> Surface:
     start, end = np.asarray(start, float), np.asarray(end, float)
     length = float(np.linalg.norm(end - start))
     axis = (end - start) / length
-    turn = trimesh.geometry.align_vectors([0.0, 0.0, 1.0], axis)[:3, :3]
+    rotation = trimesh.geometry.align_vectors([0.0, 0.0, 1.0], axis)[:3, :3]
     points, triangles = ball(radius, fineness=3)
     points[:, 2] += length * (points[:, 2] > 0.0)
-    return moved((points, triangles), start, turn)
+    return moved((points, triangles), start, rotation)
 
 
 def grid(rows: int, columns: int, *, closed_rows: bool = False, closed_columns: bool = False) -> np.ndarray:
-    """Triangles of a sheet of rows × columns points, wound round rows first."""
+    """Triangles of a sheet of rows × columns points, wound around rows first."""
     r = np.arange(rows if closed_rows else rows - 1)
     c = np.arange(columns if closed_columns else columns - 1)
     i, j = (a.ravel() for a in np.meshgrid(r, c, indexing="ij"))
@@ -67,22 +67,22 @@ def grid(rows: int, columns: int, *, closed_rows: bool = False, closed_columns: 
 
 
 def tube(line: np.ndarray, radius: float | np.ndarray, *, closed: bool = False, around: int = 24) -> Surface:
-    """A tube round a line [n, 3], its ends closed by caps or by one another."""
+    """A tube around a line [n, 3], its ends closed by caps or joined."""
     n = len(line)
     ahead, behind = (np.roll(line, -1, 0), np.roll(line, 1, 0)) if closed else (line[1:], line[:-1])
     along = ahead - behind if closed else np.gradient(line, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     side = np.cross(along[0], np.eye(3)[np.argmin(np.abs(along[0]))])
     sides = np.empty((n, 3))
-    for k in range(n):  # carried along without twist
+    for k in range(n):  # transported without twist
         side = side - (side @ along[k]) * along[k]
         side /= np.linalg.norm(side)
         sides[k] = side
-    if closed:  # what it has twisted by on the way round is spread
+    if closed:  # the twist after one turn is distributed
         last = sides[-1] - (sides[-1] @ along[0]) * along[0]
         twist = np.arctan2(last @ np.cross(along[0], sides[0]), last @ sides[0])
-        turn = -twist * np.arange(n) / n
-        sides = np.cos(turn)[:, None] * sides + np.sin(turn)[:, None] * np.cross(along, sides)
+        angle = -twist * np.arange(n) / n
+        sides = np.cos(angle)[:, None] * sides + np.sin(angle)[:, None] * np.cross(along, sides)
     angle = 2.0 * np.pi * np.arange(around) / around
     ring = (
         np.cos(angle)[None, :, None] * sides[:, None] + np.sin(angle)[None, :, None] * np.cross(along, sides)[:, None]

@@ -1,4 +1,4 @@
-"""What a mesh of each size takes: time to build, memory on the device, and a step's time.
+"""Cost of a mesh by size: time to build, memory on the device, and a step's time.
 
     python benchmarks/size.py [--device cuda:0] [--level 21] [--from-level 15] [--deterministic] [--json FILE]
 
@@ -29,7 +29,7 @@ LEVELS = range(3, 29)
 
 
 def device_arrays(thing: Any, seen: set[int]) -> Iterator[wp.array]:
-    """All Warp arrays that hang on an object, each once."""
+    """All Warp arrays that an object refers to, each once."""
     if isinstance(thing, wp.array):
         if thing.ptr and thing.ptr not in seen:
             seen.add(thing.ptr)
@@ -59,7 +59,7 @@ def size(arrays: Iterator[wp.array]) -> int:
 
 
 def used_memory(device: wp.Device) -> int | None:
-    """Bytes that Warp has taken on the device, where it can tell."""
+    """Bytes that Warp has allocated on the device, if it can tell."""
     return wp.get_mempool_used_mem_current(device) if device.is_cuda and device.is_mempool_enabled else None
 
 
@@ -102,7 +102,7 @@ def report_of(level: int, device: wp.Device, deterministic: bool) -> dict[str, A
 
 
 def force_error(sim: wc.Simulation) -> float:
-    """The forces in a jittered state on a thousand nodes, against float64."""
+    """Error of the forces on a thousand nodes in a jittered state, against float64."""
     body, mesh = sim.body, sim.body.mesh
     edge = mesh.cell_size / 2 ** (int(mesh.levels[0]) // 3)
     u = np.random.default_rng(0).random((len(mesh.points), 4), np.float32)

@@ -122,7 +122,7 @@ def force_case(
 
 
 class _NoForces(ForceField):
-    """Leaves an integrator's launches alone."""
+    """A force field without launches, to time an integrator alone."""
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None: ...
 
@@ -136,7 +136,7 @@ class _NoForces(ForceField):
 
 
 def integration_case(problem: Problem) -> Case:
-    """Velocities, displacements and the emptied force array, on a body of its own with random forces and velocities."""
+    """Velocities, displacements and the emptied force array, on a separate body with random forces and velocities."""
     dt = 1e-4
     body = problem.new_body(problem.mesh)
     body.fix(problem.held)
@@ -213,7 +213,7 @@ def step_case(
 
 
 def _beam_case(beam: wc.TetForest, device: wp.Device, worlds: int = 1) -> Case:
-    """The paper's beam of 1152 tetrahedra, hanging, or many of them; the one in the middle is checked."""
+    """The paper's beam of 1152 tetrahedra, hanging, or many of them; the middle one is checked."""
     body = wc.SoftBody(beam, wc.Isotropic(**paper.MATERIAL), worlds=worlds, device=device)
     body.fix(beam.points[:, 2] < 1e-9)
     sim = wc.Simulation(body, integrator=wc.SymplecticEuler(2e-4, DAMPING), gravity=paper.GRAVITY)
@@ -256,7 +256,7 @@ def _stepping(
 
 
 def put_back(body: wc.SoftBody, start: wp.array) -> None:
-    """Displacements vec4 [N] back to ``start``, at rest."""
+    """Reset displacements vec4 [N] to ``start``, at rest."""
     wp.copy(body.state.displacements, start)
     body.state.velocities.zero_()
     body.state.forces.zero_()
@@ -266,7 +266,7 @@ def put_back(body: wc.SoftBody, start: wp.array) -> None:
 def step_error(
     sim: wc.Simulation, start: wp.array, sample: Sample, forces: np.ndarray, world: World | None = None
 ) -> float:
-    """What one damped step from ``start`` at rest is off by, against nodal forces [n, 3] on the sample's nodes."""
+    """Error of one damped step from ``start`` at rest, given nodal forces [n, 3] on the sample's nodes."""
     body = sim.body
     nodes = sample.nodes + (world.nodes.start if world else 0)
     put_back(body, start)

@@ -1,14 +1,14 @@
-"""How large a step a solver stands, found by trying."""
+"""Search for the largest stable step of a solver."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
 
-#: Nobody takes larger steps than a frame of an animation [s].
+#: Steps longer than a frame of an animation are not needed [s].
 LONGEST = 1.0 / 60.0
 
-#: A step counts as stable if no node of the unit cube has moved further than this after so many steps [m].
+#: A step is stable if no node of the unit cube has moved farther than this after this many steps [m].
 FURTHEST = 0.25
 STEPS = 100
 
@@ -20,10 +20,10 @@ class Steppable(ABC):
     """A solver on a problem, for comparison.
 
     Attributes:
-        name: For the table.
+        name: Name in the table.
         dt: The step that ``step`` takes [s]; may be set.
         recordable: Whether a CUDA graph may record ``step``.
-        wrong: What ``error`` must not exceed; None where it is no error.
+        wrong: Upper bound of ``error``; None if that is not an error.
     """
 
     name: str
@@ -33,19 +33,19 @@ class Steppable(ABC):
 
     @abstractmethod
     def reset(self) -> None:
-        """Back to the problem's state at rest."""
+        """Restore the problem's state at rest."""
 
     @abstractmethod
     def step(self, count: int) -> None:
-        """Take so many steps."""
+        """Take this many steps."""
 
     @abstractmethod
     def largest_displacement(self) -> float:
-        """Of any node along any axis [m]; infinite if the state is not finite."""
+        """Largest displacement of any node along any axis [m]; infinite if the state is not finite."""
 
     @abstractmethod
     def error(self) -> float:
-        """What one step from the problem's state is off by."""
+        """Error of one step from the problem's state."""
 
     def stands(self, dt: float) -> bool:
         self.dt = dt
@@ -57,7 +57,7 @@ class Steppable(ABC):
         return True
 
     def largest_stable_step(self, guess: float) -> float:
-        """The largest step that stands [s], at most ``LONGEST``; 0 if none down to a thousandth of the guess does."""
+        """The largest stable step [s], at most ``LONGEST``; 0 if none above a thousandth of the guess is stable."""
         stable, unstable = 0.0, math.inf
         dt = min(guess, LONGEST)
         while stable == 0.0 or math.isinf(unstable):

@@ -70,7 +70,7 @@ def _rotation_case(
 
 
 def _warm_case(problem: Problem) -> Case:
-    """Between two states a thousandth of an edge apart, to and fro: what a step's motion is like."""
+    """Back and forth between two states a thousandth of an edge apart, like the motion in a step."""
     units, _unit = problem.units(0)
     elements = forest_elements(problem.mesh, units, problem.device)
     count = len(units)
@@ -104,7 +104,7 @@ def _rotation_bytes(problem: Problem, tets: np.ndarray) -> float:
 
 
 def product_cases(problem: Problem) -> list[Case]:
-    """Nodal forces of every element with rotations from three levels up, ended in the sum of their squares."""
+    """Nodal forces of every element with rotations from three levels up, reduced to the sum of their squares."""
     device, count = problem.device, problem.tet_count
     units, unit = problem.units(SUBTREE_LEVELS)
     elements = forest_elements(problem.mesh, units, device)

@@ -1,7 +1,7 @@
-"""Device code of the benchmark: single stages of a force kernel, which the library only has fused into whole ones.
+"""Device code of the benchmark: single stages of a force kernel, which the library only has fused.
 
-Stages are cut where something can be checked. The stiffness products end in one number an element, the sum of its
-squared nodal forces: neither a scatter nor wide stores hide what the product costs, and no compiler can shorten it.
+Stages end where a result can be checked. The stiffness products end in one number an element, the sum of its
+squared nodal forces: neither a scatter nor wide stores hide the product's cost, and no compiler can shorten it.
 The scatters add a constant, so that the exact result is a count.
 """
 
@@ -9,20 +9,19 @@ import functools
 
 import warp as wp
 
-from warp_corot.kernels.corotated.corotated import rest_shape
 from warp_corot.kernels.elements.constitutive import corotated_strain, hooke
 from warp_corot.kernels.elements.elements import (
-    ROOT2,
     ForestElements,
     add_force,
     edge_length,
     frame,
     local_gradient,
     mirror_sign,
+    nodal_forces,
     node_displacements,
-    rest_volume,
     shape_of,
 )
+from warp_corot.kernels.elements.shapes import rest_shape
 from warp_corot.kernels.elements.stiffness import stiffness_product, vec12
 from warp_corot.kernels.math.rotation import identity3
 
@@ -45,33 +44,16 @@ def square_factored_forces(
     squares: wp.array[wp.float32],
 ):
     t = wp.tid()
-    code = elements.code[t]
-    shape = shape_of(code)
     q = frame(elements, t)
     r = rotations[unit[t]] * q
     p = r * hooke(corotated_strain(local_gradient(elements, t, u), q, r), mu[0], lam[0])
-    area = rest_volume(elements, t) / edge_length(elements, t)
-    p0 = wp.vec3(p[0, 0], p[1, 0], p[2, 0]) * area
-    p1 = wp.vec3(p[0, 1], p[1, 1], p[2, 1]) * area
-    p2 = wp.vec3(p[0, 2], p[1, 2], p[2, 2]) * (area * mirror_sign(code))
-    f0 = p0
-    f1 = p1 - p0
-    f2 = p2 - p1
-    f3 = -p2
-    if shape == 1:
-        f0 = p0 + p2
-        f3 = -2.0 * p2
-    elif shape == 2:
-        f0 = -ROOT2 * p0
-        f1 = -ROOT2 * p1
-        f2 = ROOT2 * (p0 + p1) + 2.0 * p2
-        f3 = -2.0 * p2
+    f0, f1, f2, f3 = nodal_forces(elements, t, p)
     squares[t] = wp.length_sq(f0) + wp.length_sq(f1) + wp.length_sq(f2) + wp.length_sq(f3)
 
 
 @functools.cache
 def square_product_forces(skip_zeros: bool) -> wp.Kernel:
-    """The same by the explicit 12x12 K_T of each type, its zeros skipped or not."""
+    """Nodal forces by the explicit 12x12 K_T of each type, its zeros skipped or not."""
     product0 = stiffness_product(0, skip_zeros)
     product1 = stiffness_product(1, skip_zeros)
     product2 = stiffness_product(2, skip_zeros)
@@ -111,7 +93,7 @@ def square_product_forces(skip_zeros: bool) -> wp.Kernel:
             y = product1(z, m, k)
         else:
             y = product2(z, m, k)
-        # Turning the forces back into world space costs what it costs; their lengths do not change.
+        # The cost of rotating the forces back into world space is included; their lengths do not change.
         total = wp.length_sq(r * wp.vec3(y[0], y[1], y[2]))
         for n in range(1, 4):
             total += wp.length_sq(r * wp.vec3(y[3 * n], y[3 * n + 1], y[3 * n + 2]))
@@ -125,7 +107,7 @@ def square_product_forces(skip_zeros: bool) -> wp.Kernel:
 
 @wp.kernel(enable_backward=False)
 def scatter_vec3(nodes: wp.array[wp.vec4i], f: wp.array[wp.vec3]):
-    """Three scalar atomics a node on packed vec3, as Newton has it."""
+    """Three scalar atomics a node on packed vec3, as in Newton."""
     n = nodes[wp.tid()]
     for i in range(4):
         wp.atomic_add(f, n[i], wp.vec3(1.0, 2.0, 3.0))
@@ -152,7 +134,7 @@ def scatter_lists(nodes: wp.array2d[wp.int32], f: wp.array[wp.vec4]):
 
 @wp.kernel(enable_backward=False)
 def rotate_by_svd3(matrices: wp.array[wp.mat33], rotations: wp.array[wp.mat33]):
-    """U V^T of ``wp.svd3`` as anybody would write it, without the library's guards."""
+    """U V^T of ``wp.svd3`` in the simplest form, without the library's guards."""
     i = wp.tid()
     u, _s, v = wp.svd3(matrices[i])
     rotations[i] = u * wp.transpose(v)

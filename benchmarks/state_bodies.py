@@ -1,7 +1,7 @@
-"""Bodies and the states that forces are timed in, each made by physics or by a stated map.
+"""Bodies and the states in which forces are timed, each made by physics or by a given map.
 
-Physics is what the library's own corotated model does from rest, at a fixed step well below the stable one. Meshes of
-more elements than are worth stepping take the state of a coarser mesh of the same body, interpolated in its elements.
+Physics is the library's own corotated model from rest, at a fixed step well below the stable one. Meshes that
+are too large to step use the state of a coarser mesh of the same body, interpolated in its elements.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from warp_corot.experiments import paper
 #: A soft tissue; Young's modulus [Pa], density [kg/m^3].
 MATERIAL = {"young": 5e3, "poisson": 0.45, "density": 1000.0}
 GRAVITY = (0.0, -9.81, 0.0)
-#: How long bodies have moved when they are looked at [s].
+#: Time of motion before bodies are measured [s].
 LOADED_SECONDS = 0.5
-#: How long it takes to pull them [s].
+#: Duration of pulling [s].
 PULLED_SECONDS = 0.25
-#: Displacements beyond so many lengths are nonsense.
+#: Displacements beyond this many lengths are invalid.
 FARTHEST = 10.0
-#: Steps are tried in this order, as shares of the default one.
+#: Steps are tried in this order, as fractions of the default one.
 SHARES = (0.5, 0.25, 0.1)
-#: Bodies of at most so many elements are stepped.
+#: Largest number of elements of bodies that are stepped.
 STEPPED_ELEMENTS = {"cuda": 700_000, "cpu": 30_000}
 
-#: The share of subtrees that have a flat or turned leaf where there are such.
+#: Fraction of subtrees with a flat or inverted leaf in that state.
 BAD = 0.1
 
-#: Cube levels of organs, as the command line has them.
+#: Cube levels of organs, as on the command line.
 ORGAN_LEVEL = 7
 
 
-#: What makes a state of a body: in words, and displacements [N, 3].
+#: Makes a state of a body: its description, and displacements [N, 3].
 Maker = Callable[["Subject", wp.Device], tuple[str, np.ndarray]]
 
 
@@ -48,8 +48,8 @@ class State:
     """Displacements of a body's nodes.
 
     Attributes:
-        name: For the table.
-        how: What made it.
+        name: Name in the table.
+        how: How it was made.
         u: float32 [N, 3] [m].
     """
 
@@ -63,13 +63,13 @@ class Subject:
     """A body and its states.
 
     Attributes:
-        name: For the table.
+        name: Name in the table.
         mesh: A forest.
-        held: Nodes that stay where they are when the body moves, bool [N].
-        states: Names of the states that it is looked at in, keys of MAKERS, without "at rest".
-        coarser: Makes the same body of about an eighth of the elements.
-        pulled: Nodes that are pulled along z where "pulled" is a state, bool [N].
-        worlds: Copies.
+        held: Fixed nodes, bool [N].
+        states: Names of its states, keys of MAKERS, without "at rest".
+        coarser: Makes the same body with about an eighth of the elements.
+        pulled: Nodes that are pulled along z in the state "pulled", bool [N].
+        worlds: Number of copies.
     """
 
     name: str
@@ -108,7 +108,7 @@ class Subject:
         return np.linalg.det(self.edges(slice(None), u)) / np.linalg.det(self.edges(slice(None)))
 
     def all_states(self, device: wp.Device) -> Iterator[State]:
-        """At rest, then the others one after the other."""
+        """At rest, then the other states in turn."""
         yield State("at rest", "-", np.zeros_like(self.points, dtype=np.float32))
         for name in self.states:
             how, u = MAKERS[name](self, device)
@@ -119,7 +119,7 @@ class Subject:
 
 
 def beam(level: int, worlds: int = 1) -> Subject:
-    """The paper's beam, one end held."""
+    """The paper's beam, fixed at one end."""
     mesh = wc.TetForest.box(paper.CELLS, paper.CELL_SIZE, level)
     states = ("under its weight", "falling", "twisted by pi", "stretched to 1.8", "squeezed to 0.5")
     name = f"beam {level}" if worlds == 1 else f"{worlds} beams {level}"
@@ -128,7 +128,7 @@ def beam(level: int, worlds: int = 1) -> Subject:
 
 
 def notched_beam(level: int) -> Subject:
-    """The same with a slot 8 mm wide and two thirds deep across its middle, to be pulled."""
+    """The beam with a slot 8 mm wide and two thirds deep across its middle, for pulling."""
     size = np.array(paper.CELLS) * paper.CELL_SIZE
     across, middle = float(size[0]), size[2] / 2
     whole = wc.Domain.box((0.0, 0.0, 0.0), size.tolist(), device="cpu")
@@ -148,14 +148,14 @@ def notched_beam(level: int) -> Subject:
 
 
 def cube(level: int) -> Subject:
-    """One root cube of 64 mm, its floor held."""
+    """One root cube of 64 mm, with its floor fixed."""
     mesh = wc.TetForest.box((1, 1, 1), paper.CELL_SIZE, level)
     states = ("one leaf turned over", "all leaves turned over", "a tenth of subtrees bad")
     return Subject(f"cube {level}", mesh, mesh.points[:, 1] < 1e-9, states)
 
 
 def organ(name: str, count: int, worlds: int = 1) -> Subject:
-    """A ball of 10 cm or the bunny, of about so many elements, its lowest tenth held."""
+    """A ball of 10 cm or the bunny, with about this many elements, its lowest tenth fixed."""
     domain = wc.Domain.sphere(0.05) if name == "ball" else wc.Domain.from_surface("warp:bunny")
     size = float(np.ptp(domain.bounds, axis=0).max()) * 1.001 / max(1, round((count / 30) ** (1 / 3)))
     level = ORGAN_LEVEL + (count > 300_000)
@@ -171,7 +171,7 @@ def organ(name: str, count: int, worlds: int = 1) -> Subject:
 
 
 def new_body(subject: Subject, device: wp.Device) -> wc.SoftBody:
-    """One copy, held."""
+    """One copy with its fixed nodes."""
     body = wc.SoftBody(subject.mesh, wc.Isotropic(**MATERIAL), device=device)
     body.fix(subject.held)
     return body
@@ -180,7 +180,7 @@ def new_body(subject: Subject, device: wp.Device) -> wc.SoftBody:
 def _physics(
     seconds: float, damping: float = 0.0, prepare: Callable[[Subject, wc.SoftBody], None] | None = None
 ) -> Maker:
-    """What a body is like after so much time, or a coarser one, interpolated."""
+    """The state of a body, or of a coarser one, interpolated, after this time."""
 
     def make(subject: Subject, device: wp.Device) -> tuple[str, np.ndarray]:
         if subject.coarser is None or len(subject.mesh.tets) <= STEPPED_ELEMENTS[kind(device)]:
@@ -211,13 +211,13 @@ def _physics(
 
 
 def _pull(subject: Subject, body: wc.SoftBody) -> None:
-    """One end moved away by three tenths of the length."""
+    """Move one end away by three tenths of the length."""
     away = [0.0, 0.0, 0.3 * subject.length]
     body.prescribe(subject.pulled, times=[0.0, PULLED_SECONDS], displacements=np.array([[0.0, 0.0, 0.0], away]))
 
 
 def _falling(subject: Subject, device: wp.Device) -> tuple[str, np.ndarray]:
-    """From rest, until the wave from the support has come half as far as there are layers of elements."""
+    """Fall from rest until the wave from the support has passed half of the layers of elements."""
     layers = len(np.unique(np.round(subject.points[:, 2] / subject.length, 9)))
     body = new_body(subject, device)
     wc.Simulation(body, gravity=GRAVITY).advance_steps(max(layers // 2, 1))
@@ -228,7 +228,7 @@ def _falling(subject: Subject, device: wp.Device) -> tuple[str, np.ndarray]:
 
 
 def _mapped(matrix: Callable[[np.ndarray], np.ndarray], how: str) -> Maker:
-    """Every cross-section moved by the matrix [n, 3, 3] of its place along z [n], from 0 to 1."""
+    """Move every cross-section by the matrix [n, 3, 3] for its position along z [n], from 0 to 1."""
 
     def make(subject: Subject, device: wp.Device) -> tuple[str, np.ndarray]:
         x = subject.points
@@ -255,13 +255,13 @@ def _all_turned(subject: Subject, device: wp.Device) -> tuple[str, np.ndarray]:
 
 
 def _one_turned(subject: Subject, device: wp.Device) -> tuple[str, np.ndarray]:
-    """A corner of the body that few elements have, moved so that of these only one is turned over."""
+    """A corner of the body with few elements, moved so that exactly one of them is inverted."""
     tets, u = subject.mesh.tets, np.zeros_like(subject.points)
     valence = np.bincount(tets.ravel(), minlength=len(u))
     node = int(np.argmin(np.where(valence > 0, valence, np.iinfo(int).max)))
     rows, corners = np.nonzero(tets == node)
     g = subject.gradients(rows)[np.arange(len(rows)), corners]
-    # Of moves that take the first of its elements to det F = -1/4, the shortest that leaves the others the right way.
+    # Of the moves that take its first element to det F = -1/4, the shortest that does not invert the others.
     tried = np.random.default_rng(0).standard_normal((4000, 3))
     tried *= (-1.25 / (tried @ g[0]))[:, None]
     ratios = np.sort(1 + tried @ g.T, axis=1)
@@ -271,7 +271,7 @@ def _one_turned(subject: Subject, device: wp.Device) -> tuple[str, np.ndarray]:
 
 
 def _tenth_bad(subject: Subject, device: wp.Device) -> tuple[str, np.ndarray]:
-    """Nodes drawn at random, each moved so far that one of its elements is flat or turned over, until a tenth of the
+    """Random nodes, each moved so far that one of its elements is flat or inverted, until a tenth of the
     subtrees of three levels have such an element."""
     tets = subject.mesh.tets
     rng = np.random.default_rng(0)

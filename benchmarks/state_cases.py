@@ -21,18 +21,18 @@ from warp_corot.errors import InputError
 
 #: Fibres along y, three times as stiff as across.
 FIBRES = (3 * MATERIAL["young"], MATERIAL["young"], 0.4, MATERIAL["poisson"], MATERIAL["young"] / 3)
-#: Nodes whose forces are checked, and anisotropic ones, which the oracle takes as differences of differences. Nodes
-#: that a state has moved alone are checked, too.
+#: Number of nodes whose forces are checked, and for anisotropic ones, where the oracle takes second differences. Single
+#: nodes that a state has moved are checked, too.
 NODES, FIBRE_NODES = 300, 30
-#: Elements are left out of the check where s2 + s3 is below this share of s1: their rotation is any.
+#: Elements are left out of the check if s2 + s3 is below this fraction of s1: their rotation is undefined.
 DEFINITE = 0.02
-#: General meshes of more elements are not made.
+#: General meshes with more elements are not made.
 MOST_GENERAL = 10_000_000
-#: Whole steps are timed for bodies of at most so many elements.
+#: Whole steps are timed for bodies with at most this many elements.
 MOST_STEPPED = {"cuda": 200_000, "cpu": 20_000}
-#: The step that they take, as a share of the default one: the state hardly changes.
+#: Their step, as a fraction of the default one: the state hardly changes.
 STEP_SHARE = 0.01
-#: Errors are relative to the largest force, or where that is less, to the force of such a strain, of which float32
+#: Errors are relative to the largest force, or, if that is smaller, to the force of this strain, of which float32
 #: rounds away a hundred-thousandth.
 LEAST_STRAIN = 1e-2
 
@@ -44,8 +44,8 @@ class Row:
     """A law in a state, and the cases that time it by path.
 
     Attributes:
-        state: Of the body; law: its name; paths: cases by path.
-        flagged: The share of subtrees that the default path leaves to the robust rotation, once it has run.
+        state: The body's state; law: its name; paths: cases by path.
+        flagged: The fraction of subtrees that the default path leaves to the robust rotation, after a run.
     """
 
     state: State
@@ -88,14 +88,14 @@ def models(level: int) -> Iterator[tuple[str, str, Model]]:
 
 
 def flagged_share(field: ForceField) -> float | None:
-    """The share of its subtrees that a field's last launch left to the robust rotation."""
+    """The fraction of its subtrees that a field's last launch left to the robust rotation."""
     batches = getattr(getattr(field, "plan", None), "batches", ())
     flags = [batch.flagged.numpy()[: batch.count] != 0 for batch in batches]
     return float(np.concatenate(flags).mean()) if flags else None
 
 
 class Bench:
-    """The bodies that one subject is: a forest and a general mesh, isotropic and with fibres."""
+    """The bodies of one subject: a forest and a general mesh, isotropic and with fibres."""
 
     def __init__(self, subject: Subject, states: list[State], device: wp.Device):
         self.subject, self.device = subject, device
@@ -110,14 +110,14 @@ class Bench:
         )
         self.mu, self.lam = (float(value) for value in oracle.lame(MATERIAL["young"], MATERIAL["poisson"]))
         self.C = oracle.elasticity(*oracle.transverse(*FIBRES), axes=np.roll(np.eye(3), 2, axis=0))
-        #: Where forces are added up.
+        #: The array for forces.
         self.f = wp.zeros(len(mesh.points) * subject.worlds, dtype=wp.vec4, device=device)
         self._u: dict[int, wp.array] = {}
         self._forces: dict[tuple[int, str], np.ndarray] = {}
         self._definite: dict[tuple[int, str], np.ndarray] = {}
 
     def meshes(self) -> Iterator[tuple[str, wc.TetForest | wc.TetMesh, np.ndarray | float]]:
-        """By path, with the share of each element that must be put into the material."""
+        """Meshes by path, with the filled fraction of each element for the material."""
         mesh = self.subject.mesh
         yield DEFAULT, mesh, 1.0
         if len(mesh.tets) * self.subject.worlds <= MOST_GENERAL:
@@ -137,7 +137,7 @@ class Bench:
         )
 
     def fields(self) -> dict[str, dict[str, ForceField]]:
-        """Force fields by law and path; laws without a path of subtrees have none that is leaf by leaf."""
+        """Force fields by law and path; laws without a subtree path have no leaf-by-leaf one."""
         found: dict[str, dict[str, ForceField]] = {}
         self.reference: dict[str, str] = {}
         for path, mesh, share in self.meshes():
@@ -179,7 +179,7 @@ class Bench:
 
     @property
     def checked_world(self) -> slice:
-        """The nodes of the world in the middle."""
+        """The nodes of the middle world."""
         count = len(self.subject.points)
         return slice(self.subject.worlds // 2 * count, (self.subject.worlds // 2 + 1) * count)
 
@@ -192,13 +192,13 @@ class Bench:
             field.add_forces(u, f)
             return self.error(state, self.reference[law], f.numpy()[self.checked_world, :3])
 
-        # Of rotations that the device chooses the oracle knows nothing: the error is what sharing them does.
+        # The oracle does not know rotations that the device chooses: the error is the effect of sharing.
         wrong = None if self.reference[law] == "auto" else WRONG
         named = f"{self.subject.name}, {state.name}", f"{law}, {path}"
         return Case(*named, lambda: field.add_forces(u, f), error, self.tets, wrong=wrong)
 
     def step_case(self, state: State, path: str, sim: wc.Simulation) -> Case:
-        """Whole steps from a state, always the same ones; what the first does to velocities is checked."""
+        """Whole steps from a state, always the same ones; the change of velocities in the first one is checked."""
         start, body = self.on_device(state), sim.body
         steps = int(np.clip(1_000_000 // self.tets, 64, 512))
 
@@ -237,11 +237,11 @@ class Bench:
         loads: np.ndarray | None = None,
         free: np.ndarray | None = None,
     ) -> float:
-        """How far forces [N, 3] of one world are off, at the sample's nodes whose elements have definite rotations.
+        """Error of forces [N, 3] of one world, at the sample's nodes whose elements have definite rotations.
 
         Args:
-            loads: Other forces that are in them [N, 3].
-            free: Nodes that count, bool [N]; None for all.
+            loads: Other forces included in them [N, 3].
+            free: Nodes to compare, bool [N]; None for all.
         """
         sample = self.few if reference == "fibres" else self.sample
         keep = self.definite(state, reference, sample) & (True if free is None else free[sample.nodes])
@@ -266,7 +266,7 @@ class Bench:
         return self._definite[key]
 
     def x(self, state: State, sample: Sample) -> np.ndarray:
-        """Positions of the nodes that a sample uses, float64."""
+        """Positions of the nodes in a sample's elements, float64."""
         return self.subject.points[sample.used] + state.u[sample.used].astype(float)
 
     def forces(self, state: State, reference: str) -> np.ndarray:
@@ -291,7 +291,7 @@ class Bench:
         return found[1][sample.rows]
 
     def _shares(self, sample: Sample) -> np.ndarray:
-        """What share of each element of a sample the body fills [m]."""
+        """The filled fraction of each element of a sample [m]."""
         return np.broadcast_to(self.fill, len(self.subject.mesh.tets))[sample.elements]
 
     def _ancestors_gradients(self, state: State) -> np.ndarray:
@@ -305,6 +305,6 @@ class Bench:
 
 
 def is_indefinite(F: np.ndarray) -> np.ndarray:
-    """Where rotations of F [m, 3, 3] hang on their last digits, bool [m]."""
+    """Where rotations of F [m, 3, 3] depend on their last digits, bool [m]."""
     s = np.linalg.svd(F, compute_uv=False)
     return s[:, 1] + np.sign(np.linalg.det(F)) * s[:, 2] < DEFINITE * s[:, 0]

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""What forces cost in the states that tissue gets into: under its weight, twisted, pulled, turned over.
+"""Cost of forces in the states of tissue: under its weight, twisted, pulled, inverted.
 
     python benchmarks/states.py [--device cuda:0] [--levels 6 9 12 15 18] [--organs 20000 100000] [--json FILE]
 
-Every law on the path that users get, leaf by leaf and on the same elements as a general mesh, timed in turn and checked
-against float64. Young's modulus is 5 kPa, density 1000 kg/m^3; state_bodies.py has how each state is made.
+Every law on the users' path, leaf by leaf and on the same elements as a general mesh, timed in turn and checked
+against float64. Young's modulus is 5 kPa, density 1000 kg/m^3; state_bodies.py describes how each state is made.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ LEVELS = {"cuda": [6, 9, 12, 15, 18], "cpu": [6, 12]}
 ORGANS = {"cuda": [20_000, 100_000, 1_000_000], "cpu": [20_000]}
 ROUNDS = {"cuda": 9, "cpu": 5}
 BODIES = ("beam", "beams", "notch", "cube", "ball", "bunny", "balls")
-#: Copies of the level-6 beam that are stepped together.
+#: Number of copies of the level-6 beam that are stepped together.
 WORLDS = {"cuda": 1024, "cpu": 16}
-#: Copies of a ball that are stepped together, and about how many elements each has.
+#: Number of copies of a ball that are stepped together, and approximate number of elements of each.
 BALLS = {"cuda": (64, 10_000), "cpu": (4, 1_000)}
-#: Of more elements than these, some drawn at random are looked at.
+#: Of larger meshes, a random sample of this size is examined.
 LOOKED_AT = 200_000
 
 STATES = ("body", "state", "made by", "tets", "inverted", "cond 50 %", "90 %", "99 %")
@@ -41,7 +41,7 @@ FORCES = ("state", "law", "ns/tet", "spread", "Gtet/s", "/ leaf", "/ rest", "/ g
 
 
 def subjects(options: Any, where: str) -> Iterator[Subject]:
-    """One after the other, so that only one is in memory."""
+    """The subjects, one at a time, so that only one is in memory."""
     for level in options.levels:
         for name, make in (("beam", beam), ("notch", notched_beam), ("cube", cube)):
             if name in options.bodies and not (name == "notch" and level < 6):
@@ -60,7 +60,7 @@ def subjects(options: Any, where: str) -> Iterator[Subject]:
 
 
 def look(subject: Subject, state: State) -> dict[str, Any]:
-    """How strained a state is: the share of inverted elements, condition numbers of F."""
+    """Strain of a state: the fraction of inverted elements, and condition numbers of F."""
     tets = subject.mesh.tets
     if len(tets) > LOOKED_AT:
         chosen = np.random.default_rng(5).integers(0, len(tets), LOOKED_AT)
@@ -114,7 +114,7 @@ def timed(subject: Subject, device: wp.Device, options: Any) -> tuple[list[dict]
 
 
 def without_arrays(result: Result) -> Result:
-    """The same without what holds on to the device's memory."""
+    """The result without references to device memory."""
     case = dataclasses.replace(result.case, run=lambda: None, error=lambda error=result.error: error, reset=None)
     return dataclasses.replace(result, case=case)
 
@@ -146,10 +146,10 @@ def show(looks: list[dict], lines: list[dict], seconds: float) -> None:
 def command_line() -> Parser:
     of = parser(__doc__.split("\n\n")[0], "states.py")
     of.add_argument("--levels", type=int, nargs="+", help="several (default: 6 12, on CUDA 6 9 12 15 18)")
-    of.add_argument("--organs", type=int, nargs="*", help="about how many elements balls and bunnies have")
+    of.add_argument("--organs", type=int, nargs="*", help="approximate numbers of elements of balls and bunnies")
     of.add_argument("--bodies", nargs="+", choices=BODIES, default=BODIES)
-    of.add_argument("--laws", nargs="+", help="some of the laws, by their names in the table")
-    of.add_argument("--quick", action="store_true", help="one small beam and cube, two rounds: to see that it works")
+    of.add_argument("--laws", nargs="+", help="only these laws, by their names in the table")
+    of.add_argument("--quick", action="store_true", help="one small beam and cube, two rounds, as a test")
     return of
 
 

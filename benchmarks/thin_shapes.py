@@ -1,4 +1,4 @@
-"""Bodies made for trouble: shaped like organs, or thin and long."""
+"""Difficult bodies: shaped like organs, or thin and long."""
 
 from __future__ import annotations
 

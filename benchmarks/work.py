@@ -1,9 +1,9 @@
-"""What each stage must move and compute at the least, per tetrahedron.
+"""Minimum memory traffic and operations of each stage, per tetrahedron.
 
-Bytes: every array that the stage reads or writes, once, as if each value came from memory exactly once and was never
-fetched again; an array that is added to is read and written. Nodal arrays count by nodes per tetrahedron (one sixth in
-a large forest), a node being a vec4 of 16 bytes. The forest's connectivity counts as the 35-node lists of complete
-six-level subtrees, 2.2 bytes a tetrahedron, in stages that are free to use them, whatever the path in use reads; in
+Bytes: every array that the stage reads or writes counts once, as if each value came from memory exactly
+once; an array that is added to is read and written. Nodal arrays count by nodes per tetrahedron (one sixth in
+a large forest), a node being a vec4 of 16 bytes. In stages that may use them, the forest's connectivity counts as the
+35-node lists of complete six-level subtrees, 2.2 bytes a tetrahedron, for any actual path; in
 stages of single elements as four indices and the shape code, 20 bytes.
 
 Operations: additions, multiplications, divisions and roots of the formulas, one each, counted by hand below (a fused
@@ -57,7 +57,7 @@ ITERATIONS = 4
 
 
 def rotation_flops(tested: bool) -> float:
-    """Byers and Xu's iteration: four steps, which is what the tolerance takes too at this jitter."""
+    """Byers and Xu's iteration: four steps, as many as the tolerance needs at this jitter."""
     return ROTATION_START + ITERATIONS * ROTATION_STEP + (ITERATIONS - 1) * ROTATION_TEST * tested
 
 
@@ -90,7 +90,7 @@ def matrix_flops(shape: int, skip_zeros: bool) -> float:
 
 
 def model_flops(model: str, shape: int, rotation: float = 0.0) -> float | None:
-    """Whole force of one element of the forest by a model of the oracle, scatter counted."""
+    """Whole force of one element of the forest by a model of the oracle, scatter included."""
     outer = gradient_flops(shape) + force_flops(shape) + SCATTER
     inner = {
         "linear": TO_FRAME + 9 + HOOKE + MATRIX_PRODUCT,

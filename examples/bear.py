@@ -1,7 +1,7 @@
 """A toy bear of soft rubber sags, sways and comes to rest.
 
-The mesh ships with Warp (1,986 nodes, 5,354 tetrahedra). With the material below its back sags by 8.7 % of its height
-and its nose by 13.9 %; it first falls to 15 and 26 % and sways twice a second, by half as much every 0.7 s.
+The mesh comes with Warp (1,986 nodes, 5,354 tetrahedra). With the material below its back sags by 8.7 % of its height
+and its nose by 13.9 %; it first falls to 15 and 26 % and sways at 2 Hz with a half-life of 0.7 s.
 """
 
 import argparse

@@ -1,8 +1,9 @@
-"""Brain shift: the skull is opened, the fluid round the brain drains, and it sags (pip install nilearn matplotlib).
+"""Brain shift: the skull is opened, the fluid around the brain drains, and it sags (pip install nilearn matplotlib).
 
-What the fluid leaves loses its buoyancy; below it the skull holds the brain, above it nothing does (Dumpuri et al.
-2007, Med. Image Anal. 11). Moduli: Budday et al. (2015, J. Mech. Behav. Biomed. Mater. 46). In operations it sags by
-1 cm on average (Roberts et al. 1998, Neurosurgery 43); here that depends on the fluid's level most. Head: MNI ICBM 152.
+The part above the fluid loses its buoyancy; below the fluid the skull holds the brain, above nothing does (Dumpuri et
+al. 2007, Med. Image Anal. 11). Moduli: Budday et al. (2015, J. Mech. Behav. Biomed. Mater. 46). In operations it sags
+by 1 cm on average (Roberts et al. 1998, Neurosurgery 43); here that depends mostly on the fluid's level. Head: MNI ICBM
+152.
 """
 
 import argparse
@@ -24,13 +25,13 @@ parser.add_argument("--duration", type=float, default=2.0, help="seconds simulat
 parser.add_argument("--drained", type=float, default=0.06, help="depth of fluid lost [m]")
 args = parser.parse_args()
 if not (nilearn := find_spec("nilearn")):
-    raise SystemExit("the brain comes with nilearn: pip install nilearn")
+    raise SystemExit("this example needs nilearn, which has the brain: pip install nilearn")
 files = nilearn.submodule_search_locations[0] + "/datasets/data/mni_icbm152_{}_tal_nlin_sym_09a_converted.nii.gz"
 maps = {"grey": files.format("gm"), "white": files.format("wm")}
 brain = wc.Domain.from_probabilities(maps, certain=255, unit="mm", smoothing=1e-3)
-mesh = wc.TetForest.from_domain(brain, 0.032, max_level=8, surface_error=1.5e-3)  # what is simulated
+mesh = wc.TetForest.from_domain(brain, 0.032, max_level=8, surface_error=1.5e-3)  # the simulated mesh
 look = wc.TetForest.from_domain(brain, 0.032, max_level=10, surface_error=5e-4).surface()
-look = mesh.bind(look.points, look.triangles)  # what is seen
+look = mesh.bind(look.points, look.triangles)  # the drawn surface
 print(*brain.report(), *mesh.summary(), f"meshed after {time.process_time():.1f} s", sep="\n")
 closed = binary_closing(np.pad(brain.numbers[::2, ::2, ::2] > 0, 9), np.ones((3, 3, 3)), iterations=6)[9:-9, 9:-9, 9:-9]
 skull = wc.Domain.from_labels(closed, affine=brain.affine @ np.diag([2, 2, 2, 1]), smoothing=2e-3)
@@ -40,7 +41,7 @@ top = look.points[np.argmax(look.points @ up)]
 dry = (mesh.points - top) @ up > -args.drained
 body = wc.SoftBody(mesh, wc.Isotropic(np.where(mesh.elements_of("grey"), 1400, 1900), 0.49, 1040), device=args.device)
 body.fix((skull.phi(mesh.points) > -3e-3) & ~dry)
-body.load(dry, np.outer(body.masses[dry], -9.81 * 1007.0 / 1040.0 * up))  # the weight of the fluid that is gone
+body.load(dry, np.outer(body.masses[dry], -9.81 * 1007.0 / 1040.0 * up))  # the lost buoyancy
 sim = wc.Simulation(body, integrator=wc.SymplecticEuler(damping=8.0), gravity=(0.0, 0.0, 0.0))
 done = wc.record(sim, args.output, duration=args.duration, fps=12.0, surface=look, tets=True)
 u = body.displacements.numpy()

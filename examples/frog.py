@@ -1,8 +1,8 @@
 """A frog of ten tissues, picked up by its back, hangs limp (pip install pyvista matplotlib).
 
-Its segmentation, by the Whole Frog Project, comes with PyVista. It has no skin and no muscle: flesh is filled in
-between the tissues and laid four voxels thick around them. It has no unit: the frog is taken to be 9 cm long. Moduli
-are those of soft tissues but for bone, which is gristle: real bone would take steps hundreds of times shorter.
+Its segmentation, by the Whole Frog Project, comes with PyVista. It has no skin and no muscle: flesh fills the space
+between the tissues and surrounds them, four voxels thick. It has no unit: the frog is assumed to be 9 cm long. Moduli
+are those of soft tissues except bone, which is gristle: real bone would need steps hundreds of times shorter.
 """
 
 import argparse
@@ -24,7 +24,7 @@ parser.add_argument("-o", "--output", default="frog.usd")
 parser.add_argument("--duration", type=float, default=1.0, help="seconds simulated")
 args = parser.parse_args()
 if not (pyvista := find_spec("pyvista")):
-    raise SystemExit("the frog comes with PyVista: pip install pyvista")
+    raise SystemExit("this example needs PyVista, which has the frog: pip install pyvista")
 
 # Tissue: numbers in the file (99 is the filling), Young's modulus [kPa], colour.
 flesh, bone = ((99, 1, 12, 14, 16), 3.0, "#e9b8a0"), (13, 40.0, "#f3ecd8")

@@ -1,7 +1,7 @@
 """The paper's beam under four elastic models, side by side in one simulation.
 
-Held at one end and as soft as jelly, the beam hangs down. Linear elements do not know that they have turned: they
-stretch instead, and the beam swells. The others keep their volume nearly.
+Fixed at one end and as soft as jelly, the beam hangs down. Linear elements do not account for rotation: they
+stretch instead, and the beam swells. The others nearly keep their volume.
 """
 
 import argparse

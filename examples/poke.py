@@ -1,4 +1,4 @@
-"""A fingertip presses into a slab of soft tissue and circles over it: nodal loads, set anew while it runs."""
+"""A fingertip presses into a slab of soft tissue and circles over it: nodal loads that change during the run."""
 
 import argparse
 

@@ -1,6 +1,6 @@
-"""A ball is dragged across a slab, whose mesh gathers where the ball is and relaxes behind it.
+"""A ball is dragged across a slab; the mesh becomes fine at the ball and coarse again behind it.
 
-Elongation would not see what is pressed together; here elements are refined that are large for their distance.
+Elongation would not respond to compression; here elements are refined if they are large for their distance to the ball.
 Contact is a penalty: nodes inside the ball are pushed out by a force that grows with their depth.
 """
 
@@ -17,7 +17,7 @@ parser.add_argument("--device", help="cpu or cuda:0")
 parser.add_argument("-o", "--output", default="remesh.usd")
 parser.add_argument("--duration", type=float, default=3.0, help="seconds simulated")
 args = parser.parse_args()
-RADIUS, STIFFNESS = 0.015, 1.5e6  # of the ball [m]; of the penalty, for a kilogramme of a node's mass [1/s^2]
+RADIUS, STIFFNESS = 0.015, 1.5e6  # of the ball [m]; of the penalty, per kilogram of a node's mass [1/s^2]
 
 
 @wp.kernel
@@ -31,7 +31,7 @@ slab = wc.SoftBody(mesh, material, device=args.device)  # 18 x 3 x 9 cm
 slab.fix(mesh.points[:, 1] < 1e-9)
 times = np.array([0.0, 0.4, 2.4, 2.8])
 way = np.array([[0.03, 0.052, 0.045], [0.03, 0.035, 0.045], [0.15, 0.035, 0.045], [0.15, 0.1, 0.045]])
-# For the picture the ball is a body, too: tetrahedra round its centre, moved as told.
+# For the picture the ball is a body, too: tetrahedra around its centre, with prescribed motion.
 z, angle = np.linspace(-1.0, 1.0, 500), 2.4 * np.arange(500)
 shell = RADIUS * np.stack([np.sqrt(1.0 - z**2) * np.cos(angle), np.sqrt(1.0 - z**2) * np.sin(angle), z], axis=1)
 fan = wc.TetMesh(way[0] + np.insert(shell, 0, 0, axis=0), np.insert(ConvexHull(shell).simplices + 1, 0, 0, axis=1))
@@ -54,5 +54,5 @@ def press(sim):
 
 sim.on_step(press)
 done = wc.record(sim, args.output, duration=args.duration)
-print(f"{min(done.elements)} to {max(done.elements)} tetrahedra, the ball's counted; {done.stepping:.1f} s of stepping")
+print(f"{min(done.elements)} to {max(done.elements)} tetrahedra with the ball's; {done.stepping:.1f} s of stepping")
 print(f"wrote {args.output}")

@@ -1,8 +1,8 @@
-"""How many rotations does a bending beam need? Eight beams, their rotations taken from levels 0 to 6 of the tree, or
+"""How many rotations does a bending beam need? Eight beams have their rotations from levels 0 to 6 of the tree, or
 from every element.
 
-At level 0 the whole beam of 1,152 tetrahedra has 18 rotations; each level doubles them. Printed is how far each free
-end is from where it hangs when every element has its own.
+At level 0 the whole beam of 1,152 tetrahedra has 18 rotations; each level doubles them. The script prints the distance
+of each free end to its position with own rotations.
 """
 
 import argparse
@@ -17,7 +17,7 @@ parser.add_argument("-o", "--output", default="rotation_levels.usd")
 parser.add_argument("--duration", type=float, default=1.5, help="seconds simulated")
 args = parser.parse_args()
 
-levels = [0, 1, 2, 3, 4, 5, 6, None]  # None: every element its own
+levels = [0, 1, 2, 3, 4, 5, 6, None]  # None: every element has its own
 bodies = []
 for k in range(len(levels)):
     mesh = wc.TetForest.box(cells=(1, 1, 3), cell_size=0.064, level=6, origin=(0.1 * k, 0.0, 0.0))

@@ -1,9 +1,9 @@
-"""How far does a beam sag? 256 of the paper's beams, each of another Young's modulus, hang in one run.
+"""How far does a beam sag? 256 of the paper's beams, each with a different Young's modulus, hang in one run.
 
-Copies of a body are stepped together. The sag of the free end is drawn over Young's modulus (with matplotlib, if it is
-there) beside Timoshenko's beam theory, which holds for small strains. Stiff beams sag in proportion, to 0.75 of theory:
-the mesh is coarse for a material so hard to compress (at level 9 it is 0.86). Soft ones hang. The stage shows the
-softest. It takes a minute on one CPU core.
+Copies of a body are stepped together. The sag of the free end is drawn over Young's modulus (with matplotlib, if
+installed) beside Timoshenko's beam theory, which holds for small strains. Stiff beams sag in proportion, to 0.75 of
+theory: the mesh is coarse for a nearly incompressible material (at level 9 it is 0.86). Soft ones hang. The stage shows
+the softest. It takes a minute on one CPU core.
 """
 
 import argparse
@@ -43,7 +43,7 @@ for k in np.linspace(0, args.beams - 1, 9).astype(int):
 try:
     from matplotlib.figure import Figure
 except ImportError:
-    print("no picture: it takes matplotlib")
+    print("no picture: it needs matplotlib")
 else:
     ax = (figure := Figure(figsize=(7, 4.2), layout="constrained")).subplots()
     ax.loglog(young, 1e3 * theory, color="#8a8590", label="beam theory, bending and shear")

@@ -1,4 +1,4 @@
-"""A rubber bar is twisted by a full turn along keyframes, held, and let go."""
+"""A rubber bar is twisted by a full turn along keyframes, held, and released."""
 
 import argparse
 
@@ -18,7 +18,7 @@ x = mesh.points
 left, right = np.flatnonzero(x[:, 0] < 1e-9), np.flatnonzero(x[:, 0] > 0.2 - 1e-9)
 body.fix(left)
 
-# Keyframes of the right end: 33 of them on the way round, since nodes go straight from one to the next.
+# Keyframes of the right end: 33 for one turn, since nodes move straight between keyframes.
 times = np.linspace(0.0, 2.0, 33)
 arm = x[right] - [0.2, 0.02, 0.02]
 angle = 2.0 * np.pi * (0.5 - 0.5 * np.cos(np.pi * times / 2.0))[:, None]

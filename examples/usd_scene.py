@@ -1,5 +1,5 @@
-"""A USD stage is made, as any program could have made it: jelly above a table, a ball above the jelly. It is stepped
-through Newton, and its motion written over it with the stress of every tetrahedron. The stage stays on disk beside the
+"""Make a USD stage with OpenUSD: jelly above a table, a ball above the jelly. Newton steps it, and the
+motion and the stress of every tetrahedron are written over it. The stage stays beside the
 output: `warp-corot scene jelly-stage.usda -o jelly.usd` does the same.
 """
 
@@ -24,7 +24,7 @@ stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/SoftBody").GetPrim())
 UsdPhysics.Scene.Define(stage, "/physicsScene")
 
 forest = wc.TetForest.box(cells=(4, 4, 2), cell_size=0.05, level=1)
-mesh = wc.TetMesh(forest.points, forest.tets)  # turns mirrored tetrahedra round
+mesh = wc.TetMesh(forest.points, forest.tets)  # repairs mirrored tetrahedra
 jelly = UsdGeom.TetMesh.Define(stage, "/SoftBody/tetrahedra")
 jelly.AddTranslateOp().Set(Gf.Vec3d(-0.1, -0.1, 0.05))
 jelly.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(mesh.points.astype("float32")))

@@ -1,7 +1,7 @@
-"""A soft blade in a gusty wind, as a part of a JAX program: steps are an operation inside `jit` and `scan`.
+"""A soft blade in a gusty wind, as part of a JAX program: steps are an operation inside `jit` and `scan`.
 
-The wind, a JAX function of place and time, becomes forces, and these the positions some steps later, in buffers of JAX
-and without a copy. Velocities stay in the simulation; the operation has no gradient.
+The wind, a JAX function of place and time, gives the forces, and the steps give the positions a millisecond later, in
+JAX's buffers and without a copy. Velocities stay in the simulation; the operation has no gradient.
 """
 
 import argparse
@@ -16,7 +16,7 @@ try:
     import jax
     import jax.numpy as jnp
 except ImportError:
-    raise SystemExit('this takes JAX: pip install "warp-corot[jax]"') from None
+    raise SystemExit('this example needs JAX: pip install "warp-corot[jax]"') from None
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--device", help="cpu or cuda:0")
@@ -38,7 +38,7 @@ def advance(forces: wp.array(dtype=wp.vec3), positions: wp.array(dtype=wp.vec3))
     body.use_positions(positions)
     for _ in range(steps):
         sim.step()
-    body.use_loads(None)  # JAX takes its buffers back
+    body.use_loads(None)  # JAX reuses its buffers
     body.use_positions(None)
 
 

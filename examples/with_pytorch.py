@@ -1,7 +1,8 @@
-"""PyTorch holds up sixteen soft beams: forces that steps read are its tensor, and so are the positions they write.
+"""PyTorch holds up sixteen soft beams: one tensor has the forces that steps read, another the positions that they
+write.
 
-Nothing is copied and no value passes through the host. Each beam has a spring of another stiffness at its tip, with a
-damper, written as tensor code for all of them at once. It takes `pip install "warp-corot[torch]"`.
+Nothing is copied and no value passes through the host. Each beam has a spring of a different stiffness at its tip, with
+a damper, written as tensor code for all of them at once. It needs `pip install "warp-corot[torch]"`.
 """
 
 import argparse
@@ -13,7 +14,7 @@ import warp_corot as wc
 try:
     import torch
 except ImportError:
-    raise SystemExit('this takes PyTorch: pip install "warp-corot[torch]"') from None
+    raise SystemExit('this example needs PyTorch: pip install "warp-corot[torch]"') from None
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--device", help="cpu or cuda:0")
@@ -32,7 +33,7 @@ forces = torch.zeros(BEAMS, len(mesh.points), 3, device=device)  # [N]
 positions = torch.empty_like(forces)  # [m]
 body.use_loads(wp.from_torch(forces))
 body.use_positions(wp.from_torch(positions))  # written at once, and after each step
-velocities = wp.to_torch(body.velocities).view(BEAMS, -1, 3)  # the other way round: the body's own array
+velocities = wp.to_torch(body.velocities).view(BEAMS, -1, 3)  # in the other direction: the body's own array
 
 tip = torch.as_tensor(mesh.points[:, 2] > 0.12 - 1e-9, device=device)
 goal = positions[:, tip].mean(dim=1)

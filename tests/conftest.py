@@ -1,11 +1,11 @@
-"""Every test that takes ``device`` runs on every device there is."""
+"""Fixtures: a test that takes ``device`` runs on every device of the machine."""
 
 import os
 
 import pytest
 import warp as wp
 
-#: Each takes some gigabytes in the end, and compiles what it needs first.
+#: Each worker takes some gigabytes in the end, and compiles its kernels first.
 MOST_WORKERS = 4
 
 wp.config.quiet = True
@@ -13,7 +13,7 @@ wp.init()
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """A worker for each core, up to four; none where one file or test is named, which is done before workers start."""
+    """A worker for each core, up to four; none for a single file or test, which is done before workers start."""
     if len(config.args) == 1 and ".py" in config.args[0]:
         return 0
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -34,6 +34,6 @@ def rng():
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A new folder, and the working one."""
+    """A new folder, which is also the working directory."""
     monkeypatch.chdir(tmp_path)
     return tmp_path

@@ -8,17 +8,17 @@ from __future__ import annotations
 
 __version__ = "0.1.0"
 
-#: As ``typing`` has it, whose import takes a while in which Ctrl-C would end in a traceback.
+#: The same constant as in ``typing``, whose import takes time during which Ctrl-C would end in a traceback.
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
     from typing import Any
 
     from .api import *  # noqa: F403
-else:  # hidden from type checkers, to which every name would exist
+else:  # hidden from type checkers, which would accept any name
 
     def __getattr__(name: str) -> Any:
-        """The first name asked for imports all: so that the command line is ready for Ctrl-C before that."""
+        """Import everything when the first name is used, so that the command line can handle Ctrl-C before that."""
         if name.startswith("__") and name != "__all__":
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         from importlib import import_module

@@ -4,7 +4,7 @@ import sys
 
 
 def main() -> int:
-    """Run the command line as a process of its own; returns the exit status."""
+    """Run the command line as a separate process; returns the exit status."""
     try:
         from .cli import main as run
 
@@ -15,7 +15,7 @@ def main() -> int:
     finally:
         import signal
 
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # what Python still tidies up takes no time
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the rest of Python's shutdown takes no time
 
 
 if __name__ == "__main__":

@@ -2,6 +2,11 @@
 
 from warp_corot.body.activation import Activation
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.grasp import Grasp
+from warp_corot.contact.options import Contact
+from warp_corot.contact.sampled import SignedDistance, TriangleMesh
+from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Sphere
+from warp_corot.contact.tool import Tool
 from warp_corot.elasticity.polar import polar_rotation
 from warp_corot.io.write.animate import record
 from warp_corot.materials.anisotropic import Orthotropic, TransverselyIsotropic
@@ -10,8 +15,9 @@ from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.simulation.energy import Energy, WorldEnergies
 from warp_corot.simulation.progress import show_progress
 from warp_corot.simulation.simulation import Simulation
+from warp_corot.viewing.view import view
 
-from . import remesh
+from . import haptics, remesh
 from .domain import Domain
 from .elasticity import Corotated, EdgeStVK, Linear, MassSpring, NeoHookean, StVenantKirchhoff
 from .errors import CapacityWarning, InputError, StabilityWarning, StaleViewError, UnstableError
@@ -20,11 +26,17 @@ from .solvers import SymplecticEuler
 
 __all__ = [
     "Activation",
+    "Box",
     "CapacityWarning",
+    "Capsule",
+    "Contact",
     "Corotated",
+    "Cylinder",
     "Domain",
     "EdgeStVK",
     "Energy",
+    "Grasp",
+    "Ground",
     "InputError",
     "Isotropic",
     "Linear",
@@ -32,8 +44,10 @@ __all__ = [
     "NeoHookean",
     "OnlineRemesh",
     "Orthotropic",
+    "SignedDistance",
     "Simulation",
     "SoftBody",
+    "Sphere",
     "StVenantKirchhoff",
     "StabilityWarning",
     "StaleViewError",
@@ -41,11 +55,15 @@ __all__ = [
     "SymplecticEuler",
     "TetForest",
     "TetMesh",
+    "Tool",
     "TransverselyIsotropic",
+    "TriangleMesh",
     "UnstableError",
     "WorldEnergies",
+    "haptics",
     "polar_rotation",
     "record",
     "remesh",
     "show_progress",
+    "view",
 ]

@@ -1,34 +1,34 @@
-"""What goes wrong, in one clear line each."""
+"""Errors and warnings, each with one clear line."""
 
 import sys
 from types import FrameType
 
 
 class InputError(ValueError):
-    """What the user gave cannot be used: the message names the thing, its value and what would be right."""
+    """The user's input cannot be used: the message names the thing, its value and what would be right."""
 
 
 class StaleViewError(InputError):
-    """A view of a body's arrays is used after the body's mesh has changed: there are other nodes now."""
+    """A view of a body's arrays is used after the body's mesh, and so its nodes, changed."""
 
 
 class UnstableError(RuntimeError):
-    """The state is no longer finite: the message names the step at which this was seen."""
+    """The state is no longer finite: the message names the step at which this was found."""
 
 
 class StabilityWarning(UserWarning):
-    """The time step is beyond what the explicit integrator can hold."""
+    """The time step is larger than the explicit integrator's stability limit."""
 
 
 class CapacityWarning(UserWarning):
-    """A mesh that changes has no room left: it is refined no further, and the simulation goes on."""
+    """A mesh that changes has reached its capacity: it is not refined further, and the simulation continues."""
 
 
 def depth_of_user() -> int:
-    """How many calls above the one that warns the first is that is not this package's.
+    """The number of stack frames from the code that warns up to the user's code.
 
-    ``step`` is not as deep as ``advance``, and what is said at a line of the package is said there once for all
-    simulations.
+    ``step`` and ``advance`` have different depths, and Python shows a warning only once for each line of code: it must
+    be the user's line, not one of the package.
     """
     frame: FrameType | None = sys._getframe(1)
     depth, package = 1, __name__.partition(".")[0]

@@ -18,7 +18,7 @@ from warp_corot.io.pictures.colors import VertexAverage, round_limit, stress_col
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "newton"
 WIDTH, HEIGHT, FINER = 400, 300, 3
-#: Example, frame, the camera's place [m], its pitch and yaw [deg], what is said.
+#: Example, frame, the camera's position [m], its pitch and yaw [deg], and the title.
 PANELS = (
     ("hanging", 26, (2.9, -1.0, 1.6), -10.0, 137.0, "cantilevers after 0.43 s"),
     ("drop", 15, (0.92, -0.75, 0.56), -15.5, 140.5, "a soft ball falls on a rigid box"),
@@ -27,7 +27,7 @@ PANELS = (
 
 
 def with_stress(finalize):
-    """Models whose states carry stress, whatever the example asks for."""
+    """Let models' states carry stress, even if the example does not ask for it."""
 
     def finalize_with_stress(builder, **options):
         wn.register_custom_attributes(builder)
@@ -37,7 +37,7 @@ def with_stress(finalize):
 
 
 def surface_of(example):
-    """Points that are drawn, their triangles, and von Mises stress there [Pa]."""
+    """Drawn points, their triangles, and von Mises stress there [Pa]."""
     model, state = example.model, example.state_0
     tets, x = model.tet_indices.numpy().reshape(-1, 4), state.particle_q.numpy()
     volumes = np.abs(1.0 / np.linalg.det(model.tet_poses.numpy()))

@@ -1,4 +1,4 @@
-"""Docstrings say shapes and units in brackets, as in ``[N, 3] [m]``, which Markdown would take for a link."""
+"""Escapes brackets in docstrings: shapes and units like ``[N, 3] [m]`` would be links in Markdown."""
 
 import re
 

@@ -1,7 +1,7 @@
-"""What mkdocs needs to know of this repository: pages that live outside ``docs/``, and where links to them lead.
+"""Hooks for mkdocs: pages outside ``docs/``, and the targets of links to them.
 
-Pages link to one another by their places in the repository, so that links work there too. Here such links are turned
-into those of the site.
+Pages link to one another by their paths in the repository, so that links work there, too. These hooks convert the links
+to those of the site.
 """
 
 import posixpath
@@ -13,7 +13,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[2]
-#: Pages outside ``docs/``, and their places in the site.
+#: Pages outside ``docs/``, and their paths in the site.
 PAGES = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",

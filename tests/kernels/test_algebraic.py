@@ -22,7 +22,7 @@ def stresses(
 
 
 def stress_of(A, device):
-    """The closed form's, that of any A, and where the first may be trusted."""
+    """The stress in closed form, that for any A, and where the former is reliable."""
     p, q = (wp.empty(len(A), dtype=wp.mat33, device=device) for _ in range(2))
     ok = wp.empty(len(A), dtype=wp.int32, device=device)
     inputs = [wp.array(A, dtype=wp.mat33, device=device), MU, LAM]
@@ -50,7 +50,7 @@ def of_stretches(rng, low, high, count=5000):
 
 @pytest.mark.parametrize("size", [1e-6, 1e-4, 1e-2, 0.1, 0.3])
 def test_small_strains_keep_their_digits(size, device, rng):
-    """Relative to the stress itself: C - I is a sum of terms that are no larger than it is."""
+    """Relative to the stress: C - I is a sum of terms that are no larger than it is."""
     A = (size * rng.uniform(-1, 1, (5000, 3, 3))).astype(np.float32)
     P, Q, ok = stress_of(A, device)
     assert ok.all()
@@ -61,7 +61,7 @@ def test_small_strains_keep_their_digits(size, device, rng):
 
 @pytest.mark.parametrize(("low", "high"), [(0.8, 1.25), (0.5, 2.0), (0.35, 4.0)])
 def test_large_strains_and_rotations(low, high, device, rng):
-    """Of the modulus times the stretch: C - I of a turned F has the rounding of numbers of order C."""
+    """Relative to the modulus times the stretch: C - I of a rotated F has the rounding of numbers of order C."""
     A = of_stretches(rng, low, high)
     exact = expected(A)
     P, Q, ok = stress_of(A, device)
@@ -72,7 +72,7 @@ def test_large_strains_and_rotations(low, high, device, rng):
 
 
 def test_turned_over_and_flat(device, rng):
-    """Where the rotation is defined."""
+    """Inverted and flat F with defined rotations."""
     F = rng.standard_normal((5000, 3, 3))
     _, sigma, _ = np.linalg.svd(F)
     F = F[sigma[:, 1] + np.sign(np.linalg.det(F)) * sigma[:, 2] > 0.1 * sigma[:, 0]]
@@ -84,7 +84,7 @@ def test_turned_over_and_flat(device, rng):
 
 
 def test_anything_is_finite(device, rng):
-    """Zero, tiny and huge F; what is not trusted adds nothing."""
+    """Zero, tiny and huge F; unreliable elements add nothing."""
     F = np.concatenate([s * rng.standard_normal((100, 3, 3)) for s in (0.0, 1e-30, 1e-15, 1.0, 1e15)])
     P, Q, ok = stress_of((F - np.eye(3)).astype(np.float32), device)
     assert (P[~ok] == 0).all()

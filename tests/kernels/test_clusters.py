@@ -1,4 +1,4 @@
-"""Clusters of elements: their tables, elements on their axes, and the kernels' forces."""
+"""Clusters of elements: their tables, axis-aligned elements, and the kernels' forces."""
 
 from types import SimpleNamespace
 
@@ -51,7 +51,7 @@ def forces_of_elements(
 
 @pytest.fixture(scope="module")
 def ball() -> wc.TetForest:
-    """Graded, with elements of every type and frame."""
+    """A graded ball with elements of every type and frame."""
     return wc.TetForest.from_domain(wc.Domain.sphere(0.05), 0.0125, max_level=6)
 
 
@@ -82,7 +82,7 @@ def test_leaves_that_change_have_the_oracles_forces(ball, moved, layout, device)
     share = np.random.default_rng(3).uniform(0.5, 2.0, count) if elements.nodes.device.is_cuda else np.ones(count)
     number, goes = (wp.array([n], dtype=wp.int32, device=device) for n in (count, 1))
     counts = LeafCounts(most=count, now=number, before=number, goes=goes, threads=1)
-    body = SimpleNamespace(launch_elements=count)
+    body = SimpleNamespace(sizes=SimpleNamespace(launch_elements=count))
     scatter = ChangingClusterScatter(body, elements, counts, isotropic_law(corotated_stress), layout)
     material = isotropic_material([*(wp.array(v * share, dtype=wp.float32, device=device) for v in (MU, LAM)), 1])
     u = wp.array(in_four(moved), dtype=wp.vec4, device=device)
@@ -137,7 +137,7 @@ def check_tables(clusters, count, tets, layout):
             assert tasks[cluster] == 0
             continue
         np.testing.assert_array_equal(own[corners[elements]], of_cluster)
-        # Slot s + size c is corner c of the s-th element; each is added up once, and at its node.
+        # Slot s + size c is corner c of the s-th element; each is added once, at its node.
         used = slots[here] < layout.corners
         of = slots[here][used]
         assert (slots[here] <= layout.corners).all()
@@ -161,7 +161,7 @@ def test_pairs_have_the_oracles_forces(ball, moved, of_forest, device):
 
 @pytest.mark.parametrize("of_forest", [True, False])
 def test_pairs_that_have_moved_far_keep_their_digits(ball, moved, of_forest, device):
-    """Displacements of hundreds of elements, as at the end of a beam that hangs: only their differences count."""
+    """Displacements of hundreds of elements, like at the end of a hanging beam: only their differences matter."""
     mesh = ball if of_forest else wc.TetMesh(ball.points, ball.tets)
     far = in_four(moved + np.float32([3.0, -7.0, 5.0]))
     scatter = ClusterScatter(device_elements(mesh, wp.get_device(device)), isotropic_law(corotated_stress))
@@ -175,7 +175,7 @@ def test_pairs_that_have_moved_far_keep_their_digits(ball, moved, of_forest, dev
 
 @pytest.mark.parametrize("shuffled", [False, True])
 def test_tasks_of_pairs_add_up_every_slot_once(ball, shuffled):
-    """Neighbours that follow one another fill the threads; where all are strangers fewer pairs have room."""
+    """Consecutive neighbours fill the threads; if none are neighbours, fewer pairs fit."""
     order = np.arange(len(ball.tets), dtype=np.int32)
     if shuffled:
         order = np.random.default_rng(5).permutation(order)

@@ -1,6 +1,6 @@
-"""Forces in the lanes of a CPU's vector registers: digits at any strain, reach, and who is left out.
+"""Forces in the lanes of a CPU's vector registers: digits at any strain, range, and omitted leaves.
 
-Every kernel of them is also compared with float64 in ``test_miscompile``; states here are those on which it depends.
+Every such kernel is also compared with float64 in ``test_miscompile``; states here are those that lanes depend on.
 """
 
 import numpy as np
@@ -60,7 +60,7 @@ def test_small_strains_keep_their_digits_with_shared_rotations(name, levels_up, 
 )
 @pytest.mark.parametrize("name", ["type 0", "type 1", "type 2"])
 def test_stretched_flattened_and_turned_over_leaves_are_not_left_out(name, stretches, rng):
-    """All leaves alike but for a tenth, from Newton's iteration's own reach to where it has none."""
+    """All leaves are equal except a tenth, from the range of Newton's iteration to where it fails."""
     mesh = meshed(name)
     sim, body = simulation(mesh, wc.Corotated(), CPU, dt=1e-5, material=MATERIAL)
     turn, axes = (oracle.polar(rng.standard_normal((3, 3))) for _ in range(2))
@@ -76,7 +76,7 @@ def test_stretched_flattened_and_turned_over_leaves_are_not_left_out(name, stret
 
 @pytest.mark.parametrize("name", ["type 0", "type 1", "type 2"])
 def test_a_bit_names_the_leaf_that_is_left_out(name):
-    """Leaves turned over until they have no definite rotation, one by one."""
+    """Leaves are inverted until they have no definite rotation, one by one."""
     mesh = meshed(name)
     sim, body = simulation(mesh, wc.Corotated(), CPU, dt=1e-5, material=MATERIAL)
     (batch,) = sim.fields[0].plan.batches
@@ -84,7 +84,7 @@ def test_a_bit_names_the_leaf_that_is_left_out(name):
     for s, leaf in ((0, 0), (9, 3), (len(first) - 1, 7)):
         t = int(first[s]) + leaf
         u = np.zeros_like(mesh.points)
-        # Collapsed to a point, which leaves its neighbours stretched to twice.
+        # Collapsed to a point, which stretches its neighbours to twice their size.
         corners = mesh.points[mesh.tets[t]]
         u[mesh.tets[t]] = 0.8 * (corners.mean(axis=0) - corners)
         place(body, u.astype(np.float32))
@@ -96,7 +96,7 @@ def test_a_bit_names_the_leaf_that_is_left_out(name):
 
 @pytest.mark.parametrize("law", [*LAWS.values(), wc.Corotated(rotation_level="auto")], ids=repr)
 def test_what_a_lane_comes_to_does_not_depend_on_the_others(law, rng):
-    """Three worlds of subtrees and elements that eight do not divide: each to the bit as alone."""
+    """Three worlds with numbers of subtrees and elements that eight does not divide: each bit for bit as alone."""
     mesh = MESHES["mixed levels"]()
     u = [random_displacement(mesh, rng, size) for size in (0.2, 1e-4, 0.6)]
     body = wc.SoftBody(mesh, wc.Isotropic(**MATERIAL), device=CPU, worlds=3)

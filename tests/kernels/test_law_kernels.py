@@ -1,7 +1,7 @@
-"""Kernels of laws that CUDA takes, on random strained states, every node against float64.
+"""CUDA's kernels of elastic laws, on random strained states, every node against float64.
 
-Their arithmetic is the same on either device; what only CUDA has, memory shared by groups of subtrees and warps that
-add up, runs through the public models there (see ``test_miscompile``).
+Their arithmetic is the same on both devices; features that only CUDA has, shared memory of groups and sums in warps,
+are tested there through the public models (see ``test_miscompile``).
 """
 
 import numpy as np
@@ -21,9 +21,10 @@ from warp_corot.elasticity.corotated.anisotropic_general import GeneralAnisotrop
 from warp_corot.elasticity.corotated.anisotropic_subtrees import as_bytes
 from warp_corot.elasticity.paths.clusters import ClusterScatter
 from warp_corot.kernels.clusters.laws import isotropic_law
-from warp_corot.kernels.corotated.anisotropic import scatter_anisotropic
+from warp_corot.kernels.corotated.anisotropic import FibreMaterial, fibre_stress
 from warp_corot.kernels.corotated.definite import quaternions_of
 from warp_corot.kernels.elements import constitutive
+from warp_corot.kernels.elements.forces import scatter_forces
 from warp_corot.kernels.elements.general_cuda import corotated_law
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
 from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
@@ -38,7 +39,7 @@ LAWS = {
 
 
 def state(mesh, law, rng):
-    """Displacements as the device has them, and positions in float64."""
+    """Displacements in the device's form, and positions in float64."""
     u = random_displacement(mesh, rng, 0.1) if law == "linear" else turned(mesh, rng, 0.1)
     return np.pad(u, ((0, 0), (0, 1))), mesh.points + u.astype(float)
 
@@ -56,7 +57,7 @@ def assert_right(forces, expected):
 
 
 def _of_subtrees(chosen, others):
-    """Pairs of a forest and something of its kernels: each compiles for a second or two, so ``others`` are slow."""
+    """Pairs of a forest and an option of its kernels: each compiles for a second or two, so ``others`` are slow."""
     pairs = [(name, other) for other in others for name in FORESTS]
     return [pytest.param(*pair, marks=() if pair in chosen else pytest.mark.slow, id=", ".join(pair)) for pair in pairs]
 
@@ -78,7 +79,7 @@ OF_KINDS = [
 
 @pytest.mark.parametrize(("name", "law"), _of_subtrees(OF_LAWS, [*LAWS, "one material"]))
 def test_subtrees_one_by_one(name, law, device, rng):
-    """All subtrees of a forest, without the leaves that are in none; of one material under the last of the laws."""
+    """All subtrees of a forest, without single leaves; with one material for the last of the laws."""
     uniform = law == "one material"
     law = "neo_hookean" if uniform else law
     mesh = meshed(name)
@@ -120,8 +121,8 @@ def test_general_elements(law, uniform, device, rng):
 
 @pytest.mark.parametrize(("name", "kind"), _of_subtrees(OF_KINDS, ["muscle field", "wood", "stiffness field"]))
 def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
-    """Every hundredth node is displaced by an edge and more, so that some leaves of uniform forests are left to the
-    robust rotation; and active stress."""
+    """Every hundredth node is displaced by an edge and more, so that some leaves of uniform forests need the
+    robust rotation; with active stress."""
     mesh = meshed(name)
     material = anisotropic(kind, mesh, rng)
     body = wc.SoftBody(mesh, material, device=device)
@@ -131,19 +132,19 @@ def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
     wp.launch(quaternions_of, len(axes), inputs=[whole.material.axes], outputs=[axes], device=device)
     options = ("muscle" in kind, whole.material.axes_stride == 0, whole.material.stride == 0)
     plan = ForcePlan.of_forest(mesh, None, wp.get_device(device), grouped=False)
-    f, flags = wp.zeros_like(on_device), 0
+    f, flags, fibres = wp.zeros_like(on_device), 0, with_activation(whole, active)
     for batch in plan.batches:
         by_node(batch.subtrees, body.device)
         left = wp.zeros(-(-batch.count // 8), dtype=wp.uint64, device=device)
         kernel = scatter_anisotropic_subtrees(batch.shape, False, *options)
         inputs = [batch.subtrees, whole.material, axes, 1, active, on_device]
         wp.launch(kernel, batch.count, inputs=inputs, outputs=[f, as_bytes(left)], device=device, block_dim=BLOCK)
-        inputs = [left, batch.subtrees.first, body.discretization.elements, whole.material, 1, active, on_device]
+        inputs = [left, batch.subtrees.first, body.discretization.elements, fibres, on_device]
         wp.launch(repair_leaves, 8 * len(left), inputs=inputs, outputs=[f], device=device)
         flags += np.unpackbits(as_bytes(left).numpy()).sum()
     flat = plan.flat
     if len(flat):
-        inputs = [flat.elements, flat.leaves, whole.material, 1, active, on_device]
+        inputs = [flat.elements, flat.leaves, fibres, on_device]
         wp.launch(scatter_flat, len(flat), inputs=inputs, outputs=[f], device=device)
     assert flags < 0.3 * len(mesh.tets)
     assert flags > 0 or name == "mixed levels"
@@ -178,10 +179,16 @@ def strained(mesh, rng, device):
     return wp.array(u, dtype=wp.vec4, device=device), wp.array(active, dtype=wp.float32, device=device)
 
 
+def with_activation(field, active):
+    fibres = FibreMaterial()
+    fibres.passive, fibres.is_active, fibres.activation = field.material, 1, active
+    return fibres
+
+
 def leaf_by_leaf(field, active, u):
     """Forces [N, 3] of the kernel that test_anisotropy compares with the oracle."""
     f = wp.zeros_like(u)
-    kernel = scatter_anisotropic(field.discretization.element_kind, byers_xu)
-    inputs = [field.discretization.elements, field.material, 1, active, u]
+    kernel = scatter_forces(field.discretization.element_kind, FibreMaterial, fibre_stress(byers_xu))
+    inputs = [field.discretization.elements, with_activation(field, active), u]
     wp.launch(kernel, field.element_count, inputs=inputs, outputs=[f], device=u.device)
     return f.numpy()[:, :3]

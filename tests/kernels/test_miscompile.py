@@ -1,9 +1,9 @@
 """Kernels that a compiler got wrong: the shipped ones on thousands of elements, every node against float64.
 
-With Warp's own flags LLVM once compiled a large unrolled kernel into wrong code, without a word: forces were wrong at
-some nodes and right at the others. So each kernel runs here as it ships, on random states, in every lane, for every
-leaf of every type of subtree and with the last lanes left over; and each node is compared by itself. Rounding is some
-1e-6 of the largest force, a wrong lane, sign or register a hundredth of it at least.
+With Warp's own flags LLVM once silently compiled a large unrolled kernel into wrong code: forces were wrong at
+some nodes and right at the others. So each shipped kernel runs here on random states, in every lane, for every
+leaf of every type of subtree and with partly filled last lanes; and each node is compared. Rounding is some
+1e-6 of the largest force, a wrong lane, sign or register at least a hundredth of it.
 """
 
 import numpy as np
@@ -24,7 +24,7 @@ def hooke_von_mises(reference, x, mu, lam, R):
 
 
 def check(sim, body, expected, energies, sound=slice(None)):
-    """Forces at every node, and the energy, of which a single element is some 1e-4."""
+    """Forces at every node, and the energy, to which one element contributes some 1e-4."""
     forces = sim.forces().numpy()
     assert np.isfinite(forces).all()
     wrong = np.abs(forces - expected)[sound].max(axis=1) > TOLERANCE * np.abs(expected).max()
@@ -36,7 +36,7 @@ def check(sim, body, expected, energies, sound=slice(None)):
 @pytest.mark.parametrize("levels_up", [None, 1, 3, 4, 5])
 @pytest.mark.parametrize("name", FORESTS)
 def test_corotated_forests(name, levels_up, uniform, device, rng):
-    """Own rotations, one and three to five levels up: leaf by leaf, the subtree's root's, above the root."""
+    """Own rotations, and rotations one and three to five levels up: leaf by leaf, at the subtree's root, above it."""
     mesh = meshed(name)
     level = None if levels_up is None else int(np.bincount(mesh.levels).argmax()) - levels_up
     material, (mu, lam) = materials(len(mesh.tets), uniform, rng)
@@ -68,10 +68,10 @@ def test_corotated_general_elements(uniform, device, rng):
 
 @pytest.mark.parametrize("name", ["type 0", "type 1", "type 2", "general"])
 def test_some_elements_left_to_the_second_kernel(name, device, rng):
-    """Every tenth node displaced by an edge and more: elements that the fast iteration cannot turn lie in lanes between
-    those that it can.
+    """Every tenth node is displaced by an edge and more: elements that the fast iteration leaves out lie in lanes
+    between those that it handles.
 
-    Nodes are left out where an inverted element's smaller singular values nearly meet: it has no definite rotation.
+    Nodes of inverted elements whose smaller singular values nearly meet are excluded: they have no definite rotation.
     """
     mesh = meshed(name)
     sim, body = simulation(mesh, wc.Corotated(), device, dt=1e-5, material=MATERIAL)

@@ -1,4 +1,4 @@
-"""The rotation of any F without a guess, well defined or hardly: the maximiser of tr(R^T F)."""
+"""The rotation of any F without a guess, well defined or not: the maximiser of tr(R^T F)."""
 
 import numpy as np
 import oracle
@@ -23,7 +23,7 @@ def rotations(F, device):
 
 
 def signed(rng, spread, mirrored):
-    """Singular values around one, with the sign of det F on the smallest, as all that follow."""
+    """Singular values around one, with the sign of det F on the smallest, as in the following functions."""
     sigma = np.sort(np.exp(rng.normal(0.0, spread, (COUNT, 3))))[:, ::-1]
     return sigma * [1, 1, -1 if mirrored else 1]
 
@@ -62,9 +62,9 @@ def exact(F):
 
 @pytest.mark.parametrize("kind", STRETCHES)
 def test_the_maximiser_of_every_matrix(kind, device, rng):
-    """A rotation, of which the trace is the largest, and where it is defined the one that has it.
+    """The result is a rotation with the largest trace, and, where that is unique, the right one.
 
-    Where singular values meet the largest trace is that of many: 5e-3 of |F| is what may be lost there.
+    Where singular values meet, many rotations have the largest trace: the trace may be off by 5e-3 of |F| there.
     """
     F = matrices(STRETCHES[kind](rng), rng)
     R = rotations(F, device)
@@ -83,7 +83,7 @@ def test_the_maximiser_of_every_matrix(kind, device, rng):
 
 @pytest.mark.parametrize("scale", [1e-42, 1e-30, 1e-15, 1e15, 1e30, 3e38])
 def test_size_does_not_matter(scale, device, rng):
-    """Down to denormals, up to the largest float."""
+    """From denormals to the largest float."""
     F = matrices(signed(rng, 0.3, True)[:1000], rng)
     F /= np.abs(F).max(axis=(1, 2), keepdims=True)
     best, _, gap = exact(F)
@@ -103,7 +103,7 @@ def test_what_is_none_gives_the_identity(device):
 
 
 def test_the_rotation_is_a_function_of_the_matrix_alone(device, rng):
-    """Neither of the neighbours nor of what came before."""
+    """It does not depend on neighbours or on earlier calls."""
     F = np.concatenate([matrices(make(rng)[:2000], rng) for make in STRETCHES.values()])
     order = rng.permutation(len(F))
     R = rotations(F, device)

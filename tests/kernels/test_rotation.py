@@ -1,4 +1,4 @@
-"""Polar rotations of any matrix there is, by every method, and what the simulation keeps of them."""
+"""Polar rotations of any matrix, by every method, and the state that simulations keep of them."""
 
 import numpy as np
 import oracle
@@ -10,7 +10,7 @@ import warp_corot as wc
 
 METHODS = ("byers-xu", "svd", "warm")
 # Error of the polar factor (Frobenius): median, 99th percentile, largest. The SVD of McAdams et al. stops after a fixed
-# number of Jacobi sweeps, which leaves some matrices with nearly equal singular values unfinished: a baseline as it is.
+# number of Jacobi sweeps, which leaves some matrices with nearly equal singular values unfinished: it is a baseline.
 ACCURACY = {"byers-xu": (5e-7, 2e-6, 2e-5), "warm": (5e-7, 2e-6, 2e-5), "svd": (1e-6, 1e-3, 0.2)}
 
 
@@ -35,7 +35,7 @@ def matrices(rng, count):
 
 
 def gap(F):
-    """(sigma_2 + sign(det F) sigma_3) / sigma_1: how well the rotation is defined; 0 where it is not."""
+    """(sigma_2 + sign(det F) sigma_3) / sigma_1: how well the rotation is defined; 0 if it is not."""
     _, sigma, _ = np.linalg.svd(F)
     sign = np.sign(np.linalg.det(F / np.maximum(sigma[:, :1, None], 1e-300)))
     return (sigma[:, 1] + sign * sigma[:, 2]) / np.maximum(sigma[:, 0], 1e-300)
@@ -85,7 +85,7 @@ def test_not_a_number_gives_some_rotation(method, device):
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("scale", [1e-40, 1e-30, 1e-15, 1.0, 1e15, 1e30, 3e38])
 def test_scale_does_not_matter(method, scale, device, rng):
-    """The rotation of s F is that of F, for every s that float32 holds (digits lost to denormals aside)."""
+    """The rotation of s F is that of F, for every s that float32 represents (except digits lost to denormals)."""
     F = np.eye(3) + 0.3 * rng.uniform(-1, 1, (500, 3, 3))
     scaled = (scale / np.abs(F).max() * F).astype(np.float32)
     R = wc.polar_rotation(scaled, method=method, device=device)
@@ -105,7 +105,7 @@ def test_rotation_follows_the_matrix(method, device, rng):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_continuous_through_inversion(method, device, rng):
-    """An element pushed through its own plane turns no faster than its matrix does.
+    """An element pushed through its own plane rotates no faster than its matrix changes.
 
     |dR| <= 2 |dF| / (sigma_2 + sign(det) sigma_3), and along these paths that sum is at least 0.2.
     """
@@ -124,7 +124,7 @@ def test_continuous_through_inversion(method, device, rng):
 
 
 def test_fixed_iterations(device, rng):
-    """A fixed count does what it says: the error falls with it, faster and faster, down to float32's digits."""
+    """A fixed number of iterations is obeyed: the error falls with it, faster and faster, to float32's digits."""
     F = np.eye(3) + 0.3 * rng.uniform(-1, 1, (2000, 3, 3))
     exact = oracle.polar(F)
     errors = [
@@ -167,7 +167,7 @@ def test_methods_agree_in_the_force(method, device, rng):
 
 
 def test_warm_start_keeps_its_state(device, rng):
-    """By half a turn in small steps: the kept rotation follows, and looking at the forces changes nothing."""
+    """Half a turn in small steps: the stored rotation follows, and computing forces changes nothing."""
     mesh = wc.TetForest.box((1, 1, 1), 0.064, 3)
     small = random_displacement(mesh, rng, 0.05)
     reference = oracle_mesh(mesh)
@@ -184,7 +184,8 @@ def test_warm_start_keeps_its_state(device, rng):
 
 
 def test_warm_start_finds_the_rotation_from_anywhere(device, rng):
-    """From any guess: the answer, a random one, and half a turn away about a principal axis: no slope there."""
+    """From any guess: the answer, a random one, and half a turn away about a principal axis, where there is no
+    slope."""
     F = np.eye(3) + 0.5 * rng.uniform(-1, 1, (3000, 3, 3))
     F[:1000, :, 2] *= -1
     F = F[gap(F) > 0.1].astype(np.float32)
@@ -224,7 +225,7 @@ def ancestor_rotations(forest, u, level):
 
 
 def twisted(x):
-    """Turned about the z axis by 20 radians a metre, so that every part of the body has its own rotation."""
+    """A twist about the z axis by 20 radians a metre, so that every part of the body has a different rotation."""
     cos, sin = np.cos(20 * x[:, 2]), np.sin(20 * x[:, 2])
     return np.stack([cos * x[:, 0] - sin * x[:, 1], sin * x[:, 0] + cos * x[:, 1], x[:, 2]], axis=1)
 
@@ -232,7 +233,7 @@ def twisted(x):
 @pytest.mark.parametrize("level", range(7))
 @pytest.mark.parametrize("kind", ["uniform", "mixed"])
 def test_shared_rotations_equal_the_oracle(kind, level, device, rng):
-    """Every descendant of a tetrahedron of level L is turned by that tetrahedron's rotation, from its four vertices."""
+    """Every descendant of a tetrahedron of level L has that tetrahedron's rotation, from its four vertices."""
     forest = wc.TetForest.box((1, 1, 2), 0.064, 6) if kind == "uniform" else mixed_forest(cells=(1, 1, 2))
     if kind == "mixed":
         assert forest.levels.min() < 5 <= forest.levels.max()

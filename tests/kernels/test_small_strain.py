@@ -1,7 +1,7 @@
-"""Small motions are not noise: forces and energies keep their digits however small the strain is.
+"""Small motions do not drown in rounding: forces and energies keep their digits at any strain.
 
-Displacements are float32, right to 6e-8 of themselves, and a sum of differences of them to a few times that; a strain
-that is found as a difference of numbers near one is off by 1.5e-7 whatever its size.
+Displacements are float32, correct to 6e-8 relative, and their differences to a few times that; a strain
+computed as a difference of numbers near one is off by 1.5e-7 at any size.
 """
 
 import numpy as np
@@ -46,9 +46,9 @@ def test_leaf_by_leaf(level, amount, device, rng):
 
 @pytest.mark.parametrize("amount", AMOUNTS)
 def test_own_rotations_by_subtrees(amount, device, rng):
-    """The series of small displacements at and below its bound: right to 2e-5 in the worst case, beyond it to 1e-4.
+    """The series for small displacements at and below its bound: correct to 2e-5 in the worst case, beyond it to 1e-4.
 
-    ``amount`` = 0.01 lies about the bound, with leaves by both ways side by side.
+    ``amount`` = 0.01 lies near the bound, with leaves on both paths side by side.
     """
     forest = mixed_forest(cells=(2, 1, 1), level=7, passes=3, share=0.05)
     body = wc.SoftBody(forest, wc.Isotropic(**MATERIAL), device=device)
@@ -64,7 +64,7 @@ def test_own_rotations_by_subtrees(amount, device, rng):
 @pytest.mark.parametrize("amount", AMOUNTS)
 @pytest.mark.parametrize("leaf_level", [6, 7, 8])
 def test_shared_rotations_by_subtrees(leaf_level, amount, device, rng):
-    """Displacements turned back by the root's rotation keep their digits at every size."""
+    """Displacements rotated back by the root's rotation keep their digits at every size."""
     forest = wc.TetForest.box((1, 1, 1), 0.1, leaf_level)
     body = wc.SoftBody(forest, wc.Isotropic(**MATERIAL), device=device)
     u = amount * edge_scale(forest) * rng.uniform(-1, 1, forest.points.shape)
@@ -92,7 +92,7 @@ def test_shared_rotations_by_subtrees(leaf_level, amount, device, rng):
 @pytest.mark.slow
 @pytest.mark.parametrize("speed", [1.0, 1e-2, 1e-4, 1e-6])
 def test_energy_of_an_undamped_beam(speed, device):
-    """The paper's beam, soft, set off with v = a (z/L)^2: the energy is kept within 1 % over 20,000 steps."""
+    """The paper's beam, soft, with initial v = a (z/L)^2, keeps its energy within 1 % over 20,000 steps."""
     forest = wc.TetForest.box((1, 1, 3), 0.064, 3)
     fixed = np.flatnonzero(forest.points[:, 2] < 1e-9)
     material = {"young": 5e3, "poisson": 0.49, "density": 1000.0}

@@ -1,4 +1,4 @@
-"""The explicit stiffness matrices: their zeros, and that all three products are one."""
+"""The explicit stiffness matrices: their zeros, and the equality of all three products."""
 
 import numpy as np
 import oracle
@@ -43,7 +43,7 @@ def test_tables_are_the_stiffness_in_the_local_frame(kind):
 
 @pytest.mark.parametrize("level", range(9))
 def test_zeros_in_the_axes(level):
-    """In world axes every leaf of a type has as many zeros, and type 2 has fewer than in its own frame."""
+    """In world axes every leaf of a type has the same number of zeros, and type 2 has fewer than in its own frame."""
     forest = wc.TetForest.box((1, 1, 1), 1.0, level)
     matrices = oracle.stiffness(oracle_mesh(forest), 1.0, 1.7)
     assert {zeros(K) for K in matrices} == {ZEROS_OF_THE_AXES[level % 3]}

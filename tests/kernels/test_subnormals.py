@@ -1,4 +1,4 @@
-"""Subnormal numbers are zero while the CPU steps, and what they were before and after: the mode is the thread's own."""
+"""Subnormal numbers are zero while the CPU steps and as before afterwards: the mode belongs to the thread."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ SUBNORMAL = np.float32(1e-40)
 
 
 def are_kept():
-    """Whether this thread's arithmetic gives subnormal numbers and takes them for what they are."""
+    """Whether this thread's arithmetic produces and accepts subnormal numbers."""
     given, made = np.array([SUBNORMAL]), np.array([np.finfo(np.float32).tiny])
     return bool((given * np.float32(2.0) > 0).all() and (made * np.float32(0.5) > 0).all())
 

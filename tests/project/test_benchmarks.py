@@ -1,4 +1,4 @@
-"""The benchmarks run, check what they time, and report all of it. How fast anything is, no test asks."""
+"""The benchmarks run, check what they time, and report everything. No test checks speed."""
 
 import argparse
 import importlib.util
@@ -23,14 +23,16 @@ STAGES = {"rotation", "stiffness product", "scatter", "whole force", "integratio
 
 
 def run(script, *arguments, path=None):
-    """One of the scripts as users start it, small and fast; ``path`` comes before what is installed."""
-    environment = os.environ | ({} if path is None else {"PYTHONPATH": str(path)})
+    """Run a script as users do, small and fast; ``path`` comes before installed packages."""
+    paths = filter(None, [path and str(path), os.environ.get("PYTHONPATH")])
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
     command = [sys.executable, str(BENCHMARKS / script), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=Path(__file__).parent)
+    here = Path(__file__).parent
+    return subprocess.run(command, capture_output=True, encoding="utf-8", env=environment, cwd=here)
 
 
 def report(done, path):
-    """The JSON of a run that went well, whose table has a line for every row."""
+    """The JSON of a successful run, whose table has a line for every row."""
     assert done.returncode == 0, done.stderr
     found = json.loads(path.read_text(encoding="utf-8"))
     for row in found["rows"]:
@@ -61,7 +63,7 @@ def test_kernels(device, tmp_path):
         assert name in done.stdout
     for row in rows:
         assert row["error"] <= (1e-2 if "SVD" in row["variant"] else 1e-4), row
-        # A repeat moves what it must at the bandwidth that this means.
+        # A repeat moves its minimum traffic at the bandwidth that follows from it.
         if row["bytes_per_tet"] is not None:
             fraction = row["bytes_per_tet"] / row["ns_per_tet"] / found["copy_gb_per_s"]
             assert row["copy_fraction"] == pytest.approx(fraction)
@@ -178,7 +180,7 @@ def test_the_largest_stable_step_is_found(limit):
     from stable import LONGEST, PRECISION, Steppable
 
     class Threshold(Steppable):
-        """Blows up beyond a step."""
+        """A solver that diverges beyond a step."""
 
         name = "threshold"
 
@@ -238,7 +240,7 @@ def test_states(device, tmp_path):
 
 
 def test_bodies(tmp_path):
-    """A body that is meshed, one that is refused, and an earlier run beside them."""
+    """A body that is meshed, one that is refused, and an earlier run for comparison."""
     pytest.importorskip("trimesh")
     table, numbers = tmp_path / "bodies.md", tmp_path / "bodies.json"
     command = ("bodies.py", "cube-askew", "open-bowl", "--tets", 500, "--json", numbers, "-o", table)
@@ -261,3 +263,13 @@ def test_dragging_changes_patches_and_no_recording():
     assert done.returncode == 0, done.stderr
     assert len(done.stdout.splitlines()) == 2 + 6
     assert "follow keyframes" in done.stdout
+
+
+def test_the_haptic_loop_is_timed(tmp_path):
+    done = run("haptics.py", "--device", "cpu", "--level", "3", "--seconds", "3", "--json", tmp_path / "a.json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads((tmp_path / "a.json").read_text(encoding="utf-8"))
+    assert found["readings"] > 10
+    assert 0.0 < found["period"] <= found["period_99"] <= found["period_most"]
+    assert found["delay"] > 0.0
+    assert all(word in done.stdout for word in ("median", "99 %", "longest", "delay"))

@@ -1,4 +1,4 @@
-"""Every example runs on every device and writes an animation that opens."""
+"""Every example runs on every device and writes a valid animation."""
 
 import runpy
 import sys
@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
 
-#: What makes an example short enough for a test.
+#: Options that make an example short enough for a test.
 SHORT = {"sweep": ["--beams", "8"]}
-#: Packages that examples need, large, and so no part of what the tests install.
+#: Large packages that examples need and the tests do not install.
 NEEDS = {
     "brain": "nilearn",
     "frog": "pyvista",
@@ -37,7 +37,7 @@ def test_example(script, device, tmp_path, monkeypatch, capsys):
     assert stage.GetEndTimeCode() >= 3
     assert np.isfinite(last).all()
     if script.stem == "remesh":
-        assert len(last) > len(first)  # nodes gather
+        assert len(last) > len(first)  # the mesh was refined
     else:
         assert np.abs(last - first).max() > 1e-4  # something moves
     if script.stem == "sweep":

@@ -1,4 +1,4 @@
-"""What may import what."""
+"""Rules for imports."""
 
 import ast
 
@@ -7,20 +7,20 @@ from imports import Import, against_the_floors, circles, floor_of, imports, modu
 
 #: Kernels of passes over a mesh that changes.
 REMESHING = ("kernels.remesh",)
-#: Kernels that may know them: their own, and those that derive the plan of a mesh that has changed.
+#: Kernels that may import them: their own, and those that derive the plan of a changed mesh.
 PASSES = (*REMESHING, "kernels.plan")
-#: The modules that lie in no room: the public face.
+#: The modules outside the rooms: the public interface.
 ROOT_MODULES = {"__init__", "__main__", "api", "errors"}
-#: So many modules at most may import one another, lazily or for type checkers.
+#: Maximum number of modules that import one another, lazy imports and those for type checkers included.
 LARGEST_CIRCLE = 3
-#: So many imports at most may go from a lower floor to a higher one, and these do: a simulation saves and loads itself,
+#: Maximum number of imports from a lower floor to a higher one, and what they are: a simulation saves and loads itself,
 #: and a report names the package's version.
 MOST_UPWARDS = 6
 UPWARDS = {("simulation.simulation", "io.checkpoint.archive"), ("experiments.report", "__init__")}
 
 
 def test_no_force_law_knows_remeshing():
-    """Neither do kernels that are none of a pass's: what fields need comes by ``Discretization`` and ``Plan``."""
+    """Nor do kernels outside passes: fields get what they need from ``Discretization`` and ``Plan``."""
     for edge in imports():
         if edge.source.startswith("elasticity."):
             assert not edge.target.startswith(("remesh.", *REMESHING)), edge
@@ -28,7 +28,11 @@ def test_no_force_law_knows_remeshing():
             assert not edge.target.startswith(REMESHING), edge
     for name, path in modules().items():
         if name.startswith("elasticity."):
-            read = {node.attr for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Attribute)}
+            read = {
+                node.attr
+                for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+                if isinstance(node, ast.Attribute)
+            }
             assert "changing" not in read, name
 
 

@@ -1,4 +1,4 @@
-"""Bodies of domains under load: adaptive, cut meshes carry what fine uniform ones carry."""
+"""Bodies from domains under load: adaptive, cut meshes carry the loads of fine uniform ones."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ STIFF, SOFT = 2e4, 4e3
 
 
 def moved(mesh, body, points):
-    """Displacements at places of the rest shape [m], [n, 3]."""
+    """Displacements at points of the rest shape [m], [n, 3]."""
     elements, weights = mesh.embed(points)
     return np.einsum("nk,nkc->nc", weights, body.displacements.numpy()[mesh.tets[elements]])
 
@@ -21,13 +21,13 @@ def settled(body, gravity, damping, seconds, held):
     body.fix(held)
     sim = wc.Simulation(body, integrator=wc.SymplecticEuler(damping=damping), gravity=gravity)
     sim.advance(seconds)
-    # What it still moves by in a tenth of the time is far below any tolerance here.
+    # Its further motion in a tenth of the time is far below any tolerance here.
     assert np.abs(body.velocities.numpy()).max() * 0.1 * seconds < 1e-4
     return sim
 
 
 def dome(device, **size):
-    """The upper half of a ball leans over: the half below is held, so that the support is the same on every mesh."""
+    """The upper half of a ball leans over; the lower half is fixed, so that the support is the same on every mesh."""
     mesh = wc.TetForest.from_domain(wc.Domain.sphere(RADIUS, device=device), 0.04, **size)
     body = wc.SoftBody(mesh, wc.Isotropic(3e3, 0.3, DENSITY), device=device)
     gravity = 9.81 * np.array([0.6, -0.8, 0.0])
@@ -39,7 +39,7 @@ def dome(device, **size):
 
 
 def layered_domain(device):
-    """A beam of a stiff layer below a soft one; their border runs through elements."""
+    """A beam with a stiff layer below a soft one; their border runs through elements."""
     layer = wc.Domain.box((0, 0, 0), (LENGTH, LAYER, SIDE), device=device).named("stiff")
     return layer | wc.Domain.box((0, 0, 0), (LENGTH, SIDE, SIDE), device=device).named("soft")
 
@@ -58,9 +58,9 @@ def apart(one, other):
     return np.abs(one - other).max() / np.abs(other).max()
 
 
-# Both meshes are of linear tetrahedra, whose displacements err by the square of the edge length inside and, where they
-# are cut, by that of the surface's height over its chords. So adaptive meshes, fine at surfaces and borders and up to
-# twice as coarse within, must come near the fine uniform mesh, and far nearer than a uniform mesh twice as coarse.
+# Both meshes have linear tetrahedra. Displacement errors scale with the square of the edge length inside and, in cut
+# elements, with that of the surface's height over its chords. So adaptive meshes, fine at surfaces and borders and up
+# to twice as coarse within, must be close to the fine uniform mesh, and far closer than one twice as coarse.
 
 
 def test_dome_on_adaptive_and_uniform_meshes(device):
@@ -84,9 +84,9 @@ def test_two_layer_beam_on_adaptive_and_uniform_meshes(device):
 @pytest.mark.slow
 @pytest.mark.parametrize(("body", "level", "error"), [(dome, 15, 5e-5), (beam, 12, 1e-3)])
 def test_meshes_twice_as_fine(body, level, error, device):
-    """Measured by a uniform mesh of level 12, an adaptive one is as good as the uniform one of the level that it has
-    within, 9, or better: what is finer at surfaces and borders spoils nothing. It need not gain much: a beam's bending
-    errs by the edges within (2.8 % both), a ball's lean by its surface too."""
+    """Relative to a uniform mesh of level 12, an adaptive one is as good as the uniform one of its inner level,
+    9, or better: refinement at surfaces and borders does no harm. It need not gain much: errors of a beam's bending
+    come from the inner edges (2.8 % both), those of a ball's lean also from its surface."""
     finest = body(device, min_level=12, max_level=12)
     uniform = body(device, min_level=9, max_level=9)
     adaptive = body(device, min_level=9, max_level=level, surface_error=error)
@@ -97,7 +97,7 @@ def test_meshes_twice_as_fine(body, level, error, device):
 
 def test_two_layer_beam_bends_as_theory_says(device):
     """Euler and Bernoulli's sag of a clamped beam under its weight, q L^4 / (8 EI), about the layers' common neutral
-    axis; shear adds 2 % for a beam four times as long as high, and linear tetrahedra are some per cent too stiff."""
+    axis; shear adds 2 % for a beam four times as long as high, and linear tetrahedra are a few per cent too stiff."""
     areas = SIDE * np.array([LAYER, SIDE - LAYER])
     middles, heights = np.array([LAYER / 2, (SIDE + LAYER) / 2]), np.array([LAYER, SIDE - LAYER])
     young = np.array([STIFF, SOFT])
@@ -113,7 +113,7 @@ def test_two_layer_beam_bends_as_theory_says(device):
 
 
 def test_mass_is_the_domains(device):
-    """Less than the ball's by the surface's height over its chords: a quarter when edges are halved."""
+    """It is less than the ball's by the surface's height over its chords: a quarter when edges are halved."""
     exact = DENSITY * 4 / 3 * np.pi * RADIUS**3
     missing = []
     for level in (6, 9):
@@ -130,15 +130,15 @@ def test_mass_of_two_densities_is_that_of_their_layers(device):
     density = np.where(mesh.elements_of("stiff"), 2000.0, 500.0)
     body = wc.SoftBody(mesh, wc.Isotropic(1e4, 0.3, density), device=device)
     exact = LENGTH * SIDE * (2000.0 * LAYER + 500.0 * (SIDE - LAYER))
-    # An element has one label, that of the larger part of it: off by a share of the elements on the border.
+    # An element has only the label of its larger part: the error is a fraction of the elements on the border.
     assert body.masses.sum() == pytest.approx(exact, rel=0.04)
 
 
 @pytest.mark.parametrize("sliver", [0.02, 0.0])
 @pytest.mark.parametrize("seed", range(4))
 def test_no_node_is_left_without_stiffness(seed, sliver, device):
-    """Wherever the surface cuts: the stable step is that of the whole elements but for 10 %, and the lightest nodes
-    swing as fast as in whole elements: stiffness went along with mass."""
+    """For any cut: the stable step is that of whole elements within 10 %, and the lightest nodes
+    vibrate as fast as in whole elements: stiffness scales with mass."""
     rng = np.random.default_rng(seed)
     ball = wc.Domain.sphere(RADIUS * rng.uniform(0.8, 1.2), rng.uniform(-0.02, 0.02, 3), device=device)
     mesh = wc.TetForest.from_domain(ball, 0.04, max_level=9, surface_error=5e-4, sliver=sliver)
@@ -170,7 +170,7 @@ def swing(sim, body, node):
 
 
 def test_a_cut_body_stays_stable_at_the_step_that_is_found(device):
-    """Its lightest nodes kicked, undamped: the energy swings about, as it does with symplectic steps, but does not
+    """Its lightest nodes are kicked, undamped: the energy oscillates, as with symplectic steps, but does not
     grow."""
     mesh = wc.TetForest.from_domain(wc.Domain.sphere(RADIUS, (0.003, 0.007, -0.005), device=device), 0.04, max_level=9)
     body = wc.SoftBody(mesh, wc.Isotropic(3e3, 0.45, DENSITY), device=device)

@@ -1,4 +1,4 @@
-"""What is installed from a wheel is whole, and leaves nothing else behind."""
+"""A wheel installs completely and leaves nothing else behind."""
 
 import os
 import shutil

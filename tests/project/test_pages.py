@@ -1,7 +1,7 @@
-"""README and docs: every block of code runs, every command is one, every file that is named is there.
+"""README and docs: every block of code runs, every command is valid, every named file exists.
 
-Commands fall under rules by their program: those of this project are parsed by its own parser, and run where they are
-cheap; those that install or check are compared with pyproject.toml. A command under no rule fails.
+Rules apply to commands by their program: those of this project are parsed by its own parser, and run if they are
+cheap; those that install or check are compared with pyproject.toml. A command without a rule fails.
 """
 
 import os
@@ -34,11 +34,11 @@ def run_warp_corot(words):
         return
     given = str(options.input)
     if given in CHEAP or Path(given).exists():
-        assert command_line.run(*words, *command_line.SHORT) == 0, words  # of an option given twice the last counts
+        assert command_line.run(*words, *command_line.SHORT) == 0, words  # the last of repeated options is used
 
 
 def check_install(words):
-    """Extras that are asked for must be there."""
+    """Requested extras must exist."""
     named = re.findall(r"\[([\w,]+)\]", " ".join(words))
     asked = {extra for names in named for extra in names.split(",")}
     assert asked <= set(EXTRAS), f"no such extra: {asked - set(EXTRAS)}"
@@ -50,7 +50,7 @@ def check_tool(words):
 
 
 def check_python(words):
-    """A script or a module must be there; a virtual environment may be made."""
+    """A script or a module must exist; a virtual environment may be made."""
     if words[1] == "-m":
         if words[2] == "venv":
             return
@@ -90,7 +90,7 @@ def test_named_files_are_there(page):
 
 
 def test_a_file_format_is_added_as_the_recipe_says(tmp_path):
-    """To a copy of the package, which another process then runs."""
+    """The recipe is applied to a copy of the package, which another process then runs."""
     for part in ("warp_corot", "kernels"):
         ignored = shutil.ignore_patterns("__pycache__", "kernels") if part == "warp_corot" else None
         place = tmp_path / "warp_corot" / ("" if part == "warp_corot" else part)

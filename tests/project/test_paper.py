@@ -1,4 +1,4 @@
-"""The paper's experiment: its claims on a coarse beam and, slow, in full; what is written and what is refused."""
+"""The paper's experiment: its claims on a coarse beam and, slow, in full; its files and its errors."""
 
 import argparse
 import json
@@ -49,7 +49,7 @@ def parsed(*arguments):
 
 
 def check_claims(results, linear_at_least, growth_at_least):
-    """Corotated FEM stays within the published 3.6 mm of StVK, linear FEM does not and alone grows in volume."""
+    """Corotated FEM stays within the published 3.6 mm of StVK; linear FEM does not, and it alone grows in volume."""
     error = {name: results.error(name).max() for name in results.runs}
     growth = {name: run.growth[-1] for name, run in results.runs.items()}
     print({name: f"{1e3 * value:.2f} mm" for name, value in error.items()})
@@ -64,7 +64,7 @@ def check_claims(results, linear_at_least, growth_at_least):
 
 
 def check_levels(results):
-    """A rotation for each tetrahedron of the tree level; at the leaves' own level sharing is not sharing."""
+    """One rotation for each tetrahedron of the tree level; at the leaves' own level sharing has no effect."""
     level = results.settings.level
     assert [run.case.rotation_level for run in results.levels] == list(range(level + 1))
     assert [run.rotations for run in results.levels] == [18 * 2**k for k in range(level + 1)]
@@ -83,7 +83,8 @@ def test_claims_and_levels_on_a_coarse_beam(device):
 
 @pytest.mark.slow
 def test_the_full_experiment(device):
-    """80 s on the paper's mesh. Linear FEM's error (published: 22) is at least 15 mm, at its worst and at the end."""
+    """80 s on the paper's mesh. Linear FEM's error (published: 22 mm) is at least 15 mm, at its worst and at the
+    end."""
     results = run_experiment(Settings(duration=80.0, rounds=3), device=device)
     assert results.times[-1] == pytest.approx(80.0)
     check_claims(results, linear_at_least=15e-3, growth_at_least=0.15)
@@ -98,7 +99,7 @@ def test_the_full_experiment(device):
 
 
 def test_samples_are_those_of_an_uninterrupted_run(device):
-    """Looking at the beam does not change where it goes."""
+    """Sampling does not change the beam's motion."""
     results = coarse(device)
     body = wc.SoftBody(results.mesh, wc.Isotropic(young=500.0, poisson=0.49, density=10.0), device=device)
     body.fix(results.mesh.points[:, 2] < 1e-9)
@@ -111,7 +112,7 @@ def test_samples_are_those_of_an_uninterrupted_run(device):
 
 
 def test_the_shipped_path_goes_where_leaf_by_leaf_goes(device):
-    """Errors and shapes hold for the path whose stages are timed: both fall alike, to rounding."""
+    """Errors and shapes hold for the path whose stages are timed: both beams fall alike, to rounding."""
     settings = Settings(duration=0.1)
     mesh = wc.TetForest.box(CELLS, CELL_SIZE, settings.level)
     for case in cases(settings.level):
@@ -145,7 +146,7 @@ def test_rotations_within_a_tolerance_bring_the_end_where_own_ones_do(device):
 
 
 def test_every_stage_is_timed(device):
-    """Stages that a model does not have take no time; the others some, and a fused one says so."""
+    """Stages that a model lacks take no time; the others some, and a fused one is marked."""
     results = coarse(device)
     for run in results.runs.values():
         for times in (run.times.seconds, run.times.relative):
@@ -181,7 +182,7 @@ def test_json_holds_what_the_table_says(device, tmp_path):
         assert off.max() == pytest.approx(model["error_max_m"], abs=1e-7)
         assert off[-1] == pytest.approx(model["error_end_m"], abs=1e-7)
         assert f"{1e3 * model['error_max_m']:.2f}" in text or model["name"] == REFERENCE
-        # house rule: a CPU's absolute times are not given
+        # a CPU's absolute times are not reported
         assert (model["time"]["microseconds"] is None) == (device == "cpu")
     for claim, found in zip(read["claims"], judged_claims(results), strict=True):
         assert claim == asdict(found)
@@ -189,7 +190,7 @@ def test_json_holds_what_the_table_says(device, tmp_path):
 
 
 def test_claims_that_do_not_hold_are_said_not_to(device):
-    """Told that the linear model is the corotated one, the report must say that the claims fail."""
+    """If the linear model is passed as the corotated one, the report must say that the claims fail."""
     results = coarse(device)
     runs = {**results.runs, OWN: results.runs[PEER], PEER: results.runs[OWN]}
     swapped = type(results)(results.settings, results.mesh, results.device, results.times, runs)
@@ -237,7 +238,7 @@ def test_bad_values_are_refused_before_anything_is_made(arguments, says, tmp_pat
 def test_bad_folders_are_refused(tmp_path):
     (tmp_path / "file").write_text("mine")
     (tmp_path / "taken" / command.RESULTS).mkdir(parents=True)
-    for folder, says in (("file", "is a file"), ("no/where", "not there"), ("taken", "is a folder")):
+    for folder, says in (("file", "is a file"), ("no/where", "does not exist"), ("taken", "is a folder")):
         with pytest.raises(wc.InputError, match=says):
             command.run(parsed("-o", tmp_path / folder))
     assert (tmp_path / "file").read_text(encoding="utf-8") == "mine"
@@ -259,7 +260,7 @@ def test_missing_matplotlib_is_said_before_the_run(tmp_path, monkeypatch):
     ],
 )
 def test_an_interrupted_or_failed_run_is_one_line(where, raised, status, tmp_path, monkeypatch, capsys):
-    """And no status of success; a file that was there before is still whole."""
+    """The status is not success; a former file is still complete."""
     (tmp_path / "figure").write_text("old")
     results = coarse("cpu")
 

@@ -1,4 +1,4 @@
-"""Remeshing on the device: conforming, in balance, and as a sequential reference has it."""
+"""Remeshing on the device: conforming, consistent, and equal to a sequential reference."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from warp_corot.discretization.changing.pools import DeviceForest
 
 
 def run_against_reference(cells, level, device, rng, passes, *, most, limits=(0, 12)):
-    """Random marks, with swings between growing and shrinking; everything is checked after each pass."""
+    """Random marks that alternate between growth and shrinkage; everything is checked after each pass."""
     forest = wc.TetForest.box(cells, CUBE, level)
     adaptive = moving(forest, device, rng, capacity=8 * most)
     remesh = RemeshPass(adaptive, min_level=limits[0], max_level=limits[1])
@@ -44,14 +44,14 @@ def test_random_passes_are_those_of_the_sequential_reference(cells, level, devic
 
 
 def test_levels_limit_what_is_refined_and_simplified(device, rng):
-    """But what conformity asks for."""
+    """Except where conformity requires more."""
     adaptive, _ = run_against_reference((2, 1, 1), 3, device, rng, 80, most=400, limits=(3, 5))
     assert adaptive.to_forest().levels.min() == 3
 
 
 @pytest.mark.parametrize("where", ["scattered", "both ends far", "one end far"])
 def test_many_leaves_are_refined_as_the_forest_does_it(where, device, rng):
-    """Also at edges whose ends are named all over the list of leaves, as in the middle of the cube."""
+    """Edges whose ends are named all over the list of leaves, like in the middle of the cube, are included."""
     forest = wc.TetForest.box((1, 1, 1), CUBE, 14)
     count = len(forest.tets)
     if where == "scattered":
@@ -97,7 +97,7 @@ def test_simplification_leads_back_to_the_coarsest_mesh(device, rng):
 
 
 def state_by_point(device):
-    """Of each node its lattice point, ends' points and all it carries, in the order of the points."""
+    """The lattice point of each node, its ends' points and everything it carries, in the order of the points."""
     places = device.nodes_in_use
     arrays, lattice = device.carriage.arrays, device.pools.lattice.numpy()
     ends = device.pools.ends.numpy()[places]
@@ -180,7 +180,7 @@ def test_refinement_stops_cleanly_where_there_is_no_room(short_of, device, rng):
     # Nearly all the room is used: an edge is shared by eight leaves at most.
     assert min(adaptive.free_leaves // 8, adaptive.free_nodes) == 0
     assert np.allclose(momentum(adaptive)[0], p, atol=1e-5 * size)
-    # Room that is given back is used again.
+    # Returned room is used again.
     remesh.apply(np.full(adaptive.leaf_count, -1))
     fewer = len(assert_sound(adaptive).tets)
     assert fewer < len(grown.tets)
@@ -190,7 +190,8 @@ def test_refinement_stops_cleanly_where_there_is_no_room(short_of, device, rng):
 
 @pytest.mark.parametrize("passes", [40, pytest.param(1000, marks=pytest.mark.slow)])
 def test_random_passes_in_pools_that_are_often_full(passes, device, rng):
-    """Mass and the momentum that supports account for stay, and all else is sound; compacted now and then."""
+    """Mass and the momentum that supports account for are conserved, and everything is sound; compacted now and
+    then."""
     forest = wc.TetForest.box((2, 1, 1), CUBE, 2)
     held = rng.random(len(forest.points)) < 0.2
     adaptive = moving(forest, device, rng, capacity=700, held=held)

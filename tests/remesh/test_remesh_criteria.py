@@ -1,4 +1,4 @@
-"""What decides where a mesh is refined and simplified, and bodies with a void around them."""
+"""Criteria of refinement and simplification, and bodies with a void around them."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def test_elongation_of_the_longest_edge_decides(device, rng):
 
 @pytest.mark.parametrize("stretch", [1.18, 1.3, 1.5])
 def test_a_body_at_rest_stays_as_it_is(stretch, device):
-    """Under the same stretch everywhere passes come to an end, also where thresholds are next to one another."""
+    """Under uniform stretch passes end, even if the thresholds are close to each other."""
     forest = wc.TetForest.box((1, 1, 1), CUBE, 3)
     adaptive = DeviceForest(forest, 50_000, device=device)
     adaptive.carriage.set_nodes(displacements=forest.points * [stretch - 1.0, 0.0, 0.0])
@@ -68,7 +68,7 @@ def nearness(element: ElementState, parameters: wp.array[wp.float32]):
 
 
 def test_a_users_criterion_follows_a_tool(device):
-    """The mesh gathers where the tool is and relaxes behind it."""
+    """The mesh becomes fine at the tool and coarse behind it."""
     forest = wc.TetForest.box((3, 1, 1), CUBE, 3, origin=(-0.1, 0.0, 0.0))
     adaptive = DeviceForest(forest, 20000, device=device)
     tool = wp.zeros(3, dtype=wp.float32, device=device)

@@ -1,4 +1,4 @@
-"""A slab pulled and pressed at random for long: nothing is lost, nothing grows, nothing breaks."""
+"""A slab is pulled and pressed at random for long: nothing is lost, nothing grows, nothing breaks."""
 
 import gc
 import os
@@ -19,7 +19,7 @@ RADIUS = 0.3  # of a patch [m]
 
 
 class Ordeal:
-    """A slab on the floor; every second it is pushed or dragged somewhere else, and what was dragged is let go."""
+    """A slab on the floor; every second it is pushed or dragged at another place, and the dragged part is released."""
 
     def __init__(self, device, seed):
         self.rng = np.random.default_rng(seed)
@@ -62,7 +62,7 @@ class Ordeal:
         self.sim.advance_until(self.seconds)
 
     def push(self, sim):
-        """Forces on what is near the place, for the nodes there are now."""
+        """Load the current nodes near the place."""
         body = self.body
         share = np.maximum(1.0 - (self.distance(body.positions.numpy()) / RADIUS) ** 2, 0.0)
         body.load(np.arange(body.node_count), share[:, None] * body.masses[:, None] * self.pull)
@@ -83,7 +83,7 @@ def resident(device):
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads what memory is in use from /proc")
 @pytest.mark.parametrize("seconds", [8, pytest.param(3600, marks=pytest.mark.slow)])
 def test_pulled_and_pressed_at_random(seconds, device):
-    """Finite, or ``advance`` says so; mass to rounding; pools in balance; the region's volume; memory that stays."""
+    """The state is finite, or ``advance`` reports it; mass to rounding; balanced pools; volume; constant memory."""
     ordeal = Ordeal(device, seed=5)
     body, sim = ordeal.body, ordeal.sim
     mass, volume = body.masses.sum(), body.mesh.volumes.sum()
@@ -104,7 +104,7 @@ def test_pulled_and_pressed_at_random(seconds, device):
     assert sim.total_time == pytest.approx(seconds, abs=sim.dt)
     assert max(counts) > 3 * min(counts)
     assert not body.changing.is_full
-    # The first third warms up what is kept; after that nothing grows with the number of meshes there have been.
+    # The first third fills caches; after that nothing grows with the number of meshes.
     steady = np.array(memory[len(memory) // 3 :], dtype=float)
     growth = np.polyfit(np.linspace(0.0, 1.0, len(steady)), steady, 1)[0]
     assert growth < 4 << 20

@@ -14,7 +14,7 @@ TIMES, STRESS = np.array([0.0, 0.01, 0.05]), np.array([0.0, 2e3, -1e3])
 
 
 def turning(points):
-    """Fibres that turn with the depth."""
+    """Fibres that rotate with the depth."""
     angle = 12.0 * points[:, 0]
     return np.stack([np.cos(angle), np.sin(angle), np.full(len(points), 0.3)], axis=1)
 
@@ -44,7 +44,7 @@ def bar(material, device, level=6):
 
 
 def ball(device):
-    """Cut out of a domain: elements on its border are full by shares."""
+    """A ball cut out of a domain: elements on its border are partly filled."""
     domain = wc.Domain.sphere(0.04, device=device)
     return wc.TetForest.from_domain(domain, 0.03, max_level=6)
 
@@ -54,7 +54,7 @@ def depth(body):
 
 
 def active_twin(body, model, sim):
-    """A body of fixed topology in the same state, whose fibres do the same."""
+    """A body of fixed topology in the same state, with the same active stress."""
     fixed = twin(body, model, sim)
     if body.discretization.has_activation:
         fixed.body.activate(body.activation.numpy())
@@ -65,7 +65,7 @@ def active_twin(body, model, sim):
 
 
 def assert_goes_on(sim, model):
-    """A few steps come to the same as on a mesh made that way."""
+    """A few steps give the same as on a mesh made that way."""
     body, fixed = sim.body, active_twin(sim.body, model, sim)
     for each in (sim, fixed):
         each.advance_steps(3)
@@ -133,7 +133,7 @@ def test_elements_that_a_body_takes_a_share_of(has_fibres, model, device, rng):
 
 @pytest.mark.parametrize("model", MODELS, ids=repr)
 def test_elements_that_are_crushed(model, device, rng):
-    """Their material goes over to the nearest isotropic one, which is that of the present elements, too."""
+    """Their material blends into the nearest isotropic one, that of the current elements."""
     body = bar(MATERIALS["all"](), device, level=4)
     sim = wc.Simulation(body, model=model, remesh=near(0.1, device, max_level=6))
     sim.advance_steps(5)
@@ -144,7 +144,7 @@ def test_elements_that_are_crushed(model, device, rng):
 
 
 def test_fibres_pull_by_where_they_are(device):
-    """Whatever is refined and merged within each half: keyframes at one end, a constant at the other."""
+    """For any refinement within each half: keyframes at one end, a constant at the other."""
     body = bar(muscle([1, 0, 0]), device)
     body.activate(300.0, depth(body) < 0.05)
     body.activate(wc.Activation(TIMES, STRESS), depth(body) > 0.1)
@@ -154,7 +154,7 @@ def test_fibres_pull_by_where_they_are(device):
         remesh.parameters.assign([x, 0.02])
         sim.advance_steps(23)
         at = depth(body)
-        # A step's forces are those of its beginning.
+        # A step uses the forces at its beginning.
         now = np.interp(sim.time - sim.dt, TIMES, STRESS)
         expected = np.select([at < 0.05, at > 0.1], [300.0, now], 0.0)
         np.testing.assert_allclose(body.activation.numpy(), expected, atol=1e-3)
@@ -178,7 +178,7 @@ def test_keyframes_of_single_elements_go_to_what_is_made_of_them(device, rng):
 
 
 def halves(mesh):
-    """Corners of both children that each leaf would have, on the lattice [T, 4, 3] each."""
+    """Corners of both possible children of each leaf, on the lattice [T, 4, 3] each."""
     x, rows = mesh.lattice[mesh.tets].astype(int), np.arange(len(mesh.tets))
     end = 3 - mesh.levels % 3
     middle = (x[:, 0] + x[rows, end]) // 2
@@ -274,7 +274,7 @@ def test_reset_goes_back_to_what_the_first_mesh_did_last(device):
 
 
 def test_keyframes_that_nobody_follows_are_forgotten(device):
-    """However often they are set anew."""
+    """However often new ones are set."""
     body = bar(muscle([1, 0, 0]), device, level=3)
     sim = wc.Simulation(body, remesh=near(0.1, device, every=2))
     for n in range(8):
@@ -312,7 +312,7 @@ def test_a_resumed_run_is_the_uninterrupted_one(device, tmp_path):
 
 @pytest.mark.parametrize("kind", ["muscle", "wood"])
 def test_constants_of_a_stiffness(kind, rng):
-    """Those that it was made from."""
+    """They equal the constants from which it was made."""
     from warp_corot.materials.anisotropic import constants_of
 
     material = muscle([1, 0, 0], young_along=rng.uniform(2e4, 9e4, 20)) if kind == "muscle" else wood(np.eye(3))

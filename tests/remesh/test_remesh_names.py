@@ -1,4 +1,4 @@
-"""The names of remeshing that users build on: ``wc.remesh``, as a script of a user's has them."""
+"""Public names of remeshing in ``wc.remesh``, used as in a user's script."""
 
 from __future__ import annotations  # so that annotations are text, which Warp looks up among the function's globals
 
@@ -18,7 +18,7 @@ SIZE = 0.064
 
 @wp.func
 def strain_of_long_elements(element: wc.remesh.ElementState, parameters: wp.array[wp.float32]):
-    """The strain, of elements whose longest edge is longer than the second number."""
+    """The strain, for elements whose longest edge is longer than the second number."""
     found = wc.remesh.strain(element, parameters)
     if wc.remesh.longest_edge(element) <= parameters[1]:
         found = 0.0
@@ -31,7 +31,7 @@ def stretch_in_x(element: wc.remesh.ElementState, parameters: wp.array[wp.float3
 
 
 def elements_after_a_step(criterion, numbers, device, **options):
-    """Of a box of 384 elements, pulled to 1.3 times its length in x."""
+    """The number for a box of 384 elements, stretched to 1.3 times its length in x."""
     mesh = wc.TetForest.box((1, 1, 1), SIZE, 6)
     body = wc.SoftBody(mesh, wc.Isotropic(500.0, 0.45, 1000.0), device=device)
     body.displacements = mesh.points * [0.3, 0.0, 0.0]
@@ -56,7 +56,7 @@ def test_a_criterion_of_a_users_is_made_of_exported_names(device):
 
 @pytest.mark.parametrize("name", ["strain", "von_mises_stress", "nearness", "longest_edge", "green_strain"])
 def test_names_are_those_of_the_kernels(name):
-    """So that criteria written with the former import path are the same ones, and checkpoints know them."""
+    """Criteria written with the former import path are the same ones, and checkpoints know them."""
     assert getattr(wc.remesh, name) is getattr(remesh_criteria, name)
     assert wc.remesh.ElementState is remesh_mark.ElementState
     assert wc.remesh.elongation is remesh_mark.elongation

@@ -1,4 +1,4 @@
-"""How nodes of a changing mesh are numbered, what stands beyond them, and the way back to an earlier state."""
+"""Numbering of nodes of a changing mesh, padding beyond them, and the way back to an earlier state."""
 
 import numpy as np
 import pytest
@@ -11,12 +11,12 @@ from warp_corot.discretization.changing.pools import DeviceForest
 
 
 def points_of(device):
-    """Lattice points of the nodes that leaves name, by number."""
+    """Lattice points of the nodes of leaves, by number."""
     return [tuple(p) for p in device.pools.lattice.numpy()[: device.node_count].tolist()]
 
 
 def expected_numbers(before, after):
-    """Who stays, stays; the last ones fill the gaps in order; before any node is new."""
+    """Numbers before new nodes: remaining nodes keep theirs, and the last ones fill the gaps in order."""
     kept = [p if p in after else None for p in before]
     count = sum(p is not None for p in kept)
     gaps = [n for n, p in enumerate(kept[:count]) if p is None]
@@ -55,14 +55,14 @@ def test_new_nodes_come_after_all_others(device, rng):
         assert points_of(adaptive)[: len(before)] == before
         mesh = assert_sound(adaptive)
     assert len(mesh.points) > 3 * len(forest.points)
-    # Their rest positions, too, are those that a body on this mesh would have.
+    # Their rest positions equal those of a body made on this mesh.
     body = wc.SoftBody(mesh, wc.Isotropic(1e3, 0.3, DENSITY), device=device)
     rest = adaptive.carriage.arrays.rest.numpy()[: adaptive.node_count]
     assert np.allclose(rest, body.state.rest.numpy(), rtol=2e-7, atol=0)
 
 
 def test_nodes_that_move_keep_what_they_carry(device, rng):
-    """All but mass, load and velocity, which they may get from nodes that are removed."""
+    """All data except mass, load and velocity, which they may get from removed nodes."""
     forest = wc.TetForest.box((2, 1, 1), CUBE, 6)
     n = len(forest.points)
     held = rng.random(n) < 0.5
@@ -86,7 +86,7 @@ def test_nodes_that_move_keep_what_they_carry(device, rng):
 
 
 def test_nodes_at_the_rim_of_a_void_move_and_virtual_ones_stay(device, rng):
-    """Names are changed in void tetrahedra, too."""
+    """Void tetrahedra are renamed, too."""
     forest = wc.TetForest.from_domain(wc.Domain.sphere(0.05), 0.04, max_level=9, surface_error=3e-4)
     assert len(forest.lattice) > forest.node_count
     adaptive = DeviceForest(forest, 20000, density=DENSITY, device=device)
@@ -122,7 +122,7 @@ def test_what_the_last_pass_did_is_counted(device, rng):
 
 
 def test_new_held_nodes_follow_the_row_that_both_ends_follow(device, rng):
-    """-2 where these are different ones, -1 where there are none."""
+    """-2 if these differ, -1 if there are none."""
     forest = wc.TetForest.box((1, 1, 1), CUBE, 6)
     n = len(forest.points)
     held = forest.points[:, 0] < 0.6 * CUBE
@@ -154,7 +154,7 @@ def test_new_held_nodes_follow_the_row_that_both_ends_follow(device, rng):
 
 
 def in_use(device):
-    """All that is in use of all arrays, by name."""
+    """All used parts of all arrays, by name."""
     nodes, elements = device.nodes_in_use, np.flatnonzero(device.pools.level.numpy() >= 0)
     found = {"leaves": device.leaf_elements.copy(), "impulse": device.carriage.support_impulse.copy()}
     for struct, names, places in (
@@ -194,7 +194,7 @@ def test_restarting_leads_back_and_recorded_passes_go_on(kind, device, rng):
     assert_sound(adaptive)
     remesh.apply(marks[0])
     assert leaf_list(assert_sound(adaptive)) == leaves
-    # What is remembered may be any other state, and less than is in use when it is asked for.
+    # The remembered state may be any other one, and smaller than the current one.
     remesh.apply(random_marks(adaptive, rng, 0.0, 1.0))
     adaptive.remember()
     second = in_use(adaptive)
@@ -208,7 +208,7 @@ def test_restarting_leads_back_and_recorded_passes_go_on(kind, device, rng):
 
 @pytest.mark.parametrize("kind", ["box", "sphere"])
 def test_a_mesh_restarts_at_what_it_began_as(kind, device, rng):
-    """Also when its pools were full and it was compacted in between."""
+    """Even if its pools were full and it was compacted in between."""
     forest = START[kind]()
     adaptive = DeviceForest(forest, len(forest.tets) + 300, density=DENSITY, device=device)
     remesh, first = RemeshPass(adaptive), in_use(adaptive)

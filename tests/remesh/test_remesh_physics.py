@@ -1,4 +1,4 @@
-"""Meshes that follow the motion give what uniform fine ones give, with a fraction of the elements."""
+"""Remeshed bodies give the results of uniform fine meshes with a fraction of the elements."""
 
 import functools
 
@@ -24,7 +24,7 @@ def uniform(name, level, device, coarse):
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize(("name", "criterion"), CASES)
 def test_remeshed_bodies_resist_and_move_as_finely_meshed_ones(name, criterion, level, device):
-    """Within 2 % of the force and of all displacements, with a fifth of the elements, where coarse meshes are not."""
+    """Within 2 % of the force and of all displacements, with a fifth of the elements; coarse meshes are not."""
     fine, coarse = (uniform(name, level, device, which) for which in (False, True))
     found = run(SCENES[name], level, wp.get_device(device), criterion)
     print(*table(SCENES[name], [fine, coarse, found]), sep="\n")
@@ -35,7 +35,7 @@ def test_remeshed_bodies_resist_and_move_as_finely_meshed_ones(name, criterion, 
 
 
 def test_what_is_let_go_is_coarse_again(device):
-    """A bar pulled and brought back has the mesh and masses it began with, and is bent by nothing."""
+    """A bar that is stretched and brought back has its initial mesh and masses, and is straight."""
     scene = SCENES["bar"]
     mesh = scene.mesh(5)
     body = wc.SoftBody(mesh, TISSUE, device=device)
@@ -67,7 +67,7 @@ def test_what_is_let_go_is_coarse_again(device):
 
 
 def marked(forest, gradient, criterion, parameters, threshold, device):
-    """Which leaves a criterion finds to be above a threshold where the deformation gradient is the same everywhere."""
+    """The leaves where a criterion is above a threshold, at a uniform deformation gradient."""
     adaptive = DeviceForest(forest, len(forest.tets), device=device)
     adaptive.carriage.set_nodes(displacements=forest.points @ (gradient - np.eye(3)).T)
     numbers = wp.array(parameters, dtype=wp.float32, device=device)

@@ -1,4 +1,4 @@
-"""The force plan derived on the device: that of the mesh as it then is, with padding that does nothing beyond it."""
+"""The force plan derived on the device equals that of the current mesh, with padding that does nothing."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def made(mesh, device, room=4, **options):
 
 
 def shapes(elements, chosen):
-    """What codes say, whatever the order of the table of frames: level and handedness, and the frame itself."""
+    """The meaning of codes for any order of the table of frames: level and handedness, and the frame itself."""
     code = elements.code.numpy()[chosen]
     low = code & ((1 << FRAME_SHIFT) - 1)
     return np.column_stack([low, elements.frames.numpy()[code >> FRAME_SHIFT].reshape(len(code), 9)])
@@ -45,13 +45,13 @@ def assert_same_elements(found, expected, chosen, other):
 
 
 def by_unit(batch):
-    """Nodes of a batch's units of work, a row each."""
+    """Nodes of a batch's subtrees or leaves, a row for each."""
     nodes = batch.subtrees.nodes.numpy()
     return nodes if batch.grouped or batch.flagged.device.is_cpu else nodes.T
 
 
 class Comparison:
-    """A derived plan, and that of the mesh exported."""
+    """A derived plan, and that of the exported mesh."""
 
     def __init__(self, plan, forest, rotation_level, grouped):
         mesh = forest.to_forest()
@@ -139,7 +139,7 @@ class Comparison:
         assert (nodes < self.forest.node_capacity + int(SINKS)).all()
 
     def assert_exact(self, elements, count):
-        """Frames are along the axes, so that what does not move has F = I to the last digit."""
+        """Frames are axis-aligned, so that elements at rest have F = I to the last digit."""
         code = elements.code.numpy()[count:]
         assert np.isin(elements.frames.numpy()[code >> FRAME_SHIFT], (-1.0, 0.0, 1.0)).all()
 
@@ -151,7 +151,7 @@ class Comparison:
 
 
 def check(plan, forest, rotation_level, grouped=None):
-    """By the launches as they are, and then all that there is room for: nothing is left over from before."""
+    """With the current launches, and then with the full capacity: nothing is left over from before."""
     Comparison(plan, forest, rotation_level, grouped).check()
     counts = plan.class_counts.numpy()
     plan.refresh(np.full_like(counts, plan.counts.most - 1))
@@ -252,7 +252,7 @@ def test_forces_with_shared_rotations_are_those_of_a_body_on_the_present_mesh(ro
 
 
 def compare_forces(model, uniform, device, rng):
-    """Also where some elements are turned over; and what padding stands on has no force."""
+    """Including inverted elements; nodes of padding have no force."""
     source = MESHES["uniform"]()
     young = 1e4 if uniform else 1e4 * (1 + rng.random(len(source.tets)))
     material = wc.Isotropic(young, 0.4, 1000.0)

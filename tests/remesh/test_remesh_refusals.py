@@ -1,4 +1,4 @@
-"""What is refused of criteria and bodies before anything is changed, and where a full mesh is said."""
+"""Criteria and bodies that are refused before anything changes, and the warning of a full mesh."""
 
 import pytest
 import warp as wp
@@ -20,7 +20,7 @@ def that_returns_nothing(element: ElementState, parameters: wp.array[wp.float32]
 
 
 def test_criteria_that_cannot_work_are_named(device):
-    """A kernel would read beyond an array that is too short, without a word."""
+    """A kernel would silently read beyond an array that is too short."""
 
     def numbers(count, where=device):
         return wp.zeros(count, dtype=wp.float32, device=where)

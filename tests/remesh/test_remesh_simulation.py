@@ -1,4 +1,4 @@
-"""Simulations whose meshes follow the motion: what the user holds, and how time goes on."""
+"""Simulations whose meshes follow the motion: the user's views, and the course of time."""
 
 import numpy as np
 import pytest
@@ -105,7 +105,7 @@ def test_reset_goes_back_to_the_first_mesh_and_state(device):
 
 
 def test_reset_has_nodes_follow_what_those_of_the_first_mesh_did(device):
-    """Also if those of a later mesh do no more."""
+    """Even if the nodes of a later mesh no longer do."""
     body = bar(device)
     sim = wc.Simulation(body, remesh=near(0.1, device), integrator=wc.SymplecticEuler(damping=5.0))
     body.prescribe(body.mesh.points[:, 0] > 0.2 - 1e-9, times=[0.0, 0.01], displacements=[[0, 0, 0], [0.01, 0, 0]])
@@ -135,7 +135,7 @@ def test_a_full_mesh_is_said_once_and_goes_on(device):
     body = bar(device)
     count = body.element_count
     sim = wc.Simulation(body, remesh=near(0.1, device, capacity=count + 40, simplify_below=0.0))
-    with pytest.warns(wc.CapacityWarning, match=f"capacity is {count + 40} elements") as said:
+    with pytest.warns(wc.CapacityWarning, match=f"capacity of {count + 40} elements") as said:
         sim.advance_steps(40)
     assert len(said) == 1
     assert count < body.element_count <= count + 40
@@ -160,7 +160,7 @@ def test_the_step_follows_the_finest_elements(device):
     sim.advance(0.3)
     assert int(body.mesh.levels.max()) <= 4
     assert sim.stable_dt > 1.5 * coarse
-    assert sim.dt > coarse_dt  # less by what its strains allow
+    assert sim.dt > coarse_dt  # reduced by its strains
     assert sim.time == pytest.approx(before + 0.4, rel=1e-12)
 
 
@@ -223,7 +223,7 @@ def test_bound_points_stay_with_the_mesh(device):
     binding = body.bind(points)
     remesh = near(0.1, device)
     sim = wc.Simulation(body, gravity=(0, 0, 0), remesh=remesh)
-    # An affine motion is what any mesh holds exactly.
+    # Any mesh represents an affine motion exactly.
     gradient = np.array([[0.1, 0.2, 0.0], [0.0, -0.1, 0.0], [0.3, 0.0, 0.1]])
     for x in (0.05, 0.15, 0.1):
         remesh.parameters.assign([x, 0.02])
@@ -291,7 +291,7 @@ def test_others_cannot_record_steps_that_change(device):
 
 
 def test_a_turning_body_turns_on_as_fast(device):
-    """Angular momentum and energy change as lumped moments of inertia do, those of coarse meshes being larger."""
+    """Angular momentum and energy change like lumped moments of inertia; those of coarse meshes are larger."""
     body = bar(device, level=5)
     body.release(np.arange(body.node_count))
     body.velocities = np.cross([0.0, 0.0, 3.0], body.mesh.points - [0.1, 0.025, 0.025])
@@ -312,6 +312,6 @@ def test_a_turning_body_turns_on_as_fast(device):
     assert body.version > revision + 10
     found = motion()
     assert found[1] > 1.005 * inertia
-    # A pass keeps neither to the last digit where velocities vary along an edge: -0.4 % here.
+    # A pass does not keep them exactly if velocities vary along an edge: -0.4 % here.
     assert found[0] / found[1] == pytest.approx(3.0, rel=1e-2)
     assert found[2] / energy == pytest.approx(found[1] / inertia, rel=2e-2)

@@ -1,4 +1,4 @@
-"""What nodes and elements carry while a mesh changes: deformation, mass, momentum, loads, labels."""
+"""Data of nodes and elements while a mesh changes: deformation, mass, momentum, loads, labels."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ def test_children_keep_the_deformation_and_the_energy(device, rng):
 
 
 def test_removal_undoes_bisection(device, rng):
-    """If nothing moved between the two, velocities and displacements are what they were."""
+    """If nothing moved in between, velocities and displacements are restored."""
     forest = wc.TetForest.box((1, 1, 1), CUBE, 3)
     n = len(forest.points)
     held = rng.random(n) < 0.2
@@ -48,7 +48,7 @@ def test_removal_undoes_bisection(device, rng):
 
 
 def held_velocities(device):
-    """Of the nodes that are held, by lattice point: their numbers may change in a pass."""
+    """Velocities of held nodes by lattice point: their numbers may change in a pass."""
     count, arrays = device.node_count, device.carriage.arrays
     points = map(tuple, device.pools.lattice.numpy()[:count].tolist())
     known = zip(points, arrays.v.numpy()[:count], arrays.held.numpy()[:count], strict=True)
@@ -63,7 +63,7 @@ def test_supports_account_for_the_momentum_that_held_nodes_cannot_take(device, r
     arrays = adaptive.carriage.arrays
     remesh = RemeshPass(adaptive)
     for _ in range(10):
-        # New velocities, as steps in between would give: those that are held keep theirs.
+        # New velocities, as after steps: held nodes keep theirs.
         v = arrays.v.numpy().copy()
         free = (arrays.held.numpy() == 0) & (arrays.mass.numpy() > 0)
         v[free, :3] = rng.normal(size=(free.sum(), 3))
@@ -93,7 +93,7 @@ def test_nodes_between_held_ones_are_held(device):
 
 
 def test_different_densities_become_one_and_keep_mass_and_momentum(device, rng):
-    """Each leaf's density another one; two that are merged have their mean, and their mass goes where it belongs."""
+    """Each leaf has another density; merged leaves have the mean, and their mass goes to the right nodes."""
     forest = wc.TetForest.box((2, 1, 1), CUBE, 4)
     density = rng.uniform(100.0, 3000.0, len(forest.tets))
     stiffness = rng.uniform(1.0, 2.0, len(forest.tets))
@@ -138,7 +138,7 @@ def test_loads_stay_in_sum(device, rng):
 
 def test_a_new_node_takes_what_leaves_of_any_density_lose(device, rng):
     """Densities around one edge span six decades. A leaf of mass M becomes two of M / 2, each with a quarter at each of
-    its nodes: both ends lose M / 8 and the new node, which is in both, gets M / 4."""
+    its nodes: both ends lose M / 8, and the new node, which belongs to both, gets M / 4."""
     forest = wc.TetForest.box((1, 1, 1), CUBE, 6)
     density = 10.0 ** rng.uniform(-2, 4, len(forest.tets))
     edge = forest.tets[17, [0, 3]]

@@ -1,4 +1,4 @@
-"""Steps of a body that is remeshed go on as those of a body on a mesh made that way."""
+"""Steps of a body that is remeshed equal those of a body on a mesh made that way."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from warp_corot.kernels.remesh.mark import ElementState
 
 @wp.func
 def within(element: ElementState, parameters: wp.array[wp.float32]):
-    """1 for elements with a corner that is within a distance of a point."""
+    """1 for elements with a corner within a distance of a point."""
     point = wp.vec3(parameters[0], parameters[1], parameters[2])
     least = wp.length(element.corner - point)
     for n in range(1, 4):
@@ -45,7 +45,7 @@ def test_steps_go_on_as_on_a_mesh_made_that_way(model, varied, device):
     body.load(mesh.points[:, 0] > 0.2 - 1e-9, [0.0, 0.0, 0.1])
     mass = body.masses.sum()
     remesh = near(0.1, device)
-    # Given, so that both take the same: one that follows the state is measured again while the other goes on.
+    # Given, so that both take the same step: one that follows the state is measured again during the run.
     integrator = wc.SymplecticEuler(dt=DT, damping=1.0)
     sim = wc.Simulation(body, model=model, integrator=integrator, remesh=remesh)
     counts = set()

@@ -1,4 +1,4 @@
-"""A published experiment, made again: the experiment, its timing, its claims, its report and its figures."""
+"""A published experiment, repeated: the experiment, its timing, its claims, its report and its figures."""
 
 from .paper import Results, Run, Settings, run_experiment
 

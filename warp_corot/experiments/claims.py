@@ -1,4 +1,4 @@
-"""The paper's claims, each put to the test in numbers."""
+"""The paper's claims, each tested by numbers."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ import numpy as np
 
 from .paper import OWN, PEER, Results, Run
 
-#: Published errors of the observed node against StVK [m], and what linear FEM's must reach to be told from the others.
+#: Published errors of the observed node against StVK [m], and the error from which linear FEM counts as worse.
 PUBLISHED_COROTATED, PUBLISHED_LINEAR, LINEAR_AT_LEAST = 3.6e-3, 22e-3, 15e-3
-#: A volume that changes by less is kept; linear FEM's must grow by at least five times that.
+#: A volume with a smaller change is kept; linear FEM's must grow by at least five times that.
 VOLUME_KEPT = 0.01
 #: "Much faster": the whole step takes at most half the time. "No significant error": sharing rotations moves the node
-#: by at most this share of how far it sinks.
+#: by at most this fraction of its sag.
 MUCH_FASTER, SIGNIFICANT = 2.0, 0.01
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim of the paper, and what was found.
+    """A claim of the paper, and the result here.
 
     Attributes:
-        claim: In words.
-        published: What the paper says.
-        measured: What was measured.
-        holds: Whether it holds here, by the bound that ``criterion`` states.
+        claim: The claim in words.
+        published: The paper's result.
+        measured: The result here.
+        holds: Whether it holds here, within the bound in ``criterion``.
         criterion: The bound.
     """
 
@@ -93,7 +93,7 @@ def judged_claims(results: Results) -> list[Claim]:
 
 
 def speed_up(results: Results, run: Run) -> float:
-    """How many times as fast as with own rotations a whole step is, both leaf by leaf."""
+    """Speed-up of a whole step over own rotations, both leaf by leaf."""
     own = results.runs[OWN].times
     assert own is not None
     assert run.times is not None
@@ -101,7 +101,7 @@ def speed_up(results: Results, run: Run) -> float:
 
 
 def shipped_speed_up(results: Results, run: Run) -> float:
-    """The same of the steps as shipped."""
+    """Speed-up of a step as shipped."""
     own = results.runs[OWN].times
     assert own is not None
     assert run.times is not None
@@ -115,7 +115,7 @@ def _shares_well(results: Results, run: Run) -> bool:
 
 
 def _above_published(results: Results) -> str:
-    """Which levels of shared rotations are further off than published."""
+    """The levels of shared rotations with larger errors than published."""
     worst = {run.case.rotation_level: results.error(run.case.name).max() for run in results.levels}
     above = [f"{level} ({1e3 * error:.2f} mm)" for level, error in worst.items() if error >= PUBLISHED_COROTATED]
     return (

@@ -1,4 +1,4 @@
-"""Counterparts of the paper's figures 5 to 8, drawn with Matplotlib alone (an extra)."""
+"""Counterparts of the paper's figures 5 to 8, drawn with Matplotlib (an extra)."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ FILES = {
 }
 
 _ROTATION, _FORCE, _REST, _FUSED, _SHIPPED = "#d95f3b", "#3b7ea1", "#b9c3c9", "#8a6f8e", "#4c8c5f"
-#: The time after which nothing moves any more and a long run's axis is compressed [s].
+#: The time after which nothing moves and the axis of a long run is compressed [s].
 _SETTLED = 3.0
 
 
 def check_matplotlib() -> None:
-    """Says before a long run whether figures can be drawn.
+    """Check, before a long run, that figures can be drawn.
 
     Raises:
         InputError: Matplotlib is not installed.
@@ -42,14 +42,14 @@ def check_matplotlib() -> None:
 
 
 def draw_figures(folder: Path, results: Results) -> list[Path]:
-    """Draws all figures into a folder that is there, each written aside and renamed.
+    """Draw all figures into an existing folder; each is written to a temporary file and renamed.
 
     Returns:
         The files, in the order of the paper's figures.
 
     Raises:
         InputError: Matplotlib is not installed.
-        OSError: A file could not be written; one that was there before stays.
+        OSError: A file could not be written; a former one stays.
     """
     check_matplotlib()
     paths = {number: folder / name for number, name in FILES.items()}
@@ -61,7 +61,7 @@ def draw_figures(folder: Path, results: Results) -> list[Path]:
 
 
 def draw_times(path: Path, results: Results) -> None:
-    """Figure 5: what a time step costs, by model and by rotation level: stage by stage leaf by leaf, and as shipped."""
+    """Figure 5: time of a step by model and by rotation level: by stages leaf by leaf, and as shipped."""
     figure = new_figure(8.0, 4.9)
     ax = figure.add_axes((0.085, 0.255, 0.895, 0.59))
     runs = [results.runs[name] for name in (PEER, REFERENCE, "neo-hookean")]
@@ -129,7 +129,7 @@ def draw_times(path: Path, results: Results) -> None:
 
 
 def draw_errors_by_model(path: Path, results: Results) -> None:
-    """Figure 7: how far the observed node is from where it is under StVK, over time."""
+    """Figure 7: distance of the observed node from its place under StVK, over time."""
     lines = [
         (results.runs[PEER], "linear", LINEAR, 1.8),
         (results.runs["neo-hookean"], "neo-Hookean", NEO, 1.3),
@@ -140,7 +140,7 @@ def draw_errors_by_model(path: Path, results: Results) -> None:
 
 
 def draw_errors_by_level(path: Path, results: Results) -> None:
-    """Figure 8: the same by the tree level whose rotations are shared."""
+    """Figure 8: the same distance by the tree level whose rotations are shared."""
     import matplotlib
 
     shared = results.levels
@@ -160,7 +160,7 @@ def _draw_errors(
     marks: Sequence[tuple[float, str]],
     title: str,
 ) -> None:
-    """Errors over time in mm: the swing on a wide panel, and whatever follows it compressed on a narrow one."""
+    """Errors over time in mm: the swing on a wide panel, and the rest compressed on a narrow one."""
     figure = new_figure(8.0, 4.4)
     end = float(results.times[-1])
     long = end > 2.0 * _SETTLED
@@ -203,7 +203,7 @@ def _draw_errors(
 
 
 def _label_ends(ax: Axes, values: list[float], labels: list[tuple[str, object]], top: float) -> None:
-    """Names beside the ends of lines, pushed apart where they would overlap."""
+    """Write names beside the ends of lines, moved apart if they would overlap."""
     gap = 0.052 * top
     order = np.argsort(values)
     places = np.array(values, dtype=float)[order]
@@ -214,7 +214,7 @@ def _label_ends(ax: Axes, values: list[float], labels: list[tuple[str, object]],
                 places[i] += lack / 2
                 places[i - 1] -= lack / 2
         places = np.maximum(places, 0.02 * top)
-    # In shares of the axes' width, so that the gap looks alike on a wide and on a narrow panel.
+    # In fractions of the axes' width, so that the gap looks the same on a wide and on a narrow panel.
     unit = 0.01 / ax.get_position().width
     across = ax.get_yaxis_transform()
     for place, index in zip(places, order, strict=True):

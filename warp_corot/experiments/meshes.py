@@ -1,4 +1,4 @@
-"""How many tetrahedra a surface costs: adaptive against uniform meshes, on a ball and on a body with fine features.
+"""Number of tetrahedra for a surface: adaptive and uniform meshes of a ball and of a body with fine features.
 
 ``python -m warp_corot.experiments.meshes -o lod.png`` measures and draws it.
 """
@@ -23,7 +23,7 @@ from .style import FAINT, INK, LINEAR, OWN_COLOR, new_figure, save, tidy
 
 #: Edge of a root cube [m]; the bodies fit into one cube or a few.
 CELL = 1.0
-#: A mesh farther than this [m] from the spiny body, by the spines' thickness, has lost a spine or most of it.
+#: A mesh farther than this [m], the spines' thickness, from the spiny body has lost most of a spine.
 LOST = 0.02
 
 
@@ -32,12 +32,12 @@ class Point:
     """A mesh of a body.
 
     Attributes:
-        name: Of the body.
+        name: Name of the body.
         kind: "uniform", or "adaptive".
-        level: The deepest there is.
-        tets: How many tetrahedra.
-        error: Largest distance between the marched surface and the body's, either way [m].
-        seconds: From the domain to the forest.
+        level: The deepest level.
+        tets: Number of tetrahedra.
+        error: Largest distance between the marched surface and the body's, in either direction [m].
+        seconds: Time to make the forest from the domain.
     """
 
     name: str
@@ -54,7 +54,7 @@ def ball() -> Domain:
 
 
 def spiny() -> Domain:
-    """The ball with three spines of 1 cm radius that stand out by 8 cm."""
+    """The ball with three spines of 1 cm radius that protrude by 8 cm."""
     body = ball()
     for direction in ([1.0, 0.2, 0.1], [-0.3, 1.0, 0.2], [0.1, -0.2, -1.0]):
         unit = np.array(direction) / np.linalg.norm(direction)
@@ -66,8 +66,8 @@ def distance_between(mesh: TetForest, domain: Domain, samples: np.ndarray) -> fl
     """The largest distance between a mesh's marched surface and its body's [m].
 
     Args:
-        mesh: Made from the domain.
-        domain: phi must be a distance near the surface.
+        mesh: A mesh made from the domain.
+        domain: The domain; phi must be a distance near the surface.
         samples: Points on the body's surface [n, 3].
     """
     surface = mesh.surface()
@@ -78,7 +78,7 @@ def distance_between(mesh: TetForest, domain: Domain, samples: np.ndarray) -> fl
 
 
 def measured(name: str, kind: str, domain: Domain, samples: np.ndarray, **size: float | None) -> Point:
-    """A mesh made and measured. ``size`` is what `TetForest.from_domain` takes."""
+    """Make and measure a mesh. ``size`` has arguments of `TetForest.from_domain`."""
     started = time.perf_counter()
     mesh = TetForest.from_domain(domain, CELL, **size)  # type: ignore[arg-type]
     seconds = time.perf_counter() - started
@@ -87,7 +87,7 @@ def measured(name: str, kind: str, domain: Domain, samples: np.ndarray, **size: 
 
 
 def sampled(domain: Domain, error: float) -> np.ndarray:
-    """Points on the body's surface [n, 3]: those of a mesh of that surface error [m], moved along phi's gradient."""
+    """Points on the body's surface [n, 3]: those of a mesh with this surface error [m], moved along phi's gradient."""
     x = TetForest.from_domain(domain, CELL, max_level=36, surface_error=error).surface().points
     step = 1e-3 * np.eye(3)
     slope = np.stack([domain.phi(x + d) - domain.phi(x - d) for d in step], axis=1)
@@ -99,7 +99,7 @@ def sampled(domain: Domain, error: float) -> np.ndarray:
 def study(
     levels: Sequence[int] = (9, 12, 15, 18, 21), errors: Sequence[float] = (16e-3, 8e-3, 4e-3, 2e-3, 1e-3)
 ) -> list[Point]:
-    """Meshes of the ball with all of its surface, or all of it, at each level; and of the spiny one adaptive ones for
+    """Meshes of the ball, refined at its surface or everywhere, at each level; and of the spiny body, adaptive ones for
     each surface error [m] and uniform ones of the same levels."""
     points = []
     domain = ball()
@@ -124,8 +124,8 @@ def ratios_by_level(points: Sequence[Point]) -> dict[int, float]:
 
 
 def ratios_by_error(points: Sequence[Point]) -> dict[float, float]:
-    """For each uniform mesh of the spiny body the number of tetrahedra of the smallest adaptive one that is no farther
-    from it, over its own; by its error [m]. Only of uniform meshes that have the spines at all."""
+    """For each uniform mesh of the spiny body, the number of tetrahedra of the smallest adaptive mesh that is at least
+    as close, over its own; by its error [m]. Only for uniform meshes that have the spines."""
     found = {}
     for mesh in (p for p in points if (p.name, p.kind) == ("spiny", "uniform") and p.error < LOST):
         enough = [p.tets for p in points if (p.name, p.kind) == ("spiny", "adaptive") and p.error <= mesh.error]
@@ -138,7 +138,7 @@ KINDS = {"uniform": LINEAR, "adaptive": OWN_COLOR}
 
 
 def draw(points: Sequence[Point], path: Path) -> None:
-    """Tetrahedra over level for the ball, with the ratio, and over the distance reached for the spiny body.
+    """Draw tetrahedra over level for the ball, with the ratio, and over the distance for the spiny body.
 
     Raises:
         OSError: The picture cannot be written.
@@ -167,7 +167,7 @@ def draw(points: Sequence[Point], path: Path) -> None:
 
 
 def table(points: Sequence[Point]) -> list[str]:
-    """The numbers, a line a mesh."""
+    """The numbers, one line for each mesh."""
     lines = [f"{'body':6} {'mesh':9} {'level':>5} {'tetrahedra':>11} {'error, mm':>10} {'seconds':>8}"]
     for p in points:
         lines.append(f"{p.name:6} {p.kind:9} {p.level:5} {p.tets:11} {1e3 * p.error:10.2f} {p.seconds:8.2f}")

@@ -1,9 +1,9 @@
-"""The paper's experiment: a beam held at one end falls under its weight, by model and by the level of its rotations.
+"""The paper's experiment: a beam fixed at one end sags under its weight, by model and by the level of its rotations.
 
-After Tagawa, Yamada and Tanaka (IEEE EMBC 2013), section III. What the paper does not publish is chosen so that its two
-figures come out (3.6 and 22 mm): symplectic Euler, a step of 0.2 ms and mass-proportional damping of 15 /s.
+After Tagawa, Yamada and Tanaka (IEEE EMBC 2013), section III. Parameters that the paper does not publish reproduce its
+two figures (3.6 and 22 mm): symplectic Euler, a step of 0.2 ms and mass-proportional damping of 15 /s.
 
-Paths and shapes are those of the models as shipped; their steps' stages are timed leaf by leaf, as the paper has it.
+Errors and shapes are those of the models as shipped; the stages of steps are timed leaf by leaf, as in the paper.
 """
 
 from __future__ import annotations
@@ -32,31 +32,31 @@ from .timing import Stages, Times, measure_times
 Array = npt.NDArray[np.float64]
 
 CELLS, CELL_SIZE = (1, 1, 3), 0.064
-#: The node whose displacement is compared [m]: the middle of the free end.
+#: The observed node [m]: the middle of the free end.
 OBSERVED = (0.032, 0.032, 0.192)
 GRAVITY = (0.0, -9.8, 0.0)
 MATERIAL = {"young": 500.0, "poisson": 0.49, "density": 10.0}
 
-#: Simulated time [s]: the paper's, and one in which the beam comes to rest, for the impatient.
+#: Simulated time [s]: the paper's, and a shorter one in which the beam comes to rest.
 FULL_DURATION, SHORT_DURATION = 80.0, 4.0
 
-#: Names of the models that others are compared with.
+#: Names of the reference models.
 REFERENCE, PEER, OWN = "stvk", "linear", "corotated"
 
-#: Steps between two looks at the beam; as many as are recorded in one graph, so that looking costs next to nothing.
+#: Steps between samples; as many as one graph records, so that sampling costs next to nothing.
 SAMPLE_STEPS = GRAPH_STEPS
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What may be chosen about the experiment.
+    """Settings of the experiment.
 
     Attributes:
         duration: Simulated time [s].
         dt: Time step [s].
         damping: Rate of mass-proportional damping [1/s].
         level: Bisections of the mesh; the paper's is 6.
-        rounds: Timing: how often every stage is timed, in turn.
+        rounds: Number of timings of each stage, in turn.
 
     Raises:
         InputError: A value out of its range.
@@ -81,19 +81,19 @@ class Settings:
 
     @property
     def samples(self) -> int:
-        """How often the beam is looked at; the run ends at the last look, which is the one nearest to ``duration``."""
+        """Number of samples; the run ends at the last one, which is nearest to ``duration``."""
         return max(round(self.duration / (SAMPLE_STEPS * self.dt)), 1)
 
 
 @dataclass(frozen=True)
 class Case:
-    """One of the models compared.
+    """One of the models.
 
     Attributes:
-        name: Short, in results.json.
-        label: For people.
+        name: Short name in results.json.
+        label: Label in figures and tables.
         model: The elastic model.
-        rotation_level: Of a corotated model whose rotations are shared.
+        rotation_level: Level of shared rotations of a corotated model.
     """
 
     name: str
@@ -103,7 +103,7 @@ class Case:
 
 
 def cases(level: int) -> list[Case]:
-    """The models compared on a mesh of that level, the reference first."""
+    """The models for a mesh of that level, the reference first."""
     return [
         Case(REFERENCE, "St. Venant–Kirchhoff", StVenantKirchhoff()),
         Case("neo-hookean", "neo-Hookean", NeoHookean()),
@@ -118,13 +118,13 @@ class Run:
     """One model's run.
 
     Attributes:
-        case: Which model.
+        case: The model.
         path: Displacement of the observed node at each sample [m], float64 [S, 3].
         growth: Volume of the beam over its volume at rest, less 1, at each sample, float64 [S].
         positions: Nodes at the end [m], float64 [N, 3].
         speed: Largest speed of a node at the end [m/s]; rounding keeps it from being zero.
-        rotations: How many rotations are extracted a step.
-        times: What a step costs; None where it was not asked for.
+        rotations: Number of rotations that a step extracts.
+        times: Times of a step; None if they were not measured.
     """
 
     case: Case
@@ -141,11 +141,11 @@ class Results:
     """The whole experiment.
 
     Attributes:
-        settings: As asked for.
+        settings: The settings.
         mesh: The beam.
-        device: Where it ran.
+        device: The device of the runs.
         times: Time of each sample [s], float64 [S].
-        runs: By name, in the order of ``cases``.
+        runs: Runs by name, in the order of ``cases``.
     """
 
     settings: Settings
@@ -155,7 +155,7 @@ class Results:
     runs: dict[str, Run] = field(default_factory=dict)
 
     def error(self, name: str, reference: str = REFERENCE) -> Array:
-        """Distance of the observed node from where it is in the reference's run at the same time [m], float64 [S]."""
+        """Distance of the observed node from its place in the reference's run at the same time [m], float64 [S]."""
         return np.linalg.norm(self.runs[name].path - self.runs[reference].path, axis=1)
 
     @cached_property
@@ -175,12 +175,12 @@ def run_experiment(
     Args:
         settings: None: the short form.
         device: "cpu", "cuda:0", …; None for Warp's default.
-        progress: Called with what is under way and the number of units of work done since the last call, of
-            ``work(settings)`` in all.
+        progress: Called with the current activity and the units of work done since the last call; in all there are
+            ``work(settings)``.
 
     Raises:
-        InputError: A device that is not there, or a step beyond what the mesh can hold.
-        UnstableError: A state is not finite any more.
+        InputError: The device does not exist, or the step is too large for the mesh.
+        UnstableError: A state is no longer finite.
     """
     chosen = settings or Settings()
     tell = progress or (lambda what, done: None)
@@ -200,12 +200,12 @@ def run_experiment(
 
 
 def work(settings: Settings) -> int:
-    """Units of work of the experiment: one a sample of a model, one a round of timing."""
+    """Units of work of the experiment: one for each sample of a model and each round of timing."""
     return settings.samples * len(cases(settings.level)) + settings.rounds
 
 
 def beam(mesh: TetForest, model: Model, settings: Settings, device: wp.Device) -> Simulation:
-    """The beam at rest, held at z = 0, about to fall.
+    """The beam at rest, fixed at z = 0, before it sags.
 
     Raises:
         InputError: The step is beyond the largest stable one.
@@ -223,7 +223,7 @@ def beam(mesh: TetForest, model: Model, settings: Settings, device: wp.Device) -
 
 
 def follow(sim: Simulation, case: Case, samples: int, tell: Callable[[str, int], None]) -> Run:
-    """Let the beam fall and look at it as it goes."""
+    """Run the simulation and sample it."""
     body = sim.body
     mesh = body.mesh
     node = int(np.argmin(np.linalg.norm(mesh.points - OBSERVED, axis=1)))

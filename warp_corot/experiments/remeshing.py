@@ -1,6 +1,6 @@
-"""What remeshing saves: a notched bar pulled and a slab pressed, on meshes that follow and on uniform ones.
+"""Savings by remeshing: a notched bar in tension and a pressed slab, on remeshed and on uniform meshes.
 
-``python -m warp_corot.experiments.remeshing`` measures it: the reaction force, displacements, and the time taken.
+``python -m warp_corot.experiments.remeshing`` measures the reaction force, displacements, and the wall time.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ CELL = 0.02
 TISSUE = Isotropic(young=1e4, poisson=0.3, density=1000.0)
 #: Speed of sound in a thin bar [m/s].
 SPEED = 10.0**0.5
-#: How long the face moves, and how long until all is at rest, in times that sound takes to go across.
+#: Duration of the face's motion, and time until rest, in times that sound needs to cross the body.
 MOVING, RESTING = 6.0, 12.0
 KEYS = 41
 
@@ -43,15 +43,15 @@ Vectors = npt.NDArray[np.float64]
 
 
 class Scene(ABC):
-    """A body held at one face and moved at another, slowly and then no more, until it is at rest.
+    """A body fixed at one face and moved at another, slowly, then held until it is at rest.
 
     Attributes:
-        name: What it is.
-        size: In root cubes along each axis.
-        travel: How far the moved face goes [m], [3].
-        across: How far sound goes through what is strained [m].
-        probes: Where the displacement is compared: two points' difference or one point's [cubes], and which axis.
-        criteria: What to remesh by, with its thresholds; ``depth`` is how many levels there are between the coarsest
+        name: Name of the scene.
+        size: Size in root cubes along each axis.
+        travel: Displacement of the moved face [m], [3].
+        across: Distance that sound travels through the strained part [m].
+        probes: Places to compare displacements: two points' difference or one point's [cubes], and which axis.
+        criteria: Criteria with their thresholds; ``depth`` is the number of levels between the coarsest
             elements and the finest ones, ``parameters`` are in cubes, that of the strain in the coarsest ones' edges.
     """
 
@@ -64,18 +64,18 @@ class Scene(ABC):
 
     @abstractmethod
     def mesh(self, level: int) -> TetForest:
-        """Uniform, of this level; the body is the same at each."""
+        """The uniform mesh of this level; the body is the same at each."""
 
     @abstractmethod
     def held(self, cubes: Vectors) -> Mask:
-        """Which nodes are fixed, by their places in cubes [n, 3]."""
+        """Which nodes are fixed, by their positions in cubes [n, 3]."""
 
     @abstractmethod
     def moved(self, cubes: Vectors) -> Mask:
-        """Which nodes go the whole way."""
+        """Which nodes are moved all the way."""
 
     def coarsest(self, finest: int, criterion: str | None = None) -> int:
-        """The level that a mesh with one criterion begins with, or the lowest of all."""
+        """The initial level of a mesh with one criterion, or the lowest of all."""
         chosen = self.criteria if criterion is None else [criterion]
         return finest - max(self.criteria[name]["depth"] for name in chosen)
 
@@ -92,7 +92,7 @@ class Scene(ABC):
 
 
 class NotchedBar(Scene):
-    """A bar with a notch through half its height, pulled by a fifth of its length."""
+    """A bar with a notch through half its height, stretched by a fifth of its length."""
 
     name = "notched bar, pulled"
     size = (9, 2, 1)
@@ -162,18 +162,18 @@ class PressedSlab(Scene):
 
 @dataclass(frozen=True)
 class Outcome:
-    """A run's end.
+    """The result of a run.
 
     Attributes:
         mesh: "uniform", or the criterion's name.
-        level: The finest.
-        elements: At the end.
-        most: The most there were.
-        force: What moves the moved face, along its way [N].
+        level: The finest level.
+        elements: Number of elements at the end.
+        most: Largest number of elements.
+        force: Force on the moved face, along its path [N].
         displacements: By the names of the scene's probes [m].
         field: Displacements of the nodes of the coarse mesh, which all meshes share [m], [n, 3].
         unrest: Kinetic over elastic energy.
-        steps: Time steps.
+        steps: Number of time steps.
         seconds: Wall time of the steps, and of the passes between them.
     """
 
@@ -189,14 +189,14 @@ class Outcome:
     seconds: float
 
     def errors(self, reference: Outcome) -> dict[str, float]:
-        """How far force and displacements are from another's, relative to them; of the field in the mean square."""
+        """Relative errors of force and displacements against a reference; of the field in the mean square."""
         off = np.linalg.norm(self.field - reference.field) / np.linalg.norm(reference.field)
         found = {"force": self.force / reference.force - 1.0, "field": float(off)}
         return found | {name: u / reference.displacements[name] - 1.0 for name, u in self.displacements.items()}
 
 
 def run(scene: Scene, finest: int, device: wp.Device, criterion: str | None = None, *, coarse: bool = False) -> Outcome:
-    """The scene on the uniform mesh of the finest level, or the coarsest one, or on one that is remeshed in between."""
+    """Run the scene on the uniform mesh of the finest level, or on the coarsest one, or on a remeshed one."""
     lowest = scene.coarsest(finest)
     level = lowest if coarse else finest if criterion is None else scene.coarsest(finest, criterion)
     mesh = scene.mesh(level)
@@ -213,7 +213,7 @@ def run(scene: Scene, finest: int, device: wp.Device, criterion: str | None = No
         gravity=(0.0, 0.0, 0.0),
         remesh=None if criterion is None else scene.remesh(criterion, finest, device),
     )
-    sim.advance_steps(1)  # kernels are loaded, steps recorded
+    sim.advance_steps(1)  # loads kernels and records steps
     most = body.element_count
     started = time.perf_counter()
     for end in crossing * np.linspace(0.0, MOVING + RESTING, KEYS)[1:]:
@@ -240,12 +240,12 @@ def run(scene: Scene, finest: int, device: wp.Device, criterion: str | None = No
 
 
 def _keys(mesh: TetForest) -> npt.NDArray[np.int64]:
-    """A number for each node's place, the same in all meshes."""
+    """A number for each node's position, the same in all meshes."""
     return mesh.lattice[: len(mesh.points)].astype(np.int64) @ np.array([1 << 42, 1 << 21, 1])
 
 
 def _displacement(cubes: Vectors, u: npt.NDArray[np.float64], places: Sequence[Sequence[float]]) -> float:
-    """One node's, or by how much more a node moves than another."""
+    """The displacement of one node, or the difference between two."""
     found = [u[np.argmin(np.linalg.norm(cubes - np.asarray(place), axis=1))] for place in places]
     return float(found[0] - found[1] if len(found) == 2 else found[0])
 
@@ -254,13 +254,13 @@ SCENES: dict[str, Scene] = {"bar": NotchedBar(), "slab": PressedSlab()}
 
 
 def study(scene: Scene, finest: int, device: wp.Device) -> list[Outcome]:
-    """The uniform fine mesh, the uniform coarse one, and one for each criterion."""
+    """Runs on the uniform fine mesh, the uniform coarse one, and one for each criterion."""
     uniform = [run(scene, finest, device, coarse=coarse) for coarse in (False, True)]
     return uniform + [run(scene, finest, device, criterion) for criterion in scene.criteria]
 
 
 def table(scene: Scene, outcomes: Sequence[Outcome]) -> list[str]:
-    """The numbers, a line a run; errors are relative to the first."""
+    """The numbers, one line for each run; errors are relative to the first."""
     first = outcomes[0]
     lines = [f"{scene.name}, level {first.level}: {first.force:.4f} N; errors of {', '.join(first.errors(first))}"]
     lines.append(f"{'mesh':11} {'elements':>9} {'share':>6} {'steps':>6} {'seconds':>8} {'faster':>7}  errors")

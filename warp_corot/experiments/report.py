@@ -1,4 +1,4 @@
-"""What the paper's experiment found: a table for people and results.json for programs."""
+"""Results of the paper's experiment: a table for people and results.json for programs."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def table(results: Results) -> str:
 
 
 def to_json(results: Results) -> dict:
-    """What results.json holds: plain values, named with their units; ``schema_version`` says how to read them."""
+    """The content of results.json: plain values, named with their units; ``schema_version`` is its version."""
     s = results.settings
     kept = _kept_samples(results)
     return {
@@ -118,10 +118,10 @@ def to_json(results: Results) -> dict:
 
 
 def write_json(path: Path, results: Results) -> None:
-    """Write results.json, aside and renamed.
+    """Write results.json to a temporary file and rename it.
 
     Raises:
-        OSError: It could not be written; a file that was there before stays.
+        OSError: It could not be written; a former file stays.
     """
     text = json.dumps(to_json(results), indent=1, ensure_ascii=False, allow_nan=False)
     with written_whole(path) as part:
@@ -129,12 +129,12 @@ def write_json(path: Path, results: Results) -> None:
 
 
 def device_name(results: Results) -> str:
-    """The card's name, or the processor's."""
+    """Name of the GPU or the processor."""
     return results.device.name if results.device.is_cuda else f"CPU ({processor_name()}, one core)"
 
 
 def processor_name() -> str:
-    """The processor's name where the system tells, else its architecture."""
+    """Name of the processor if the system gives it, else its architecture."""
     try:
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
@@ -183,7 +183,7 @@ def _microseconds(t: StageTimes) -> dict[str, float]:
 
 
 def _kept_samples(results: Results) -> np.ndarray:
-    """Every sample while the beam swings, then one in fifty, and the last."""
+    """Every sample while the beam swings, then one in fifty, and the last one."""
     index = np.arange(len(results.times))
     return np.flatnonzero((results.times < 4.0) | (index % 50 == 0) | (index == index[-1]))
 

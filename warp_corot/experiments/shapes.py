@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def draw_shapes(path: Path, results: Results) -> None:
-    """Figure 6: the shapes at the end, each before its rest shape, and their outlines on one another."""
+    """Figure 6: the shapes at the end, each in front of its rest shape, and their outlines superimposed."""
     mesh = results.mesh
     faces, _ = boundary_faces(mesh.tets, mesh.points)
     named = [(PEER, "linear"), (REFERENCE, "St. Venant–Kirchhoff"), ("neo-hookean", "neo-Hookean")]
@@ -49,7 +49,7 @@ def draw_shapes(path: Path, results: Results) -> None:
 
 
 def _draw_outlines(ax: Axes, results: Results) -> None:
-    """The beams' sides at x = 0 seen along the x axis."""
+    """Draw the beams' sides at x = 0, seen along the x axis."""
     mesh = results.mesh
     lines = ((None, "rest", "#c9c7ce", 1.0), (PEER, "linear", LINEAR, 1.8), (REFERENCE, "StVK", INK, 1.8),
              (OWN, "corotated, own", OWN_COLOR, 1.8))  # fmt: skip

@@ -1,4 +1,4 @@
-"""What the figures share: colours, headings, axes, and how they are written."""
+"""The common style of the figures: colours, headings, axes, and output."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ LINEAR, OWN_COLOR, NEO = "#c8452f", "#1f6f8b", "#8a8590"
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of that many inches, apart from pyplot and its global state."""
+    """An empty figure with this size in inches, without pyplot and its global state."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), dpi=DPI, facecolor="white")
 
 
 def head(figure: Figure, title: str, results: Results) -> None:
-    """Title, and under it what was simulated and where."""
+    """Write the title, and below it the simulation and the device."""
     mesh = results.mesh
     figure.text(0.012, 0.97, title, fontsize=12.5, color=INK, va="top", weight="bold")
     about = (
@@ -38,7 +38,7 @@ def head(figure: Figure, title: str, results: Results) -> None:
 
 
 def tidy(ax: Axes) -> None:
-    """Two thin axes and faint lines to read values by."""
+    """Draw two thin axes and faint grid lines."""
     for side in ("top", "right"):
         ax.spines[side].set_visible(False)
     for side in ("left", "bottom"):
@@ -52,6 +52,6 @@ def tidy(ax: Axes) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, aside and renamed."""
+    """Write a figure as PNG to a temporary file and rename it."""
     with written_whole(path) as part:
         figure.savefig(part, format="png", dpi=DPI)

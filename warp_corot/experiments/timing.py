@@ -1,11 +1,11 @@
-"""What each stage of a time step costs: rotation, force, and the rest.
+"""Times of the stages of a time step: rotation, force, and the rest.
 
-Every stage is recorded in a graph of many launches of its own and replayed; all stages of all models are timed in turn,
-round after round, so that whatever else the machine does meets all alike. Times of one round are set against the
+For every stage, a graph of many launches is recorded and replayed; all stages of all models are timed in turn,
+round after round, so that other load on the machine affects all alike. Times of one round are relative to the
 peer's time in the same round.
 
-Stages are those of the leaf-by-leaf path: corotated forces as shipped go by subtrees, with rotation and force in one
-kernel. Only the whole step of that path is timed, beside the stages.
+Stages are those of the leaf-by-leaf path: corotated forces as shipped use subtrees, with rotation and force in one
+kernel. For that path only the whole step is timed.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from warp_corot.solvers.system import System
 #: Launches of one stage recorded in a graph.
 LAUNCHES = 64
 
-#: Steps of the whole-step measurement: a run as a user starts it.
+#: Steps of the whole-step measurement, run as a user runs them.
 RUN_STEPS = 512
 
-#: A sample replays its graph until it lasts about this long [s].
+#: A sample replays its graph for about this long [s].
 SAMPLE_SECONDS = 5e-3
 
 REST = "rest"
@@ -39,14 +39,14 @@ REST = "rest"
 
 @dataclass(frozen=True)
 class StageTimes:
-    """Cost of one time step by stage, in seconds or in units of the peer's.
+    """Time of a step by stage, in seconds or relative to the peer's.
 
     Attributes:
-        rotation: Extracting the rotations; 0 where there are none, or where it is part of the force's kernel.
+        rotation: Extraction of the rotations; 0 if there are none, or if the force's kernel includes it.
         force: Elastic nodal forces.
         rest: Integration of velocities and displacements.
-        step: The whole step, not the sum of the stages: a run of steps as users start it, divided by their number.
-        shipped: The whole step of the path that the model takes by default; ``step`` where that is leaf by leaf.
+        step: The whole step, not the sum of the stages: the time of a user's run divided by its number of steps.
+        shipped: The whole step of the model's default path; equal to ``step`` if that is leaf by leaf.
     """
 
     rotation: float
@@ -69,7 +69,7 @@ class Times:
         seconds: Absolute [s].
         relative: In units of the peer's stages' sum in the same round.
         spread: Interquartile range of the relative whole step, over its median.
-        fused: Rotation and force are one kernel leaf by leaf too; its time is under ``force``.
+        fused: Whether rotation and force are one kernel leaf by leaf, too; its time is under ``force``.
     """
 
     seconds: StageTimes
@@ -80,12 +80,12 @@ class Times:
 
 @dataclass
 class Stages:
-    """One model's stages, to be timed in the present state of its body.
+    """One model's stages, timed in the current state of its body.
 
     Attributes:
-        sim: Leaf by leaf.
-        shipped: The same body by the default path; None where that is leaf by leaf.
-        graphs: By stage, once recorded.
+        sim: The simulation, leaf by leaf.
+        shipped: The same body on the default path; None if that is leaf by leaf.
+        graphs: Recorded graphs by stage.
     """
 
     sim: Simulation
@@ -94,7 +94,7 @@ class Stages:
 
     @classmethod
     def of(cls, sim: Simulation) -> Stages:
-        """The stages of a simulation of one body that takes the default path."""
+        """The stages of a simulation of one body on the default path."""
         model = sim.models[0]
         if not (isinstance(model, Corotated) and model.subtrees):
             return cls(sim)
@@ -108,12 +108,12 @@ class Stages:
 
     @property
     def _staged(self) -> bool:
-        """Whether the step extracts rotations in a launch of its own."""
+        """Whether the step extracts rotations in a separate launch."""
         model_field = self.sim.fields[0]
         return isinstance(model_field, CorotatedField) and model_field.model.rotation_level is not None
 
     def record(self) -> None:
-        """Record each stage of the force many times over; forces go to an array that nobody reads."""
+        """Record each stage of the force many times; forces go to an array that is not read."""
         model_field, u = self.sim.fields[0], self.sim.body.state.displacements
         f = wp.zeros_like(u)
         if self._staged:
@@ -123,12 +123,12 @@ class Stages:
             self.graphs["force"] = recorded(lambda: rotated.add_rotated_forces(u, f), u.device)
         else:
             self.graphs["force"] = recorded(lambda: model_field.add_forces(u, f), u.device)
-        # The graphs hold the address of f only.
+        # The graphs hold only the address of f.
         self._forces = f
 
 
 def recorded(launch: Callable[[], object], device: wp.Device) -> wp.Graph:
-    """A graph of many launches, its kernels loaded and run once."""
+    """A graph of many launches, after its kernels were loaded and run once."""
     launch()
     with wp.ScopedCapture(device=device) as capture:
         for _ in range(LAUNCHES):
@@ -139,12 +139,12 @@ def recorded(launch: Callable[[], object], device: wp.Device) -> wp.Graph:
 def measure_times(
     stages: dict[str, Stages], peer: str, rounds: int, tell: Callable[[], None] = lambda: None
 ) -> dict[str, Times]:
-    """Median cost of every stage of every simulation, in its present state (whole steps move it on from there).
+    """Median time of every stage of every simulation, in its current state (whole steps change it).
 
     Args:
-        stages: By name; all on one device.
-        peer: The one that the others are set against.
-        rounds: How often every stage is timed.
+        stages: Stages by name; all on one device.
+        peer: The name of the reference.
+        rounds: Number of timings of each stage.
         tell: Called after each round.
     """
     device = stages[peer].sim.device
@@ -187,7 +187,7 @@ def measure_times(
 
 
 class _NoForces(ForceField):
-    """Leaves an integrator's launches alone."""
+    """A force field without launches, to time an integrator alone."""
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None: ...
 
@@ -203,7 +203,7 @@ class _NoForces(ForceField):
 
 
 def _integration(sim: Simulation) -> tuple[wp.Graph, list]:
-    """The integrator alone on a body like the simulation's, without velocity and weight, so that it stays put."""
+    """The integrator alone on a body like the simulation's, without velocity and weight, so that it does not move."""
     original = sim.body
     body = SoftBody(original.mesh, original.material, device=original.device)
     body.fix(original.constrained)
@@ -215,7 +215,7 @@ def _integration(sim: Simulation) -> tuple[wp.Graph, list]:
 
 
 def _replays(graph: wp.Graph, device: wp.Device) -> int:
-    """How many replays make one sample; warms up on the way."""
+    """Number of replays in one sample; this also warms up."""
     count = 1
     while True:
         seconds = LAUNCHES * count * _seconds(graph, count, device)

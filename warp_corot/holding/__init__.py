@@ -1,1 +1,1 @@
-"""How a body is held where the user does not say."""
+"""The choice of fixed nodes if the user names none."""

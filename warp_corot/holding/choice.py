@@ -1,5 +1,5 @@
-"""How a body is held where nobody says: by what it stands on, if that carries it, else by its largest flat region or
-a broad side of it. Each separate piece is held by itself."""
+"""Where a body is fixed if the user names no nodes: at the part it stands on, if that supports it, else at its largest
+flat region or a broad side. Each separate piece is fixed by itself."""
 
 from __future__ import annotations
 
@@ -19,29 +19,31 @@ from .regions import Patch, Shape, broad_sides, flat_region, lowest_part
 from .sag import CoarseBody
 from .sag_mesh import MOST_TETS, MeshBody
 
-#: A patch carries a body that comes to rest within this share of its height.
+#: A patch supports a body whose sag is at most this fraction of its height.
 LARGEST_SAG = 0.3
-#: A body on a patch below its centre of mass leans by its own weight: sideways gravity must move the centre by less
-#: than this share of its height above the patch. At the whole of it a slender column buckles (Greenhill 1881).
+#: A body above its supporting patch leans under its own weight: sideways gravity must move its centre of mass by less
+#: than this fraction of the centre's height above the patch. At the full height a slender column buckles (Greenhill
+#: 1881).
 LARGEST_LEAN = 0.55
-#: Pieces of fewer tetrahedra, or less than this share of the largest one, are held by their lower half without a look.
+#: Pieces with fewer tetrahedra, or below this fraction of the largest one, are fixed at their lower half without a
+#: check.
 SMALL_PIECE, SMALL_SHARE = 12, 0.01
-#: Pieces that are named one by one.
+#: Number of pieces that are named one by one.
 NAMED = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Hold:
-    """How a piece is held.
+    """How a piece is fixed.
 
     Attributes:
-        nodes: Held, indices into the mesh's nodes.
-        of: Nodes of the piece.
-        where: In words: "its lowest 10 %".
+        nodes: Fixed nodes, indices into the mesh's nodes.
+        of: Number of nodes of the piece.
+        where: The place in words: "its lowest 10 %".
         stands: Whether it stands on its lowest part.
-        why_not: Why it does not stand, in words; empty if it does.
-        sag: How far it sags, by linear statics, as a share of its height; 0 where nobody looked.
-        stiffer: How many times as stiff it would have to be for the patch to carry it; 1 if it does.
+        why_not: The reason why it does not stand, in words; empty if it does.
+        sag: How far it sags, by linear statics, as a fraction of its height; 0 if not estimated.
+        stiffer: The factor on its stiffness with which the patch would support it; 1 if it does already.
     """
 
     nodes: npt.NDArray[np.intp]
@@ -55,11 +57,11 @@ class Hold:
 
 @dataclass(frozen=True, eq=False)
 class Holds:
-    """How a body is held, piece by piece, the largest first.
+    """How a body is fixed, piece by piece, the largest first.
 
     Attributes:
-        pieces: One each.
-        count: Nodes of the mesh.
+        pieces: One entry for each piece.
+        count: Number of nodes of the mesh.
     """
 
     pieces: Sequence[Hold]
@@ -67,7 +69,7 @@ class Holds:
 
     @property
     def nodes(self) -> npt.NDArray[np.bool_]:
-        """Held nodes, bool [N]."""
+        """Fixed nodes, bool [N]."""
         mask = np.zeros(self.count, bool)
         for hold in self.pieces:
             mask[hold.nodes] = True
@@ -75,7 +77,7 @@ class Holds:
 
     @property
     def stiffer(self) -> float:
-        """How many times as stiff the body would have to be for every patch to carry its piece."""
+        """The factor on the body's stiffness with which every patch would support its piece."""
         return max(hold.stiffer for hold in self.pieces)
 
     @property
@@ -90,12 +92,12 @@ class Holds:
 
     @property
     def title(self) -> str:
-        """The same in a few words: "piece 1 standing on its lowest 10 %, and 5 more"."""
+        """A short form: "piece 1 standing on its lowest 10 %, and 5 more"."""
         left = len(self.pieces) - 1
         return f"piece 1 {_words_of(self.pieces[0])}, and {left} more" if left else self.words
 
     def reasons(self) -> list[str]:
-        """What a user should know of each piece, a line each."""
+        """What a user should know about each piece, a line for each."""
         several = len(self.pieces) > 1
         lines = []
         for number, hold in enumerate(self.pieces[: NAMED if several else 1], start=1):
@@ -116,7 +118,7 @@ def _words_of(hold: Hold) -> str:
 
 @dataclass(eq=False)
 class _Piece:
-    """A piece of a body: its own shape, what it is made of, and gravity [m/s^2]."""
+    """A piece of a body: its shape, its material, and gravity [m/s^2]."""
 
     shape: Shape
     tets: npt.NDArray[np.integer]
@@ -144,12 +146,12 @@ class _Piece:
                 best = needed, sag, patch
             if needed <= 1.0:
                 break
-        if best is None:  # a few nodes, of which every patch has all
+        if best is None:  # a piece of a few nodes, which every patch contains
             return self.held_simply()
         return self._of(best[2], False, why, best[1], max(best[0], 1.0))
 
     def held_simply(self) -> Hold:
-        """By the lower half of its nodes, three at least, but not all."""
+        """Fixed at the lower half of its nodes, at least three, but not all."""
         shape = self.shape
         heights = shape.points[shape.nodes] @ shape.up
         count = min(max(len(heights) // 2, 3), len(heights) - 1)
@@ -163,7 +165,7 @@ class _Piece:
                 yield patch
 
     def _tried(self, patch: Patch, *, stands: bool) -> tuple[float, float, str]:
-        """How many times as stiff the piece would have to be for a patch to carry it; how far it sags as a share of its
+        """The factor on the piece's stiffness with which a patch would support it; its sag as a fraction of its
         height; and what is wrong with the patch, in words."""
         shape, g = self.shape, float(np.linalg.norm(self.gravity))
         held = shape.points[patch.nodes]
@@ -175,7 +177,7 @@ class _Piece:
         sag = down.largest / shape.height
         above = float((self.body.centre - held.mean(axis=0)) @ shape.up)
         lean = max(float(np.linalg.norm(shape.across @ s.centre)) for s in sideways) / above if above > 0.0 else 0.0
-        # What hangs, or is held at its side, cannot fall over.
+        # A piece that hangs, or is fixed at its side, cannot fall over.
         lean *= above > LARGEST_SAG * shape.height or stands
         needed = max(sag / LARGEST_SAG, lean / LARGEST_LEAN)
         if stands and needed <= 1.0 and not footprint.holds(self.body.centre + down.centre):
@@ -195,19 +197,19 @@ def holds_of(
     gravity: npt.ArrayLike,
     surface: Any = None,
 ) -> Holds:
-    """How a person would hold a body so that it neither falls nor topples.
+    """Fix a body as a person would, so that it neither falls nor topples.
 
-    A piece stands on the lowest tenth of its height if its centre of mass is over that, and stays there when the piece
-    sags. Otherwise its largest flat region holds it, or the first of its broad sides that carries it, each at least a
-    tenth of its nodes; if none does, the one in which it sags least. Sags are estimated by linear statics, of large
-    meshes on a coarse grid (`sag_mesh.MeshBody`, `sag.CoarseBody`).
+    A piece stands on the lowest tenth of its height if its centre of mass is above that and stays there when the piece
+    sags. Otherwise it is fixed at its largest flat region, or at the first of its broad sides that supports it, each
+    with at least a tenth of its nodes; if none does, at the one with the smallest sag. Sags are estimated by linear
+    statics, for large meshes on a coarse grid (`sag_mesh.MeshBody`, `sag.CoarseBody`).
 
     Args:
         mesh: The body.
         young: Young's modulus [Pa], a number or [T].
-        density: [kg/m^3], a number or [T].
-        gravity: [m/s^2], [3].
-        surface: A ``SurfaceMesh`` bound to the mesh where the body ends within its tetrahedra; None: their boundary.
+        density: Density [kg/m^3], a number or [T].
+        gravity: Acceleration [m/s^2], [3].
+        surface: A ``SurfaceMesh`` bound to the mesh, if the body ends within its tetrahedra; None: their boundary.
     """
     g = np.asarray(gravity, dtype=np.float64)
     up = np.eye(3)["XYZ".index(mesh.up_axis)] if not g.any() else -g / np.linalg.norm(g)
@@ -235,7 +237,7 @@ def holds_of(
 
 
 def piece_of_nodes(mesh: Mesh, of_tet: npt.NDArray[np.integer]) -> npt.NDArray[np.intp]:
-    """The piece of each node, the largest where several meet, -1 for nodes in no tetrahedron, [N]."""
+    """The piece of each node [N]: the largest if several meet there, -1 for nodes in no tetrahedron."""
     none = len(of_tet)
     found = np.full(len(mesh.points), none)
     np.minimum.at(found, mesh.tets.ravel(), np.repeat(of_tet, 4))

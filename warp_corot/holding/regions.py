@@ -1,4 +1,4 @@
-"""Parts of a body by which it can be held: its lowest part, its largest flat region, its broad sides."""
+"""Parts at which a body can be fixed: its lowest part, its largest flat region, its broad sides."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-#: Share of the height that is the lowest part.
+#: Fraction of the height that counts as the lowest part.
 LOWEST = 0.1
-#: Share of a piece's nodes that a patch has at least.
+#: Smallest fraction of a piece's nodes in a patch.
 LEAST_NODES = 0.1
-#: A region is flat if its triangles face the same way, within this angle, in a layer of this share of the body's size;
-#: and if it is at least this share of the surface.
+#: A region is flat if its triangles face the same direction within this angle, in a layer of this fraction of the
+#: body's size, and if it is at least this fraction of the surface.
 SAME_WAY, LAYER, LEAST_FLAT = np.cos(np.radians(15.0)), 0.03, 0.08
-#: Nodes whose distances from it differ by less than this share are in one layer.
+#: Nodes whose distances to it differ by less than this fraction are in one layer.
 SAME_LAYER = 1.0e-6
-#: Ways in which regions are looked for.
+#: Directions in which regions are searched.
 WAYS = 200
-#: About so many triangles say which ways are worth a look.
+#: About this many triangles choose the directions to check.
 MOST_FACES = 20_000
-#: Of the ways, so many are looked at closely.
+#: Number of directions that are checked closely.
 CLOSELY = 8
 
 Array = npt.NDArray[np.float64]
@@ -31,7 +31,7 @@ Indices = npt.NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """Nodes of a body, indices, and where they are, in words."""
+    """Nodes of a body, by index, and their place in words."""
 
     nodes: Indices
     where: str
@@ -45,7 +45,7 @@ class Footprint:
     edges: Array
 
     def holds(self, point: Array) -> bool:
-        """Whether a point is over it."""
+        """Whether a point is above it."""
         x, y = self.across @ point
         return len(self.edges) > 0 and bool((self.edges @ [x, y, 1.0] <= 0.0).all())
 
@@ -56,11 +56,11 @@ class Shape:
 
     Attributes:
         points: Nodes of the mesh at rest [m], [N, 3].
-        nodes: Those of the piece, indices.
+        nodes: Nodes of the piece, by index.
         drawn: Points of the surface [m], [V, 3].
-        triangles: Of the surface, those of the piece, [F, 3].
-        up: Against gravity, unit vector.
-        bound: Nodes of the element that each point of the surface is bound to, [V, 4]; None: it is one of them itself.
+        triangles: Triangles of the piece's surface, [F, 3].
+        up: Unit vector against gravity.
+        bound: Nodes of the element to which each surface point is bound, [V, 4]; None: the point is a node itself.
     """
 
     points: Array
@@ -104,11 +104,11 @@ class Shape:
         return (a + b + c) / 3.0, unit, 0.5 * doubled
 
     def around(self, drawn: Indices) -> Indices:
-        """Nodes of the elements that hold points of the surface."""
+        """Nodes of the elements that contain points of the surface."""
         return drawn if self.bound is None else np.unique(self.bound[drawn])
 
     def footprint(self, points: Array) -> Footprint:
-        """What points cover of the ground."""
+        """The area that points cover on the ground."""
         from scipy.spatial import ConvexHull, QhullError
 
         try:
@@ -117,7 +117,7 @@ class Shape:
             return Footprint(self.across, np.empty((0, 3)))
 
     def beyond(self, direction: Array, share: float, *, least: float = 0.0) -> Indices:
-        """Nodes of the piece in the outermost share of its extent along a direction, at least a share of them."""
+        """Nodes of the piece in the outermost fraction of its extent along a direction, at least a fraction of them."""
         along = self.skin @ direction
         reach = along.max() - share * np.ptp(along)
         of_nodes = self.points[self.nodes] @ direction
@@ -128,7 +128,7 @@ class Shape:
 
 
 def lowest_part(shape: Shape) -> Patch:
-    """The lowest tenth of the height; the lowest nodes if there are none in it."""
+    """Nodes in the lowest tenth of the height; the lowest nodes if it contains none."""
     nodes = shape.beyond(-shape.up, LOWEST)
     if not len(nodes):
         heights = shape.points[shape.nodes] @ shape.up
@@ -137,7 +137,7 @@ def lowest_part(shape: Shape) -> Patch:
 
 
 def flat_region(shape: Shape) -> Patch | None:
-    """The nodes next to the largest flat region of the surface, from a tenth to a half of all; None where none is
+    """The nodes next to the largest flat region of the surface, from a tenth to a half of all; None if no region is
     flat."""
     from scipy.spatial import cKDTree
 
@@ -145,7 +145,7 @@ def flat_region(shape: Shape) -> Patch | None:
         return None
     centroids, normals, areas = shape.faces
     way, chosen = _largest_flat(centroids, normals, areas, LAYER * shape.size)
-    if areas[chosen].sum() < LEAST_FLAT * areas.sum():
+    if not areas[chosen].sum() > LEAST_FLAT * areas.sum():  # also if all faces are points, without area
         return None
     region = np.concatenate([centroids[chosen], shape.drawn[np.unique(shape.triangles[chosen])]])
     x = shape.points[shape.nodes]
@@ -160,8 +160,8 @@ def flat_region(shape: Shape) -> Patch | None:
 
 
 def _nearest_layers(off: Array, near: npt.NDArray[np.bool_], most: int) -> npt.NDArray[np.bool_]:
-    """Of nodes that are near a region, at most so many: whole layers of those that are least off it, for a part of one
-    would leave a corner of it loose."""
+    """At most this many of the nodes near a region: whole layers of those closest to it, because a partial layer
+    would leave a corner of the region loose."""
     if np.count_nonzero(near) <= most:
         return near
     first_left_out = np.sort(off[near])[most]
@@ -169,7 +169,7 @@ def _nearest_layers(off: Array, near: npt.NDArray[np.bool_], most: int) -> npt.N
 
 
 def broad_sides(shape: Shape) -> Iterator[Patch]:
-    """The outermost tenths along the up axis and the body's principal axes, the broadest first."""
+    """The outermost tenths along the up axis and the body's principal axes, broadest first."""
     x = shape.skin - shape.skin.mean(axis=0)
     principal = np.linalg.eigh(x.T @ x)[1].T
     ways = [shape.up, *principal, *-principal]
@@ -185,12 +185,12 @@ def broad_sides(shape: Shape) -> Iterator[Patch]:
 
 
 def _largest_flat(centroids: Array, normals: Array, areas: Array, layer: float) -> tuple[Array, Indices]:
-    """Which way the largest flat region faces, and its triangles."""
+    """The direction that the largest flat region faces, and its triangles."""
     turns = np.arange(WAYS) + 0.5
     z, angle = 1.0 - 2.0 * turns / WAYS, np.pi * (1.0 + np.sqrt(5.0)) * turns
     ring = np.sqrt(1.0 - z * z)
     ways = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
-    # How much faces each way, of triangles gathered by the way that is nearest to theirs.
+    # The area facing each direction; each triangle counts for the direction nearest to its normal.
     some = slice(None, None, 1 + len(areas) // MOST_FACES)
     gathered = np.bincount(np.argmax(normals[some] @ ways.T, axis=1), areas[some], WAYS)
     facing = np.where(ways @ ways.T > SAME_WAY, gathered, 0.0).sum(axis=1)
@@ -216,7 +216,7 @@ def _largest_flat(centroids: Array, normals: Array, areas: Array, layer: float) 
 
 
 def _facing(way: Array, up: Array) -> str:
-    """Which way, in words: "facing up", "facing -x"."""
+    """The direction in words: "facing up", "facing -x"."""
     if abs(way @ up) > SAME_WAY:
         return "facing up" if way @ up > 0.0 else "facing down"
     axis = int(np.argmax(np.abs(way)))

@@ -1,6 +1,6 @@
-"""How far a body sags when some of its nodes are held: linear statics on a coarse grid of cubes.
+"""How far a body sags if some of its nodes are fixed: linear statics on a coarse grid of cubes.
 
-Each cube has the stiffness and the weight of what the body has inside it. It is a trilinear brick with incompatible
+Each cube has the stiffness and the weight of the part of the body inside it. It is a trilinear brick with incompatible
 modes (Wilson et al. 1973; Taylor, Beresford and Wilson 1976), so that parts one cube thick bend as they should.
 """
 
@@ -18,17 +18,17 @@ from scipy.spatial import cKDTree
 
 from warp_corot.mesh.surfaces.boundary import signed_volumes
 
-#: About how many full cubes a body is made of.
+#: Approximate number of full cubes of a body.
 CUBES = 1000
-#: Samples of the body's volume a cube.
+#: Samples of the body's volume in each cube.
 SAMPLES = 8
-#: More tetrahedra than this are thinned out before they are sampled.
+#: Larger meshes are thinned out to this number of tetrahedra before they are sampled.
 MOST_TETS = 200_000
-#: Of the grid only: volumetric locking would stiffen it, and how far a body sags hardly depends on it.
+#: Poisson's ratio of the grid only: volumetric locking would stiffen it, and the sag hardly depends on it.
 POISSON = 0.3
-#: Conjugate gradients end when this many iterations add less than this share to the work of the weights.
+#: Conjugate gradients end when this many iterations add less than this fraction to the work of the weights.
 LAST, ENOUGH, MOST_ITERATIONS = 20, 3e-3, 1000
-#: They end, too, when the body as a whole has gone this many times its length away.
+#: They also end when the whole body has moved this many times its length.
 FAR = 10.0
 
 Array = npt.NDArray[np.float64]
@@ -36,7 +36,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sag:
-    """What a held body does under an acceleration, in linear statics.
+    """What a fixed body does under an acceleration, in linear statics.
 
     Attributes:
         largest: Largest displacement of any part [m].
@@ -48,20 +48,20 @@ class Sag:
 
 
 class CoarseBody:
-    """A body as cubes.
+    """A body made of cubes.
 
     Args:
         points: Rest positions [m], [N, 3].
-        tets: Of the body, [T, 4].
-        volumes: What the body fills of each [m^3], [T].
+        tets: Tetrahedra of the body, [T, 4].
+        volumes: Volume of the body in each [m^3], [T].
         young: Young's modulus [Pa], a number or [T].
-        density: [kg/m^3], a number or [T].
+        density: Density [kg/m^3], a number or [T].
     """
 
     def __init__(self, points: Array, tets: npt.NDArray[np.integer], volumes: Array, young: Any, density: Any):
         inside = np.broadcast_to(young, len(tets)), np.broadcast_to(density, len(tets))
         samples, of_tet, shares = _samples(points, tets, volumes)
-        # Finer cubes than the mesh's own elements would show what the mesh cannot do.
+        # Cubes finer than the mesh's own elements would show motions that the mesh cannot make.
         own = np.average(np.cbrt(6.0 * np.abs(signed_volumes(points, tets))), weights=volumes)
         self.edge = max(float(np.cbrt(volumes.sum() / CUBES)), float(own))
         self._origin = samples.min(axis=0) - 0.5 * self.edge
@@ -81,10 +81,10 @@ class CoarseBody:
         self._weights = np.bincount(self._places.ravel(), np.repeat(self._masses / 8.0, 8))
 
     def sag(self, held: npt.NDArray[np.integer], accelerations: npt.ArrayLike) -> list[Sag]:
-        """What the body does under each of some accelerations.
+        """The response of the body to each of several accelerations.
 
         Args:
-            held: Nodes that are held, indices.
+            held: Indices of the fixed nodes.
             accelerations: [m/s^2], [k, 3].
         """
         free = np.repeat(~self._held(held), 3)
@@ -96,14 +96,14 @@ class CoarseBody:
             weights = np.repeat(self._weights, 3)[free]
             u[free] = solved(self._matrix[free][:, free], loads[free], far, weights)
         moved = np.moveaxis(u.reshape(-1, 3, len(given)), 2, 0)
-        # Corners of cubes that hold hardly anything are nowhere in the body: whole cubes are asked.
+        # Corners of nearly empty cubes are not in the body, so displacements are means over the corners of cubes.
         of_cubes = moved[:, self._places].mean(axis=2)
         lengths = np.linalg.norm(of_cubes, axis=2).max(axis=1)
         centres = np.einsum("c,kcx->kx", self._masses, of_cubes) / self._masses.sum()
         return [Sag(float(length), centre) for length, centre in zip(lengths, centres, strict=True)]
 
     def _held(self, nodes: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
-        """Corners whose nearest node is held; if there are none, those next to held nodes."""
+        """Corners whose nearest node is fixed; if there are none, those next to fixed nodes."""
         mask = np.isin(self._nearest, nodes)
         if not mask.any():
             mask[cKDTree(self._lattice).query((self._points[nodes] - self._origin) / self.edge)[1]] = True
@@ -123,7 +123,7 @@ _CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 def _samples(
     points: Array, tets: npt.NDArray[np.integer], volumes: Array
 ) -> tuple[Array, npt.NDArray[np.integer], Array]:
-    """Points spread evenly over the tetrahedra, the tetrahedron of each, and the volume that each stands for."""
+    """Points spread evenly over the tetrahedra, the tetrahedron of each, and the volume that each represents."""
     stride = max(1, len(tets) // MOST_TETS)
     chosen = np.arange(0, len(tets), stride)
     counts = np.ceil(SAMPLES * CUBES * volumes[chosen] / volumes[chosen].sum()).astype(int)
@@ -174,16 +174,16 @@ def solved(
     weights: npt.NDArray[Any],
     precondition: Callable[[Array], Array] | None = None,
 ) -> Array:
-    """Conjugate gradients for several right sides at once.
+    """Conjugate gradients for several right-hand sides at once.
 
-    What is hardly held goes on growing; it is left once its centre of mass is far away.
+    A part that is hardly fixed moves further and further; its iteration ends once its centre of mass is far away.
 
     Args:
         matrix: [n, n].
         loads: [n, k].
         far: The body's length [m].
-        weights: Of what is displaced, [n].
-        precondition: Of residuals [n, k]; None: by the diagonal.
+        weights: Weight of each degree of freedom in the centre of mass, [n].
+        precondition: Preconditioner of residuals [n, k]; None: by the diagonal.
     """
     inverse = 1.0 / matrix.diagonal()[:, None] if precondition is None else 1.0
     prepared = precondition or (lambda r: inverse * r)

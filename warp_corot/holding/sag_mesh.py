@@ -1,7 +1,7 @@
-"""How far a body sags when some of its nodes are held: linear statics of its own tetrahedra.
+"""How far a body sags if some of its nodes are fixed: linear statics of its own tetrahedra.
 
-These are what is simulated, so that a thin neck bends and parts that lie next to one another stay apart, which coarse
-cubes (`sag.CoarseBody`) do not show. Conjugate gradients are preconditioned by the diagonal and, on a coarse grid of
+The simulation uses the same tetrahedra, so a thin neck bends and adjacent parts stay apart, which coarse cubes
+(`sag.CoarseBody`) do not show. Conjugate gradients are preconditioned by the diagonal and, on a coarse grid of
 groups of nodes, by their rigid motions (unsmoothed aggregation; Bulgakov and Kuhn 1995).
 """
 
@@ -16,26 +16,26 @@ from scipy.sparse.linalg import splu
 
 from .sag import POISSON, Array, Sag, solved
 
-#: More tetrahedra than this take too long.
+#: Meshes with more tetrahedra take too long.
 MOST_TETS = 60_000
-#: About how many groups of nodes.
+#: Approximate number of groups of nodes.
 GROUPS = 400
-#: What the largest displacement is that of: this share of the weight moves by less. The rest may be crumbs that hang on
-#: by next to nothing; they dangle, and say nothing of how the body is held.
+#: The largest displacement is a quantile: this fraction of the weight moves by less. The rest may be crumbs with
+#: a weak connection; they dangle and say nothing about how the body is fixed.
 SHARE = 0.999
-#: Of rotations of a group whose nodes lie on a line, over the diagonal.
+#: Regularization of the rotations of a group whose nodes lie on a line, relative to the diagonal.
 SHIFT = 1.0e-8
 
 
 class MeshBody:
-    """A body as it is meshed.
+    """A body with its own mesh.
 
     Args:
         points: Rest positions [m], [N, 3].
-        tets: Of the body, [T, 4].
-        volumes: What the body fills of each [m^3], [T].
+        tets: Tetrahedra of the body, [T, 4].
+        volumes: Volume of the body in each [m^3], [T].
         young: Young's modulus [Pa], a number or [T].
-        density: [kg/m^3], a number or [T].
+        density: Density [kg/m^3], a number or [T].
     """
 
     def __init__(self, points: Array, tets: npt.NDArray[np.integer], volumes: Array, young: Any, density: Any):
@@ -50,10 +50,10 @@ class MeshBody:
         self._motions = _rigid_motions(self._x, float(np.cbrt(volumes.sum() / GROUPS)))
 
     def sag(self, held: npt.NDArray[np.integer], accelerations: npt.ArrayLike) -> list[Sag]:
-        """What the body does under each of some accelerations.
+        """The response of the body to each of several accelerations.
 
         Args:
-            held: Nodes that are held, indices.
+            held: Indices of the fixed nodes.
             accelerations: [m/s^2], [k, 3].
         """
         free = np.flatnonzero(np.tile(~np.isin(self._used, held), 3))
@@ -77,7 +77,7 @@ class MeshBody:
 
 
 def _stiffness(points: Array, tets: npt.NDArray[np.integer], moduli: Array) -> csr_array:
-    """Of linear tetrahedra, all x before all y before all z, [3 N, 3 N]; ``moduli`` are Young's times volumes [N m]."""
+    """Stiffness of linear tetrahedra, all x, all y, all z, [3 N, 3 N]; ``moduli``: Young's times volumes [N m]."""
     mu, lam = 0.5 / (1.0 + POISSON), POISSON / ((1.0 + POISSON) * (1.0 - 2.0 * POISSON))
     count, slopes = len(tets), _slopes(points[tets])
     places = np.repeat(np.arange(count), 4), tets.ravel()
@@ -99,7 +99,7 @@ def _slopes(corners: Array) -> Array:
 
 
 def _rigid_motions(points: Array, edge: float) -> csr_array:
-    """The six rigid motions of groups of nodes, each of those in a cube of an edge [m], [3 N, 6 groups]."""
+    """The six rigid motions of groups of nodes, one group for each cube of an edge [m], [3 N, 6 groups]."""
     cubes = np.floor((points - points.min(axis=0)) / edge).astype(int)
     _, group = np.unique(cubes, axis=0, return_inverse=True)
     group = group.ravel()
@@ -121,7 +121,7 @@ def _preconditioner(matrix: csr_array, motions: csr_array) -> Any:
     inverse = np.divide(1.0, diagonal, out=np.zeros_like(diagonal), where=diagonal > 0.0)[:, None]
     coarse = motions.T @ matrix @ motions
     scale = coarse.diagonal()
-    # Groups that are held altogether have no motions.
+    # Groups with all nodes fixed have no motions.
     coarse = coarse + diags_array(np.where(scale > 0.0, SHIFT * scale, 1.0) + SHIFT**2 * scale.max())
     factors = splu(coarse.tocsc())
     return lambda r: inverse * r + motions @ factors.solve(motions.T @ r)

@@ -1,1 +1,1 @@
-"""What users hand in, checked: numbers, indices, devices, keyframes, expressions that select nodes."""
+"""Checks of users' input: numbers, indices, devices, keyframes, expressions that select nodes."""

@@ -1,10 +1,11 @@
-"""What users give, checked: numbers, lists and things of a kind."""
+"""Checks of users' input: numbers, lists and objects of a type."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
+from types import UnionType
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ def checked_count(given: Any, name: str, least: int) -> int:
     """A whole number of at least ``least``.
 
     Raises:
-        InputError: It is not.
+        InputError: It is something else.
     """
     try:
         count = int(given)
@@ -36,11 +37,11 @@ def checked_numbers(given: npt.ArrayLike | wp.array, name: str, wanted: str) -> 
 
     Args:
         given: Numbers, nested lists of them, a NumPy array or a Warp array.
-        name: What it is, for the message.
-        wanted: What it must be, for the message, such as "[10, 3]".
+        name: The name for the message.
+        wanted: What it must be, for the message: "[10, 3]".
 
     Raises:
-        InputError: It holds something else, or its rows are not of one length.
+        InputError: It holds something else, or its rows have different lengths.
     """
     try:
         return np.asarray(given.numpy() if isinstance(given, wp.array) else given, dtype=np.float64)
@@ -49,7 +50,7 @@ def checked_numbers(given: npt.ArrayLike | wp.array, name: str, wanted: str) -> 
 
 
 def checked_number(given: Any, name: str, unit: str = "") -> float:
-    """One number, which may be infinite or none.
+    """One number, which may be infinite or NaN.
 
     Raises:
         InputError: It is something else.
@@ -75,19 +76,19 @@ def checked_path(given: Any, name: str) -> Path:
 
 
 def shown(given: Any) -> str:
-    """Something that a user gave, for a message: short, in one line."""
+    """A user's value for a message: short, in one line."""
     text = " ".join(repr(given).split())
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def refuse_tape() -> None:
-    """See that no ``wp.Tape`` is recording: kernels here have no adjoint, and gradients would be zero.
+    """Check that no ``wp.Tape`` is recording: kernels here have no adjoint, and gradients would be zero.
 
     Raises:
-        InputError: One is.
+        InputError: A tape is recording.
     """
     try:
-        with wp.Tape():  # two at a time are refused
+        with wp.Tape():  # Warp refuses a second tape
             pass
     except RuntimeError:
         raise InputError(
@@ -96,11 +97,11 @@ def refuse_tape() -> None:
         ) from None
 
 
-def checked_things(given: Any, kind: type, name: str, wanted: str) -> tuple:
-    """One thing of a kind or several of them, as a tuple.
+def checked_things(given: Any, kind: type | UnionType, name: str, wanted: str) -> tuple:
+    """One object of a type or several of them, as a tuple.
 
     Raises:
-        InputError: Something in it is of another kind.
+        InputError: One of them has another type.
     """
     things = tuple(given) if isinstance(given, Iterable) and not isinstance(given, str) else (given,)
     for thing in things:
@@ -110,7 +111,7 @@ def checked_things(given: Any, kind: type, name: str, wanted: str) -> tuple:
 
 
 def check_float32(values: npt.ArrayLike, what: str, unit: str) -> None:
-    """See that float32 holds positive values with all its digits.
+    """Check that float32 holds positive values with all their digits.
 
     Raises:
         InputError: It does not.
@@ -119,4 +120,4 @@ def check_float32(values: npt.ArrayLike, what: str, unit: str) -> None:
     bad = numbers[~((numbers >= FLOAT32.tiny) & (numbers <= FLOAT32.max))]
     if len(bad):
         limits = f"{FLOAT32.tiny:.2g} to {FLOAT32.max:.2g}"
-        raise InputError(f"{what} is {bad[0]:.3g} {unit}; float32, in which all is computed, holds {limits}")
+        raise InputError(f"{what} is {bad[0]:.3g} {unit}; it must be within the range of float32, {limits}")

@@ -8,10 +8,10 @@ from warp_corot.errors import InputError
 
 
 def checked_device(device: str | wp.Device | None) -> wp.Device:
-    """The device of that name; Warp's default for None.
+    """The device with this name; Warp's default for None.
 
     Raises:
-        InputError: There is no such device; the message lists those there are.
+        InputError: There is no device with this name; the message lists the devices that exist.
     """
     wp.init()
     try:

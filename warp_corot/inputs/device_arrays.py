@@ -1,4 +1,4 @@
-"""Vectors that are on a device already, of Warp, PyTorch or JAX: taken as they are, without a way through the host."""
+"""Vectors in device arrays of Warp, PyTorch or JAX: used without a copy to the host."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from .checks import shown
 
 
 def vectors_on_device(given: Any, name: str, counts: tuple[int, ...], device: wp.Device) -> wp.array | None:
-    """One vector, or one for each of some nodes, if they are in an array of a device; None for anything else.
+    """Vectors in a device array, one for all nodes or one for each; None for any other input.
 
-    Nothing waits for the device, so values are not checked.
+    The host does not wait for the device, so values are not checked.
 
     Args:
-        given: A ``wp.array`` of vec3 [n] or float32 [n, 3], or an array of float32 [n, 3] of another program that knows
-            DLPack, as PyTorch's and JAX's do. float32 [3] is one vector.
-        name: What they are, for the message.
-        counts: How many there may be, besides one.
-        device: Where they must be, or are copied to.
+        given: A ``wp.array`` of vec3 [n] or float32 [n, 3], or an array of float32 [n, 3] that supports DLPack, as
+            those of PyTorch and JAX do. float32 [3] is one vector.
+        name: The name for the message.
+        counts: Allowed numbers of vectors, besides one.
+        device: The device of the result; arrays on other devices are copied to it.
 
     Returns:
         vec3 [n].
 
     Raises:
-        InputError: Another type, or another number of vectors.
+        InputError: Another dtype, or another number of vectors.
     """
     array = _as_warp(given)
     if array is None:
@@ -52,6 +52,6 @@ def _as_warp(given: Any) -> wp.array | None:
         return None
     try:
         array = wp.from_dlpack(given)
-    except Exception as error:  # whatever the other program raises
+    except Exception as error:  # any error of the other program
         raise InputError(f"{shown(given)} cannot be read through DLPack: {error}") from None
     return array if array.dtype == wp.float32 else None

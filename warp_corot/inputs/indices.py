@@ -9,15 +9,15 @@ from warp_corot.errors import InputError
 
 
 def checked_indices(given: npt.ArrayLike, count: int, thing: str) -> npt.NDArray[np.intp]:
-    """The indices that a mask or a list names, in the order given, negative ones counted from the end.
+    """The indices that a mask or a list gives, in the given order, negative ones counted from the end.
 
     Args:
         given: Mask bool [count], or indices from -count to count - 1.
-        count: How many there are.
-        thing: What they are, for the message: "node", "leaf".
+        count: Number of things that can be indexed.
+        thing: Their name for the message: "node", "leaf".
 
     Raises:
-        InputError: Mask of the wrong shape, an index out of range, or neither a mask nor whole numbers.
+        InputError: A mask of the wrong shape, an index out of range, or neither a mask nor whole numbers.
     """
     try:
         chosen = np.asarray(given)

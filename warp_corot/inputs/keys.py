@@ -1,4 +1,4 @@
-"""What keyframes of nodes and of elements share."""
+"""What keyframes of nodes and of elements have in common."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def checked_times(times: npt.ArrayLike) -> npt.NDArray[np.float64]:
 def staying(
     followers: npt.NDArray[np.integer], chosen: npt.NDArray[np.integer], values: npt.NDArray[np.floating]
 ) -> tuple[npt.NDArray[np.integer], npt.NDArray[np.floating]] | None:
-    """Who follows keyframes and is not among the chosen, with their values; None if all stay.
+    """Those that follow keyframes and are not among the chosen, with their values; None if all stay.
 
     Args:
         followers: [n].
-        chosen: Who is to follow them no more.
+        chosen: Those that stop following.
         values: A column for each follower, or one for all, [K, n, …] or [K, 1, …].
     """
     stays = ~np.isin(followers, chosen)

@@ -1,7 +1,7 @@
-"""Nodes chosen by an expression in their rest coordinates, such as ``"z < 0.01"`` or ``"top or sphere(0, 0, 1, 0.2)"``.
+"""Selection of nodes by an expression in rest coordinates: ``"z < 0.01"`` or ``"top or sphere(0, 0, 1, 0.2)"``.
 
-The expression is parsed with Python's grammar and walked by hand: names, numbers and operators listed here, nothing
-else. It is never evaluated as code.
+Python's parser reads the expression, and the code here evaluates the names, numbers and operators that it lists.
+Nothing is ever evaluated as Python code.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ FUNCTIONS: dict[str, tuple[Callable[..., np.ndarray], int, int | None]] = {
     "max": (lambda *a: np.maximum.reduce(np.broadcast_arrays(*a)), 2, None),
 }
 
-#: Regions by name, with the number of arguments (a second one where the last may be left out). They mean all nodes,
-#: wherever they stand in the expression.
+#: Regions by name, with the number of arguments (two numbers if the last argument is optional). A region refers to
+#: all nodes, wherever it stands in the expression.
 REGIONS = {"sphere": (4, 4), "box": (6, 6), "nearest": (3, 4)}
 
 _ARITHMETIC: dict[type[ast.operator], Callable[..., np.ndarray]] = {
@@ -57,7 +57,7 @@ _COMPARISONS: dict[type[ast.cmpop], Callable[..., np.ndarray]] = {
     ast.NotEq: np.not_equal,
 }
 _LONGEST = 1000
-#: Not a name that an expression can have: which nodes are looked at, indices.
+#: The indices of the nodes that are evaluated, under a name that no expression can have.
 _PLACES = "#"
 _PARENTHESES = " (with & and |, put each condition in parentheses)"
 
@@ -74,21 +74,21 @@ def select_nodes(
     ``none``. Operators: arithmetic, comparisons (also chained), ``and``, ``or``, ``not`` and, between comparisons in
     parentheses, ``&``, ``|``, ``~``. Functions: see ``FUNCTIONS``. Regions: ``sphere(x, y, z, radius)``,
     ``box(x, y, z, x, y, z)`` between two corners, ``nearest(x, y, z)`` for the node that is nearest to a point and
-    ``nearest(x, y, z, n)`` for the n nearest [m]. The right side of ``and`` and ``or`` is looked at
-    only where the left side leaves it open, so that ``y > 0 and x / y < 1`` divides by no zero.
+        ``nearest(x, y, z, n)`` for the n nearest [m]. The right side of ``and`` and ``or`` is evaluated
+        only at nodes where the left side does not decide, so that ``y > 0 and x / y < 1`` never divides by zero.
 
     Args:
         expression: For example ``"x > 0.1 and not (y < 0.2)"``, ``"hypot(x, y) < 0.02"``, ``"z < zmin + 0.01"``.
         points: Rest positions [m], [N, 3].
-        bounds: Lowest and highest coordinates [m], [2, 3]; None: those of the points.
-        named: More names and what gives their nodes, bool [N]; called where the expression has the name.
+        bounds: Lowest and highest coordinates [m], [2, 3]; None: of the points.
+        named: More names, each with a function that gives its nodes, bool [N]; called if the expression has the name.
 
     Returns:
         Mask, bool [N].
 
     Raises:
-        InputError: Not such an expression, a number that is not finite (a division by zero, the root of a negative
-            number), or a result that is not true or false; the message names the part.
+        InputError: Not an expression of this kind, a number that is not finite (a division by zero, the root of a
+            negative number), or a result that is not true or false; the message names the part.
     """
     x = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     lowest, highest = (x.min(axis=0), x.max(axis=0)) if bounds is None else np.asarray(bounds, dtype=np.float64)
@@ -99,7 +99,7 @@ def select_nodes(
 
 
 class _Evaluation:
-    """One expression over N nodes; numbers are float64, truths bool, each [N] or a scalar."""
+    """One expression over N nodes; numbers are float64, truth values bool, each [N] or a scalar."""
 
     def __init__(self, expression: str, points: npt.NDArray[np.float64], named: Named):
         self.expression = expression
@@ -120,13 +120,13 @@ class _Evaluation:
         except (RecursionError, MemoryError):
             raise self._error("it is too deeply nested") from None
         if value.dtype != np.bool_:
-            raise self._error('the result is a number, it must be true or false, as "z < 0.01" is')
+            raise self._error('the result is a number; it must be true or false, like "z < 0.01"')
         return np.array(np.broadcast_to(value, self.count))
 
     def _checked_text(self) -> str:
         text = self.expression.strip()
         if not text:
-            raise self._error('it is empty, it must be a condition such as "z < 0.01"')
+            raise self._error('it is empty; it must be a condition like "z < 0.01"')
         if len(text) > _LONGEST or not text.isprintable():
             raise self._error(f"it must be at most {_LONGEST} printable characters")
         return text
@@ -171,13 +171,13 @@ class _Evaluation:
                 return self._region(name, [self._constant_number(arg, names) for arg in args])[names[_PLACES]]
             case ast.Call(func=ast.Name(id=name)) if name not in FUNCTIONS:
                 known_functions = ", ".join([*FUNCTIONS, *REGIONS])
-                raise self._error(f"{name!r} is no function here; functions are {known_functions}")
+                raise self._error(f"{name!r} is not a function here; functions are {known_functions}")
         raise self._error(f"{ast.unparse(node)!r} is not understood{self._hint()}")
 
     def _constant_number(self, node: ast.expr, names: Names) -> float:
         value = self._number(node, names, self.count)
         if value.ndim:
-            raise self._error(f"{ast.unparse(node)!r} is not the same at all nodes, as numbers of a region must be")
+            raise self._error(f"{ast.unparse(node)!r} differs from node to node; numbers of a region must be constant")
         return float(value)
 
     def _region(self, name: str, given: list[float]) -> npt.NDArray[np.bool_]:
@@ -205,10 +205,10 @@ class _Evaluation:
         try:
             return self._finite(node, np.asarray(float(value)), 1)
         except OverflowError:
-            raise self._error("a number in it is too large") from None
+            raise self._error("it has a number that is too large") from None
 
     def _chain(self, is_and: bool, values: list[ast.expr], names: Names, count: int) -> np.ndarray:
-        """``and`` and ``or``: each part only at the nodes that the parts before leave open."""
+        """``and`` and ``or``: each part is evaluated only at nodes that the parts before do not decide."""
         result = np.array(np.broadcast_to(self._truth(values[0], names, count), count))
         for value in values[1:]:
             open_nodes = np.flatnonzero(result == is_and)

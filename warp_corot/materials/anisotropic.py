@@ -15,23 +15,24 @@ from .isotropic import Field, Isotropic, Material, place, set_checked
 
 Array = npt.NDArray[np.float64]
 
-#: The entries of ``Anisotropic.stiffness`` and of ``frames``, row by row, where elements carry them one by one.
+#: The entries of ``Anisotropic.stiffness`` and of ``frames``, row by row, when elements carry them one by one.
 STIFFNESS_ENTRIES = tuple(f"stiffness{n}" for n in range(9))
 FRAME_ENTRIES = tuple(f"frame{n}" for n in range(9))
 
-# How far from a right angle the axes of a material may be: the largest cosine between two.
+# The largest cosine between two axes of a material, which limits how far they are from a right angle.
 _RIGHT_ANGLE = 1e-3
 
 
 class Anisotropic(Material):
-    """A material with three axes at right angles, about which it is symmetric. In these its compliance is
+    """A material with three axes of symmetry at right angles. In these axes its compliance is
 
         e_i = s_i / E_i - sum_(j != i) nu_ji / E_j s_j,    2 e_ij = s_ij / G_ij,    nu_ij / E_i = nu_ji / E_j,
 
-    so that nu_ij is the contraction along axis j over the stretch along axis i when pulled along axis i.
+    so that nu_ij is the contraction along axis j over the stretch along axis i under tension along axis i.
     """
 
-    #: What must be positive besides the moduli for the stiffness to be positive definite; ``_margin`` is its value.
+    #: A quantity that must be positive, besides the moduli, for a positive definite stiffness; ``_margin`` is its
+    #: value.
     condition: ClassVar[str]
 
     @abstractmethod
@@ -68,7 +69,7 @@ class Anisotropic(Material):
 
     @property
     def isotropic(self) -> Isotropic:
-        """The isotropic material of the same density that is nearest in stiffness: Voigt's average over directions."""
+        """The isotropic material of the same density with the nearest stiffness: Voigt's average over directions."""
         c = self.stiffness()
         bulk = (c[..., :3].sum(-1) + 2.0 * c[..., 3:6].sum(-1)) / 9.0
         mu = (c[..., :3].sum(-1) - c[..., 3:6].sum(-1) + 3.0 * c[..., 6:].sum(-1)) / 15.0
@@ -82,7 +83,7 @@ class Anisotropic(Material):
 
     def _check_definite(self) -> None:
         if self.functions:
-            return  # a body checks their values
+            return  # a body checks the values of functions
         margin = self._margin()
         bad = np.argwhere(~(margin > 0))
         if len(bad):
@@ -95,18 +96,18 @@ class Anisotropic(Material):
 
 @dataclass(frozen=True, eq=False)
 class TransverselyIsotropic(Anisotropic):
-    """A material of fibres: stiff or soft along one direction, the same in all directions across.
+    """A material with fibres: it has one stiffness along them and another one in all directions across.
 
-    Every number may be given per element, per world or as a function of the rest position, as those of ``Isotropic``.
+    Every number may be given per element, per world or as a function of the rest position, as in ``Isotropic``.
 
     Attributes:
         young_along: Young's modulus along the fibres, E_f > 0 [Pa].
-        young_across: Across them, E_t > 0 [Pa].
-        poisson_along: nu_ft: contraction across over stretch along, pulled along the fibres.
-        poisson_across: nu_tt: contraction across over stretch across, pulled across, -1 < nu_tt < 1.
-        shear_along: Shear modulus G_ft > 0 of planes with the fibres [Pa]; across them it is E_t / (2 (1 + nu_tt)).
-        direction: Of the fibres in rest space, of any length but zero: [3], [T, 3], [worlds, T, 3] or a function
-            ``f(points [n, 3]) -> [n, 3]``.
+        young_across: Young's modulus across the fibres, E_t > 0 [Pa].
+        poisson_along: nu_ft: contraction across over stretch along the fibres, under tension along them.
+        poisson_across: nu_tt: contraction across over stretch across, under tension across, -1 < nu_tt < 1.
+        shear_along: Shear modulus G_ft > 0 of planes that contain the fibres [Pa]; across it is E_t / (2 (1 + nu_tt)).
+        direction: Direction of the fibres in rest space, of any nonzero length: [3], [T, 3], [worlds, T, 3] or a
+            function ``f(points [n, 3]) -> [n, 3]``.
         density: Mass per rest volume > 0 [kg/m^3].
 
     Raises:
@@ -163,7 +164,7 @@ class TransverselyIsotropic(Anisotropic):
 
     def frames(self) -> Array:
         along = self.direction
-        # Any two directions across will do: the first at right angles to the axis that the fibre is farthest from.
+        # Any two directions across will do: the first is perpendicular to the axis that is farthest from the fibre.
         across = np.cross(along, np.eye(3)[np.abs(along).argmin(axis=-1)])
         across /= np.linalg.norm(across, axis=-1, keepdims=True)
         return np.stack([along, across, np.cross(along, across)], axis=-1)
@@ -171,19 +172,19 @@ class TransverselyIsotropic(Anisotropic):
 
 @dataclass(frozen=True, eq=False)
 class Orthotropic(Anisotropic):
-    """A material with three directions at right angles, each of its own stiffness.
+    """A material with three directions at right angles, each with its own stiffness.
 
     Moduli and ratios may be given per element, [T, 3], per world and element, [worlds, T, 3] or [worlds, 1, 3], or as
     functions of the rest position, ``f(points [n, 3]) -> [n, 3]``.
 
     Attributes:
         young: E_1, E_2, E_3 > 0 [Pa], [3].
-        poisson: nu_12, nu_13, nu_23, [3]: nu_ij is the contraction along axis j over the stretch along axis i, pulled
-            along axis i.
+        poisson: nu_12, nu_13, nu_23, [3]: nu_ij is the contraction along axis j over the stretch along axis i, under
+            tension along axis i.
         shear: G_12, G_13, G_23 > 0 [Pa], [3].
-        axes: Axes 1, 2 and 3 in rest space, a row each, at right angles and of any length but zero: [3, 3],
-            [T, 3, 3], [worlds, T, 3, 3] or a function ``f(points [n, 3]) -> [n, 3, 3]``. Fibres, where there is active
-            stress, are along the first.
+        axes: Axes 1, 2 and 3 in rest space, a row each, at right angles and of any nonzero length: [3, 3],
+            [T, 3, 3], [worlds, T, 3, 3] or a function ``f(points [n, 3]) -> [n, 3, 3]``. Fibres with active stress lie
+            along the first.
         density: Mass per rest volume > 0 [kg/m^3].
 
     Raises:
@@ -223,14 +224,14 @@ class Orthotropic(Anisotropic):
 
     def frames(self) -> Array:
         first, second = self.axes[..., 0, :], self.axes[..., 1, :]
-        # Rounding and small angles off; which way an axis points does not matter.
+        # Removes rounding and small angles; the sign of an axis does not matter.
         second = second - np.sum(first * second, axis=-1, keepdims=True) * first
         second /= np.linalg.norm(second, axis=-1, keepdims=True)
         return np.stack([first, second, np.cross(first, second)], axis=-1)
 
 
 def constants_of(stiffness: Array) -> tuple[Array, Array, Array]:
-    """``Anisotropic.constants`` of what ``Anisotropic.stiffness`` gives, [..., 9]."""
+    """``Anisotropic.constants`` from the values of ``Anisotropic.stiffness``, [..., 9]."""
     normal = stiffness[..., [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(*stiffness.shape[:-1], 3, 3)
     compliance = np.linalg.inv(normal)
     young = 1.0 / np.diagonal(compliance, axis1=-2, axis2=-1)
@@ -243,26 +244,26 @@ def _stacked(*values: npt.ArrayLike) -> Array:
 
 
 def _symmetric_ratios(young: Array, poisson: Array) -> tuple[Array, Array, Array]:
-    """nu_ij sqrt(E_j / E_i) for 12, 13, 23, which does not change when i and j change places."""
+    """nu_ij sqrt(E_j / E_i) for 12, 13, 23, which is symmetric in i and j."""
     e1, e2, e3 = (young[..., i] for i in range(3))
     n12, n13, n23 = (poisson[..., i] for i in range(3))
     return n12 * np.sqrt(e2 / e1), n13 * np.sqrt(e3 / e1), n23 * np.sqrt(e3 / e2)
 
 
 def _determinant(r12: Array, r13: Array, r23: Array) -> Array:
-    """Of the compliance scaled to a diagonal of ones."""
+    """The determinant of the compliance scaled to a diagonal of ones."""
     return 1.0 - r12**2 - r13**2 - r23**2 - 2.0 * r12 * r13 * r23
 
 
 def _unit(vectors: Array, name: str) -> Array:
-    """Vectors [..., 3] of length one; those that have it stay as they are, so that doing it again changes nothing."""
+    """Vectors [..., 3] of length one; those of length one are not changed, so that repetition changes nothing."""
     largest = np.abs(vectors).max(axis=-1, keepdims=True)
     zero = np.argwhere(largest[..., 0] == 0)
     if len(zero):
         rank = 1 if name == "direction" else 2
         where = place(zero[0][: largest.ndim - rank], largest.shape[: largest.ndim - rank])
-        raise InputError(f"{name}{where} has length zero; it must have any other")
-    # Scaled first, so that no square is out of range.
+        raise InputError(f"{name}{where} has length zero; it must have a nonzero length")
+    # Scaling comes first, so that no square overflows or underflows.
     scaled = vectors / largest
     norm = np.linalg.norm(scaled, axis=-1, keepdims=True)
     return np.where(np.abs(largest * norm - 1.0) < 1e-14, vectors, scaled / norm)

@@ -1,4 +1,4 @@
-"""Materials: isotropic ones here, others in ``anisotropy``."""
+"""Materials: the common base class and isotropic materials; ``anisotropic`` has the others."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ Values = float | npt.NDArray[np.floating]
 
 
 class Material(ABC):
-    """What bodies are made of: frozen dataclasses of fields that are uniform or vary from element to element.
+    """The base class of materials: frozen dataclasses whose fields are uniform or vary from element to element.
 
     Class attributes:
-        components: Shape of one value of those fields that are no numbers.
+        components: Shape of one value of each field that is not a number.
     """
 
     components: ClassVar[dict[str, tuple[int, ...]]] = {}
@@ -32,7 +32,7 @@ class Material(ABC):
     @property
     @abstractmethod
     def isotropic(self) -> Isotropic:
-        """The isotropic material that is nearest."""
+        """The nearest isotropic material."""
 
     @property
     def functions(self) -> tuple[str, ...]:
@@ -40,13 +40,13 @@ class Material(ABC):
         return tuple(f.name for f in fields(self) if callable(getattr(self, f.name)))  # type: ignore[arg-type]
 
     def at(self, points: npt.NDArray[np.float64]) -> Self:
-        """The same with functions replaced by their values.
+        """The same material with values in place of functions.
 
         Args:
             points: Rest positions, one for each element [m], [n, 3].
 
         Raises:
-            InputError: A function gives values of another shape, or out of their range.
+            InputError: A function gives values with another shape, or out of their range.
         """
         found = {}
         for name in self.functions:
@@ -66,10 +66,10 @@ class Material(ABC):
         return replace(self, **found) if found else self  # type: ignore[type-var]
 
     def check_shapes(self, worlds: int, count: int) -> None:
-        """See that there is a value for each element, or for all.
+        """Check that there is one value for each element, or one for all.
 
         Raises:
-            InputError: Arrays that do not broadcast to [worlds, count].
+            InputError: An array does not broadcast to [worlds, count].
         """
         for field in fields(self):  # type: ignore[arg-type]
             shape, tail = np.shape(getattr(self, field.name)), self.components.get(field.name, ())
@@ -87,7 +87,7 @@ class Material(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Isotropic(Material):
-    """An isotropic elastic material, uniform or with a value per element, per world, or both.
+    """An isotropic elastic material, uniform or with values per element, per world, or both.
 
     Attributes:
         young: Young's modulus E > 0 [Pa], a number, [T], [worlds, 1], [worlds, T], or a function of the rest position:
@@ -124,7 +124,7 @@ class Isotropic(Material):
 
 
 def set_checked(material: Material, name: str, unit: str, low: float, high: float) -> None:
-    """Replace a field by its values as float64, unless it is a function.
+    """Replace a field by its values in float64, unless it is a function.
 
     Raises:
         InputError: No numbers, a wrong shape, or a value that is not between ``low`` and ``high``.
@@ -154,7 +154,7 @@ def set_checked(material: Material, name: str, unit: str, low: float, high: floa
 
 
 def place(index: npt.NDArray[np.integer], head: tuple[int, ...]) -> str:
-    """In words, which of the values of [T] or [worlds, T] is meant."""
+    """In words, which one of the values [T] or [worlds, T] the index refers to."""
     if not head:
         return ""
     where = f" of element {index[-1]}" if head[-1] > 1 or len(head) == 1 else ""

@@ -34,19 +34,19 @@ class Keys:
         return self.first + self.stress.shape[1]
 
     def follow(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.bool_]:
-        """Whose row is one of these."""
+        """Which elements have a row in these keyframes."""
         return (rows >= self.first) & (rows < self.end)
 
 
 class CarriedActivation:
-    """Active stress as elements carry it, handed between body and pools; of other bodies nothing is done.
+    """Active stress that elements carry, passed between body and pools; bodies without active stress are left alone.
 
     Args:
         body: The body.
         forest: Its pools.
 
     Attributes:
-        keys: The keyframes that elements follow, or did on the mesh that ``put_back`` is for.
+        keys: The keyframes that elements follow, or followed on the mesh that ``put_back`` restores.
     """
 
     def __init__(self, body: SoftBody, forest: DeviceForest):
@@ -56,10 +56,10 @@ class CarriedActivation:
         self._made: list[ElementActivation] = []
 
     def note(self, kept_rows: wp.array | None) -> None:
-        """Take over what the user has done.
+        """Read the user's changes.
 
         Args:
-            kept_rows: Rows that ``put_back`` may be asked to write, whose keyframes are still wanted then.
+            kept_rows: Rows that ``put_back`` may write, whose keyframes must be kept.
         """
         body = self._body
         if not body.discretization.has_activation:
@@ -70,13 +70,13 @@ class CarriedActivation:
             self._write(ACTIVATION_ROW, self._adopt(now, kept_rows))
 
     def kept(self) -> dict[str, wp.array]:
-        """What ``put_back`` takes, of the present mesh."""
+        """The data for ``put_back``, on the current mesh."""
         if not self._body.discretization.has_activation:
             return {}
         return {name: self._read(name) for name in (ACTIVATION, ACTIVATION_ROW)}
 
     def put_back(self, kept: dict[str, wp.array]) -> None:
-        """Write this into the mesh for which it was; the pools are that already."""
+        """Write the data into the mesh from which they came; the pools hold that mesh already."""
         for name in (ACTIVATION, ACTIVATION_ROW):
             if name in kept:
                 self._write(name, kept[name])
@@ -87,13 +87,13 @@ class CarriedActivation:
             self.serve()
 
     def serve(self) -> None:
-        """Let the body's elements follow the keyframes that they carry the rows of."""
+        """Let the body's elements follow the keyframes of the rows that they carry."""
         rows = self._read(ACTIVATION_ROW).numpy()
         self._made = [made for keys in self.keys if (made := _of_keys(keys, rows, self._body.device))]
         self._body.conditions.set_activations(self._made)
 
     def _adopt(self, activations: Sequence[ElementActivation], kept_rows: wp.array | None) -> wp.array:
-        """Number the keyframes of these, and say which row each element follows, int32 [T]."""
+        """Number these keyframes, and return the row that each element follows, int32 [T]."""
         rows = np.full(self._body.element_count, int(NO_ROW), np.int32)
         wanted = np.empty(0, np.int32) if kept_rows is None else kept_rows.numpy()
         self.keys = [keys for keys in self.keys if keys.follow(wanted).any()]
@@ -126,7 +126,7 @@ class CarriedActivation:
 
 
 def _of_keys(keys: Keys, rows: npt.NDArray[np.int32], device: wp.Device) -> ElementActivation | None:
-    """Who follows these keyframes, if anybody does."""
+    """The elements that follow these keyframes; None if there are none."""
     elements = np.flatnonzero(keys.follow(rows))
     if not len(elements):
         return None

@@ -1,4 +1,4 @@
-"""A body's material as its elements carry it through passes."""
+"""A body's material, carried by its elements through passes."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from warp_corot.materials.isotropic import Isotropic, Material
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
 
-#: The active stress, and, of whole numbers, the row of keyframes that it follows.
+#: The active stress, and, as a whole number, the row of keyframes that it follows.
 ACTIVATION = "activation"
 ACTIVATION_ROW = "activation_row"
 
 
 def carried_material(former: Discretization) -> CarriedMaterial:
-    """What the body's elements are to carry of its material."""
+    """The material data that the body's elements carry."""
     return (CarriedAnisotropic if isinstance(former.material, Anisotropic) else CarriedMaterial)(former)
 
 
 class CarriedMaterial:
-    """What of an isotropic material varies from element to element.
+    """Fields of an isotropic material that vary from element to element.
 
     Attributes:
-        given: The material that the body began with.
-        values: What elements carry, by name, [T] each: Lamé's parameters times the filled share, and without it. Of the
-            latter a parent has the mean that counts by what its children hold.
+        given: The body's initial material.
+        values: Values that elements carry, by name, [T] each: Lamé's parameters with and without the factor of the
+            filled fraction. For the latter a parent has the mean weighted by what its children hold.
     """
 
     def __init__(self, former: Discretization):
@@ -50,40 +50,40 @@ class CarriedMaterial:
             own = (Column(array.numpy(), int(MEAN_OF_CONTENTS)) for array in former.lame[:2])
             self.values |= dict(zip(("own_mu", "own_lam"), own, strict=True))
         self._lame = ("own_mu", "own_lam") if "own_mu" in self.values else ("mu", "lam") if former.lame[2] else ()
-        #: Lamé's parameters of the material itself [Pa], or what elements carry them as.
+        #: Lamé's parameters of the material itself [Pa], or the names under which elements carry them.
         self.lame: Any = self._lame or tuple(float(array.numpy()[0]) for array in former.lame[:2])
-        #: 2 mu + lambda [Pa] of all elements if they are alike, else 0.
+        #: 2 mu + lambda [Pa] of all elements if they are equal, else 0.
         self.modulus = 0.0 if self.values else float(2.0 * former.mu.numpy()[0] + former.lam.numpy()[0])
 
     def density(self, count: int) -> npt.NDArray[np.float64]:
-        """Mass per rest volume of what elements hold [kg/m^3], [count]."""
+        """Mass per rest volume of the filled part of elements [kg/m^3], [count]."""
         return np.broadcast_to(self.given.density, (1, count))[0]
 
     def lame_of(self, plan: DevicePlan) -> tuple[wp.array, wp.array, int] | None:
-        """Lamé's parameters of the present elements and their stride, if they vary."""
+        """Lamé's parameters of the current elements and their stride, if they vary."""
         if not self._lame:
             return None
         mu, lam = (plan.values[name] for name in self._lame)
         return mu, lam, 1
 
     def serve(self, plan: DevicePlan, lame: tuple[wp.array, wp.array, int]) -> None:
-        """Have ``derive`` write what the present elements carry.
+        """Let ``derive`` write the material of the current elements.
 
         Args:
-            plan: Of these elements.
+            plan: The plan of these elements.
             lame: Their Lamé parameters.
         """
 
     def derive(self, plan: DevicePlan) -> None:
-        """Launch what writes the material that kernels read, if the plan has just been derived; may be recorded."""
+        """Launch the kernels that write the material for forces, if the plan was just derived; may be recorded."""
 
     @property
     def anisotropic(self) -> OrthotropicMaterial:
-        """The material of leaves and of padding as kernels read it, if it is anisotropic."""
+        """The material of leaves and padding as kernels read it, if it is anisotropic."""
         raise TypeError(f"the material is {type(self.given).__name__}, which is not anisotropic")
 
     def present(self, forest: DeviceForest) -> Material:
-        """The material of the present elements."""
+        """The material of the current elements."""
         density = self._present_density(forest)
         if not self._lame:
             return Isotropic(self.given.young, self.given.poisson, density)
@@ -98,12 +98,12 @@ class CarriedMaterial:
 
 
 class CarriedAnisotropic(CarriedMaterial):
-    """What of an anisotropic material varies from element to element, and active stress.
+    """Fields of an anisotropic material that vary from element to element, and active stress.
 
-    Beside the nearest isotropic material elements carry axes, stiffness in these, active stress and the row of
-    keyframes that it follows. Children have all their parent's. A parent has its first child's axes and row; its
-    stiffness is the mean of both children's, counted by what they hold, and so is its active stress if both follow the
-    same row or none; otherwise that is the first child's.
+    Besides the nearest isotropic material, elements carry axes, stiffness in these axes, active stress and the row of
+    keyframes that it follows. Children have the values of their parent. A parent has its first child's axes and row;
+    its stiffness is the mean of both children's, weighted by what they hold, and so is its active stress if both follow
+    the same row or none; otherwise it has the active stress of the first child.
     """
 
     def __init__(self, former: Discretization):
@@ -126,7 +126,8 @@ class CarriedAnisotropic(CarriedMaterial):
         return self._anisotropic
 
     def serve(self, plan: DevicePlan, lame: tuple[wp.array, wp.array, int]) -> None:
-        given, material, count = self._anisotropic, OrthotropicMaterial(), plan.counts.most
+        given, count = self._anisotropic, plan.counts.most
+        material: Any = OrthotropicMaterial()
         material.assign(given)
         material.mu, material.lam, material.stride = lame
         if given.axes_stride:
@@ -157,12 +158,12 @@ class CarriedAnisotropic(CarriedMaterial):
 def _columns(
     names: Sequence[str], values: npt.NDArray[np.float64], count: int, merging: int
 ) -> dict[str, npt.NDArray[np.floating] | Column | Numbers]:
-    """Columns of values [count, …], a number each."""
+    """Columns of values [count, …], one number each."""
     table = values.reshape(count, len(names))
     return {name: Column(column, merging) for name, column in zip(names, table.T, strict=True)}
 
 
 def _of_leaves(forest: DeviceForest, names: Sequence[str]) -> npt.NDArray[np.float64]:
-    """What the present leaves carry in some columns, [T, names]."""
+    """Columns that the current leaves carry, [T, names]."""
     chosen = [forest.carriage.names.index(name) for name in names]
     return forest.carriage.arrays.values.numpy()[forest.leaf_elements][:, chosen].astype(np.float64)

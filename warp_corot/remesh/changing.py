@@ -1,4 +1,4 @@
-"""A body whose mesh follows its motion: its arrays are the pools', and each pass is followed by one look at counts."""
+"""A body whose mesh follows its motion: it shares the pools' arrays, and the host reads the counts after each pass."""
 
 from __future__ import annotations
 
@@ -29,25 +29,25 @@ if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
     from warp_corot.elasticity import ForceField
 
-#: Nodes are launched in multiples of this.
+#: The number of launched nodes is a multiple of this.
 NODE_GRANULE = 256
 
 
 class Changing:
-    """What remeshes a body.
+    """The remeshing of one body.
 
-    Made before the body's force field is, whose launches then go through the pools.
+    It is made before the body's force field, whose launches then run over the pools.
 
     Attributes:
         body: The body.
-        options: What was asked for, with numbers everywhere.
+        options: The user's options with all defaults filled in.
         forest: The pools.
-        passes: What changes them.
-        carried_material: What elements carry of the material.
-        conditions: What is done to nodes and fibres.
-        survey: What limits the time step.
+        passes: The passes that change the pools.
+        carried_material: The material data that elements carry.
+        conditions: Supports, loads and active stress.
+        survey: The data that limit the time step.
         discretization: The mesh as the force field sees it.
-        is_full: Whether refinement had to be left out for want of room.
+        is_full: Whether refinement was left out because the capacity was reached.
 
     Raises:
         InputError: A general mesh, more than one world, or options that do not fit the mesh.
@@ -84,17 +84,18 @@ class Changing:
         )
         self.survey = Survey(self.forest, self.carried_material.modulus)
         self.discretization = ChangingMesh(body.discretization, self.forest, self.carried_material)
-        #: What is looked at after a pass: counts of the pools and of the plan, the survey, and who follows keyframes.
+        #: What the host reads after a pass: counts of the pools and of the plan, the survey, and nodes that follow
+        #: keyframes.
         self._report: wp.array | None = None
         self._report_parts: list[int] = []
-        #: A pass and what follows; none where a device's graphs know no conditions.
+        #: A recorded pass with its consequences; None if the device's graphs have no conditional nodes.
         self._graph: wp.Graph | None = None
         self._give_pools_to(body)
 
-    # --- what the body asks for ------------------------------------------------------------------------------------
+    # --- interface for the body ------------------------------------------------------------------------------------
 
     def remember(self) -> None:
-        """Make the present mesh and state what ``reset`` goes back to."""
+        """Make the current mesh and state those that ``reset`` restores."""
         self.body.state.adopt_positions()
         self.forest.remember()
         self.conditions.keep()
@@ -102,7 +103,7 @@ class Changing:
     # --- passes ----------------------------------------------------------------------------------------------------
 
     def serve(self, field: ForceField) -> None:
-        """Keep the plan of a force field that was bound to the body up to date, and tell the field after each pass."""
+        """Keep the plan of the body's force field up to date, and notify the field after each pass."""
         self.field = field
         field.load_kernels()
         parts = self._found()
@@ -117,7 +118,7 @@ class Changing:
             self._graph = capture.graph
 
     def run(self) -> None:
-        """One pass over the mesh, and what follows from it if anything has changed."""
+        """Make one pass over the mesh, and update what depends on the mesh if it has changed."""
         self.body.state.adopt_positions()
         self.conditions.note()
         if self._graph is None:
@@ -127,15 +128,15 @@ class Changing:
         self._look()
 
     def renew(self) -> None:
-        """Derive everything from the mesh as it is."""
+        """Derive everything from the current mesh."""
         self._plan.outdate()
         self._launch_derived()
         self._look(anyway=True)
 
     def reset(self, chosen: wp.array, clock: Clock) -> None:
-        """Go back to the mesh and state of the beginning, or of the last ``remember``, if the world is chosen.
+        """Restore the initial mesh and state, or those of the last ``remember``, if the world is chosen.
 
-        Loads and held nodes, and what these follow, are those that this mesh had last.
+        Loads, held nodes and keyframes are the last ones given on that mesh.
         """
         if not chosen.numpy()[0]:
             return
@@ -156,7 +157,7 @@ class Changing:
         return self.discretization.kept
 
     def _give_pools_to(self, body: SoftBody) -> None:
-        """The body's arrays are the pools' from now on, with what was in them."""
+        """Let the body use the pools' arrays from now on, with their contents."""
         arrays, initial = self.forest.carriage.arrays, body.state.initial
         body.state.move_into(arrays.rest, arrays.u, arrays.v, arrays.reaction)
         body.conditions.move_into(arrays.held, arrays.mass32, arrays.inverse_mass, arrays.load)
@@ -164,7 +165,7 @@ class Changing:
         self._keep_initial_state(initial)
 
     def _launch(self) -> None:
-        """Launch a pass and all that is derived from the mesh, or record it."""
+        """Launch a pass and everything that is derived from the mesh, or record it."""
         self.passes.launch()
         self._launch_derived()
 
@@ -180,11 +181,11 @@ class Changing:
             start += len(part)
 
     def _found(self) -> tuple[wp.array, ...]:
-        """What launches find that the host looks at, int32."""
+        """Results of launches that the host reads, int32."""
         return self.forest.pools.counts, self._plan.class_counts, self.survey.found, self.conditions.found
 
     def _look(self, *, anyway: bool = False) -> None:
-        """The one look at what the device has done: if the mesh is another one, body and field go through that."""
+        """Read the device's results once; if the mesh has changed, update the body and its force field."""
         assert self._report is not None
         counted, classes, surveyed, followers = np.split(self._report.numpy(), np.cumsum(self._report_parts)[:-1])
         counts = PassCounts.of(counted)
@@ -209,7 +210,7 @@ class Changing:
             binding.rebind(self.forest.pools)
 
     def _keep_initial_state(self, initial: tuple[wp.array, wp.array] | None) -> None:
-        """Let ``reset`` go back to rest on the present mesh, or to the initial state that the body has."""
+        """Let ``reset`` restore rest on the current mesh, or the body's initial state."""
         arrays, count = self.forest.carriage.arrays, self.body.node_count
         present = [wp.clone(array) for array in (arrays.u, arrays.v)]
         arrays.u.zero_()
@@ -231,7 +232,7 @@ class Changing:
 
 
 def fitted(options: OnlineRemesh, body: SoftBody) -> OnlineRemesh:
-    """The options with numbers in place of what is found from the body's mesh.
+    """The options with all defaults filled in from the body's mesh.
 
     Raises:
         InputError: A general mesh, more than one world, options that do not fit the mesh, parameters on another device,
@@ -244,11 +245,11 @@ def fitted(options: OnlineRemesh, body: SoftBody) -> OnlineRemesh:
         raise InputError(f"worlds is {body.worlds}; only a body in one world can be remeshed")
     numbers = options.parameters
     if numbers is not None and numbers.device != body.device:
-        raise InputError(f"parameters is on {numbers.device}; it must be on {body.device}, as the body is")
+        raise InputError(f"parameters is on {numbers.device}; it must be on the body's device, {body.device}")
     if options.criterion is not None:
         try:
             wp.load_module(marking_kernel(options.criterion).module, body.device)
-        except Exception as error:  # of whatever kind: it is the user's code that is compiled
+        except Exception as error:  # any error, since the user's code is compiled
             reason = str(error).strip().rpartition("\n")[2].lstrip(";")
             raise InputError(f"the criterion {options.criterion.func.__name__!r} does not compile: {reason}") from error
     return options.on(mesh)

@@ -22,12 +22,13 @@ class ChangingMesh(Discretization):
     """A forest that changes.
 
     Args:
-        former: What it was so far.
+        former: The discretization before the first change.
         forest: The pools.
-        carried: What elements carry of the material.
+        carried: The material data that elements carry.
 
     Attributes:
-        kept: The plan that is kept up to date: the first one that is asked for. Others are of the mesh as it is then.
+        kept: The plan that is kept up to date: the first one requested. Other plans describe the mesh when they are
+            made.
     """
 
     def __init__(self, former: Discretization, forest: DeviceForest, carried: CarriedMaterial):
@@ -39,7 +40,7 @@ class ChangingMesh(Discretization):
         self.smallest_volume = former.smallest_volume
         self._is_uniform = former.is_uniform
         self.kept: DevicePlan | None = None
-        #: What the host knows of the present mesh, by name.
+        #: What the host knows of the current mesh, by name.
         self._known: dict[str, Any] = {}
 
     @property
@@ -94,18 +95,18 @@ class ChangingMesh(Discretization):
         return self._carried.anisotropic
 
     def mesh_changed(self, nodes: int, elements: int, smallest_volume: float) -> None:
-        """The device has changed the mesh: what the host knows of it is out of date.
+        """Record that the device has changed the mesh: the host's copies are out of date.
 
         Args:
-            nodes, elements: How many there are now.
-            smallest_volume: Of an element [m^3].
+            nodes, elements: Current numbers.
+            smallest_volume: Smallest volume of an element [m^3].
         """
         self._known.clear()
         self.sizes.mesh_changed(nodes, elements)
         self.smallest_volume = smallest_volume
 
     def launch(self) -> None:
-        """Launch what brings the plan and the material up to date, or record it."""
+        """Launch the kernels that update the plan and the material, or record them."""
         assert self.kept is not None
         self.kept.launch()
         self._carried.derive(self.kept)

@@ -1,4 +1,4 @@
-"""The conditions of a body whose mesh changes: supports, loads, active stress, and the keyframes of both."""
+"""The conditions of a body whose mesh changes: supports, loads, active stress, and their keyframes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
 
 
-#: What is kept for ``put_back``.
+#: The arrays that ``put_back`` restores.
 KEPT: dict[str, Any] = {
     "held": wp.uint8,
     "load": wp.vec4,
@@ -32,17 +32,17 @@ KEPT: dict[str, Any] = {
 
 
 class CarriedConditions:
-    """Held nodes, loads, active stress and keyframes, handed between body and pools.
+    """Held nodes, loads, active stress and keyframes, passed between body and pools.
 
     Args:
         body: The body.
         forest: Its pools.
 
     Attributes:
-        keyframes: What nodes follow.
-        activation: Active stress, and what it follows.
+        keyframes: The keyframes that nodes follow.
+        activation: Active stress and the keyframes that it follows.
         kept: Held nodes, loads, rows, velocities and active stress as ``put_back`` writes them.
-        found: What ``launch`` has found, int32, for ``follow``.
+        found: The result of ``launch``, int32, for ``follow``.
     """
 
     def __init__(self, body: SoftBody, forest: DeviceForest):
@@ -53,7 +53,7 @@ class CarriedConditions:
         self._revision = -1
         self._is_back = False
         self.kept: dict[str, wp.array] = {}
-        #: The rows in what is kept; None: not looked at yet.
+        #: The rows in ``kept``; None: not read yet.
         self._kept_rows: set[int] | None = None
         self.found = wp.zeros(kernels.PLACES, dtype=wp.int32, device=forest.device)
         #: Nodes that follow keyframes, and their rows, in any order.
@@ -61,21 +61,21 @@ class CarriedConditions:
 
     @property
     def of_present_mesh(self) -> bool:
-        """Whether what is kept is that of the present mesh."""
+        """Whether ``kept`` belongs to the current mesh."""
         return self._body.sizes.version == self._revision
 
     def keep(self) -> None:
-        """From now on, what this mesh has last is what ``put_back`` writes."""
+        """Let ``put_back`` restore the last conditions of this mesh from now on."""
         self._revision = self._body.sizes.version
         self.note()
 
     def set_kept(self, kept: dict[str, wp.array], *, of_present_mesh: bool) -> None:
-        """Write this from now on, of the present mesh or of another."""
+        """Let ``put_back`` restore these conditions from now on, of the current mesh or of another."""
         self.kept, self._kept_rows = kept, None
         self._revision = self._body.sizes.version if of_present_mesh else -1
 
     def note(self) -> None:
-        """Take over what the user has done; to be called before the mesh changes."""
+        """Read the user's changes; call it before the mesh changes."""
         self._take_trajectories()
         self.activation.note(self.kept.get(ACTIVATION_ROW))
         if self.of_present_mesh:
@@ -85,7 +85,7 @@ class CarriedConditions:
             self._kept_rows = None
 
     def put_back(self) -> None:
-        """Write what was kept into the mesh for which it was."""
+        """Write the kept conditions into the mesh to which they belong."""
         arrays, count = self._forest.carriage.arrays, len(self.kept["held"])
         for name in ("held", "load", "row"):
             wp.copy(getattr(arrays, name), self.kept[name], count=count)
@@ -97,7 +97,7 @@ class CarriedConditions:
         self._is_back = True
 
     def launch(self, goes: wp.array) -> None:
-        """Look which nodes follow keyframes if ``goes`` [1] is not zero; may be recorded."""
+        """Find the nodes that follow keyframes if ``goes`` [1] is not zero; may be recorded."""
         forest = self._forest
         device, threads = forest.device, forest.threads
         wp.launch(begin_counts, kernels.PLACES, inputs=[goes], outputs=[self.found], device=device)
@@ -108,11 +108,11 @@ class CarriedConditions:
         """Tell the host which nodes and elements follow keyframes after a pass, new ones among them.
 
         Args:
-            found: A copy of the array of this name.
+            found: A copy of the attribute ``found``.
         """
         self.activation.follow()
         body = self._body
-        # Nodes that were let go later follow again what they did on the mesh that is back.
+        # Nodes released later follow their former keyframes again on the restored mesh.
         if not (body.conditions.trajectories or self._is_back):
             return
         self._is_back = False
@@ -127,7 +127,7 @@ class CarriedConditions:
             body.conditions.set_trajectories(trajectories)
 
     def _settle(self) -> None:
-        """Give rows to nodes between such as follow different ones."""
+        """Give rows to new nodes between nodes that follow different ones."""
         arrays = self._forest.carriage.arrays
         rows = self._of_nodes(arrays.row)
         ends = self._forest.pools.ends[: len(rows)].numpy()
@@ -145,7 +145,7 @@ class CarriedConditions:
             self._forget(rows)
 
     def _forget(self, rows: npt.NDArray[np.int32]) -> None:
-        """Forget the keyframes that no node follows, now or in what is kept."""
+        """Forget the keyframes that no node follows, now or in ``kept``."""
         if self._kept_rows is None:
             self._kept_rows = set(np.unique(self.kept["row"].numpy()).tolist()) if "row" in self.kept else set()
         self.keyframes.forget(but=self._kept_rows.union(np.unique(rows).tolist()))

@@ -1,4 +1,4 @@
-"""Keyframed nodes of a changing mesh: which keyframes each follows, and what new nodes between them follow."""
+"""Keyframed nodes of a changing mesh: the keyframes of each, and those of new nodes between them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.body.trajectory import Trajectory
+from warp_corot.body.trajectory import NodeKeyframes, Trajectory
 from warp_corot.kernels.remesh.state import MIXED_ROWS, NO_ROW
 
 
@@ -30,24 +30,24 @@ class Keyframes:
 
     Attributes:
         rows: The rows by their numbers.
-        between: Which row is the mean of two others.
+        between: The two rows whose mean a row is.
     """
 
     def __init__(self) -> None:
         self.rows: dict[int, Row] = {}
         self.between: dict[tuple[int, int], int] = {}
         self._trajectories: list[Trajectory] = []
-        #: The nodes and rows that these were made of; None if they were not made here.
+        #: The nodes and rows from which these were made; None if they were not made here.
         self._made_of: tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]] | None = None
 
     def are(self, trajectories: Sequence[Trajectory]) -> bool:
-        """Whether these are the trajectories that were made or taken over last."""
+        """Whether these trajectories are those made or adopted last."""
         return len(trajectories) == len(self._trajectories) and all(
             a is b for a, b in zip(trajectories, self._trajectories, strict=True)
         )
 
     def adopt(self, trajectories: Sequence[Trajectory], node_count: int) -> npt.NDArray[np.int32]:
-        """Take trajectories over, and say which row each node follows, int32 [N]."""
+        """Adopt trajectories, and return the row that each node follows, int32 [N]."""
         found = np.full(node_count, int(NO_ROW), np.int32)
         for trajectory in trajectories:
             times, displacements = trajectory.keys()
@@ -60,12 +60,12 @@ class Keyframes:
     def settle(
         self, rows: npt.NDArray[np.int32], ends: npt.NDArray[np.int32], displacements: npt.NDArray[np.floating]
     ) -> npt.NDArray[np.int32]:
-        """Give a row to each new node between nodes that follow different ones: the mean of theirs.
+        """Give a row to each new node between nodes that follow different ones: the mean of the two.
 
         Args:
-            rows: As the nodes have them, int32 [N].
-            ends: Whose midpoint each node is, int32 [N, 2].
-            displacements: The nodes' present ones [m], [N, 3]: where an end that follows nothing stays.
+            rows: Current rows of the nodes, int32 [N].
+            ends: The two ends of the edge whose midpoint each node is, int32 [N, 2].
+            displacements: Current displacements of the nodes [m], [N, 3], where an end without keyframes stays.
         """
         settled = rows.copy()
         left = np.flatnonzero(settled == int(MIXED_ROWS))
@@ -79,12 +79,12 @@ class Keyframes:
     def trajectories(
         self, nodes: npt.NDArray[np.int32], rows: npt.NDArray[np.int32], device: wp.Device
     ) -> list[Trajectory]:
-        """What nodes follow, as trajectories; those made last if they are still right.
+        """The nodes' keyframes as trajectories; the last ones if they are still valid.
 
         Args:
-            nodes: Who follows any, ascending, int32 [n].
-            rows: Which each follows, int32 [n].
-            device: Where.
+            nodes: Nodes that follow a row, ascending, int32 [n].
+            rows: The row of each, int32 [n].
+            device: The device of the result.
         """
         of = nodes, rows
         if self._made_of is not None and all(map(np.array_equal, of, self._made_of)):
@@ -100,14 +100,14 @@ class Keyframes:
                 displacements = self.rows[same_times[0]].displacements
             else:
                 displacements = np.stack([self.rows[row].displacements for row in rows[chosen].tolist()], axis=1)
-            made.append(Trajectory.of_keys(nodes[chosen], times, displacements, device))
+            made.append(NodeKeyframes.checked(nodes[chosen], times, displacements).on(device))
         if not _alike(made, self._trajectories):
             self._trajectories = made
         self._made_of = of
         return self._trajectories
 
     def forget(self, but: set[int]) -> None:
-        """Keep the rows of these numbers only."""
+        """Keep only the rows with these numbers."""
         wanted = but & self.rows.keys()
         if len(wanted) < len(self.rows):
             self.rows = {number: row for number, row in self.rows.items() if number in wanted}

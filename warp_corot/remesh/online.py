@@ -1,4 +1,4 @@
-"""What a user asks for: how a mesh is to follow the motion."""
+"""The user's options for remeshing."""
 
 from __future__ import annotations
 
@@ -22,35 +22,35 @@ from warp_corot.mesh.lattice import MAX_LEVEL, check_levels
 class OnlineRemesh:
     """Refinement and simplification while a simulation runs; see ``warp_corot.remesh``.
 
-    Every ``every`` steps a pass looks at all elements: an element is bisected where the criterion is above
-    ``refine_above``, and given up with its sibling where both are below ``simplify_below`` and their parent would not
-    be refined again. Between the two nothing happens. An element is bisected once a pass, and again where its
-    neighbours ask for it. One of which the body takes less than half is not refined for its own sake.
+    Every ``every`` steps a pass evaluates all elements. It bisects an element whose criterion is above
+    ``refine_above``, and merges two siblings if both are below ``simplify_below`` and their parent would not be refined
+    again. Between the thresholds nothing happens. A pass bisects an element once, and again if conformity requires it.
+    An element with less than half its volume inside the body is only refined for conformity.
 
-    Children have their parent's material, with the direction of its fibres, and pull as it did. A parent has the mean
+    Children have their parent's material, fibre direction and active stress. A parent has the mean
     of its children's stiffness, density and active stress, but its first child's directions, and that child's active
-    stress where the two follow different keyframes.
+    stress if the two follow different keyframes.
 
-    ``Simulation.reset()`` goes back to the mesh of the initial state, with the loads, held nodes and motions that it
-    had last: what was given while there was another mesh is gone.
+    ``Simulation.reset()`` restores the mesh of the initial state, with the last loads, held nodes and motions of that
+    mesh: those given on other meshes are lost.
 
     Attributes:
-        refine_above, simplify_below: Thresholds in the criterion's unit; the first is the larger one. By default of the
-            elongation of an element's longest edge, deformed over rest (Tagawa et al. 2013).
-        min_level, max_level: Elements of these levels are not simplified and not refined, 0 to 48; three levels halve
+        refine_above, simplify_below: Thresholds in the criterion's unit; the first is the larger one. By default they
+            apply to the elongation of an element's longest edge, deformed over rest length (Tagawa et al. 2013).
+        min_level, max_level: Elements at these levels are not simplified and not refined, 0 to 48; three levels halve
             the edge length. None: the coarsest level of the mesh, and three beyond its finest.
         every: Steps between passes.
-        capacity: How many elements there may be; None: four times those of the mesh, at least 100,000. When it is
-            reached refinement stops, with one warning, and the simulation goes on.
-        criterion: In place of the elongation: ``remesh.strain``, ``von_mises_stress`` or ``nearness``, or a Warp
-            function (``@wp.func``) of your own of a ``remesh.ElementState`` and an array of numbers.
-        parameters: Those numbers, float32 [n] on the simulation's device, which may be written to between steps. They
-            must be all that the criterion reads: there is no check within kernels.
+        capacity: Largest number of elements; None: four times those of the mesh, at least 100,000. When it is
+            reached, refinement stops with one warning, and the simulation continues.
+        criterion: ``remesh.strain``, ``von_mises_stress`` or ``nearness`` in place of the elongation, or your own Warp
+            function (``@wp.func``) of a ``remesh.ElementState`` and an array of numbers.
+        parameters: These numbers, float32 [n] on the simulation's device. You may write to them between steps. The
+            criterion must not read beyond them: kernels do not check.
 
     Raises:
         InputError: Thresholds that cannot both hold, levels out of order or beyond the lattice's depth, a criterion
-            that is no Warp function or has other arguments, too few parameters, or a number of steps or elements that
-            is not positive.
+            that is not a Warp function or has other arguments, too few parameters, or a number of steps or elements
+            that is not positive.
     """
 
     refine_above: float = 1.25
@@ -73,7 +73,7 @@ class OnlineRemesh:
         checked_parameters(self.parameters, self.criterion)
 
     def on(self, mesh: TetForest) -> OnlineRemesh:
-        """The same with numbers in place of what is found from a mesh.
+        """The same options with all defaults filled in from a mesh.
 
         Raises:
             InputError: The mesh has more elements than ``capacity``.

@@ -23,15 +23,15 @@ class Remeshing:
 
     Args:
         bodies, models: The simulation's.
-        asked: What was asked for, for all bodies or one for each.
-        deterministic: Whether a run must come out the same bit by bit.
+        asked: The user's argument: options for all bodies or one entry for each.
+        deterministic: Whether runs must be reproducible bit for bit.
 
     Attributes:
-        changing: What remeshes each body, None for those that stay as they are.
+        changing: The remeshing of each body; None for bodies that are not remeshed.
         every: Steps after which a pass may be due; 0 if there is none.
 
     Raises:
-        InputError: What was asked for is neither, or cannot be had of these bodies and models.
+        InputError: The argument has another type, or these bodies and models cannot be remeshed.
     """
 
     def __init__(
@@ -50,10 +50,10 @@ class Remeshing:
         if not self.every:
             return
         if deterministic and bodies[0].device.is_cuda:
-            raise InputError("a deterministic run on CUDA cannot be remeshed: new nodes are numbered as threads come")
+            raise InputError("a deterministic run on CUDA cannot be remeshed: threads number new nodes in any order")
         from .changing import Changing, fitted
 
-        # All of them before the first one is given pools: what is refused leaves the bodies as they are.
+        # All checks come before the first body is given pools: an error leaves the bodies unchanged.
         for each, body, model in zip(options, bodies, models, strict=True):
             if each is not None:
                 body.check_own_arrays()
@@ -67,20 +67,20 @@ class Remeshing:
         self._said_full: set[int] = set()
 
     def serve(self, fields: Sequence[ForceField]) -> None:
-        """Let the bodies' force fields, made by now, go through the pools."""
+        """Let the bodies' force fields, which exist by now, use the pools."""
         for changing, field in zip(self.changing, fields, strict=True):
             if changing is not None:
                 changing.serve(field)
 
     def is_due(self, steps: int) -> bool:
-        """Whether any pass is due after so many steps."""
+        """Whether any pass is due after this number of steps."""
         return self.every > 0 and steps % self.every == 0
 
     def run(self, steps: int) -> bool:
-        """The passes that are due after so many steps; whether any was.
+        """Make the passes that are due after this number of steps; returns whether there was any.
 
         Warns:
-            CapacityWarning: A body has no room left for what should be refined; once.
+            CapacityWarning: A body's capacity does not suffice for the refinement; once.
         """
         due = [c for c in self.changing if c is not None and steps % c.options.every == 0]
         for changing in due:
@@ -88,12 +88,12 @@ class Remeshing:
             if changing.is_full and id(changing) not in self._said_full:
                 self._said_full.add(id(changing))
                 most = f"{changing.options.capacity} elements"
-                message = f"the mesh has no room left, its capacity is {most}; it is refined no further"
+                message = f"the mesh has reached its capacity of {most}; it is not refined further"
                 warnings.warn(message, CapacityWarning, stacklevel=depth_of_user())
         return bool(due)
 
     def step_may_change(self) -> bool:
-        """Whether the stable step is to be found anew; to be asked once a pass."""
+        """Whether the stable step must be found again; call it once after each pass."""
         return any([changing.survey.step_may_change() for changing in self.changing if changing is not None])
 
 
