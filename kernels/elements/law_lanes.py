@@ -29,5 +29,5 @@ LAWS = {
     "corotated": constants(INDEFINITE=INDEFINITE) + native("strain", "invariants", "stretch", "corotated"),
     "linear": native("small_strain", "linear"),
     "stvk": native("strain", "stvk"),
-    "neo-hookean": constants(CONTINUED_BELOW=CONTINUED_BELOW) + native("strain", "invariants", "neo_hookean"),
+    "neo-hookean": constants(CONTINUED_BELOW=CONTINUED_BELOW) + native("strain", "invariants", "log", "neo_hookean"),
 }

@@ -21,7 +21,7 @@ from warp_corot.mesh import TetForest
 from .clock import Clock
 from .elements import ElementKind, Elements, Mesh, device_elements, element_kind, in_worlds, parts, with_targets
 from .levels import Levels, TreeNodes
-from .plan import ForcePlan, Plan, Units
+from .plan import FlatLeaves, ForcePlan, Plan, Units
 from .sizes import Sizes
 from .slots import Slots
 from .subtrees import pays_in_groups
@@ -110,6 +110,10 @@ class Discretization(ABC):
     @abstractmethod
     def anisotropic_material(self) -> OrthotropicMaterial:
         """The anisotropic material as kernels read it, world after world where it is not uniform."""
+
+    def lame_of_flat(self, flat: FlatLeaves) -> tuple[wp.array, wp.array] | None:
+        """Lamé's parameters for the forces of leaves that are in no subtree, where the plan keeps them, else None."""
+        return flat.material
 
     @property
     def is_anisotropic(self) -> bool:

@@ -69,7 +69,7 @@ class Slots:
         parts = np.split(number, np.cumsum([nodes.size for nodes in units])[:-1])
         return slots, [part.reshape(nodes.shape) for part, nodes in zip(parts, units, strict=True)]
 
-    def gather(self, f: wp.array) -> None:
-        """Add each node's slots to its force, vec4 [worlds * N]."""
-        inputs = [self.starts, self.order, self.values]
+    def gather(self, f: wp.array, values: wp.array | None = None) -> None:
+        """Add each node's slots to its force, vec4 [worlds * N]; ``values`` are others in the place of the slots'."""
+        inputs = [self.starts, self.order, self.values if values is None else values]
         wp.launch(gather_slots, dim=len(f), inputs=inputs, outputs=[f], device=f.device)

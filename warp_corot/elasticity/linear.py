@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from warp_corot.discretization.discretization import discretization_of
 from warp_corot.elasticity.paths.laws import law_field
 from warp_corot.kernels.elements.constitutive import (
     linear_cauchy,
@@ -13,7 +12,9 @@ from warp_corot.kernels.elements.constitutive import (
     linear_energy,
     linear_stress,
 )
+from warp_corot.kernels.elements.dilatation import SMALL
 
+from .dilatation import bind_law, check_dilatation
 from .model import ForceField, Model
 
 if TYPE_CHECKING:
@@ -22,18 +23,32 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Linear(Model):
-    """W = V (mu e:e + lambda/2 tr(e)^2) with e = sym(F) - I. Conserves linear but not angular momentum."""
+    """W = V (mu e:e + lambda/2 tr(e)^2) with e = sym(F) - I. Conserves linear but not angular momentum.
+
+    Attributes:
+        dilatation: "element": each element has its own, as the paper has it, and nearly incompressible tissue is too
+            stiff. "shared": elements share it, see ``elasticity.dilatation``. None: shared where a Poisson's ratio is
+            0.45 or more.
+    """
 
     strained_safety: ClassVar[float] = 0.9  # its stiffness never changes
 
+    dilatation: str | None = None
+
+    def __post_init__(self) -> None:
+        check_dilatation(self.dilatation)
+
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
-        discretization = discretization_of(body)
-        return law_field(
-            "linear",
-            discretization,
-            stress=linear_stress,
-            differential=linear_differential,
-            energy=linear_energy,
-            cauchy=linear_cauchy,
-            deterministic=deterministic,
-        )
+        return bind_law(_bind, SMALL, self.dilatation, body, deterministic)
+
+
+def _bind(discretization: Discretization, deterministic: bool) -> ForceField:
+    return law_field(
+        "linear",
+        discretization,
+        stress=linear_stress,
+        differential=linear_differential,
+        energy=linear_energy,
+        cauchy=linear_cauchy,
+        deterministic=deterministic,
+    )

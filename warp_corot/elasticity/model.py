@@ -196,8 +196,9 @@ class ForceField(ABC):
 
     def isotropic_of(self, flat: FlatLeaves) -> IsotropicMaterial:
         """Lamé's parameters for the forces of leaves that are in no subtree."""
-        if flat.material is not None:
-            return isotropic_material([*flat.material, 1])
+        kept = self.discretization.lame_of_flat(flat)
+        if kept is not None:
+            return isotropic_material([*kept, 1])
         if self.discretization.material_stride == 0 or not len(flat):
             return self.isotropic
         own = [chosen(values, flat.leaves) for values in (self.discretization.mu, self.discretization.lam)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from warp_corot.discretization.discretization import discretization_of
 from warp_corot.elasticity.paths.laws import law_field
 from warp_corot.kernels.elements.constitutive import (
     neo_hookean_cauchy,
@@ -13,7 +12,9 @@ from warp_corot.kernels.elements.constitutive import (
     neo_hookean_energy,
     neo_hookean_stress,
 )
+from warp_corot.kernels.elements.dilatation import LOG_VOLUME
 
+from .dilatation import bind_law, check_dilatation
 from .model import ForceField, Model
 
 if TYPE_CHECKING:
@@ -31,16 +32,29 @@ class NeoHookean(Model):
     up to 4.5 times that at rest, 2 mu + 3 lambda, when crushed; a body's stable step shrinks by the root of that.
 
     Total-Lagrangian too: with explicit central differences, TLED (Miller et al. 2007).
+
+    Attributes:
+        dilatation: "element": each element has its own, as the paper has it, and nearly incompressible tissue is too
+            stiff. "shared": elements share it, see ``elasticity.dilatation``. None: shared where a Poisson's ratio is
+            0.45 or more.
     """
 
+    dilatation: str | None = None
+
+    def __post_init__(self) -> None:
+        check_dilatation(self.dilatation)
+
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
-        discretization = discretization_of(body)
-        return law_field(
-            "neo-hookean",
-            discretization,
-            stress=neo_hookean_stress,
-            differential=neo_hookean_differential,
-            energy=neo_hookean_energy,
-            cauchy=neo_hookean_cauchy,
-            deterministic=deterministic,
-        )
+        return bind_law(_bind, LOG_VOLUME, self.dilatation, body, deterministic)
+
+
+def _bind(discretization: Discretization, deterministic: bool) -> ForceField:
+    return law_field(
+        "neo-hookean",
+        discretization,
+        stress=neo_hookean_stress,
+        differential=neo_hookean_differential,
+        energy=neo_hookean_energy,
+        cauchy=neo_hookean_cauchy,
+        deterministic=deterministic,
+    )

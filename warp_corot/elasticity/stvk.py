@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from warp_corot.discretization.discretization import discretization_of
 from warp_corot.elasticity.paths.laws import law_field
 from warp_corot.kernels.elements.constitutive import (
     stvk_cauchy,
@@ -13,7 +12,9 @@ from warp_corot.kernels.elements.constitutive import (
     stvk_energy,
     stvk_stress,
 )
+from warp_corot.kernels.elements.dilatation import GREEN
 
+from .dilatation import bind_law, check_dilatation
 from .model import ForceField, Model
 
 if TYPE_CHECKING:
@@ -26,16 +27,29 @@ class StVenantKirchhoff(Model):
 
     Stepped by explicit central differences (symplectic Euler is their leapfrog form) this is what the literature calls
     TLED (Miller et al. 2007). Softens when compressed and lets elements invert at large strain; the paper's reference.
+
+    Attributes:
+        dilatation: "element": each element has its own, as the paper has it, and nearly incompressible tissue is too
+            stiff. "shared": elements share it, see ``elasticity.dilatation``. None: shared where a Poisson's ratio is
+            0.45 or more.
     """
 
+    dilatation: str | None = None
+
+    def __post_init__(self) -> None:
+        check_dilatation(self.dilatation)
+
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
-        discretization = discretization_of(body)
-        return law_field(
-            "stvk",
-            discretization,
-            stress=stvk_stress,
-            differential=stvk_differential,
-            energy=stvk_energy,
-            cauchy=stvk_cauchy,
-            deterministic=deterministic,
-        )
+        return bind_law(_bind, GREEN, self.dilatation, body, deterministic)
+
+
+def _bind(discretization: Discretization, deterministic: bool) -> ForceField:
+    return law_field(
+        "stvk",
+        discretization,
+        stress=stvk_stress,
+        differential=stvk_differential,
+        energy=stvk_energy,
+        cauchy=stvk_cauchy,
+        deterministic=deterministic,
+    )

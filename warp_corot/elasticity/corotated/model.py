@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warp_corot.discretization.discretization import discretization_of
-from warp_corot.elasticity.model import Model
+from warp_corot.elasticity.dilatation import bind_law, check_dilatation
+from warp_corot.elasticity.model import ForceField, Model
 from warp_corot.elasticity.paths.general import CorotatedGeneralField
 from warp_corot.elasticity.polar import METHODS, rotation_function
 from warp_corot.errors import InputError
+from warp_corot.kernels.elements.dilatation import VOLUME
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.forest import MAX_LEVEL
@@ -57,6 +58,9 @@ class Corotated(Model):
         stiffness: "factored" (sums and differences), "sparse" (the paper's explicit K_T by type, zeros skipped) or
             "dense" (the same with all 144 products); the last two for forests only. All agree to rounding.
         subtrees: False: leaf by leaf also where the fast path could be taken, as the paper has it; for comparison.
+        dilatation: "element": each element has its own, tr(R^T F) - 3, as the paper has it, and nearly incompressible
+            tissue is too stiff. "shared": elements share theirs, J - 1 of each, see ``elasticity.dilatation``. None:
+            shared where a Poisson's ratio of an isotropic material is 0.45 or more.
 
     Raises:
         InputError: An option is none of these.
@@ -67,8 +71,10 @@ class Corotated(Model):
     iterations: int | None = None
     stiffness: str = "factored"
     subtrees: bool = True
+    dilatation: str | None = None
 
     def __post_init__(self) -> None:
+        check_dilatation(self.dilatation)
         _check_level(self.rotation_level)
         if self.rotation not in METHODS:
             raise InputError(f"rotation is {self.rotation!r}; it must be one of {', '.join(METHODS)}")
@@ -95,10 +101,10 @@ class Corotated(Model):
     def kept_of_elements(self) -> str | None:
         return "rotation is 'warm', which is kept from step to step" if self.rotation == "warm" else None
 
-    def bind(
-        self, body: Discretized | Discretization, *, deterministic: bool = False
-    ) -> CorotatedField | AnisotropicField:
-        discretization = discretization_of(body)
+    def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
+        return bind_law(self._bind, VOLUME, self.dilatation, body, deterministic)
+
+    def _bind(self, discretization: Discretization, deterministic: bool) -> CorotatedField | AnisotropicField:
         if discretization.is_anisotropic:
             return self._bind_anisotropic(discretization, deterministic)
         fast = self.rotation == "byers-xu" and self.iterations is None and self.stiffness == "factored"
