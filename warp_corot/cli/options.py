@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from warp_corot.elasticity import MODELS
+from warp_corot.elasticity.dilatation import ELEMENT, SHARED
 
 from . import patches, run_file
 from .label_materials import FORM
@@ -183,6 +184,12 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
         metavar="L",
         help="share rotations among elements, on the mesh of box, a surface or a scan: at the tree's level L; or, "
         "with auto or a tolerance in radians, where they are similar (default: each element has its own)",
+    )
+    body.add_argument(
+        "--dilatation",
+        choices=(ELEMENT, SHARED),
+        help="whether elements share their change of volume: shared does not lock where Poisson's ratio is near 1/2, "
+        "and is slower (default: element)",
     )
     body.add_argument(
         "--region",

@@ -32,6 +32,7 @@ ARGUMENTS = (
     "duration",
     "fps",
     "rotation_level",
+    "dilatation",
     "friction",
 )
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_corot.elasticity import MODELS
+from warp_corot.elasticity.dilatation import ELEMENT, SHARED
 from warp_corot.holding.choice import NAMED
 from warp_corot.mesh import TetForest
 
@@ -78,10 +79,13 @@ def title_of(bodies: Sequence[Body]) -> str:
 def _of_body(body: Body) -> list[tuple[str, str]]:
     model = next(name for name, kind in MODELS.items() if type(body.model) is kind)
     level = getattr(body.model, "rotation_level", None)
+    words = [model] if level is None else [model, f"rotations of level {level}"]
+    if getattr(body.model, "dilatation", ELEMENT) == SHARED:
+        words.append("shared dilatation")
     rows = [
         *_body(body.subject),
         *_materials(body.subject, body.soft.mesh, body.soft.material),
-        ("model", model if level is None else f"{model}, rotations of level {level}"),
+        ("model", ", ".join(words)),
         ("fixed", f"{body.held.count} nodes, {body.held.words}" if body.held.count else "nothing"),
     ]
     return rows + [("" if number else "moved", str(load)) for number, load in enumerate(body.loads)]

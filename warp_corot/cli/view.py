@@ -136,6 +136,7 @@ def run_text(asked: Sequence[argparse.Namespace], sim: Simulation) -> bytes:
         model, remesh = sim.models[0], sim.remesh[0]
         now.model = next(name for name, kind in MODELS.items() if type(model) is kind)
         now.rotation_level = getattr(model, "rotation_level", None)
+        now.dilatation = getattr(model, "dilatation", None)
         now.remesh = remesh is not None
         if not now.remesh:
             now.refine_above = now.simplify_below = now.remesh_levels = now.remesh_every = now.capacity = None

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-import numpy as np
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization, discretization_of
@@ -29,21 +28,29 @@ if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretized
 
 ELEMENT, SHARED = "element", "shared"
-#: Poisson's ratio from which elements share their dilatation if nothing else is asked for.
-SHARED_FROM = 0.45
 
 
-def check_dilatation(dilatation: str | None) -> None:
+def check_dilatation(dilatation: str) -> None:
     """Check the option of a model.
 
     Raises:
         InputError: It is none of the values.
     """
-    if dilatation not in (None, ELEMENT, SHARED):
-        raise InputError(f"dilatation is {shown(dilatation)}; it must be {ELEMENT!r}, {SHARED!r} or None")
+    if dilatation not in (ELEMENT, SHARED):
+        raise InputError(f"dilatation is {shown(dilatation)}; it must be {ELEMENT!r} or {SHARED!r}")
 
 
-def shares_dilatation(dilatation: str | None, discretization: Discretization) -> bool:
+def refuse_shared(dilatation: str, model: str) -> None:
+    """Check the option of a model of springs, which has no dilatation to share.
+
+    Raises:
+        InputError: It is not "element".
+    """
+    if dilatation != ELEMENT:
+        raise InputError(f"dilatation is {shown(dilatation)}; for {model}, which has springs, it must be {ELEMENT!r}")
+
+
+def shares_dilatation(dilatation: str, discretization: Discretization) -> bool:
     """Whether the elements of a discretization share their dilatation under an option of the model.
 
     Raises:
@@ -51,16 +58,14 @@ def shares_dilatation(dilatation: str | None, discretization: Discretization) ->
     """
     if dilatation == SHARED and discretization.is_anisotropic:
         name = type(discretization.material).__name__
-        raise InputError(f"dilatation is {SHARED!r} and the material is {name}; it must be {ELEMENT!r} or None")
-    if dilatation is not None or discretization.is_anisotropic or discretization.material is None:
-        return dilatation == SHARED
-    return bool(np.max(discretization.material.isotropic.poisson) >= SHARED_FROM)
+        raise InputError(f"dilatation is {SHARED!r} and the material is {name}; it must be {ELEMENT!r}")
+    return dilatation == SHARED
 
 
 def bind_law(
     bind: Callable[[Discretization, bool], ForceField],
     of: Dilatation,
-    dilatation: str | None,
+    dilatation: str,
     body: Discretized | Discretization,
     deterministic: bool,
 ) -> ForceField:

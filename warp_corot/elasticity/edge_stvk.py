@@ -12,6 +12,7 @@ from warp_corot.kernels.elements.forces import element_von_mises, law_value
 from warp_corot.kernels.elements.spring_stiffness import edge_stvk_differential
 from warp_corot.kernels.elements.springs import edge_stvk_energies, scatter_edge_stvk
 
+from .dilatation import ELEMENT, refuse_shared
 from .model import ElementField, ForceField, Model
 
 if TYPE_CHECKING:
@@ -25,13 +26,16 @@ class EdgeStVK(Model):
     Attributes:
         springs: "biquadratic": D = l^2 - L^2, equal to ``StVenantKirchhoff``; "quadratic": D = 2 L (l - L), its
             small-strain form.
+        dilatation: "element": the only choice, of springs.
     """
 
     springs: str = "biquadratic"
+    dilatation: str = ELEMENT
 
     def __post_init__(self) -> None:
         if self.springs not in ("biquadratic", "quadratic"):
             raise InputError(f"springs is {self.springs!r}; it must be 'biquadratic' or 'quadratic'")
+        refuse_shared(self.dilatation, "EdgeStVK")
 
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
         discretization = discretization_of(body)

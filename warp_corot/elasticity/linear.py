@@ -14,7 +14,7 @@ from warp_corot.kernels.elements.constitutive import (
 )
 from warp_corot.kernels.elements.dilatation import SMALL
 
-from .dilatation import bind_law, check_dilatation
+from .dilatation import ELEMENT, bind_law, check_dilatation
 from .model import ForceField, Model
 
 if TYPE_CHECKING:
@@ -26,14 +26,13 @@ class Linear(Model):
     """W = V (mu e:e + lambda/2 tr(e)^2) with e = sym(F) - I. Conserves linear but not angular momentum.
 
     Attributes:
-        dilatation: "element": each element has its own, as the paper has it, and nearly incompressible tissue is too
-            stiff. "shared": elements share it, see ``elasticity.dilatation``. None: shared where a Poisson's ratio is
-            0.45 or more.
+        dilatation: "element": each element has its own, and nearly incompressible tissue is too stiff. "shared":
+            elements share it, see ``elasticity.dilatation``; slower.
     """
 
     strained_safety: ClassVar[float] = 0.9  # its stiffness never changes
 
-    dilatation: str | None = None
+    dilatation: str = ELEMENT
 
     def __post_init__(self) -> None:
         check_dilatation(self.dilatation)

@@ -19,6 +19,7 @@ from warp_corot.kernels.elements.spring_stiffness import add_mass_spring_diagona
 from warp_corot.kernels.elements.springs import mass_spring_energies, scatter_mass_spring
 from warp_corot.kernels.tables.shapes import EDGES
 
+from .dilatation import ELEMENT, refuse_shared
 from .model import ForceField, Model
 
 if TYPE_CHECKING:
@@ -33,7 +34,15 @@ class MassSpring(Model):
     The stiffness is Van Gelder's (1998) carried to three dimensions: averaged over all directions of edges it gives
     Young's modulus E with Poisson's ratio 1/4. Springs between pairs of points cannot have any other ratio, so the
     material's own is ignored. Von Mises stress is that of Hooke's law with E and 1/4 on the Green strain.
+
+    Attributes:
+        dilatation: "element": the only choice, of springs.
     """
+
+    dilatation: str = ELEMENT
+
+    def __post_init__(self) -> None:
+        refuse_shared(self.dilatation, "MassSpring")
 
     @property
     def kept_of_elements(self) -> str | None:

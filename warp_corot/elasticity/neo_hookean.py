@@ -14,7 +14,7 @@ from warp_corot.kernels.elements.constitutive import (
 )
 from warp_corot.kernels.elements.dilatation import LOG_VOLUME
 
-from .dilatation import bind_law, check_dilatation
+from .dilatation import ELEMENT, bind_law, check_dilatation
 from .model import ForceField, Model
 
 if TYPE_CHECKING:
@@ -34,12 +34,11 @@ class NeoHookean(Model):
     Total-Lagrangian too: with explicit central differences, TLED (Miller et al. 2007).
 
     Attributes:
-        dilatation: "element": each element has its own, as the paper has it, and nearly incompressible tissue is too
-            stiff. "shared": elements share it, see ``elasticity.dilatation``. None: shared where a Poisson's ratio is
-            0.45 or more.
+        dilatation: "element": each element has its own, and nearly incompressible tissue is too stiff. "shared":
+            elements share it, see ``elasticity.dilatation``; slower.
     """
 
-    dilatation: str | None = None
+    dilatation: str = ELEMENT
 
     def __post_init__(self) -> None:
         check_dilatation(self.dilatation)

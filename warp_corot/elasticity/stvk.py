@@ -14,7 +14,7 @@ from warp_corot.kernels.elements.constitutive import (
 )
 from warp_corot.kernels.elements.dilatation import GREEN
 
-from .dilatation import bind_law, check_dilatation
+from .dilatation import ELEMENT, bind_law, check_dilatation
 from .model import ForceField, Model
 
 if TYPE_CHECKING:
@@ -29,12 +29,11 @@ class StVenantKirchhoff(Model):
     TLED (Miller et al. 2007). Softens when compressed and lets elements invert at large strain; the paper's reference.
 
     Attributes:
-        dilatation: "element": each element has its own, as the paper has it, and nearly incompressible tissue is too
-            stiff. "shared": elements share it, see ``elasticity.dilatation``. None: shared where a Poisson's ratio is
-            0.45 or more.
+        dilatation: "element": each element has its own, and nearly incompressible tissue is too stiff. "shared":
+            elements share it, see ``elasticity.dilatation``; slower.
     """
 
-    dilatation: str | None = None
+    dilatation: str = ELEMENT
 
     def __post_init__(self) -> None:
         check_dilatation(self.dilatation)

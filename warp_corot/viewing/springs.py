@@ -194,7 +194,8 @@ class _BodySprings:
     def write(self, slot: int) -> None:
         """Let the device have a hand as it is now."""
         spring = self._held[slot]
-        row: Any = np.zeros(1, dtype=kernels.Spring.numpy_dtype())
+        of_spring: Any = kernels.Spring
+        row: Any = np.zeros(1, dtype=of_spring.numpy_dtype())
         if spring is not None:
             row["motion"], row["stiffness"], row["damping"] = spring.motion, spring.stiffness, spring.damping
             row["limit"], row["rigid"], row["count"] = spring.limit, int(spring.rigid), len(spring.patch.points)

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warp_corot.elasticity import MODELS, Corotated, Model
+from warp_corot.elasticity import MODELS, Corotated, EdgeStVK, MassSpring, Model
+from warp_corot.elasticity.dilatation import ELEMENT, SHARED
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest
 from warp_corot.remesh.online import OnlineRemesh
@@ -62,7 +63,7 @@ class Tissue:
         law, rotations, stiffness, poisson = self._then
         models = None
         if now[:2] != (law, rotations):
-            models = [model_of(now[0], now[1])] * len(sim.bodies)
+            models = [model_of(now[0], now[1], sim.models[0])] * len(sim.bodies)
         own = now[3] if now[3] != poisson else None
         materials = [changed(body.material, now[2] / stiffness, own) for body in sim.bodies]
         former = [None if each is None else each.options for each in sim.remeshing.changing]
@@ -71,12 +72,18 @@ class Tissue:
         self._then = now
 
 
-def model_of(law: str, rotations: str) -> Model:
-    """The model that the controls name; only the corotated one has rotations."""
+def model_of(law: str, rotations: str, former: Model | None = None) -> Model:
+    """The model that the controls name; only the corotated one has rotations, and springs have no dilatation to share.
+
+    Args:
+        former: The one before, whose dilatation goes on.
+    """
     kind = MODELS[law]
-    if kind is not Corotated or rotations == OWN:
-        return kind()
-    return Corotated(rotation_level=_number(rotations))
+    shared = getattr(former, "dilatation", ELEMENT) == SHARED and kind not in (EdgeStVK, MassSpring)
+    options: dict[str, Any] = {"dilatation": SHARED} if shared else {}
+    if kind is Corotated and rotations != OWN:
+        options["rotation_level"] = _number(rotations)
+    return kind(**options)
 
 
 def changed(material: Any, scale: float, poisson: float | None) -> Any:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warp_corot.elasticity.dilatation import bind_law, check_dilatation
+from warp_corot.elasticity.dilatation import ELEMENT, bind_law, check_dilatation
 from warp_corot.elasticity.model import ForceField, Model
 from warp_corot.elasticity.paths.general import CorotatedGeneralField
 from warp_corot.elasticity.polar import METHODS, rotation_function
@@ -59,8 +59,7 @@ class Corotated(Model):
             "dense" (the same with all 144 products); the last two for forests only. All agree to rounding.
         subtrees: False: leaf by leaf also where the fast path could be taken, as the paper has it; for comparison.
         dilatation: "element": each element has its own, tr(R^T F) - 3, as the paper has it, and nearly incompressible
-            tissue is too stiff. "shared": elements share theirs, J - 1 of each, see ``elasticity.dilatation``. None:
-            shared where a Poisson's ratio of an isotropic material is 0.45 or more.
+            tissue is too stiff. "shared": elements share theirs, J - 1 of each, see ``elasticity.dilatation``; slower.
 
     Raises:
         InputError: An option is none of these.
@@ -71,7 +70,7 @@ class Corotated(Model):
     iterations: int | None = None
     stiffness: str = "factored"
     subtrees: bool = True
-    dilatation: str | None = None
+    dilatation: str = ELEMENT
 
     def __post_init__(self) -> None:
         check_dilatation(self.dilatation)

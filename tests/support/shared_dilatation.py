@@ -1,0 +1,89 @@
+"""Dilatation that elements share, in float64 NumPy: energies and the linear stiffness, from points and tetrahedra."""
+
+import numpy as np
+import oracle
+from scipy.sparse import coo_matrix, diags
+from scipy.sparse.linalg import spsolve
+
+
+def of_eights(mesh):
+    """Which elements share one dilatation: a matrix of ones [groups, T], each eight elements in a row."""
+    count = len(mesh.tets)
+    return coo_matrix((np.ones(count), (np.arange(count) // 8, np.arange(count)))).tocsr()
+
+
+def of_nodes(mesh):
+    """A quarter of each element at each of its nodes, [N, T]."""
+    count = len(mesh.tets)
+    places = (np.asarray(mesh.tets).ravel(), np.repeat(np.arange(count), 4))
+    return coo_matrix((np.full(4 * count, 0.25), places), (len(mesh.points), count)).tocsr()
+
+
+def of_forest(forest):
+    """Eights where a complete subtree of three levels is, nodes of the other elements elsewhere, [groups, T]."""
+    tree, levels = forest.tree, np.asarray(forest.levels)
+    above = np.asarray(tree.above(tree.leaves, 3))
+    _, group, count = np.unique(above, return_inverse=True, return_counts=True)
+    deep = np.full(len(count), np.inf)
+    np.minimum.at(deep, group, levels)
+    level_of = np.asarray(levels)
+    same = np.ones(len(count), bool)
+    np.logical_and.at(same, group, level_of == deep[group])
+    complete = ((count == 8) & same)[group] & (above >= 0)
+    eights = coo_matrix((complete * 1.0, (group, np.arange(len(levels))))).tocsr()
+    nodes = of_nodes(forest) @ diags(1.0 - complete)
+    return vstacked(eights, nodes)
+
+
+def vstacked(*parts):
+    from scipy.sparse import vstack
+
+    return vstack(parts).tocsr()
+
+
+MEASURES = {
+    "linear": lambda F: np.trace(F, axis1=1, axis2=2) - 3.0,
+    "stvk": lambda F: 0.5 * (np.einsum("tij,tij->t", F, F) - 3.0),
+    "neo_hookean": lambda F: np.linalg.det(F) - 1.0,
+    "corotated": lambda F: np.linalg.det(F) - 1.0,
+}
+
+
+def energy(law, mesh, groups, lam, u):
+    """The energy that lambda multiplies [J]."""
+    reference = oracle.Mesh(mesh.points, mesh.tets)
+    theta = MEASURES[law](reference.deformation_gradients(reference.points + u))
+    weights = groups @ (lam * reference.volumes)
+    mean = np.divide(groups @ (lam * reference.volumes * theta), weights, out=np.zeros_like(weights), where=weights > 0)
+    density = 0.5 * (np.log1p(mean) if law == "neo_hookean" else mean) ** 2
+    return float(np.sum(weights * density))
+
+
+def linear_sag(mesh, groups, young, poisson, density, gravity, fixed):
+    """Static displacements [N, 3] of linear elasticity with shared dilatation [m]; ``groups`` None: of each element."""
+    reference = oracle.Mesh(mesh.points, mesh.tets)
+    mu, lam = oracle.lame(young, poisson)
+    count, total = len(reference.tets), len(reference.points)
+    grad = reference.gradients
+    strain = np.zeros((count, 3, 3, 4, 3))
+    for i in range(3):
+        strain[:, i, :, :, i] += 0.5 * np.swapaxes(grad, 1, 2)
+        strain[:, :, i, :, i] += 0.5 * np.swapaxes(grad, 1, 2)
+    shear = 2.0 * mu * np.einsum("tijam,tijbn,t->tambn", strain, strain, reference.volumes).reshape(count, 12, 12)
+    dof = (3 * reference.tets[:, :, None] + np.arange(3)).reshape(count, 12)
+    rows, columns = np.repeat(dof, 12, axis=1).ravel(), np.tile(dof, (1, 12)).ravel()
+    stiffness = coo_matrix((shear.ravel(), (rows, columns)), (3 * total, 3 * total)).tocsr()
+    traces = (grad * reference.volumes[:, None, None]).reshape(count, 12)
+    divergence = coo_matrix((traces.ravel(), (np.repeat(np.arange(count), 12), dof.ravel())), (count, 3 * total))
+    groups = diags(np.ones(count)) if groups is None else groups
+    shared = groups @ divergence
+    volumes = groups @ reference.volumes
+    stiffness = (
+        stiffness
+        + lam * shared.T @ diags(np.where(volumes > 0, 1.0 / np.where(volumes > 0, volumes, 1.0), 0.0)) @ shared
+    )
+    loads = reference.masses(density)[:, None] * np.asarray(gravity, float)
+    free = np.flatnonzero(np.repeat(~fixed, 3))
+    u = np.zeros(3 * total)
+    u[free] = spsolve(stiffness[free][:, free].tocsc(), loads.ravel()[free])
+    return u.reshape(-1, 3)
