@@ -1,0 +1,1 @@
+"""Solvers of large steps and static answers: operators, preconditioners, conjugate gradients and Newton's method."""

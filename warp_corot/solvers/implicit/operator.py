@@ -1,0 +1,74 @@
+"""What iterative solvers and preconditioners know of a linear system.
+
+Vectors over nodes are ``wp.vec4`` arrays as those of ``body.state.State`` are: [worlds * nodes], world after world,
+the fourth lane zero. All methods that take vectors launch kernels and do not wait for the device, so that a solve can be
+recorded.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import warp as wp
+
+
+class LinearOperator(Protocol):
+    """A symmetric matrix A = a M + b D + c K at one state of a body: mass, damping and stiffness.
+
+    Rows and columns of nodes that are not free are those of the identity: A maps their displacements to themselves, and
+    they do not act on others.
+
+    Attributes:
+        device: Of the arrays.
+        worlds: Copies of the body, which do not interact.
+        node_count: Nodes of one world, at least; vectors have ``worlds * node_count`` entries or more.
+        inverse_mass: Zero at nodes that are not free, float32 [worlds * nodes] [1/kg].
+        displacements: Where A is taken, vec4 [worlds * nodes] [m]; new values with each linearisation.
+        scales: a [1/s^2], b [1/s] and c, float32 [3] on the device, so that recorded launches stay valid.
+        revision: Changes whenever launches do, so that they must be recorded again: other arrays, other elements. A
+            new linearisation or new scales do not change it.
+    """
+
+    @property
+    def device(self) -> wp.Device: ...
+
+    @property
+    def worlds(self) -> int: ...
+
+    @property
+    def node_count(self) -> int: ...
+
+    @property
+    def inverse_mass(self) -> wp.array: ...
+
+    @property
+    def displacements(self) -> wp.array: ...
+
+    @property
+    def scales(self) -> wp.array: ...
+
+    @property
+    def revision(self) -> int: ...
+
+    def apply(self, x: wp.array, y: wp.array) -> None:
+        """Launch y = A x; both vec4 [worlds * nodes], different arrays."""
+        ...
+
+    def diagonal_blocks(self) -> wp.array:
+        """Launch the 3x3 blocks on the diagonal of A, and give their array, mat33 [worlds * nodes]."""
+        ...
+
+
+class Preconditioner(Protocol):
+    """An approximate inverse B of an operator: linear, symmetric and positive definite.
+
+    Where nodes are not free, B leaves zeros of r as they are.
+    """
+
+    def update(self, operator: LinearOperator) -> None:
+        """Launch what follows a new linearisation or new scales of the operator."""
+        ...
+
+    def apply(self, r: wp.array, z: wp.array) -> None:
+        """Launch z = B r; both vec4 [worlds * nodes], different arrays."""
+        ...
