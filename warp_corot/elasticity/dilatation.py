@@ -23,6 +23,7 @@ from warp_corot.kernels.subtrees.cuda import BLOCK
 from warp_corot.mesh import TetForest
 
 from .model import ForceField
+from .tangent import Tangent
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretized
@@ -192,6 +193,10 @@ class DilatationField(ForceField):
                 without the turning of the gradient of J, which is positive semidefinite; True: the derivative.
         """
         self._law("add_stiffness", exact)(u, p, y)
+        self.add_shared_product(u, p, y, exact)
+
+    def add_shared_product(self, u: wp.array, p: wp.array, y: wp.array, exact: bool | None = None) -> None:
+        """The part of ``add_stiffness`` that comes from the shared dilatation."""
         turning = self._turning(exact)
         for batch in self.plan.batches:
             kernel = subtrees.add_product_of_subtrees(self._of)
@@ -207,6 +212,10 @@ class DilatationField(ForceField):
         Where dilatations are at nodes the blocks are larger than those of K.
         """
         self._law("add_diagonal", exact)(u, blocks)
+        self.add_shared_diagonal(u, blocks, exact)
+
+    def add_shared_diagonal(self, u: wp.array, blocks: wp.array, exact: bool | None = None) -> None:
+        """The part of ``add_diagonal`` that comes from the shared dilatation."""
         turning = self._turning(exact)
         for batch in self.plan.batches:
             kernel = subtrees.add_diagonal_of_subtrees(self._of)
@@ -215,6 +224,9 @@ class DilatationField(ForceField):
         if count:
             sums, kernel = self._sum_at_nodes(u, self._none), nodal.add_diagonal_from_nodes(self._kind, self._of)
             self.launch(kernel, count, [elements, material, u, sums, turning], [blocks])
+
+    def tangent(self, *, exact: bool = False) -> Tangent:
+        return SharedTangent(self, exact)
 
     def _law(self, name: str, exact: bool | None) -> Callable[..., None]:
         method = getattr(self.shear, name)
@@ -266,10 +278,14 @@ class DilatationField(ForceField):
             return len(flat), flat.elements, self.isotropic_of(flat)
         return self.element_count, self.elements, self.isotropic
 
-    def _sum_at_nodes(self, u: wp.array, p: wp.array) -> wp.array:
-        """Sums of ``kernels.elements.dilatation.sum_at_nodes`` for all nodes."""
+    def prepare_sums(self, u: wp.array) -> None:
+        """Make room for sums at the nodes of displacements u; not while launches are recorded."""
         if len(self._sums) < len(u):
             self._sums = wp.empty_like(u)
+
+    def _sum_at_nodes(self, u: wp.array, p: wp.array) -> wp.array:
+        """Sums of ``kernels.elements.dilatation.sum_at_nodes`` for all nodes."""
+        self.prepare_sums(u)
         sums = self._sums[: len(u)]
         sums.zero_()
         kernel = nodal.sum_at_nodes(self._kind, self._of)
@@ -283,3 +299,35 @@ class DilatationField(ForceField):
             assert self.slots is not None
             self.slots.gather(sums, self._slot_sums)
         return sums
+
+
+class SharedTangent(Tangent):
+    """K of a field with a shared dilatation.
+
+    Args:
+        field: The field.
+        exact: As for ``ForceField.tangent``.
+    """
+
+    field: DilatationField
+
+    def __init__(self, field: DilatationField, exact: bool):
+        super().__init__(field)
+        self.shear, self._exact = field.shear.tangent(exact=exact), exact
+
+    def prepare(self, u: wp.array) -> None:
+        super().prepare(u)
+        self.shear.prepare(u)
+        self.field.prepare_sums(u)
+
+    def take(self, u: wp.array) -> None:
+        super().take(u)
+        self.shear.take(u)
+
+    def add_product(self, p: wp.array, y: wp.array) -> None:
+        self.shear.add_product(p, y)
+        self.field.add_shared_product(self.displacements, p, y, self._exact)
+
+    def add_diagonal(self, blocks: wp.array) -> None:
+        self.shear.add_diagonal(blocks)
+        self.field.add_shared_diagonal(self.displacements, blocks, self._exact)

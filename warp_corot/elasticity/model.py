@@ -28,6 +28,7 @@ from warp_corot.kernels.elements.stiffness_products import law_differential
 
 from .stiffness import ElementStiffness
 from .structs import Kept
+from .tangent import Tangent
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
@@ -96,6 +97,14 @@ class ForceField(ABC):
     @abstractmethod
     def add_diagonal(self, u: wp.array, blocks: wp.array) -> None:
         """Add the 3x3 blocks on the diagonal of the same K(u) to those of the nodes [N/m], mat33 [worlds * N]."""
+
+    def tangent(self, *, exact: bool = False) -> Tangent:
+        """The same K for many products at the same displacements.
+
+        Args:
+            exact: Whether K must be the exact derivative where the field has two; see ``CorotatedField``.
+        """
+        return Tangent(self)
 
     def plan_of(self, discretization: Discretization) -> Plan:
         """The plan that the field goes through; by default the elements one by one."""

@@ -34,17 +34,20 @@ class Viscosity:
 
     def add_forces(self) -> None:
         """Launch what adds the forces of the present displacements and velocities to the body's [N]."""
-        f = self.body.state.forces
+        state = self.body.state
+        self.scatter(state.displacements, state.velocities, state.forces)
+
+    def scatter(self, u: wp.array, v: wp.array, f: wp.array) -> None:
+        """Launch what adds the forces of displacements u and velocities v, in which they are linear, to f [N]."""
         if self._slotted is None:
-            self._launch(self.field.elements, f)
+            self._launch(self.field.elements, u, v, f)
             return
         slots = self._slotted.slots
         assert slots is not None
         slots.values.zero_()
-        self._launch(self._slotted.elements, slots.values)
+        self._launch(self._slotted.elements, u, v, slots.values)
         slots.gather(f)
 
-    def _launch(self, elements: object, f: wp.array) -> None:
-        state = self.body.state
-        inputs = [elements, self.seconds, self.field.isotropic, state.displacements, state.velocities]
+    def _launch(self, elements: object, u: wp.array, v: wp.array, f: wp.array) -> None:
+        inputs = [elements, self.seconds, self.field.isotropic, u, v]
         wp.launch(self._kernel, self.field.element_count, inputs, [f], device=self.body.device)

@@ -14,6 +14,7 @@ from warp_corot.elasticity.model import ForceField
 from warp_corot.elasticity.paths.lanes import Lanes
 from warp_corot.elasticity.stiffness import ElementStiffness
 from warp_corot.elasticity.structs import Kept
+from warp_corot.elasticity.tangent import Tangent
 from warp_corot.errors import InputError
 from warp_corot.kernels.corotated.corotated import (
     extract_rotations,
@@ -180,6 +181,24 @@ class CorotatedField(ForceField):
         stiffness, material = self._tangent(u, exact)
         stiffness.add_diagonal(self.elements, material, u, blocks)
 
+    def tangent(self, *, exact: bool = False) -> Tangent:
+        """As for every field; the rotations are found once. With shared rotations K is never the exact derivative."""
+        if exact and self.model.rotation_level is None:
+            return Tangent(self, exact=True)
+        return RotatedTangent(self)
+
+    def write_rotations(self, u: wp.array, rotations: wp.array) -> None:
+        """Write the rotation of every unit, mat33 [units]; leaves no trace in the state."""
+        is_warm, kind = self.model.rotation == "warm", self.discretization.element_kind
+        units = self._sharing().units
+        kernel = extract_rotations(kind, byers_xu) if is_warm else self._extract
+        self.launch(kernel, units.count, [units.elements, u], [rotations])
+
+    def stiffness_with(self, rotations: wp.array) -> tuple[ElementStiffness, RotatedMaterial]:
+        """The stiffness with these rotations of the units, held fixed, and the material that it reads."""
+        material = rotated_material(self.isotropic, rotations, self._sharing().units.unit)
+        return ElementStiffness(self.discretization, given_differential, RotatedMaterial), material
+
     def used_rotations(self, u: wp.array) -> wp.array:
         """The rotation of every unit, as forces use it; leaves no trace in the state."""
         with self.state_kept():
@@ -196,8 +215,7 @@ class CorotatedField(ForceField):
             return ElementStiffness(self.discretization, exact_differential(rotation)), isotropic
         if self.model.rotation_level is None and not is_warm:
             return ElementStiffness(self.discretization, own_differential(self.model.own_rotation)), isotropic
-        material = rotated_material(isotropic, self.used_rotations(u), self._sharing().units.unit)
-        return ElementStiffness(self.discretization, given_differential, RotatedMaterial), material
+        return self.stiffness_with(self.used_rotations(u))
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         self.extract_rotations(u)
@@ -224,6 +242,37 @@ class CorotatedField(ForceField):
         shared = self._sharing()
         material = self._rotated(isotropic, shared.rotations, shared.units.unit)
         self.launch(kernel, self.element_count, [self.elements, material, u], [output])
+
+
+class RotatedTangent(Tangent):
+    """The paper's R K R^T with rotations that are found once.
+
+    Attributes:
+        rotations: Of the units, mat33 [units].
+    """
+
+    field: CorotatedField
+
+    def __init__(self, field: CorotatedField):
+        super().__init__(field)
+        self.rotations = wp.zeros(0, dtype=wp.mat33, device=field.device)
+
+    def prepare(self, u: wp.array) -> None:
+        super().prepare(u)
+        if len(self.rotations) != self.field.unit_count:
+            self.rotations = wp.zeros(self.field.unit_count, dtype=wp.mat33, device=self.field.device)
+
+    def take(self, u: wp.array) -> None:
+        super().take(u)
+        self.field.write_rotations(u, self.rotations)
+
+    def add_product(self, p: wp.array, y: wp.array) -> None:
+        stiffness, material = self.field.stiffness_with(self.rotations)
+        stiffness.add_product(self.field.elements, material, self.displacements, p, y)
+
+    def add_diagonal(self, blocks: wp.array) -> None:
+        stiffness, material = self.field.stiffness_with(self.rotations)
+        stiffness.add_diagonal(self.field.elements, material, self.displacements, blocks)
 
 
 class LeafField(CorotatedField):

@@ -1,8 +1,8 @@
 """What iterative solvers and preconditioners know of a linear system.
 
-Vectors over nodes are ``wp.vec4`` arrays as those of ``body.state.State`` are: [worlds * nodes], world after world,
-the fourth lane zero. All methods that take vectors launch kernels and do not wait for the device, so that a solve can be
-recorded.
+Vectors over nodes are ``wp.vec4`` arrays like those of ``body.state.State``: [worlds * nodes], world after world, the
+fourth lane zero. Vectors that A and preconditioners are applied to are zero at nodes that are not free. All methods
+that take vectors launch kernels and do not wait for the device, so that a solve can be recorded.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ import warp as wp
 class LinearOperator(Protocol):
     """A symmetric matrix A = a M + b D + c K at one state of a body: mass, damping and stiffness.
 
-    Rows and columns of nodes that are not free are those of the identity: A maps their displacements to themselves, and
-    they do not act on others.
+    Rows of nodes that are not free are those of the identity, and their diagonal blocks too.
 
     Attributes:
         device: Of the arrays.

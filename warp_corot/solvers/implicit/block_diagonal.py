@@ -1,0 +1,30 @@
+"""The simplest preconditioner: the inverses of the 3x3 blocks on the diagonal."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warp_corot.kernels.implicit.tangent import apply_blocks, invert_blocks
+
+from .operator import LinearOperator
+
+
+class BlockDiagonal:
+    """z = B r with the inverse of each node's own block, made positive definite where it is not.
+
+    Args:
+        operator: For its sizes.
+    """
+
+    def __init__(self, operator: LinearOperator):
+        self._count, self.device = operator.worlds * operator.node_count, operator.device
+        self._inverses = wp.zeros(self._count, dtype=wp.mat33, device=self.device)
+
+    def update(self, operator: LinearOperator) -> None:
+        self._launch(invert_blocks, [operator.diagonal_blocks()], [self._inverses])
+
+    def apply(self, r: wp.array, z: wp.array) -> None:
+        self._launch(apply_blocks, [self._inverses, r], [z])
+
+    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, self._count, inputs, outputs, device=self.device)

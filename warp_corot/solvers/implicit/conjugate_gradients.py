@@ -1,0 +1,113 @@
+"""Preconditioned conjugate gradients as launches: no scalar comes to the host, so that a solve can be recorded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.kernels.implicit import conjugate_gradients as kernels
+
+from .operator import LinearOperator, Preconditioner
+from .sums import WorldSums
+
+
+@dataclass(frozen=True)
+class SolveReport:
+    """How a solve ended in each world.
+
+    Attributes:
+        iterations: int32 [worlds].
+        residual: Norm of b - A x over that of b, as the iteration has it, float64 [worlds].
+        converged: Whether that is within the tolerance, bool [worlds].
+        negative: Whether a direction p with p . A p <= 0 ended the iteration, bool [worlds].
+        broken: Whether something was not finite, or the preconditioner not positive definite, bool [worlds].
+    """
+
+    iterations: npt.NDArray[np.int32]
+    residual: npt.NDArray[np.float64]
+    converged: npt.NDArray[np.bool_]
+    negative: npt.NDArray[np.bool_]
+    broken: npt.NDArray[np.bool_]
+
+
+class ConjugateGradients:
+    """Solves A x = b in all worlds side by side, each until its own residual is small.
+
+    A world whose A shows negative curvature keeps the iterate before that, or the preconditioned b if there is none:
+    a direction of descent in either case.
+
+    Args:
+        operator: A, for its sizes.
+        length: Entries of vectors.
+        most: Iterations at most.
+
+    Attributes:
+        tolerance: Norm of the residual over that of b at which a world stops, float64 [worlds] on the device.
+        iterations: Of the last solve, int32 [worlds] on the device.
+        status: How it ended, as in ``kernels.implicit.conjugate_gradients``, int32 [worlds] on the device.
+    """
+
+    def __init__(self, operator: LinearOperator, length: int, *, most: int = 1000):
+        self.operator, self.device, self.worlds, self.most = operator, operator.device, operator.worlds, most
+        self._count = operator.node_count
+        self._r, self._z, self._p, self._q = (wp.zeros(length, dtype=wp.vec4, device=self.device) for _ in range(4))
+        self._sums = WorldSums(self.worlds, self._count, kernels.COLUMNS, self.device)
+        shape = (self.worlds, kernels.SCALARS)
+        self._scalars = wp.zeros(shape, dtype=wp.float64, device=self.device)
+        self.tolerance = wp.full(self.worlds, 1e-6, dtype=wp.float64, device=self.device)
+        self.iterations, self.status = (wp.zeros(self.worlds, dtype=wp.int32, device=self.device) for _ in range(2))
+        self._running = wp.zeros(1, dtype=wp.int32, device=self.device)
+
+    def launch(self, preconditioner: Preconditioner, b: wp.array, x: wp.array) -> None:
+        """Launch a solve, recorded or at once.
+
+        Args:
+            preconditioner: Up to date with the operator.
+            b: Right side, zero at nodes that are not free, vec4 [worlds * nodes].
+            x: The solution.
+        """
+        r, z, sums = self._r, self._z, self._sums
+        self._launch(kernels.begin, [b, x, r])
+        preconditioner.apply(r, z)
+        sums.launch_products(r, r, int(kernels.SQUARE))
+        sums.launch_products(r, z, int(kernels.PRODUCT))
+        self._running.zero_()
+        outputs = [self._scalars, self.iterations, self.status, self._running]
+        sums.launch_scalars(kernels.take_first, [self.tolerance], outputs)
+        self._take_direction()
+        wp.capture_while(self._running, self._iterate, preconditioner=preconditioner, x=x)
+
+    def _iterate(self, preconditioner: Preconditioner, x: wp.array) -> None:
+        r, z, p, q, sums = self._r, self._z, self._p, self._q, self._sums
+        outputs = [self._scalars, self.iterations, self.status, self._running]
+        self.operator.apply(p, q)
+        sums.launch_products(p, q, int(kernels.CURVATURE))
+        sums.launch_scalars(kernels.take_alpha, [], outputs)
+        inputs = [p, q, self._scalars, *sums.sizes, x, r]
+        wp.launch(kernels.advance, sums.shape, inputs, [sums.parts], device=self.device)
+        preconditioner.apply(r, z)
+        sums.launch_products(r, z, int(kernels.PRODUCT))
+        sums.launch_scalars(kernels.take_beta, [self.most], outputs)
+        self._take_direction()
+
+    def _take_direction(self) -> None:
+        self._launch(kernels.take_direction, [self._z, self._scalars, self._count, self._p])
+
+    def _launch(self, kernel: wp.Kernel, arguments: list) -> None:
+        wp.launch(kernel, self.worlds * self._count, arguments, device=self.device)
+
+    def report(self) -> SolveReport:
+        """How the last solve ended; waits for the device."""
+        status, scalars = self.status.numpy(), self._scalars.numpy()
+        first = scalars[:, int(kernels.FIRST)]
+        share = scalars[:, int(kernels.RR)] / np.where(first > 0.0, first, 1.0)
+        return SolveReport(
+            iterations=self.iterations.numpy(),
+            residual=np.sqrt(share),
+            converged=status == int(kernels.CONVERGED),
+            negative=status == int(kernels.NEGATIVE),
+            broken=status == int(kernels.BROKEN),
+        )

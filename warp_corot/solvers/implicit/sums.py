@@ -1,0 +1,45 @@
+"""Sums over the nodes of each world, on the device."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warp_corot.kernels.implicit.sums import sum_products
+
+#: Lanes of a warp, nodes of a thread at least, and warps of all worlds at most.
+WARP, NODES, WARPS = 32, 4, 512
+
+
+class WorldSums:
+    """Room for sums, and how their launches are made.
+
+    Args:
+        worlds: How many worlds.
+        count: Nodes of each.
+        columns: How many sums there are side by side.
+        device: Where.
+
+    Attributes:
+        parts: Parts of the sums, float64 [worlds, parts, columns].
+        shape: Threads of a launch over all nodes [2].
+        sizes: The arguments count, threads and lanes of its kernel.
+    """
+
+    def __init__(self, worlds: int, count: int, columns: int, device: wp.Device):
+        self.device, self.worlds = device, worlds
+        self.lanes = 1 if device.is_cpu else WARP
+        wanted = -(-count // (NODES * WARP))
+        warps = 1 if device.is_cpu else max(min(wanted, WARPS // worlds), 1)
+        threads = warps * self.lanes
+        self.parts = wp.zeros((worlds, warps, columns), dtype=wp.float64, device=device)
+        self.shape, self.sizes = (worlds, threads), [count, threads, self.lanes]
+
+    def launch_products(self, a: wp.array, b: wp.array, column: int) -> None:
+        """Launch a . b of each world, vec4."""
+        inputs = [a, b, *self.sizes, column]
+        wp.launch(sum_products, self.shape, inputs, [self.parts], device=self.device)
+
+    def launch_scalars(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+        """Launch a kernel that adds the parts up, the lanes of a warp for each world."""
+        dim = (self.worlds, self.lanes)
+        wp.launch(kernel, dim, [self.parts, self.lanes, *inputs], outputs, device=self.device)

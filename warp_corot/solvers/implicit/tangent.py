@@ -1,0 +1,103 @@
+"""The operator of implicit steps and static answers: mass, damping and the tangent stiffness of one body."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from warp_corot.elasticity import ForceField
+from warp_corot.kernels.implicit.tangent import finish_blocks, finish_rows
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.elasticity.viscosity import Viscosity
+
+
+class TangentOperator:
+    """A = a M + b D + c K of a body, a ``LinearOperator``.
+
+    Args:
+        body: The body.
+        field: Its elastic forces.
+        viscosity: Its viscous forces, D; None for none.
+        stiff_forces: Other forces that have a stiffness: ``add_stiffness(body, p, y)`` and
+            ``add_diagonal(body, blocks)``, as ``ForceField`` but at the body's present state.
+        exact: Whether K is the exact derivative, which may be indefinite, where the law has two.
+
+    Attributes:
+        tangent: The elastic K.
+    """
+
+    def __init__(
+        self,
+        body: SoftBody,
+        field: ForceField,
+        *,
+        viscosity: Viscosity | None = None,
+        stiff_forces: Sequence[Any] = (),
+        exact: bool = False,
+    ):
+        self.body, self.field, self.viscosity, self.stiff_forces = body, field, viscosity, tuple(stiff_forces)
+        self.device, self.worlds = body.device, body.worlds
+        self.tangent = field.tangent(exact=exact)
+        self.scales = wp.array([0.0, 0.0, 1.0], dtype=wp.float32, device=self.device)
+        self._none = wp.zeros(1, dtype=wp.vec4, device=self.device)
+        self.prepare()
+
+    def prepare(self) -> None:
+        """Make room for the body's present nodes; not while launches are recorded."""
+        u = self.body.state.displacements
+        self.tangent.prepare(u)
+        self._damped = self._none if self.viscosity is None else wp.zeros_like(u)
+        self._blocks = wp.zeros(len(u), dtype=wp.mat33, device=self.device)
+
+    @property
+    def node_count(self) -> int:
+        return self.body.sizes.launch_nodes // self.worlds
+
+    @property
+    def inverse_mass(self) -> wp.array:
+        return self.body.conditions.inverse_mass
+
+    @property
+    def displacements(self) -> wp.array:
+        return self.tangent.displacements
+
+    @property
+    def revision(self) -> int:
+        return self.body.launch_revision
+
+    def set_scales(self, mass: float, damping: float, stiffness: float) -> None:
+        """Set a [1/s^2], b [1/s] and c; not while launches are recorded."""
+        self.scales.assign([mass, damping, stiffness])
+
+    def take(self, u: wp.array) -> None:
+        """Launch the linearisation at displacements u [m], vec4 [worlds * nodes]."""
+        self.tangent.take(u)
+
+    def apply(self, x: wp.array, y: wp.array) -> None:
+        y.zero_()
+        self.tangent.add_product(x, y)
+        for forces in self.stiff_forces:
+            forces.add_stiffness(self.body, x, y)
+        if self.viscosity is not None:
+            self._damped.zero_()
+            self.viscosity.scatter(self.displacements, x, self._damped)
+        conditions = self.body.conditions
+        inputs = [self.scales, conditions.mass, conditions.inverse_mass, x, self._damped]
+        self._launch(finish_rows, inputs, [y])
+
+    def diagonal_blocks(self) -> wp.array:
+        blocks, conditions = self._blocks, self.body.conditions
+        blocks.zero_()
+        self.tangent.add_diagonal(blocks)
+        for forces in self.stiff_forces:
+            forces.add_diagonal(self.body, blocks)
+        stiffening = 0.0 if self.viscosity is None else self.viscosity.seconds
+        self._launch(finish_blocks, [self.scales, conditions.mass, conditions.inverse_mass, stiffening], [blocks])
+        return blocks
+
+    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, self.body.sizes.launch_nodes, inputs, outputs, device=self.device)
