@@ -1,0 +1,184 @@
+"""The cycle: smoothing, transfers, and what goes in and comes out.
+
+Smoothing is Chebyshev's iteration with the inverse diagonal blocks. It needs a bound on the largest eigenvalue of
+D^-1 A. The matrix of each element, and of each ancestor, is positive semidefinite and couples four nodes, so it is at
+most four times its own diagonal blocks: 4 is a bound on all levels.
+"""
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import load_node, store_node
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def row_product(
+    p0: int,
+    p1: int,
+    first_entry: int,
+    first_node: int,
+    columns: wp.array[wp.int32],
+    blocks: wp.array[wp.mat33],
+    x: wp.array[wp.vec4],
+):
+    total = wp.vec3()
+    for p in range(p0, p1):
+        total += blocks[first_entry + p] * load_node(x, first_node + columns[p])
+    return total
+
+
+@wp.kernel(enable_backward=False)
+def take_in(
+    # In
+    ranks: int,
+    mesh_nodes: int,
+    alpha: float,
+    nodes: wp.array[wp.int32],
+    free: wp.array[wp.uint8],
+    inverses: wp.array[wp.mat33],
+    given: wp.array[wp.vec4],
+    # Out
+    r: wp.array[wp.vec4],
+    z: wp.array[wp.vec4],
+):
+    """The residual by rank, zero where nodes are held, and the first step from zero."""
+    world, i = wp.tid()
+    node = nodes[i]
+    at = world * ranks + i
+    value = wp.vec3()
+    if node < mesh_nodes and free[at] != wp.uint8(0):
+        value = load_node(given, world * mesh_nodes + node)
+    store_node(r, at, value)
+    store_node(z, at, alpha * (inverses[at] * value))
+
+
+@wp.kernel(enable_backward=False)
+def hand_out(
+    # In
+    ranks: int,
+    mesh_nodes: int,
+    nodes: wp.array[wp.int32],
+    free: wp.array[wp.uint8],
+    given: wp.array[wp.vec4],
+    z: wp.array[wp.vec4],
+    # Out
+    result: wp.array[wp.vec4],
+):
+    """The result by number; held nodes have the identity."""
+    world, i = wp.tid()
+    node = nodes[i]
+    if node >= mesh_nodes:
+        return
+    at = world * ranks + i
+    to = world * mesh_nodes + node
+    if free[at] != wp.uint8(0):
+        store_node(result, to, load_node(z, at))
+    else:
+        store_node(result, to, load_node(given, to))
+
+
+@wp.kernel(enable_backward=False)
+def smooth(
+    # In
+    count: int,
+    entries: int,
+    alpha: float,
+    beta: float,
+    from_zero: bool,
+    starts: wp.array[wp.int32],
+    columns: wp.array[wp.int32],
+    blocks: wp.array[wp.mat33],
+    inverses: wp.array[wp.mat33],
+    r: wp.array[wp.vec4],
+    z: wp.array[wp.vec4],
+    # In and out
+    other: wp.array[wp.vec4],
+):
+    """One step: ``other`` has the values before z, which are taken as zero if told so, and gets those after it."""
+    world, i = wp.tid()
+    at = world * count + i
+    product = row_product(starts[i], starts[i + 1], world * entries, world * count, columns, blocks, z)
+    now = load_node(z, at)
+    step = alpha * (inverses[at] * (load_node(r, at) - product))
+    if beta != 0.0:
+        before = wp.vec3()
+        if not from_zero:
+            before = load_node(other, at)
+        step += beta * (now - before)
+    store_node(other, at, now + step)
+
+
+@wp.kernel(enable_backward=False)
+def find_residual(
+    # In
+    count: int,
+    entries: int,
+    starts: wp.array[wp.int32],
+    columns: wp.array[wp.int32],
+    blocks: wp.array[wp.mat33],
+    r: wp.array[wp.vec4],
+    z: wp.array[wp.vec4],
+    # Out
+    residual: wp.array[wp.vec4],
+):
+    """r - A z."""
+    world, i = wp.tid()
+    at = world * count + i
+    product = row_product(starts[i], starts[i + 1], world * entries, world * count, columns, blocks, z)
+    store_node(residual, at, load_node(r, at) - product)
+
+
+@wp.kernel(enable_backward=False)
+def restrict_residual(
+    # In
+    ranks: int,
+    coarse: int,
+    fine: int,
+    alpha: float,
+    free: wp.array[wp.uint8],
+    starts: wp.array[wp.int32],
+    midpoints: wp.array[wp.int32],
+    inverses: wp.array[wp.mat33],
+    residual: wp.array[wp.vec4],
+    # Out
+    r: wp.array[wp.vec4],
+    z: wp.array[wp.vec4],
+):
+    """P^T of the finer level's residual, zero where nodes are held, and the first step from zero."""
+    world, i = wp.tid()
+    at = world * coarse + i
+    total = wp.vec3()
+    if free[world * ranks + i] != wp.uint8(0):
+        for p in range(starts[i], starts[i + 1]):
+            total += load_node(residual, world * fine + midpoints[p])
+        total = 0.5 * total + load_node(residual, world * fine + i)
+    store_node(r, at, total)
+    store_node(z, at, alpha * (inverses[at] * total))
+
+
+@wp.kernel(enable_backward=False)
+def prolongate_correction(
+    # In
+    ranks: int,
+    coarse: int,
+    fine: int,
+    free: wp.array[wp.uint8],
+    ends: wp.array[wp.vec2i],
+    correction: wp.array[wp.vec4],
+    # In and out
+    z: wp.array[wp.vec4],
+):
+    """z += P of the coarser level's correction, where nodes are free."""
+    world, i = wp.tid()
+    if free[world * ranks + i] == wp.uint8(0):
+        return
+    first = world * coarse
+    value = wp.vec3()
+    if i < coarse:
+        value = load_node(correction, first + i)
+    else:
+        pair = ends[i]
+        value = 0.5 * (load_node(correction, first + pair[0]) + load_node(correction, first + pair[1]))
+    at = world * fine + i
+    store_node(z, at, load_node(z, at) + value)

@@ -1,0 +1,129 @@
+"""The coarsest level: its inverse, found by one block a world for each linearisation, and applied in one launch."""
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.elements.lanes import COMPILER_FLAGS
+from warp_corot.kernels.stepping.block import synchronize_block
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_FLAGS})
+
+#: What is added to the diagonal, scaled to one: the inverse stays finite where nothing holds a body.
+SHIFT = wp.constant(wp.float64(1.0e-5))
+
+
+@wp.kernel(enable_backward=False)
+def fill_dense(
+    # In
+    entries: int,
+    starts: wp.array[wp.int32],
+    columns: wp.array[wp.int32],
+    diagonal: wp.array[wp.int32],
+    blocks: wp.array[wp.mat33],
+    # Out
+    matrix: wp.array3d[wp.float64],
+    scale: wp.array2d[wp.float64],
+):
+    """The matrix with a diagonal of ones; rows without an entry are zero, and their scale is."""
+    world, i = wp.tid()
+    first = world * entries
+    own = blocks[first + diagonal[i]]
+    for a in range(3):
+        for column in range(matrix.shape[2]):
+            matrix[world, 3 * i + a, column] = wp.float64(0.0)
+        scale[world, 3 * i + a] = wp.float64(0.0)
+        if own[a, a] > 0.0:
+            scale[world, 3 * i + a] = wp.float64(1.0) / wp.sqrt(wp.float64(own[a, a]))
+    for p in range(starts[i], starts[i + 1]):
+        j = columns[p]
+        other = blocks[first + diagonal[j]]
+        for a in range(3):
+            for b in range(3):
+                if own[a, a] > 0.0 and other[b, b] > 0.0:
+                    value = wp.float64(blocks[first + p][a, b])
+                    size = wp.sqrt(wp.float64(own[a, a]) * wp.float64(other[b, b]))
+                    matrix[world, 3 * i + a, 3 * j + b] = value / size
+    for a in range(3):
+        matrix[world, 3 * i + a, 3 * i + a] += SHIFT
+        if own[a, a] <= 0.0:
+            matrix[world, 3 * i + a, 3 * i + a] = wp.float64(1.0)
+
+
+@wp.func_native("""
+const double* row = &wp::index(rows, world, 0);
+double* a = &wp::index(matrix, world, i, 0);
+for (int j = 0; j <= i; ++j) a[j] -= factor * row[j];
+""")
+def subtract_row(
+    matrix: wp.array3d[wp.float64], rows: wp.array2d[wp.float64], world: int, i: int, factor: wp.float64
+): ...
+
+
+@wp.kernel(enable_backward=False)
+def invert_dense(
+    # In and out
+    matrix: wp.array3d[wp.float64],
+    # Out
+    rows: wp.array2d[wp.float64],
+):
+    """Minus the inverse of each world's matrix, in its lower triangle, by symmetric sweeps; one block a world, which
+    keeps the row of each pivot in ``rows``."""
+    thread = wp.tid()
+    threads = wp.block_dim()
+    world = thread / threads
+    lane = thread % threads
+    size = matrix.shape[1]
+    for k in range(size):
+        pivot = matrix[world, k, k]
+        for j in range(lane, size, threads):
+            if j < k:
+                rows[world, j] = matrix[world, k, j]
+            elif j > k:
+                rows[world, j] = matrix[world, j, k]
+            else:
+                rows[world, j] = wp.float64(0.0)
+        synchronize_block()
+        inverse = wp.float64(1.0) / pivot
+        for i in range(lane, size, threads):
+            if i != k:
+                factor = rows[world, i] * inverse
+                subtract_row(matrix, rows, world, i, factor)
+                if i > k:
+                    matrix[world, i, k] = factor
+            else:
+                for j in range(k):
+                    matrix[world, k, j] = rows[world, j] * inverse
+                matrix[world, k, k] = -inverse
+        synchronize_block()
+
+
+@wp.kernel(enable_backward=False)
+def store_inverse(
+    # In
+    matrix: wp.array3d[wp.float64],
+    scale: wp.array2d[wp.float64],
+    # Out
+    inverse: wp.array3d[float],
+):
+    world, i, j = wp.tid()
+    value = matrix[world, wp.max(i, j), wp.min(i, j)]
+    inverse[world, i, j] = float(-value * scale[world, i] * scale[world, j])
+
+
+@wp.kernel(enable_backward=False)
+def apply_dense(
+    # In
+    count: int,
+    inverse: wp.array3d[float],
+    r: wp.array[wp.vec4],
+    # Out
+    z: wp.array[wp.vec4],
+):
+    world, i = wp.tid()
+    total = wp.vec3()
+    for j in range(count):
+        value = load_node(r, world * count + j)
+        for a in range(3):
+            for b in range(3):
+                total[a] += inverse[world, 3 * i + a, 3 * j + b] * value[b]
+    store_node(z, world * count + i, total)

@@ -1,0 +1,233 @@
+"""Which nodes of a level are neighbours, and what each entry of its matrix is the sum of.
+
+An entry in the upper triangle, or on the diagonal, is a sum of contributions: of leaves on the finest level, of entries
+of the next finer level on others (Galerkin). Contributions are listed with the pair of ranks as a key, and sorted.
+"""
+
+import warp as wp
+
+
+@wp.func
+def key_of(i: int, j: int, bits: int):
+    return (wp.int64(i) << wp.int64(bits)) | wp.int64(j)
+
+
+@wp.func
+def pair_of(key: wp.int64, bits: int):
+    return wp.vec2i(int(key >> wp.int64(bits)), int(key & ((wp.int64(1) << wp.int64(bits)) - wp.int64(1))))
+
+
+@wp.func
+def parents(i: int, coarse: int, ends: wp.array[wp.vec2i]):
+    """The node itself and -1 if it is among the ``coarse`` first ones, else the ends of its edge."""
+    if i < coarse:
+        return wp.vec2i(i, -1)
+    return ends[i]
+
+
+@wp.kernel(enable_backward=False)
+def find_ranks(
+    # In
+    nodes: wp.array[wp.int32],
+    # Out
+    rank: wp.array[wp.int32],
+):
+    i = wp.tid()
+    rank[nodes[i]] = i
+
+
+@wp.kernel(enable_backward=False)
+def rank_ends(
+    # In
+    by_number: wp.array[wp.vec2i],
+    rank: wp.array[wp.int32],
+    # Out
+    ends: wp.array[wp.vec2i],
+):
+    i = wp.tid()
+    pair = by_number[i]
+    if pair[0] < 0:
+        ends[i] = pair
+    else:
+        ends[i] = wp.vec2i(rank[pair[0]], rank[pair[1]])
+
+
+@wp.kernel(enable_backward=False)
+def list_leaf_pairs(
+    # In
+    bits: int,
+    tets: wp.array[wp.vec4i],
+    rank: wp.array[wp.int32],
+    # Out
+    keys: wp.array[wp.int64],
+    codes: wp.array[wp.int32],
+):
+    """The six pairs of nodes of each leaf; a code is 16 times the leaf, plus 4 times the place of the node with the
+    lower rank in it, plus that of the other."""
+    t = wp.tid()
+    at = int(6 * t)
+    for m in range(3):
+        for n in range(m + 1, 4):
+            i = rank[tets[t][m]]
+            j = rank[tets[t][n]]
+            if i < j:
+                keys[at] = key_of(i, j, bits)
+                codes[at] = 16 * t + 4 * m + n
+            else:
+                keys[at] = key_of(j, i, bits)
+                codes[at] = 16 * t + 4 * n + m
+            at += 1
+
+
+@wp.kernel(enable_backward=False)
+def list_diagonal(
+    # In
+    first: int,
+    bits: int,
+    # Out
+    keys: wp.array[wp.int64],
+    codes: wp.array[wp.int32],
+):
+    """An entry on the diagonal for each node, whether leaves name it or not, after ``first`` others."""
+    i = wp.tid()
+    keys[first + i] = key_of(i, i, bits)
+    codes[first + i] = -1
+
+
+@wp.kernel(enable_backward=False)
+def count_products(
+    # In
+    coarse: int,
+    pairs: wp.array[wp.vec2i],
+    ends: wp.array[wp.vec2i],
+    # Out
+    counts: wp.array[wp.int32],
+):
+    """To how many entries of the coarser level's upper triangle each entry contributes."""
+    p = wp.tid()
+    first = parents(pairs[p][0], coarse, ends)
+    second = parents(pairs[p][1], coarse, ends)
+    count = int(0)
+    for a in range(2):
+        for b in range(2):
+            if first[a] >= 0 and second[b] >= first[a]:
+                count += 1
+    counts[p] = count
+
+
+@wp.kernel(enable_backward=False)
+def list_products(
+    # In
+    coarse: int,
+    bits: int,
+    pairs: wp.array[wp.vec2i],
+    ends: wp.array[wp.vec2i],
+    sums: wp.array[wp.int32],
+    # Out
+    keys: wp.array[wp.int64],
+    codes: wp.array[wp.int32],
+):
+    """Each contribution's key, and as its code 4 times the entry plus how often it is halved; ``sums`` are the
+    inclusive sums of the counts."""
+    p = wp.tid()
+    first = parents(pairs[p][0], coarse, ends)
+    second = parents(pairs[p][1], coarse, ends)
+    halvings = wp.where(first[1] >= 0, 1, 0) + wp.where(second[1] >= 0, 1, 0)
+    at = int(0)
+    if p > 0:
+        at = sums[p - 1]
+    for a in range(2):
+        for b in range(2):
+            if first[a] >= 0 and second[b] >= first[a]:
+                keys[at] = key_of(first[a], second[b], bits)
+                codes[at] = 4 * p + halvings
+                at += 1
+
+
+@wp.kernel(enable_backward=False)
+def name_upper(
+    # In
+    count: int,
+    bits: int,
+    keys: wp.array[wp.int64],
+    starts: wp.array[wp.int32],
+    # Out
+    upper: wp.array[wp.vec2i],
+    full_keys: wp.array[wp.int64],
+    sources: wp.array[wp.int32],
+):
+    """Each upper entry's pair, and the keys of it and its mirror image; an entry on the diagonal is its own, and gets
+    row ``count``, past all, instead."""
+    u = wp.tid()
+    pair = pair_of(keys[starts[u]], bits)
+    upper[u] = pair
+    full_keys[2 * u] = key_of(pair[0], pair[1], bits)
+    sources[2 * u] = 2 * u
+    sources[2 * u + 1] = 2 * u + 1
+    full_keys[2 * u + 1] = key_of(pair[1], pair[0], bits)
+    if pair[0] == pair[1]:
+        full_keys[2 * u + 1] = key_of(count, count, bits)
+
+
+@wp.kernel(enable_backward=False)
+def name_entries(
+    # In
+    bits: int,
+    keys: wp.array[wp.int64],
+    sources: wp.array[wp.int32],
+    # Out
+    pairs: wp.array[wp.vec2i],
+    columns: wp.array[wp.int32],
+    diagonal: wp.array[wp.int32],
+    places: wp.array[wp.int32],
+):
+    """The sorted entries; ``places`` are where each upper entry and its mirror image stand among them."""
+    p = wp.tid()
+    pair = pair_of(keys[p], bits)
+    pairs[p] = pair
+    columns[p] = pair[1]
+    places[sources[p]] = p
+    if pair[0] == pair[1]:
+        diagonal[pair[0]] = p
+        places[sources[p] + 1] = p
+
+
+@wp.kernel(enable_backward=False)
+def find_row_starts(
+    # In
+    count: int,
+    bits: int,
+    keys: wp.array[wp.int64],
+    # Out
+    starts: wp.array[wp.int32],
+):
+    """Where each row begins among ``count`` sorted keys, and where the last one ends."""
+    row = wp.tid()
+    wanted = key_of(row, 0, bits)
+    low = int(0)
+    high = int(count)
+    while low < high:
+        middle = low + (high - low) / 2
+        if keys[middle] < wanted:
+            low = middle + 1
+        else:
+            high = middle
+    starts[row] = low
+
+
+@wp.kernel(enable_backward=False)
+def list_midpoints(
+    # In
+    coarse: int,
+    bits: int,
+    ends: wp.array[wp.vec2i],
+    # Out
+    keys: wp.array[wp.int64],
+    midpoints: wp.array[wp.int32],
+):
+    """Each end of the edges of nodes past the ``coarse`` first ones, with that node."""
+    i = wp.tid()
+    node = coarse + i
+    for n in range(2):
+        keys[2 * i + n] = key_of(ends[node][n], node, bits)
+        midpoints[2 * i + n] = node

@@ -1,0 +1,218 @@
+"""The values of each level's matrix: of the finest from the leaves, of the others from the next finer one.
+
+A leaf has K_mn = V (lambda g_m g_n^T + mu g_n g_m^T + mu (g_m . g_n) I) with the gradients g of its hat functions
+turned by its rotation: the corotated R K R^T, or linear elasticity where nothing is turned. Every entry gathers what it
+is the sum of, so there are no atomic additions and sums have one order.
+
+Rows and columns of held nodes are zero; their displacements are left out of the cycle.
+"""
+
+import functools
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import (
+    ForestElements,
+    edge_length,
+    frame,
+    local_gradient,
+    mirror_sign,
+    rest_volume,
+    shape_of,
+)
+from warp_corot.kernels.math.rotation import quick_rotation
+
+wp.set_module_options({"enable_backward": False})
+
+#: Determinant of a block over the cube of a third of its trace, below which the block is not inverted as it is.
+LEAST_DETERMINANT = wp.constant(1.0e-5)
+
+
+@wp.kernel(enable_backward=False)
+def find_free(
+    # In
+    ranks: int,
+    mesh_nodes: int,
+    nodes: wp.array[wp.int32],
+    inverse_mass: wp.array[float],
+    # Out
+    free: wp.array[wp.uint8],
+):
+    """Which nodes are free, by rank; those that no leaf names are."""
+    world, i = wp.tid()
+    node = nodes[i]
+    is_free = bool(True)
+    if node < mesh_nodes:
+        is_free = inverse_mass[world * mesh_nodes + node] > 0.0
+    free[world * ranks + i] = wp.where(is_free, wp.uint8(1), wp.uint8(0))
+
+
+@wp.func
+def turned_frame(elements: ForestElements, t: int, u: wp.array[wp.vec4]):
+    return quick_rotation(frame(elements, t) + local_gradient(elements, t, u))
+
+
+@wp.func
+def rest_frame(elements: ForestElements, t: int, u: wp.array[wp.vec4]):
+    return frame(elements, t)
+
+
+@functools.cache
+def write_frames(is_turned: bool) -> wp.Kernel:
+    """Each leaf's frame at displacements u, or at rest, times sqrt(V) / h; the third column of the Maubach frame."""
+    frame_of = turned_frame if is_turned else rest_frame
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def write_frames(
+        # In
+        elements: ForestElements,
+        u: wp.array[wp.vec4],
+        # Out
+        frames: wp.array[wp.mat33],
+    ):
+        t = wp.tid()
+        q = frame_of(elements, t, u) * (wp.sqrt(rest_volume(elements, t)) / edge_length(elements, t))
+        mirrored = mirror_sign(elements.code[t])
+        for axis in range(3):
+            q[axis, 2] = q[axis, 2] * mirrored
+        frames[t] = q
+
+    return write_frames
+
+
+@wp.kernel(enable_backward=False)
+def gather_leaves(
+    # In
+    world_elements: int,
+    entries: int,
+    elements: ForestElements,
+    frames: wp.array[wp.mat33],
+    gradients: wp.array[wp.vec3],
+    mu: wp.array[float],
+    lam: wp.array[float],
+    stride: int,
+    scales: wp.array[float],
+    upper: wp.array[wp.vec2i],
+    starts: wp.array[wp.int32],
+    codes: wp.array[wp.int32],
+    places: wp.array[wp.vec2i],
+    # Out
+    blocks: wp.array[wp.mat33],
+):
+    """The entries off the diagonal; ``gradients`` are those of ``tables.shapes``, [shape, node]."""
+    world, u = wp.tid()
+    if upper[u][0] == upper[u][1]:
+        return
+    first = world * world_elements
+    total = wp.mat33()
+    for at in range(starts[u], starts[u + 1]):
+        code = codes[at]
+        t = first + (code >> 4)
+        row = 4 * shape_of(elements.code[t])
+        q = frames[t]
+        a = q * gradients[row + ((code >> 2) & 3)]
+        b = q * gradients[row + (code & 3)]
+        m = mu[t * stride]
+        total += wp.outer(lam[t * stride] * a, b) + wp.outer(m * b, a)
+        d = m * wp.dot(a, b)
+        total[0, 0] += d
+        total[1, 1] += d
+        total[2, 2] += d
+    total = scales[2] * total
+    where = places[u]
+    blocks[world * entries + where[0]] = total
+    blocks[world * entries + where[1]] = wp.transpose(total)
+
+
+@wp.func
+def inverse_block(a: wp.mat33):
+    """The inverse of a symmetric positive definite block, of one that is nearly singular with something added; zero of
+    zero."""
+    third = (a[0, 0] + a[1, 1] + a[2, 2]) / 3.0
+    result = wp.mat33()
+    if third > 0.0:
+        unit = a / third
+        if wp.determinant(unit) < LEAST_DETERMINANT:
+            unit += 0.05 * wp.identity(n=3, dtype=float)
+        result = wp.inverse(unit) / third
+    return result
+
+
+@wp.kernel(enable_backward=False)
+def finish_leaves(
+    # In
+    ranks: int,
+    mesh_nodes: int,
+    entries: int,
+    nodes: wp.array[wp.int32],
+    inverse_mass: wp.array[float],
+    scales: wp.array[float],
+    free: wp.array[wp.uint8],
+    starts: wp.array[wp.int32],
+    columns: wp.array[wp.int32],
+    diagonal: wp.array[wp.int32],
+    # In and out
+    blocks: wp.array[wp.mat33],
+    # Out
+    inverses: wp.array[wp.mat33],
+):
+    """The finest level's diagonal: stiffness does not answer to translation, so that its rows' blocks sum to zero, and
+    mass; and zeros where nodes are held."""
+    world, i = wp.tid()
+    first = world * entries
+    own = diagonal[i]
+    is_free = free[world * ranks + i] != wp.uint8(0)
+    total = wp.mat33()
+    for p in range(starts[i], starts[i + 1]):
+        if p != own:
+            total -= blocks[first + p]
+            if not is_free or free[world * ranks + columns[p]] == wp.uint8(0):
+                blocks[first + p] = wp.mat33()
+    inverse = wp.mat33()
+    if is_free:
+        node = nodes[i]
+        if node < mesh_nodes:
+            mass = scales[0] / inverse_mass[world * mesh_nodes + node]
+            total += mass * wp.identity(n=3, dtype=float)
+        inverse = inverse_block(total)
+    else:
+        total = wp.mat33()
+    blocks[first + own] = total
+    inverses[world * ranks + i] = inverse
+
+
+@wp.kernel(enable_backward=False)
+def gather_products(
+    # In
+    ranks: int,
+    level_nodes: int,
+    entries: int,
+    fine_entries: int,
+    free: wp.array[wp.uint8],
+    upper: wp.array[wp.vec2i],
+    starts: wp.array[wp.int32],
+    codes: wp.array[wp.int32],
+    places: wp.array[wp.vec2i],
+    fine_blocks: wp.array[wp.mat33],
+    # Out
+    blocks: wp.array[wp.mat33],
+    inverses: wp.array[wp.mat33],
+):
+    """P^T A P of a coarser level, and the inverses of its diagonal blocks."""
+    world, u = wp.tid()
+    i = upper[u][0]
+    j = upper[u][1]
+    total = wp.mat33()
+    if free[world * ranks + i] != wp.uint8(0) and free[world * ranks + j] != wp.uint8(0):
+        weights = wp.vec3(1.0, 0.5, 0.25)
+        for at in range(starts[u], starts[u + 1]):
+            code = codes[at]
+            total += weights[code & 3] * fine_blocks[world * fine_entries + (code >> 2)]
+    where = places[u]
+    first = world * entries
+    if i == j:
+        total = 0.5 * (total + wp.transpose(total))
+        inverses[world * level_nodes + i] = inverse_block(total)
+    else:
+        blocks[first + where[1]] = wp.transpose(total)
+    blocks[first + where[0]] = total

@@ -1,0 +1,325 @@
+"""Geometric multigrid: its matrices against dense ones, the cycle's laws, and iterations over levels."""
+
+import functools
+
+import numpy as np
+import pytest
+import warp as wp
+from cases import MATERIAL, MODELS, mixed_forest, random_displacement
+from tangents import on_device
+from tree_levels import TreeLevels
+
+import warp_corot as wc
+from warp_corot.solvers.implicit.block_diagonal import BlockDiagonal
+from warp_corot.solvers.implicit.conjugate_gradients import ConjugateGradients
+from warp_corot.solvers.implicit.multigrid import Multigrid
+from warp_corot.solvers.implicit.tangent import TangentOperator
+
+ROUNDING = float(np.finfo(np.float32).eps)
+MASS = 2.0e3  # a of A = a M + K [1/s^2]
+
+
+def uniform(level=5):
+    return wc.TetForest.box((1, 1, 1), 0.064, level)
+
+
+@functools.cache
+def ball(max_level=7):
+    """A carved forest, whose coarse levels have nodes that no leaf names, with elements filled to 2 %."""
+    domain = wc.Domain.sphere(0.1, (0.01, 0.003, -0.006), device="cpu")
+    domain = domain | wc.Domain.sphere(0.06, (0.11, 0.02, 0.01), device="cpu")
+    return wc.TetForest.from_domain(domain, 0.12, max_level=max_level, surface_error=0.0005)
+
+
+FORESTS = {"uniform": uniform, "mixed": lambda: mixed_forest(level=5), "ball": ball}
+
+
+def lowest_tenth(mesh):
+    return mesh.points[:, 1] <= np.quantile(mesh.points[:, 1], 0.1)
+
+
+def operator_of(
+    mesh, device, *, model="corotated", fixed=None, poisson=0.3, young=MATERIAL["young"], worlds=1, mass=0.0
+):
+    material = wc.Isotropic(young, poisson, MATERIAL["density"])
+    body = wc.SoftBody(mesh, material, worlds=worlds, device=device)
+    body.fix(lowest_tenth(mesh) if fixed is None else fixed)
+    operator = TangentOperator(body, MODELS[model]().bind(body))
+    operator.set_scales(mass, 0.0, 1.0)
+    return operator
+
+
+def multigrid_of(operator, model="corotated", u=None, **options):
+    multigrid = Multigrid(operator.body, is_turned=model != "linear", **options)
+    given = np.zeros((len(operator.inverse_mass), 3)) if u is None else u
+    operator.take(on_device(given.astype(np.float32), operator.field))
+    multigrid.update(operator)
+    return multigrid
+
+
+def dense(level, world=0):
+    """The matrix of a level, float64 [3 n, 3 n]."""
+    pattern, n = level.pattern, level.count
+    matrix = np.zeros((n, 3, n, 3))
+    rows, columns = pattern.pairs.numpy().T
+    entries = slice(world * pattern.entries, (world + 1) * pattern.entries)
+    matrix[rows, :, columns] = level.blocks.numpy()[entries]
+    return matrix.reshape(3 * n, 3 * n)
+
+
+def as_matrix(apply, nodes, device):
+    """The dense matrix of something that is applied to vectors, float64 [3 nodes, 3 nodes]."""
+    columns = []
+    y = wp.zeros(nodes, dtype=wp.vec4, device=device)
+    for column in range(3 * nodes):
+        x = np.zeros((nodes, 4), np.float32)
+        x[column // 3, column % 3] = 1.0
+        apply(wp.array(x, dtype=wp.vec4, device=device), y)
+        columns.append(y.numpy()[:, :3].astype(float).ravel())
+    return np.array(columns).T
+
+
+def solve(operator, preconditioner, tolerance=1e-5):
+    """Iterations to the answer to the body's weight."""
+    body = operator.body
+    b = np.zeros((len(body.masses), 3), np.float32)
+    b[:, 1] = -9.8 * body.masses * (operator.inverse_mass.numpy()[: len(b)] > 0.0)
+    right = on_device(b, operator.field)
+    cg = ConjugateGradients(operator, len(right), most=2000)
+    cg.tolerance.fill_(tolerance)
+    cg.launch(preconditioner, right, wp.zeros_like(right))
+    report = cg.report()
+    assert report.converged.all()
+    return int(report.iterations.max())
+
+
+def iterations(operator, **options):
+    return solve(operator, multigrid_of(operator, **options))
+
+
+@pytest.mark.parametrize("model", ["linear", "corotated"])
+@pytest.mark.parametrize("name", FORESTS)
+def test_finest_matrix_is_the_operators(name, model, device, rng):
+    """In two worlds with different displacements; rows and columns of held nodes are zero."""
+    mesh = FORESTS[name]()
+    fixed = rng.random((2, len(mesh.points))) < 0.1
+    operator = operator_of(mesh, device, model=model, fixed=fixed.ravel(), worlds=2, mass=MASS)
+    u = np.concatenate([random_displacement(mesh, rng, 0.2) for _ in range(2)])
+    multigrid = multigrid_of(operator, model, u)
+    level, count = multigrid.levels[0], len(mesh.points)
+    x = rng.standard_normal((2, count, 3)).astype(np.float32)
+    x[fixed] = 0.0
+    y = wp.zeros(2 * count, dtype=wp.vec4, device=device)
+    operator.apply(on_device(x.reshape(-1, 3), operator.field), y)
+    expected = y.numpy()[:, :3].reshape(2, count, 3)
+    nodes = mesh_nodes(multigrid)
+    named = nodes < count
+    for world in range(2):
+        ranked = np.zeros((level.count, 3))
+        ranked[named] = x[world][nodes[named]]
+        found = (dense(level, world) @ ranked.ravel()).reshape(-1, 3)
+        assert not found[~named].any()
+        error = np.abs(found[named] - expected[world][nodes[named]]).max()
+        assert error < 50 * ROUNDING * np.abs(expected).max()
+        assert not dense(level, world).reshape(level.count, 3, -1)[named][fixed[world][nodes[named]]].any()
+
+
+def mesh_nodes(multigrid):
+    """The number of each rank's node."""
+    return multigrid.discretization.levels().nodes.numpy()
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+@pytest.mark.parametrize("name", FORESTS)
+def test_coarse_matrices_are_the_products(name, stride, device, rng):
+    """P^T A P with the prolongation that walking down the tree gives, without the nodes that are held."""
+    mesh = FORESTS[name]()
+    operator = operator_of(mesh, device, fixed=rng.random(len(mesh.points)) < 0.1, mass=MASS)
+    multigrid = multigrid_of(operator, u=random_displacement(mesh, rng, 0.2), stride=stride)
+    levels = multigrid.discretization.levels()
+    places = np.concatenate([np.arange(levels.mesh_nodes), levels.others.numpy()])
+    tree, nodes = TreeLevels.of(mesh.tree, len(mesh.lattice)), mesh_nodes(multigrid)
+    free = np.ones(levels.node_count)
+    free[: levels.mesh_nodes] = operator.inverse_mass.numpy() > 0.0
+    free = free[nodes]
+    assert len(multigrid.levels) > 1
+    for fine, coarse in zip(multigrid.levels, multigrid.levels[1:], strict=False):
+        depth = [int(np.searchsorted(levels.starts, level.count)) - 1 for level in (fine, coarse)]
+        numbered = tree.prolongation(places, depth[1], depth[0])
+        P = numbered[np.ix_(nodes[: fine.count], nodes[: coarse.count])]
+        P = np.kron(free[: fine.count, None] * P * free[: coarse.count], np.eye(3))
+        expected = P.T @ dense(fine) @ P
+        np.testing.assert_allclose(dense(coarse), expected, rtol=0, atol=20 * ROUNDING * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("name", FORESTS)
+def test_each_cycle_is_symmetric_positive_definite_and_a_good_inverse(name, device, rng):
+    mesh = {"uniform": lambda: uniform(6), "mixed": lambda: mixed_forest(level=5), "ball": lambda: ball(5)}[name]()
+    operator = operator_of(mesh, device)
+    multigrid = multigrid_of(operator, u=random_displacement(mesh, rng, 0.2))
+    count = len(mesh.points)
+    free = np.repeat(operator.inverse_mass.numpy() > 0.0, 3)
+    B = as_matrix(multigrid.apply, count, device)
+    assert np.abs(B - B.T).max() < 50 * ROUNDING * np.abs(B).max()
+    np.testing.assert_array_equal(B[~free][:, ~free], np.eye((~free).sum()))
+    assert not B[~free][:, free].any()
+    B = B[np.ix_(free, free)]
+    A = as_matrix(operator.apply, count, device)[np.ix_(free, free)]
+    root = np.linalg.cholesky(0.5 * (B + B.T))
+    values = np.linalg.eigvalsh(root.T @ (0.5 * (A + A.T)) @ root)
+    print(f"{name}: eigenvalues of B A {values[0]:.3f} to {values[-1]:.3f}")
+    assert values[0] > 0.05
+    assert values[-1] < 1.001
+
+
+def test_smoothing_bound_holds(device, rng):
+    """Eigenvalues of D^-1 A are at most 4 on every level, also where E jumps and nodes are held."""
+    mesh = ball(5)
+    young = np.where(rng.random(len(mesh.tets)) < 0.5, 1e3, 1e7)
+    operator = operator_of(mesh, device, young=young, poisson=0.49)
+    for level in multigrid_of(operator, stride=1).levels:
+        inverses = level.inverses.numpy().astype(float)
+        used = inverses.any(axis=(1, 2))
+        root = np.linalg.cholesky(0.5 * (inverses + inverses.swapaxes(1, 2))[used])
+        rows = np.repeat(used, 3)
+        A = dense(level)[np.ix_(rows, rows)].reshape(len(root), 3, len(root), 3)
+        scaled = np.einsum("iba,ibjc,jcd->iajd", root, A, root).reshape(3 * len(root), -1)
+        assert np.linalg.eigvalsh(0.5 * (scaled + scaled.T))[-1] < 4.0
+
+
+@pytest.mark.parametrize(("poisson", "most"), [(0.3, 12), (0.45, 16), (0.49, 32)])
+def test_iterations_hardly_grow_with_the_level(poisson, most, device):
+    """A clamped beam at levels 6 and 9: to 1e-5; block diagonal preconditioning takes twice as many at each halving."""
+    counts = []
+    for level in (6, 9):
+        mesh = wc.TetForest.box((1, 1, 3), 0.064, level)
+        operator = operator_of(mesh, device, fixed=mesh.points[:, 2] < 1e-9, poisson=poisson)
+        counts.append(iterations(operator))
+    diagonal = BlockDiagonal(operator)
+    diagonal.update(operator)
+    plain = solve(operator, diagonal)
+    print(f"Poisson's ratio {poisson}: {counts} iterations, {plain} with block diagonal at the finer level")
+    assert counts[-1] <= counts[0] + 6
+    assert max(counts) <= most
+    assert plain > 6 * counts[-1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("poisson", "most"), [(0.3, 12), (0.45, 18), (0.49, 36)])
+def test_iterations_at_more_levels(poisson, most, device):
+    for level in (6, 9, 12, 15):
+        mesh = wc.TetForest.box((1, 1, 3), 0.064, level)
+        operator = operator_of(mesh, device, fixed=mesh.points[:, 2] < 1e-9, poisson=poisson)
+        count = iterations(operator)
+        print(f"level {level}, Poisson's ratio {poisson}: {count} iterations")
+        assert count <= most
+
+
+@pytest.mark.parametrize("case", ["filled to 2 %", "stiffness jumps", "held inside"])
+def test_iterations_on_an_adaptive_organ(case, device, rng):
+    mesh = ball(9)
+    assert mesh.fill.min() < 0.03
+    young = np.where(mesh.points[mesh.tets].mean(axis=1)[:, 0] > 0.03, 5e7, 5e3)
+    fixed = rng.random(len(mesh.points)) < 0.02
+    options = {"filled to 2 %": {}, "stiffness jumps": {"young": young}, "held inside": {"fixed": fixed}}[case]
+    count = iterations(operator_of(mesh, device, poisson=0.45, **options))
+    print(f"{case}: {count} iterations")
+    assert count <= {"filled to 2 %": 16, "stiffness jumps": 24, "held inside": 18}[case]
+
+
+def test_mass_of_a_step_makes_it_easier(device):
+    operator = operator_of(ball(), device, poisson=0.45, mass=60.0**2)
+    assert iterations(operator) <= 10
+
+
+def test_a_large_grid_of_cubes_has_no_inverse(device):
+    """Its coarsest level has more nodes than are inverted, and is smoothed."""
+    mesh = wc.TetForest.box((8, 3, 3), 0.064, 3)
+    operator = operator_of(mesh, device, fixed=mesh.points[:, 0] < 1e-9)
+    assert multigrid_of(operator).levels[-1].count > 64
+    assert iterations(operator) <= 25
+
+
+def test_a_body_held_nowhere_with_mass(device):
+    operator = operator_of(uniform(6), device, fixed=[], mass=100.0)
+    assert iterations(operator) <= 12
+
+
+def test_shared_dilatation_is_preconditioned_by_plain_elements(device):
+    mesh = uniform(6)
+    body = wc.SoftBody(mesh, wc.Isotropic(5e3, 0.45, 1e3), device=device)
+    body.fix(lowest_tenth(mesh))
+    operator = TangentOperator(body, wc.Linear(dilatation="shared").bind(body))
+    operator.set_scales(0.0, 0.0, 1.0)
+    count = iterations(operator, model="linear")
+    print(f"{count} iterations")
+    assert count <= 40
+
+
+def test_worlds_do_not_touch(device, rng):
+    """A cycle in three worlds is, in each, that of the world alone."""
+    mesh = mixed_forest(level=4)
+    fixed = rng.random((3, len(mesh.points))) < 0.1
+    r = rng.standard_normal((3, len(mesh.points), 3)).astype(np.float32)
+
+    def cycle(fixed, r, worlds):
+        operator = operator_of(mesh, device, fixed=fixed.ravel(), worlds=worlds)
+        z = wp.zeros(worlds * len(mesh.points), dtype=wp.vec4, device=device)
+        multigrid_of(operator).apply(on_device(r.reshape(-1, 3), operator.field), z)
+        return z.numpy().reshape(worlds, -1, 4)
+
+    together = cycle(fixed, r, 3)
+    for world in range(3):
+        np.testing.assert_array_equal(together[world], cycle(fixed[world], r[world], 1)[0])
+
+
+def test_updates_and_cycles_can_be_recorded(device, rng):
+    mesh = mixed_forest(level=4)
+    operator = operator_of(mesh, device)
+    multigrid = multigrid_of(operator)
+    u, r = (on_device(random_displacement(mesh, rng, 0.2), operator.field) for _ in range(2))
+    expected, z = wp.zeros_like(r), wp.zeros_like(r)
+    with wp.ScopedCapture(device=device) as capture:
+        operator.take(u)
+        multigrid.update(operator)
+        multigrid.apply(r, z)
+    for _ in range(2):
+        u.assign(np.pad(random_displacement(mesh, rng, 0.2), ((0, 0), (0, 1))))
+        wp.capture_launch(capture.graph)
+        operator.take(u)
+        multigrid.update(operator)
+        multigrid.apply(r, expected)
+        np.testing.assert_array_equal(z.numpy(), expected.numpy())
+
+
+def test_a_mesh_that_changes_is_followed(device, rng):
+    from remesh_cases import random_marks
+
+    mesh = ball()
+    body = wc.SoftBody(mesh, wc.Isotropic(5e3, 0.3, 1e3), device=device)
+    wc.Simulation(body, model=wc.NeoHookean(), remesh=wc.OnlineRemesh(capacity=20000, min_level=0, max_level=12))
+    multigrid = Multigrid(body)
+    assert not multigrid.follow()
+    for _ in range(2):
+        body.changing.passes.apply(random_marks(body.changing.forest, rng, 0.05, 0.3))
+        body.changing.renew()
+        assert multigrid.follow()
+        body.fix(lowest_tenth(body.mesh))
+        operator = TangentOperator(body, wc.Corotated().bind(body))
+        multigrid.update(operator)
+        changed = np.concatenate([level.blocks.numpy().ravel() for level in multigrid.levels])
+        alone = operator_of(body.mesh, device, young=5e3, fixed=lowest_tenth(body.mesh))
+        expected = np.concatenate([level.blocks.numpy().ravel() for level in multigrid_of(alone).levels])
+        np.testing.assert_allclose(changed, expected, rtol=0, atol=20 * ROUNDING * np.abs(expected).max())
+
+
+def test_general_meshes_and_wrong_options_are_refused(device):
+    forest = uniform(1)
+    body = wc.SoftBody(wc.TetMesh(forest.points, forest.tets), wc.Isotropic(5e3, 0.3, 1e3), device=device)
+    with pytest.raises(wc.InputError, match="only a TetForest has levels; this mesh is a TetMesh"):
+        Multigrid(body)
+    body = wc.SoftBody(forest, wc.Isotropic(5e3, 0.3, 1e3), device=device)
+    with pytest.raises(wc.InputError, match="stride is 4; it must be 1, 2 or 3"):
+        Multigrid(body, stride=4)
+    with pytest.raises(wc.InputError, match="degree is 0; it must be 1 or more"):
+        Multigrid(body, degree=0)

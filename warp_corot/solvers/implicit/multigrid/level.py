@@ -1,0 +1,100 @@
+"""One level: its matrix, what the cycle works with, and the launches that go from it to the next coarser one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.implicit.multigrid import cycle, values
+
+from .pattern import Midpoints, Pattern
+
+#: A bound on the eigenvalues of D^-1 A: every part of A is positive semidefinite and couples four nodes.
+LARGEST_EIGENVALUE = 4.0
+#: Over how large a range of these the smoother works.
+SMOOTHED_RANGE = 20.0
+
+
+def smoothing_factors(degree: int, range_: float) -> list[tuple[float, float]]:
+    """How much of the preconditioned residual, and of the step before, each step of Chebyshev's iteration takes.
+
+    Args:
+        degree: Number of steps.
+        range_: The largest eigenvalue of D^-1 A over the least that is damped well.
+    """
+    largest, least = LARGEST_EIGENVALUE, LARGEST_EIGENVALUE / range_
+    middle, half = 0.5 * (largest + least), 0.5 * (largest - least)
+    factors, rho = [(1.0 / middle, 0.0)], half / middle
+    for _ in range(degree - 1):
+        following = 1.0 / (2.0 * middle / half - rho)
+        factors.append((2.0 * following / half, rho * following))
+        rho = following
+    return factors
+
+
+class Level:
+    """A level's matrix and vectors.
+
+    Args:
+        pattern: Of its matrix.
+        worlds: Copies.
+        ranks: Nodes of all levels, M.
+        free: Which nodes are free, by rank, uint8 [worlds * M].
+        degree, range_: Of the smoother.
+
+    Attributes:
+        blocks: Values of the entries, mat33 [worlds * entries].
+        inverses: Of the diagonal blocks, mat33 [worlds * n].
+        r, z, other: Residual, correction, and a vector to work with, vec4 [worlds * n].
+        factors: Of the smoother's steps.
+    """
+
+    def __init__(self, pattern: Pattern, worlds: int, ranks: int, free: wp.array, degree: int, range_: float):
+        self.pattern, self.worlds, self.ranks, self.free = pattern, worlds, ranks, free
+        self.device = pattern.starts.device
+        self.count = pattern.count
+        self.blocks = wp.zeros(worlds * pattern.entries, dtype=wp.mat33, device=self.device)
+        self.inverses = wp.zeros(worlds * self.count, dtype=wp.mat33, device=self.device)
+        self.r, self.z, self.other = (
+            wp.zeros(worlds * self.count, dtype=wp.vec4, device=self.device) for _ in range(3)
+        )
+        self.factors = smoothing_factors(degree, range_)
+
+    @property
+    def matrix(self) -> list[Any]:
+        """The matrix as kernels take it."""
+        return [self.pattern.starts, self.pattern.columns, self.blocks]
+
+    def smooth(self, from_step: int = 0) -> None:
+        """Go on with ``z`` from a step of the smoother."""
+        for step in range(from_step, len(self.factors)):
+            alpha, beta = self.factors[step]
+            inputs = [self.count, self.pattern.entries, alpha, beta if step else 0.0, step == from_step]
+            inputs += [*self.matrix, self.inverses, self.r, self.z]
+            self.launch(cycle.smooth, self.count, inputs, [self.other])
+            self.z, self.other = self.other, self.z
+
+    def gather_from(self, fine: Level) -> None:
+        """Find the matrix P^T A P of the finer level's."""
+        pattern = self.pattern
+        inputs = [self.ranks, self.count, pattern.entries, fine.pattern.entries, self.free, pattern.upper]
+        inputs += [pattern.sum_starts, pattern.codes, pattern.places, fine.blocks]
+        self.launch(values.gather_products, len(pattern.upper), inputs, [self.blocks, self.inverses])
+
+    def restrict_from(self, fine: Level, midpoints: Midpoints) -> None:
+        """Take over the finer level's residual, and make the smoother's first step."""
+        inputs = [fine.count, fine.pattern.entries, *fine.matrix, fine.r, fine.z]
+        fine.launch(cycle.find_residual, fine.count, inputs, [fine.other])
+        inputs = [self.ranks, self.count, fine.count, self.factors[0][0], self.free]
+        inputs += [midpoints.starts, midpoints.midpoints, self.inverses, fine.other]
+        self.launch(cycle.restrict_residual, self.count, inputs, [self.r, self.z])
+
+    def correct(self, fine: Level, ends: wp.array) -> None:
+        """Add the correction of this level to the finer one's."""
+        inputs = [self.ranks, self.count, fine.count, self.free, ends, self.z]
+        self.launch(cycle.prolongate_correction, fine.count, inputs, [fine.z])
+
+    def launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
+        """Launch a kernel over so many things in each world."""
+        wp.launch(kernel, dim=(self.worlds, count), inputs=inputs, outputs=outputs, device=self.device)

@@ -1,0 +1,165 @@
+"""Geometric multigrid on the bisection tree: a symmetric V-cycle with Galerkin matrices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+import warp as wp
+
+from warp_corot.discretization.discretization import Discretization, Discretized, discretization_of
+from warp_corot.discretization.levels import Levels
+from warp_corot.errors import InputError
+from warp_corot.kernels.elements.elements import ForestElements
+from warp_corot.kernels.implicit.multigrid import cycle, pattern, values
+from warp_corot.kernels.tables.shapes import GRADIENT
+from warp_corot.solvers.implicit.operator import LinearOperator
+
+from .coarsest import DenseInverse
+from .level import SMOOTHED_RANGE, Level
+from .pattern import Midpoints, Pattern, PatternFinder
+
+#: Levels of more nodes than this are made coarser, while there are coarser ones.
+FEW_NODES = 64
+#: The largest coarsest level that is inverted [nodes].
+MOST_DENSE = 64
+#: The smoother's degree and range on a coarsest level that is larger, as of a grid of many cubes.
+COARSEST_SMOOTHER = (32, 1000.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Transfer:
+    """Between a level and the next coarser one."""
+
+    fine: Level
+    coarse: Level
+    midpoints: Midpoints
+
+
+class Multigrid:
+    """A preconditioner: one V-cycle over the levels of a forest, for a body's stiffness and mass.
+
+    The finest level's matrix is that of the elements with the present rotations held fixed, R K R^T (or linear
+    elasticity), with the mass; every coarser one is P^T A P with linear interpolation P. Held nodes are left out on
+    every level. So the cycle is linear, symmetric and positive definite.
+
+    Args:
+        body: A body on a forest, or its discretization.
+        is_turned: Whether elements turn; False: linear elasticity.
+        stride: Number of bisections from one level to the next, 1 to 3.
+        degree: Of the smoother, before and after.
+
+    Attributes:
+        discretization: The body's.
+        revision: Changes whenever launches do.
+
+    Raises:
+        InputError: The mesh is no forest, or a stride or degree is out of its range.
+    """
+
+    def __init__(self, body: Discretized | Discretization, *, is_turned: bool = True, stride: int = 3, degree: int = 3):
+        if stride not in (1, 2, 3):
+            raise InputError(f"stride is {stride!r}; it must be 1, 2 or 3")
+        if degree < 1:
+            raise InputError(f"degree is {degree!r}; it must be 1 or more")
+        self.discretization = discretization_of(body)
+        self.is_turned, self.stride, self.degree = is_turned, stride, degree
+        self.revision, self._version = -1, -1
+        self.follow()
+
+    @property
+    def device(self) -> wp.Device:
+        return self.discretization.device
+
+    def follow(self) -> bool:
+        """Follow the mesh, if it has changed; returns whether launches are others now. Waits for the device."""
+        if self._version == self.discretization.sizes.version:
+            return False
+        self._version = self.discretization.sizes.version
+        self._build(self.discretization.levels())
+        self.revision += 1
+        return True
+
+    def update(self, operator: LinearOperator) -> None:
+        """Launch what finds all matrices at the operator's displacements and scales."""
+        discretization, finest = self.discretization, self.levels[0]
+        elements = cast("ForestElements", discretization.elements)
+        inverse_mass, scales = operator.inverse_mass, operator.scales
+        free_inputs = [self.count, self._mesh_nodes, self._nodes, inverse_mass]
+        finest.launch(values.find_free, self.count, free_inputs, [self._free])
+        kernel = values.write_frames(self.is_turned)
+        leaves = discretization.sizes.elements
+        inputs: list[Any] = [elements, operator.displacements]
+        wp.launch(kernel, dim=leaves, inputs=inputs, outputs=[self._frames], device=self.device)
+        found = finest.pattern
+        inputs = [discretization.sizes.world_elements, found.entries, elements, self._frames, self._gradients]
+        inputs += [discretization.mu, discretization.lam, discretization.material_stride, scales]
+        inputs += [found.upper, found.sum_starts, found.codes, found.places]
+        finest.launch(values.gather_leaves, len(found.upper), inputs, [finest.blocks])
+        inputs = [self.count, self._mesh_nodes, found.entries, self._nodes, inverse_mass, scales, self._free]
+        inputs += [found.starts, found.columns, found.diagonal]
+        finest.launch(values.finish_leaves, self.count, inputs, [finest.blocks, finest.inverses])
+        for transfer in self._transfers:
+            transfer.coarse.gather_from(transfer.fine)
+        if self._coarsest is not None:
+            self._coarsest.update()
+
+    def apply(self, r: wp.array, z: wp.array) -> None:
+        """Launch z = B r, one cycle from zero; both vec4 [worlds * nodes]."""
+        finest = self.levels[0]
+        inputs = [self.count, self._mesh_nodes, finest.factors[0][0], self._nodes, self._free, finest.inverses, r]
+        finest.launch(cycle.take_in, self.count, inputs, [finest.r, finest.z])
+        for transfer in self._transfers:
+            transfer.fine.smooth(1)
+            transfer.coarse.restrict_from(transfer.fine, transfer.midpoints)
+        if self._coarsest is None:
+            self.levels[-1].smooth(1)
+        else:
+            self._coarsest.solve()
+        for transfer in reversed(self._transfers):
+            transfer.coarse.correct(transfer.fine, self._ends)
+            transfer.fine.smooth()
+        inputs = [self.count, self._mesh_nodes, self._nodes, self._free, r, finest.z]
+        finest.launch(cycle.hand_out, self.count, inputs, [z])
+
+    # --- pieces ------------------------------------------------------------------------------------------------------
+
+    def _build(self, levels: Levels) -> None:
+        sizes, device = self.discretization.sizes, self.device
+        self.count, self._mesh_nodes, self._nodes = levels.node_count, levels.mesh_nodes, levels.nodes
+        rank = wp.empty(self.count, dtype=wp.int32, device=device)
+        wp.launch(pattern.find_ranks, self.count, [levels.nodes], [rank], device=device)
+        self._ends = wp.empty(self.count, dtype=wp.vec2i, device=device)
+        wp.launch(pattern.rank_ends, self.count, [levels.ends, rank], [self._ends], device=device)
+        self._free = wp.zeros(sizes.worlds * self.count, dtype=wp.uint8, device=device)
+        self._frames = wp.zeros(sizes.elements, dtype=wp.mat33, device=device)
+        weights = np.swapaxes(np.array(GRADIENT), 1, 2).reshape(12, 3)
+        self._gradients = wp.array(weights, dtype=wp.vec3, device=device)
+        finder = PatternFinder(self._ends)
+        elements = cast("ForestElements", self.discretization.elements)
+        counts = self._counts(levels)
+        found = finder.of_leaves(elements.nodes, sizes.world_elements, rank)
+        self.levels = [self._level(found, counts)]
+        self._transfers = []
+        for count in counts[1:]:
+            fine = self.levels[-1]
+            coarse = self._level(finder.of_products(fine.pattern, count), counts)
+            self._transfers.append(Transfer(fine, coarse, finder.midpoints(count, fine.count)))
+            self.levels.append(coarse)
+        self._coarsest = DenseInverse(self.levels[-1]) if counts[-1] <= MOST_DENSE else None
+
+    def _level(self, found: Pattern, counts: list[int]) -> Level:
+        """A level with its smoother; the coarsest one's is only used where it is not inverted."""
+        smoother = COARSEST_SMOOTHER if found.count == counts[-1] else (self.degree, SMOOTHED_RANGE)
+        return Level(found, self.discretization.worlds, self.count, self._free, *smoother)
+
+    def _counts(self, levels: Levels) -> list[int]:
+        """Numbers of nodes of the levels that the cycle has, finest first."""
+        counts, level = [levels.node_count], levels.depth
+        while level > 0 and counts[-1] > FEW_NODES:
+            # Three bisections of the third shape also bisect an edge that the first of them makes.
+            stride = 2 if level % 3 == 2 and self.stride == 3 else self.stride
+            level = max(level - stride, 0)
+            counts.append(levels.starts[level + 1])
+        return counts

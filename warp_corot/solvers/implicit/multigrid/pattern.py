@@ -1,0 +1,154 @@
+"""The pattern of each level's matrix: found by launches and a few counts that come to the host."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.implicit.multigrid import pattern as kernels
+from warp_corot.kernels.meshing.growth import gather_flagged
+from warp_corot.kernels.plan.levels import flag_first
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """The entries of a level's matrix, one world's, by rank.
+
+    Attributes:
+        count: Nodes of the level, n.
+        entries: How many entries there are.
+        starts: Where rows begin, and where the last one ends, int32 [n + 1].
+        columns: int32 [entries], ascending in a row.
+        pairs: Row and column of each entry, vec2i [entries].
+        diagonal: Where each row's diagonal entry is, int32 [n].
+        upper: Rank and higher or equal rank of each entry in the upper triangle, vec2i [U].
+        places: Where each of these and its mirror image are among the entries, vec2i [U].
+        sum_starts: Where the contributions to each of these begin, and where the last one's end, int32 [U + 1].
+        codes: The contributions, int32: see ``kernels.implicit.multigrid.pattern``.
+    """
+
+    count: int
+    entries: int
+    starts: wp.array
+    columns: wp.array
+    pairs: wp.array
+    diagonal: wp.array
+    upper: wp.array
+    places: wp.array
+    sum_starts: wp.array
+    codes: wp.array
+
+
+@dataclass(frozen=True, eq=False)
+class Midpoints:
+    """For each node of a level the finer level's nodes on whose edges it is an end.
+
+    Attributes:
+        starts: Where each node's begin, and where the last one's end, int32 [n + 1].
+        midpoints: Ranks, ascending for each node, int32.
+    """
+
+    starts: wp.array
+    midpoints: wp.array
+
+
+class PatternFinder:
+    """Finds the patterns of levels.
+
+    Args:
+        ends: Ranks of the ends of each node's edge by rank, vec2i [M].
+    """
+
+    def __init__(self, ends: wp.array):
+        self.ends, self.device = ends, ends.device
+        # One more than there are ranks, for keys past all.
+        self.bits = len(ends).bit_length()
+
+    def of_leaves(self, tets: wp.array, leaves: int, rank: wp.array) -> Pattern:
+        """Of the finest level, from the nodes of the first leaves by number and the rank of each number."""
+        nodes = len(rank)
+        keys, codes = self._keys(6 * leaves + nodes)
+        self._launch(kernels.list_leaf_pairs, leaves, [self.bits, tets, rank], [keys, codes])
+        self._launch(kernels.list_diagonal, nodes, [6 * leaves, self.bits], [keys, codes])
+        return self._pattern(nodes, 6 * leaves + nodes, keys, codes)
+
+    def of_products(self, fine: Pattern, coarse: int) -> Pattern:
+        """Of the level of so many nodes, from the next finer one."""
+        counts = self._ints(fine.entries)
+        self._launch(kernels.count_products, fine.entries, [coarse, fine.pairs, self.ends], [counts])
+        wp.utils.array_scan(counts, counts, inclusive=True)
+        total = int(counts[-1:].numpy()[0])
+        keys, codes = self._keys(total)
+        inputs = [coarse, self.bits, fine.pairs, self.ends, counts]
+        self._launch(kernels.list_products, fine.entries, inputs, [keys, codes])
+        return self._pattern(coarse, total, keys, codes)
+
+    def midpoints(self, coarse: int, fine: int) -> Midpoints:
+        """Of levels of so many nodes."""
+        count = 2 * (fine - coarse)
+        keys, midpoints = self._keys(count)
+        self._launch(kernels.list_midpoints, fine - coarse, [coarse, self.bits, self.ends], [keys, midpoints])
+        self._sort(keys, midpoints, count)
+        return Midpoints(self._row_starts(coarse, count, keys), _first(midpoints, count))
+
+    # --- pieces ------------------------------------------------------------------------------------------------------
+
+    def _pattern(self, nodes: int, contributions: int, keys: wp.array, codes: wp.array) -> Pattern:
+        self._sort(keys, codes, contributions)
+        flags, sums = self._ints(contributions), self._ints(contributions)
+        self._launch(flag_first, contributions, [keys], [flags])
+        wp.utils.array_scan(flags, sums, inclusive=True)
+        count = int(sums[-1:].numpy()[0])
+        starts = self._ints(count + 1)
+        starts.fill_(contributions)
+        self._launch(gather_flagged, contributions, [flags, sums, 0], [starts])
+        upper = wp.empty(count, dtype=wp.vec2i, device=self.device)
+        full, sources = self._keys(2 * count)
+        self._launch(kernels.name_upper, count, [nodes, self.bits, keys, starts], [upper, full, sources])
+        self._sort(full, sources, 2 * count)
+        entries = 2 * count - nodes
+        pairs = wp.empty(entries, dtype=wp.vec2i, device=self.device)
+        columns, diagonal, places = self._ints(entries), self._ints(nodes), self._ints(2 * count)
+        inputs = [self.bits, full, sources]
+        self._launch(kernels.name_entries, entries, inputs, [pairs, columns, diagonal, places])
+        return Pattern(
+            nodes,
+            entries,
+            self._row_starts(nodes, entries, full),
+            columns,
+            pairs,
+            diagonal,
+            upper,
+            places.reshape((count, 2)).view(wp.vec2i),
+            starts,
+            _first(codes, contributions),
+        )
+
+    def _row_starts(self, rows: int, count: int, keys: wp.array) -> wp.array:
+        starts = self._ints(rows + 1)
+        self._launch(kernels.find_row_starts, rows + 1, [count, self.bits, keys], [starts])
+        return starts
+
+    def _keys(self, count: int) -> tuple[wp.array, wp.array]:
+        """Keys and values, with twice the room, as sorting needs it."""
+        return wp.empty(2 * count, dtype=wp.int64, device=self.device), self._ints(2 * count)
+
+    def _sort(self, keys: wp.array, values: wp.array, count: int) -> None:
+        if count:
+            wp.utils.radix_sort_pairs(keys, values, count, end_bit=2 * self.bits)
+
+    def _ints(self, count: int) -> wp.array:
+        return wp.empty(count, dtype=wp.int32, device=self.device)
+
+    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+
+def _first(array: wp.array, count: int) -> wp.array:
+    """A copy of the first places, in place of an array with twice the room."""
+    kept = wp.empty(count, dtype=array.dtype, device=array.device)
+    if count:
+        wp.copy(kept, array, count=count)
+    return kept
