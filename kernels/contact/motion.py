@@ -135,12 +135,23 @@ def between(a: wp.transform, b: wp.transform, share: float):
 
 
 @wp.func
+def distance_between(a: wp.transform, b: wp.transform, reach: float):
+    """How far apart a point of an obstacle is in two poses, at most [m]."""
+    far = wp.length(wp.transform_get_translation(b) - wp.transform_get_translation(a))
+    p = wp.transform_get_rotation(a)
+    q = wp.transform_get_rotation(b)
+    # What rounding would leave of no turn counts a lot for what is large.
+    if p[0] == q[0] and p[1] == q[1] and p[2] == q[2] and p[3] == q[3]:
+        return far
+    turn = wp.quat_inverse(p) * q
+    sine = wp.length(wp.vec3(turn[0], turn[1], turn[2]))
+    return far + reach * 2.0 * wp.atan2(sine, wp.abs(turn[3]))
+
+
+@wp.func
 def sent(now: wp.transform, target: wp.transform, most: float, reach: float):
     """Towards a place, no point of the obstacle by more than ``most`` [m]."""
-    far = wp.length(wp.transform_get_translation(target) - wp.transform_get_translation(now))
-    turn = wp.quat_inverse(wp.transform_get_rotation(now)) * wp.transform_get_rotation(target)
-    sine = wp.length(wp.vec3(turn[0], turn[1], turn[2]))
-    far += reach * 2.0 * wp.atan2(sine, wp.abs(turn[3]))
+    far = distance_between(now, target, reach)
     if far <= most:
         return target
     return between(now, target, most / far)

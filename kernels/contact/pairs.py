@@ -11,6 +11,7 @@ from warp_corot.kernels.stepping.pace import DT, Pace
 from .closest import on_segments, on_triangle, point_of
 from .law import Law, held_back, least_motion
 from .motion import Surface
+from .near import PAIRED, Near
 from .vertices import across
 
 wp.set_module_options({"enable_backward": False})
@@ -44,10 +45,12 @@ class Meeting:
 
 @wp.struct
 class Rows:
-    """Pairs that are near, [P]; those of one node or edge, of S + E, are from one start to the next."""
+    """Pairs that are near, [P]; those of one node or edge, of S + E, follow one another, in order of the other."""
 
-    starts: wp.array[wp.int32]  # [S + E + 1]
-    owner: wp.array[wp.int32]  # the node, or S and the edge
+    total: wp.array[wp.int32]  # [1] how many there are, or were if there were room
+    starts: wp.array[wp.int32]  # [S + E]
+    counts: wp.array[wp.int32]  # [S + E]
+    owner: wp.array[wp.int32]  # the node, or S and the edge; -1 for none
     other: wp.array[wp.int32]  # the triangle, or the edge
     places: wp.array[wp.vec4i]
     shares: wp.array[wp.vec4]
@@ -60,7 +63,7 @@ class Rows:
 
 @wp.func
 def row_count(rows: Rows):
-    return wp.min(rows.starts[rows.starts.shape[0] - 1], rows.owner.shape[0])
+    return wp.min(rows.total[0], rows.owner.shape[0])
 
 
 @wp.func
@@ -164,19 +167,15 @@ def push(row: int, force: wp.vec3, rows: Rows, added: wp.array[wp.vec3]):
         wp.atomic_add(added, p[k], w[k] * force)
 
 
-@wp.kernel(enable_backward=False)
-def locate_rows(surface: Surface, meeting: Meeting, rows: Rows, added: wp.array[wp.vec3]):
-    """Where each pair is closest, and the force with which it begins: that of the last step."""
-    row = wp.tid()
-    if row >= row_count(rows):
-        return
+@wp.func
+def locate_row(row: int, surface: Surface, meeting: Meeting, rows: Rows, added: wp.array[wp.vec3]):
     nodes = meeting.body.shape[0]
     owner = rows.owner[row]
     is_near = bool(False)
-    if owner < nodes:
-        is_near = locate_node(row, owner, rows.other[row], surface, meeting, rows)
-    else:
+    if owner >= nodes:
         is_near = locate_edge(row, owner - nodes, rows.other[row], surface, meeting, rows)
+    elif owner >= 0:
+        is_near = locate_node(row, owner, rows.other[row], surface, meeting, rows)
     was = rows.force[row]
     rows.force[row] = wp.vec3()
     rows.acts[row] = 0
@@ -197,17 +196,13 @@ def missing(row: int, law: Law, dt: float, surface: Surface, rows: Rows):
     return least_motion(rows.gap[row], law, dt) - wp.dot(opened(row, surface, rows), rows.normal[row])
 
 
-@wp.kernel(enable_backward=False)
-def judge_rows(law: Law, pace: Pace, surface: Surface, rows: Rows, crowd: wp.array[wp.float32]):
-    """Which pairs act, and the sum of their shares at each node."""
-    row = wp.tid()
-    if row >= row_count(rows):
-        return
+@wp.func
+def judge_row(row: int, law: Law, dt: float, surface: Surface, rows: Rows, crowd: wp.array[wp.float32]):
     w = rows.shares[row]
     acts = int(0)
     if w[0] > 0.0:
         force = wp.dot(rows.force[row], rows.normal[row])
-        if force > 0.0 or missing(row, law, float(pace.seconds[DT]), surface, rows) > 0.0:
+        if force > 0.0 or missing(row, law, dt, surface, rows) > 0.0:
             acts = 1
             p = rows.places[row]
             for k in range(4):
@@ -215,9 +210,63 @@ def judge_rows(law: Law, pace: Pace, surface: Surface, rows: Rows, crowd: wp.arr
     rows.acts[row] = acts
 
 
+@wp.func
+def solve_row(
+    row: int,
+    law: Law,
+    dt: float,
+    surface: Surface,
+    friction: float,
+    crowd: wp.array[wp.float32],
+    rows: Rows,
+    added: wp.array[wp.vec3],
+):
+    if rows.acts[row] == 0:
+        return
+    p = rows.places[row]
+    w = rows.shares[row]
+    yielding = float(0.0)
+    for k in range(4):
+        yielding += wp.abs(w[k]) * crowd[p[k]] * surface.yielding[p[k]]
+    if yielding <= 0.0:
+        return
+    n = rows.normal[row]
+    before = rows.force[row]
+    normal_force = wp.max(wp.dot(before, n) + missing(row, law, dt, surface, rows) / yielding, 0.0)
+    slip = across(opened(row, surface, rows), n)
+    force = normal_force * n + held_back(across(before, n) - slip / yielding, normal_force, friction)
+    rows.force[row] = force
+    push(row, force - before, rows, added)
+
+
+# --- all of them, however many threads there are --------------------------------------------------------------------
+
+
+@wp.kernel(enable_backward=False)
+def locate_rows(threads: int, surface: Surface, meeting: Meeting, rows: Rows, added: wp.array[wp.vec3]):
+    """Where each pair is closest, and the force with which it begins: that of the last step."""
+    row = wp.tid()
+    count = row_count(rows)
+    while row < count:
+        locate_row(row, surface, meeting, rows, added)
+        row += threads
+
+
+@wp.kernel(enable_backward=False)
+def judge_rows(threads: int, law: Law, pace: Pace, surface: Surface, rows: Rows, crowd: wp.array[wp.float32]):
+    """Which pairs act, and the sum of their shares at each node."""
+    row = wp.tid()
+    count = row_count(rows)
+    dt = float(pace.seconds[DT])
+    while row < count:
+        judge_row(row, law, dt, surface, rows, crowd)
+        row += threads
+
+
 @wp.kernel(enable_backward=False)
 def solve_rows(
     # In
+    threads: int,
     law: Law,
     pace: Pace,
     surface: Surface,
@@ -230,31 +279,25 @@ def solve_rows(
 ):
     """Correct the force of each pair that acts."""
     row = wp.tid()
-    if row >= row_count(rows) or rows.acts[row] == 0:
-        return
-    p = rows.places[row]
-    w = rows.shares[row]
-    yielding = float(0.0)
-    for k in range(4):
-        yielding += wp.abs(w[k]) * crowd[p[k]] * surface.yielding[p[k]]
-    if yielding <= 0.0:
-        return
-    n = rows.normal[row]
-    before = rows.force[row]
-    normal_force = wp.max(wp.dot(before, n) + missing(row, law, float(pace.seconds[DT]), surface, rows) / yielding, 0.0)
-    slip = across(opened(row, surface, rows), n)
-    force = normal_force * n + held_back(across(before, n) - slip / yielding, normal_force, friction)
-    rows.force[row] = force
-    push(row, force - before, rows, added)
+    count = row_count(rows)
+    dt = float(pace.seconds[DT])
+    while row < count:
+        solve_row(row, law, dt, surface, friction, crowd, rows, added)
+        row += threads
 
 
 @wp.kernel(enable_backward=False)
-def apply_added(surface: Surface, added: wp.array[wp.vec3], crowd: wp.array[wp.float32]):
+def apply_added(threads: int, near: Near, surface: Surface, added: wp.array[wp.vec3], crowd: wp.array[wp.float32]):
     """Give nodes what was added to their forces."""
-    s = wp.tid()
-    crowd[s] = 0.0
-    force = added[s]
-    if wp.dot(force, force) > 0.0:
-        surface.f[s] = surface.f[s] + force
-        surface.d[s] = surface.d[s] + surface.yielding[s] * force
-        added[s] = wp.vec3()
+    k = wp.tid()
+    count = near.count[0]
+    while k < count:
+        s = near.nodes[k]
+        k += threads
+        if (near.flags[s] & PAIRED) != 0:
+            crowd[s] = 0.0
+            force = added[s]
+            if wp.dot(force, force) > 0.0:
+                surface.f[s] = surface.f[s] + force
+                surface.d[s] = surface.d[s] + surface.yielding[s] * force
+                added[s] = wp.vec3()

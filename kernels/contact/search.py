@@ -4,23 +4,26 @@ import warp as wp
 
 from .closest import on_segments, on_triangle, point_of
 from .motion import Surface
-from .pairs import BAND, Meeting, Rows, triangle_normal
+from .near import PAIRED, Near, mark
+from .pairs import BAND, Meeting, Rows, row_count, triangle_normal
+from .watch import Watch
 
 wp.set_module_options({"enable_backward": False})
 
-#: How far a node may go until pairs are looked for again, over what it goes if it goes on as now.
-AHEAD = wp.constant(2.0)
 #: The sine of the angle from which on an edge is sharp.
 SHARP = wp.constant(0.15)
 #: Where boxes of nothing are [m].
 NOWHERE = wp.constant(1.0e6)
 
 
-@wp.kernel(enable_backward=False)
-def reserve_motion(steps: int, least: float, surface: Surface, reach: wp.array[wp.float32]):
-    """How far nodes may go in so many steps."""
-    s = wp.tid()
-    reach[s] = least + AHEAD * float(steps) * wp.length(surface.d[s])
+@wp.struct
+class OldRows:
+    """What is kept of rows while others are found; see ``Rows``."""
+
+    starts: wp.array[wp.int32]  # [S + E]
+    counts: wp.array[wp.int32]  # [S + E]
+    other: wp.array[wp.int32]
+    force: wp.array[wp.vec3]
 
 
 @wp.func
@@ -114,8 +117,11 @@ def node_is_near(s: int, t: int, surface: Surface, meeting: Meeting):
     b = surface.x[c[1]]
     e = surface.x[c[2]]
     x = surface.x[s]
-    far = wp.length(x - point_of(on_triangle(x, a, b, e), a, b, e))
-    return far <= meeting.reach[s] + triangle_reach(surface, meeting, c) + BAND * triangle_size(surface, c)
+    way = x - point_of(on_triangle(x, a, b, e), a, b, e)
+    far = meeting.reach[s] + triangle_reach(surface, meeting, c)
+    if wp.dot(way, wp.cross(b - a, e - a)) < 0.0:
+        far += BAND * triangle_size(surface, c)
+    return wp.length(way) <= far
 
 
 @wp.func
@@ -126,10 +132,6 @@ def edge_is_near(k: int, m: int, surface: Surface, meeting: Meeting):
         return False
     if not may_meet(e[0], f[0], surface, meeting):
         return False
-    other = bend(surface, meeting, m)
-    # Two sharp edges are found by the first of them.
-    if other < -SHARP or (other > SHARP and m < k):
-        return False
     p = surface.x[e[0]]
     q = surface.x[e[1]]
     a = surface.x[f[0]]
@@ -137,116 +139,160 @@ def edge_is_near(k: int, m: int, surface: Surface, meeting: Meeting):
     s, t = on_segments(p, q, a, b)
     far = wp.length(p + s * (q - p) - a - t * (b - a))
     band = BAND * wp.min(wp.length(q - p), wp.length(b - a))
-    return far <= edge_reach(meeting, e) + edge_reach(meeting, f) + band
+    if not (far <= edge_reach(meeting, e) + edge_reach(meeting, f) + band):
+        return False
+    other = bend(surface, meeting, m)
+    # Two sharp edges are found by the first of them.
+    return not (other < -SHARP or (other > SHARP and m < k))
+
+
+@wp.func
+def add_other(start: int, count: int, other: int, rows: Rows):
+    """Put one more behind a start, in order."""
+    row = start + count
+    while row > start and rows.other[row - 1] > other:
+        rows.other[row] = rows.other[row - 1]
+        row -= 1
+    rows.other[row] = other
+
+
+@wp.func
+def near_node(i: int, start: int, of_triangles: wp.uint64, surface: Surface, meeting: Meeting, rows: Rows):
+    """Count the triangles near a node; write them if there is a start."""
+    count = int(0)
+    reach = meeting.reach[i]
+    beyond = wp.vec3(reach, reach, reach)
+    query = wp.bvh_query_aabb(of_triangles, surface.x[i] - beyond, surface.x[i] + beyond)
+    t = int(0)
+    while wp.bvh_query_next(query, t):
+        if node_is_near(i, t, surface, meeting):
+            if start >= 0:
+                add_other(start, count, t, rows)
+            count += 1
+    return count
+
+
+@wp.func
+def near_edge(k: int, start: int, of_edges: wp.uint64, surface: Surface, meeting: Meeting, rows: Rows):
+    """Count the edges near a sharp one; write them if there is a start."""
+    count = int(0)
+    e = meeting.edges[k]
+    a = surface.x[e[0]]
+    b = surface.x[e[1]]
+    reach = edge_reach(meeting, e)
+    beyond = wp.vec3(reach, reach, reach)
+    query = wp.bvh_query_aabb(of_edges, wp.min(a, b) - beyond, wp.max(a, b) + beyond)
+    m = int(0)
+    while wp.bvh_query_next(query, m):
+        if edge_is_near(k, m, surface, meeting):
+            if start >= 0:
+                add_other(start, count, m, rows)
+            count += 1
+    return count
+
+
+@wp.func
+def near_owner(
+    i: int,
+    start: int,
+    of_triangles: wp.uint64,
+    of_edges: wp.uint64,
+    surface: Surface,
+    meeting: Meeting,
+    rows: Rows,
+):
+    nodes = meeting.body.shape[0]
+    count = int(0)
+    if i < nodes:
+        if surface.node[i] >= 0:
+            count = near_node(i, start, of_triangles, surface, meeting, rows)
+    elif is_sharp(surface, meeting, i - nodes):
+        count = near_edge(i - nodes, start, of_edges, surface, meeting, rows)
+    return count
+
+
+@wp.func
+def mark_row(owner: int, other: int, meeting: Meeting, near: Near):
+    """Mark the nodes of a pair."""
+    nodes = meeting.body.shape[0]
+    if owner < nodes:
+        c = meeting.triangles[other]
+        mark(near, owner, PAIRED)
+        for k in range(3):
+            mark(near, c[k], PAIRED)
+    else:
+        e = meeting.edges[owner - nodes]
+        f = meeting.edges[other]
+        for k in range(2):
+            mark(near, e[k], PAIRED)
+            mark(near, f[k], PAIRED)
 
 
 @wp.kernel(enable_backward=False)
 def find_pairs(
     # In
-    writes: int,
+    watch: Watch,
     of_triangles: wp.uint64,
     of_edges: wp.uint64,
     surface: Surface,
     meeting: Meeting,
-    old_starts: wp.array[wp.int32],
-    old_other: wp.array[wp.int32],
-    old_force: wp.array[wp.vec3],
+    old: OldRows,
     # Out
-    counts: wp.array[wp.int32],
     rows: Rows,
+    near: Near,
+    most: wp.array[wp.int32],
 ):
-    """Count the pairs of each node and edge; or write them, each with the force that it had before."""
+    """Find the pairs of each node and edge, each with the force that it had before."""
     i = wp.tid()
-    nodes = meeting.body.shape[0]
-    count = int(0)
-    if i < nodes:
-        if surface.node[i] >= 0:
-            reach = meeting.reach[i]
-            beyond = wp.vec3(reach, reach, reach)
-            query = wp.bvh_query_aabb(of_triangles, surface.x[i] - beyond, surface.x[i] + beyond)
-            t = int(0)
-            while wp.bvh_query_next(query, t):
-                if node_is_near(i, t, surface, meeting):
-                    if writes != 0:
-                        write_pair(i, t, count, old_starts, old_other, old_force, rows)
-                    count += 1
-    else:
-        k = i - nodes
-        e = meeting.edges[k]
-        if is_sharp(surface, meeting, k):
-            a = surface.x[e[0]]
-            b = surface.x[e[1]]
-            reach = edge_reach(meeting, e)
-            beyond = wp.vec3(reach, reach, reach)
-            query = wp.bvh_query_aabb(of_edges, wp.min(a, b) - beyond, wp.max(a, b) + beyond)
-            m = int(0)
-            while wp.bvh_query_next(query, m):
-                if edge_is_near(k, m, surface, meeting):
-                    if writes != 0:
-                        write_pair(i, m, count, old_starts, old_other, old_force, rows)
-                    count += 1
-    if writes == 0:
-        counts[i] = count
-        if i == 0:
-            counts[counts.shape[0] - 1] = 0
-
-
-@wp.func
-def write_pair(
-    owner: int,
-    other: int,
-    number: int,
-    old_starts: wp.array[wp.int32],
-    old_other: wp.array[wp.int32],
-    old_force: wp.array[wp.vec3],
-    rows: Rows,
-):
-    row = rows.starts[owner] + number
-    if row >= rows.owner.shape[0]:
+    if watch.due[0] == 0:
         return
-    force = wp.vec3()
-    for k in range(old_starts[owner], wp.min(old_starts[owner + 1], old_other.shape[0])):
-        if old_other[k] == other:
-            force = old_force[k]
-    rows.owner[row] = owner
-    rows.other[row] = other
-    rows.force[row] = force
+    room = rows.owner.shape[0]
+    count = near_owner(i, -1, of_triangles, of_edges, surface, meeting, rows)
+    start = int(0)
+    rows.counts[i] = 0
+    if count > 0:
+        start = wp.atomic_add(rows.total, 0, count)
+    rows.starts[i] = start
+    if start + count > room:
+        # The run is made again with more room.
+        wp.atomic_max(most, 0, start + count)
+        for row in range(start, room):
+            rows.owner[row] = -1
+        return
+    if count == 0:
+        return
+    near_owner(i, start, of_triangles, of_edges, surface, meeting, rows)
+    rows.counts[i] = count
+    before = old.starts[i]
+    last = before + old.counts[i]
+    for row in range(start, start + count):
+        other = rows.other[row]
+        while before < last and old.other[before] < other:
+            before += 1
+        force = wp.vec3()
+        if before < last and old.other[before] == other:
+            force = old.force[before]
+        rows.owner[row] = i
+        rows.force[row] = force
+        mark_row(i, other, meeting, near)
 
 
 @wp.kernel(enable_backward=False)
-def keep_rows(rows: Rows, old_starts: wp.array[wp.int32], old_other: wp.array[wp.int32], old_force: wp.array[wp.vec3]):
+def keep_rows(watch: Watch, rows: Rows, old: OldRows):
     """Keep the rows that there are beside those that are to come."""
     i = wp.tid()
+    if watch.due[0] == 0:
+        return
     if i < rows.starts.shape[0]:
-        old_starts[i] = rows.starts[i]
-    if i < rows.other.shape[0]:
-        old_other[i] = rows.other[i]
-        old_force[i] = rows.force[i]
+        old.starts[i] = rows.starts[i]
+        old.counts[i] = rows.counts[i]
+    if i < row_count(rows):
+        old.other[i] = rows.other[i]
+        old.force[i] = rows.force[i]
 
 
 @wp.kernel(enable_backward=False)
-def note_most(rows: Rows, most: wp.array[wp.float64]):
-    """How many rows were needed, for the host."""
-    most[0] = wp.max(most[0], wp.float64(rows.starts[rows.starts.shape[0] - 1]))
-
-
-@wp.kernel(enable_backward=False)
-def remember_places(surface: Surface, places: wp.array[wp.vec3]):
-    """Where nodes are when pairs are looked for."""
-    s = wp.tid()
-    places[s] = surface.x[s]
-
-
-@wp.kernel(enable_backward=False)
-def check_reach(surface: Surface, reach: wp.array[wp.float32], places: wp.array[wp.vec3], missed: wp.array[wp.int32]):
-    """Count nodes that have gone farther than pairs were looked for."""
-    s = wp.tid()
-    if surface.node[s] >= 0 and wp.length(surface.x[s] + surface.d[s] - places[s]) > reach[s]:
-        wp.atomic_add(missed, 0, 1)
-
-
-@wp.kernel(enable_backward=False)
-def report_search(missed: wp.array[wp.int32], most: wp.array[wp.float64], report: wp.array[wp.float64]):
-    """Tell the host how many rows were needed, and how often nodes went too far."""
-    report[0] = wp.float64(most[0])
-    report[1] = wp.float64(missed[0])
+def begin_rows(watch: Watch, rows: Rows):
+    """There are none."""
+    if watch.due[0] != 0:
+        rows.total[0] = 0

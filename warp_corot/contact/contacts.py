@@ -16,6 +16,7 @@ from warp_corot.solvers.system import System
 from .obstacles import Obstacles
 from .options import Contact
 from .pairs import Pairs, smallest_size
+from .search import Search
 from .surface import ContactSurface
 from .tool import Obstacle
 
@@ -67,6 +68,7 @@ class Contacts:
         self.obstacles = Obstacles(obstacles, options.friction, system, dt)
         self.surface = ContactSurface(system.bodies)
         self.law = self._law(stable_dt)
+        self.search = Search(self.surface, self.obstacles, self._smallest)
         #: Soft surfaces that may touch one another; None without.
         self.pairs: Pairs | None = None
         if len(system.bodies) > 1 or options.self_contact:
@@ -74,7 +76,7 @@ class Contacts:
                 raise InputError(
                     "a deterministic run on CUDA cannot have soft surfaces touch: forces are added as threads come"
                 )
-            self.pairs = Pairs(self.surface, options.friction, options.self_contact, self._smallest)
+            self.pairs = Pairs(self.surface, self.search, options.friction, options.self_contact)
         self._revision = 0
         self._make_arrays()
 
@@ -97,6 +99,8 @@ class Contacts:
         return {name: array for name, array in arrays.items() if array.size}
 
     def prepare(self) -> None:
+        if self.is_full:
+            self.grow()
         before = self.surface.revision
         if self.surface.follow():
             if self.surface.revision != before:
@@ -105,6 +109,7 @@ class Contacts:
                 self._anchors.zero_()
                 self.touches.force.zero_()
             self._share_arrays()
+            self.search.follow()
             if self.pairs is not None:
                 self.pairs.follow()
         if self.pairs is not None:
@@ -114,13 +119,15 @@ class Contacts:
 
     @property
     def is_full(self) -> bool:
-        return self.pairs is not None and self.pairs.is_full
+        return self.search.has_missed or (self.pairs is not None and self.pairs.is_full)
 
     def grow(self) -> None:
+        self.search.widen()
         if self.pairs is not None:
             self.pairs.grow()
 
     def forget(self) -> None:
+        self.search.forget()
         if self.pairs is not None:
             self.pairs.forget()
 
@@ -153,8 +160,11 @@ class Contacts:
             self.obstacles.launch_motion(offset)
         self._predict(offset, damping)
         if self.pairs is not None:
-            self.pairs.launch_begin(offset)
+            self.search.launch(offset)
+            self.pairs.launch_begin()
         self._solve()
+        if self.pairs is not None:
+            self.search.launch_after()
         for k, body in enumerate(system.bodies):
             inputs = [surface.parts[k].start, surface.arrays, pace, offset, body.state.velocities]
             outputs = [body.state.forces, self._accounts[k], body.state.contact_forces]
@@ -188,7 +198,7 @@ class Contacts:
                 sums.fold_wrenches, obstacles.wrenches.shape, [self._parts], [obstacles.wrenches], device=self.device
             )
         if self.pairs is not None:
-            self.pairs.launch_report()
+            self.search.launch_report()
         inputs = [surface.arrays, surface.triangles, surface.corner_starts, surface.corners]
         self._launch(sums.node_pressures, surface.count, inputs, [self._pressures])
         for k, part in enumerate(surface.parts):

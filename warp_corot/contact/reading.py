@@ -70,7 +70,7 @@ def _of_pairs(contacts: Contacts, pairs: Pairs) -> list[ContactPoint]:
     """Each pair once: the force on the node, or on the first edge."""
     rows, x = pairs.rows, contacts.surface.arrays.x.numpy().astype(float)
     nodes, bodies = contacts.surface.count, contacts.system.bodies
-    count = min(int(rows.starts.numpy()[-1]), len(rows.owner))
+    count = min(int(rows.total.numpy()[0]), len(rows.owner))
     acts, owner = rows.acts.numpy()[:count], rows.owner.numpy()[:count]
     force, normal = (array.numpy()[:count].astype(float) for array in (rows.force, rows.normal))
     places, shares, gap = rows.places.numpy(), rows.shares.numpy().astype(float), rows.gap.numpy()

@@ -1,0 +1,128 @@
+"""What is near is found before it is reached, whenever it was last looked for."""
+
+import numpy as np
+import pytest
+
+import warp_corot as wc
+
+SOFT = wc.Isotropic(young=2e4, poisson=0.4, density=1000.0)
+CALM = wc.SymplecticEuler(viscosity=1e-3)
+
+
+def block(device, z, cells=(2, 2, 1), at=0.0, **options):
+    mesh = wc.TetForest.box(cells=cells, cell_size=0.02, level=options.pop("level", 2), origin=(at, at, z))
+    return wc.SoftBody(mesh, SOFT, device=device, **options)
+
+
+def closest(p, a, b, c):
+    """Distances [n] of points from triangles: to their insides or to their edges."""
+    normal = np.cross(b - a, c - a)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    height = ((p - a) * normal).sum(axis=1)
+    foot = p - height[:, None] * normal
+    inside = np.ones(len(p), bool)
+    least = np.full(len(p), np.inf)
+    for u, v in ((a, b), (b, c), (c, a)):
+        inside &= (np.cross(v - u, foot - u) * normal).sum(axis=1) >= 0.0
+        share = np.clip(((p - u) * (v - u)).sum(axis=1) / ((v - u) ** 2).sum(axis=1), 0.0, 1.0)
+        least = np.minimum(least, np.linalg.norm(p - u - share[:, None] * (v - u), axis=1))
+    return np.where(inside, np.abs(height), least)
+
+
+def within_reach(contacts, itself):
+    """All nodes and triangles that could meet in the last step, seen one by one: [n, 2]."""
+    surface = contacts.surface
+    arrays, corners = surface.arrays, surface.triangles.numpy()
+    node, world, body = arrays.node.numpy(), arrays.world.numpy(), surface.body_of_places()
+    x, step = arrays.x.numpy().astype(float), np.linalg.norm(arrays.d.numpy().astype(float), axis=1)
+    s, t = (each.ravel() for each in np.meshgrid(np.flatnonzero(node >= 0), np.flatnonzero(corners[:, 0] >= 0)))
+    c = corners[t]
+    may = (c != s[:, None]).all(axis=1) & (world[s] == world[c[:, 0]])
+    may &= itself | (body[s] != body[c[:, 0]])
+    s, t, c = s[may], t[may], c[may]
+    far = closest(x[s], x[c[:, 0]], x[c[:, 1]], x[c[:, 2]])
+    near = far <= step[s] + step[c].max(axis=1)
+    return np.column_stack([s, t])[near]
+
+
+def candidates(contacts):
+    rows = contacts.pairs.rows
+    count = int(rows.total.numpy()[0])
+    owner, other = rows.owner.numpy()[:count], rows.other.numpy()[:count]
+    return set(zip(owner.tolist(), other.tolist(), strict=True))
+
+
+def watched(sim, steps, itself):
+    """Make steps one at a time and look at each; how many pairs were within reach."""
+    seen = 0
+    for _ in range(steps):
+        sim.advance_steps(1)
+        pairs = within_reach(sim.contact, itself)
+        seen += len(pairs)
+        assert set(map(tuple, pairs.tolist())) <= candidates(sim.contact)
+    assert sim.contact.search.count < steps
+    return seen
+
+
+@pytest.mark.parametrize("itself", [False, True])
+def test_all_that_may_meet_is_known(device, rng, itself):
+    """Against every pair, while two blocks of two worlds are thrown at one another, turn and bounce."""
+    low, high = block(device, 0.0, worlds=2), block(device, 0.0202, cells=(1, 1, 1), at=0.008, worlds=2)
+    sim = wc.Simulation([low, high], contact=wc.Contact(self_contact=itself), gravity=(0.0, 0.0, 0.0), integrator=CALM)
+    for body, toward in ((low, 0.5), (high, -1.0)):
+        x = body.positions.numpy()
+        spin = rng.uniform(-20.0, 20.0, 3)
+        centre = x.mean(axis=0)
+        body.velocities = np.cross(spin, x - centre) + np.array([0.0, 0.0, toward]) + rng.uniform(-0.05, 0.05, x.shape)
+    assert watched(sim, 120, itself) > 50
+
+
+def test_all_that_may_meet_is_known_of_bodies_that_adapt(device):
+    low, high = block(device, 0.0, level=3), block(device, 0.0202, level=3)
+    sim = wc.Simulation(
+        [low, high],
+        contact=wc.Contact(),
+        gravity=(0.0, 0.0, 0.0),
+        remesh=wc.OnlineRemesh(every=16, max_level=5, refine_above=1.01, simplify_below=1.002),
+    )
+    before = len(low.mesh.tets)
+    high.velocities = np.tile((0.0, 0.0, -1.0), (high.node_count, 1))
+    assert watched(sim, 60, False) > 50
+    assert len(low.mesh.tets) != before
+
+
+def thrown(device, least, **sizes):
+    """Where two blocks are that were thrown at one another, and the search for pairs."""
+    low, high = block(device, 0.0), block(device, 0.0205, cells=(1, 1, 1), at=0.008)
+    integrator = wc.SymplecticEuler(dt=2e-4, viscosity=1e-3)
+    sim = wc.Simulation([low, high], contact=wc.Contact(), gravity=(0.0, 0.0, 0.0), integrator=integrator)
+    low.fix("z == zmin")
+    high.velocities = np.tile((0.2, 0.1, -0.5), (high.node_count, 1))
+    search = sim.contact.search
+    search.watch.least.fill_(least)
+    search.watch.size = sizes.get("size", search.watch.size)
+    search.farthest = sizes.get("most", search.farthest)
+    sim.advance(0.02)
+    return high.positions.numpy(), search
+
+
+def test_it_does_not_matter_when_it_was_looked():
+    """Bit by bit on the CPU, where pairs are added up in one order: whether it is looked in many steps or in few."""
+    found = [thrown("cpu", least) for least in (2e-4, 8e-3)]
+    counts = [search.count for _, search in found]
+    assert counts[0] > counts[1]
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+
+
+def test_what_goes_too_far_is_found_out():
+    """Where too little is reserved the run is made again with more, and comes out as if there had been enough."""
+    enough, _ = thrown("cpu", 2e-4)
+    again, search = thrown("cpu", 1e-6, size=1e-9)
+    assert float(search.watch.least.numpy()[0]) > 1e-5
+    assert not search.has_missed
+    np.testing.assert_array_equal(again, enough)
+
+
+def test_nobody_looks_farther_than_steps_can_go(device):
+    with pytest.raises(wc.UnstableError, match="in one step"):
+        thrown(device, 1e-6, size=1e-9, most=1e-7)
