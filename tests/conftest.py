@@ -9,6 +9,8 @@ import warp as wp
 MOST_WORKERS = 4
 
 wp.config.quiet = True
+# As the command line has it. Newton's kernels have adjoints otherwise, which take most of the time to compile.
+wp.config.enable_backward = False
 wp.init()
 
 

@@ -157,7 +157,7 @@ class TestTape:
         assert x.grad.numpy()[0] == 6.0
 
 
-@wp.kernel
+@wp.kernel(enable_backward=True)
 def _squared(x: wp.array(dtype=float), y: wp.array(dtype=float)):
     y[wp.tid()] = x[wp.tid()] * x[wp.tid()]
 
