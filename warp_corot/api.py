@@ -15,6 +15,7 @@ from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.simulation.energy import Energy, WorldEnergies
 from warp_corot.simulation.progress import show_progress
 from warp_corot.simulation.simulation import Simulation
+from warp_corot.simulation.static import StaticReport, solve_static
 from warp_corot.viewing.view import view
 
 from . import haptics, remesh
@@ -51,6 +52,7 @@ __all__ = [
     "StVenantKirchhoff",
     "StabilityWarning",
     "StaleViewError",
+    "StaticReport",
     "SurfaceMesh",
     "SymplecticEuler",
     "TetForest",
@@ -65,5 +67,6 @@ __all__ = [
     "record",
     "remesh",
     "show_progress",
+    "solve_static",
     "view",
 ]

@@ -51,7 +51,7 @@ def take_first(
     status: wp.array[wp.int32],
     running: wp.array[wp.int32],
 ):
-    """Scalars before the first iteration; worlds without a right side are done."""
+    """Scalars before the first iteration; worlds without a right side, or with a tolerance of one, are done."""
     world, lane = wp.tid()
     rr = add_up(parts, world, lane, lanes, SQUARE)
     rz = add_up(parts, world, lane, lanes, PRODUCT)
@@ -66,7 +66,9 @@ def take_first(
         status[world] = CONVERGED
         if rr > wp.float64(0.0) or not is_number(rr):
             status[world] = BROKEN
-            if is_number(rr) and is_number(rz) and rz > wp.float64(0.0):
+            if is_number(rr) and tolerance[world] >= wp.float64(1.0):
+                status[world] = CONVERGED
+            elif is_number(rr) and is_number(rz) and rz > wp.float64(0.0):
                 status[world] = RUNNING
                 wp.atomic_add(running, 0, 1)
 

@@ -1,0 +1,387 @@
+"""Newton's method for the least of Pi(u) = W(u) - (loads and weight) . u + 1/2 a (d - h) . M (d - h), world by world.
+
+W is the strain energy, u = base + d with the increment d, and the last term is the inertia of a time step; a static
+answer has none of it. Increments keep the digits of short steps. The residual is r = -dPi/du at free nodes, and zero at
+others. Scalars of each world decide on the device, so that an iteration can be recorded.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.stepping.balance import most_of_lanes, sum_of_lanes
+from warp_corot.kernels.stepping.integrate import by_vectors, vector_at
+
+from .conjugate_gradients import NEGATIVE, is_number
+from .sums import add_up, dot64
+
+wp.set_module_options({"enable_backward": False})
+
+#: Columns of parts: of sums |r|^2, |external and reaction forces|^2, r . step, the same with all but elastic forces,
+#: step . M step and strain energies, and of largest values |step|^2 and |u|^2.
+SQUARE, REFERENCE, SLOPE, OUTER, INERTIA, ENERGY, STEP, REACH = (wp.constant(k) for k in range(8))
+COLUMNS = 8
+#: Places in the scalars of a world: the norm of the residual now and before, of what it is compared with, the share of
+#: the step that is taken, the strain energy at its beginning, r . step, the relative correction, and the tolerance of
+#: the linear solve.
+RESIDUAL, BEFORE, COMPARED, SHARE, ENERGY_NOW, SLOPE_NOW, CORRECTION, SOLVED_TO = (wp.constant(k) for k in range(8))
+SCALARS = 8
+#: How a world stands.
+RUNNING, CONVERGED, STUCK, LIMIT, BROKEN = (wp.constant(k) for k in range(5))
+
+#: Least decrease, as a share of what the slope promises.
+ARMIJO = wp.constant(wp.float64(1e-4))
+#: What float32 leaves uncertain of a strain energy, as a share of it.
+ROUNDING = wp.constant(wp.float64(1e-6))
+#: The shortest share of a step that is tried.
+SHORTEST = wp.constant(wp.float64(1e-7))
+#: Tolerances of the linear solve: the largest, and the smallest that is asked for.
+LOOSEST, TIGHTEST = wp.constant(wp.float64(0.1)), wp.constant(wp.float64(1e-5))
+#: The tolerance to which a step is solved for whose size may end the iteration.
+TRUSTED = wp.constant(wp.float64(1e-3))
+
+
+@wp.kernel(enable_backward=False)
+def find_residual(
+    # In
+    gravity: wp.vec3,
+    mass: wp.array[wp.float32],
+    inverse_mass: wp.array[wp.float32],
+    has_load: int,
+    load: wp.array[Any],
+    external_share: wp.array[wp.float32],
+    inertia: wp.array[wp.float32],
+    pull: wp.array[wp.vec4],
+    increment: wp.array[wp.vec4],
+    count: int,
+    threads: int,
+    lanes: int,
+    # In and out
+    f: wp.array[wp.vec4],
+    others: wp.array[wp.vec4],
+    # Out
+    r: wp.array[wp.vec4],
+    outer: wp.array[wp.vec4],
+    parts: wp.array3d[wp.float64],
+):
+    """r = f + outer at free nodes, outer = others + external + m (pull - a d).
+
+    Elastic forces f and other ones are zeroed, for the next to add to.
+    """
+    world, thread = wp.tid()
+    square = wp.float64(0.0)
+    reference = wp.float64(0.0)
+    k = thread
+    while k < count:
+        i = world * count + k
+        internal = load_node(f, i)
+        other = load_node(others, i)
+        external = mass[i] * gravity
+        if has_load != 0:
+            external += vector_at(load, i)
+        external = external_share[0] * external
+        rest = wp.vec3()
+        push = wp.vec3()
+        if inverse_mass[i] > 0.0:
+            external += other + mass[i] * load_node(pull, i)
+            push = external - (inertia[0] * mass[i]) * load_node(increment, i)
+            rest = internal + push
+            reference += dot64(external, external)
+        else:
+            reference += dot64(internal, internal)
+        square += dot64(rest, rest)
+        store_node(r, i, rest)
+        store_node(outer, i, push)
+        store_node(f, i, wp.vec3())
+        store_node(others, i, wp.vec3())
+        k += threads
+    square = sum_of_lanes(square)
+    reference = sum_of_lanes(reference)
+    if thread % lanes == 0:
+        parts[world, thread / lanes, SQUARE] = square
+        parts[world, thread / lanes, REFERENCE] = reference
+
+
+@wp.kernel(enable_backward=False)
+def measure_step(
+    # In
+    mass: wp.array[wp.float32],
+    r: wp.array[wp.vec4],
+    outer: wp.array[wp.vec4],
+    step: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    count: int,
+    threads: int,
+    lanes: int,
+    # Out
+    parts: wp.array3d[wp.float64],
+):
+    """Parts of r . step, outer . step, step . M step, and the largest |step|^2 and |u|^2."""
+    world, thread = wp.tid()
+    slope = wp.float64(0.0)
+    work = wp.float64(0.0)
+    inertia = wp.float64(0.0)
+    longest = wp.float64(0.0)
+    reach = wp.float64(0.0)
+    k = thread
+    while k < count:
+        i = world * count + k
+        s = load_node(step, i)
+        x = load_node(u, i)
+        square = dot64(s, s)
+        slope += dot64(load_node(r, i), s)
+        work += dot64(load_node(outer, i), s)
+        inertia += wp.float64(mass[i]) * square
+        longest = wp.max(longest, square)
+        reach = wp.max(reach, dot64(x, x))
+        k += threads
+    slope = sum_of_lanes(slope)
+    work = sum_of_lanes(work)
+    inertia = sum_of_lanes(inertia)
+    longest = most_of_lanes(longest)
+    reach = most_of_lanes(reach)
+    if thread % lanes == 0:
+        part = thread / lanes
+        parts[world, part, SLOPE] = slope
+        parts[world, part, OUTER] = work
+        parts[world, part, INERTIA] = inertia
+        parts[world, part, STEP] = longest
+        parts[world, part, REACH] = reach
+
+
+@wp.kernel(enable_backward=False)
+def sum_energies(energies: wp.array[wp.float64], count: int, threads: int, lanes: int, parts: wp.array3d[wp.float64]):
+    """Parts of strain energies, ``count`` of each world."""
+    world, thread = wp.tid()
+    total = wp.float64(0.0)
+    k = thread
+    while k < count:
+        total += energies[world * count + k]
+        k += threads
+    total = sum_of_lanes(total)
+    if thread % lanes == 0:
+        parts[world, thread / lanes, ENERGY] = total
+
+
+@wp.func
+def largest(parts: wp.array3d[wp.float64], world: int, lane: int, lanes: int, column: int):
+    """The largest of a world's parts, in the first lane."""
+    most = wp.float64(0.0)
+    k = lane
+    while k < parts.shape[1]:
+        most = wp.max(most, parts[world, k, column])
+        k += lanes
+    return most_of_lanes(most)
+
+
+@wp.func
+def stop(status: wp.array[wp.int32], running: wp.array[wp.int32], world: int, how: int):
+    status[world] = how
+    wp.atomic_sub(running, 0, 1)
+
+
+@wp.kernel(enable_backward=False)
+def begin_worlds(
+    scalars: wp.array2d[wp.float64],
+    iterations: wp.array[wp.int32],
+    solved: wp.array[wp.int32],
+    status: wp.array[wp.int32],
+    running: wp.array[wp.int32],
+):
+    """All worlds run."""
+    world = wp.tid()
+    for k in range(SCALARS):
+        scalars[world, k] = wp.float64(0.0)
+    iterations[world] = 0
+    solved[world] = 0
+    status[world] = RUNNING
+    wp.atomic_add(running, 0, 1)
+
+
+@wp.kernel(enable_backward=False)
+def judge_residual(
+    # In
+    parts: wp.array3d[wp.float64],
+    lanes: int,
+    tolerance: wp.float64,
+    most: int,
+    # In and out
+    scalars: wp.array2d[wp.float64],
+    iterations: wp.array[wp.int32],
+    status: wp.array[wp.int32],
+    running: wp.array[wp.int32],
+    # Out
+    solve_tolerance: wp.array[wp.float64],
+):
+    """Stop where the residual is small; else say how well the step must be solved for (Eisenstat and Walker 1996).
+
+    It is small against the norm of external and reaction forces. Worlds that have stopped need no step: a tolerance of
+    one.
+    """
+    world, lane = wp.tid()
+    square = add_up(parts, world, lane, lanes, SQUARE)
+    reference = add_up(parts, world, lane, lanes, REFERENCE)
+    energy = add_up(parts, world, lane, lanes, ENERGY)
+    if lane == 0:
+        solve_tolerance[world] = wp.float64(1.0)
+        if status[world] == RUNNING:
+            before = scalars[world, RESIDUAL]
+            now = wp.sqrt(square)
+            compared = wp.sqrt(reference)
+            scalars[world, BEFORE] = before
+            scalars[world, RESIDUAL] = now
+            scalars[world, COMPARED] = compared
+            scalars[world, ENERGY_NOW] = energy
+            if not (is_number(square) and is_number(energy)):
+                stop(status, running, world, BROKEN)
+            elif now <= tolerance * compared:
+                stop(status, running, world, CONVERGED)
+            elif iterations[world] >= most:
+                stop(status, running, world, LIMIT)
+            else:
+                wanted = LOOSEST
+                if before > wp.float64(0.0):
+                    gained = now / before
+                    wanted = wp.min(wp.float64(0.9) * gained * gained, LOOSEST)
+                # No better than what ends the iteration.
+                useful = wp.float64(0.3) * tolerance * compared / now
+                wanted = wp.max(wp.max(wanted, wp.min(useful, LOOSEST)), TIGHTEST)
+                if iterations[world] > 0 and scalars[world, CORRECTION] <= tolerance:
+                    wanted = wp.min(wanted, TRUSTED)
+                scalars[world, SOLVED_TO] = wanted
+                solve_tolerance[world] = wanted
+
+
+@wp.kernel(enable_backward=False)
+def begin_search(
+    # In
+    parts: wp.array3d[wp.float64],
+    lanes: int,
+    inner: wp.array[wp.int32],
+    # In and out
+    scalars: wp.array2d[wp.float64],
+    iterations: wp.array[wp.int32],
+    solved: wp.array[wp.int32],
+    status: wp.array[wp.int32],
+    running: wp.array[wp.int32],
+    # Out
+    searching: wp.array[wp.int32],
+):
+    """Try the whole step in every world that runs; one that does not go down is none."""
+    world, lane = wp.tid()
+    slope = add_up(parts, world, lane, lanes, SLOPE)
+    if lane == 0:
+        scalars[world, SHARE] = wp.float64(0.0)
+        scalars[world, SLOPE_NOW] = slope
+        if status[world] == RUNNING:
+            iterations[world] = iterations[world] + 1
+            solved[world] = solved[world] + inner[world]
+            if is_number(slope) and slope > wp.float64(0.0):
+                scalars[world, SHARE] = wp.float64(1.0)
+                wp.atomic_add(searching, 0, 1)
+            else:
+                stop(status, running, world, STUCK)
+
+
+@wp.kernel(enable_backward=False)
+def try_step(
+    # In
+    scalars: wp.array2d[wp.float64],
+    base: wp.array[wp.vec4],
+    step: wp.array[wp.vec4],
+    count: int,
+    commits: int,
+    # In and out
+    increment: wp.array[wp.vec4],
+    # Out
+    u: wp.array[wp.vec4],
+):
+    """u = base + d + share step; to commit is to let d be that increment."""
+    i = wp.tid()
+    share = float(scalars[i / count, SHARE])
+    d = load_node(increment, i)
+    if share > 0.0:
+        d += share * load_node(step, i)
+    if commits != 0:
+        store_node(increment, i, d)
+    store_node(u, i, load_node(base, i) + d)
+
+
+@wp.kernel(enable_backward=False)
+def judge_trial(
+    # In
+    parts: wp.array3d[wp.float64],
+    lanes: int,
+    inertia: wp.array[wp.float32],
+    status: wp.array[wp.int32],
+    # In and out
+    scalars: wp.array2d[wp.float64],
+    accepted: wp.array[wp.int32],
+    searching: wp.array[wp.int32],
+):
+    """Take the step where Pi is lower by a share of what the slope promises; else try a shorter one.
+
+    Pi's change is that of W, and the rest is a polynomial of the share. Shares follow the parabola through Pi's values
+    and its slope.
+    """
+    world, lane = wp.tid()
+    energy = add_up(parts, world, lane, lanes, ENERGY)
+    square = add_up(parts, world, lane, lanes, INERTIA)
+    work = add_up(parts, world, lane, lanes, OUTER)
+    if lane == 0 and status[world] == RUNNING and accepted[world] == 0:
+        share = scalars[world, SHARE]
+        slope = scalars[world, SLOPE_NOW]
+        before = scalars[world, ENERGY_NOW]
+        change = energy - before - share * work
+        change += wp.float64(0.5) * wp.float64(inertia[0]) * share * share * square
+        noise = ROUNDING * (wp.abs(before) + wp.abs(energy))
+        if is_number(energy) and change <= noise - ARMIJO * share * slope:
+            accepted[world] = 1
+            wp.atomic_sub(searching, 0, 1)
+        elif share <= SHORTEST:
+            scalars[world, SHARE] = wp.float64(0.0)
+            accepted[world] = 1
+            wp.atomic_sub(searching, 0, 1)
+        else:
+            shorter = wp.float64(0.1)
+            if is_number(energy):
+                shorter = wp.clamp(
+                    wp.float64(0.5) * share * slope / (change + share * slope), wp.float64(0.1), wp.float64(0.5)
+                )
+            scalars[world, SHARE] = shorter * share
+
+
+@wp.kernel(enable_backward=False)
+def judge_step(
+    # In
+    parts: wp.array3d[wp.float64],
+    lanes: int,
+    tolerance: wp.float64,
+    inner_status: wp.array[wp.int32],
+    # In and out
+    scalars: wp.array2d[wp.float64],
+    status: wp.array[wp.int32],
+    running: wp.array[wp.int32],
+):
+    """Stop where a whole step was small against displacements or in energy, or none could be taken.
+
+    A step that was solved for roughly may be small because it lacks what is smooth: the next one is solved for well.
+    """
+    world, lane = wp.tid()
+    longest = largest(parts, world, lane, lanes, STEP)
+    reach = largest(parts, world, lane, lanes, REACH)
+    if lane == 0 and status[world] == RUNNING:
+        correction = wp.sqrt(longest) / wp.max(wp.sqrt(reach), wp.float64(1e-30))
+        scalars[world, CORRECTION] = correction
+        if scalars[world, SHARE] == wp.float64(0.0):
+            stop(status, running, world, STUCK)
+        elif scalars[world, SHARE] < wp.float64(1.0) or inner_status[world] == NEGATIVE:
+            scalars[world, CORRECTION] = wp.max(correction, wp.float64(1.0))
+        elif scalars[world, SOLVED_TO] <= TRUSTED:
+            promised = scalars[world, SLOPE_NOW]
+            if correction <= tolerance or promised <= tolerance * tolerance * scalars[world, ENERGY_NOW]:
+                stop(status, running, world, CONVERGED)
+
+
+FIND_RESIDUAL = by_vectors(find_residual, "load")

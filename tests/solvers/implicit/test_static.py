@@ -1,0 +1,187 @@
+"""Static answers against Newton's method on the float64 oracle, scikit-fem, and states that are known."""
+
+import numpy as np
+import oracle
+import pytest
+from cases import CUBE, MATERIAL, MODELS, jittered, oracle_mesh
+
+import warp_corot as wc
+
+GRAVITY = (0.0, -9.8, 0.0)
+LAWS = ("linear", "corotated", "stvk", "neo_hookean")
+
+
+def beam(level, *, device="cpu", worlds=1, **material):
+    """The paper's beam, held at one end."""
+    mesh = wc.TetForest.box((1, 1, 3), CUBE, level)
+    body = wc.SoftBody(mesh, wc.Isotropic(**(MATERIAL | material)), worlds=worlds, device=device)
+    body.fix(mesh.points[:, 2] < 1e-9)
+    return body
+
+
+def displaced(body):
+    return body.displacements.numpy().astype(float)
+
+
+def expected(body, model, loads, fixed, young=MATERIAL["young"], poisson=MATERIAL["poisson"], **options):
+    mesh = oracle_mesh(body.mesh)
+    return oracle.equilibrium(model, mesh, *oracle.lame(young, poisson), fixed, loads, **options) - mesh.points
+
+
+def weight(body):
+    return oracle_mesh(body.mesh).masses(MATERIAL["density"])[:, None] * np.array(GRAVITY)
+
+
+@pytest.mark.parametrize("model", LAWS)
+@pytest.mark.parametrize("level", [3, pytest.param(6, marks=pytest.mark.slow)])
+def test_tip_of_a_hanging_beam(model, level, device):
+    """Within 1e-5 of the float64 solution; the wall carries the weight."""
+    body = beam(level, device=device)
+    report = wc.solve_static(body, model=MODELS[model](), gravity=GRAVITY)
+    fixed = body.mesh.points[:, 2] < 1e-9
+    right = expected(body, model, weight(body), fixed)
+    error = np.abs(displaced(body) - right).max() / np.abs(right).max()
+    print(
+        f"{model}, level {level}: {report.iterations} iterations, {report.linear_iterations} linear, off by {error:.1e}"
+    )
+    assert report.converged
+    assert report.load_share == 1.0
+    assert error < 1e-5
+    assert np.abs(right).max() > 0.05
+    reactions = body.reactions.numpy().astype(float)
+    assert reactions.sum(0) == pytest.approx(-weight(body).sum(0), abs=2e-4 * abs(weight(body).sum()))
+    assert not reactions[~fixed].any()
+    assert not body.velocities.numpy().any()
+
+
+@pytest.mark.parametrize("model", ["edge_stvk", "mass_spring"])
+def test_other_models_come_to_rest(model, device):
+    """Their elastic forces balance the weight at every free node, to rounding."""
+    body = beam(3, device=device)
+    report = wc.solve_static(body, model=MODELS[model](), gravity=GRAVITY)
+    field = MODELS[model]().bind(body)
+    free = body.mesh.points[:, 2] > 1e-9
+    forces = field.elastic_forces(body.state.displacements).numpy()[:, :3] + weight(body)
+    assert report.converged
+    assert np.abs(forces[free]).max() < 1e-3 * np.linalg.norm(weight(body), axis=1).max()
+
+
+@pytest.mark.parametrize("make", [lambda: wc.TetForest.box((1, 1, 1), CUBE, 4), jittered])
+@pytest.mark.parametrize("model", LAWS)
+def test_patch(model, make, device):
+    """With an affine motion of the surface the inside moves by the same, whatever the mesh."""
+    mesh = make()
+    body = wc.SoftBody(mesh, wc.Isotropic(**MATERIAL), device=device)
+    surface = np.unique(body.surface_triangles)
+    gradient = np.array([[0.08, 0.05, 0.0], [-0.02, -0.05, 0.03], [0.0, 0.04, 0.06]])
+    affine = mesh.points @ gradient.T
+    body.fix(surface)
+    start = np.zeros_like(affine)
+    start[surface] = affine[surface]
+    body.displacements = start
+    report = wc.solve_static(body, model=MODELS[model](), gravity=(0, 0, 0))
+    assert report.converged
+    assert len(surface) < len(mesh.points)
+    assert np.abs(displaced(body) - affine).max() < 2e-6 * np.abs(affine).max()
+
+
+def test_worlds_are_solved_side_by_side(device):
+    """Each with its own loads, as if alone; one without any does not move."""
+    body, alone = beam(3, device=device, worlds=3), beam(3, device=device)
+    tip = np.argmax(body.mesh.points.sum(1))
+    forces = np.zeros((3, len(body.mesh.points), 3))
+    forces[1, tip], forces[2, tip] = (0.002, 0.0, 0.0), (0.0, 0.0, -0.01)
+    body.load(np.arange(len(body.mesh.points)), forces)
+    report = wc.solve_static(body, gravity=(0, 0, 0))
+    assert report.world_converged.tolist() == [True] * 3
+    found = displaced(body).reshape(3, -1, 3)
+    assert not found[0].any()
+    for world in (1, 2):
+        alone.displacements = np.zeros_like(alone.mesh.points)
+        alone.load([tip], forces[world, tip])
+        assert wc.solve_static(alone, gravity=(0, 0, 0)).converged
+        assert np.abs(found[world] - displaced(alone)).max() < 1e-5 * np.abs(found[world]).max()
+
+
+@pytest.mark.parametrize("young", [1.0, 1e9])
+def test_soft_and_hard_tissue(young, device):
+    """The beam of 1 Pa hangs twenty times as long as it is; that of 1 GPa sinks by 33 nm."""
+    body = beam(3, device=device, young=young, poisson=0.4)
+    report = wc.solve_static(body, model=wc.NeoHookean(), gravity=GRAVITY)
+    sag = -displaced(body)[:, 1].max(), -displaced(body)[:, 1].min()
+    print(f"{young:g} Pa: {sag}, {report}")
+    assert report.converged
+    if young > 1.0:
+        fixed = body.mesh.points[:, 2] < 1e-9
+        right = expected(body, "linear", weight(body), fixed, young=1e3, poisson=0.4, increments=1)
+        assert displaced(body) == pytest.approx(right * 1e3 / young, abs=1e-4 * sag[1])
+
+
+@pytest.mark.parametrize("start", ["flat", "turned over", "far away"])
+def test_any_start_leads_to_rest(start, device):
+    """From a beam that is crushed into a plane, turned inside out or blown up: the state that rest leads to."""
+    body, usual = beam(3, device=device), beam(3, device=device)
+    assert wc.solve_static(usual, gravity=GRAVITY).converged
+    u = body.mesh.points * np.array({"flat": [0, -1, 0], "turned over": [0, -2, 0], "far away": [0, 100, 0]}[start])
+    u[body.mesh.points[:, 2] < 1e-9] = 0.0
+    body.displacements = u
+    report = wc.solve_static(body, gravity=GRAVITY)
+    assert np.isfinite(displaced(body)).all()
+    assert report.converged, report.message
+    assert np.abs(displaced(body) - displaced(usual)).max() < 1e-5 * np.abs(displaced(usual)).max()
+
+
+def test_a_body_that_nothing_holds(device):
+    """Under gravity it has no state of rest, and the report says so; under forces in balance it has one."""
+    mesh = wc.TetForest.box((1, 1, 1), CUBE, 3)
+    body = wc.SoftBody(mesh, wc.Isotropic(**MATERIAL), device=device)
+    report = wc.solve_static(body, gravity=GRAVITY)
+    assert not report.converged
+    assert "no node is held" in report.message
+    assert not displaced(body).any()
+    ends = [np.flatnonzero(np.isclose(mesh.points[:, 2], z)) for z in (0.0, CUBE)]
+    for nodes, pull in zip(ends, (-1.0, 1.0), strict=True):
+        body.load(nodes, [0.0, 0.0, pull * 0.1 / len(nodes)])
+    report = wc.solve_static(body, model=wc.Linear(), gravity=(0, 0, 0))
+    assert report.converged, report.message
+    longer = displaced(body)[ends[1], 2].mean() - displaced(body)[ends[0], 2].mean()
+    assert longer > 0.0
+
+
+def test_what_has_no_answer_keeps_the_last_state_at_rest(device):
+    """St. Venant and Kirchhoff's law gives way under a load that presses it flat; the report says how far it went."""
+    body = beam(3, device=device)
+    tip = body.mesh.points[:, 2] > 3 * CUBE - 1e-9
+    body.load(np.flatnonzero(tip), [0.0, 0.0, -1e4])
+    report = wc.solve_static(body, gravity=GRAVITY, model=wc.StVenantKirchhoff(), iterations=20)
+    print(report.message)
+    assert np.isfinite(displaced(body)).all()
+    assert np.isfinite(report.energy)
+    assert report.converged == (report.load_share == 1.0)
+    if not report.converged:
+        assert "not converged" in report.message
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"tolerance": 0.0}, "tolerance is 0.0"),
+        ({"iterations": 0}, "iterations"),
+        ({"load_steps": 1.5}, "load_steps"),
+        ({"preconditioner": "none"}, "preconditioner is 'none'"),
+        ({"model": 3}, "model"),
+        ({"gravity": (0, 1)}, "gravity"),
+    ],
+)
+def test_options_that_are_none(options, says):
+    with pytest.raises(wc.InputError, match=says):
+        wc.solve_static(beam(3), **options)
+
+
+def test_no_body_and_no_free_node():
+    with pytest.raises(wc.InputError, match="body is 3"):
+        wc.solve_static(3)
+    body = beam(3)
+    body.fix(np.arange(body.node_count))
+    with pytest.raises(wc.InputError, match="at least one must be free"):
+        wc.solve_static(body)

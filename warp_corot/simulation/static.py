@@ -1,0 +1,199 @@
+"""Static answers: where a body comes to rest under its loads."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.elasticity import Corotated, ForceField, Model
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_count, checked_number, refuse_tape, shown
+from warp_corot.solvers.implicit.preconditioners import check_preconditioner
+from warp_corot.solvers.implicit.static import StaticSolver, status_words
+
+from .parts import checked_gravity, checked_models
+
+#: Loads on a body that nothing holds are in balance if their sum is less than this share of the sum of their sizes.
+BALANCED = 1e-5
+
+
+@dataclass(frozen=True)
+class StaticReport:
+    """What ``solve_static`` found.
+
+    Attributes:
+        converged: Whether every world is at rest.
+        message: What happened, in one line.
+        iterations: Newton's iterations.
+        linear_iterations: Iterations of conjugate gradients in all of these together.
+        residual: The norm of the forces that are out of balance over that of external and reaction forces: of the last
+            iteration of the world with the largest. Rounding of float32 leaves some 1e-5 of it on fine meshes.
+        correction: The largest displacement of the last iteration over the largest displacement.
+        energy: Elastic energy minus the work of loads and gravity from the rest shape, of all worlds [J].
+        time: Wall time [s].
+        load_share: Share of loads and gravity that the state carries; less than 1 if the solve did not converge.
+        world_converged: Whether each world is at rest, bool [worlds].
+    """
+
+    converged: bool
+    message: str
+    iterations: int
+    linear_iterations: int
+    residual: float
+    correction: float
+    energy: float
+    time: float
+    load_share: float
+    world_converged: npt.NDArray[np.bool_]
+
+
+def solve_static(
+    body: SoftBody,
+    *,
+    model: Model | None = None,
+    gravity: npt.ArrayLike | None = None,
+    tolerance: float = 1e-6,
+    iterations: int = 100,
+    load_steps: int = 1,
+    preconditioner: str | None = None,
+    deterministic: bool = False,
+) -> StaticReport:
+    """Move a body to where it is at rest under gravity and its loads, by Newton's method.
+
+    The search begins at the body's displacements, and held nodes stay where these put them: set ``body.displacements``
+    to prescribe others. Each iteration solves for a step by preconditioned conjugate gradients with the exact
+    derivative of the forces, and a line search on the energy shortens the step where that is needed. Where the method
+    does not converge, loads and gravity are added in smaller and smaller parts. The state that is left is the last one
+    at rest, with the share of the load that it carries in the report; it is the beginning where there is none. Then
+    velocities are zero.
+
+    Args:
+        body: The body.
+        model: Elastic model; None for ``Corotated()``.
+        gravity: [m/s^2]; None for 9.81 down the up axis of the mesh.
+        tolerance: A world is at rest where its residual is below this, or the last whole step moves no node by more
+            than this share of the largest displacement.
+        iterations: Newton's iterations for each part of the load at most.
+        load_steps: Equal parts in which loads and gravity are added; more than one leads along the path of a load that
+            grows where there are several states of rest.
+        preconditioner: "diagonal" or None, which chooses.
+        deterministic: Whether forces must come out the same bit by bit every time also on CUDA.
+
+    Raises:
+        InputError: Something is no body, model or number as described, the model does not go with the mesh, the body is
+            remeshed, or all its nodes are held.
+    """
+    refuse_tape()
+    began = time.perf_counter()
+    if not isinstance(body, SoftBody):
+        raise InputError(f"body is {shown(body)}; it must be a SoftBody")
+    if body.changing is not None:
+        raise InputError("the body is remeshed; solve_static needs a mesh that stays as it is")
+    if not 0.0 < checked_number(tolerance, "tolerance") < 1.0:
+        raise InputError(f"tolerance is {tolerance}; it must be between 0 and 1")
+    most, steps = checked_count(iterations, "iterations", least=1), checked_count(load_steps, "load_steps", least=1)
+    check_preconditioner(preconditioner)
+    (law,) = checked_models(Corotated() if model is None else model, 1)
+    down = checked_gravity(gravity, body.mesh.up_axis)
+    if not (body.conditions.inverse_mass.numpy() > 0).any():
+        raise InputError(f"all {body.node_count} nodes of the body are held; at least one must be free to move")
+
+    body.state.adopt_positions()
+    field = law.bind(body, deterministic=deterministic)
+    answer = _Answer(body, field, down)
+    if answer.falls():
+        message = "no node is held, and the loads do not balance: the body has no state of rest; fix some nodes"
+        return answer.report(began, message)
+    solver = StaticSolver(
+        body, field, down, tolerance=tolerance, most=most, load_steps=steps, preconditioner=preconditioner
+    )
+    found = solver.solve()
+    answer.finish()
+    converged = found.converged & (solver.share == 1.0)
+    return answer.report(
+        began,
+        "the body is at rest" if converged.all() else _what_stopped(body, solver, status_words(found)),
+        iterations=solver.iterations,
+        linear_iterations=solver.linear_iterations,
+        residual=float(found.residual.max()),
+        correction=float(found.correction.max()),
+        load_share=solver.share,
+        world_converged=converged,
+    )
+
+
+class _Answer:
+    """The loads of a body, and what is left of a solve."""
+
+    def __init__(self, body: SoftBody, field: ForceField, gravity: tuple[float, float, float]):
+        self.body, self.field = body, field
+        conditions, count = body.conditions, body.sizes.nodes
+        self.loads = body.masses[:, None] * np.array(gravity)
+        if conditions.has_loads:
+            self.loads = self.loads + conditions.loads.numpy()[:count, :3].astype(np.float64)
+
+    def falls(self) -> bool:
+        """Whether nothing holds the body, and its loads do not balance."""
+        worlds = self.body.worlds
+        held = self.body.conditions.held_mask().reshape(worlds, -1).any(axis=1)
+        of_worlds = self.loads.reshape(worlds, -1, 3)
+        sums = np.linalg.norm(of_worlds.sum(axis=1), axis=1)
+        return bool((~held & (sums > BALANCED * np.linalg.norm(of_worlds, axis=2).sum(axis=1))).any())
+
+    def finish(self) -> None:
+        """Let the body rest: no velocity, reactions at held nodes, positions published."""
+        body, state = self.body, self.body.state
+        state.velocities.zero_()
+        elastic = self.field.elastic_forces(state.displacements).numpy()[: body.sizes.nodes, :3]
+        held = body.conditions.held_mask()[:, None]
+        reactions = np.zeros((body.sizes.nodes, 4), np.float32)
+        reactions[:, :3] = np.where(held, -(elastic + self.loads), 0.0)
+        state.reactions[: body.sizes.nodes].assign(reactions)
+        state.publish_positions()
+
+    def report(
+        self,
+        began: float,
+        message: str,
+        *,
+        iterations: int = 0,
+        linear_iterations: int = 0,
+        residual: float = math.inf,
+        correction: float = math.inf,
+        load_share: float = 0.0,
+        world_converged: npt.NDArray[np.bool_] | None = None,
+    ) -> StaticReport:
+        body = self.body
+        u = body.state.displacements.numpy()[: body.sizes.nodes, :3].astype(np.float64)
+        energy = self.field.elastic_energy(body.state.displacements) - float(np.sum(self.loads * u))
+        converged = np.zeros(body.worlds, bool) if world_converged is None else world_converged
+        return StaticReport(
+            converged=bool(converged.all()),
+            message=message,
+            iterations=iterations,
+            linear_iterations=linear_iterations,
+            residual=residual,
+            correction=correction,
+            energy=energy,
+            time=time.perf_counter() - began,
+            load_share=load_share,
+            world_converged=converged,
+        )
+
+
+def _what_stopped(body: SoftBody, solver: StaticSolver, why: str) -> str:
+    """The message of a solve that did not converge."""
+    from warp_corot.mesh.pieces import pieces_of
+
+    piece = pieces_of(body.mesh.tets)
+    held = np.asarray(body.conditions.held_mask().reshape(body.worlds, -1).any(axis=0))
+    pieces = np.unique(piece[held[body.mesh.tets].any(axis=1)])
+    loose = int(piece.max()) + 1 - len(pieces)
+    if loose and len(pieces):
+        why = f"nothing holds {loose} of the {int(piece.max()) + 1} pieces of the mesh"
+    return f"not converged: {why}; the body is left at rest under {solver.share:.3g} of its load"

@@ -1,0 +1,186 @@
+"""Newton's method with a line search on the energy, as launches that can be recorded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.kernels.implicit import newton as kernels
+
+from .conjugate_gradients import ConjugateGradients
+from .operator import Preconditioner
+from .sums import WorldSums
+from .tangent import TangentOperator
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+
+@dataclass(frozen=True)
+class NewtonReport:
+    """How Newton's method ended in each world.
+
+    Attributes:
+        iterations: Newton's, int32 [worlds].
+        linear_iterations: Of all its linear solves together, int32 [worlds].
+        residual: Norm of the forces that are out of balance over that of external and reaction forces, float64
+            [worlds].
+        correction: The largest displacement of the last step over the largest displacement, float64 [worlds].
+        status: As in ``kernels.implicit.newton``, int32 [worlds].
+    """
+
+    iterations: npt.NDArray[np.int32]
+    linear_iterations: npt.NDArray[np.int32]
+    residual: npt.NDArray[np.float64]
+    correction: npt.NDArray[np.float64]
+    status: npt.NDArray[np.int32]
+
+    @property
+    def converged(self) -> npt.NDArray[np.bool_]:
+        return self.status == int(kernels.CONVERGED)
+
+    @property
+    def broken(self) -> npt.NDArray[np.bool_]:
+        """Whether something was not finite at the beginning."""
+        return self.status == int(kernels.BROKEN)
+
+
+class Newton:
+    """Minimises the energy of one body, each world by itself; see ``kernels.implicit.newton``.
+
+    The unknown is ``increment``; ``body.state.displacements`` follow it as base + increment.
+
+    Args:
+        operator: The tangent operator. Its scale a is that of the inertia, or larger, to shorten steps.
+        preconditioner: Of the linear solves.
+        gravity: [m/s^2].
+        tolerance: Of the residual, and of the last step; see ``NewtonReport``.
+        most: Iterations at most.
+        most_linear: Of one linear solve.
+        others: Launches forces besides elasticity to ``body.state.forces``.
+
+    Attributes:
+        base, increment: What displacements are made of [m], vec4.
+        inertia: The scale a of the inertia [1/s^2], float32 [1].
+        pull: a h, acceleration that the inertia of a time step asks for [m/s^2], vec4.
+        external_share: What loads and gravity are multiplied by, float32 [1].
+        running: How many worlds go on, int32 [1].
+    """
+
+    def __init__(
+        self,
+        operator: TangentOperator,
+        preconditioner: Preconditioner,
+        gravity: Sequence[float],
+        *,
+        tolerance: float = 1e-6,
+        most: int = 100,
+        most_linear: int = 5000,
+        others: Callable[[], None] | None = None,
+    ):
+        self.operator, self.preconditioner, self.gravity = operator, preconditioner, wp.vec3(*gravity)
+        self.tolerance, self.most, self._others = tolerance, most, others
+        self.body, self.field, self.device, self.worlds = (
+            operator.body,
+            operator.field,
+            operator.device,
+            operator.worlds,
+        )
+        like = self.body.state.displacements
+        self._forces, self._residual, self._outer, self._step, self.base, self.increment, self.pull = (
+            wp.zeros_like(like) for _ in range(7)
+        )
+        self.solver = ConjugateGradients(operator, len(like), most=most_linear)
+        self._count = operator.node_count
+        self._sums = WorldSums(self.worlds, self._count, kernels.COLUMNS, self.device)
+        self._energies = wp.zeros(self.field.energy_count, dtype=wp.float64, device=self.device)
+        self._scalars = wp.zeros((self.worlds, kernels.SCALARS), dtype=wp.float64, device=self.device)
+        self.inertia = wp.zeros(1, dtype=wp.float32, device=self.device)
+        self.external_share = wp.ones(1, dtype=wp.float32, device=self.device)
+        self._iterations, self._solved, self._status, self._accepted = (
+            wp.zeros(self.worlds, dtype=wp.int32, device=self.device) for _ in range(4)
+        )
+        self.running, self._searching = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
+
+    # --- launches ----------------------------------------------------------------------------------------------------
+
+    def launch_begin(self) -> None:
+        """Launch that all worlds begin from ``base`` and ``increment``."""
+        self.running.zero_()
+        outputs = [self._scalars, self._iterations, self._solved, self._status, self.running]
+        wp.launch(kernels.begin_worlds, self.worlds, [], outputs, device=self.device)
+        self._try_step(commits=False)
+
+    def launch_iteration(self) -> None:
+        """Launch one iteration of all worlds that run."""
+        u, sums = self.body.state.displacements, self._sums
+        self._launch_energies()
+        self.launch_residual()
+        outputs = [self._scalars, self._iterations, self._status, self.running, self.solver.tolerance]
+        sums.launch_scalars(kernels.judge_residual, [wp.float64(self.tolerance), self.most], outputs)
+        self.launch_solve()
+        inputs = [self.body.conditions.mass, self._residual, self._outer, self._step, u, *sums.sizes]
+        wp.launch(kernels.measure_step, sums.shape, inputs, [sums.parts], device=self.device)
+        self._searching.zero_()
+        self._accepted.zero_()
+        inputs = [self.solver.iterations]
+        outputs = [self._scalars, self._iterations, self._solved, self._status, self.running, self._searching]
+        sums.launch_scalars(kernels.begin_search, inputs, outputs)
+        wp.capture_while(self._searching, self._launch_trial)
+        self._try_step(commits=True)
+        inputs = [wp.float64(self.tolerance), self.solver.status]
+        sums.launch_scalars(kernels.judge_step, inputs, [self._scalars, self._status, self.running])
+
+    def launch_residual(self) -> None:
+        """Launch the forces that are out of balance in the present state."""
+        body, sums, conditions = self.body, self._sums, self.body.conditions
+        self.field.add_forces(body.state.displacements, self._forces)
+        if self._others is not None:
+            self._others()
+        inputs: list[Any] = [self.gravity, conditions.mass, conditions.inverse_mass, int(conditions.has_loads)]
+        inputs += [conditions.loads, self.external_share, self.inertia, self.pull, self.increment, *sums.sizes]
+        outputs = [self._forces, body.state.forces, self._residual, self._outer, sums.parts]
+        kernel = kernels.FIND_RESIDUAL[conditions.loads.dtype]
+        wp.launch(kernel, sums.shape, inputs, outputs, device=self.device)
+
+    def launch_solve(self) -> None:
+        """Launch the linearisation, and the step that it gives."""
+        self.operator.take(self.body.state.displacements)
+        self.preconditioner.update(self.operator)
+        self.solver.launch(self.preconditioner, self._residual, self._step)
+
+    def _launch_trial(self) -> None:
+        self._try_step(commits=False)
+        self._launch_energies()
+        inputs = [self.inertia, self._status]
+        self._sums.launch_scalars(kernels.judge_trial, inputs, [self._scalars, self._accepted, self._searching])
+
+    def _launch_energies(self) -> None:
+        self._energies.zero_()
+        self.field.write_energies(self.body.state.displacements, self._energies)
+        sums = self._sums
+        inputs = [self._energies, len(self._energies) // self.worlds, *sums.sizes[1:]]
+        wp.launch(kernels.sum_energies, sums.shape, inputs, [sums.parts], device=self.device)
+
+    def _try_step(self, *, commits: bool) -> None:
+        inputs = [self._scalars, self.base, self._step, self._count, int(commits)]
+        outputs = [self.increment, self.body.state.displacements]
+        wp.launch(kernels.try_step, self.worlds * self._count, inputs, outputs, device=self.device)
+
+    # --- on the host -------------------------------------------------------------------------------------------------
+
+    def report(self) -> NewtonReport:
+        """How all worlds stand; waits for the device."""
+        scalars = self._scalars.numpy()
+        compared = scalars[:, int(kernels.COMPARED)]
+        return NewtonReport(
+            iterations=self._iterations.numpy(),
+            linear_iterations=self._solved.numpy(),
+            residual=scalars[:, int(kernels.RESIDUAL)] / np.where(compared > 0.0, compared, 1.0),
+            correction=scalars[:, int(kernels.CORRECTION)],
+            status=self._status.numpy(),
+        )

@@ -1,0 +1,190 @@
+"""Static answers: Newton's method with load steps that get shorter where it does not converge."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.elasticity import ForceField
+from warp_corot.kernels.implicit import newton as kernels
+
+from .newton import Newton, NewtonReport
+from .preconditioners import preconditioner_of
+from .tangent import TangentOperator
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+
+#: Mass in the operator of a body that nothing holds, as a share of what its slowest vibration has.
+SHIFT = 1.0
+#: The smallest share of the load that is added in one step.
+LEAST_SHARE = 1.0 / 64.0
+
+
+class StaticSolver:
+    """Finds where a body is at rest under its loads, from its present displacements.
+
+    Args:
+        body: The body.
+        field: Its elastic forces.
+        gravity: [m/s^2].
+        tolerance: As for ``Newton``.
+        most: Iterations of each load step at most.
+        load_steps: Equal steps in which loads and gravity are added.
+        preconditioner: The name of one, or None.
+
+    Attributes:
+        iterations, linear_iterations: Of all load steps, of the world that needed most.
+        share: How much of the load the last good state carries.
+    """
+
+    def __init__(
+        self,
+        body: SoftBody,
+        field: ForceField,
+        gravity: Sequence[float],
+        *,
+        tolerance: float,
+        most: int,
+        load_steps: int,
+        preconditioner: str | None,
+    ):
+        self.body, self.field, self._load_steps = body, field, load_steps
+        self.operator = TangentOperator(body, field, exact=True)
+        chosen = preconditioner_of(preconditioner, self.operator)
+        self.newton = Newton(self.operator, chosen, gravity, tolerance=tolerance, most=most)
+        self.iterations = self.linear_iterations = 0
+        self.share = 0.0
+
+    def solve(self) -> NewtonReport:
+        """Find the state of rest; the body has the last good state then. Waits for the device.
+
+        Where the search begins with elements turned over, such elements may be held in place by their neighbours. Then
+        another search begins with all free nodes at rest, and the state with less energy is taken.
+        """
+        state = self.body.state
+        self.operator.set_scales(self._keep_free_worlds(), 0.0, 1.0)
+        graph = self._record()
+        given, rest = wp.clone(state.displacements), self._free_nodes_at_rest()
+        report = self._solve_from(given, graph)
+        if np.array_equal(given.numpy(), rest) or (report.converged.all() and not self._turned_over()):
+            return report
+        first, share, energy = wp.clone(state.displacements), self.share, self._energy()
+        again = self._solve_from(wp.array(rest, dtype=wp.vec4, device=self.body.device), graph)
+        if again.converged.all() and (not report.converged.all() or self._energy() <= energy):
+            return again
+        self.share = share
+        wp.copy(state.displacements, first)
+        return report
+
+    def _solve_from(self, start: wp.array, graph: wp.Graph) -> NewtonReport:
+        """Add the load in parts, smaller and smaller ones where Newton's method does not converge."""
+        newton = self.newton
+        wp.copy(newton.base, start)
+        newton.increment.zero_()
+        good = wp.clone(newton.increment)
+        self.share, step = 0.0, 1.0 / self._load_steps
+        while True:
+            share = self.share + step
+            share = 1.0 if share > 1.0 - 1e-9 else share
+            report = self._run(graph, share)
+            if report.converged.all():
+                self.share = share
+                if share == 1.0:
+                    return report
+                wp.copy(good, newton.increment)
+                continue
+            wp.copy(newton.increment, good)
+            step *= 0.5
+            if step < LEAST_SHARE:
+                self._put_back(good)
+                return report
+
+    def _keep_free_worlds(self) -> float:
+        """Let worlds that nothing holds stay where they are: a uniform acceleration takes what little their loads do
+        not balance (inertia relief). The share of the mass in the operator that makes it definite there [1/s^2]."""
+        body, worlds = self.body, self.body.worlds
+        free = np.logical_not(body.conditions.held_mask().reshape(worlds, -1).any(axis=1))
+        if not free.any():
+            return 0.0
+        masses = body.masses.reshape(worlds, -1, 1)
+        mean = self._loads().reshape(worlds, -1, 3).sum(axis=1, keepdims=True) / masses.sum(axis=1, keepdims=True)
+        pull = np.zeros((len(self.newton.pull), 4), np.float32)
+        pull[: body.sizes.nodes, :3] = np.where(free[:, None, None], -mean, 0.0 * masses).reshape(-1, 3)
+        self.newton.pull.assign(pull)
+        size = float(np.ptp(body.mesh.points, axis=0).max())
+        density = masses.sum() / (worlds * np.sum(body.mesh.volumes))
+        return SHIFT * float(body.discretization.mu.numpy().mean()) / (density * size**2)
+
+    def _free_nodes_at_rest(self) -> npt.NDArray[np.float32]:
+        """Displacements of held nodes as they are, and zero at others [n, 4]."""
+        u = self.body.state.displacements.numpy().copy()
+        u[self.body.conditions.inverse_mass.numpy() > 0.0] = 0.0
+        return u
+
+    def _turned_over(self) -> bool:
+        """Whether an element is inside out."""
+        mesh, body = self.body.mesh, self.body
+        u = body.state.displacements.numpy()[: body.sizes.nodes, :3].reshape(body.worlds, -1, 3)
+        rest = mesh.points[mesh.tets]
+        at_rest = np.linalg.det(rest[:, 1:] - rest[:, :1])
+        for world in u:
+            x = rest + world[mesh.tets]
+            if (np.linalg.det(x[:, 1:] - x[:, :1]) * at_rest <= 0.0).any():
+                return True
+        return False
+
+    def _energy(self) -> float:
+        """Strain energy minus the work of loads and gravity [J], of all worlds."""
+        state, count = self.body.state, self.body.sizes.nodes
+        u = state.displacements.numpy()[:count, :3].astype(np.float64)
+        return self.field.elastic_energy(state.displacements) - float(np.sum(self._loads() * u))
+
+    def _loads(self) -> npt.NDArray[np.float64]:
+        """Loads and weight [N], [worlds * N, 3]."""
+        conditions, count = self.body.conditions, self.body.sizes.nodes
+        loads = self.body.masses[:, None] * np.array([*self.newton.gravity], np.float64)
+        if conditions.has_loads:
+            loads = loads + conditions.loads.numpy()[:count, :3]
+        return loads
+
+    def _run(self, graph: wp.Graph, share: float) -> NewtonReport:
+        """Newton's method at one share of the load."""
+        newton = self.newton
+        newton.external_share.fill_(share)
+        newton.launch_begin()
+        while newton.running.numpy()[0] > 0:
+            wp.capture_launch(graph)
+        report = newton.report()
+        self.iterations += int(report.iterations.max())
+        self.linear_iterations += int(report.linear_iterations.max())
+        return report
+
+    def _record(self) -> wp.Graph:
+        """Record an iteration, once all that it uses is there."""
+        newton, u = self.newton, self.body.state.displacements
+        self.field.elastic_forces(u)
+        self.field.elastic_energies(u)
+        self.operator.take(u)
+        with wp.ScopedCapture(device=self.body.device) as capture:
+            newton.launch_iteration()
+        return capture.graph
+
+    def _put_back(self, increment: wp.array) -> None:
+        wp.copy(self.newton.increment, increment)
+        self.newton.running.zero_()
+        self.newton.launch_begin()
+
+
+def status_words(report: NewtonReport) -> str:
+    """Why Newton's method ended in the worlds that did not converge."""
+    status = set(report.status[~report.converged].tolist())
+    if int(kernels.BROKEN) in status:
+        return "the state is not finite"
+    if int(kernels.LIMIT) in status:
+        return "the iterations were not enough"
+    return "no step along the search direction lowers the energy"
