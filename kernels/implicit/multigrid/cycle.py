@@ -8,24 +8,49 @@ most four times its own diagonal blocks: 4 is a bound on all levels.
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.elements.lanes import COMPILER_FLAGS
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_FLAGS})
 
 
-@wp.func
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    wp::vec_t<3, wp::float32> total;
+    for (int p = begin; p < end; ++p) {
+        const float* m = &wp::index(blocks, first_entry + p).data[0][0];
+        const float4 v = *reinterpret_cast<const float4*>(&wp::index(x, first_node + wp::index(columns, p)));
+        total[0] += m[0] * v.x + m[3] * v.y + m[6] * v.z;
+        total[1] += m[1] * v.x + m[4] * v.y + m[7] * v.z;
+        total[2] += m[2] * v.x + m[5] * v.y + m[8] * v.z;
+    }
+    return total;
+#else
+    typedef float float4 __attribute__((vector_size(16)));
+    typedef float float4u __attribute__((vector_size(16), aligned(4)));
+    float4 total = {0.0f, 0.0f, 0.0f, 0.0f};
+    const float* m = &wp::index(blocks, first_entry + begin).data[0][0];
+    const int* column = &wp::index(columns, begin);
+    const float* values = &wp::index(x, first_node)[0];
+    for (int p = begin; p < end; ++p, m += 9, ++column) {
+        const float* v = values + 4 * *column;
+        total += *reinterpret_cast<const float4u*>(m) * v[0] + *reinterpret_cast<const float4u*>(m + 3) * v[1];
+        total += *reinterpret_cast<const float4u*>(m + 6) * v[2];
+    }
+    return wp::vec_t<3, wp::float32>(total[0], total[1], total[2]);
+#endif
+""")
 def row_product(
-    p0: int,
-    p1: int,
+    begin: int,
+    end: int,
     first_entry: int,
     first_node: int,
     columns: wp.array[wp.int32],
     blocks: wp.array[wp.mat33],
     x: wp.array[wp.vec4],
-):
-    total = wp.vec3()
-    for p in range(p0, p1):
-        total += blocks[first_entry + p] * load_node(x, first_node + columns[p])
-    return total
+) -> wp.vec3:
+    """The product of a row with x. Entries are transposed, so that four lanes add up columns; of the last one they read
+    a number past its end."""
+    ...
 
 
 @wp.kernel(enable_backward=False)

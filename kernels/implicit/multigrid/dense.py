@@ -40,7 +40,7 @@ def fill_dense(
         for a in range(3):
             for b in range(3):
                 if own[a, a] > 0.0 and other[b, b] > 0.0:
-                    value = wp.float64(blocks[first + p][a, b])
+                    value = wp.float64(blocks[first + p][b, a])
                     size = wp.sqrt(wp.float64(own[a, a]) * wp.float64(other[b, b]))
                     matrix[world, 3 * i + a, 3 * j + b] = value / size
     for a in range(3):

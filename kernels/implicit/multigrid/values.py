@@ -4,7 +4,8 @@ A leaf has K_mn = V (lambda g_m g_n^T + mu g_n g_m^T + mu (g_m . g_n) I) with th
 turned by its rotation: the corotated R K R^T, or linear elasticity where nothing is turned. Every entry gathers what it
 is the sum of, so there are no atomic additions and sums have one order.
 
-Rows and columns of held nodes are zero; their displacements are left out of the cycle.
+Entries are stored transposed, as ``cycle.row_product`` takes them. Rows and columns of held nodes are zero; their
+displacements are left out of the cycle.
 """
 
 import functools
@@ -120,8 +121,8 @@ def gather_leaves(
         total[2, 2] += d
     total = scales[2] * total
     where = places[u]
-    blocks[world * entries + where[0]] = total
-    blocks[world * entries + where[1]] = wp.transpose(total)
+    blocks[world * entries + where[0]] = wp.transpose(total)
+    blocks[world * entries + where[1]] = total
 
 
 @wp.func

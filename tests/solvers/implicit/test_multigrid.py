@@ -63,7 +63,7 @@ def dense(level, world=0):
     matrix = np.zeros((n, 3, n, 3))
     rows, columns = pattern.pairs.numpy().T
     entries = slice(world * pattern.entries, (world + 1) * pattern.entries)
-    matrix[rows, :, columns] = level.blocks.numpy()[entries]
+    matrix[rows, :, columns] = level.blocks.numpy()[entries].swapaxes(1, 2)
     return matrix.reshape(3 * n, 3 * n)
 
 

@@ -44,7 +44,7 @@ class Level:
         degree, range_: Of the smoother.
 
     Attributes:
-        blocks: Values of the entries, mat33 [worlds * entries].
+        blocks: Values of the entries, transposed, mat33 [worlds * entries + 1].
         inverses: Of the diagonal blocks, mat33 [worlds * n].
         r, z, other: Residual, correction, and a vector to work with, vec4 [worlds * n].
         factors: Of the smoother's steps.
@@ -54,7 +54,8 @@ class Level:
         self.pattern, self.worlds, self.ranks, self.free = pattern, worlds, ranks, free
         self.device = pattern.starts.device
         self.count = pattern.count
-        self.blocks = wp.zeros(worlds * pattern.entries, dtype=wp.mat33, device=self.device)
+        # One more, since products read past the last.
+        self.blocks = wp.zeros(worlds * pattern.entries + 1, dtype=wp.mat33, device=self.device)
         self.inverses = wp.zeros(worlds * self.count, dtype=wp.mat33, device=self.device)
         self.r, self.z, self.other = (
             wp.zeros(worlds * self.count, dtype=wp.vec4, device=self.device) for _ in range(3)
