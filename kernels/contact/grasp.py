@@ -57,7 +57,6 @@ def hold_in_tool(
     # In and out
     f: wp.array[wp.vec4],
     contact_forces: wp.array[wp.vec4],
-    account: wp.array2d[wp.float64],
     # Out
     forces: wp.array[wp.vec3],
 ):
@@ -93,9 +92,6 @@ def hold_in_tool(
     forces[k] = force
     store_node(f, i, pull + force)
     store_node(contact_forces, i, load_node(contact_forces, i) + force)
-    work = wp.float64(wp.dot(force, 0.5 * (before * velocity + d + yielding * force)))
-    account[0, k] = account[0, k] + work
-    account[1, k] = account[1, k] + wp.abs(work)
 
 
 @wp.kernel(enable_backward=False)

@@ -92,34 +92,20 @@ def add_contact_forces(
     # In
     start: int,
     surface: Surface,
-    pace: Pace,
-    offset: int,
-    v: wp.array[wp.vec4],
     # In and out
     f: wp.array[wp.vec4],
-    account: wp.array2d[wp.float64],
     # Out
     contact_forces: wp.array[wp.vec4],
 ):
-    """Add what was found to a body's forces, and to its account the work: of each force along half of the motion before
-    and half of the motion after it, as symplectic Euler keeps energy."""
-    k = wp.tid()
-    s = start + k
+    """Add what was found to a body's forces."""
+    s = start + wp.tid()
     i = surface.node[s]
     if i < 0:
         return
     force = surface.f[s]
     store_node(contact_forces, i, force)
-    if wp.dot(force, force) == 0.0:
-        return
-    before = float(pace.seconds[DT])
-    if offset == 0:
-        before = float(length_before(pace))
-    store_node(f, i, load_node(f, i) + force)
-    moved = 0.5 * (before * load_node(v, i) + surface.d[s])
-    work = wp.float64(wp.dot(force, moved))
-    account[0, k] = account[0, k] + work
-    account[1, k] = account[1, k] + wp.abs(work)
+    if wp.dot(force, force) > 0.0:
+        store_node(f, i, load_node(f, i) + force)
 
 
 @wp.func

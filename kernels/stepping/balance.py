@@ -102,6 +102,11 @@ def take_over(
 
 
 @wp.func
+def is_zero(a: wp.vec3):
+    return a[0] == 0.0 and a[1] == 0.0 and a[2] == 0.0
+
+
+@wp.func
 def dot64(a: wp.vec3, b: wp.vec3):
     return (
         wp.float64(a[0]) * wp.float64(b[0]) + wp.float64(a[1]) * wp.float64(b[1]) + wp.float64(a[2]) * wp.float64(b[2])
@@ -123,8 +128,10 @@ def sum_nodes(
     f: wp.array[wp.vec4],
     u: wp.array[wp.vec4],
     v: wp.array[wp.vec4],
-    touched: int,
-    contact: wp.array[wp.vec4],
+    pushed: int,
+    others: wp.array[wp.vec4],
+    constrained: int,
+    constraints: wp.array[wp.vec4],
     orders: wp.array[wp.float64],
     keeps: int,
     # In and out
@@ -141,7 +148,8 @@ def sum_nodes(
     beyond the stable step, where it need not be positive.
     The work of supports that ``add_support_work`` has added up counts half of f's share too early; that half is
     ``SUPPORTS``. Velocities at the time of the displacements, halfway, have ``UNTIMELY`` more than that product.
-    Contact forces of the last step, if any, are part of what accelerates nodes; their work is counted elsewhere.
+    The forces besides elasticity in the last step are part of what accelerates nodes; their work is counted elsewhere.
+    That of constraints takes a change of the step into account, so that ``AHEAD`` does not where they act.
     """
     world, thread = wp.tid()
     slot = int(orders[SLOT])
@@ -173,10 +181,12 @@ def sum_nodes(
                 pull += wp.vec3d(external)
                 power += dot64(external, velocity)
                 work += dot64(external, x) - dot64(external, load_node(kept_u[slot], i))
-            if touched != 0:
-                pull += wp.vec3d(load_node(contact, i))
+            if pushed != 0:
+                pull += wp.vec3d(load_node(others, i))
             square = wp.dot(pull, pull) / m
-            ahead += wp.float64(0.5) * (before * power + both * square)
+            ahead += wp.float64(0.5) * before * power
+            if constrained == 0 or is_zero(load_node(constraints, i)):
+                ahead += wp.float64(0.5) * both * square
             untimely += square
             kinetic += wp.float64(0.5) * m * dot64(velocity, velocity)
             gravitational -= m * dot64(gravity, x)

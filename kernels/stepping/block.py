@@ -439,7 +439,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
                         moving = symplectic_euler_velocity(moving, force, w, gravity, kick, damped)
                         velocity(wp.static(STORE), place, moving)
                     else:
-                        add_support_work(elastic, dt * moving, support_work)
+                        add_support_work(elastic, kick * moving, support_work)
                         if step == steps - 1:
                             store_node(reactions, i, -(force + mass[i] * gravity))
                     moved = displacement(wp.static(LOAD), place, force) + dt * moving

@@ -112,7 +112,7 @@ def step_symplectic_euler(
         store_node(v, i, velocity)
     else:
         store_node(reactions, i, -(force + mass[i] * gravity))
-        add_support_work(elastic, dt * velocity, support_work)
+        add_support_work(elastic, kick * velocity, support_work)
     displacement = load_node(u, i) + dt * velocity
     store_node(u, i, displacement)
     store_node(f, i, wp.vec3())
@@ -145,7 +145,7 @@ def follow_trajectory(
     """Give prescribed nodes the velocity that takes them to their keyframed displacement at the end of the step.
 
     The work of a step is that of the mean of the forces f at its two ends, by the trapezoidal rule: each force counts
-    with half the motion before it and half the motion after. The step itself counts the latter as a whole.
+    with half the motion before it and half the motion after. The step itself takes the velocity after for both.
     """
     k = wp.tid()
     i = nodes[k]
@@ -160,7 +160,7 @@ def follow_trajectory(
     if offset == 0:
         before = float(length_before(pace))
     velocity = (target - load_node(u, i)) / dt
-    add_support_work(load_node(f, i), 0.5 * (before * load_node(v, i) - dt * velocity), support_work)
+    add_support_work(load_node(f, i), 0.5 * before * (load_node(v, i) - velocity), support_work)
     store_node(v, i, velocity)
 
 

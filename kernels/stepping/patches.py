@@ -365,13 +365,13 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                     target = value + share * (body.values[at + columns] - value)
                     towards = (target - x) / dt
                     # As ``follow_trajectory``: each force counts with half the motion before it and half after.
-                    add_support_work(elastic, 0.5 * (before * velocity - dt * towards), support_work)
+                    add_support_work(elastic, 0.5 * before * (velocity - towards), support_work)
                     velocity = towards
                 force = elastic + load_here
                 if w > 0.0:
                     velocity = symplectic_euler_velocity(velocity, force, w, gravity, 0.5 * (before + dt), damped)
                 else:
-                    add_support_work(elastic, dt * velocity, support_work)
+                    add_support_work(elastic, 0.5 * (before + dt) * velocity, support_work)
                     if step == steps - 1:
                         store_node(reactions, i, -(force + mass[i] * gravity))
                 x = x + dt * velocity

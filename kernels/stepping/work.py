@@ -1,4 +1,8 @@
-"""The work of forces besides elasticity, so that the balance of energy knows what they put in or take out."""
+"""The work of forces besides elasticity, so that the balance of energy knows what they put in or take out.
+
+A support pays for all that acts on its nodes, as ``integrate.add_support_work`` counts it. What is not elastic is given
+back here, since the balance has no energy for it.
+"""
 
 from typing import Any
 
@@ -10,6 +14,12 @@ from .integrate import by_vectors, symplectic_euler_velocity, vector_at
 from .pace import DT, Pace, length_before
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def add_work(account: wp.array2d[wp.float64], i: int, work: float):
+    account[0, i] = account[0, i] + wp.float64(work)
+    account[1, i] = account[1, i] + wp.abs(wp.float64(work))
 
 
 @wp.kernel(enable_backward=False)
@@ -43,7 +53,7 @@ def count_work(
     total = load_node(f, i)
     store_node(others, i, total - load_node(elastic, i))
     w = inverse_mass[i]
-    if w == 0.0 or wp.dot(force, force) == 0.0:
+    if wp.dot(force, force) == 0.0:
         return
     dt = float(pace.seconds[DT])
     before = dt
@@ -52,10 +62,57 @@ def count_work(
     if has_load != 0:
         total += vector_at(load, i)
     velocity = load_node(v, i)
-    later = symplectic_euler_velocity(velocity, total, w, gravity, 0.5 * (before + dt), 1.0 / (1.0 + dt * damping))
-    work = wp.float64(0.5 * wp.dot(force, before * velocity + dt * later))
-    account[0, i] = account[0, i] + work
-    account[1, i] = account[1, i] + wp.abs(work)
+    later = velocity
+    if w > 0.0:
+        later = symplectic_euler_velocity(velocity, total, w, gravity, 0.5 * (before + dt), 1.0 / (1.0 + dt * damping))
+    add_work(account, i, 0.5 * wp.dot(force, before * velocity + dt * later))
+
+
+@wp.kernel(enable_backward=False)
+def count_constraints(
+    # In
+    damping: float,
+    gravity: wp.vec3,
+    inverse_mass: wp.array[wp.float32],
+    has_load: int,
+    load: wp.array[Any],
+    pace: Pace,
+    offset: int,
+    constrained: wp.array[wp.vec4],
+    f: wp.array[wp.vec4],
+    v: wp.array[wp.vec4],
+    # In and out
+    account: wp.array2d[wp.float64],
+):
+    """The work of the forces of constraints, which are part of f.
+
+    A step gives a node the kinetic energy of all forces times their common time, half of the step before and half of
+    this one, times the mean of the velocities v and w before and after it. Elastic forces F, gravity and loads count
+    elsewhere, along half of the motion before and half of the motion after. Constraints say where a node goes, so the
+    rest is theirs: (b + d) / 2 C . (v + w) / 2 + (b - d) / 4 F . (w - v) for steps b and d.
+    """
+    i = wp.tid()
+    force = load_node(constrained, i)
+    if wp.dot(force, force) == 0.0:
+        return
+    dt = float(pace.seconds[DT])
+    before = dt
+    if offset == 0:
+        before = float(length_before(pace))
+    kick = 0.5 * (before + dt)
+    velocity = load_node(v, i)
+    w = inverse_mass[i]
+    if w == 0.0:
+        add_work(account, i, kick * wp.dot(force, velocity))
+        return
+    total = load_node(f, i)
+    if has_load != 0:
+        total += vector_at(load, i)
+    later = symplectic_euler_velocity(velocity, total, w, gravity, kick, 1.0 / (1.0 + dt * damping))
+    others = total - force + gravity / w
+    work = 0.5 * kick * wp.dot(force, velocity + later)
+    add_work(account, i, work + 0.25 * (before - dt) * wp.dot(others, later - velocity))
 
 
 COUNT_WORK = by_vectors(count_work, "load")
+COUNT_CONSTRAINTS = by_vectors(count_constraints, "load")

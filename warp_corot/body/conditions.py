@@ -13,6 +13,7 @@ from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.nodal import same_array
 from warp_corot.kernels.stepping.activation import follow_activation
 from warp_corot.kernels.stepping.conditions import LOAD_NODES, free_nodes, hold_nodes, release_nodes
+from warp_corot.kernels.stepping.integrate import follow_trajectory
 
 from .activation import Activation, ElementActivation
 from .patch_arrays import PatchArrays
@@ -149,6 +150,16 @@ class Conditions:
     def make_activation(self) -> None:
         """Ensure that there is an active stress for every element."""
         self.revision += int(self.discretization.make_activation())
+
+    def follow_trajectories(self, clock: Clock, offset: int, support_work: wp.array) -> None:
+        """Launch that prescribed nodes get the velocity of a step, of the ``offset``-th since the clock was last
+        advanced, and count what their supports put in against the forces so far."""
+        state = self.state
+        for each in self.trajectories:
+            inputs = [each.nodes, each.times, each.displacements, clock.arrays, self.world_starts]
+            inputs += [self.sizes.world_nodes, offset, state.forces, state.displacements]
+            outputs = [state.velocities, support_work]
+            wp.launch(follow_trajectory, len(each.nodes), inputs, outputs, device=self.device)
 
     def follow_activations(self, clock: Clock, offset: int) -> None:
         """Launch the kernel that sets the active stress of elements that follow keyframes.

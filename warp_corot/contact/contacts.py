@@ -88,10 +88,6 @@ class Contacts:
         return self._revision + self.surface.revision + self.obstacles.revision + pairs
 
     @property
-    def accounts(self) -> list[wp.array]:
-        return self._accounts
-
-    @property
     def state(self) -> dict[str, wp.array]:
         touches = self.touches
         sides = {"touch_normals": touches.normal.flatten(), "touch_forces": touches.force.flatten()}
@@ -155,7 +151,6 @@ class Contacts:
 
     def launch(self, offset: int, damping: float) -> None:
         system, surface = self.system, self.surface
-        pace = system.pace.arrays
         if self.obstacles.count:
             self.obstacles.launch_motion(offset)
         self._predict(offset, damping)
@@ -166,8 +161,8 @@ class Contacts:
         if self.pairs is not None:
             self.search.launch_after()
         for k, body in enumerate(system.bodies):
-            inputs = [surface.parts[k].start, surface.arrays, pace, offset, body.state.velocities]
-            outputs = [body.state.forces, self._accounts[k], body.state.contact_forces]
+            outputs = [body.state.forces, body.state.contact_forces]
+            inputs = [surface.parts[k].start, surface.arrays]
             self._launch(motion.add_contact_forces, self._count(k), inputs, outputs)
 
     def measure(self) -> None:
@@ -278,9 +273,6 @@ class Contacts:
         self.forces = wp.zeros((obstacles, count), dtype=wp.vec3, device=device)
         self.totals = wp.zeros_like(self.forces)
         self._anchors = wp.zeros((obstacles, count), dtype=wp.vec4, device=device)
-        self._accounts = [
-            wp.zeros((2, self._count(k)), dtype=wp.float64, device=device) for k in range(len(surface.parts))
-        ]
         self.touches = triangles.Touches()
         shape = (obstacles, surface.triangle_count if self.obstacles.have_edges else 0)
         for name in ("shares", "normal", "moved", "force", "more"):

@@ -58,7 +58,6 @@ class Grasp:
         count = len(everywhere)
         self._nodes = wp.array(everywhere, dtype=wp.int32, device=self.device)
         self._places, self._forces = (wp.zeros(count, dtype=wp.vec3, device=self.device) for _ in range(2))
-        self._account = wp.zeros((2, count), dtype=wp.float64, device=self.device)
         self._wrenches: wp.array = wp.zeros(body.worlds, dtype=wp.spatial_vectorf, device=self.device)
         body.state.adopt_positions()
         state = body.state
@@ -92,10 +91,6 @@ class Grasp:
     is_full = False
 
     @property
-    def accounts(self) -> list[wp.array]:
-        return [self._account]
-
-    @property
     def state(self) -> dict[str, wp.array]:
         return {}
 
@@ -107,7 +102,7 @@ class Grasp:
         inputs = [self._nodes, self._per_world, self._number, self._obstacles.motions, self._places, self._stiffness]
         inputs += [damping, system.gravity, conditions.inverse_mass, int(conditions.has_loads), conditions.loads]
         inputs += [system.pace.arrays, offset, state.rest, state.displacements, state.velocities]
-        outputs = [state.forces, state.contact_forces, self._account, self._forces]
+        outputs = [state.forces, state.contact_forces, self._forces]
         kernel = kernels.HOLD_IN_TOOL[conditions.loads.dtype]
         wp.launch(kernel, len(self._nodes), inputs, outputs, device=self.device)
 

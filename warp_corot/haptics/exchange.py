@@ -54,7 +54,6 @@ class Exchange(Constraint):
     """
 
     launch_revision = 1
-    accounts: list[wp.array] = []  # noqa: RUF012 (it has no forces, and so no work)
     state: dict[str, wp.array] = {}  # noqa: RUF012
     is_full = False
 

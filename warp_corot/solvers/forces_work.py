@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warp_corot.kernels.stepping.work import COUNT_WORK, separate_forces
+from warp_corot.kernels.stepping.work import COUNT_CONSTRAINTS, COUNT_WORK, separate_forces
 from warp_corot.solvers.steps.pace import Pace
 
 if TYPE_CHECKING:
@@ -15,13 +15,16 @@ if TYPE_CHECKING:
 
 
 class ForcesWork:
-    """Counts the work of the forces of a system, constraints left out, which count their own.
+    """Counts the work of the forces of a system, and that of its constraints.
 
     Args:
         bodies, pace, gravity: The system's.
 
     Attributes:
-        accounts: As ``Constraint`` has them, one for each body.
+        accounts: The work of forces on the nodes of each body, and the sum of its absolute values [J]: float64 [2, n],
+            world after world.
+        of_constraints: The same of constraints, by the number of the body; of bodies that have been touched. What a
+            constraint has done stays when it is taken away.
         others: All that acted besides elasticity in the last step [N], vec4, for each body.
     """
 
@@ -29,11 +32,21 @@ class ForcesWork:
         self._bodies, self._pace, self._gravity = bodies, pace, gravity
         self.accounts: list[wp.array] = []
         self.others: list[wp.array] = []
+        self.of_constraints: dict[int, wp.array] = {}
         self._elastic: list[wp.array] = []
 
-    def prepare(self) -> None:
-        """Make room for the present arrays of nodes; not while launches are recorded."""
+    def prepare(self, counted: bool) -> None:
+        """Make room for the present arrays of nodes; not while launches are recorded.
+
+        Args:
+            counted: Whether there are forces whose work is counted.
+        """
         lengths = [len(body.state.displacements) for body in self._bodies]
+        for k, (body, length) in enumerate(zip(self._bodies, lengths, strict=True)):
+            if body.state.is_touched and (k not in self.of_constraints or self.of_constraints[k].shape[1] != length):
+                self.of_constraints[k] = wp.zeros((2, length), dtype=wp.float64, device=body.device)
+        if not counted:
+            return
         if lengths == [len(array) for array in self.others]:
             return
         device = self._bodies[0].device
@@ -59,3 +72,13 @@ class ForcesWork:
             inputs += [self._pace.arrays, offset, self._elastic[k], state.forces, state.velocities]
             outputs = [self.others[k], self.accounts[k]]
             wp.launch(COUNT_WORK[conditions.loads.dtype], body.sizes.launch_nodes, inputs, outputs, device=body.device)
+
+    def launch_constraints(self, offset: int, damping: float) -> None:
+        """Launch the work of constraints, when all of them have added their forces."""
+        for k, account in self.of_constraints.items():
+            body = self._bodies[k]
+            state, conditions = body.state, body.conditions
+            inputs = [damping, self._gravity, conditions.inverse_mass, int(conditions.has_loads), conditions.loads]
+            inputs += [self._pace.arrays, offset, state.contact_forces, state.forces, state.velocities]
+            kernel = COUNT_CONSTRAINTS[conditions.loads.dtype]
+            wp.launch(kernel, body.sizes.launch_nodes, inputs, [account], device=body.device)

@@ -39,18 +39,15 @@ class Forces(Protocol):
 class Constraint(Protocol):
     """Something that answers to the motion that all other forces would lead to in a step, such as contact.
 
+    Its forces are part of ``state.forces`` and, alone, of ``state.contact_forces``, from which their work is counted.
+
     Attributes:
         launch_revision: Changes whenever its launches do, so that steps must be recorded again.
-        accounts: The work that its forces have done on the free nodes of each body, and the sum of its absolute
-            values [J]: float64 [2, n] each, world after world.
         state: Other arrays from which it goes on, by name; they are kept and put back with the state of the bodies.
     """
 
     @property
     def launch_revision(self) -> int: ...
-
-    @property
-    def accounts(self) -> list[wp.array]: ...
 
     @property
     def state(self) -> dict[str, wp.array]: ...
@@ -60,7 +57,8 @@ class Constraint(Protocol):
         ...
 
     def launch(self, offset: int, damping: float) -> None:
-        """Launch what adds its forces to ``state.forces`` of the bodies, after all other forces.
+        """Launch what adds its forces to ``state.forces`` and ``state.contact_forces`` of the bodies, after all other
+        forces, and after prescribed nodes have got the velocities of the step.
 
         Args:
             offset: How many steps are launched that the clock does not count yet.
@@ -136,34 +134,40 @@ class System:
 
     @property
     def accounts(self) -> list[wp.array]:
-        """The work of forces and of constraints on each body; see ``Constraint``."""
-        of_forces = self._work.accounts if self._counted else []
-        return of_forces + [account for each in self.constraints for account in each.accounts]
+        """The work of forces and of constraints on each body; see ``ForcesWork``."""
+        return [*(self._work.accounts if self._counted else []), *self._work.of_constraints.values()]
 
     @property
     def state(self) -> list[wp.array]:
         """All arrays of constraints from which they go on, accounts among them."""
         others = [array for each in self.constraints for array in each.state.values()]
-        return self.accounts + others
+        return self.accounts + others + [body.state.contact_forces for body in self.bodies if body.state.is_touched]
 
     def prepare(self) -> None:
         """Bring up to date what constraints know of the bodies; not while launches are recorded."""
-        if self._counted:
-            self._work.prepare()
         for each in self.constraints:
             each.prepare()
+        self._work.prepare(bool(self._counted))
 
     @property
     def _counted(self) -> list[Forces]:
         """The forces whose work is counted for them."""
         return [each for each in self.forces if not _counts_itself(each)]
 
-    def add_other_forces(self, offset: int, damping: float) -> None:
-        """Launch all that acts besides elasticity: forces, and then constraints; see ``Constraint.launch``."""
+    def add_other_forces(self, offset: int, damping: float, moving: Sequence[int]) -> None:
+        """Launch all that acts besides elasticity: forces, and then constraints; see ``Constraint.launch``.
+
+        Args:
+            offset, damping: As there.
+            moving: The bodies whose prescribed nodes get the velocities of the step here.
+        """
         self.offset = offset
         for forces in self.forces:
             if _counts_itself(forces):
                 forces.add_forces()
+        # A support pays for what has been added so far, and not for what is counted below.
+        for k in moving:
+            self.bodies[k].conditions.follow_trajectories(self.pace, offset, self.support_work)
         counted = self._counted
         if counted:
             self._work.launch_begin()
@@ -174,6 +178,7 @@ class System:
             each.launch(offset, damping)
         if counted:
             self._work.launch_count(offset, damping)
+        self._work.launch_constraints(offset, damping)
 
     def pushing(self, k: int) -> wp.array | None:
         """What acted on a body besides elasticity in the last step [N], vec4, as the balance of energy must know it.

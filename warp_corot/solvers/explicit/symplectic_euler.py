@@ -12,7 +12,7 @@ import warp as wp
 from warp_corot.elasticity.viscosity import Viscosity
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number
-from warp_corot.kernels.stepping.integrate import STEP_SYMPLECTIC_EULER, follow_trajectory
+from warp_corot.kernels.stepping.integrate import STEP_SYMPLECTIC_EULER
 from warp_corot.solvers.integrator import Integrator, Stepper
 
 from .block import BlockSteps
@@ -114,31 +114,13 @@ class SymplecticEulerStepper(Stepper):
             if offset > 0 or not forces_known:
                 for k in one_by_one:
                     self.system.add_elastic_forces(k, offset)
-            self.system.add_other_forces(offset, self.damping)
+            self.system.add_other_forces(offset, self.damping, one_by_one)
             for k in one_by_one:
                 self._move(self.system.bodies[k], offset)
 
     def _move(self, body: SoftBody, offset: int) -> None:
         """Launch the motion of the ``offset``-th step since the clock was last advanced."""
         system = self.system
-        for trajectory in body.conditions.trajectories:
-            wp.launch(
-                follow_trajectory,
-                dim=len(trajectory.nodes),
-                inputs=[
-                    trajectory.nodes,
-                    trajectory.times,
-                    trajectory.displacements,
-                    system.pace.arrays,
-                    body.conditions.world_starts,
-                    body.world_node_count,
-                    offset,
-                    body.state.forces,
-                    body.state.displacements,
-                ],
-                outputs=[body.state.velocities, system.support_work],
-                device=body.device,
-            )
         wp.launch(
             STEP_SYMPLECTIC_EULER[body.conditions.loads.dtype],
             dim=body.sizes.launch_nodes,

@@ -225,6 +225,8 @@ class Balance:
             v,
             int(pushing is not None),
             u if pushing is None else pushing,
+            int(body.state.is_touched),
+            body.state.contact_forces,
             system.pace.orders,
             int(keeps),
         ]

@@ -191,7 +191,6 @@ class Guard:
         self.system.pace.put_back(self._good)
         for body in self.bodies:
             body.state.forces.zero_()
-            body.state.contact_forces.zero_()
             body.state.publish_positions()
         for each in self.system.constraints:
             each.forget()
