@@ -1,32 +1,41 @@
-"""The arrays that launches read of a derived plan (``plan``): nodes and codes of subtrees and of single leaves.
+"""The arrays that launches read of a plan (``plan``): nodes and codes of subtrees and of single leaves.
 
-Everything is written up to the current size, and as padding up to the former size. Padding refers to
+Everything is written up to the current size, for each world, and as padding up to the former size. Padding refers to
 sinks, nodes that do not move.
 """
 
 import warp as wp
 
 from warp_corot.kernels.elements.elements import LEVEL_MASK
-from warp_corot.kernels.remesh.pools import SINKS, Pools, padding
 from warp_corot.kernels.tables.shapes import MIRROR_BIT
 
 from .lists import LEAVES_OF_SUBTREE
-from .plan import Plan, above, extent, flat_row, padding_code
+from .plan import Plan, extent, flat_row, places_t
+from .tree import Tree, code_above, padding, sink
+
+# Nodes of a single subtree; places for nodes of a group.
+SINGLE_NODES = 10
+GROUP_NODES = 40
 
 
 @wp.struct
 class Batches:
-    """Arrays by class, or by kind (shape and sharing) if only groups or only single subtrees have them."""
+    """Arrays of subtrees, class after class."""
 
     # The leaf of the subtree, or of the group, and its node for each place, by shape; negative past the last.
     places: wp.array2d[wp.vec2i]  # [3, 10]
     group_places: wp.array2d[wp.vec2i]  # [3, 40]
-    by_node: int  # 1: nodes of single subtrees are [10, subtrees], else [subtrees, 10]
-    nodes: wp.array3d[wp.int32]  # [kinds, 10, subtrees]
-    group_nodes: wp.array3d[wp.int32]  # [kinds, groups, 40]
-    code: wp.array2d[wp.int32]  # [classes, subtrees] of the root
-    root_nodes: wp.array2d[wp.vec4i]  # [members, subtrees] of those that share their root's rotation
-    unit: wp.array2d[wp.int32]  # [classes, subtrees] used by the leaves, if a rotation further up is shared
+    # Nodes of a class begin at a place. Those of groups are [groups, 40]; of single subtrees [10, room], else
+    # [room, 10] if ``by_node`` is zero.
+    by_node: int
+    node_begin: places_t
+    room: places_t
+    nodes: wp.array[wp.int32]
+    # As ``Plan.first``; ``roots`` is the place there of the first class that shares its root's rotation.
+    code: wp.array[wp.int32]  # of the root
+    unit: wp.array[wp.int32]  # used by the leaves, if a rotation further up is shared
+    roots: int
+    root_nodes: wp.array[wp.vec4i]  # counted from there
 
 
 @wp.struct
@@ -49,45 +58,79 @@ class FlatLeaves:
 
 
 @wp.func
-def sink(i: int, pools: Pools):
-    return pools.sink + i % SINKS
+def kind_of_class(c: int, plan: Plan):
+    """Shape and sharing of a class; see ``lists.kind_of``."""
+    return c / plan.members
 
 
 @wp.func
-def fill_single(kind: int, shape: int, k: int, first: int, pools: Pools, batches: Batches):
-    """Nodes of the k-th single subtree of a kind; ``first`` is its first leaf, -1 for padding."""
-    for n in range(10):
-        node = sink(k, pools)
+def shape_of_kind(kind: int, plan: Plan):
+    shape = int(kind)
+    if kind == 3:
+        shape = plan.rotation_level % 3
+    elif kind > 3:
+        shape = kind - 4
+    return shape
+
+
+@wp.func
+def is_grouped(c: int, plan: Plan):
+    return plan.members == 2 and c % 2 == 0
+
+
+@wp.func
+def node_place(c: int, k: int, n: int, batches: Batches):
+    """The place of the n-th node of the k-th single subtree of a class."""
+    if batches.by_node != 0:
+        return batches.node_begin[c] + n * batches.room[c] + k
+    return batches.node_begin[c] + SINGLE_NODES * k + n
+
+
+@wp.func
+def share_place(c: int, k: int, n: int, batches: Batches):
+    """The place of the n-th of the five nodes of a group that go with its subtree k of a class."""
+    return batches.node_begin[c] + 5 * k + n
+
+
+@wp.func
+def root_nodes(first: int, shape: int, shift: int, tree: Tree, batches: Batches):
+    """The corners of a subtree, the first four of its nodes."""
+    nodes = wp.vec4i(0)
+    for n in range(4):
+        place = batches.places[shape, n]
+        nodes[n] = tree.leaf_tets[first + place[0]][place[1]] + shift
+    return nodes
+
+
+@wp.func
+def fill_single(c: int, shape: int, k: int, first: int, shift: int, tree: Tree, batches: Batches):
+    """Nodes of the k-th single subtree of a class; ``first`` is its first leaf, -1 for padding."""
+    for n in range(SINGLE_NODES):
+        node = sink(k, tree)
         if first >= 0:
             place = batches.places[shape, n]
-            node = pools.leaf_tets[first + place[0]][place[1]]
-        if batches.by_node != 0:
-            batches.nodes[kind, n, k] = node
-        else:
-            batches.nodes[kind, k, n] = node
+            node = tree.leaf_tets[first + place[0]][place[1]] + shift
+        batches.nodes[node_place(c, k, n, batches)] = node
 
 
 @wp.func
-def fill_share(kind: int, shape: int, k: int, first: int, pools: Pools, batches: Batches):
-    """Five nodes of the group with the k-th subtree of a kind; ``first`` is the group's first leaf, or -1."""
+def fill_share(c: int, shape: int, k: int, first: int, shift: int, tree: Tree, batches: Batches):
+    """Five nodes of the group with the k-th subtree of a class; ``first`` is the group's first leaf, or -1."""
     for n in range(5):
-        m = 5 * (k % 8) + n
-        node = sink(k, pools)
-        if first >= 0:
-            place = batches.group_places[shape, m]
-            node = int(-1)
-            if place[0] >= 0:
-                node = pools.leaf_tets[first + place[0]][place[1]]
-        elif batches.group_places[shape, m][0] < 0:
-            node = int(-1)
-        batches.group_nodes[kind, k / 8, m] = node
+        place = batches.group_places[shape, 5 * (k % 8) + n]
+        node = int(-1)
+        if place[0] >= 0:
+            node = sink(k, tree)
+            if first >= 0:
+                node = tree.leaf_tets[first + place[0]][place[1]] + shift
+        batches.nodes[share_place(c, k, n, batches)] = node
 
 
 @wp.kernel(enable_backward=False)
 def fill_batches(
     # In
     threads: int,
-    pools: Pools,
+    tree: Tree,
     # In and out
     plan: Plan,
     # Out
@@ -95,44 +138,49 @@ def fill_batches(
 ):
     """Fill one class with each row of threads."""
     c, t = wp.tid()
-    kind = c / plan.members
-    grouped = plan.members == 2 and c % 2 == 0
-    shape = kind
-    if kind == 3:
-        shape = plan.rotation_level % 3
-    elif kind > 3:
-        shape = kind - 4
-    for k in range(t, extent(c, plan), threads):
+    kind = kind_of_class(c, plan)
+    shape = shape_of_kind(kind, plan)
+    grouped = is_grouped(c, plan)
+    places = extent(c, plan)
+    begin = plan.begin[c]
+    for k in range(t, plan.worlds * places, threads):
+        world = k / places
+        in_world = k - world * places
+        shift = world * plan.world_nodes
+        place = begin + k
         first = int(-1)
-        code = padding_code(pools)
-        if k < plan.counts[c]:
-            first = plan.first[c, k]
-            root = above(pools.leaves[first], 3, pools)
-            code = pools.code[root]
+        code = tree.padding_code
+        if in_world < plan.counts[c]:
+            first = plan.first[begin + in_world]
+            code = plan.code[first]
+            for _ in range(3):
+                code = code_above(code, 0, tree)
             if kind == 3:
-                batches.root_nodes[c % plan.members, k] = pools.tets[root]
+                batches.root_nodes[place - batches.roots] = root_nodes(first, shape, shift, tree, batches)
             elif kind > 3:
-                batches.unit[c, k] = plan.unit[first]
+                batches.unit[place] = plan.unit[first] + world * plan.world_units
+            if world > 0:
+                plan.first[place] = first + world * plan.world_leaves
         else:
-            plan.first[c, k] = 0
+            plan.first[place] = 0
             if kind == 3:
-                batches.root_nodes[c % plan.members, k] = padding(k, pools)
+                batches.root_nodes[place - batches.roots] = padding(k, tree)
             elif kind > 3:
-                batches.unit[c, k] = 0
-        batches.code[c, k] = code
+                batches.unit[place] = 0
+        batches.code[place] = code
         if not grouped:
-            fill_single(kind, shape, k, first, pools, batches)
+            fill_single(c, shape, k, first, shift, tree, batches)
         else:
             if first >= 0:
-                first -= LEAVES_OF_SUBTREE * (k % 8)
-            fill_share(kind, shape, k, first, pools, batches)
+                first -= LEAVES_OF_SUBTREE * (in_world % 8)
+            fill_share(c, shape, k, first, shift, tree, batches)
 
 
 @wp.kernel(enable_backward=False)
 def fill_flat(
     # In
     threads: int,
-    pools: Pools,
+    tree: Tree,
     # In and out
     plan: Plan,
     # Out
@@ -140,26 +188,32 @@ def fill_flat(
 ):
     """Fill the leaves in no subtree."""
     row = flat_row(plan)
-    for k in range(wp.tid(), extent(row, plan), threads):
-        nodes = padding(k, pools)
-        code = padding_code(pools)
+    places = extent(row, plan)
+    for k in range(wp.tid(), plan.worlds * places, threads):
+        world = k / places
+        in_world = k - world * places
+        nodes = padding(k, tree)
+        code = tree.padding_code
         unit = int(0)
         mu = float(0.0)
         lam = float(0.0)
-        if k < plan.counts[row]:
-            i = plan.flat[k]
-            nodes = pools.leaf_tets[i]
+        if in_world < plan.counts[row]:
+            i = plan.flat[in_world]
+            shift = world * plan.world_nodes
+            nodes = tree.leaf_tets[i] + wp.vec4i(shift, shift, shift, shift)
             code = plan.code[i]
-            if plan.rotation_level >= 0:
-                unit = plan.unit[i]
+            if plan.with_units != 0:
+                unit = plan.unit[i] + world * plan.world_units
             if leaves.mu_row >= 0:
                 mu = plan.values[leaves.mu_row, i]
                 lam = plan.values[leaves.lam_row, i]
+            if world > 0:
+                plan.flat[k] = i + world * plan.world_leaves
         else:
             plan.flat[k] = 0
         leaves.nodes[k] = nodes
         leaves.code[k] = code
-        if plan.rotation_level >= 0:
+        if plan.with_units != 0:
             leaves.unit[k] = unit
         if leaves.mu_row >= 0:
             leaves.mu[k] = mu

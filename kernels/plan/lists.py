@@ -1,4 +1,4 @@
-"""The leaves in complete subtrees, and the others: the lists of a derived plan (``plan``).
+"""The leaves in complete subtrees, and the others: the lists of a plan (``plan``).
 
 Leaves are in tree order, so the leaves of a subtree are contiguous: eight leaves of one level are a subtree if the
 first and the last have the same ancestor three levels up. Likewise 64 leaves under an ancestor six levels up
@@ -11,10 +11,9 @@ the start of its lists, which are thus in tree order for any number of threads.
 
 import warp as wp
 
-from warp_corot.kernels.remesh.pools import LEAVES, Pools
-
-from .plan import Plan, above, flat_row, level_of
-from .units import begins_unit, unit_of
+from .plan import Plan, flat_row, level_of, places_t
+from .tree import Tree, above, element_of, parent_of, which_child
+from .units import begins_unit, list_unit
 
 #: Maximum number of classes: three shapes with own rotations, one with its root's, three with one from further up; on
 #: CUDA each in groups, then one by one.
@@ -28,15 +27,13 @@ FIRST_OF_UNIT = wp.constant(16)
 LEAVES_OF_SUBTREE = 8
 LEAVES_OF_GROUP = 64
 
-places_t = wp.types.vector(length=16, dtype=wp.int32)
-
 
 @wp.func
-def place_in_subtree(e: int, pools: Pools):
+def place_in_subtree(e: int, tree: Tree):
     """The index, in tree order, of a tetrahedron among the eight descendants three levels below its ancestor."""
-    p = pools.parent[e]
-    q = pools.parent[p]
-    return (e - pools.roots) % 2 + 2 * ((p - pools.roots) % 2) + 4 * ((q - pools.roots) % 2)
+    p = parent_of(e, tree)
+    q = parent_of(p, tree)
+    return which_child(e, tree) + 2 * which_child(p, tree) + 4 * which_child(q, tree)
 
 
 @wp.func
@@ -53,10 +50,10 @@ def kind_of(level: int, plan: Plan):
 
 
 @wp.func
-def complete(i: int, size: int, depth: int, pools: Pools, plan: Plan):
+def complete(i: int, size: int, depth: int, tree: Tree, plan: Plan):
     """The tetrahedron ``depth`` levels up whose descendants at their level are leaf i and the next ones, ``size`` in
     all; -1 if they are not."""
-    if i < 0 or i + size > pools.counts[LEAVES]:
+    if i < 0 or i + size > tree.leaf_count[0]:
         return -1
     level = level_of(i, plan)
     if level < depth or level_of(i + size - 1, plan) != level:
@@ -64,43 +61,42 @@ def complete(i: int, size: int, depth: int, pools: Pools, plan: Plan):
     for n in range(1, size - 1):
         if level_of(i + n, plan) != level:
             return -1
-    root = above(pools.leaves[i], depth, pools)
-    if above(pools.leaves[i + size - 1], depth, pools) != root:
+    root = above(element_of(i, tree), depth, tree)
+    if above(element_of(i + size - 1, tree), depth, tree) != root:
         return -1
     return root
 
 
 @wp.func
-def class_at(i: int, pools: Pools, plan: Plan):
+def class_at(i: int, tree: Tree, plan: Plan):
     """The class of the subtree that begins at leaf i; -1 if none does."""
-    e = pools.leaves[i]
-    if plan.with_subtrees == 0 or e < pools.roots or (e - pools.roots) % 2 == 1:
-        return -1
     level = level_of(i, plan)
+    if plan.with_subtrees == 0 or level < 3 or which_child(element_of(i, tree), tree) == 1:
+        return -1
     kind = kind_of(level, plan)
     if kind < 0:
         return -1
-    root = complete(i, LEAVES_OF_SUBTREE, 3, pools, plan)
+    root = complete(i, LEAVES_OF_SUBTREE, 3, tree, plan)
     if root < 0:
         return -1
     if plan.members == 1:
         return kind
     if level >= 6:
-        start = i - LEAVES_OF_SUBTREE * place_in_subtree(root, pools)
-        if complete(start, LEAVES_OF_GROUP, 6, pools, plan) >= 0:
+        start = i - LEAVES_OF_SUBTREE * place_in_subtree(root, tree)
+        if complete(start, LEAVES_OF_GROUP, 6, tree, plan) >= 0:
             return 2 * kind
     return 2 * kind + 1
 
 
 @wp.func
-def covered_from(i: int, pools: Pools, plan: Plan):
+def covered_from(i: int, tree: Tree, plan: Plan):
     """Number of leaves from the i-th on that belong to a subtree that begins before it."""
     if level_of(i, plan) < 3:
         return 0
-    place = place_in_subtree(pools.leaves[i], pools)
+    place = place_in_subtree(element_of(i, tree), tree)
     if place == 0 or place > i:
         return 0
-    if class_at(i - place, pools, plan) < 0:
+    if class_at(i - place, tree, plan) < 0:
         return 0
     return LEAVES_OF_SUBTREE - place
 
@@ -109,7 +105,7 @@ def covered_from(i: int, pools: Pools, plan: Plan):
 def mark_leaves(
     # In
     threads: int,
-    pools: Pools,
+    tree: Tree,
     # In and out
     plan: Plan,
     # Out
@@ -119,13 +115,13 @@ def mark_leaves(
     t = wp.tid()
     totals = places_t()
     if plan.goes[0] != 0:
-        leaves = pools.counts[LEAVES]
+        leaves = tree.leaf_count[0]
         stretch = (leaves + threads - 1) / threads
         begin = t * stretch
         end = wp.min(begin + stretch, leaves)
         if begin < end:
             i = int(begin)
-            inside = covered_from(begin, pools, plan)
+            inside = covered_from(begin, tree, plan)
             while i < end:
                 at = int(FLAT)
                 size = int(1)
@@ -133,7 +129,7 @@ def mark_leaves(
                     at = int(COVERED)
                     size = inside
                 else:
-                    found = class_at(i, pools, plan)
+                    found = class_at(i, tree, plan)
                     if found >= 0:
                         at = found
                         size = LEAVES_OF_SUBTREE
@@ -148,7 +144,7 @@ def mark_leaves(
                     # A subtree that shares its rotation belongs to one unit.
                     new = bool(False)
                     if not shared or (n == 0 and at != COVERED):
-                        new = begins_unit(i + n, pools, plan)
+                        new = begins_unit(i + n, tree, plan)
                     if new:
                         mark += FIRST_OF_UNIT
                         totals[flat_row(plan) + 1] += 1
@@ -159,18 +155,35 @@ def mark_leaves(
 
 
 @wp.kernel(enable_backward=False)
-def list_leaves(
+def count_rows(
     # In
     threads: int,
-    pools: Pools,
     ends: wp.array[wp.int32],
     # In and out
     plan: Plan,
 ):
-    """Write the lists and the counts; ``ends`` are inclusive sums."""
+    """Write the counts of classes, of leaves in none and of units; ``ends`` are inclusive sums."""
+    row = wp.tid()
+    if plan.goes[0] != 0:
+        count = ends[(row + 1) * threads - 1]
+        if row > 0:
+            count -= ends[row * threads - 1]
+        plan.counts[row] = count
+
+
+@wp.kernel(enable_backward=False)
+def list_leaves(
+    # In
+    threads: int,
+    tree: Tree,
+    ends: wp.array[wp.int32],
+    # In and out
+    plan: Plan,
+):
+    """Write the lists; ``ends`` are inclusive sums."""
     t = wp.tid()
     if plan.goes[0] != 0:
-        leaves = pools.counts[LEAVES]
+        leaves = tree.leaf_count[0]
         stretch = (leaves + threads - 1) / threads
         places = places_t()
         for row in range(plan.classes + 2):
@@ -182,23 +195,18 @@ def list_leaves(
                 before -= ends[row * threads - 1]
             places[row] = before
         unit_row = flat_row(plan) + 1
+        places[unit_row] += plan.first_unit - 1
         for i in range(t * stretch, wp.min((t + 1) * stretch, leaves)):
             mark = int(plan.marks[i])
             at = mark & MARK_BITS
             if at < CLASSES:
-                plan.first[at, places[at]] = i
+                plan.first[plan.begin[at] + places[at]] = i
                 places[at] += 1
             elif at == FLAT:
                 plan.flat[places[flat_row(plan)]] = i
                 places[flat_row(plan)] += 1
-            if plan.rotation_level >= 0:
+            if plan.with_units != 0:
                 if mark >= FIRST_OF_UNIT:
-                    # Offset by one: the first place is padding.
                     places[unit_row] += 1
-                    e = unit_of(pools.leaves[i], pools, plan)
-                    plan.unit_nodes[places[unit_row]] = pools.tets[e]
-                    plan.unit_code[places[unit_row]] = pools.code[e]
+                    list_unit(places[unit_row], i, tree, plan)
                 plan.unit[i] = places[unit_row]
-        if t == threads - 1:
-            for row in range(plan.classes + 2):
-                plan.counts[row] = places[row]

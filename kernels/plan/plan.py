@@ -1,23 +1,31 @@
-"""The force plan of a forest that changes: its arrays, and the data of leaves by their places in them.
+"""A force plan: its arrays, and what its kernels share.
 
 ``lists`` finds the leaves in complete subtrees and the others; ``units`` the elements whose rotations are
-found; ``batches`` writes the arrays that launches read.
+found; ``batches`` writes the arrays that launches read; ``slots`` numbers places for forces. A forest that stays as it
+is gets arrays of exact sizes, for all worlds; one that changes (``changing``) gets arrays for its capacity.
 """
 
 import warp as wp
 
 from warp_corot.kernels.elements.elements import LEVEL_MASK
-from warp_corot.kernels.remesh.pools import ADDED, LEAVES, REMOVED, Pools
+
+places_t = wp.types.vector(length=16, dtype=wp.int32)
 
 
 @wp.struct
 class Plan:
-    """The derived arrays, sized for the capacity, with padding beyond the current size."""
+    """The derived arrays; those for the capacity have padding beyond the current size."""
 
     rotation_level: int  # -1: rotations are not shared
     with_subtrees: int  # 0: all leaves are computed one by one
+    with_units: int  # 0: units are counted, but not listed
     members: int  # 2: groups and single subtrees; 1: there are no groups
     classes: int
+    # Copies of the body, and the numbers of nodes, leaves and units in each.
+    worlds: int
+    world_nodes: int
+    world_leaves: int
+    world_units: int
     # Numbers for each class, for leaves in none, for units and for leaves; and the former numbers.
     counts: wp.array[wp.int32]
     before: wp.array[wp.int32]
@@ -28,10 +36,12 @@ class Plan:
     values: wp.array2d[wp.float32]  # [names, leaves]
     marks: wp.array[wp.int8]
     unit: wp.array[wp.int32]
-    # Subtrees by class, and the leaves in none.
-    first: wp.array2d[wp.int32]  # [classes, subtrees]
+    # First leaves of the subtrees, class after class, and the leaves in none.
+    begin: places_t  # of each class
+    first: wp.array[wp.int32]
     flat: wp.array[wp.int32]
-    # Units; the first place is always padding, for leaves that are padding.
+    # Units. Where leaves may be padding the first place is padding for them, and units are counted from 1.
+    first_unit: int
     unit_nodes: wp.array[wp.vec4i]
     unit_code: wp.array[wp.int32]
 
@@ -50,76 +60,10 @@ def leaf_row(plan: Plan):
 
 @wp.func
 def extent(row: int, plan: Plan):
-    """Number of written places in a row, padding included."""
+    """Number of written places in a row, padding included; of one world."""
     if plan.goes[0] == 0:
         return 0
     return wp.max(plan.counts[row], plan.before[row])
-
-
-@wp.func
-def padding_code(pools: Pools):
-    """The code of a root, whose frame is along the axes: deformation gradients of padding are exact, energies zero."""
-    return pools.code[0]
-
-
-@wp.kernel(enable_backward=False)
-def begin_plan(
-    # In
-    pools: Pools,
-    # In and out
-    plan: Plan,
-):
-    plan.goes[0] = 0
-    if pools.counts[ADDED] + pools.counts[REMOVED] > 0 or plan.stale[0] != 0:
-        plan.goes[0] = 1
-        for row in range(plan.classes + 3):
-            plan.before[row] = plan.counts[row]
-        plan.counts[leaf_row(plan)] = pools.counts[LEAVES]
-    plan.stale[0] = 0
-
-
-@wp.kernel(enable_backward=False)
-def begin_counts(
-    # In
-    goes: wp.array[wp.int32],
-    # Out
-    found: wp.array[wp.int32],
-):
-    """Reset the counts if they will be counted again."""
-    if goes[0] != 0:
-        found[wp.tid()] = 0
-
-
-@wp.kernel(enable_backward=False)
-def gather_leaves(
-    # In
-    threads: int,
-    pools: Pools,
-    carried_values: wp.array2d[wp.float32],
-    # In and out
-    plan: Plan,
-):
-    """Data of leaves by their places in the list; values of padding are zero."""
-    for i in range(wp.tid(), extent(leaf_row(plan), plan), threads):
-        if i < pools.counts[LEAVES]:
-            e = pools.leaves[i]
-            plan.code[i] = pools.code[e]
-            for c in range(plan.values.shape[0]):
-                plan.values[c, i] = carried_values[e, c]
-        else:
-            plan.code[i] = padding_code(pools)
-            if plan.rotation_level >= 0:
-                plan.unit[i] = 0
-            for c in range(plan.values.shape[0]):
-                plan.values[c, i] = 0.0
-
-
-@wp.func
-def above(e: int, steps: int, pools: Pools):
-    found = int(e)
-    for _ in range(steps):
-        found = pools.parent[found]
-    return found
 
 
 @wp.func

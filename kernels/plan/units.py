@@ -1,4 +1,4 @@
-"""The elements whose rotations are found if leaves share them: the units of a derived plan (``plan``), in tree order.
+"""The elements whose rotations are found if leaves share them: the units of a plan (``plan``), in tree order.
 
 A unit is the highest tetrahedron above a leaf that is not above the rotation level and whose corners are nodes. The
 leaves of a unit are contiguous.
@@ -6,34 +6,23 @@ leaves of a unit are contiguous.
 
 import warp as wp
 
-from warp_corot.kernels.remesh.pools import NODE_TOP, Pools, padding
+from warp_corot.kernels.elements.elements import LEVEL_MASK
 
-from .plan import Plan, extent, flat_row, level_of, padding_code
+from .plan import Plan, extent, flat_row, level_of
+from .tree import Tree, code_above, element_of, padding, parent_of, which_child
 
 
 @wp.func
-def on_nodes(e: int, pools: Pools):
+def on_nodes(e: int, tree: Tree):
     """Whether all corners are nodes of leaves; on the rim of a domain's mesh they may not be."""
-    if pools.node_limit == pools.sink:
+    if tree.named != 0:
         return True
-    tet = pools.tets[e]
-    return wp.max(wp.max(tet[0], tet[1]), wp.max(tet[2], tet[3])) < pools.counts[NODE_TOP]
+    tet = tree.tets[e]
+    return wp.max(wp.max(tet[0], tet[1]), wp.max(tet[2], tet[3])) < tree.node_count[0]
 
 
 @wp.func
-def unit_of(e: int, pools: Pools, plan: Plan):
-    """The highest tetrahedron above a leaf, or the leaf, that is not above the rotation level and stands on nodes."""
-    found = int(e)
-    climbed = int(e)
-    while pools.level[climbed] > plan.rotation_level:
-        climbed = pools.parent[climbed]
-        if on_nodes(climbed, pools):
-            found = climbed
-    return found
-
-
-@wp.func
-def begins_unit(i: int, pools: Pools, plan: Plan):
+def begins_unit(i: int, tree: Tree, plan: Plan):
     """Whether leaf i has a different unit from the one before it.
 
     They share one if a common ancestor that is not above the level stands on nodes.
@@ -43,35 +32,80 @@ def begins_unit(i: int, pools: Pools, plan: Plan):
         return False
     if i == 0 or wp.min(level_of(i, plan), level_of(i - 1, plan)) <= limit:
         return True
-    a = int(pools.leaves[i - 1])
-    b = int(pools.leaves[i])
+    a = element_of(i - 1, tree)
+    b = element_of(i, tree)
     level_a = level_of(i - 1, plan)
     level_b = level_of(i, plan)
-    while a != b and (level_a > limit or level_b > limit):
+    # Elements of different levels may have the same number in a uniform tree.
+    while (a != b or level_a != level_b) and (level_a > limit or level_b > limit):
         if level_a >= level_b:
-            a = pools.parent[a]
+            a = parent_of(a, tree)
             level_a -= 1
         else:
-            b = pools.parent[b]
+            b = parent_of(b, tree)
             level_b -= 1
     if a != b:
         return True
-    while not on_nodes(a, pools) and level_a > limit:
-        a = pools.parent[a]
+    while not on_nodes(a, tree) and level_a > limit:
+        a = parent_of(a, tree)
         level_a -= 1
-    return not on_nodes(a, pools)
+    return not on_nodes(a, tree)
+
+
+@wp.func
+def list_unit(k: int, i: int, tree: Tree, plan: Plan):
+    """Write the unit of leaf i, the first of its leaves, to place k.
+
+    It is the highest tetrahedron above the leaf, or the leaf, that is not above the rotation level and stands on nodes.
+    """
+    code = plan.code[i]
+    e = element_of(i, tree)
+    unit = int(e)
+    climbed_code = int(code)
+    while (climbed_code & LEVEL_MASK) > plan.rotation_level:
+        climbed_code = code_above(climbed_code, which_child(e, tree), tree)
+        e = parent_of(e, tree)
+        if on_nodes(e, tree):
+            unit = e
+            code = climbed_code
+    plan.unit_code[k] = code
+    if tree.uniform == 0:
+        plan.unit_nodes[k] = tree.tets[unit]
+    else:
+        nodes = wp.vec4i(0)
+        for n in range(4):
+            nodes[n] = tree.leaf_tets[i + tree.corner_leaves[n]][tree.corner_nodes[n]]
+        plan.unit_nodes[k] = nodes
 
 
 @wp.kernel(enable_backward=False)
 def pad_units(
     # In
     threads: int,
-    pools: Pools,
+    tree: Tree,
     # In and out
     plan: Plan,
 ):
-    """Number units after the first place, which is padding."""
+    """Write padding to the first place, and after the units."""
     row = flat_row(plan) + 1
-    for k in range(plan.counts[row] + 1 + wp.tid(), extent(row, plan) + 1, threads):
-        plan.unit_nodes[k] = padding(k, pools)
-        plan.unit_code[k] = padding_code(pools)
+    count = plan.counts[row]
+    for k in range(count + wp.tid(), extent(row, plan) + 1, threads):
+        place = wp.where(k == count, 0, k)
+        plan.unit_nodes[place] = padding(place, tree)
+        plan.unit_code[place] = tree.padding_code
+
+
+@wp.kernel(enable_backward=False)
+def repeat_units(
+    # In and out
+    plan: Plan,
+):
+    """Units of the first world for the others too."""
+    world, i = wp.tid()
+    if i < plan.world_leaves:
+        plan.unit[(world + 1) * plan.world_leaves + i] = plan.unit[i] + (world + 1) * plan.world_units
+    if i < plan.world_units:
+        k = (world + 1) * plan.world_units + i
+        shift = (world + 1) * plan.world_nodes
+        plan.unit_nodes[k] = plan.unit_nodes[i] + wp.vec4i(shift, shift, shift, shift)
+        plan.unit_code[k] = plan.unit_code[i]

@@ -13,6 +13,8 @@ nodes without mass that stay at rest, and leaves whose four nodes are all one of
 
 import warp as wp
 
+from warp_corot.kernels.plan.tree import SINKS
+
 # Places in ``Pools.counts``.
 LEAVES = wp.constant(0)
 NODE_TOP = wp.constant(1)  # nodes that leaves name: all lower numbers
@@ -39,8 +41,6 @@ NEW_LEAVES = wp.constant(21)
 FIRST_NEW = wp.constant(22)  # nodes made in this pass have this number or a higher one, until nodes are removed
 COUNTS = 23
 
-#: Number of places past the last node that padding names in turn, so that additions to them seldom collide.
-SINKS = wp.constant(1024)
 #: Places past the last possible leaf, for launches that are larger than needed.
 LEAF_PADDING = 1024
 

@@ -15,7 +15,7 @@ from thousands import FORESTS, TOLERANCE, materials, meshed, turned
 
 import warp_corot as wc
 from warp_corot.discretization.clusters.single import isotropic_material
-from warp_corot.discretization.plan import ForcePlan
+from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.elasticity.corotated.anisotropic import AnisotropicField
 from warp_corot.elasticity.corotated.anisotropic_general import GeneralAnisotropicField
 from warp_corot.elasticity.corotated.anisotropic_subtrees import as_bytes

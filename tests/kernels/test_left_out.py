@@ -13,7 +13,7 @@ from left_out_launches import Launches
 
 import warp_corot as wc
 from warp_corot.discretization.clusters.single import isotropic_material
-from warp_corot.discretization.plan import ForcePlan
+from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.elasticity.corotated.left_out import LeftOutLeaves
 from warp_corot.kernels.subtrees.repair import COUNT_STRIDE, LISTS
 

@@ -12,7 +12,7 @@ from cases import edge_scale, mixed_forest, oracle_mesh, place, random_displacem
 from left_out_launches import Launches
 
 import warp_corot as wc
-from warp_corot.discretization.plan import ForcePlan
+from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.kernels.subtrees.cuda import scatter_subtrees_shared
 from warp_corot.kernels.subtrees.repair import LeftOut
 

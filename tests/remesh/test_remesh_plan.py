@@ -10,7 +10,8 @@ from warp_corot.discretization.changing.passes import RemeshPass
 from warp_corot.discretization.changing.plan import DevicePlan
 from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.discretization.changing.sizes import launch_size
-from warp_corot.discretization.plan import ForcePlan, Units
+from warp_corot.discretization.elements import device_elements
+from warp_corot.discretization.planning.fixed import ForcePlan, units_of
 from warp_corot.discretization.subtrees import Sharing
 from warp_corot.kernels.remesh.pools import SINKS
 from warp_corot.kernels.tables.shapes import FRAME_SHIFT
@@ -58,10 +59,10 @@ class Comparison:
         self.plan, self.forest = plan, forest
         self.leaves = len(mesh.tets)
         self.expected = ForcePlan.of_forest(mesh, rotation_level, forest.device, grouped=grouped)
+        self.mesh_elements = device_elements(mesh, forest.device)
         self.mesh_units = None
         if rotation_level is not None:
-            self.mesh_units = Units.of_forest(mesh, rotation_level, forest.device)
-        self.mesh_elements = wc.SoftBody(mesh, MATERIAL, device=forest.device).discretization.elements
+            self.mesh_units = units_of(mesh, self.mesh_elements, rotation_level, 1)
 
     def check(self):
         plan, expected = self.plan, self.expected

@@ -4,11 +4,11 @@ import itertools
 
 import numpy as np
 import pytest
+from plan_oracle import shape_codes
 from sequential import Bisection
 
 from warp_corot.discretization.changing.fields import CARRIED_BY_NODES
 from warp_corot.discretization.changing.pools import DeviceForest
-from warp_corot.discretization.elements import shape_codes
 from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 from warp_corot.mesh.lattice import LATTICE_BITS
 

@@ -19,12 +19,13 @@ from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest
 
 from .clock import Clock
-from .elements import ElementKind, Elements, Mesh, device_elements, element_kind, in_worlds, parts, with_targets
+from .elements import ElementKind, Elements, Mesh, device_elements, element_kind, with_targets
+from .frames import parts
 from .levels import Levels, TreeNodes
-from .plan import FlatLeaves, ForcePlan, Plan, Units
+from .plan import FlatLeaves, Plan
+from .planning.fixed import ForcePlan, pays_in_groups, units_of
 from .sizes import Sizes
 from .slots import Slots
-from .subtrees import pays_in_groups
 
 #: Elements, and with them nodes, are numbered in 32 bits.
 MOST_ELEMENTS = 2**31 - 1
@@ -228,7 +229,7 @@ class FixedMesh(Discretization):
 
     @property
     def prefers_subtrees(self) -> bool:
-        return isinstance(self._mesh, TetForest) and pays_in_groups(self._mesh, self.worlds)
+        return isinstance(self._mesh, TetForest) and pays_in_groups(self._mesh, self.elements, self.worlds)
 
     def plan(
         self, rotation_level: int | None = None, *, subtrees: bool = True, deterministic: bool = False
@@ -239,11 +240,11 @@ class FixedMesh(Discretization):
                 mesh, rotation_level, device, worlds=worlds, elements=elements, deterministic=deterministic
             )
         slots = find_units = None
-        if deterministic:
-            slots, (targets,) = Slots.of_units([mesh.tets], len(mesh.points), device, worlds)
-            elements = with_targets(elements, in_worlds(targets, worlds, slots.per_world))
         if isinstance(mesh, TetForest) and rotation_level is not None:
-            find_units = partial(Units.of_forest, mesh, rotation_level, device, worlds)
+            find_units = partial(units_of, mesh, elements, rotation_level, worlds)
+        if deterministic:
+            slots, targets = Slots.of_units(mesh.tets, len(mesh.points), device, worlds)
+            elements = with_targets(elements, wp.array(targets, dtype=wp.vec4i, device=device))
         return ForcePlan.leaf_by_leaf(elements, slots, find_units)
 
     def _tree_nodes(self) -> TreeNodes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +10,7 @@ import warp as wp
 
 from warp_corot.errors import InputError
 from warp_corot.kernels.elements.reproducible import gather_slots
+from warp_corot.kernels.plan.slots import find_starts, number_slots, order_slots
 
 from .elements import in_worlds
 
@@ -35,41 +35,63 @@ class Slots:
     per_world: int
 
     @classmethod
-    def of_units(
-        cls, units: Sequence[npt.NDArray[np.int32]], node_count: int, device: wp.Device, worlds: int = 1
-    ) -> tuple[Slots, list[npt.NDArray[np.int32]]]:
-        """Slots for units of work, and which slot each unit's nodes have.
+    def of_nodes(cls, nodes: wp.array, per_world: int, used: int, node_count: int, worlds: int) -> Slots:
+        """Slots by the node that each belongs to.
 
         Args:
-            units: Nodes of the units of one kind, [n, m] for each kind, of one world; negative where there is none.
+            nodes: Nodes of the slots of one world, ``node_count`` for slots that are not used, and as many places more,
+                int32 [2 * per_world]; what it holds is lost.
+            per_world: How many slots there are in a world.
+            used: How many of these are used.
+            node_count: Number of nodes of one world.
+        """
+        device = nodes.device
+        slots = wp.empty_like(nodes)
+        wp.launch(number_slots, per_world, outputs=[slots], device=device)
+        wp.utils.radix_sort_pairs(nodes, slots, per_world)
+        starts = wp.empty(worlds * node_count + 1, dtype=wp.int32, device=device)
+        inputs = [per_world, node_count, used, nodes]
+        wp.launch(find_starts, (worlds, node_count + 1), inputs, [starts], device=device)
+        order = wp.empty(worlds * used, dtype=wp.int32, device=device)
+        wp.launch(order_slots, (worlds, used), [per_world, used, slots], [order], device=device)
+        return cls(starts, order, wp.zeros(worlds * per_world, dtype=wp.vec4, device=device), per_world)
+
+    @classmethod
+    def of_units(
+        cls, units: npt.NDArray[np.int32], node_count: int, device: wp.Device, worlds: int = 1
+    ) -> tuple[Slots, npt.NDArray[np.int32]]:
+        """Slots for units of work that have as many nodes each.
+
+        Args:
+            units: Their nodes, of one world, [n, m].
             node_count: Number of nodes of one world.
 
         Returns:
-            The slots, and for each kind their numbers in the same places, int32 [n, m], of one world.
+            The slots, and their numbers in the same places in all worlds, int32 [worlds * n, m].
 
         Raises:
             InputError: More slots than can be numbered.
         """
-        flat = np.concatenate([nodes.ravel() for nodes in units])
-        if worlds * len(flat) > MOST_SLOTS:
-            raise InputError(
-                f"a deterministic run of this body needs {worlds * len(flat)} slots for forces; "
-                f"there can be {MOST_SLOTS} at most"
-            )
-        there = np.flatnonzero(flat >= 0)
-        order = there[np.argsort(flat[there], kind="stable")]
-        ends = np.cumsum(np.bincount(flat[there], minlength=node_count))
-        slots = cls(
-            wp.array(np.concatenate([[0], in_worlds(ends, worlds, len(order))]), dtype=wp.int32, device=device),
-            wp.array(in_worlds(order, worlds, len(flat)), dtype=wp.int32, device=device),
-            wp.zeros(worlds * len(flat), dtype=wp.vec4, device=device),
-            len(flat),
-        )
-        number = np.where(flat < 0, -1, np.arange(len(flat))).astype(np.int32)
-        parts = np.split(number, np.cumsum([nodes.size for nodes in units])[:-1])
-        return slots, [part.reshape(nodes.shape) for part, nodes in zip(parts, units, strict=True)]
+        check_slots(worlds * units.size)
+        nodes = wp.empty(2 * units.size, dtype=wp.int32, device=device)
+        nodes[: units.size].assign(np.ascontiguousarray(units, dtype=np.int32).ravel())
+        numbers = np.arange(units.size, dtype=np.int32).reshape(units.shape)
+        slots = cls.of_nodes(nodes, units.size, units.size, node_count, worlds)
+        return slots, in_worlds(numbers, worlds, units.size)
 
     def gather(self, f: wp.array, values: wp.array | None = None) -> None:
         """Add each node's slots to its force, vec4 [worlds * N]; ``values`` are others in the place of the slots'."""
         inputs = [self.starts, self.order, self.values if values is None else values]
         wp.launch(gather_slots, dim=len(f), inputs=inputs, outputs=[f], device=f.device)
+
+
+def check_slots(count: int) -> None:
+    """See that so many slots can be numbered.
+
+    Raises:
+        InputError: They cannot.
+    """
+    if count > MOST_SLOTS:
+        raise InputError(
+            f"a deterministic run of this body needs {count} slots for forces; there can be {MOST_SLOTS} at most"
+        )

@@ -83,9 +83,8 @@ class MassSpringField(ForceField):
         self._edges = wp.array(in_worlds(edges, worlds, len(points)), dtype=wp.vec2i, device=self.device)
         self._targets = self._edges
         if self.deterministic:
-            self.slots, (targets,) = Slots.of_units([edges], len(points), self.device, worlds)
-            own = in_worlds(targets, worlds, self.slots.per_world)
-            self._targets = wp.array(own, dtype=wp.vec2i, device=self.device)
+            self.slots, targets = Slots.of_units(edges, len(points), self.device, worlds)
+            self._targets = wp.array(targets, dtype=wp.vec2i, device=self.device)
         self._rest = wp.array(repeated(rest, worlds), dtype=wp.vec3, device=self.device)
         self._stiffness = wp.array(stiffness, dtype=wp.float32, device=self.device)
         # Lamé's parameters of E and nu = 1/4 are both 0.4 E.

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.discretization.changing.pools import DeviceForest
-from warp_corot.kernels.plan.plan import begin_counts
+from warp_corot.kernels.plan.changing import begin_counts
 from warp_corot.kernels.remesh import followers as kernels
 
 from .carried_activation import CarriedActivation

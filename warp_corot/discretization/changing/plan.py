@@ -1,22 +1,26 @@
-"""The force plan of a forest that changes, derived on the device after each pass; see ``kernels.plan.plan``."""
+"""The force plan of a forest that changes, derived after each pass; see ``kernels.plan.plan``."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.discretization.plan import FlatLeaves, LeafCounts, Units
-from warp_corot.discretization.subtrees import Batch, Sharing
-from warp_corot.kernels.elements.elements import ForestElements, GeneralElements, Subtrees
-from warp_corot.kernels.plan import batches as remesh_batches
-from warp_corot.kernels.plan import lists as remesh_lists
-from warp_corot.kernels.plan import plan as remesh_plan
-from warp_corot.kernels.plan import units as remesh_units
+from warp_corot.discretization.elements import edge_lengths
+from warp_corot.discretization.frames import device_frames
+from warp_corot.discretization.plan import LeafCounts, Units
+from warp_corot.discretization.planning.arrays import GRANULE, PlanArrays, Room
+from warp_corot.discretization.planning.planner import Planner
+from warp_corot.discretization.subtrees import Sharing
+from warp_corot.kernels.elements.elements import ForestElements
+from warp_corot.kernels.elements.general_cpu import rest_matrices
+from warp_corot.kernels.plan import changing as kernels
+from warp_corot.kernels.plan.plan import Plan
+from warp_corot.kernels.plan.tree import Tree
+from warp_corot.kernels.remesh.pools import LEAF_PADDING, LEAVES, NODE_TOP
+from warp_corot.kernels.tables.shapes import MIRROR_BIT
+from warp_corot.mesh.lattice import MAX_LEVEL
 
-from .plan_arrays import GRANULE, PlanArrays
 from .pools import DeviceForest
 from .sizes import launch_size
 
@@ -55,25 +59,25 @@ class DevicePlan:
         self.device = forest.device
         self._with_subtrees = subtrees
         grouped = self.device.is_cuda if grouped is None else grouped
-        made = PlanArrays(forest, rotation_level, subtrees=subtrees, grouped=grouped)
-        self._kinds, self._most_subtrees = made.kinds, made.most_subtrees
-        self._plan, self._batches, self._leaves = made.plan, made.batches, made.leaves
-        self._rows = self._plan.classes + 2
+        most_leaves = forest.capacity + LEAF_PADDING
+        self._most_subtrees = max(-(-forest.capacity // (8 * GRANULE)) if subtrees else 0, 1) * GRANULE
+        self.elements = self._leaves(most_leaves)
+        made = PlanArrays(tree_of(forest), self.elements, rotation_level, subtrees=subtrees, grouped=grouped)
+        self._made, self._plan = made, made.plan
+        classes, shared = made.plan.classes, made.rotation_shared
+        made.make(Room([self._most_subtrees] * classes, most_leaves, most_leaves * shared, most_leaves))
+        self._fill_in(most_leaves)
+        self._planner = Planner(made, forest.threads)
+        self._rows = classes + 2
         all_leaves = slice(self._rows, self._rows + 1)
         self.counts = LeafCounts(
-            most=len(made.plan.code),
+            most=most_leaves,
             now=self._plan.counts[all_leaves],
             before=self._plan.before[all_leaves],
             goes=self._plan.goes,
             threads=forest.threads,
         )
-        self._flagged = wp.zeros((self._plan.classes, self._most_subtrees), dtype=wp.uint8, device=self.device)
-        self._sums, self._ends = (
-            wp.zeros(self._rows * forest.threads, dtype=wp.int32, device=self.device) for _ in range(2)
-        )
         self.class_counts = self._plan.counts
-        self._edge_lengths = made.edge_lengths
-        self.elements = self._elements(forest.pools.leaf_tets, self._plan.code)
         self.values = {name: self._plan.values[n] for n, name in enumerate(forest.carriage.names)}
         self._sizes = [0] * self._rows
         self._refit()
@@ -81,19 +85,19 @@ class DevicePlan:
 
     def launch(self) -> None:
         """Launch what derives the plan if the last pass has changed the mesh; may be recorded."""
-        pools, plan, threads = self.forest.pools, self._plan, self.forest.threads
-        self._launch(remesh_plan.begin_plan, 1, pools, plan)
-        self._launch(remesh_plan.gather_leaves, threads, threads, pools, self.forest.carriage.arrays.values, plan)
+        forest, plan, planner = self.forest, self._plan, self._planner
+        wp.launch(kernels.begin_plan, 1, [forest.pools, plan], device=self.device)
+        inputs = [forest.threads, forest.pools, self._made.tree, forest.carriage.arrays.values, plan]
+        wp.launch(kernels.gather_leaves, forest.threads, inputs, device=self.device)
         if not (self._with_subtrees or self.rotation_shared):
             return
-        self._launch(remesh_lists.mark_leaves, threads, threads, pools, plan, self._sums)
-        wp.utils.array_scan(self._sums, self._ends, inclusive=True)
-        self._launch(remesh_lists.list_leaves, threads, threads, pools, self._ends, plan)
+        planner.find()
+        planner.list()
         if self._with_subtrees:
-            self._launch(remesh_batches.fill_batches, (plan.classes, threads), threads, pools, plan, self._batches)
-            self._launch(remesh_batches.fill_flat, threads, threads, pools, plan, self._leaves)
+            planner.fill_batches()
+            planner.fill_flat()
         if self.rotation_shared:
-            self._launch(remesh_units.pad_units, threads, threads, pools, plan)
+            planner.pad_units()
 
     def outdate(self) -> None:
         """Let the next launches derive the plan also if the last pass has changed nothing, as after ``restart``."""
@@ -132,7 +136,7 @@ class DevicePlan:
         return names.index(name) if name in names else -1
 
     @property
-    def arrays(self) -> remesh_plan.Plan:
+    def arrays(self) -> Plan:
         """``kernels.plan.plan.Plan``, for launches that derive more from it."""
         return self._plan
 
@@ -142,13 +146,13 @@ class DevicePlan:
         if not self._with_subtrees:
             return []
         members = (True, False) if self._plan.members == 2 else (False,)
-        return [(shape, grouped, sharing) for sharing, shape in self._kinds for grouped in members]
+        return [(shape, grouped, sharing) for sharing, shape in self._made.kinds for grouped in members]
 
     @property
     def rotation_shared(self) -> bool:
-        return bool(self._plan.rotation_level >= 0)
+        return self._made.rotation_shared
 
-    # --- what launches go through ----------------------------------------------------------------------------------
+    # --- what launches go through ------------------------------------------------------------------------------------
 
     @property
     def units(self) -> Units | None:
@@ -158,62 +162,62 @@ class DevicePlan:
     @property
     def all_units(self) -> Units:
         """What rotations are found of, whether a launch of forces asks for it or not; the first is padding."""
-        plan = self._plan
-        return Units(self._elements(plan.unit_nodes, plan.unit_code), self._sizes[-1], plan.unit)
+        return self._made.units(self._sizes[-1])
 
     def _refit(self) -> None:
         """``batches`` and ``flat`` of the present sizes."""
         sizes, classes = self._sizes, self._plan.classes
-        self.batches = tuple(self._batch(c, sizes[c]) for c in range(classes) if sizes[c])
-        self.flat = self._flat(sizes[classes])
+        self.batches = tuple(self._made.batch(c, sizes[c]) for c in range(classes) if sizes[c])
+        self.flat = self._made.flat(sizes[classes])
 
-    def _batch(self, row: int, count: int) -> Batch:
-        arrays, grouped = self._batches, self._plan.members == 2 and row % 2 == 0
-        kind = row // self._plan.members
-        sharing, shape = self._kinds[kind]
-        subtrees = Subtrees()
-        if grouped:
-            subtrees.nodes = arrays.group_nodes[kind][: count // 8]
-        elif arrays.by_node:
-            subtrees.nodes = arrays.nodes[kind][:, :count]
-        else:
-            subtrees.nodes = arrays.nodes[kind][:count]
-        subtrees.targets = subtrees.nodes
-        subtrees.code = arrays.code[row][:count]
-        subtrees.first = self._plan.first[row][:count]
-        subtrees.frames, subtrees.size = self.elements.frames, self.elements.size
-        roots = unit = None
-        if sharing is Sharing.ROOT:
-            roots = self._elements(arrays.root_nodes[row % self._plan.members][:count], subtrees.code)
-        elif sharing is Sharing.ABOVE:
-            unit = arrays.unit[row][:count]
-        return Batch(shape, grouped, count, sharing, subtrees, roots, unit, self._flagged[row][:count])
+    # --- pieces ------------------------------------------------------------------------------------------------------
 
-    def _flat(self, count: int) -> FlatLeaves:
-        leaves, general = self._leaves, None
-        if len(leaves.volume):
-            general = GeneralElements()
-            general.nodes = general.targets = _first(leaves.nodes, count)
-            general.rest_inverse, general.volume = _first(leaves.rest_inverse, count), _first(leaves.volume, count)
-        return FlatLeaves(
-            leaves=_first(self._plan.flat, count),
-            elements=self._elements(_first(leaves.nodes, count), _first(leaves.code, count)),
-            unit=_first(leaves.unit, count) if self.rotation_shared else None,
-            general=general,
-            material=(_first(leaves.mu, count), _first(leaves.lam, count)) if leaves.mu_row >= 0 else None,
-        )
-
-    def _elements(self, nodes: wp.array, code: wp.array) -> ForestElements:
-        elements = ForestElements()
-        elements.nodes = elements.targets = nodes
-        elements.code = code
-        elements.frames, elements.size = self.forest.pools.frames, self._edge_lengths
+    def _leaves(self, count: int) -> ForestElements:
+        """The leaves, with places for their codes."""
+        forest, elements = self.forest, ForestElements()
+        elements.nodes = elements.targets = forest.pools.leaf_tets
+        elements.code = wp.empty(count, dtype=wp.int32, device=self.device)
+        elements.frames, elements.size = forest.pools.frames, edge_lengths(forest.source, self.device)
         return elements
 
-    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, int], *arguments: Any) -> None:
-        wp.launch(kernel, dim=dim, inputs=list(arguments), device=self.device)
+    def _fill_in(self, most_leaves: int) -> None:
+        """What only a plan that changes has; and counts as if all places were taken, so that all becomes padding."""
+        plan, leaves, names = self._plan, self._made.leaves, self.forest.carriage.names
+        plan.first_unit = 1
+        plan.stale, plan.goes = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
+        plan.marks = wp.zeros(most_leaves, dtype=wp.int8, device=self.device)
+        plan.values = wp.zeros((len(names), most_leaves), dtype=wp.float32, device=self.device)
+        units, found = (most_leaves - 1) * self.rotation_shared, int(self._with_subtrees)
+        plan.counts.assign([found * self._most_subtrees] * plan.classes + [found * most_leaves, units, most_leaves])
+        count = most_leaves if self._with_subtrees else 0
+        if "mu" in names:
+            leaves.mu_row, leaves.lam_row = (names.index(name) for name in ("mu", "lam"))
+            leaves.mu, leaves.lam = (wp.zeros(count, dtype=wp.float32, device=self.device) for _ in range(2))
+        # Eight elements at a time, on the CPU, want to have their own rotations.
+        if self.device.is_cpu and not self.rotation_shared and count:
+            leaves.rest_inverse = wp.empty(count, dtype=wp.mat33, device=self.device)
+            leaves.volume = wp.empty(count, dtype=wp.float32, device=self.device)
+            frames = 2 * len(self.forest.pools.frames)
+            codes = (np.arange(frames)[:, None] << MIRROR_BIT) + np.arange(3)
+            leaves.inverse_of, _ = self._rest_matrices(codes.ravel())
+            _, leaves.volume_of = self._rest_matrices(np.arange(MAX_LEVEL + 1))
+
+    def _rest_matrices(self, codes: npt.NDArray[np.integer]) -> tuple[wp.array, wp.array]:
+        """Rest matrices and volumes of elements by their codes."""
+        elements = self._made.elements(self.elements.nodes, wp.array(codes, dtype=wp.int32, device=self.device))
+        found = tuple(wp.empty(len(codes), dtype=dtype, device=self.device) for dtype in (wp.mat33, wp.float32))
+        wp.launch(rest_matrices, len(codes), [elements], list(found), device=self.device)
+        return found[0], found[1]
 
 
-def _first(array: wp.array, count: int) -> wp.array:
-    """The first places of an array, which may have none."""
-    return array[:count] if len(array) > count else array
+def tree_of(forest: DeviceForest) -> Tree:
+    """What the planner's kernels read of pools."""
+    pools, tree = forest.pools, Tree()
+    tree.leaf_count, tree.node_count = (pools.counts[row : row + 1] for row in (int(LEAVES), int(NODE_TOP)))
+    tree.named = int(pools.node_limit == pools.sink)
+    tree.leaf_tets, tree.leaves = pools.leaf_tets, pools.leaves
+    tree.roots, tree.parent, tree.tets = pools.roots, pools.parent, pools.tets
+    tree.parent_code = device_frames(forest.device).of_parents
+    # The frame of a root is along the axes: deformation gradients of padding are exact, energies zero.
+    tree.sink, tree.padding_code = pools.sink, int(pools.code[:1].numpy()[0])
+    return tree

@@ -9,6 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.discretization.frames import all_frames, device_frames
+from warp_corot.discretization.planning.planner import threads_on
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count
 from warp_corot.inputs.device import checked_device
@@ -17,12 +19,8 @@ from warp_corot.mesh import TetForest
 from warp_corot.mesh.tree import LIVE, VOID, Tree
 
 from .fields import padding
-from .frames import all_frames
 from .snapshot import Snapshot
 from .transfer import Carriage, Column, Numbers
-
-#: Threads of a launch on CUDA for each multiprocessor.
-THREADS_PER_PROCESSOR = 1024
 
 
 class PassCounts(NamedTuple):
@@ -107,7 +105,7 @@ class DeviceForest:
         self.tree_capacity = elements + 2 * more
         if self.tree_capacity >= 2**31:
             raise InputError(f"capacity is {capacity}: that is {self.tree_capacity} tetrahedra; there can be 2**31 - 1")
-        self.threads = 1 if self.device.is_cpu else self.device.sm_count * THREADS_PER_PROCESSOR
+        self.threads = threads_on(self.device)
         self.pools = self._make_pools(tree)
         self.carriage = Carriage(forest, self.node_capacity, self.tree_capacity, density, values or {}, self.device)
         self.remember()
@@ -220,7 +218,7 @@ class DeviceForest:
         pools.first_child = self._filled(tree.first_child, self.tree_capacity, wp.int32, LIVE)
         codes = frames.codes(forest.lattice, tree.tets, tree.level)
         pools.code = self._filled(codes, self.tree_capacity, wp.int32)
-        pools.frames = wp.array(frames.frames, dtype=wp.mat33, device=device)
+        pools.frames = device_frames(device).frames
         pools.child_code = wp.array(frames.of_children, dtype=wp.int32, device=device)
         pools.next = wp.empty(self.tree_capacity, dtype=wp.int32, device=device)
         free_pairs = np.arange(self.tree_capacity - 2, elements - 1, -2, dtype=np.int32)

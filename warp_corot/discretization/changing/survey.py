@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.kernels.plan.plan import begin_counts
+from warp_corot.kernels.plan.changing import begin_counts
 from warp_corot.kernels.remesh import survey as kernels
 
 from .pools import DeviceForest

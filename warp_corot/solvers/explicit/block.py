@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from warp_corot.discretization.plan import Batch, ForcePlan, Sharing
+from warp_corot.discretization.plan import Batch, Sharing
+from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.elasticity.corotated.subtrees import SubtreeField
 from warp_corot.kernels.stepping.block import BlockBody, step_block
 from warp_corot.kernels.tables.block_layout import (

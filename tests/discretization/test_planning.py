@@ -1,0 +1,174 @@
+"""The force plans of forests that stay as they are equal those of the NumPy oracle to the last bit."""
+
+import numpy as np
+import pytest
+import warp as wp
+from plan_oracle import OraclePlan, OracleUnits
+
+import warp_corot as wc
+from warp_corot.discretization.frames import all_frames
+from warp_corot.discretization.planning.fixed import ForcePlan, pays_in_groups
+from warp_corot.discretization.subtrees import GROUPED_LEAVES, Sharing
+from warp_corot.kernels.tables.shapes import FRAME_SHIFT
+
+MATERIAL = wc.Isotropic(young=1e4, poisson=0.4, density=1000.0)
+
+
+def uniform(level):
+    return wc.TetForest.box((2, 1, 1), 0.1, level)
+
+
+def mixed(level):
+    rng, forest = np.random.default_rng(level), uniform(level)
+    for _ in range(3):
+        forest = forest.refine(rng.choice(len(forest.tets), 5, replace=False))
+    return forest
+
+
+def sphere(level):
+    """With void leaves, and corners of ancestors that no leaf names."""
+    forest = wc.TetForest.from_domain(wc.Domain.sphere(0.05), 0.04, max_level=level, surface_error=1e-3)
+    assert len(forest.lattice) > forest.node_count
+    return forest
+
+
+MESHES = [(uniform, 0), (uniform, 2), (uniform, 7), (mixed, 2), (mixed, 5), (mixed, 7), (sphere, 6), (sphere, 8)]
+
+
+def frames_of(elements, code):
+    return elements.frames.numpy()[code >> FRAME_SHIFT]
+
+
+def assert_same_codes(elements, codes, frames):
+    """The same levels and handedness, and the very same frames, whatever table they stand in."""
+    found, low = elements.code.numpy(), (1 << FRAME_SHIFT) - 1
+    assert np.array_equal(found & low, codes & low)
+    assert np.array_equal(frames_of(elements, found), frames[codes >> FRAME_SHIFT].astype(np.float32))
+
+
+def by_unit(nodes, grouped):
+    """Nodes of a batch's subtrees or groups, a row for each."""
+    return nodes.numpy() if grouped or nodes.device.is_cpu else nodes.numpy().T
+
+
+def assert_same_units(units, unit, expected, expected_unit):
+    """Leaves or subtrees use the same tetrahedra, in whatever order these stand."""
+    assert units.count == expected.count
+    own, other = unit.numpy(), expected_unit
+    assert np.array_equal(units.elements.nodes.numpy()[own], expected.nodes[other])
+    code, wanted = units.elements.code.numpy()[own], expected.codes[other]
+    assert np.array_equal(code & 127, wanted & 127)
+    assert np.array_equal(frames_of(units.elements, code), expected.frames[wanted >> FRAME_SHIFT].astype(np.float32))
+
+
+def assert_same(plan, expected):
+    assert len(plan.batches) == len(expected.batches)
+    for batch, wanted in zip(plan.batches, expected.batches, strict=True):
+        assert (batch.shape, batch.grouped, batch.sharing) == (wanted.shape, wanted.grouped, wanted.sharing)
+        assert batch.count == wanted.count
+        assert np.array_equal(batch.subtrees.first.numpy(), wanted.first)
+        assert np.array_equal(by_unit(batch.subtrees.nodes, batch.grouped), wanted.nodes)
+        assert np.array_equal(by_unit(batch.subtrees.targets, batch.grouped), wanted.targets)
+        assert_same_codes(batch.subtrees, wanted.codes, wanted.frames)
+        assert (batch.roots is not None) == (batch.sharing is Sharing.ROOT)
+        if batch.roots is not None:
+            assert np.array_equal(batch.roots.nodes.numpy(), wanted.root_nodes)
+        assert (batch.unit is not None) == (batch.sharing is Sharing.ABOVE)
+        if batch.unit is not None:
+            assert_same_units(plan.units, batch.unit, expected.units, expected.units.unit[wanted.first])
+        assert len(batch.flagged) == -(-batch.count // 8) * 8
+        assert not batch.flagged.numpy().any()
+    assert np.array_equal(plan.flat.leaves.numpy(), expected.flat)
+    assert np.array_equal(plan.flat.elements.nodes.numpy(), expected.flat_nodes)
+    assert np.array_equal(plan.flat.elements.code.numpy(), plan.elements.code.numpy()[expected.flat])
+    assert (plan.units is None) == (expected.units is None)
+    if expected.units is not None:
+        assert_same_units(plan.units, plan.units.unit, expected.units, expected.units.unit)
+        assert (np.diff(plan.units.unit.numpy()) >= 0).all()
+        if len(expected.flat):
+            assert_same_units(plan.units, plan.flat.unit, expected.units, expected.units.unit[expected.flat])
+
+
+@pytest.mark.parametrize("grouped", [False, True])
+@pytest.mark.parametrize("rotation_level", [None, 0, 1, 3, 4, 6, 9])
+@pytest.mark.parametrize(("mesh", "level"), MESHES)
+def test_a_plan_is_the_oracles(mesh, level, rotation_level, grouped, device):
+    forest, device = mesh(level), wp.get_device(device)
+    for worlds in (1, 3):
+        plan = ForcePlan.of_forest(forest, rotation_level, device, worlds=worlds, grouped=grouped)
+        assert_same(plan, OraclePlan(forest, rotation_level, worlds=worlds, grouped=grouped))
+        assert plan.slots is None
+        if rotation_level is not None:
+            expected = OracleUnits(forest, rotation_level, worlds)
+            assert_same_units(plan.all_units, plan.all_units.unit, expected, expected.unit)
+
+
+@pytest.mark.parametrize("grouped", [False, True])
+@pytest.mark.parametrize("rotation_level", [None, 4])
+@pytest.mark.parametrize(("mesh", "level"), MESHES)
+def test_slots_are_the_oracles(mesh, level, rotation_level, grouped, device):
+    forest, device = mesh(level), wp.get_device(device)
+    for worlds in (1, 3):
+        options = {"worlds": worlds, "grouped": grouped, "deterministic": True}
+        plan = ForcePlan.of_forest(forest, rotation_level, device, **options)
+        expected = OraclePlan(forest, rotation_level, **options)
+        assert_same(plan, expected)
+        assert np.array_equal(plan.elements.targets.numpy(), expected.targets)
+        assert np.array_equal(plan.flat.elements.targets.numpy(), expected.flat_targets)
+        assert np.array_equal(plan.slots.starts.numpy(), expected.starts)
+        assert np.array_equal(plan.slots.order.numpy(), expected.order)
+        assert (plan.slots.per_world, len(plan.slots.values)) == (expected.per_world, worlds * expected.per_world)
+
+
+@pytest.mark.parametrize("threads", [2, 7, 5000])
+def test_any_number_of_threads_comes_to_the_same_plan(threads, device, monkeypatch):
+    for module in ("fixed", "targets"):
+        monkeypatch.setattr(f"warp_corot.discretization.planning.{module}.threads_on", lambda device: threads)
+    forest, device = mixed(7), wp.get_device(device)
+    options = {"worlds": 2, "grouped": True, "deterministic": True}
+    plan = ForcePlan.of_forest(forest, 4, device, **options)
+    expected = OraclePlan(forest, 4, **options)
+    assert_same(plan, expected)
+    assert np.array_equal(plan.elements.targets.numpy(), expected.targets)
+    assert np.array_equal(plan.slots.order.numpy(), expected.order)
+
+
+def test_a_field_without_subtrees_has_slots_and_units_too(device):
+    forest = mixed(5)
+    body = wc.SoftBody(forest, MATERIAL, worlds=2, device=device)
+    plan = body.discretization.plan(3, subtrees=False, deterministic=True)
+    assert np.array_equal(plan.elements.targets.numpy().ravel(), np.arange(8 * len(forest.tets)))
+    node = body.discretization.elements.nodes.numpy().ravel()
+    assert np.array_equal(plan.slots.order.numpy(), np.argsort(node, kind="stable"))
+    assert np.array_equal(np.diff(plan.slots.starts.numpy()), np.bincount(node))
+    expected = OracleUnits(forest, 3, worlds=2)
+    assert_same_units(plan.all_units, plan.all_units.unit, expected, expected.unit)
+
+
+def test_more_slots_than_can_be_numbered_are_refused(device, monkeypatch):
+    monkeypatch.setattr("warp_corot.discretization.slots.MOST_SLOTS", 100)
+    body = wc.SoftBody(uniform(5), MATERIAL, device=device)
+    for subtrees in (True, False):
+        with pytest.raises(wc.InputError, match="slots for forces; there can be 100 at most"):
+            body.discretization.plan(subtrees=subtrees, deterministic=True)
+
+
+def test_subtrees_pay_when_many_leaves_are_in_groups(device):
+    forest = uniform(7)
+    body = wc.SoftBody(forest, MATERIAL, device=device)
+    count = len(forest.tets)
+    worlds = -(-GROUPED_LEAVES // count)
+    assert pays_in_groups(forest, body.discretization.elements, worlds)
+    assert not pays_in_groups(forest, body.discretization.elements, worlds - 1)
+
+
+def test_a_parents_frame_follows_from_its_childs():
+    """Whatever the parent, and for the first and the second child alike."""
+    table, forest = all_frames(), mixed(8)
+    tree = forest.tree
+    codes = table.codes(forest.lattice, tree.tets, tree.level)
+    child = np.flatnonzero(tree.parent >= 0)
+    which = child - tree.first_child[tree.parent[child]]
+    found = table.of_parents[codes[child] >> FRAME_SHIFT, tree.level[child] % 3, which]
+    assert set(which) == {0, 1}
+    assert np.array_equal(found | (tree.level[child] - 1), codes[tree.parent[child]])
