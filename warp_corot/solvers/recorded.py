@@ -24,8 +24,10 @@ from .integrator import Stepper
 from .subnormals import FlushedSubnormals
 from .system import System
 
-#: Steps recorded in one graph; more where a launch is many steps.
+#: Steps recorded in one graph: on CUDA; on the CPU, where a replay costs nothing and recording a step takes as long as
+#: making ten; and where a launch is many steps.
 GRAPH_STEPS = 64
+CPU_GRAPH_STEPS = 8
 BLOCK_STEPS = 1024
 #: Steps up to which what is asked for twice is recorded as it is: recording takes longer than many replays.
 SHORT = 8
@@ -112,6 +114,13 @@ class RecordedSteps:
         return self._stepper.many_a_launch
 
     @property
+    def _longest(self) -> int:
+        """Steps recorded in one graph at most."""
+        if self.in_blocks:
+            return BLOCK_STEPS
+        return CPU_GRAPH_STEPS if self._pace.device.is_cpu else GRAPH_STEPS
+
+    @property
     def interval(self) -> int:
         """Steps from one measurement to the next."""
         if self.calm == UNKNOWN:
@@ -156,7 +165,7 @@ class RecordedSteps:
             return
         if segment.count <= SHORT:
             self._asked.add(segment)
-        for piece in segment.pieces(BLOCK_STEPS if self.in_blocks else GRAPH_STEPS):
+        for piece in segment.pieces(self._longest):
             self._replay_recording(piece)
 
     def replay_many(self, count: int) -> None:
