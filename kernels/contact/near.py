@@ -13,11 +13,13 @@ PAIRED, BESIDE, AROUND = wp.constant(1), wp.constant(2), wp.constant(4)
 
 @wp.struct
 class Near:
-    """Nodes that something is near, found by the last search."""
+    """What the last search has found."""
 
     flags: wp.array[wp.int32]  # [S] what is
     nodes: wp.array[wp.int32]  # [S]
     count: wp.array[wp.int32]  # [1]
+    touches: wp.array[wp.int32]  # [O T] obstacles at triangles: o T + t
+    touch_count: wp.array[wp.int32]  # [1]
 
 
 @wp.func
@@ -37,3 +39,4 @@ def reserve_nodes(surface: Surface, watch: Watch, near: Near):
     near.flags[s] = 0
     if s == 0:
         near.count[0] = 0
+        near.touch_count[0] = 0

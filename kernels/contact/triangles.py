@@ -12,7 +12,8 @@ from warp_corot.kernels.stepping.pace import DT, Pace
 from .closest import deepest_on_triangle, on_triangle, point_of, segment_to_triangle
 from .law import Law, held_back, least_motion
 from .motion import Motions, Surface
-from .shapes import CAPSULE, GROUND, SPHERE, Shapes, carried, distance_to
+from .near import AROUND, Near
+from .shapes import CAPSULE, SPHERE, Shapes, carried, distance_to
 from .vertices import across
 
 wp.set_module_options({"enable_backward": False})
@@ -62,27 +63,23 @@ def nearest(shapes: Shapes, o: int, pose: wp.transform, most: float, a: wp.vec3,
     return w, gap, n
 
 
-@wp.kernel(enable_backward=False)
-def find_touches(
-    # In
+@wp.func
+def find_touch(
+    o: int,
+    t: int,
     shapes: Shapes,
     motions: Motions,
     law: Law,
     surface: Surface,
     triangles: wp.array[wp.vec3i],
-    # In and out
     touches: Touches,
 ):
-    """Where obstacles come close to triangles but not to their corners."""
-    o, t = wp.tid()
     was = touches.force[o, t]
     side = touches.normal[o, t]
     touches.shares[o, t] = wp.vec3()
     touches.force[o, t] = wp.vec3()
     touches.acts[o, t] = 0
     corners = triangles[t]
-    if shapes.kind[o] == GROUND or corners[0] < 0:
-        return
     pose = motions.now[surface.world[corners[0]], o]
     later = motions.later[surface.world[corners[0]], o]
     a = surface.x[corners[0]]
@@ -117,6 +114,37 @@ def find_touches(
         touches.more[o, t] = force
 
 
+@wp.kernel(enable_backward=False)
+def find_touches(
+    # In
+    threads: int,
+    near: Near,
+    shapes: Shapes,
+    motions: Motions,
+    law: Law,
+    surface: Surface,
+    triangles: wp.array[wp.vec3i],
+    # In and out
+    touches: Touches,
+):
+    """Where obstacles come close to triangles but not to their corners."""
+    k = wp.tid()
+    count = near.touch_count[0]
+    while k < count:
+        place = near.touches[k]
+        k += threads
+        find_touch(
+            place // triangles.shape[0],
+            place % triangles.shape[0],
+            shapes,
+            motions,
+            law,
+            surface,
+            triangles,
+            touches,
+        )
+
+
 @wp.func
 def approach(touches: Touches, o: int, t: int, surface: Surface, corners: wp.vec3i):
     """How far the triangle's point moves from the obstacle in this step [m]."""
@@ -126,26 +154,38 @@ def approach(touches: Touches, o: int, t: int, surface: Surface, corners: wp.vec
 
 
 @wp.kernel(enable_backward=False)
-def judge_touches(law: Law, pace: Pace, surface: Surface, triangles: wp.array[wp.vec3i], touches: Touches):
-    """Which of them act."""
-    o, t = wp.tid()
-    w = touches.shares[o, t]
-    acts = int(0)
-    if w[0] + w[1] + w[2] > 0.0:
-        d = approach(touches, o, t, surface, triangles[t])
-        n = touches.normal[o, t]
-        wanted = least_motion(touches.gap[o, t], law, float(pace.seconds[DT])) - wp.dot(d, n)
-        if wanted > 0.0 or wp.dot(touches.force[o, t], n) > 0.0:
-            acts = 1
-    touches.acts[o, t] = acts
-
-
-@wp.kernel(enable_backward=False)
-def crowd_nodes(
-    corner_starts: wp.array[wp.int32], corners: wp.array[wp.int32], touches: Touches, crowd: wp.array[wp.float32]
+def judge_touches(
+    # In
+    threads: int,
+    near: Near,
+    law: Law,
+    pace: Pace,
+    surface: Surface,
+    triangles: wp.array[wp.vec3i],
+    # In and out
+    touches: Touches,
 ):
-    """The shares of all contacts that act at each node."""
-    s = wp.tid()
+    """Which of them act."""
+    k = wp.tid()
+    count = near.touch_count[0]
+    dt = float(pace.seconds[DT])
+    while k < count:
+        o = near.touches[k] // triangles.shape[0]
+        t = near.touches[k] % triangles.shape[0]
+        k += threads
+        w = touches.shares[o, t]
+        acts = int(0)
+        if w[0] + w[1] + w[2] > 0.0:
+            d = approach(touches, o, t, surface, triangles[t])
+            n = touches.normal[o, t]
+            wanted = least_motion(touches.gap[o, t], law, dt) - wp.dot(d, n)
+            if wanted > 0.0 or wp.dot(touches.force[o, t], n) > 0.0:
+                acts = 1
+        touches.acts[o, t] = acts
+
+
+@wp.func
+def crowd_at(s: int, corner_starts: wp.array[wp.int32], corners: wp.array[wp.int32], touches: Touches):
     total = float(0.0)
     for k in range(corner_starts[s], corner_starts[s + 1]):
         t = corners[k] / 3
@@ -153,26 +193,42 @@ def crowd_nodes(
         for o in range(touches.acts.shape[0]):
             if touches.acts[o, t] != 0:
                 total += touches.shares[o, t][corner]
-    crowd[s] = total
+    return total
 
 
 @wp.kernel(enable_backward=False)
-def solve_touches(
+def crowd_nodes(
     # In
+    threads: int,
+    near: Near,
+    corner_starts: wp.array[wp.int32],
+    corners: wp.array[wp.int32],
+    touches: Touches,
+    # Out
+    crowd: wp.array[wp.float32],
+):
+    """The shares of all contacts that act at each node."""
+    k = wp.tid()
+    count = near.count[0]
+    while k < count:
+        s = near.nodes[k]
+        k += threads
+        if (near.flags[s] & AROUND) != 0:
+            crowd[s] = crowd_at(s, corner_starts, corners, touches)
+
+
+@wp.func
+def solve_touch(
+    o: int,
+    t: int,
     shapes: Shapes,
     law: Law,
-    pace: Pace,
+    dt: float,
     surface: Surface,
-    triangles: wp.array[wp.vec3i],
+    corners: wp.vec3i,
     crowd: wp.array[wp.float32],
-    # In and out
     touches: Touches,
 ):
-    """Correct the force of each that acts."""
-    o, t = wp.tid()
-    if touches.acts[o, t] == 0:
-        return
-    corners = triangles[t]
     w = touches.shares[o, t]
     yielding = float(0.0)
     for k in range(3):
@@ -184,7 +240,7 @@ def solve_touches(
         return
     n = touches.normal[o, t]
     d = approach(touches, o, t, surface, corners)
-    wanted = least_motion(touches.gap[o, t], law, float(pace.seconds[DT])) - wp.dot(d, n)
+    wanted = least_motion(touches.gap[o, t], law, dt) - wp.dot(d, n)
     normal_force = wp.max(wp.dot(before, n) + wanted / yielding, 0.0)
     sideways = held_back(across(before, n) - across(d, n) / yielding, normal_force, shapes.friction[o])
     force = normal_force * n + sideways
@@ -193,16 +249,34 @@ def solve_touches(
 
 
 @wp.kernel(enable_backward=False)
-def apply_touches(
+def solve_touches(
     # In
-    corner_starts: wp.array[wp.int32],
-    corners: wp.array[wp.int32],
-    touches: Touches,
-    # In and out
+    threads: int,
+    near: Near,
+    shapes: Shapes,
+    law: Law,
+    pace: Pace,
     surface: Surface,
+    triangles: wp.array[wp.vec3i],
+    crowd: wp.array[wp.float32],
+    # In and out
+    touches: Touches,
 ):
-    """Give each node its share of what was added, in one order."""
-    s = wp.tid()
+    """Correct the force of each that acts."""
+    k = wp.tid()
+    count = near.touch_count[0]
+    dt = float(pace.seconds[DT])
+    while k < count:
+        o = near.touches[k] // triangles.shape[0]
+        t = near.touches[k] % triangles.shape[0]
+        k += threads
+        if touches.acts[o, t] != 0:
+            solve_touch(o, t, shapes, law, dt, surface, triangles[t], crowd, touches)
+
+
+@wp.func
+def added_at(s: int, corner_starts: wp.array[wp.int32], corners: wp.array[wp.int32], touches: Touches):
+    """What was added to the force on a node, summed in one order [N]."""
     total = wp.vec3()
     for k in range(corner_starts[s], corner_starts[s + 1]):
         t = corners[k] / 3
@@ -210,9 +284,31 @@ def apply_touches(
         for o in range(touches.acts.shape[0]):
             if touches.acts[o, t] != 0:
                 total += touches.shares[o, t][corner] * touches.more[o, t]
-    if wp.dot(total, total) > 0.0:
-        surface.f[s] = surface.f[s] + total
-        surface.d[s] = surface.d[s] + surface.yielding[s] * total
+    return total
+
+
+@wp.kernel(enable_backward=False)
+def apply_touches(
+    # In
+    threads: int,
+    near: Near,
+    corner_starts: wp.array[wp.int32],
+    corners: wp.array[wp.int32],
+    touches: Touches,
+    # In and out
+    surface: Surface,
+):
+    """Give each node its share of what was added."""
+    k = wp.tid()
+    count = near.count[0]
+    while k < count:
+        s = near.nodes[k]
+        k += threads
+        if (near.flags[s] & AROUND) != 0:
+            total = added_at(s, corner_starts, corners, touches)
+            if wp.dot(total, total) > 0.0:
+                surface.f[s] = surface.f[s] + total
+                surface.d[s] = surface.d[s] + surface.yielding[s] * total
 
 
 @wp.kernel(enable_backward=False)

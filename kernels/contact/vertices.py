@@ -6,6 +6,7 @@ from warp_corot.kernels.stepping.pace import DT, Pace
 
 from .law import SETTLING, Law, held_back, least_motion
 from .motion import Motions, Surface
+from .near import BESIDE, Near
 from .shapes import Shapes, carried, distance_to
 
 wp.set_module_options({"enable_backward": False})
@@ -19,25 +20,19 @@ def across(a: wp.vec3, normal: wp.vec3):
     return a - wp.dot(a, normal) * normal
 
 
-@wp.kernel(enable_backward=False)
-def touch_obstacles(
-    # In
+@wp.func
+def touch(
+    s: int,
     is_first: int,
     shapes: Shapes,
     motions: Motions,
     law: Law,
-    pace: Pace,
+    dt: float,
     anchors: wp.array2d[wp.vec4],
-    # In and out
     surface: Surface,
     forces: wp.array2d[wp.vec3],
 ):
-    """Forces [O, S] that keep nodes out of obstacles by the end of the step, with friction; corrected where something
-    else has moved nodes since the first time.
-
-    Where a node sticks it is held at an anchor, a point of the obstacle in its frame with 1 as fourth number.
-    """
-    s = wp.tid()
+    """The forces of all obstacles on a node."""
     count = forces.shape[0]
     total = wp.vec3()
     for o in range(count):
@@ -50,7 +45,6 @@ def touch_obstacles(
     world = surface.world[s]
     x = surface.x[s]
     d = surface.d[s]
-    dt = float(pace.seconds[DT])
     going = int(ROUNDS)
     while going > 0:
         touched = int(0)
@@ -88,17 +82,44 @@ def touch_obstacles(
 
 
 @wp.kernel(enable_backward=False)
-def keep_anchors(
+def touch_obstacles(
     # In
+    threads: int,
+    near: Near,
+    is_first: int,
+    shapes: Shapes,
+    motions: Motions,
+    law: Law,
+    pace: Pace,
+    anchors: wp.array2d[wp.vec4],
+    # In and out
+    surface: Surface,
+    forces: wp.array2d[wp.vec3],
+):
+    """Forces [O, S] that keep nodes out of obstacles by the end of the step, with friction; corrected where something
+    else has moved nodes since the first time.
+
+    Where a node sticks it is held at an anchor, a point of the obstacle in its frame with 1 as fourth number.
+    """
+    k = wp.tid()
+    count = near.count[0]
+    dt = float(pace.seconds[DT])
+    while k < count:
+        s = near.nodes[k]
+        k += threads
+        if (near.flags[s] & BESIDE) != 0:
+            touch(s, is_first, shapes, motions, law, dt, anchors, surface, forces)
+
+
+@wp.func
+def anchor(
+    s: int,
     shapes: Shapes,
     motions: Motions,
     surface: Surface,
     forces: wp.array2d[wp.vec3],
-    # Out
     anchors: wp.array2d[wp.vec4],
 ):
-    """Set anchors where nodes begin to stick, drag them along where nodes slip, and drop them where nothing touches."""
-    s = wp.tid()
     if surface.yielding[s] == 0.0:
         return
     world = surface.world[s]
@@ -116,3 +137,25 @@ def keep_anchors(
             if slips or anchors[o, s][3] == 0.0:
                 p = wp.quat_rotate_inv(wp.transform_get_rotation(pose), end - wp.transform_get_translation(pose))
                 anchors[o, s] = wp.vec4(p[0], p[1], p[2], 1.0)
+
+
+@wp.kernel(enable_backward=False)
+def keep_anchors(
+    # In
+    threads: int,
+    near: Near,
+    shapes: Shapes,
+    motions: Motions,
+    surface: Surface,
+    forces: wp.array2d[wp.vec3],
+    # Out
+    anchors: wp.array2d[wp.vec4],
+):
+    """Set anchors where nodes begin to stick, drag them along where nodes slip, and drop them where nothing touches."""
+    k = wp.tid()
+    count = near.count[0]
+    while k < count:
+        s = near.nodes[k]
+        k += threads
+        if (near.flags[s] & BESIDE) != 0:
+            anchor(s, shapes, motions, surface, forces, anchors)

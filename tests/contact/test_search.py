@@ -74,7 +74,7 @@ def test_all_that_may_meet_is_known(device, rng, itself):
         spin = rng.uniform(-20.0, 20.0, 3)
         centre = x.mean(axis=0)
         body.velocities = np.cross(spin, x - centre) + np.array([0.0, 0.0, toward]) + rng.uniform(-0.05, 0.05, x.shape)
-    assert watched(sim, 120, itself) > 50
+    assert watched(sim, 60, itself) > 50
 
 
 def test_all_that_may_meet_is_known_of_bodies_that_adapt(device):
@@ -87,7 +87,7 @@ def test_all_that_may_meet_is_known_of_bodies_that_adapt(device):
     )
     before = len(low.mesh.tets)
     high.velocities = np.tile((0.0, 0.0, -1.0), (high.node_count, 1))
-    assert watched(sim, 60, False) > 50
+    assert watched(sim, 40, False) > 50
     assert len(low.mesh.tets) != before
 
 
@@ -126,3 +126,70 @@ def test_what_goes_too_far_is_found_out():
 def test_nobody_looks_farther_than_steps_can_go(device):
     with pytest.raises(wc.UnstableError, match="in one step"):
         thrown(device, 1e-6, size=1e-9, most=1e-7)
+
+
+def marked(contacts):
+    """The nodes and the triangles that the first obstacle is known to be near."""
+    near = contacts.search.near
+    nodes = near.nodes.numpy()[: int(near.count.numpy()[0])]
+    beside = nodes[near.flags.numpy()[nodes] & 2 != 0]
+    touches = near.touches.numpy()[: int(near.touch_count.numpy()[0])]
+    first = touches[touches < contacts.surface.triangle_count]
+    return set(beside.tolist()), set(first.tolist())
+
+
+def reached_by_ball(contacts, radius):
+    """The nodes and the triangles that a ball could meet in the last step, seen one by one."""
+    surface, motions = contacts.surface, contacts.obstacles.motions
+    arrays, corners = surface.arrays, surface.triangles.numpy()
+    used, world = np.flatnonzero(arrays.node.numpy() >= 0), arrays.world.numpy()
+    x, step = arrays.x.numpy().astype(float), np.linalg.norm(arrays.d.numpy().astype(float), axis=1)
+    centre, later = (poses.numpy()[:, 0, :3].astype(float) for poses in (motions.now, motions.later))
+    moved = np.linalg.norm(later - centre, axis=1)
+    gaps = np.linalg.norm(x - centre[world], axis=1) - radius
+    nodes = used[gaps[used] <= step[used] + moved[world[used]]]
+    shown = np.flatnonzero(corners[:, 0] >= 0)
+    c = corners[shown]
+    far = closest(centre[world[c[:, 0]]], x[c[:, 0]], x[c[:, 1]], x[c[:, 2]]) - radius
+    return set(nodes.tolist()), set(shown[far <= step[c].max(axis=1) + moved[world[c[:, 0]]]].tolist())
+
+
+@pytest.mark.parametrize("adapts", [False, True])
+def test_all_that_a_tool_may_reach_is_known(device, rng, adapts):
+    """Against every node and triangle, while a ball goes to and fro at random through two worlds, or over a body that
+    adapts."""
+    low = block(device, 0.0, level=3) if adapts else block(device, 0.0, worlds=2)
+    low.fix("z == zmin")
+    ball = wc.Tool(wc.Sphere(0.012))
+    places = rng.uniform((0.0, 0.0, 0.024), (0.04, 0.04, 0.036), (12, 3))
+    ball.follow(0.003 * np.arange(12), places)
+    remesh = wc.OnlineRemesh(every=16, max_level=5, refine_above=1.02, simplify_below=1.005) if adapts else None
+    sim = wc.Simulation(low, obstacles=[ball, wc.Ground()], gravity=(0.0, 0.0, 0.0), remesh=remesh)
+    seen = np.zeros(2, int)
+    steps = 60
+    for _ in range(steps):
+        sim.advance_steps(1)
+        for k, (reached, known) in enumerate(
+            zip(reached_by_ball(sim.contact, 0.012), marked(sim.contact), strict=True)
+        ):
+            assert reached <= known
+            seen[k] += len(reached)
+    assert seen.min() > 5
+    assert sim.contact.search.count < 0.7 * steps
+
+
+@pytest.mark.parametrize("shape", [wc.Box((0.01, 0.008, 0.006)), wc.Capsule(0.002, 0.02)], ids=["box", "capsule"])
+def test_tools_feel_the_same_whenever_it_was_looked(shape):
+    """Bit by bit on the CPU."""
+    found = []
+    for least in (1e-4, 1e-2):
+        body, tool = block("cpu", 0.0, level=3), wc.Tool(shape)
+        tool.follow([0.0, 0.03], [(0.021, 0.02, 0.0325), (0.023, 0.019, 0.02)], [(0, 0, 0, 1), (0.3, 0, 0, 0.95)])
+        sim = wc.Simulation(body, obstacles=[wc.Ground(), tool], integrator=wc.SymplecticEuler(dt=2e-4, viscosity=1e-3))
+        sim.contact.search.watch.least.fill_(least)
+        sim.advance(0.03)
+        found.append((sim.contact.search.count, body.positions.numpy(), tool.wrench.numpy()))
+    assert found[0][0] > found[1][0]
+    np.testing.assert_array_equal(found[0][1], found[1][1])
+    np.testing.assert_array_equal(found[0][2], found[1][2])
+    assert found[0][2].any()

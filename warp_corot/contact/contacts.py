@@ -9,13 +9,14 @@ import numpy as np
 import warp as wp
 
 from warp_corot.errors import InputError, StabilityWarning, depth_of_user
-from warp_corot.kernels.contact import motion, sums, triangles, vertices
+from warp_corot.kernels.contact import motion, sums
 from warp_corot.kernels.contact.law import Law
 from warp_corot.solvers.system import System
 
 from .obstacles import Obstacles
 from .options import Contact
 from .pairs import Pairs, smallest_size
+from .rigid_forces import RigidForces
 from .search import Search
 from .surface import ContactSurface
 from .tool import Obstacle
@@ -46,9 +47,8 @@ class Contacts:
     Attributes:
         surface: The surface nodes and triangles of all bodies.
         obstacles: What is rigid.
-        forces: Of each obstacle on each surface node itself in the last step [N], vec3 [O, S].
-        touches: Obstacles at triangles.
-        totals: The same with the nodes' shares of the forces between them, when they were last published.
+        rigid: Forces of obstacles; None without.
+        search: Says when to look for what is near.
 
     Raises:
         InputError: As ``Obstacles``; or soft surfaces may touch, and the run must be deterministic on CUDA.
@@ -69,6 +69,9 @@ class Contacts:
         self.surface = ContactSurface(system.bodies)
         self.law = self._law(stable_dt)
         self.search = Search(self.surface, self.obstacles, self._smallest)
+        self.rigid: RigidForces | None = None
+        if self.obstacles.count:
+            self.rigid = RigidForces(self.surface, self.obstacles, self.search, self.law, system.pace.arrays)
         #: Soft surfaces that may touch one another; None without.
         self.pairs: Pairs | None = None
         if len(system.bodies) > 1 or options.self_contact:
@@ -89,9 +92,7 @@ class Contacts:
 
     @property
     def state(self) -> dict[str, wp.array]:
-        touches = self.touches
-        sides = {"touch_normals": touches.normal.flatten(), "touch_forces": touches.force.flatten()}
-        arrays = {"anchors": self._anchors.flatten(), **sides, **self.obstacles.state}
+        arrays = {} if self.rigid is None else {**self.rigid.state, **self.obstacles.state}
         return {name: array for name, array in arrays.items() if array.size}
 
     def prepare(self) -> None:
@@ -101,11 +102,10 @@ class Contacts:
         if self.surface.follow():
             if self.surface.revision != before:
                 self._make_arrays()
-            else:
-                self._anchors.zero_()
-                self.touches.force.zero_()
             self._share_arrays()
             self.search.follow()
+            if self.rigid is not None:
+                self.rigid.follow()
             if self.pairs is not None:
                 self.pairs.follow()
         if self.pairs is not None:
@@ -154,12 +154,9 @@ class Contacts:
         if self.obstacles.count:
             self.obstacles.launch_motion(offset)
         self._predict(offset, damping)
-        if self.pairs is not None:
-            self.search.launch(offset)
-            self.pairs.launch_begin()
+        self.search.launch(offset)
         self._solve()
-        if self.pairs is not None:
-            self.search.launch_after()
+        self.search.launch_after()
         for k, body in enumerate(system.bodies):
             outputs = [body.state.forces, body.state.contact_forces]
             inputs = [surface.parts[k].start, surface.arrays]
@@ -177,12 +174,8 @@ class Contacts:
 
     def publish(self) -> None:
         surface, obstacles = self.surface, self.obstacles
-        if obstacles.count:
-            forces = self.forces
-            if obstacles.have_edges:
-                forces = self.totals
-                inputs = [surface.corner_starts, surface.corners, self.touches, self.forces]
-                wp.launch(triangles.share_touches, forces.shape, inputs, [forces], device=self.device)
+        if self.rigid is not None:
+            forces = self.rigid.launch_totals()
             threads = self._parts.shape[2] * self._lanes
             for part in surface.parts:
                 inputs = [part.start, part.nodes, self._lanes, threads, surface.arrays, obstacles.motions, forces]
@@ -192,8 +185,7 @@ class Contacts:
             wp.launch(
                 sums.fold_wrenches, obstacles.wrenches.shape, [self._parts], [obstacles.wrenches], device=self.device
             )
-        if self.pairs is not None:
-            self.search.launch_report()
+        self.search.launch_report()
         inputs = [surface.arrays, surface.triangles, surface.corner_starts, surface.corners]
         self._launch(sums.node_pressures, surface.count, inputs, [self._pressures])
         for k, part in enumerate(surface.parts):
@@ -202,8 +194,8 @@ class Contacts:
             self._launch(sums.triangle_pressures, self.system.worlds * part.triangles, inputs, outputs)
 
     def reset(self, chosen: wp.array) -> None:
-        self._anchors.zero_()
-        self.touches.force.zero_()
+        if self.rigid is not None:
+            self.rigid.forget()
         self.forget()
         self.obstacles.reset(chosen)
 
@@ -234,52 +226,24 @@ class Contacts:
 
     def _solve(self) -> None:
         """Launch the forces in turn: of obstacles on nodes, of obstacles between these, and of soft surfaces."""
-        surface, obstacles = self.surface, self.obstacles
-        rigid = [obstacles.shapes, obstacles.motions]
-        step = [*rigid, self.law, self.system.pace.arrays, self._anchors]
-        both = [surface.arrays, self.forces]
-        around = [surface.corner_starts, surface.corners, self.touches]
-        dim = (obstacles.count, surface.triangle_count)
-        if obstacles.have_edges:
-            inputs = [*rigid, self.law, surface.arrays, surface.triangles]
-            wp.launch(triangles.find_touches, dim, inputs, [self.touches], device=self.device)
-            self._launch(triangles.apply_touches, surface.count, around, [surface.arrays])
-        if obstacles.count:
-            self._launch(vertices.touch_obstacles, surface.count, [1, *step], both)
-        for _ in range(ROUNDS if obstacles.have_edges or self.pairs is not None else 0):
-            if obstacles.have_edges:
-                self._touch_triangles(dim)
-            if self.pairs is not None:
-                self.pairs.launch_round(self.law, self.system.pace.arrays)
-            if obstacles.count:
-                self._launch(vertices.touch_obstacles, surface.count, [0, *step], both)
-        if obstacles.count:
-            self._launch(vertices.keep_anchors, surface.count, [*rigid, *both], [self._anchors])
-
-    def _touch_triangles(self, dim: tuple[int, int]) -> None:
-        """Launch one round of the forces of obstacles between the nodes."""
-        surface, touches = self.surface, self.touches
-        around = [surface.corner_starts, surface.corners, touches]
-        step = [self.law, self.system.pace.arrays, surface.arrays, surface.triangles]
-        wp.launch(triangles.judge_touches, dim, step, [touches], device=self.device)
-        self._launch(triangles.crowd_nodes, surface.count, around, [self._crowd])
-        inputs = [self.obstacles.shapes, *step, self._crowd]
-        wp.launch(triangles.solve_touches, dim, inputs, [touches], device=self.device)
-        self._launch(triangles.apply_touches, surface.count, around, [surface.arrays])
+        rigid, pairs = self.rigid, self.pairs
+        if pairs is not None:
+            pairs.launch_begin()
+        if rigid is not None:
+            rigid.launch_begin()
+        for _ in range(ROUNDS if self.obstacles.have_edges or pairs is not None else 0):
+            if rigid is not None:
+                rigid.launch_round()
+            if pairs is not None:
+                pairs.launch_round(self.law, self.system.pace.arrays)
+            if rigid is not None:
+                rigid.launch_correction()
+        if rigid is not None:
+            rigid.launch_end()
 
     def _make_arrays(self) -> None:
         surface, device = self.surface, self.device
         count, obstacles = surface.count, self.obstacles.count
-        self.forces = wp.zeros((obstacles, count), dtype=wp.vec3, device=device)
-        self.totals = wp.zeros_like(self.forces)
-        self._anchors = wp.zeros((obstacles, count), dtype=wp.vec4, device=device)
-        self.touches = triangles.Touches()
-        shape = (obstacles, surface.triangle_count if self.obstacles.have_edges else 0)
-        for name in ("shares", "normal", "moved", "force", "more"):
-            setattr(self.touches, name, wp.zeros(shape, dtype=wp.vec3, device=device))
-        self.touches.gap = wp.zeros(shape, dtype=wp.float32, device=device)
-        self.touches.acts = wp.zeros(shape, dtype=wp.int32, device=device)
-        self._crowd = wp.zeros(count, dtype=wp.float32, device=device)
         self._lanes = 1 if device.is_cpu else WARP
         most = max(part.nodes for part in surface.parts)
         warps = 1 if device.is_cpu else max(min(most // WARP, MOST_WARPS), 1)

@@ -158,9 +158,9 @@ class Pairs:
 
     def _apply(self) -> None:
         """Launch that nodes get what was added."""
-        threads = self.search.threads(self.surface.count)
-        inputs = [threads, self.search.near, self.surface.arrays, self._added, self._crowd]
-        wp.launch(kernels.apply_added, threads, inputs, device=self.device)
+        among = self.search.at_nodes
+        inputs = [*among, self.surface.arrays, self._added, self._crowd]
+        wp.launch(kernels.apply_added, among[0], inputs, device=self.device)
 
 
 def smallest_size(volumes: list[float]) -> float:

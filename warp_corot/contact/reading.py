@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from .contacts import Contacts
     from .pairs import Pairs
+    from .rigid_forces import RigidForces
     from .tool import Obstacle
 
 Floats = npt.NDArray[np.float64]
@@ -61,9 +62,11 @@ class ContactPoint:
 def contact_points(contacts: Contacts) -> list[ContactPoint]:
     """All contacts of the last step; waits for the device."""
     found = [] if contacts.pairs is None else _of_pairs(contacts, contacts.pairs)
-    if contacts.obstacles.count:
-        found += _at_nodes(contacts)
-    return found + (_at_triangles(contacts) if contacts.obstacles.have_edges else [])
+    if contacts.rigid is not None:
+        found += _at_nodes(contacts, contacts.rigid)
+        if contacts.rigid.have_edges:
+            found += _at_triangles(contacts, contacts.rigid)
+    return found
 
 
 def _of_pairs(contacts: Contacts, pairs: Pairs) -> list[ContactPoint]:
@@ -98,13 +101,13 @@ def _of_pairs(contacts: Contacts, pairs: Pairs) -> list[ContactPoint]:
     return found
 
 
-def _at_nodes(contacts: Contacts) -> list[ContactPoint]:
+def _at_nodes(contacts: Contacts, rigid: RigidForces) -> list[ContactPoint]:
     surface, obstacles = contacts.surface, contacts.obstacles
-    gaps = wp.zeros(contacts.forces.shape, dtype=wp.float32, device=contacts.device)
-    normals = wp.zeros(contacts.forces.shape, dtype=wp.vec3, device=contacts.device)
-    inputs = [obstacles.shapes, obstacles.motions, surface.arrays, contacts.forces]
-    wp.launch(sums.describe_touches, contacts.forces.shape, inputs, [gaps, normals], device=contacts.device)
-    forces = contacts.forces.numpy().astype(float)
+    gaps = wp.zeros(rigid.forces.shape, dtype=wp.float32, device=contacts.device)
+    normals = wp.zeros(rigid.forces.shape, dtype=wp.vec3, device=contacts.device)
+    inputs = [obstacles.shapes, obstacles.motions, surface.arrays, rigid.forces]
+    wp.launch(sums.describe_touches, rigid.forces.shape, inputs, [gaps, normals], device=contacts.device)
+    forces = rigid.forces.numpy().astype(float)
     gap, normal, x = gaps.numpy(), normals.numpy().astype(float), surface.arrays.x.numpy().astype(float)
     found = []
     for o, s in np.argwhere(forces.any(axis=2)):
@@ -113,8 +116,8 @@ def _at_nodes(contacts: Contacts) -> list[ContactPoint]:
     return found
 
 
-def _at_triangles(contacts: Contacts) -> list[ContactPoint]:
-    touches, surface = contacts.touches, contacts.surface
+def _at_triangles(contacts: Contacts, rigid: RigidForces) -> list[ContactPoint]:
+    touches, surface = rigid.touches, contacts.surface
     acts, force = touches.acts.numpy(), touches.force.numpy().astype(float)
     shares, normal, gap = (
         touches.shares.numpy().astype(float),

@@ -63,9 +63,19 @@ class Search:
         self._branches = device.is_cpu or wp.is_conditional_graph_supported()
         self.follow()
 
-    def threads(self, count: int) -> int:
+    def threads(self, room: int) -> int:
         """Threads for what is in a list with room for so many."""
-        return 1 if self.device.is_cpu else min(max(count, 1), MOST_THREADS)
+        return 1 if self.device.is_cpu else min(max(room, 1), MOST_THREADS)
+
+    @property
+    def at_nodes(self) -> list:
+        """How many threads are to go through the nodes that something is near, and these."""
+        return [self.threads(self.surface.count), self.near]
+
+    @property
+    def at_touches(self) -> list:
+        """The same of obstacles at triangles."""
+        return [self.threads(len(self.near.touches)), self.near]
 
     # --- what the host sees ----------------------------------------------------------------------------------------
 
@@ -76,7 +86,9 @@ class Search:
             self.watch.places = wp.zeros(count, dtype=wp.vec3, device=device)
             self.watch.reach = wp.zeros(count, dtype=wp.float32, device=device)
             self.near.flags, self.near.nodes = (wp.zeros(count, dtype=wp.int32, device=device) for _ in range(2))
-            self.near.count = wp.zeros(1, dtype=wp.int32, device=device)
+            self.near.count, self.near.touch_count = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
+            pairs = self.obstacles.count * self.surface.triangle_count if self.obstacles.have_edges else 0
+            self.near.touches = wp.zeros(pairs, dtype=wp.int32, device=device)
             self._taken = self.surface.revision
         self.forget()
 
@@ -126,6 +138,8 @@ class Search:
 
     def launch(self, offset: int) -> None:
         """Launch a search, if it is due in this step."""
+        if not self.finders:
+            return
         if offset == 0:
             self._on_nodes(kernels.watch_nodes, [self.surface.arrays, self.watch])
         if self.obstacles.count:
@@ -137,7 +151,8 @@ class Search:
 
     def launch_after(self) -> None:
         """Launch after a step whether it is time to look again."""
-        self._on_nodes(kernels.follow_nodes, [self.surface.arrays, self.watch])
+        if self.finders:
+            self._on_nodes(kernels.follow_nodes, [self.surface.arrays, self.watch])
 
     def launch_report(self) -> None:
         """Launch what the host sees after a run."""

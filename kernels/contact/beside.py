@@ -1,0 +1,81 @@
+"""Which surface nodes and triangles obstacles are near."""
+
+import warp as wp
+
+from .law import Law
+from .motion import Motions, Surface
+from .near import AROUND, BESIDE, Near, mark
+from .shapes import GROUND, Shapes, distance_to
+from .triangles import Touches
+from .watch import Watch
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel(enable_backward=False)
+def find_nodes_beside(
+    # In
+    watch: Watch,
+    shapes: Shapes,
+    motions: Motions,
+    law: Law,
+    surface: Surface,
+    # Out
+    near: Near,
+    forces: wp.array2d[wp.vec3],
+    anchors: wp.array2d[wp.vec4],
+):
+    """Mark nodes that may touch an obstacle before the next search; others have no forces of obstacles."""
+    s = wp.tid()
+    if watch.due[0] == 0:
+        return
+    if surface.node[s] >= 0:
+        world = surface.world[s]
+        for o in range(forces.shape[0]):
+            far = watch.reach[s] + watch.reach_of[world, o] + law.tolerance
+            gap, _normal = distance_to(shapes, o, motions.now[world, o], surface.x[s], far)
+            if gap <= far:
+                mark(near, s, BESIDE)
+                return
+    for o in range(forces.shape[0]):
+        forces[o, s] = wp.vec3()
+        anchors[o, s] = wp.vec4()
+
+
+@wp.kernel(enable_backward=False)
+def find_triangles_beside(
+    # In
+    watch: Watch,
+    shapes: Shapes,
+    motions: Motions,
+    law: Law,
+    surface: Surface,
+    triangles: wp.array[wp.vec3i],
+    # Out
+    near: Near,
+    touches: Touches,
+):
+    """List triangles that may touch an obstacle before the next search; others have no forces of obstacles."""
+    o, t = wp.tid()
+    if watch.due[0] == 0:
+        return
+    corners = triangles[t]
+    if shapes.kind[o] != GROUND and corners[0] >= 0:
+        world = surface.world[corners[0]]
+        a = surface.x[corners[0]]
+        b = surface.x[corners[1]]
+        c = surface.x[corners[2]]
+        middle = (a + b + c) / 3.0
+        size = wp.max(wp.length(a - middle), wp.max(wp.length(b - middle), wp.length(c - middle)))
+        reach = wp.max(watch.reach[corners[0]], wp.max(watch.reach[corners[1]], watch.reach[corners[2]]))
+        # The middle moves, and so do the corners about it.
+        far = size + 3.0 * reach + watch.reach_of[world, o] + law.tolerance
+        gap, _normal = distance_to(shapes, o, motions.now[world, o], middle, far)
+        if gap <= far:
+            near.touches[wp.atomic_add(near.touch_count, 0, 1)] = o * triangles.shape[0] + t
+            for k in range(3):
+                mark(near, corners[k], AROUND)
+            return
+    touches.shares[o, t] = wp.vec3()
+    touches.force[o, t] = wp.vec3()
+    touches.acts[o, t] = 0
