@@ -38,7 +38,9 @@ class Linear(Model):
         check_dilatation(self.dilatation)
 
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
-        return bind_law(_bind, SMALL, self.dilatation, body, deterministic)
+        field = bind_law(_bind, SMALL, self.dilatation, body, deterministic)
+        field.is_linear = True
+        return field
 
 
 def _bind(discretization: Discretization, deterministic: bool) -> ForceField:

@@ -47,12 +47,14 @@ class ForceField(ABC):
     Attributes:
         plan: What launches go through.
         elements: All of its elements.
+        is_linear: Whether forces are linear in displacements.
 
     Raises:
         InputError: The body's material is anisotropic and the field does not know such.
     """
 
     takes_anisotropic: ClassVar[bool] = False
+    is_linear: bool = False
 
     def __init__(self, body: Discretized | Discretization, deterministic: bool = False):
         discretization = discretization_of(body)

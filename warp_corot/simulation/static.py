@@ -81,7 +81,8 @@ def solve_static(
         iterations: Newton's iterations for each part of the load at most.
         load_steps: Equal parts in which loads and gravity are added; more than one leads along the path of a load that
             grows where there are several states of rest.
-        preconditioner: "diagonal" or None, which chooses.
+        preconditioner: Of conjugate gradients: "multigrid" on the levels of a forest, "diagonal" with each node's own
+            3x3 block, or None: multigrid for forests, the diagonal for general meshes.
         deterministic: Whether forces must come out the same bit by bit every time also on CUDA.
 
     Raises:

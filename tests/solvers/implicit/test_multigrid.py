@@ -323,3 +323,28 @@ def test_general_meshes_and_wrong_options_are_refused(device):
         Multigrid(body, stride=4)
     with pytest.raises(wc.InputError, match="degree is 0; it must be 1 or more"):
         Multigrid(body, degree=0)
+
+
+@pytest.mark.parametrize("model", ["corotated", "neo_hookean"])
+def test_static_answers_take_it_for_forests(model, device):
+    """The answer is that with the block diagonal, for far fewer linear iterations."""
+    reports, found = [], []
+    for name in ("diagonal", None):
+        mesh = wc.TetForest.box((1, 1, 3), 0.064, 6)
+        body = wc.SoftBody(mesh, wc.Isotropic(**(MATERIAL | {"poisson": 0.45})), device=device)
+        body.fix(mesh.points[:, 2] < 1e-9)
+        reports.append(wc.solve_static(body, model=MODELS[model](), preconditioner=name))
+        found.append(body.displacements.numpy())
+    assert all(report.converged for report in reports)
+    assert np.abs(found[0] - found[1]).max() < 1e-5 * np.abs(found[0]).max()
+    print([report.linear_iterations for report in reports])
+    assert reports[1].linear_iterations < reports[0].linear_iterations / 8
+
+
+def test_static_answers_of_general_meshes_take_the_diagonal(device):
+    forest = uniform(2)
+    body = wc.SoftBody(wc.TetMesh(forest.points, forest.tets), wc.Isotropic(5e3, 0.3, 1e3), device=device)
+    body.fix(lowest_tenth(forest))
+    assert wc.solve_static(body).converged
+    with pytest.raises(wc.InputError, match="only a TetForest has levels; this mesh is a TetMesh"):
+        wc.solve_static(body, preconditioner="multigrid")

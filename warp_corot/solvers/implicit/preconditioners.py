@@ -2,29 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
+from warp_corot.kernels.elements.elements import ForestElements
 
 from .block_diagonal import BlockDiagonal
-from .operator import LinearOperator, Preconditioner
+from .multigrid import Multigrid
+from .operator import Preconditioner
+from .tangent import TangentOperator
+
+
+def _multigrid(operator: TangentOperator) -> Multigrid:
+    return Multigrid(operator.body, is_turned=not operator.field.is_linear)
+
 
 #: By name.
-PRECONDITIONERS = {"diagonal": BlockDiagonal}
-#: What is taken if none is named.
-DEFAULT = "diagonal"
+PRECONDITIONERS: dict[str, Callable[[TangentOperator], Preconditioner]] = {
+    "multigrid": _multigrid,
+    "diagonal": BlockDiagonal,
+}
 
 
-def preconditioner_of(name: Any, operator: LinearOperator) -> Preconditioner:
-    """A preconditioner by its name, or what is chosen for the operator's mesh for None.
+def preconditioner_of(name: Any, operator: TangentOperator) -> Preconditioner:
+    """A preconditioner by its name; for None multigrid where the mesh is a forest, else the block diagonal.
 
     Raises:
-        InputError: There is none of this name.
+        InputError: There is none of this name, or it is multigrid and the mesh is no forest.
     """
-    if name is None:
-        return PRECONDITIONERS[DEFAULT](operator)
     check_preconditioner(name)
+    if name is None:
+        name = "multigrid" if operator.body.discretization.element_kind is ForestElements else "diagonal"
     return PRECONDITIONERS[name](operator)
 
 
