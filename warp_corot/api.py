@@ -23,10 +23,12 @@ from .domain import Domain
 from .elasticity import Corotated, EdgeStVK, Linear, MassSpring, NeoHookean, StVenantKirchhoff
 from .errors import CapacityWarning, InputError, StabilityWarning, StaleViewError, UnstableError
 from .mesh import SurfaceMesh, TetForest, TetMesh
-from .solvers import SymplecticEuler
+from .solvers import BDF2, BackwardEuler, GeneralizedAlpha, Newmark, SymplecticEuler
 
 __all__ = [
+    "BDF2",
     "Activation",
+    "BackwardEuler",
     "Box",
     "CapacityWarning",
     "Capsule",
@@ -36,6 +38,7 @@ __all__ = [
     "Domain",
     "EdgeStVK",
     "Energy",
+    "GeneralizedAlpha",
     "Grasp",
     "Ground",
     "InputError",
@@ -43,6 +46,7 @@ __all__ = [
     "Linear",
     "MassSpring",
     "NeoHookean",
+    "Newmark",
     "OnlineRemesh",
     "Orthotropic",
     "SignedDistance",

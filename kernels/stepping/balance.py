@@ -117,6 +117,7 @@ def dot64(a: wp.vec3, b: wp.vec3):
 def sum_nodes(
     # In
     pace: Pace,
+    lag: wp.float64,
     gravity: wp.vec3,
     count: int,
     threads: int,
@@ -148,13 +149,14 @@ def sum_nodes(
     beyond the stable step, where it need not be positive.
     The work of supports that ``add_support_work`` has added up counts half of f's share too early; that half is
     ``SUPPORTS``. Velocities at the time of the displacements, halfway, have ``UNTIMELY`` more than that product.
+    With a ``lag`` of zero velocities are at the time of the displacements, and there is nothing of this.
     The forces besides elasticity in the last step are part of what accelerates nodes; their work is counted elsewhere.
     That of constraints takes a change of the step into account, so that ``AHEAD`` does not where they act.
     """
     world, thread = wp.tid()
     slot = int(orders[SLOT])
-    dt = pace.seconds[DT]
-    before = length_before(pace)
+    dt = lag * pace.seconds[DT]
+    before = lag * length_before(pace)
     both = wp.float64(0.25) * (before * before - dt * dt)
     kinetic = wp.float64(0.0)
     ahead = wp.float64(0.0)

@@ -25,7 +25,7 @@ from warp_corot.mesh import TetForest
 from warp_corot.mesh.surfaces.boundary import signed_volumes
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import SymplecticEuler
-from warp_corot.solvers.recorded import GRAPH_STEPS
+from warp_corot.solvers.integrator import GRAPH_STEPS
 
 from .timing import Stages, Times, measure_times
 

@@ -83,6 +83,21 @@ def checked_contact(
     return given, Contact() if contact is None else contact
 
 
+def check_implicit(integrator: Integrator, *, touches: bool, remeshes: bool) -> None:
+    """See that an implicit integrator can make the steps that are asked for.
+
+    Raises:
+        InputError: Bodies touch something, or are remeshed.
+    """
+    if not integrator.is_implicit:
+        return
+    name = type(integrator).__name__
+    if touches:
+        raise InputError(f"{name} knows no contact; with obstacles or contact the integrator must be SymplecticEuler")
+    if remeshes:
+        raise InputError(f"{name} knows no remeshing; with remesh the integrator must be SymplecticEuler")
+
+
 def check_constraints(system: System, stepper: Stepper, integrator: Integrator) -> None:
     """See that steps answer to what the bodies touch.
 

@@ -278,8 +278,12 @@ class Running:
             return
         if sim.safe_step is None or self._returns >= MOST_RETURNS:
             self._returns = 0
+            message = fault_message(sim, fault, MOST_RETURNS)
+            if sim.integrator.is_implicit:
+                sim.guard.go_back()
+                message += f"; the state is that of t = {sim.time:.4g} s again"
             sim.guard.forget()
-            raise UnstableError(fault_message(sim, fault, MOST_RETURNS))
+            raise UnstableError(message)
         if not self._returns:
             self._wrong_until = sim.time
         self._returns += 1

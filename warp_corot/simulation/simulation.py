@@ -34,6 +34,7 @@ from warp_corot.solvers.system import NEVER, Forces, System
 from .energy import Energy, WorldEnergies, find_energies
 from .parts import (
     check_constraints,
+    check_implicit,
     checked_bodies,
     checked_contact,
     checked_gravity,
@@ -41,6 +42,7 @@ from .parts import (
     checked_models,
 )
 from .running import Running
+from .solves import Solves
 
 
 @dataclass(frozen=True)
@@ -55,9 +57,10 @@ class Simulation:
     Args:
         bodies: A ``SoftBody`` or several on one device.
         model: Elastic model, or one for each body.
-        integrator: Time integrator. With ``dt=None`` the step follows the state: it is measured again during the run,
-            and a state that goes wrong all the same is made again with half the step. A step that is given stays, and a
-            run in which it is too long ends with an error.
+        integrator: Time integrator, ``SymplecticEuler()`` if none is given, or an implicit one such as
+            ``BackwardEuler(dt=0.01)``. With ``dt=None`` the step follows the state: it is measured again during the
+            run, and a state that goes wrong all the same is made again with half the step. A step that is given stays,
+            and a run in which it is too long ends with an error.
         gravity: [m/s^2]; None for 9.81 down the up axis of the first body's mesh.
         deterministic: Whether a run must come out the same bit by bit every time. On the CPU it always does; on CUDA
             forces are then added up in one order, which takes time and memory (``benchmarks/README.md``).
@@ -70,14 +73,15 @@ class Simulation:
     Attributes:
         bodies: Tuple of the bodies.
         worlds: Copies of the bodies, the same number for each.
-        stable_dt: Largest linearly stable step at rest [s], estimated; infinite where nothing can vibrate.
+        stable_dt: Largest linearly stable step at rest [s], estimated; infinite where nothing can vibrate, and for
+            implicit integrators.
         gravity: Tuple [m/s^2].
 
     Raises:
         InputError: No body, one given twice, bodies on different devices or of different numbers of worlds, a number of
             models that is not the number of bodies, a body of which no node is free to move, non-finite gravity, a
             model that does not go with its mesh, something that is none of these, or bodies that cannot be remeshed as
-            asked (see ``OnlineRemesh``); obstacles that are none, or an integrator that knows no contact.
+            asked (see ``OnlineRemesh``); obstacles that are none, or an integrator that knows no contact or remeshing.
 
     Warns:
         StabilityWarning: The given step is larger than ``stable_dt``.
@@ -102,6 +106,8 @@ class Simulation:
         self.models = checked_models(Corotated() if model is None else model, len(self.bodies))
         self.integrator = checked_integrator(SymplecticEuler() if integrator is None else integrator)
         self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
+        touching = checked_contact(obstacles, contact)
+        check_implicit(self.integrator, touches=touching is not None, remeshes=remesh is not None)
 
         self.remeshing = Remeshing(self.bodies, self.models, remesh, deterministic=self.deterministic)
         bound = zip(self.models, self.bodies, strict=True)
@@ -114,7 +120,6 @@ class Simulation:
         self.pace = Pace(ANY_STEP if given is None else float(given), self.device)
         self.system = System(self.bodies, self.fields, self.pace, self.gravity)
         stable = self._find_stable_steps()
-        touching = checked_contact(obstacles, contact)
         #: What keeps bodies out of obstacles and of one another; None where nothing touches.
         self.contact: Contacts | None = None
         if touching is not None:
@@ -125,11 +130,11 @@ class Simulation:
         #: What chooses the step, if none was given.
         self.safe_step = SafeStep(self.system, self.models, stable) if given is None else None
         self.guard = Guard(self.system)
-        stepper = self.integrator.bind(self.system)
+        self.stepper = stepper = self.integrator.bind(self.system)
         check_constraints(self.system, stepper, self.integrator)
         self.recorded = RecordedSteps(self.system, stepper, self.guard, self.safe_step)
         #: What is to be kept besides the states of bodies and fields for a run to go on as it would have.
-        self.kept = self.pace.state | ({} if self.safe_step is None else self.safe_step.state)
+        self.kept = self.pace.state | ({} if self.safe_step is None else self.safe_step.state) | stepper.kept
         self._running = Running(self)
 
     # --- stepping --------------------------------------------------------------------------------------------------
@@ -153,6 +158,12 @@ class Simulation:
     def dt_range(self) -> tuple[float, float]:
         """The shortest and the longest time step so far [s]."""
         return (self.dt, self.dt) if self.safe_step is None else self.safe_step.range
+
+    @property
+    def solves(self) -> Solves | None:
+        """What the steps of an implicit integrator took to solve so far; None for others. Waits for the device."""
+        totals = getattr(self.stepper, "totals", None)
+        return None if totals is None else Solves(*(int(total) for total in totals.numpy()))
 
     @property
     def steps(self) -> int:
@@ -352,6 +363,9 @@ class Simulation:
 
     def _find_stable_steps(self) -> list[float]:
         """The largest stable step of each body at rest [s], of which ``stable_dt`` is the smallest."""
+        if self.integrator.is_implicit:
+            self.stable_dt = math.inf
+            return [math.inf] * len(self.bodies)
         frequencies = [largest_frequency(body, f) for body, f in zip(self.bodies, self.fields, strict=True)]
         added = sum(getattr(each, "curvature", 0.0) for each in self.system.forces)
         steps = [self.integrator.stable_step(math.sqrt(frequency**2 + added)) for frequency in frequencies]

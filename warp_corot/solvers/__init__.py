@@ -1,10 +1,28 @@
 """Time integrators, one file each. A new one is listed here."""
 
 from warp_corot.solvers.explicit.symplectic_euler import SymplecticEuler
+from warp_corot.solvers.implicit.schemes import BDF2, BackwardEuler, GeneralizedAlpha, ImplicitIntegrator, Newmark
 from warp_corot.solvers.steps.stable_step import largest_frequency
 
 from .integrator import Integrator, Stepper
 
-INTEGRATORS: dict[str, type[Integrator]] = {"symplectic-euler": SymplecticEuler}
+INTEGRATORS: dict[str, type[Integrator]] = {
+    "symplectic-euler": SymplecticEuler,
+    "backward-euler": BackwardEuler,
+    "newmark": Newmark,
+    "bdf2": BDF2,
+    "generalized-alpha": GeneralizedAlpha,
+}
 
-__all__ = ["INTEGRATORS", "Integrator", "Stepper", "SymplecticEuler", "largest_frequency"]
+__all__ = [
+    "BDF2",
+    "INTEGRATORS",
+    "BackwardEuler",
+    "GeneralizedAlpha",
+    "ImplicitIntegrator",
+    "Integrator",
+    "Newmark",
+    "Stepper",
+    "SymplecticEuler",
+    "largest_frequency",
+]

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
+
+import warp as wp
 
 if TYPE_CHECKING:
     from .system import System
+
+#: Steps recorded in one graph where a launch is not many steps.
+GRAPH_STEPS = 64
 
 
 class Stepper(ABC):
@@ -15,6 +20,13 @@ class Stepper(ABC):
 
     #: Whether steps launch the forces of the system's constraints.
     resolves_constraints = False
+    #: How many steps one recording has at most.
+    graph_steps = GRAPH_STEPS
+
+    @property
+    def kept(self) -> dict[str, wp.array]:
+        """What a step leaves for the next one besides the state of bodies and fields, by name."""
+        return {}
 
     @property
     def many_a_launch(self) -> bool:
@@ -42,6 +54,8 @@ class Integrator(ABC):
     """The description of a time integrator: a frozen dataclass of plain values with a step ``dt`` [s] or None."""
 
     dt: float | None
+    #: Whether steps of any length are stable.
+    is_implicit: ClassVar[bool] = False
 
     def stable_step(self, frequency: float) -> float:
         """The largest stable step [s] of a body whose largest angular frequency at rest is this [rad/s]; infinite for

@@ -24,9 +24,8 @@ from .integrator import Stepper
 from .subnormals import FlushedSubnormals
 from .system import System
 
-#: Steps recorded in one graph: on CUDA; on the CPU, where a replay costs nothing and recording a step takes as long as
-#: making ten; and where a launch is many steps.
-GRAPH_STEPS = 64
+#: Steps recorded in one graph: on the CPU, where a replay costs nothing and recording a step takes as long as making
+#: ten, if that is fewer than ``Stepper.graph_steps``; and where a launch is many steps.
 CPU_GRAPH_STEPS = 8
 BLOCK_STEPS = 1024
 #: Steps up to which what is asked for twice is recorded as it is: recording takes longer than many replays.
@@ -118,7 +117,8 @@ class RecordedSteps:
         """Steps recorded in one graph at most."""
         if self.in_blocks:
             return BLOCK_STEPS
-        return CPU_GRAPH_STEPS if self._pace.device.is_cpu else GRAPH_STEPS
+        most = self._stepper.graph_steps
+        return min(most, CPU_GRAPH_STEPS) if self._pace.device.is_cpu else most
 
     @property
     def interval(self) -> int:

@@ -111,6 +111,8 @@ class System:
         support_work: What moving supports, and forces that say so, have put in, and the sum of its absolute values [J],
             float64 [2].
         offset: Which step since the clock was last advanced is being launched.
+        lag: How far velocities are behind displacements, in halves of a step: 1 for symplectic Euler.
+        histories: Arrays that a step leaves for the next one besides the state of bodies and fields.
         bad_step: The first step after which something was not finite, int64 [1] on the device.
     """
 
@@ -119,6 +121,8 @@ class System:
         self.forces: list[Forces] = []
         self.constraints: list[Constraint] = []
         self.changes = self.offset = 0
+        self.lag = 1.0
+        self.histories: list[wp.array] = []
         self._work = ForcesWork(self.bodies, pace, self.gravity)
         self.device, self.worlds = bodies[0].device, bodies[0].worlds
         self.motion_rates = wp.zeros(2, dtype=wp.float32, device=self.device)
@@ -135,7 +139,7 @@ class System:
     @property
     def accounts(self) -> list[wp.array]:
         """The work of forces and of constraints on each body; see ``ForcesWork``."""
-        return [*(self._work.accounts if self._counted else []), *self._work.of_constraints.values()]
+        return [*(self._work.accounts if self.counted else []), *self._work.of_constraints.values()]
 
     @property
     def state(self) -> list[wp.array]:
@@ -147,10 +151,10 @@ class System:
         """Bring up to date what constraints know of the bodies; not while launches are recorded."""
         for each in self.constraints:
             each.prepare()
-        self._work.prepare(bool(self._counted))
+        self._work.prepare(bool(self.counted))
 
     @property
-    def _counted(self) -> list[Forces]:
+    def counted(self) -> list[Forces]:
         """The forces whose work is counted for them."""
         return [each for each in self.forces if not _counts_itself(each)]
 
@@ -168,7 +172,7 @@ class System:
         # A support pays for what has been added so far, and not for what is counted below.
         for k in moving:
             self.bodies[k].conditions.follow_trajectories(self.pace, offset, self.support_work)
-        counted = self._counted
+        counted = self.counted
         if counted:
             self._work.launch_begin()
             for forces in counted:
@@ -185,7 +189,7 @@ class System:
 
         None for nothing.
         """
-        if self._counted:
+        if self.counted:
             return self._work.others[k]
         state = self.bodies[k].state
         return state.contact_forces if state.is_touched else None

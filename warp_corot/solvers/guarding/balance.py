@@ -212,6 +212,7 @@ class Balance:
         pushing = system.pushing(system.bodies.index(body))
         inputs = [
             pace,
+            wp.float64(system.lag),
             system.gravity,
             body.sizes.launch_nodes // self.worlds,
             self._threads,

@@ -64,6 +64,9 @@ class Newton:
         others: Launches forces besides elasticity to ``body.state.forces``.
 
     Attributes:
+        forces: Room for elastic forces, zero between launches [N], vec4.
+        step: The last step [m], vec4.
+        iterations, solved, status: Of each world, as ``NewtonReport`` has them, int32 [worlds].
         base, increment: What displacements are made of [m], vec4.
         inertia: The scale a of the inertia [1/s^2], float32 [1].
         pull: a h, acceleration that the inertia of a time step asks for [m/s^2], vec4.
@@ -91,7 +94,7 @@ class Newton:
             operator.worlds,
         )
         like = self.body.state.displacements
-        self._forces, self._residual, self._outer, self._step, self.base, self.increment, self.pull = (
+        self.forces, self._residual, self._outer, self.step, self.base, self.increment, self.pull = (
             wp.zeros_like(like) for _ in range(7)
         )
         self.solver = ConjugateGradients(operator, len(like), most=most_linear)
@@ -101,7 +104,7 @@ class Newton:
         self._scalars = wp.zeros((self.worlds, kernels.SCALARS), dtype=wp.float64, device=self.device)
         self.inertia = wp.zeros(1, dtype=wp.float32, device=self.device)
         self.external_share = wp.ones(1, dtype=wp.float32, device=self.device)
-        self._iterations, self._solved, self._status, self._accepted = (
+        self.iterations, self.solved, self.status, self._accepted = (
             wp.zeros(self.worlds, dtype=wp.int32, device=self.device) for _ in range(4)
         )
         self.running, self._searching = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
@@ -111,7 +114,7 @@ class Newton:
     def launch_begin(self) -> None:
         """Launch that all worlds begin from ``base`` and ``increment``."""
         self.running.zero_()
-        outputs = [self._scalars, self._iterations, self._solved, self._status, self.running]
+        outputs = [self._scalars, self.iterations, self.solved, self.status, self.running]
         wp.launch(kernels.begin_worlds, self.worlds, [], outputs, device=self.device)
         self._try_step(commits=False)
 
@@ -120,30 +123,30 @@ class Newton:
         u, sums = self.body.state.displacements, self._sums
         self._launch_energies()
         self.launch_residual()
-        outputs = [self._scalars, self._iterations, self._status, self.running, self.solver.tolerance]
+        outputs = [self._scalars, self.iterations, self.status, self.running, self.solver.tolerance]
         sums.launch_scalars(kernels.judge_residual, [wp.float64(self.tolerance), self.most], outputs)
         self.launch_solve()
-        inputs = [self.body.conditions.mass, self._residual, self._outer, self._step, u, *sums.sizes]
+        inputs = [self.body.conditions.mass, self._residual, self._outer, self.step, u, *sums.sizes]
         wp.launch(kernels.measure_step, sums.shape, inputs, [sums.parts], device=self.device)
         self._searching.zero_()
         self._accepted.zero_()
         inputs = [self.solver.iterations]
-        outputs = [self._scalars, self._iterations, self._solved, self._status, self.running, self._searching]
+        outputs = [self._scalars, self.iterations, self.solved, self.status, self.running, self._searching]
         sums.launch_scalars(kernels.begin_search, inputs, outputs)
         wp.capture_while(self._searching, self._launch_trial)
         self._try_step(commits=True)
         inputs = [wp.float64(self.tolerance), self.solver.status]
-        sums.launch_scalars(kernels.judge_step, inputs, [self._scalars, self._status, self.running])
+        sums.launch_scalars(kernels.judge_step, inputs, [self._scalars, self.status, self.running])
 
     def launch_residual(self) -> None:
         """Launch the forces that are out of balance in the present state."""
         body, sums, conditions = self.body, self._sums, self.body.conditions
-        self.field.add_forces(body.state.displacements, self._forces)
+        self.field.add_forces(body.state.displacements, self.forces)
         if self._others is not None:
             self._others()
         inputs: list[Any] = [self.gravity, conditions.mass, conditions.inverse_mass, int(conditions.has_loads)]
         inputs += [conditions.loads, self.external_share, self.inertia, self.pull, self.increment, *sums.sizes]
-        outputs = [self._forces, body.state.forces, self._residual, self._outer, sums.parts]
+        outputs = [self.forces, body.state.forces, self._residual, self._outer, sums.parts]
         kernel = kernels.FIND_RESIDUAL[conditions.loads.dtype]
         wp.launch(kernel, sums.shape, inputs, outputs, device=self.device)
 
@@ -151,12 +154,12 @@ class Newton:
         """Launch the linearisation, and the step that it gives."""
         self.operator.take(self.body.state.displacements)
         self.preconditioner.update(self.operator)
-        self.solver.launch(self.preconditioner, self._residual, self._step)
+        self.solver.launch(self.preconditioner, self._residual, self.step)
 
     def _launch_trial(self) -> None:
         self._try_step(commits=False)
         self._launch_energies()
-        inputs = [self.inertia, self._status]
+        inputs = [self.inertia, self.status]
         self._sums.launch_scalars(kernels.judge_trial, inputs, [self._scalars, self._accepted, self._searching])
 
     def _launch_energies(self) -> None:
@@ -167,7 +170,7 @@ class Newton:
         wp.launch(kernels.sum_energies, sums.shape, inputs, [sums.parts], device=self.device)
 
     def _try_step(self, *, commits: bool) -> None:
-        inputs = [self._scalars, self.base, self._step, self._count, int(commits)]
+        inputs = [self._scalars, self.base, self.step, self._count, int(commits)]
         outputs = [self.increment, self.body.state.displacements]
         wp.launch(kernels.try_step, self.worlds * self._count, inputs, outputs, device=self.device)
 
@@ -178,9 +181,9 @@ class Newton:
         scalars = self._scalars.numpy()
         compared = scalars[:, int(kernels.COMPARED)]
         return NewtonReport(
-            iterations=self._iterations.numpy(),
-            linear_iterations=self._solved.numpy(),
+            iterations=self.iterations.numpy(),
+            linear_iterations=self.solved.numpy(),
             residual=scalars[:, int(kernels.RESIDUAL)] / np.where(compared > 0.0, compared, 1.0),
             correction=scalars[:, int(kernels.CORRECTION)],
-            status=self._status.numpy(),
+            status=self.status.numpy(),
         )

@@ -39,19 +39,22 @@ class TangentOperator:
         stiff_forces: Sequence[Any] = (),
         exact: bool = False,
     ):
-        self.body, self.field, self.viscosity, self.stiff_forces = body, field, viscosity, tuple(stiff_forces)
+        self.body, self.field, self.viscosity = body, field, viscosity
+        self.stiff_forces = tuple(stiff_forces)
         self.device, self.worlds = body.device, body.worlds
         self.tangent = field.tangent(exact=exact)
         self.scales = wp.array([0.0, 0.0, 1.0], dtype=wp.float32, device=self.device)
         self._none = wp.zeros(1, dtype=wp.vec4, device=self.device)
+        self._blocks = wp.zeros(0, dtype=wp.mat33, device=self.device)
         self.prepare()
 
     def prepare(self) -> None:
         """Make room for the body's present nodes; not while launches are recorded."""
         u = self.body.state.displacements
         self.tangent.prepare(u)
-        self._damped = self._none if self.viscosity is None else wp.zeros_like(u)
-        self._blocks = wp.zeros(len(u), dtype=wp.mat33, device=self.device)
+        if len(self._blocks) != len(u):
+            self._damped = self._none if self.viscosity is None else wp.zeros_like(u)
+            self._blocks = wp.zeros(len(u), dtype=wp.mat33, device=self.device)
 
     @property
     def node_count(self) -> int:

@@ -1,0 +1,272 @@
+"""Implicit time steps on the nodes: what a step begins with, and the state that it ends with.
+
+A scheme is a table of coefficients, row by row a sum of the stage's increment d, the velocity v, and two vectors h1 and
+h2 that the step before has left, such as its acceleration. The first row of tables is for a step that goes on from the
+one before, the second for one that begins.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.stepping.integrate import add_support_work, by_vectors, is_finite, vector_at
+from warp_corot.kernels.stepping.pace import DONE, Pace
+
+from .conjugate_gradients import BROKEN
+from .tangent import DAMPING, MASS, STIFFNESS
+
+wp.set_module_options({"enable_backward": False})
+
+#: Rows of a scheme: acceleration and velocity of the stage, velocity after the step, what h1 and h2 are then; the last
+#: has the share of the step that the stage is, and the share of v dt that the search for the increment begins with.
+ACCELERATION, RATE, VELOCITY, FIRST, SECOND, STAGE = (wp.constant(k) for k in range(6))
+ROWS = 6
+#: Columns: d, v, h1 and h2.
+COLUMNS = 4
+
+
+@wp.func
+def combined(table: wp.array3d[wp.float32], row: int, which: int, v: wp.vec3, h1: wp.vec3, h2: wp.vec3):
+    """A row's sum without its first term."""
+    return table[which, row, 1] * v + table[which, row, 2] * h1 + table[which, row, 3] * h2
+
+
+@wp.kernel(enable_backward=False)
+def find_changes(
+    # In
+    inverse_mass: wp.array[wp.float32],
+    u: wp.array[wp.vec4],
+    v: wp.array[wp.vec4],
+    left_u: wp.array[wp.vec4],
+    left_v: wp.array[wp.vec4],
+    # Out
+    begins: wp.array[wp.int32],
+):
+    """Whether free nodes are where, and as fast as, the step before has left them; else this one begins."""
+    i = wp.tid()
+    if inverse_mass[i] > 0.0:
+        a = load_node(u, i) - load_node(left_u, i)
+        b = load_node(v, i) - load_node(left_v, i)
+        if not (wp.dot(a, a) == 0.0 and wp.dot(b, b) == 0.0):
+            begins[0] = 1
+
+
+@wp.kernel(enable_backward=False)
+def choose_scales(
+    # In
+    begins: wp.array[wp.int32],
+    table: wp.array3d[wp.float32],
+    damping: float,
+    # Out
+    scales: wp.array[wp.float32],
+    inertia: wp.array[wp.float32],
+):
+    """The scales of the operator for this step, with damping in proportion to the mass."""
+    which = begins[0]
+    a = table[which, ACCELERATION, 0]
+    b = table[which, RATE, 0]
+    scales[MASS] = a + damping * b
+    scales[DAMPING] = b
+    scales[STIFFNESS] = 1.0
+    inertia[0] = a + damping * b
+
+
+@wp.kernel(enable_backward=False)
+def begin_step(
+    # In
+    begins: wp.array[wp.int32],
+    table: wp.array3d[wp.float32],
+    dt: float,
+    damping: float,
+    inverse_mass: wp.array[wp.float32],
+    v: wp.array[wp.vec4],
+    h1: wp.array[wp.vec4],
+    h2: wp.array[wp.vec4],
+    # In and out
+    u: wp.array[wp.vec4],
+    # Out
+    base: wp.array[wp.vec4],
+    increment: wp.array[wp.vec4],
+    pull: wp.array[wp.vec4],
+    drift: wp.array[wp.vec4],
+):
+    """The base of the increments, their first values, and what inertia and damping pull with.
+
+    Held nodes move with the velocity they have. ``drift`` is the stage's velocity without its increment's share, one
+    entry where nobody asks for it; h1 and h2 are one entry where a scheme has none.
+    """
+    i = wp.tid()
+    which = begins[0]
+    velocity = load_node(v, i)
+    first = wp.vec3()
+    second = wp.vec3()
+    if h1.shape[0] > 1:
+        first = load_node(h1, i)
+    if h2.shape[0] > 1:
+        second = load_node(h2, i)
+    place = load_node(u, i)
+    share = table[which, STAGE, 0]
+    d = (share * dt) * velocity
+    rate = combined(table, RATE, which, velocity, first, second)
+    if inverse_mass[i] > 0.0:
+        d = (share * table[which, STAGE, 1] * dt) * velocity
+        store_node(pull, i, -(combined(table, ACCELERATION, which, velocity, first, second) + damping * rate))
+    store_node(base, i, place)
+    store_node(increment, i, d)
+    store_node(u, i, place + d)
+    if drift.shape[0] > 1:
+        if inverse_mass[i] == 0.0:
+            rate = velocity - table[which, RATE, 0] * d
+        store_node(drift, i, rate)
+
+
+@wp.kernel(enable_backward=False)
+def find_rates(
+    scales: wp.array[wp.float32],
+    increment: wp.array[wp.vec4],
+    drift: wp.array[wp.vec4],
+    rates: wp.array[wp.vec4],
+):
+    """The stage's velocities, of the present increments."""
+    i = wp.tid()
+    store_node(rates, i, scales[DAMPING] * load_node(increment, i) + load_node(drift, i))
+
+
+@wp.kernel(enable_backward=False)
+def take_step(
+    # In
+    step: wp.array[wp.vec4],
+    # In and out
+    increment: wp.array[wp.vec4],
+    # Out
+    u: wp.array[wp.vec4],
+):
+    """Add a step to the increments, and to the displacements of the stage."""
+    i = wp.tid()
+    s = load_node(step, i)
+    store_node(increment, i, load_node(increment, i) + s)
+    store_node(u, i, load_node(u, i) + s)
+
+
+@wp.kernel(enable_backward=False)
+def end_step(
+    # In
+    begins: wp.array[wp.int32],
+    table: wp.array3d[wp.float32],
+    world_nodes: int,
+    status: wp.array[wp.int32],
+    inverse_mass: wp.array[wp.float32],
+    base: wp.array[wp.vec4],
+    increment: wp.array[wp.vec4],
+    pace: Pace,
+    offset: int,
+    # In and out
+    v: wp.array[wp.vec4],
+    h1: wp.array[wp.vec4],
+    h2: wp.array[wp.vec4],
+    # Out
+    u: wp.array[wp.vec4],
+    left_u: wp.array[wp.vec4],
+    left_v: wp.array[wp.vec4],
+    bad_step: wp.array[wp.int64],
+):
+    """The state after the step. One whose forces were not finite has none, and says so."""
+    i = wp.tid()
+    which = begins[0]
+    d = load_node(increment, i)
+    velocity = load_node(v, i)
+    if inverse_mass[i] > 0.0:
+        first = wp.vec3()
+        second = wp.vec3()
+        if h1.shape[0] > 1:
+            first = load_node(h1, i)
+        if h2.shape[0] > 1:
+            second = load_node(h2, i)
+        after = table[which, VELOCITY, 0] * d + combined(table, VELOCITY, which, velocity, first, second)
+        if h1.shape[0] > 1:
+            store_node(h1, i, table[which, FIRST, 0] * d + combined(table, FIRST, which, velocity, first, second))
+        if h2.shape[0] > 1:
+            store_node(h2, i, table[which, SECOND, 0] * d + combined(table, SECOND, which, velocity, first, second))
+        velocity = after
+    d = d / table[which, STAGE, 0]
+    if status[i / world_nodes] == BROKEN:
+        d = wp.vec3(wp.nan, wp.nan, wp.nan)
+    place = load_node(base, i) + d
+    store_node(u, i, place)
+    store_node(v, i, velocity)
+    store_node(increment, i, d)
+    if left_u.shape[0] > 1:
+        store_node(left_u, i, place)
+        store_node(left_v, i, velocity)
+    if not is_finite(place):
+        wp.atomic_min(bad_step, 0, pace.counts[DONE] + wp.int64(offset + 1))
+
+
+@wp.kernel(enable_backward=False)
+def count_supports(
+    # In
+    gravity: wp.vec3,
+    mass: wp.array[wp.float32],
+    inverse_mass: wp.array[wp.float32],
+    has_load: int,
+    load: wp.array[Any],
+    elastic: wp.array[wp.vec4],
+    others: wp.array[wp.vec4],
+    increment: wp.array[wp.vec4],
+    # Out
+    reactions: wp.array[wp.vec4],
+    support_work: wp.array[wp.float64],
+):
+    """What supports take after the step, and what moving ones have put in against elastic forces."""
+    i = wp.tid()
+    if inverse_mass[i] == 0.0:
+        force = load_node(elastic, i)
+        total = force + load_node(others, i) + mass[i] * gravity
+        if has_load != 0:
+            total += vector_at(load, i)
+        store_node(reactions, i, -total)
+        add_support_work(force, load_node(increment, i), support_work)
+
+
+@wp.kernel(enable_backward=False)
+def count_work(
+    inverse_mass: wp.array[wp.float32],
+    others: wp.array[wp.vec4],
+    increment: wp.array[wp.vec4],
+    account: wp.array2d[wp.float64],
+):
+    """Add the work of forces besides elasticity on free nodes to its account."""
+    i = wp.tid()
+    if inverse_mass[i] > 0.0:
+        work = wp.float64(wp.dot(load_node(others, i), load_node(increment, i)))
+        account[0, i] = account[0, i] + work
+        account[1, i] = account[1, i] + wp.abs(work)
+
+
+@wp.kernel(enable_backward=False)
+def count_solves(
+    # In
+    iterations: wp.array[wp.int32],
+    linear_iterations: wp.array[wp.int32],
+    status: wp.array[wp.int32],
+    good: int,
+    # Out
+    totals: wp.array[wp.int64],
+):
+    """Count steps, iterations of Newton and of linear solves, of the world that needed most, and unfinished steps."""
+    most = int(0)
+    linear = int(0)
+    unfinished = int(0)
+    for world in range(status.shape[0]):
+        most = wp.max(most, iterations[world])
+        linear = wp.max(linear, linear_iterations[world])
+        if status[world] != good:
+            unfinished = 1
+    totals[0] = totals[0] + wp.int64(1)
+    totals[1] = totals[1] + wp.int64(most)
+    totals[2] = totals[2] + wp.int64(linear)
+    totals[3] = totals[3] + wp.int64(unfinished)
+
+
+COUNT_SUPPORTS = by_vectors(count_supports, "load")

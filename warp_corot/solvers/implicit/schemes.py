@@ -1,0 +1,226 @@
+"""Implicit time integrators as tables of coefficients; ``kernels.implicit.steps`` says what rows and columns are."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_count, checked_number
+from warp_corot.kernels.implicit import steps as kernels
+from warp_corot.solvers.integrator import Integrator, Stepper
+
+from .preconditioners import check_preconditioner
+
+if TYPE_CHECKING:
+    from warp_corot.solvers.system import System
+
+#: The shortest step of which float32 holds the square of the inverse [s].
+SHORTEST = 1e-15
+
+#: The tolerance of the schemes of second order by default.
+TOLERANCE = 1e-4
+
+Table = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ImplicitIntegrator(Integrator):
+    """What all implicit integrators have in common. Steps are stable whatever their length.
+
+    Each step solves M a + D v + f(u) = loads by Newton's method, with conjugate gradients for the linear systems.
+
+    Attributes:
+        dt: Time step [s].
+        damping: Rate of mass-proportional damping >= 0 [1/s].
+        viscosity: Viscous over elastic stress at one strain >= 0 [s], as for ``SymplecticEuler``.
+        tolerance: None: one iteration of Newton's method, a linear solve, as is usual in interactive simulation.
+            ``BackwardEuler`` bears that with long steps, and it is the default there; the others need short ones. A
+            number: iterations with a line search on the energy until the residual is less than this share of the
+            forces, or the last one moves no node by more than this share of the largest displacement.
+        iterations: Iterations of Newton's method in a step at most, with a tolerance.
+        linear_tolerance: Residual of the linear solve over its right side, without a tolerance.
+        linear_iterations: Iterations of a linear solve at most.
+        preconditioner: Of the linear solves, as for ``solve_static``.
+
+    Raises:
+        InputError: A value out of its range.
+    """
+
+    dt: float = 0.01
+    damping: float = 0.0
+    viscosity: float = 0.0
+    tolerance: float | None = None
+    iterations: int = 20
+    linear_tolerance: float = 1e-4
+    linear_iterations: int = 1000
+    preconditioner: str | None = None
+
+    is_implicit: ClassVar[bool] = True
+    #: How many vectors a step leaves for the next.
+    history: ClassVar[int] = 0
+
+    def __post_init__(self) -> None:
+        if self.dt is None or not SHORTEST <= checked_number(self.dt, "dt", "s") < math.inf:
+            raise InputError(f"dt is {self.dt}; {type(self).__name__} needs a step of {SHORTEST:g} s or more")
+        for name, unit in (("damping", "1/s"), ("viscosity", "s")):
+            value = getattr(self, name)
+            if not 0 <= checked_number(value, name, unit) < math.inf:
+                raise InputError(f"{name} is {value}; it must be zero or a positive number [{unit}]")
+        for name in ("tolerance", "linear_tolerance"):
+            value = getattr(self, name)
+            if not (name == "tolerance" and value is None) and not 0.0 < checked_number(value, name) < 1.0:
+                raise InputError(f"{name} is {value}; it must be between 0 and 1")
+        for name in ("iterations", "linear_iterations"):
+            checked_count(getattr(self, name), name, least=1)
+        check_preconditioner(self.preconditioner)
+
+    def stable_step(self, frequency: float) -> float:
+        """Infinite: any step is stable."""
+        return math.inf
+
+    @abstractmethod
+    def scheme(self, dt: float) -> Table:
+        """Coefficients of a step that goes on from the one before, float64 [ROWS, COLUMNS]."""
+
+    def start(self, dt: float) -> Table:
+        """The same of a step that begins: backward Euler's."""
+        return backward_euler(dt)
+
+    def bind(self, system: System) -> Stepper:
+        from .stepper import ImplicitStepper
+
+        return ImplicitStepper(system, self)
+
+
+def table(**rows: tuple[float, ...]) -> Table:
+    """A table of named rows, with zeros where there are fewer than four numbers."""
+    made = np.zeros((kernels.ROWS, kernels.COLUMNS))
+    for name, row in rows.items():
+        made[int(getattr(kernels, name)), : len(row)] = row
+    return made
+
+
+def backward_euler(
+    dt: float, *, first: tuple[float, ...] = (), second: tuple[float, ...] = (), guess: float = 0.0
+) -> Table:
+    """a = (v_after - v) / dt, v_after = d / dt, with what it leaves for another scheme."""
+    inverse = 1.0 / dt
+    return table(
+        ACCELERATION=(inverse**2, -inverse),
+        RATE=(inverse,),
+        VELOCITY=(inverse,),
+        FIRST=first,
+        SECOND=second,
+        STAGE=(1.0, guess),
+    )
+
+
+@dataclass(frozen=True)
+class BackwardEuler(ImplicitIntegrator):
+    """v_after = v + dt a(u_after), u_after = u + dt v_after: first order, and damps what it does not resolve."""
+
+    def scheme(self, dt: float) -> Table:
+        return backward_euler(dt)
+
+
+@dataclass(frozen=True)
+class GeneralizedAlpha(ImplicitIntegrator):
+    """The method of Chung and Hulbert (1993): second order, with the damping of fast vibrations that one asks for.
+
+    Attributes:
+        spectral_radius: What a step leaves of the fastest vibrations, 0 to 1: 1 keeps energy, 0 damps most.
+    """
+
+    tolerance: float | None = TOLERANCE
+    spectral_radius: float = 0.8
+
+    history: ClassVar[int] = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0.0 <= checked_number(self.spectral_radius, "spectral_radius") <= 1.0:
+            raise InputError(f"spectral_radius is {self.spectral_radius}; it must be between 0 and 1")
+
+    def scheme(self, dt: float) -> Table:
+        rho = self.spectral_radius
+        mass_share, force_share = (2.0 * rho - 1.0) / (rho + 1.0), rho / (rho + 1.0)
+        gamma = 0.5 - mass_share + force_share
+        return generalized_alpha(dt, 0.25 * (1.0 - mass_share + force_share) ** 2, gamma, mass_share, force_share)
+
+    def start(self, dt: float) -> Table:
+        return backward_euler(dt, first=(1.0 / dt**2, -1.0 / dt))
+
+
+@dataclass(frozen=True)
+class Newmark(ImplicitIntegrator):
+    """u_after = u + dt v + dt^2 ((1/2 - beta) a + beta a_after), v_after = v + dt ((1 - gamma) a + gamma a_after).
+
+    Attributes:
+        beta, gamma: Newmark's parameters; 1/4 and 1/2, the average acceleration, keep the energy of linear motions,
+            with second order.
+    """
+
+    tolerance: float | None = TOLERANCE
+    beta: float = 0.25
+    gamma: float = 0.5
+
+    history: ClassVar[int] = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0.5 <= checked_number(self.gamma, "gamma") <= 1.0:
+            raise InputError(f"gamma is {self.gamma}; it must be between 0.5 and 1")
+        if not 0.5 * self.gamma <= checked_number(self.beta, "beta") <= 1.0:
+            raise InputError(f"beta is {self.beta}; it must be between gamma / 2 and 1 for steps of any length")
+
+    def scheme(self, dt: float) -> Table:
+        return generalized_alpha(dt, self.beta, self.gamma, 0.0, 0.0)
+
+    def start(self, dt: float) -> Table:
+        return backward_euler(dt, first=(1.0 / dt**2, -1.0 / dt))
+
+
+def generalized_alpha(dt: float, beta: float, gamma: float, mass_share: float, force_share: float) -> Table:
+    """With h1 the acceleration after the last step; forces are those at the stage, ``force_share`` before the end."""
+    whole = 1.0 / (1.0 - force_share)  # the step's increment over the stage's
+    of_step, of_velocity, of_before = whole / (beta * dt**2), -1.0 / (beta * dt), 1.0 - 0.5 / beta
+    moves = (gamma * dt * of_step, 1.0 - gamma / beta, dt * (1.0 - 0.5 * gamma / beta))
+    left = 1.0 - mass_share
+    rest = 1.0 - force_share
+    return table(
+        ACCELERATION=(left * of_step, left * of_velocity, left * of_before + mass_share),
+        RATE=(rest * moves[0], rest * moves[1] + force_share, rest * moves[2]),
+        VELOCITY=moves,
+        FIRST=(of_step, of_velocity, of_before),
+        STAGE=(rest, 1.0),
+    )
+
+
+@dataclass(frozen=True)
+class BDF2(ImplicitIntegrator):
+    """The backward differentiation formula of two steps: second order, and damps what it does not resolve."""
+
+    tolerance: float | None = TOLERANCE
+
+    history: ClassVar[int] = 2
+
+    def scheme(self, dt: float) -> Table:
+        """With h1 the displacement of the last step, and h2 the velocity before it."""
+        inverse = 1.0 / dt
+        return table(
+            ACCELERATION=(2.25 * inverse**2, -2.0 * inverse, -0.75 * inverse**2, 0.5 * inverse),
+            RATE=(1.5 * inverse, 0.0, -0.5 * inverse),
+            VELOCITY=(1.5 * inverse, 0.0, -0.5 * inverse),
+            FIRST=(1.0,),
+            SECOND=(0.0, 1.0),
+            STAGE=(1.0, 1.0),
+        )
+
+    def start(self, dt: float) -> Table:
+        return backward_euler(dt, first=(1.0,), second=(0.0, 1.0))

@@ -1,0 +1,216 @@
+"""Implicit time steps of all bodies of a system, as launches that can be recorded."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from warp_corot.elasticity.viscosity import Viscosity
+from warp_corot.kernels.implicit import conjugate_gradients
+from warp_corot.kernels.implicit import newton as kernels_of_newton
+from warp_corot.kernels.implicit import steps as kernels
+from warp_corot.kernels.stepping.integrate import follow_trajectory
+from warp_corot.solvers.integrator import Stepper
+
+from .newton import Newton
+from .preconditioners import preconditioner_of
+from .tangent import TangentOperator
+
+if TYPE_CHECKING:
+    from warp_corot.solvers.system import System
+
+    from .schemes import ImplicitIntegrator
+
+
+class ImplicitStepper(Stepper):
+    """Steps of an implicit integrator.
+
+    Args:
+        system: The bodies; velocities are at the time of displacements.
+        integrator: The description.
+
+    Attributes:
+        totals: Steps, iterations of Newton's method and of linear solves, and steps that did not come within the
+            tolerance, of all bodies, int64 [4].
+    """
+
+    graph_steps = 8
+
+    def __init__(self, system: System, integrator: ImplicitIntegrator):
+        self.system, self.integrator = system, integrator
+        system.lag = 0.0
+        self.totals = wp.zeros(4, dtype=wp.int64, device=system.device)
+        self._bodies = [BodySteps(self, k) for k in range(len(system.bodies))]
+        system.histories += [array for body in self._bodies for array in body.history]
+
+    @property
+    def kept(self) -> dict[str, wp.array]:
+        arrays = enumerate(array for body in self._bodies for array in body.history)
+        return {f"history.{number}": array for number, array in arrays}
+
+    def prepare(self) -> None:
+        for body in self._bodies:
+            body.prepare()
+
+    def forces(self, offset: int = 0) -> None:
+        for k in range(len(self._bodies)):
+            self.system.add_elastic_forces(k, offset)
+
+    def steps(self, count: int, *, forces_known: bool = False) -> None:
+        for offset in range(count):
+            if forces_known and offset == 0:
+                self.forget_forces()
+            for body in self._bodies:
+                body.launch(offset)
+
+    def add_other_forces(self) -> None:
+        """Launch all forces besides elasticity in the present state to ``state.forces`` of the bodies."""
+        self.forget_forces()
+        for forces in self.system.forces:
+            forces.add_forces()
+
+    def add_counted_forces(self) -> None:
+        """The same of those whose work is counted for them."""
+        self.forget_forces()
+        for forces in self.system.counted:
+            forces.add_forces()
+
+    def forget_forces(self) -> None:
+        """Launch that no forces act yet."""
+        for body in self.system.bodies:
+            body.state.forces.zero_()
+
+
+class BodySteps:
+    """Steps of one body.
+
+    Args:
+        stepper: Of all.
+        k: Which body of the system.
+
+    Attributes:
+        history: What a step leaves for the next one, and the state in which it left the body, vec4 each.
+    """
+
+    def __init__(self, stepper: ImplicitStepper, k: int):
+        self.stepper, self.k = stepper, k
+        system, options = stepper.system, stepper.integrator
+        self.body, self.field, self.system = system.bodies[k], system.fields[k], system
+        self.device = self.body.device
+        self.viscosity = Viscosity(self.body, self.field, options.viscosity) if options.viscosity else None
+        exact = options.tolerance is not None
+        self.operator = TangentOperator(self.body, self.field, viscosity=self.viscosity, exact=exact)
+        self.newton = Newton(
+            self.operator,
+            preconditioner_of(options.preconditioner, self.operator),
+            system.gravity,
+            tolerance=options.tolerance or options.linear_tolerance,
+            most=options.iterations,
+            most_linear=options.linear_iterations,
+            others=self._add_others,
+        )
+        like = self.body.state.displacements
+        self._none = wp.zeros(1, dtype=wp.vec4, device=self.device)
+        wanted = options.history
+        self._h = [wp.zeros_like(like) if number < wanted else self._none for number in range(2)]
+        self._left = [wp.full_like(like, np.nan) if wanted else self._none for _ in range(2)]
+        self.history = [*self._h[:wanted], *(self._left if wanted else [])]
+        self._drift, self._rates = (self._none if self.viscosity is None else wp.zeros_like(like) for _ in range(2))
+        self._begins = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self._one = wp.ones(self.body.worlds, dtype=wp.int32, device=self.device)
+        tables = np.stack([options.scheme(options.dt), options.start(options.dt)])
+        self._table = wp.array(tables, dtype=wp.float32, device=self.device)
+
+    def prepare(self) -> None:
+        """Have all that launches use, so that they can be recorded."""
+        self.operator.prepare()
+        self.operator.stiff_forces = tuple(each for each in self.system.forces if hasattr(each, "add_stiffness"))
+        if self.stepper.integrator.tolerance is None:
+            self.newton.solver.tolerance.fill_(self.stepper.integrator.linear_tolerance)
+        u = self.body.state.displacements
+        self.field.elastic_forces(u)
+        self.field.elastic_energies(u)
+
+    def launch(self, offset: int) -> None:
+        """Launch the ``offset``-th step since the clock was last advanced."""
+        newton, solver = self.newton, self.newton.solver
+        self.body.conditions.follow_activations(self.system.pace, offset + 1)
+        self._follow_trajectories(offset)
+        self._begin()
+        if self.stepper.integrator.tolerance is None:
+            newton.launch_residual()
+            newton.launch_solve()
+            self._launch(kernels.take_step, [newton.step], [newton.increment, self.body.state.displacements])
+            counts, good = [self._one, solver.iterations, solver.status], conjugate_gradients.CONVERGED
+        else:
+            newton.launch_begin()
+            wp.capture_while(newton.running, newton.launch_iteration)
+            counts, good = [newton.iterations, newton.solved, newton.status], kernels_of_newton.CONVERGED
+        self._end(offset, counts[-1])
+        wp.launch(kernels.count_solves, 1, [*counts, int(good)], [self.stepper.totals], device=self.device)
+
+    # --- pieces ------------------------------------------------------------------------------------------------------
+
+    def _follow_trajectories(self, offset: int) -> None:
+        """Launch the velocities that take nodes to their keyframes at the end of the step."""
+        body, system = self.body, self.system
+        for each in body.conditions.trajectories:
+            inputs = [each.nodes, each.times, each.displacements, system.pace.arrays, body.conditions.world_starts]
+            inputs += [body.world_node_count, offset, body.state.forces, body.state.displacements]
+            outputs = [body.state.velocities, system.support_work]
+            wp.launch(follow_trajectory, len(each.nodes), inputs, outputs, device=self.device)
+
+    def _begin(self) -> None:
+        """Launch what the step is solved from."""
+        state, conditions, newton, options = (
+            self.body.state,
+            self.body.conditions,
+            self.newton,
+            self.stepper.integrator,
+        )
+        self._begins.zero_()
+        if self.history:
+            inputs = [conditions.inverse_mass, state.displacements, state.velocities, *self._left]
+            self._launch(kernels.find_changes, inputs, [self._begins])
+        inputs = [self._begins, self._table, options.damping]
+        outputs = [self.operator.scales, newton.inertia]
+        wp.launch(kernels.choose_scales, 1, inputs, outputs, device=self.device)
+        inputs = [self._begins, self._table, options.dt, options.damping, conditions.inverse_mass]
+        inputs += [state.velocities, *self._h]
+        outputs = [state.displacements, newton.base, newton.increment, newton.pull, self._drift]
+        self._launch(kernels.begin_step, inputs, outputs)
+
+    def _add_others(self) -> None:
+        """Launch forces besides elasticity at the stage."""
+        self.stepper.add_other_forces()
+        if self.viscosity is not None:
+            inputs = [self.operator.scales, self.newton.increment, self._drift]
+            self._launch(kernels.find_rates, inputs, [self._rates])
+            state = self.body.state
+            self.viscosity.scatter(state.displacements, self._rates, state.forces)
+
+    def _end(self, offset: int, status: wp.array) -> None:
+        """Launch the state after the step, reactions, and the work of supports and forces."""
+        body, system, newton = self.body, self.system, self.newton
+        state, conditions = body.state, body.conditions
+        inputs = [self._begins, self._table, self.operator.node_count, status, conditions.inverse_mass]
+        inputs += [newton.base, newton.increment, system.pace.arrays, offset]
+        outputs = [state.velocities, *self._h, state.displacements, *self._left, system.bad_step]
+        self._launch(kernels.end_step, inputs, outputs)
+        if system.counted:
+            self.stepper.add_counted_forces()
+            account = system.accounts[self.k]
+            self._launch(kernels.count_work, [conditions.inverse_mass, state.forces, newton.increment], [account])
+        self.field.add_forces(state.displacements, newton.forces)
+        self.stepper.add_other_forces()
+        inputs = [system.gravity, conditions.mass, conditions.inverse_mass, int(conditions.has_loads)]
+        inputs += [conditions.loads, newton.forces, state.forces, newton.increment]
+        kernel = kernels.COUNT_SUPPORTS[conditions.loads.dtype]
+        self._launch(kernel, inputs, [state.reactions, system.support_work])
+        newton.forces.zero_()
+        self.stepper.forget_forces()
+
+    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, self.body.sizes.launch_nodes, inputs, outputs, device=self.device)
