@@ -288,12 +288,6 @@ def test_a_tool_that_is_too_fast_for_the_given_step_is_refused(device):
     tool.follow([0.0, 1.0], [(0.0, 0.0, 0.1), (0.0, 0.0, 0.2)])
 
 
-def test_checkpoints_refuse_contact(device, tmp_path):
-    sim = wc.Simulation(block(device), obstacles=wc.Ground(), gravity=DOWN)
-    with pytest.raises(wc.InputError, match="contact"):
-        sim.save(tmp_path / "sim.npz")
-
-
 # --- input ---------------------------------------------------------------------------------------------------------
 
 

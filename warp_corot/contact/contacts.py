@@ -100,14 +100,7 @@ class Contacts:
             self.grow()
         before = self.surface.revision
         if self.surface.follow():
-            if self.surface.revision != before:
-                self._make_arrays()
-            self._share_arrays()
-            self.search.follow()
-            if self.rigid is not None:
-                self.rigid.follow()
-            if self.pairs is not None:
-                self.pairs.follow()
+            self._follow(before)
         if self.pairs is not None:
             if not self.pairs.is_planted:
                 self._predict(0, 0.0)
@@ -199,7 +192,26 @@ class Contacts:
         self.forget()
         self.obstacles.reset(chosen)
 
+    def take_rooms(self, rooms: Sequence[Sequence[int]], room: int) -> None:
+        """Have as much room as there was: ``surface.rooms``, and ``pairs.room`` if soft surfaces may touch."""
+        before = self.surface.revision
+        self.surface.make_room(rooms)
+        self._follow(before)
+        if self.pairs is not None:
+            self.pairs.take_room(room)
+
     # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _follow(self, revision: int) -> None:
+        """Take the present surfaces, which were others at that revision."""
+        if self.surface.revision != revision:
+            self._make_arrays()
+        self._share_arrays()
+        self.search.follow()
+        if self.rigid is not None:
+            self.rigid.follow()
+        if self.pairs is not None:
+            self.pairs.follow()
 
     @property
     def _smallest(self) -> float:

@@ -54,6 +54,7 @@ class Grasp:
         self._per_world = len(nodes)
         everywhere = (nodes + body.world_node_count * np.arange(body.worlds)[:, None]).ravel()
         self.nodes = nodes
+        self.stiffness = None if stiffness is None else float(stiffness)
         self._stiffness = 0.0 if stiffness is None else float(stiffness) / len(nodes)
         count = len(everywhere)
         self._nodes = wp.array(everywhere, dtype=wp.int32, device=self.device)
@@ -93,6 +94,11 @@ class Grasp:
     @property
     def state(self) -> dict[str, wp.array]:
         return {}
+
+    @property
+    def kept(self) -> dict[str, wp.array]:
+        """What a checkpoint holds: where nodes are in the tool's frame, and the last forces."""
+        return {"places": self._places, "forces": self._forces, "wrenches": self._wrenches}
 
     def prepare(self) -> None:
         """Nothing changes."""

@@ -84,6 +84,16 @@ class Pairs:
         self.search.forget()
         self.revision += 1
 
+    @property
+    def room(self) -> int:
+        """How many pairs there is room for."""
+        return self._room
+
+    def take_room(self, room: int) -> None:
+        """Have room for so many pairs, of which there are none until the next search."""
+        if room != self._room:
+            self._make_room(room)
+
     # --- what the host sees ----------------------------------------------------------------------------------------
 
     @property

@@ -139,6 +139,15 @@ class ContactSurface:
         self._fill()
         return True
 
+    @property
+    def rooms(self) -> list[list[int]]:
+        """Places for nodes, triangles and edges of each body in a world."""
+        return [[part.nodes, part.triangles, part.edges] for part in self.parts]
+
+    def make_room(self, rooms: Sequence[Sequence[int]]) -> None:
+        """Take the present meshes, with as much room as ``rooms`` was."""
+        self._make_room([Skin.of(body) for body in self.bodies], rooms)
+
     def places_of(self, k: int) -> slice:
         """The places of a body's nodes."""
         part = self.parts[k]
@@ -154,13 +163,15 @@ class ContactSurface:
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
-    def _make_room(self, skins: Sequence[Skin]) -> None:
+    def _make_room(self, skins: Sequence[Skin], rooms: Sequence[Sequence[int]] | None = None) -> None:
         self.parts = []
         start = triangle_start = edge_start = 0
-        for body, skin in zip(self.bodies, skins, strict=True):
+        for k, (body, skin) in enumerate(zip(self.bodies, skins, strict=True)):
             more = ROOM if body.changing is not None else 1.0
             sizes = (len(skin.nodes), len(skin.triangles), len(skin.edges))
             nodes, triangles, edges = (int(more * max(size, 1)) for size in sizes)
+            if rooms is not None:
+                nodes, triangles, edges = (max(int(room), size) for room, size in zip(rooms[k], sizes, strict=True))
             self.parts.append(Part(start, triangle_start, edge_start, nodes, triangles, edges, skin, body.version))
             start += self.worlds * nodes
             triangle_start += self.worlds * triangles

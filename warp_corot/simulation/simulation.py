@@ -14,6 +14,7 @@ import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.contacts import Contacts
+from warp_corot.contact.grasp import Grasp
 from warp_corot.contact.options import Contact
 from warp_corot.contact.reading import ContactPoint, contact_points
 from warp_corot.contact.tool import Obstacle
@@ -319,6 +320,16 @@ class Simulation:
         chosen = self._index(body)
         self.bodies[chosen].state.adopt_positions()
         return self.fields[chosen].von_mises(self.bodies[chosen].state.displacements)
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """Shapes and tools that bodies touch, as they were given."""
+        return () if self.contact is None else self.contact.obstacles.given
+
+    @property
+    def grasps(self) -> tuple[Grasp, ...]:
+        """The grasps that hold now."""
+        return tuple(each for each in self.system.constraints if isinstance(each, Grasp))
 
     def contacts(self) -> list[ContactPoint]:
         """Where bodies were touched in the last step, with normals, gaps and forces; waits for the device."""

@@ -26,6 +26,7 @@ from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import INTEGRATORS
 
+from .contact import obstacles_of, pack_contact, unpack_contact
 from .mesh import pack_mesh, unpack_mesh
 from .remesh import pack_changing, remesh_options, unpack_changing
 
@@ -37,8 +38,8 @@ Remesh = OnlineRemesh | Sequence[OnlineRemesh | None] | None
 FORMAT = "warp-corot checkpoint"
 #: 2: worlds, deterministic runs. 3: anisotropic materials, activation, forests made from domains. 4: meshes that
 #: change, steps of changing length. 5: a step that follows the state, starts of worlds in seconds. 6: the step at the
-#: last check. All are read.
-VERSION = 6
+#: last check. 7: contact. All are read.
+VERSION = 7
 
 MATERIALS = {kind.__name__: kind for kind in (Isotropic, TransverselyIsotropic, Orthotropic)}
 
@@ -47,15 +48,14 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
     """Write the simulation's state to ``path``, completely or not at all: to a temporary file, synced, then renamed.
 
     Raises:
-        InputError: The folder does not exist, the path is a folder, it cannot be written to, or bodies touch something.
+        InputError: The folder does not exist, the path is a folder, it cannot be written to, or an obstacle of a class
+            of your own.
     """
     target = checked_path(path, "path")
     if not target.parent.is_dir():
         raise InputError(f"cannot save {target}: the folder {target.parent} does not exist")
     if target.is_dir():
         raise InputError(f"cannot save {target}: it is a folder")
-    if sim.system.constraints:
-        raise InputError(f"cannot save {target}: checkpoints do not hold contact yet")
     arrays: dict[str, np.ndarray] = {}
     header: dict[str, Any] = {
         "format": FORMAT,
@@ -78,6 +78,7 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
     packed = zip(sim.bodies, sim.models, sim.fields, sim.remeshing.changing, strict=True)
     for number, (body, model, field, changing) in enumerate(packed):
         header["bodies"].append(_pack_body(body, model, field, changing, f"body{number}.", arrays))
+    header["contact"] = pack_contact(sim.contact, sim.grasps, arrays)
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
     _write_whole(target, arrays)
 
@@ -198,6 +199,9 @@ def _upgrade(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
         arrays["kept.seconds"] = np.append(arrays["kept.seconds"], 0.0)
         arrays["guard.lately"] = np.zeros((4, header["worlds"]))
         arrays["guard.counted"] = np.full((7, header["worlds"]), np.nan)
+    if header["version"] < 7:
+        header["contact"] = None
+        arrays["guard.counted"] = np.vstack([arrays["guard.counted"], np.zeros((1, header["worlds"]))])
 
 
 def _upgrade_steps(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
@@ -234,6 +238,7 @@ def _rebuilt_simulation(
             gravity=header["gravity"],
             deterministic=header["deterministic"],
             remesh=remesh_options(header["bodies"], arrays, place, remesh),
+            **obstacles_of(header["contact"], arrays),
         )
     sim.steps_before_reset, sim.time_before_reset = header["steps_before_reset"], header["time_before_reset"]
     if header["stable_dt"] is not None:
@@ -248,6 +253,7 @@ def _rebuilt_simulation(
             field.state[name].assign(arrays[f"body{number}.field.{name}"])
     for name in header["kept"]:
         sim.kept[name].assign(arrays[f"kept.{name}"])
+    unpack_contact(sim.contact, header["contact"], arrays)
     sim.guard.resume(**{name: arrays[f"guard.{name}"] for name in ("scale", "drift", "lately", "counted")})
     return sim
 

@@ -144,6 +144,7 @@ class Guard:
         """Take the present state for good if no run has led to it; whether a user may have written to it."""
         given = False
         if self._reference is None:
+            self.prepare()
             given = self._counted is None
             self._absolute_base = np.zeros(self.worlds)
             self.system.restart_work()
@@ -214,13 +215,13 @@ class Guard:
     @property
     def state(self) -> dict[str, Floats]:
         """What a run that goes on needs besides the present state."""
-        counted = np.full((7, self.worlds), np.nan)
+        counted = np.full((8, self.worlds), np.nan)
         before = self._reference
         if before is not None and not self._has_changed():
             now = self._find(whole=False)
             supports = before.supports - now.supports
             counted[:6] = before.exact, before.gravitational, supports, self._loads_since, self._height, self._loads
-            counted[6] = before.untimely
+            counted[6:] = before.untimely, now.supports_absolute - self._absolute_base
         times = np.broadcast_to([[self._counted_at], [self._window_at]], (2, self.worlds))
         lately = np.array([self._lately, self._lately_before, *times])
         return {"scale": self._scale, "drift": self._drift, "lately": lately, "counted": counted}
@@ -239,7 +240,8 @@ class Guard:
     def _begin_from(self, found: Energies) -> None:
         """Count from the energies of a state that was given."""
         if self._counted is not None:
-            exact, gravitational, supports, self._loads_since, self._height, self._loads, untimely = self._counted
+            exact, gravitational, supports, self._loads_since, self._height, self._loads = self._counted[:6]
+            untimely, self._absolute_base = self._counted[6], -self._counted[7]
             found = replace(found, exact=exact, gravitational=gravitational, supports=supports, untimely=untimely)
         else:
             self._loads, self._height = np.zeros(self.worlds), found.gravitational

@@ -1,0 +1,64 @@
+"""What contact goes on from, for checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import warp as wp
+
+from warp_corot.errors import InputError
+
+from .contacts import Contacts
+
+#: What the shapes and the meshes give again.
+GIVEN = {"_meeting", "shapes"}
+
+
+def kept_arrays(contacts: Contacts) -> dict[str, wp.array]:
+    """All arrays in which contact keeps something from one step to the next, by name."""
+    owners = {name: getattr(contacts, name) for name in ("search", "rigid", "pairs", "obstacles")}
+    found = {
+        f"{owner}.{name}": array
+        for owner, thing in {"contact": contacts, **owners}.items()
+        if thing is not None
+        for key, value in vars(thing).items()
+        if key not in GIVEN
+        for name, array in _arrays_in(key, value)
+    }
+    return {name: array for name, array in found.items() if array.size}
+
+
+def keep_again(contacts: Contacts, rooms: list[list[int]], room: int, kept: dict[str, Any]) -> None:
+    """Go on from what ``kept_arrays`` gave.
+
+    Args:
+        contacts: Of the same bodies and obstacles.
+        rooms: ``contacts.surface.rooms`` as it was.
+        room: ``contacts.pairs.room`` as it was; 0 without.
+        kept: The arrays' values.
+
+    Raises:
+        InputError: They do not fit.
+    """
+    contacts.take_rooms(rooms, room)
+    arrays = kept_arrays(contacts)
+    for name, array in arrays.items():
+        values = kept[name]
+        if values.shape[: array.ndim] != array.shape:
+            raise InputError(f"{name} has shape {list(values.shape)}; it must begin with {list(array.shape)}")
+        array.assign(values)
+
+
+def _arrays_in(name: str, value: Any) -> Iterator[tuple[str, wp.array]]:
+    """An array, those of a list, or those of a Warp struct."""
+    if isinstance(value, wp.array):
+        yield name, value
+    elif isinstance(value, list):
+        for k, each in enumerate(value):
+            if isinstance(each, wp.array):
+                yield f"{name}.{k}", each
+    elif hasattr(value, "native_name"):
+        fields = [field for kind in type(value).__mro__ for field in getattr(kind, "__annotations__", {})]
+        for field in fields:
+            yield from _arrays_in(f"{name}.{field}", getattr(value, field))

@@ -1,0 +1,139 @@
+"""Contact in checkpoints: obstacles, tools, grasps, and what steps go on from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from warp_corot.contact.contacts import Contacts
+from warp_corot.contact.grasp import Grasp
+from warp_corot.contact.keeping import keep_again, kept_arrays
+from warp_corot.contact.options import Contact
+from warp_corot.contact.sampled import SignedDistance, TriangleMesh
+from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere
+from warp_corot.contact.tool import Obstacle, Tool
+from warp_corot.errors import InputError
+
+Arrays = dict[str, np.ndarray]
+
+#: How shapes are made again from their sizes; the place and the thickness are set afterwards.
+SHAPES = {
+    "Ground": lambda size, arrays, prefix: Ground(),
+    "Sphere": lambda size, arrays, prefix: Sphere(size[0]),
+    "Capsule": lambda size, arrays, prefix: Capsule(size[0], 2.0 * size[1]),
+    "Cylinder": lambda size, arrays, prefix: Cylinder(size[0], 2.0 * size[1]),
+    "Box": lambda size, arrays, prefix: Box([2.0 * each for each in size]),
+    "TriangleMesh": lambda size, arrays, prefix: TriangleMesh(arrays[prefix + "points"], arrays[prefix + "triangles"]),
+    "SignedDistance": lambda size, arrays, prefix: SignedDistance(
+        arrays[prefix + "values"], arrays[prefix + "lower"], spacing=size
+    ),
+}
+#: Arrays of shapes that have some.
+OF_SHAPES = ("points", "triangles", "values", "lower")
+
+
+def pack_contact(contacts: Contacts | None, grasps: Sequence[Grasp], arrays: Arrays) -> dict[str, Any] | None:
+    """Put contact into arrays; returns the remaining data for JSON, None where nothing touches.
+
+    Raises:
+        InputError: A shape of another class, or something else that constrains the bodies.
+    """
+    if contacts is None:
+        return None
+    for name, array in kept_arrays(contacts).items():
+        arrays[f"contact.{name}"] = array.numpy()
+    for number, body in enumerate(contacts.system.bodies):
+        arrays[f"contact.forces{number}"] = body.state.contact_forces.numpy()
+    options, law, tools = contacts.options, contacts.law, contacts.obstacles.tools
+    given = zip(contacts.obstacles.given, tools, strict=True)
+    return {
+        "friction": options.friction,
+        "self_contact": options.self_contact,
+        "law": [law.tolerance, law.recovery],
+        "obstacles": [_pack_tool(tool, each is tool, f"tool{k}.", arrays) for k, (each, tool) in enumerate(given)],
+        "rooms": contacts.surface.rooms,
+        "room": 0 if contacts.pairs is None else contacts.pairs.room,
+        "grasps": [_pack_grasp(contacts, grasp, f"grasp{k}.", arrays) for k, grasp in enumerate(grasps)],
+    }
+
+
+def obstacles_of(described: dict[str, Any] | None, arrays: Arrays) -> dict[str, Any]:
+    """The arguments ``obstacles`` and ``contact`` of a simulation."""
+    if described is None:
+        return {}
+    obstacles = [_unpacked_tool(each, f"tool{k}.", arrays) for k, each in enumerate(described["obstacles"])]
+    return {"obstacles": obstacles, "contact": Contact(described["friction"], bool(described["self_contact"]))}
+
+
+def unpack_contact(contacts: Contacts | None, described: dict[str, Any] | None, arrays: Arrays) -> None:
+    """Let a simulation's contact go on as it was."""
+    if described is None or contacts is None:
+        return
+    kept = {name.removeprefix("contact."): values for name, values in arrays.items() if name.startswith("contact.")}
+    contacts.law.tolerance, contacts.law.recovery = described["law"]
+    keep_again(contacts, described["rooms"], described["room"], kept)
+    bodies = contacts.system.bodies
+    for number, body in enumerate(bodies):
+        body.state.contact_forces.assign(arrays[f"contact.forces{number}"])
+    for k, each in enumerate(described["grasps"]):
+        tool = contacts.obstacles.tools[each["tool"]]
+        grasp = Grasp(bodies[each["body"]], arrays[f"grasp{k}.nodes"], tool=tool, stiffness=each["stiffness"])
+        for name, array in grasp.kept.items():
+            array.assign(arrays[f"grasp{k}.{name}"])
+
+
+def _pack_grasp(contacts: Contacts, grasp: Grasp, prefix: str, arrays: Arrays) -> dict[str, Any]:
+    arrays[prefix + "nodes"] = grasp.nodes
+    for name, array in grasp.kept.items():
+        arrays[prefix + name] = array.numpy()
+    tool = contacts.obstacles.tools.index(grasp.tool)
+    return {"body": contacts.system.bodies.index(grasp.body), "tool": tool, "stiffness": grasp.stiffness}
+
+
+def _pack_tool(tool: Tool, moves: bool, prefix: str, arrays: Arrays) -> dict[str, Any]:
+    shape = tool.shape
+    kind = type(shape).__name__
+    if kind not in SHAPES:
+        raise InputError(f"a {kind} cannot be saved; only {', '.join(SHAPES)}")
+    arrays[prefix + "place"] = shape.pose
+    arrays[prefix + "pose"] = tool.pose
+    for name in OF_SHAPES:
+        if hasattr(shape, name):
+            arrays[prefix + name] = getattr(shape, name)
+    if tool.keys is not None:
+        arrays[prefix + "times"], arrays[prefix + "poses"] = tool.keys
+    return {
+        "shape": kind,
+        "size": list(shape.size),
+        "thickness": shape.thickness if np.isfinite(shape.thickness) else None,
+        "friction": shape.friction,
+        "moves": moves,
+        "speed": tool.speed,
+        "is_sent": tool.is_sent,
+        "follows": tool.keys is not None,
+    }
+
+
+def _unpacked_tool(described: dict[str, Any], prefix: str, arrays: Arrays) -> Obstacle:
+    shape: Shape = SHAPES[described["shape"]](described["size"], arrays, prefix)
+    place, pose = (_finite(arrays[prefix + name], (7,)) for name in ("place", "pose"))
+    shape.position, shape.quaternion = place[:3], place[3:]
+    shape.friction = described["friction"]
+    if described["thickness"] is not None:
+        shape.thickness = float(described["thickness"])
+    if not described["moves"]:
+        return shape
+    tool = Tool(shape, speed=described["speed"])
+    tool.pose, tool.is_sent = pose, bool(described["is_sent"])
+    if described["follows"]:
+        times = _finite(arrays[prefix + "times"])
+        tool.keys = times, _finite(arrays[prefix + "poses"], (len(times), 7))
+    return tool
+
+
+def _finite(values: np.ndarray, shape: tuple[int, ...] | None = None) -> np.ndarray:
+    if values.dtype != np.float64 or (shape is not None and values.shape != shape) or not np.isfinite(values).all():
+        raise InputError(f"an array of a tool has shape {list(values.shape)} or is not finite")
+    return values
