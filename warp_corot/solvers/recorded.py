@@ -24,8 +24,8 @@ from .integrator import Stepper
 from .subnormals import FlushedSubnormals
 from .system import System
 
-#: Steps recorded in one graph: on the CPU, where a replay costs nothing and recording a step takes as long as making
-#: ten, if that is fewer than ``Stepper.graph_steps``; and where a launch is many steps.
+#: Steps recorded in one graph: on the CPU, where a replay costs next to nothing and recording a step takes as long as
+#: ten steps, if that is fewer than ``Stepper.graph_steps``; and where one launch makes many steps.
 CPU_GRAPH_STEPS = 8
 BLOCK_STEPS = 1024
 #: Steps up to which what is asked for twice is recorded as it is: recording takes longer than many replays.
@@ -64,17 +64,24 @@ class Segment:
         """The same as the first one of a run, or the last."""
         return replace(self, begins=begins, publishes=ends, ends=ends, whole=whole)
 
-    def pieces(self, longest: int) -> Iterator[Segment]:
-        """The same in pieces of a power of two steps, at most ``longest``, of which there are few different ones."""
-        left, piece = self.count, replace(self, publishes=False, ends=False, whole=False)
-        while True:
-            size = min(1 << max(left.bit_length() - 1, 0), longest) if left else 0
-            left -= size
-            if not left:
-                break
+    def pieces(self, longest: int, *, edges: bool = False) -> Iterator[Segment]:
+        """The same in pieces of a power of two steps, at most ``longest``, of which there are few different ones.
+
+        With ``edges`` the first and the last piece are single steps: they have most of the differences.
+        """
+        sizes = [1, *powers(self.count - 2, longest), 1] if edges and self.count > 2 else powers(self.count, longest)
+        piece = replace(self, publishes=False, ends=False, whole=False)
+        for size in sizes[:-1]:
             yield replace(piece, count=size)
             piece = Segment(0)
-        yield replace(piece, count=size, publishes=self.publishes, ends=self.ends, whole=self.whole)
+        yield replace(piece, count=sizes[-1], publishes=self.publishes, ends=self.ends, whole=self.whole)
+
+
+def powers(count: int, longest: int) -> list[int]:
+    """Powers of two that add up to this, at most ``longest`` each, from the largest down; of zero, zero."""
+    found = [longest] * (count // longest)
+    found += [1 << bit for bit in reversed(range(longest.bit_length())) if count % longest >> bit & 1]
+    return found or [0]
 
 
 class RecordedSteps:
@@ -111,14 +118,6 @@ class RecordedSteps:
     def in_blocks(self) -> bool:
         """Whether many steps are one launch."""
         return self._stepper.many_a_launch
-
-    @property
-    def _longest(self) -> int:
-        """Steps recorded in one graph at most."""
-        if self.in_blocks:
-            return BLOCK_STEPS
-        most = self._stepper.graph_steps
-        return min(most, CPU_GRAPH_STEPS) if self._pace.device.is_cpu else most
 
     @property
     def interval(self) -> int:
@@ -165,7 +164,13 @@ class RecordedSteps:
             return
         if segment.count <= SHORT:
             self._asked.add(segment)
-        for piece in segment.pieces(self._longest):
+        if self.in_blocks:
+            pieces = segment.pieces(BLOCK_STEPS)
+        elif self._pace.device.is_cpu:
+            pieces = segment.pieces(min(CPU_GRAPH_STEPS, self._stepper.graph_steps), edges=True)
+        else:
+            pieces = segment.pieces(self._stepper.graph_steps)
+        for piece in pieces:
             self._replay_recording(piece)
 
     def replay_many(self, count: int) -> None:
