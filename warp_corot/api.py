@@ -23,7 +23,7 @@ from .domain import Domain
 from .elasticity import Corotated, EdgeStVK, Linear, MassSpring, NeoHookean, StVenantKirchhoff
 from .errors import CapacityWarning, InputError, StabilityWarning, StaleViewError, UnstableError
 from .mesh import SurfaceMesh, TetForest, TetMesh
-from .solvers import BDF2, BackwardEuler, GeneralizedAlpha, Newmark, SymplecticEuler
+from .solvers import BDF2, BackwardEuler, GeneralizedAlpha, Newmark, QuasiStatic, SymplecticEuler
 
 __all__ = [
     "BDF2",
@@ -49,6 +49,7 @@ __all__ = [
     "Newmark",
     "OnlineRemesh",
     "Orthotropic",
+    "QuasiStatic",
     "SignedDistance",
     "Simulation",
     "SoftBody",

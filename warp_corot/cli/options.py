@@ -9,6 +9,7 @@ from warp_corot.elasticity import MODELS
 from warp_corot.elasticity.dilatation import ELEMENT, SHARED
 
 from . import patches, run_file
+from .implicit import IMPLICIT_DT, STEPPING
 from .label_materials import FORM
 from .loading import add_load_options
 from .organs import MAX_LEVEL_FOR_ERROR
@@ -53,6 +54,8 @@ def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParse
   warp-corot simulate box --remesh --refine-above 1.03 --simplify-below 1.01 -o beam.usd
   warp-corot simulate liver.stl --unit mm --fix bottom --pull "nearest(0.1, 0, 0.05, 20)" 0 0 0.03 -o liver.usd
   warp-corot simulate box --fix "z == zmin" --twist "z == zmax" 90 --probe "z == zmax" --csv beam.csv -o beam.usd
+  warp-corot simulate liver.stl --unit mm --static --fix bottom -o sag.usd
+  warp-corot simulate liver.stl --unit mm --integrator backward-euler --dt 16ms -o liver.usd
   warp-corot simulate warp:bunny --drop 5cm -o falls.usd --preview falls.gif
   warp-corot simulate liver.stl --unit mm --tool capsule:r=4mm,l=100mm --tool-path path.csv --csv force.csv -o liver.usd
   warp-corot simulate run.toml -o out.usd
@@ -79,6 +82,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the command's options to a parser."""
     add_input(parser)
     _add_outputs(parser)
+    parser.add_argument(
+        "--static",
+        action="store_true",
+        help="find where the body is at rest in place of its motion: one frame, or with --pull, --twist or --press a "
+        "state of rest for each frame",
+    )
     add_scene_options(parser)
     more = parser.add_argument_group("more results")
     add_preview_options(more)
@@ -238,7 +247,13 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
         "--dt",
         type=seconds,
         help="time step [s], shortened so that a whole number of them makes a frame (default: the step follows the "
-        "state)",
+        f"state; {1e3 * IMPLICIT_DT:g} ms with an implicit --integrator)",
+    )
+    motion.add_argument(
+        "--integrator",
+        choices=STEPPING,
+        help="explicit, symplectic-euler, whose steps are bound by the smallest element, or an implicit one for steps "
+        "of any length (default: symplectic-euler)",
     )
 
     add_touch_options(parser.add_argument_group("what the body touches"))

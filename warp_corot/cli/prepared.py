@@ -88,7 +88,11 @@ def _frames(args: argparse.Namespace, bodies: Sequence[Body]) -> tuple[float, in
     """The duration [s], and the number of frames after the first one."""
     from warp_corot.io.write.animate import frame_count
 
-    duration = max(body.subject.duration for body in bodies) if args.duration is None else args.duration
+    duration = args.duration
+    if duration is None and getattr(args, "static", False) and not any(body.loads for body in bodies):
+        duration = 1.0 / args.fps
+    if duration is None:
+        duration = max(body.subject.duration for body in bodies)
     return duration, frame_count(duration, args.fps)
 
 

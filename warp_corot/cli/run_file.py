@@ -30,6 +30,7 @@ PATHS = ("input", "output", "also", "preview", "csv", "tool_path")
 SHARED = (
     *("output", "also", "preview", "preview_frames", "preview_views", "csv"),
     *("gravity", "damping", "viscosity", "duration", "fps", "dt", "device", "ramp"),
+    *("integrator", "static"),
     *("ground", "drop", "tool", "tool_path", "touch", "self_contact", "friction"),
 )
 #: Keys in tables of loads, besides times and shares.

@@ -12,6 +12,7 @@ from warp_corot.simulation.simulation import Simulation
 
 from .about import about
 from .bodies import Body
+from .implicit import rest
 from .options import add_parser
 from .prepared import Run, prepared
 from .previews import Previews, check_preview
@@ -47,6 +48,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         if args.write_run is not None:
             write_run(args.write_run, options)
+        rested = rest(shared, ready.sim)
         _record(args, shared, ready, done, table, previews)
         if previews is not None:
             previews.draw(ready.bodies, title_of(ready.bodies))
@@ -59,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     except OSError as error:
         complain(str(error))
         return 1
-    print(summary(ready.bodies, ready.sim, done, ready.touched.rows))
+    print(summary(ready.bodies, ready.sim, done, ready.touched.rows, rested))
     return 0
 
 

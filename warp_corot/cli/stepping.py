@@ -10,9 +10,10 @@ import numpy as np
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.simulation.simulation import Simulation
-from warp_corot.solvers import SymplecticEuler
+from warp_corot.solvers import INTEGRATORS, Integrator, QuasiStatic, SymplecticEuler
 
 from .bodies import Body, gravity_of
+from .implicit import IMPLICIT_DT, check_implicit, integrator_name, is_static
 from .remesh import as_remesh_options
 from .touching import Touched
 
@@ -21,18 +22,26 @@ def make_simulation(args: argparse.Namespace, bodies: Sequence[Body], touched: T
     """The simulation, its kernels compiled; a given step is shortened until a whole number of them makes a frame."""
     from warp_corot.io.write.animate import steps_per_frame
 
+    check_implicit(args, touches=touched.contact is not None, remeshes=any(body.remesh for body in bodies))
     first = bodies[0].subject
     damping = first.damping if args.damping is None else args.damping
     viscosity = args.viscosity or 0.0
     SymplecticEuler(args.dt, damping, viscosity)  # checks all values; the step is shortened later
-    tried = min(_tried_step(body, damping, viscosity) for body in bodies)
-    steps = steps_per_frame(args.fps, args.dt or tried)  # refuses an excessive number
-    dt = None if args.dt is None else 1.0 / (args.fps * steps)
+    integrator: Integrator
+    if is_static(args):
+        integrator = QuasiStatic(1.0 / args.fps)
+    elif INTEGRATORS[integrator_name(args)].is_implicit:
+        steps = steps_per_frame(args.fps, args.dt or IMPLICIT_DT)
+        integrator = INTEGRATORS[integrator_name(args)](1.0 / (args.fps * steps), damping, viscosity)  # type: ignore[call-arg]
+    else:
+        tried = min(_tried_step(body, damping, viscosity) for body in bodies)
+        steps = steps_per_frame(args.fps, args.dt or tried)  # refuses an excessive number
+        integrator = SymplecticEuler(None if args.dt is None else 1.0 / (args.fps * steps), damping, viscosity)
     with as_remesh_options():
         return Simulation(
             [body.soft for body in bodies],
             model=[body.model for body in bodies],
-            integrator=SymplecticEuler(dt, damping, viscosity),
+            integrator=integrator,
             gravity=gravity_of(args, first),
             remesh=[body.remesh for body in bodies] if any(body.remesh for body in bodies) else None,
             obstacles=list(touched.obstacles.values()),

@@ -11,7 +11,9 @@ from warp_corot.elasticity import MODELS
 from warp_corot.elasticity.dilatation import ELEMENT, SHARED
 from warp_corot.holding.choice import NAMED
 from warp_corot.mesh import TetForest
+from warp_corot.solvers import INTEGRATORS
 
+from .implicit import solved
 from .remesh import remesh_rows
 
 if TYPE_CHECKING:
@@ -29,7 +31,13 @@ if TYPE_CHECKING:
 MOST_KINDS = 8
 
 
-def summary(bodies: Sequence[Body], sim: Simulation, done: Recording, touched: Sequence[tuple[str, str]] = ()) -> str:
+def summary(
+    bodies: Sequence[Body],
+    sim: Simulation,
+    done: Recording,
+    touched: Sequence[tuple[str, str]] = (),
+    rested: Sequence[str] = (),
+) -> str:
     """The run in a dozen lines.
 
     Args:
@@ -37,6 +45,7 @@ def summary(bodies: Sequence[Body], sim: Simulation, done: Recording, touched: S
         sim: The simulation at its end.
         done: The recording.
         touched: Lines on what the bodies touch.
+        rested: Lines on the static answers of the bodies.
     """
     shared = bodies[0].args
     integrator = asdict(sim.integrator)  # type: ignore[call-overload]
@@ -54,7 +63,8 @@ def summary(bodies: Sequence[Body], sim: Simulation, done: Recording, touched: S
         *remesh_rows(sim, done),
         *touched,
         ("gravity", f"{' '.join(f'{g:g}' for g in sim.gravity)} m/s^2, {damping}"),
-        ("time step", f"{_steps(sim)}; largest stable one at rest about {milliseconds(sim.stable_dt)}{at_last}"),
+        *[("static", line) for line in rested],
+        *_time_step(sim, at_last),
         ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"),
         ("wall time", f"{done.stepping:.2f} s stepping, {done.writing:.2f} s writing"),
         ("displacement", f"{length(done.largest_displacement)} largest, {at_end}"),
@@ -140,6 +150,16 @@ def _materials(subject: Subject, mesh: Mesh, material: Isotropic) -> list[tuple[
 
 def _values(young: float, poisson: float, density: float) -> str:
     return f"E = {pressure(float(young))}, nu = {poisson:g}, rho = {density:g} kg/m^3"
+
+
+def _time_step(sim: Simulation, at_last: str) -> list[tuple[str, str]]:
+    """The length of steps, and what limits them or what they took to solve."""
+    if not sim.integrator.is_implicit:
+        return [
+            ("time step", f"{_steps(sim)}; largest stable one at rest about {milliseconds(sim.stable_dt)}{at_last}")
+        ]
+    name = next(name for name, kind in INTEGRATORS.items() if type(sim.integrator) is kind)
+    return [("time step", f"{milliseconds(sim.dt)}, {name}"), ("solves", solved(sim) or "none")]
 
 
 def _steps(sim: Simulation) -> str:

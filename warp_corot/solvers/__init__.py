@@ -1,7 +1,14 @@
 """Time integrators, one file each. A new one is listed here."""
 
 from warp_corot.solvers.explicit.symplectic_euler import SymplecticEuler
-from warp_corot.solvers.implicit.schemes import BDF2, BackwardEuler, GeneralizedAlpha, ImplicitIntegrator, Newmark
+from warp_corot.solvers.implicit.schemes import (
+    BDF2,
+    BackwardEuler,
+    GeneralizedAlpha,
+    ImplicitIntegrator,
+    Newmark,
+    QuasiStatic,
+)
 from warp_corot.solvers.steps.stable_step import largest_frequency
 
 from .integrator import Integrator, Stepper
@@ -12,6 +19,7 @@ INTEGRATORS: dict[str, type[Integrator]] = {
     "newmark": Newmark,
     "bdf2": BDF2,
     "generalized-alpha": GeneralizedAlpha,
+    "quasi-static": QuasiStatic,
 }
 
 __all__ = [
@@ -22,6 +30,7 @@ __all__ = [
     "ImplicitIntegrator",
     "Integrator",
     "Newmark",
+    "QuasiStatic",
     "Stepper",
     "SymplecticEuler",
     "largest_frequency",

@@ -258,6 +258,25 @@ def test_options_of_single_schemes():
         wc.Newmark(gamma=0.2)
 
 
+def test_quasi_static_steps_are_static_answers(device):
+    """Where keyframes have pulled the end of the beam, ``solve_static`` finds the same with the end held there."""
+    body, rest = beam(device), beam(device)
+    end = np.flatnonzero(body.mesh.points[:, 2] > 0.19)
+    body.prescribe(end, times=[0.0, 1.0], displacements=[[0, 0, 0], [0.0, 0.04, 0.02]])
+    sim = wc.Simulation(body, integrator=wc.QuasiStatic(dt=0.25), gravity=(0, -9.8, 0))
+    sim.advance(1.0)
+    assert sim.solves.unfinished == 0
+    u = np.zeros_like(rest.mesh.points)
+    u[end] = [0.0, 0.04, 0.02]
+    rest.displacements = u
+    rest.fix(end)
+    assert wc.solve_static(rest, gravity=(0, -9.8, 0)).converged
+    assert np.abs(body.displacements.numpy() - rest.displacements.numpy()).max() < 1e-6
+    free = wc.SoftBody(body.mesh, wc.Isotropic(YOUNG, POISSON, DENSITY), device=device)
+    with pytest.raises(wc.InputError, match="no node of the body is held"):
+        wc.Simulation(free, integrator=wc.QuasiStatic(dt=0.25))
+
+
 def test_contact_and_remeshing_are_refused():
     with pytest.raises(wc.InputError, match="BackwardEuler knows no contact"):
         wc.Simulation(beam(), integrator=wc.BackwardEuler(), obstacles=wc.Ground())

@@ -224,3 +224,27 @@ class BDF2(ImplicitIntegrator):
 
     def start(self, dt: float) -> Table:
         return backward_euler(dt, first=(1.0,), second=(0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class QuasiStatic(ImplicitIntegrator):
+    """A body that is at rest at every time: motion so slow that there is no inertia.
+
+    ``dt`` only says how far keyframes move on from one state of rest to the next; velocities are zero. ``damping`` and
+    ``viscosity`` do nothing. ``Simulation.solves`` counts steps that did not come to rest. Every body needs held nodes.
+    """
+
+    tolerance: float | None = 1e-6
+    iterations: int = 100
+
+    def scheme(self, dt: float) -> Table:
+        return table(STAGE=(1.0, 0.0))
+
+    def start(self, dt: float) -> Table:
+        return self.scheme(dt)
+
+    def bind(self, system: System) -> Stepper:
+        for body in system.bodies:
+            if not body.conditions.held_mask().reshape(body.worlds, -1).any(axis=1).all():
+                raise InputError("no node of the body is held; QuasiStatic needs some in each world")
+        return super().bind(system)

@@ -1,0 +1,81 @@
+"""``warp-corot simulate`` with ``--static`` and implicit integrators."""
+
+import numpy as np
+import pytest
+from command_line import assert_refused, simulate
+from pxr import Usd, UsdGeom
+
+import warp_corot as wc
+
+BOX = ["box", "--device", "cpu"]
+
+
+def frames_of(path):
+    """The points of the tetrahedra in each frame."""
+    stage = Usd.Stage.Open(str(path))
+    (mesh,) = [UsdGeom.TetMesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.TetMesh)]
+    times = mesh.GetPointsAttr().GetTimeSamples()
+    return [np.array(mesh.GetPointsAttr().Get(time)) for time in times]
+
+
+def test_static_writes_the_state_at_rest(tmp_path, capsys):
+    """The frames show what ``solve_static`` finds; the summary says what it took."""
+    path = tmp_path / "sag.usd"
+    assert simulate(*BOX, "--static", "--density", "5", "-o", path) == 0
+    out = capsys.readouterr().out
+    assert "at rest after" in out
+    assert "quasi-static" in out
+    mesh = wc.TetForest.box((1, 1, 3), 0.064, 6)
+    body = wc.SoftBody(mesh, wc.Isotropic(500.0, 0.49, 5.0), device="cpu")
+    body.fix(mesh.points[:, 2] == 0.0)
+    assert wc.solve_static(body, gravity=(0, -9.8, 0)).converged
+    first, last = frames_of(path)
+    assert np.abs(first - body.positions.numpy()).max() < 1e-6
+    assert np.abs(last - first).max() < 1e-6
+
+
+def test_static_follows_a_pull(tmp_path, capsys):
+    """A state of rest for each frame, and the patch where the pull has brought it by then."""
+    path, table = tmp_path / "pulled.usd", tmp_path / "pulled.csv"
+    pull = ["--pull", "z == zmax", "0", "0", "0.02", "--probe", "z == zmax", "--csv", table]
+    assert simulate(*BOX, "--static", *pull, "--duration", "0.2", "--fps", "20", "-o", path) == 0
+    assert "did not converge" not in capsys.readouterr().out
+    frames = frames_of(path)
+    assert len(frames) == 5
+    ends = [points[:, 2].max() - 0.192 for points in frames]
+    assert ends[-1] == pytest.approx(0.02, abs=1e-4)
+    assert ends[1] == pytest.approx(0.01, abs=1e-3)
+
+
+def test_an_implicit_run(tmp_path, capsys):
+    """Steps of 16 ms are shortened to a whole number a frame; the run file makes the same run."""
+    path, run = tmp_path / "swings.usd", tmp_path / "run.toml"
+    options = ["--integrator", "backward-euler", "--dt", "16ms", "--duration", "0.1", "--fps", "30"]
+    assert simulate(*BOX, *options, "--write-run", run, "-o", path) == 0
+    out = capsys.readouterr().out
+    assert "11.11 ms, backward-euler" in out or "16.67 ms, backward-euler" in out
+    assert "linear ones a step" in out
+    assert 'integrator = "backward-euler"' in run.read_text()
+    first = frames_of(path)
+    assert simulate(run, "-o", tmp_path / "again.usd") == 0
+    assert np.array_equal(first[-1], frames_of(tmp_path / "again.usd")[-1])
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--static", "--dt", "1ms"], "--static has no steps in time; leave out --dt"),
+        (["--static", "--integrator", "newmark"], "leave out --integrator"),
+        (["--static", "--drop", "1cm"], "--static knows no contact"),
+        (["--integrator", "bdf2", "--remesh"], "--integrator bdf2 knows no remeshing"),
+        (["--integrator", "generalized-alpha", "--dt", "-1ms"], "--dt is -0.001"),
+        (["--integrator", "euler"], "argument --integrator: invalid choice: 'euler'"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(options, said, tmp_path, capsys):
+    assert_refused(tmp_path, capsys, said, *BOX, *options, "-o", tmp_path / "out.usd")
+
+
+def test_a_body_that_nothing_holds_has_no_static_answer(tmp_path, capsys):
+    assert simulate(*BOX, "--static", "--fix", "none", "-o", tmp_path / "falls.usd") in (2, 3)
+    assert "no node" in capsys.readouterr().err
