@@ -44,6 +44,20 @@ class Surfaces:
 
 
 @wp.struct
+class PairLists:
+    """Newton's lists of pairs: a row for each vertex and for each edge."""
+
+    margin: float  # distance at which surfaces begin to push one another [m]
+    parallel: float  # sine of an angle below which two edges are parallel
+    triangle_starts: wp.array[wp.int32]
+    triangle_counts: wp.array[wp.int32]
+    triangles: wp.array[wp.int32]  # of each pair the vertex and the triangle
+    edge_starts: wp.array[wp.int32]
+    edge_counts: wp.array[wp.int32]
+    edges: wp.array[wp.int32]  # of each pair both edges
+
+
+@wp.struct
 class Pair:
     """Two points that touch; x = sum of weights x_j is their difference, from the second to the first."""
 
@@ -206,52 +220,64 @@ def add_pair_force(
         add_force(f, pair.nodes[n], pair.weights[n] * force)
 
 
+@wp.func
+def row_size(starts: wp.array[wp.int32], counts: wp.array[wp.int32], n: int):
+    """Number of pairs that row n of a list holds, no more than fit."""
+    if n >= counts.shape[0]:
+        return 0
+    return wp.min(counts[n], starts[n + 1] - starts[n])
+
+
+@wp.func
+def is_cut_short(starts: wp.array[wp.int32], counts: wp.array[wp.int32], n: int):
+    """Whether row n of a list holds fewer pairs than were found."""
+    return n < counts.shape[0] and row_size(starts, counts, n) < counts[n]
+
+
+@wp.func
+def pair_count(lists: PairLists, n: int):
+    """Number of pairs in the rows of vertex n and edge n."""
+    in_triangles = row_size(lists.triangle_starts, lists.triangle_counts, n)
+    return in_triangles + row_size(lists.edge_starts, lists.edge_counts, n)
+
+
+@wp.func
+def listed_pair(surfaces: Surfaces, lists: PairLists, n: int, c: int, q: wp.array[wp.vec3]):
+    """The c-th pair in the rows of vertex n and edge n. Two edges are listed twice: the second has a gap above zero."""
+    in_triangles = row_size(lists.triangle_starts, lists.triangle_counts, n)
+    if c < in_triangles:
+        t = lists.triangles[2 * (lists.triangle_starts[n] + c) + 1]
+        return vertex_pair(surfaces, n, t, lists.margin, q)
+    other = lists.edges[2 * (lists.edge_starts[n] + c - in_triangles) + 1]
+    if n < other:
+        return edge_pair(surfaces, n, other, lists.margin, lists.parallel, q)
+    pair = Pair()
+    pair.gap = 1.0
+    return pair
+
+
 @wp.kernel(enable_backward=False)
 def count_pair_loads(
     # In
     surfaces: Surfaces,
-    margin: float,
-    parallel: float,
-    triangle_starts: wp.array[wp.int32],
-    triangle_counts: wp.array[wp.int32],
-    triangles: wp.array[wp.int32],
-    edge_starts: wp.array[wp.int32],
-    edge_counts: wp.array[wp.int32],
-    edges: wp.array[wp.int32],
+    lists: PairLists,
     q: wp.array[wp.vec3],
     # In and out
     load: wp.array[wp.float32],
 ):
     """Add twice the weights of all pairs that touch."""
     n = wp.tid()
-    if n < triangle_counts.shape[0]:
-        start = triangle_starts[n]
-        for c in range(wp.min(triangle_counts[n], triangle_starts[n + 1] - start)):
-            pair = vertex_pair(surfaces, n, triangles[2 * (start + c) + 1], margin, q)
-            if pair.gap < 0.0:
-                add_pair_load(pair, load)
-    if n < edge_counts.shape[0]:
-        start = edge_starts[n]
-        for c in range(wp.min(edge_counts[n], edge_starts[n + 1] - start)):
-            other = edges[2 * (start + c) + 1]
-            if n < other:
-                pair = edge_pair(surfaces, n, other, margin, parallel, q)
-                if pair.gap < 0.0:
-                    add_pair_load(pair, load)
+    for c in range(pair_count(lists, n)):
+        pair = listed_pair(surfaces, lists, n, c, q)
+        if pair.gap < 0.0:
+            add_pair_load(pair, load)
 
 
 @wp.kernel(enable_backward=False)
 def scatter_pairs(
     # In
     surfaces: Surfaces,
-    margin: float,
-    parallel: float,
-    triangle_starts: wp.array[wp.int32],
-    triangle_counts: wp.array[wp.int32],
-    triangles: wp.array[wp.int32],
-    edge_starts: wp.array[wp.int32],
-    edge_counts: wp.array[wp.int32],
-    edges: wp.array[wp.int32],
+    lists: PairLists,
     law: ContactLaw,
     dt: float,
     load: wp.array[wp.float32],
@@ -268,24 +294,12 @@ def scatter_pairs(
 ):
     """Forces of all pairs. A row that holds fewer pairs than were found marks the world."""
     n = wp.tid()
-    if n < triangle_counts.shape[0]:
-        start = triangle_starts[n]
-        room = triangle_starts[n + 1] - start
-        if triangle_counts[n] > room:
-            wp.atomic_max(trouble, place_of(world[n], trouble.shape[0]), TOO_MANY_PAIRS)
-        for c in range(wp.min(triangle_counts[n], room)):
-            pair = vertex_pair(surfaces, n, triangles[2 * (start + c) + 1], margin, q)
-            if pair.gap < 0.0:
-                add_pair_force(pair, law, dt, load, flags, world, inverse_mass, qd, gravity, before, f)
-    if n < edge_counts.shape[0]:
-        start = edge_starts[n]
-        room = edge_starts[n + 1] - start
-        if edge_counts[n] > room:
-            i = surfaces.edges[n, 2]
-            wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), TOO_MANY_PAIRS)
-        for c in range(wp.min(edge_counts[n], room)):
-            other = edges[2 * (start + c) + 1]
-            if n < other:
-                pair = edge_pair(surfaces, n, other, margin, parallel, q)
-                if pair.gap < 0.0:
-                    add_pair_force(pair, law, dt, load, flags, world, inverse_mass, qd, gravity, before, f)
+    if is_cut_short(lists.triangle_starts, lists.triangle_counts, n):
+        wp.atomic_max(trouble, place_of(world[n], trouble.shape[0]), TOO_MANY_PAIRS)
+    if is_cut_short(lists.edge_starts, lists.edge_counts, n):
+        i = surfaces.edges[n, 2]
+        wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), TOO_MANY_PAIRS)
+    for c in range(pair_count(lists, n)):
+        pair = listed_pair(surfaces, lists, n, c, q)
+        if pair.gap < 0.0:
+            add_pair_force(pair, law, dt, load, flags, world, inverse_mass, qd, gravity, before, f)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -164,7 +163,7 @@ class Obstacles:
         """What one of them feels [N, N m], spatial vectors [worlds]."""
         return self.wrenches[number]
 
-    def _shapes(self, shapes: Sequence[Shape], friction: float) -> Any:
+    def _shapes(self, shapes: Sequence[Shape], friction: float) -> Shapes:
         device = self.device
         made = Shapes()
         made.kind = wp.array([shape.kind for shape in shapes], dtype=wp.int32, device=device)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
+
+from warp_corot.kernels.stepping.pace import Pace
 
 
 class Clock(Protocol):
@@ -13,4 +15,4 @@ class Clock(Protocol):
     """
 
     @property
-    def arrays(self) -> Any: ...
+    def arrays(self) -> Pace: ...

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias, TypeVar
+from typing import Protocol, TypeAlias, TypeVar, cast
 
 import numpy as np
 import warp as wp
@@ -19,6 +19,7 @@ Elements: TypeAlias = "ForestElements | GeneralElements"
 ElementKind: TypeAlias = type
 
 E = TypeVar("E", bound="ForestElements | GeneralElements")
+S = TypeVar("S")
 
 
 def element_kind(mesh: Mesh) -> ElementKind:
@@ -66,10 +67,22 @@ def repeated(values: np.ndarray, worlds: int) -> np.ndarray:
 
 def with_targets(elements: E, targets: wp.array) -> E:
     """The same elements with their forces added elsewhere, vec4i [T]."""
-    other: Any = type(elements)()
-    other.assign(elements)
+    other = copied(elements)
     other.targets = targets
     return other
+
+
+def copied(struct: S) -> S:
+    """Another instance of a Warp struct, with the same arrays and numbers."""
+    other = type(struct)()
+    cast("Assigned", other).assign(struct)
+    return other
+
+
+class Assigned(Protocol):
+    """What every Warp struct can do besides."""
+
+    def assign(self, other: object) -> None: ...
 
 
 def _forest_elements(

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Generic, TypeVar
+
+S = TypeVar("S")
 
 
-class Kept:
+class Kept(Generic[S]):
     """The struct of some values, made again where one of these is another object.
 
     Args:
         make: Makes the struct of the values.
     """
 
-    def __init__(self, make: Callable[..., Any]):
+    def __init__(self, make: Callable[..., S]):
         self._make = make
         self._values: tuple = ()
-        self._struct: Any = None
+        self._struct: S | None = None
 
-    def __call__(self, *values: Any) -> Any:
+    def __call__(self, *values: object) -> S:
         if self._struct is None or any(a is not b for a, b in zip(values, self._values, strict=True)):
             self._values, self._struct = values, self._make(*values)
         return self._struct

@@ -14,9 +14,11 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.kernels.newton.attachments import scatter_attachments
 from warp_corot.kernels.newton.contacts import ContactLaw, scatter_soft_contacts
+from warp_corot.kernels.newton.pairs import PairLists
 from warp_corot.kernels.newton.worlds import check_contact_count
 from warp_corot.kernels.newton.yielding import gather_attachments, gather_soft_contacts, solve_yielding
 
+from .arguments import Step
 from .library import newton
 from .pairs import SoftPairs
 from .touching import CROWD, Loads, has_surfaces, records_of
@@ -121,33 +123,24 @@ class Contacts:
             wp.launch(check_contact_count, dim=len(trouble), inputs=inputs, outputs=[trouble], device=self.device)
 
     def add_forces(
-        self,
-        state: newton.State,
-        of_bodies: newton.State,
-        contacts: newton.Contacts | None,
-        dt: float,
-        f: wp.array,
-        trouble: wp.array,
-        reported: wp.array | None = None,
-        share: float = 1.0,
+        self, substep: Step, of_bodies: newton.State, f: wp.array, trouble: wp.array, share: float = 1.0
     ) -> None:
-        """Add forces on a state's particles to f, vec4 [P], and set ``reactions``.
+        """Add forces on particles to f, vec4 [P], and set ``reactions``.
 
         Args:
-            state: The state of the particles.
+            substep: From the particles' state; its ``reported`` gets the wrenches of rigid and then soft contacts,
+                spatial_vector [R + S].
             of_bodies: The state of the bodies.
-            contacts: Newton's contacts, or None.
-            dt: Length of the substep [s].
             f: Forces [N], which already hold all others.
             trouble: Failures of worlds.
-            reported: Wrenches of rigid and then soft contacts, spatial_vector [R + S], or None.
             share: The substep's share of the step, in the mean of ``reported``.
         """
+        state, _, _, contacts, dt, reported = substep
         model = self.model
         touching = contacts if contacts is not None and contacts.soft_contact_max and model.shape_count else None
         attached = model.attachment_particle_body_count
         law = self._law()
-        pairs = None if self.pairs is None or contacts is None else self.pairs.data_of(contacts)
+        pairs = None if self.pairs is None or contacts is None else self.pairs.lists_of(contacts)
         records: list[wp.array] = []
         if touching is not None or pairs is not None:
             wp.copy(self._before, f)
@@ -177,7 +170,7 @@ class Contacts:
         of_bodies: newton.State,
         touching: newton.Contacts | None,
         records: list[wp.array],
-        pairs: list[wp.array] | None,
+        pairs: PairLists | None,
     ) -> None:
         """Find how many contacts share each particle, if several may."""
         self._loads.begin((touching is not None and self.crowded) or pairs is not None)

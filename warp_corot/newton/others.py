@@ -17,6 +17,7 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.kernels.newton.linear import scatter_bending, scatter_springs, scatter_triangles
 
+from .arguments import Step
 from .library import ModelView, SolverBase, SolverSemiImplicit, newton
 
 #: Effective number of contacts of a particle with others in a heap, for their total stiffness. A pair that moves
@@ -127,16 +128,9 @@ class Others:
         """The array for the forces on particles in the step [N], vec3 [P]."""
         return self._particle_f
 
-    def step(
-        self,
-        now: newton.State,
-        out: newton.State,
-        control: newton.Control | None,
-        contacts: newton.Contacts | None,
-        dt: float,
-        body_f: wp.array | None,
-    ) -> None:
-        """Step from ``now`` to ``out`` with the given wrenches on bodies and forces on particles."""
+    def step(self, substep: Step, body_f: wp.array | None) -> None:
+        """Make a step with the given wrenches on bodies and forces on particles."""
+        now, out, control, contacts, dt, _ = substep
         rigid = self._without_soft(contacts)
         with _forces(now, self._particle_f if self.has_particles else now.particle_f, body_f):
             if self._solver is not None:

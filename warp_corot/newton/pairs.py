@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from warp_corot.errors import InputError
 from warp_corot.kernels.newton.contacts import ContactLaw
-from warp_corot.kernels.newton.pairs import Surfaces, count_pair_loads, scatter_pairs
+from warp_corot.kernels.newton.pairs import PairLists, Surfaces, count_pair_loads, scatter_pairs
 
 from .library import newton
 
@@ -49,7 +49,7 @@ class SoftPairs:
         surfaces.exposed = self._on_device(exposed, wp.int32)
         surfaces.rest = wp.clone(model.particle_q)
 
-    def data_of(self, contacts: newton.Contacts) -> list[wp.array]:
+    def lists_of(self, contacts: newton.Contacts) -> PairLists:
         """Newton's lists of pairs.
 
         Raises:
@@ -62,23 +62,23 @@ class SoftPairs:
                 "pipeline.init_soft_self_contact(margin=..., gap=...) before pipeline.contacts(), and "
                 "pipeline.collide(state, contacts, soft_self_contact=True)"
             )
-        return [
-            data.vertex_colliding_triangles_offsets,
-            data.vertex_colliding_triangles_count,
-            data.vertex_colliding_triangles,
-            data.edge_colliding_edges_offsets,
-            data.edge_colliding_edges_count,
-            data.edge_colliding_edges,
-        ]
+        lists = PairLists()
+        lists.margin, lists.parallel = self.margin, PARALLEL
+        lists.triangle_starts = data.vertex_colliding_triangles_offsets
+        lists.triangle_counts = data.vertex_colliding_triangles_count
+        lists.triangles = data.vertex_colliding_triangles
+        lists.edge_starts = data.edge_colliding_edges_offsets
+        lists.edge_counts = data.edge_colliding_edges_count
+        lists.edges = data.edge_colliding_edges
+        return lists
 
-    def count_loads(self, data: list[wp.array], q: wp.array, load: wp.array) -> None:
+    def count_loads(self, lists: PairLists, q: wp.array, load: wp.array) -> None:
         """Add to the loads of particles, float32 [P]."""
-        inputs = [self._surfaces, self.margin, PARALLEL, *data, q]
-        self._launch(count_pair_loads, inputs, [load])
+        self._launch(count_pair_loads, [self._surfaces, lists, q], [load])
 
     def add_forces(
         self,
-        data: list[wp.array],
+        lists: PairLists,
         state: newton.State,
         law: ContactLaw,
         dt: float,
@@ -89,7 +89,7 @@ class SoftPairs:
     ) -> None:
         """Add forces [N] to f, vec4 [P]; ``before`` holds those before contacts'."""
         model = self.model
-        inputs = [self._surfaces, self.margin, PARALLEL, *data, law, dt, load]
+        inputs = [self._surfaces, lists, law, dt, load]
         inputs += [model.particle_flags, model.particle_world, model.particle_inv_mass]
         inputs += [state.particle_q, state.particle_qd, model.gravity, before]
         self._launch(scatter_pairs, inputs, [f, trouble])
@@ -98,7 +98,7 @@ class SoftPairs:
         dim = max(self.model.particle_count, self.model.edge_count)
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
-    def _on_device(self, values: npt.NDArray[Any], dtype: Any) -> wp.array:
+    def _on_device(self, values: npt.NDArray[Any], dtype: type) -> wp.array:
         return wp.array(values, dtype=dtype, device=self.device)
 
 

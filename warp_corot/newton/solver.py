@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 import warnings
-from numbers import Real
 from typing import Any
 
 import warp as wp
@@ -12,22 +10,18 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import refuse_tape
 
+from .arguments import Step, check_options, check_step, checked_dt, checked_mask
 from .contact import Contacts
 from .following import Following
-from .library import CouplingInterface, ModelView, SolverBase, newton
+from .library import CouplingInterface, SolverBase, newton
 from .others import Others
-from .stability import stable_step
-from .state import STATE, attribute_of, register_custom_attributes
-from .steps import Step, Steps
-from .tetrahedra import LAME, Tetrahedra
-
-#: Fraction of the largest stable step that errors suggest: elements stiffen when strained.
-SAFETY = 0.7
+from .stability import SAFETY, check_substep, stable_steps
+from .state import register_custom_attributes
+from .steps import Steps
+from .tetrahedra import Tetrahedra
 
 #: Factor by which a recorded substep may exceed the safe one; below the smallest margin of the safe substep.
 EXCESS = 1.1
-
-ROTATIONS = ("byers-xu", "warm")
 
 
 class SolverCorotated(SolverBase, CouplingInterface):
@@ -112,22 +106,15 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self_contact_margin: float | None = None,
         stable_dt: float | None = None,
     ):
-        if not isinstance(model, newton.Model) and not isinstance(model, ModelView):
-            raise InputError(f"model is {_named(model)}; it must be a newton.Model, the result of builder.finalize()")
-        if not isinstance(lame, str) or lame not in LAME:
-            raise InputError(f"lame is {lame!r}; it must be one of {', '.join(LAME)}")
-        if not isinstance(rotation, str) or rotation not in ROTATIONS:
-            raise InputError(f"rotation is {rotation!r}; it must be one of {', '.join(ROTATIONS)}")
-        if not (_is_finite(damping) and damping >= 0):
-            raise InputError(f"damping is {damping!r}; it must be zero or a positive rate in 1/s")
-        if substeps is not None and not (_is_finite(substeps) and substeps == int(substeps) and substeps >= 1):
-            raise InputError(f"substeps is {substeps!r}; it must be a positive whole number or None")
-        if stable_dt is not None and not (isinstance(stable_dt, Real) and stable_dt > 0):
-            raise InputError(f"stable_dt is {stable_dt!r}; it must be a positive number of seconds or None")
-        if self_contact_margin is not None and not (_is_finite(self_contact_margin) and self_contact_margin > 0):
-            raise InputError(
-                f"self_contact_margin is {self_contact_margin!r}; it must be a positive distance in m or None"
-            )
+        check_options(
+            model,
+            lame=lame,
+            rotation=rotation,
+            damping=damping,
+            substeps=substeps,
+            stable_dt=stable_dt,
+            self_contact_margin=self_contact_margin,
+        )
         super().__init__(model)
         self._substeps = None if substeps is None else int(substeps)
         self._given_stable_dt = stable_dt
@@ -201,12 +188,12 @@ class SolverCorotated(SolverBase, CouplingInterface):
         """
         refuse_tape()
         self.validate_observables(observables, contacts)
-        self._check_arguments(state_in, state_out, control, contacts)
-        following = self._following
-        self._steps.check_earlier(following)
-        self._see_surfaces(contacts)
         reported = None if observables is None else observables.contact_f
-        step, count = Step(state_in, state_out, control, contacts, dt, reported), self._count_for(dt)
+        step, following = Step(state_in, state_out, control, contacts, dt, reported), self._following
+        check_step(step, self.model, self.tetrahedra.warm)
+        self._steps.report.check_earlier(following)
+        self._see_surfaces(contacts)
+        count = self._count_for(dt)
         if following is not None and self.device.is_cpu and not self.device.is_capturing:
             self._steps.launch_retried(step, following)
         else:
@@ -234,7 +221,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
                 UserWarning,
                 stacklevel=2,
             )
-        self._steps.check(self.stable_dt, self._following)
+        self._steps.report.check(self.stable_dt, self._following)
         if self._following is not None and self._following.was_recorded:
             self._following.recover()
 
@@ -252,7 +239,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
             flags: ``newton.StateFlags`` of what is reset: PARTICLE_Q, PARTICLE_QD, and, if this solver steps the
                 bodies, BODY_Q and BODY_QD; None: all.
         """
-        mask = self._all_worlds if world_mask is None else self._checked_mask(world_mask)
+        mask = self._all_worlds if world_mask is None else checked_mask(world_mask, self.model)
         self._steps.reset(state, mask, int(newton.StateFlags.ALL if flags is None else flags))
         self._others.reset(state, world_mask, flags)
 
@@ -300,14 +287,11 @@ class SolverCorotated(SolverBase, CouplingInterface):
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _find_stable_steps(self) -> None:
-        tets, others, contacts = self.tetrahedra, self._others, self._contacts
         given = self._given_stable_dt
-        self.stable_dt = self.contact_dt = stable_step(tets, others) if given is None else float(given)
-        stiffness, damping = others.contact
-        stiffness += contacts.stiffest
-        if given is None and (stiffness > 0 or damping > 0):
-            of_bodies = contacts.stiffest * contacts.lightest
-            self.contact_dt = min(self.stable_dt, stable_step(tets, others, stiffness, damping, of_bodies))
+        if given is None:
+            self.stable_dt, self.contact_dt = stable_steps(self.tetrahedra, self._others, self._contacts)
+        else:
+            self.stable_dt = self.contact_dt = float(given)
         if self._following is not None:
             self._following.find_rest(self.contact_dt)
 
@@ -325,70 +309,9 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self._find_stable_steps()
 
     def _count_for(self, dt: float) -> int:
-        if not (_is_finite(dt) and dt > 0):
-            raise InputError(f"dt is {dt!r}; it must be a positive number of seconds")
+        dt = checked_dt(dt)
         if self._following is not None:
             return self._following.count_for(dt)
         count = self._substeps or 1
-        if dt / count > self.stable_dt:
-            each = f", {count} substeps of {dt / count:.3g} s" if count > 1 else ""
-            needed = math.ceil(dt / (SAFETY * self.contact_dt))
-            raise InputError(
-                f"dt is {dt:.3g} s{each}; the largest stable step is about {self.stable_dt:.3g} s: "
-                f"make shorter steps, or SolverCorotated(..., substeps={needed}), or substeps=None"
-            )
+        check_substep(dt, count, self.stable_dt, self.contact_dt)
         return count
-
-    def _check_arguments(
-        self,
-        state_in: newton.State,
-        state_out: newton.State,
-        control: newton.Control | None,
-        contacts: newton.Contacts | None,
-    ) -> None:
-        model = self.model
-        for name, state in (("state_in", state_in), ("state_out", state_out)):
-            if getattr(state, "particle_q", self) is self:
-                raise InputError(f"{name} is {_named(state)}; it must be a newton.State, the result of model.state()")
-            if state.particle_q is None or len(state.particle_q) != model.particle_count:
-                there = 0 if state.particle_q is None else len(state.particle_q)
-                raise InputError(f"{name} has {there} particles; the model has {model.particle_count}")
-            if state.particle_q.device != self.device:
-                raise InputError(f"{name} is on {state.particle_q.device}; the model is on {self.device}")
-            if self.tetrahedra.warm and attribute_of(state, "rotation") is None:
-                raise InputError(
-                    f"{name} has no rotations, which rotation='warm' needs: call "
-                    "SolverCorotated.register_custom_attributes(builder) before finalize"
-                )
-            for attribute in STATE:
-                array = attribute_of(state, attribute)
-                if array is not None and len(array) != model.tet_count:
-                    raise InputError(f"{name} has {attribute} of {len(array)} tetrahedra; there are {model.tet_count}")
-        if control is not None and control.tet_activations is not None:
-            if len(control.tet_activations) != model.tet_count:
-                raise InputError(
-                    f"control has {len(control.tet_activations)} tet_activations; there are {model.tet_count}"
-                )
-            if control.tet_activations.device != self.device:
-                raise InputError(f"control is on {control.tet_activations.device}; the model is on {self.device}")
-        if contacts is not None and contacts.soft_contact_max and contacts.soft_contact_count.device != self.device:
-            raise InputError(f"contacts are on {contacts.soft_contact_count.device}; the model is on {self.device}")
-
-    def _checked_mask(self, world_mask: wp.array) -> wp.array:
-        wanted = f"it must be bool [{self.model.world_count + 1}] on {self.device}"
-        if not isinstance(world_mask, wp.array):
-            raise InputError(f"world_mask is {world_mask!r}; {wanted}")
-        right = world_mask.dtype == wp.bool and world_mask.shape == (self.model.world_count + 1,)
-        if not right or world_mask.device != self.device:
-            found = f"{world_mask.dtype.__name__} {list(world_mask.shape)} on {world_mask.device}"
-            raise InputError(f"world_mask is {found}; {wanted}")
-        return world_mask
-
-
-def _is_finite(value: Any) -> bool:
-    """Whether a value is a finite number."""
-    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _named(value: Any) -> str:
-    return "None" if value is None else f"a {type(value).__name__}"

@@ -10,16 +10,20 @@ import numpy as np
 import warp as wp
 
 from warp_corot.discretization.clusters.single import isotropic_material
+from warp_corot.errors import InputError
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, linear_stress
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.forces import law_stress, scatter_forces
 from warp_corot.kernels.stepping.lanczos import add_scaled, scale_by
 from warp_corot.solvers.steps.stable_step import SmallForces, largest_eigenvalue
 
+from .contact import Contacts
 from .library import newton
 from .others import Others
 from .tetrahedra import Tetrahedra
 
+#: Fraction of the largest stable step that errors suggest: elements stiffen when strained.
+SAFETY = 0.7
 #: Number of attempts to lengthen a step, and the largest eigenvalue, of 4, from which it is long enough.
 LENGTHENINGS = 6
 ENOUGH = 3.95
@@ -111,3 +115,28 @@ def stable_step(
         # Eigenvalues grow no faster than dt^2.
         dt *= math.sqrt(4.0 / found)
     return dt
+
+
+def stable_steps(tets: Tetrahedra, others: Others, contacts: Contacts) -> tuple[float, float]:
+    """The largest stable step about rest [s], and the same with a contact or an attachment at every particle."""
+    alone = stable_step(tets, others)
+    stiffness, damping = others.contact
+    stiffness += contacts.stiffest
+    if not (stiffness > 0 or damping > 0):
+        return alone, alone
+    return alone, min(alone, stable_step(tets, others, stiffness, damping, contacts.stiffest * contacts.lightest))
+
+
+def check_substep(dt: float, count: int, stable_dt: float, contact_dt: float) -> None:
+    """Check a step of ``dt`` in ``count`` substeps against the result of ``stable_steps`` [s].
+
+    Raises:
+        InputError: The substeps are too long.
+    """
+    if dt / count > stable_dt:
+        each = f", {count} substeps of {dt / count:.3g} s" if count > 1 else ""
+        needed = math.ceil(dt / (SAFETY * contact_dt))
+        raise InputError(
+            f"dt is {dt:.3g} s{each}; the largest stable step is about {stable_dt:.3g} s: "
+            f"make shorter steps, or SolverCorotated(..., substeps={needed}), or substeps=None"
+        )

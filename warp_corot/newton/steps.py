@@ -2,38 +2,24 @@
 
 from __future__ import annotations
 
-import warnings
-from typing import NamedTuple
-
-import numpy as np
 import warp as wp
 
-from warp_corot.errors import InputError, UnstableError
 from warp_corot.kernels.newton import particles as kernels
 from warp_corot.kernels.newton import worlds as worlds
 from warp_corot.kernels.newton.contacts import add_wrenches
 from warp_corot.solvers.subnormals import FlushedSubnormals
 
+from .arguments import Step
 from .contact import Contacts
 from .following import RETRIES, Following
 from .library import newton
 from .others import Others
+from .report import Report
 from .state import attribute_of
 from .tetrahedra import Tetrahedra
 
 #: A particle speed [m/s] that is a failure for any step.
 RUNAWAY = float(worlds.RUNAWAY)
-
-
-class Step(NamedTuple):
-    """The arguments of ``SolverCorotated.step``, and the array for the mean wrenches of contacts in the step."""
-
-    state_in: newton.State
-    state_out: newton.State
-    control: newton.Control | None
-    contacts: newton.Contacts | None
-    dt: float
-    reported: wp.array | None = None
 
 
 class Steps:
@@ -43,6 +29,9 @@ class Steps:
         model: The model.
         tetrahedra, contacts, others: The parts of the model.
         damping: Rate of mass-proportional damping [1/s].
+
+    Attributes:
+        report: Failures of worlds.
     """
 
     def __init__(self, model: newton.Model, tetrahedra: Tetrahedra, contacts: Contacts, others: Others, damping: float):
@@ -52,15 +41,7 @@ class Steps:
         self._flushed = FlushedSubnormals(self.device)
         p, b = model.particle_count, model.body_count
         self._f = wp.zeros(p, dtype=wp.vec4, device=self.device)
-        self._places = max(int(model.world_count), 1) + 1
-        self._trouble = wp.zeros(self._places, dtype=wp.int32, device=self.device)
-        self._report = wp.zeros(worlds.REPORTS, dtype=wp.int32, device=self.device)
-        #: The report, which the host can read without waiting.
-        self._seen = wp.zeros(1, dtype=wp.int32, device="cpu", pinned=self.device.is_cuda)
-        self._seen_by_device = self._seen
-        if self.device.is_cuda:
-            # The same memory: a pinned array has the same address on host and device.
-            self._seen_by_device = wp.array(ptr=self._seen.ptr, shape=1, dtype=wp.int32, device=self.device)
+        self.report = Report(model)
         types = (wp.vec3, wp.vec3)
         self._particles_before = [wp.empty(p, dtype=dtype, device=self.device) for dtype in types]
         self._nothing = [wp.empty(0, dtype=dtype, device=self.device) for dtype in types]
@@ -91,102 +72,44 @@ class Steps:
         share = following.share
         for attempt in range(RETRIES + 1):
             self.launch(step, following.count_for(dt), following)
-            if not self._report.numpy()[worlds.UNSTABLE]:
+            if not self.report.is_unstable:
                 return
             if attempt == RETRIES:
                 break
             following.share *= 0.5
-            self._report[worlds.UNSTABLE : worlds.UNSTABLE + 1].zero_()
+            self.report.forget_unstable()
             self._bring_back(state_in, step.state_out)
             if kept:
                 wp.copy(state_in.body_f, self._body_f)
         following.share = share
 
     def _launch_step(self, step: Step, count: int, following: Following | None) -> None:
-        model, (state_in, state_out, control, contacts, dt, reported) = self.model, step
-        if reported is not None:
-            reported.zero_()
-        activation = model.tet_activations
-        if control is not None and control.tet_activations is not None:
-            activation = control.tet_activations
-        before = self._launch_begin(state_in, state_out, contacts)
+        state_in, state_out, dt = step.state_in, step.state_out, step.dt
+        if step.reported is not None:
+            step.reported.zero_()
+        before = self._launch_begin(step)
         now = state_in
-        number, left, done, substep = 0, count, 0.0, dt / count
+        number, left, done, each = 0, count, 0.0, dt / count
         while left:
             copied = number == 0 and before[0] is self._particles_before
             self._launch_gathering(now, state_in, number, copied)
             if following is not None and following.is_due():
-                following.measure(now, dt - done, substep)
+                following.measure(now, dt - done, each)
                 if self.device.is_cpu and not self.device.is_capturing:
                     left = following.count_for(dt - done)
-                    substep = (dt - done) / left
-            self._launch_forces(now, state_in, activation, contacts, substep, reported, substep / dt)
-            if self.others.has_bodies:
-                wp.copy(self._body_f, state_in.body_f)
-                self._add_wrenches(1.0, self._body_f)
-            elif model.body_count:
-                self._add_wrenches(substep / dt, state_in.body_f)
-            fastest = RUNAWAY if following is None else min(RUNAWAY, following.reach / substep)
-            self._launch_motion(now, state_out, control, contacts, substep, fastest)
+                    each = (dt - done) / left
+            substep = step._replace(state_in=now, dt=each)
+            self._launch_forces(substep, state_in, each / dt)
+            fastest = RUNAWAY if following is None else min(RUNAWAY, following.reach / each)
+            self._launch_motion(substep, fastest)
             self._launch_undoing(state_out, *before)
-            number, left, done = number + 1, left - 1, done + substep
+            number, left, done = number + 1, left - 1, done + each
             if self.tetrahedra.warm or not left:
                 self.tetrahedra.write_attributes(state_out, now)
             now = state_out
         if following is not None:
             following.made = number
-        if self._may_be_wrong():
-            inputs, outputs = [self._trouble], [self._report, self._seen_by_device]
-            self._launch(worlds.report_trouble, self._places, inputs, outputs)
-
-    def _may_be_wrong(self) -> bool:
-        # On the CPU a check costs less than a launch; a recorded step must handle all cases.
-        return self.device.is_cuda or self.device.is_capturing or bool(self._trouble.numpy().any())
-
-    def check_earlier(self, following: Following | None) -> None:
-        """Report errors of steps that have finished. On CUDA, outside captures; does not wait.
-
-        If substeps follow the state, a world that failed continues with twice as many, and a warning says so.
-        """
-        if self.device.is_cpu or self.device.is_capturing or not self._seen.numpy()[0]:
-            return
-        try:
-            self.check(None, following)
-        except UnstableError as error:
-            if following is None or following.share < 0.5**RETRIES:
-                raise
-            warnings.warn(str(error), UserWarning, stacklevel=3)
-
-    def check(self, stable_dt: float | None, following: Following | None) -> None:
-        """See ``SolverCorotated.check``."""
-        report = self._report.numpy().copy()
-        if not report.any():
-            return
-        self._report.zero_()
-        self._seen.zero_()
-        worst = int(np.flatnonzero(report)[-1])
-        world = int(report[worst]) - 1
-        where = f" in world {world}" if self.model.world_count > 1 and world < self.model.world_count else ""
-        if worst == int(worlds.BAD_INPUT):
-            raise InputError(f"state_in is not finite{where}; state_out keeps its former values there")
-        if worst == int(worlds.TOO_MANY_PAIRS):
-            raise InputError(
-                "there are more pairs of soft bodies than Newton has room for: call pipeline.init_soft_self_contact "
-                f"with larger vertex_buffer_pre_alloc and edge_buffer_pre_alloc{where}; no step was made"
-            )
-        if worst == int(worlds.TOO_MANY_CONTACTS):
-            raise InputError(
-                "there are more soft contacts than contacts.soft_contact_max: make the CollisionPipeline with a "
-                "larger soft_contact_max; no step was made"
-            )
-        hint = "" if stable_dt is None else f"; the largest stable step at rest is about {stable_dt:.3g} s"
-        wrong = "not finite" if following is None else "not finite or beyond reason"
-        if following is not None and self.device.is_cpu and not following.was_recorded:
-            hint += f"; {2**RETRIES} times the substeps did not help"
-        elif following is not None:
-            following.share *= 0.5
-            hint += "; from now on steps have twice the substeps, recorded ones when they are recorded again"
-        raise UnstableError(f"the step's result is {wrong}{where}; that state was not changed{hint}")
+        self.report.launch()
 
     def reset(self, state: newton.State, mask: wp.array, flags: int) -> None:
         model, bits = self.model, newton.StateFlags
@@ -206,15 +129,13 @@ class Steps:
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
-    def _launch_begin(
-        self, state_in: newton.State, state_out: newton.State, contacts: newton.Contacts | None
-    ) -> tuple[list[wp.array], list[wp.array]]:
+    def _launch_begin(self, step: Step) -> tuple[list[wp.array], list[wp.array]]:
         """Launch what is done once a step.
 
         Returns:
             Particles and bodies before the step: those of ``state_in``, or copies if the step overwrites them.
         """
-        model, others = self.model, self.others
+        model, others, state_in, state_out = self.model, self.others, step.state_in, step.state_out
         if others.has_particles:
             _copy(self._kept_particles, [state_out.particle_q, state_out.particle_qd])
         particles = [state_in.particle_q, state_in.particle_qd]
@@ -224,13 +145,13 @@ class Steps:
         if model.body_count:
             bodies = [state_in.body_q, state_in.body_qd]
             inputs = [*bodies, model.body_world, int(worlds.BAD_INPUT)]
-            self._launch(worlds.check_bodies, model.body_count, inputs, [self._trouble])
+            self._launch(worlds.check_bodies, model.body_count, inputs, [self.report.trouble])
         if others.has_bodies:
             _copy(self._kept_bodies, [state_out.body_q, state_out.body_qd])
             if _overlap(bodies, [state_out.body_q, state_out.body_qd]):
                 _copy(self._bodies_before, bodies)
                 bodies = self._bodies_before
-        self.contacts.check_count(contacts, self._trouble)
+        self.contacts.check_count(step.contacts, self.report.trouble)
         return particles, bodies
 
     def _bring_back(self, state_in: newton.State, state_out: newton.State) -> None:
@@ -251,65 +172,63 @@ class Steps:
         wrong = int(worlds.UNSTABLE if number else worlds.BAD_INPUT)
         inputs = [now.particle_q, now.particle_qd, state_in.particle_f, model.particle_world, tets.rest, wrong]
         copies = self._particles_before if copied else self._nothing
-        outputs = [tets.x, tets.u, self._f, *copies, self._trouble]
+        outputs = [tets.x, tets.u, self._f, *copies, self.report.trouble]
         self._launch(kernels.gather_particles, model.particle_count, inputs, outputs)
 
-    def _launch_forces(
-        self,
-        now: newton.State,
-        state_in: newton.State,
-        activation: wp.array,
-        contacts: newton.Contacts | None,
-        dt: float,
-        reported: wp.array | None,
-        share: float,
-    ) -> None:
-        """All other forces on particles."""
-        tets = self.tetrahedra
-        tets.add_forces(now, activation, self._f)
-        of_bodies = now if self.others.has_bodies else state_in
-        self.contacts.add_forces(now, of_bodies, contacts, dt, self._f, self._trouble, reported, share)
+    def _launch_forces(self, substep: Step, given: newton.State, share: float) -> None:
+        """All other forces on particles, and on bodies those of particles.
 
-    def _launch_motion(
-        self,
-        now: newton.State,
-        out: newton.State,
-        control: newton.Control | None,
-        contacts: newton.Contacts | None,
-        dt: float,
-        fastest: float,
-    ) -> None:
+        Args:
+            substep: From the present state.
+            given: The state that the step began with.
+            share: The substep's share of the step.
+        """
+        model, others, control = self.model, self.others, substep.control
+        activation = model.tet_activations
+        if control is not None and control.tet_activations is not None:
+            activation = control.tet_activations
+        self.tetrahedra.add_forces(substep.state_in, activation, self._f)
+        of_bodies = substep.state_in if others.has_bodies else given
+        self.contacts.add_forces(substep, of_bodies, self._f, self.report.trouble, share)
+        if others.has_bodies:
+            wp.copy(self._body_f, given.body_f)
+            self._add_wrenches(1.0, self._body_f)
+        elif model.body_count:
+            self._add_wrenches(share, given.body_f)
+
+    def _launch_motion(self, substep: Step, fastest: float) -> None:
         model, others = self.model, self.others
+        now, out, dt = substep.state_in, substep.state_out, substep.dt
         particle_world = model.particle_world
         if others.has_particles:
             self._launch(kernels.unpad, model.particle_count, [self._f], [others.particle_forces])
         else:
             inputs = [dt, self.damping, model.particle_max_velocity, fastest, model.gravity, model.particle_inv_mass]
             inputs += [model.particle_flags, particle_world, self._f, now.particle_q, now.particle_qd]
-            outputs = [out.particle_q, out.particle_qd, self._trouble]
+            outputs = [out.particle_q, out.particle_qd, self.report.trouble]
             self._launch(kernels.step_particles, model.particle_count, inputs, outputs)
         if others.has_bodies or others.has_particles:
-            others.step(now, out, control, contacts, dt, self._body_f if others.has_bodies else now.body_f)
+            others.step(substep, self._body_f if others.has_bodies else now.body_f)
         if others.has_particles and self.damping > 0:
             inputs = [dt, self.damping, model.particle_inv_mass, model.particle_flags]
             self._launch(kernels.damp_particles, model.particle_count, inputs, [out.particle_q, out.particle_qd])
         if others.has_bodies:
             inputs = [out.body_q, out.body_qd, model.body_world, int(worlds.UNSTABLE)]
-            self._launch(worlds.check_bodies, model.body_count, inputs, [self._trouble])
+            self._launch(worlds.check_bodies, model.body_count, inputs, [self.report.trouble])
         if others.has_particles:
             inputs = [out.particle_q, out.particle_qd, fastest, particle_world]
-            self._launch(worlds.check_particles, model.particle_count, inputs, [self._trouble])
+            self._launch(worlds.check_particles, model.particle_count, inputs, [self.report.trouble])
 
     def _launch_undoing(self, out: newton.State, particles: list[wp.array], bodies: list[wp.array]) -> None:
         """Restore the worlds with a failure."""
-        if not self._may_be_wrong():
+        if not self.report.may_be_wrong:
             return
         model = self.model
-        inputs = [model.particle_world, self._trouble, *particles, *self._kept_particles]
+        inputs = [model.particle_world, self.report.trouble, *particles, *self._kept_particles]
         outputs = [out.particle_q, out.particle_qd]
         self._launch(worlds.put_back_particles, model.particle_count, inputs, outputs)
         if self.others.has_bodies:
-            inputs = [model.body_world, self._trouble, *bodies, *self._kept_bodies]
+            inputs = [model.body_world, self.report.trouble, *bodies, *self._kept_bodies]
             self._launch(worlds.put_back_bodies, model.body_count, inputs, [out.body_q, out.body_qd])
 
     def _add_wrenches(self, share: float, target: wp.array) -> None:

@@ -13,6 +13,7 @@ import warp as wp
 from warp_corot.discretization.changing.plan import DevicePlan
 from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.discretization.changing.transfer import Column, Numbers
+from warp_corot.discretization.elements import copied
 from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial, vec9
 from warp_corot.kernels.remesh.anisotropic import assemble_materials
 from warp_corot.kernels.remesh.state import FIRST, MEAN_IF_ALIKE, MEAN_OF_CONTENTS, NO_ROW
@@ -127,8 +128,7 @@ class CarriedAnisotropic(CarriedMaterial):
 
     def serve(self, plan: DevicePlan, lame: tuple[wp.array, wp.array, int]) -> None:
         given, count = self._anisotropic, plan.counts.most
-        material: Any = OrthotropicMaterial()
-        material.assign(given)
+        material = copied(given)
         material.mu, material.lam, material.stride = lame
         if given.axes_stride:
             material.axes = wp.array(np.tile(np.eye(3), (count, 1, 1)), dtype=wp.mat33, device=plan.forest.device)

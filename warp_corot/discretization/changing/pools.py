@@ -257,7 +257,7 @@ class DeviceForest:
         self,
         values: npt.NDArray[Any],
         size: int,
-        dtype: Any,
+        dtype: type,
         rest: int = 0,
         places: npt.NDArray[np.int32] | slice | None = None,
     ) -> wp.array:

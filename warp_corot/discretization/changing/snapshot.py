@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_corot.kernels.meshing.growth import LIVE, VOID
 from warp_corot.kernels.remesh import pools as kernels
-from warp_corot.kernels.remesh.state import NO_ROW
+from warp_corot.kernels.remesh.state import NO_ROW, Carried
 from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 
 from .fields import CARRIED_BY_NODES, CARRIED_BY_TETRAHEDRA, OF_NODES, OF_TETRAHEDRA, padding
@@ -44,7 +44,7 @@ class Snapshot:
     pieces: tuple[Piece, ...]
 
     @classmethod
-    def of(cls, pools: kernels.Pools, carried: Any) -> Snapshot:
+    def of(cls, pools: kernels.Pools, carried: Carried) -> Snapshot:
         """The present state of ``kernels.remesh.pools.Pools`` and ``kernels.remesh.state.Carried``."""
         counts = pools.counts.numpy().copy()
         stretches = ((name, start, count) for name, start, count in _in_use(pools, carried, counts) if count)
@@ -54,7 +54,7 @@ class Snapshot:
         )
         return cls(counts, tuple(pieces))
 
-    def restore(self, pools: kernels.Pools, carried: Any) -> None:
+    def restore(self, pools: kernels.Pools, carried: Carried) -> None:
         """Write it back into the same arrays."""
         present = pools.counts.numpy()
         leaves, known = int(present[kernels.LEAVES]), int(self.counts[kernels.LEAVES])
@@ -71,7 +71,7 @@ class Snapshot:
 
 
 def check_places(
-    pools: kernels.Pools, carried: Any, counts: npt.NDArray[np.int32], pieces: dict[str, npt.NDArray[Any]]
+    pools: kernels.Pools, carried: Carried, counts: npt.NDArray[np.int32], pieces: dict[str, npt.NDArray[Any]]
 ) -> None:
     """See that kernels that are given stretches of arrays stay within these.
 
@@ -102,12 +102,12 @@ def check_places(
         raise ValueError(f"{counts[kernels.NODE_TOP]} nodes are counted, and there are {pools.node_limit}")
 
 
-def array_of(pools: kernels.Pools, carried: Any, name: str) -> wp.array:
+def array_of(pools: kernels.Pools, carried: Carried, name: str) -> wp.array:
     """An array of the pools or of what is carried."""
     return getattr(carried if name in _CARRIED else pools, name)
 
 
-def _in_use(pools: kernels.Pools, carried: Any, counts: npt.NDArray[np.int32]) -> Iterator[tuple[str, int, int]]:
+def _in_use(pools: kernels.Pools, carried: Carried, counts: npt.NDArray[np.int32]) -> Iterator[tuple[str, int, int]]:
     """Names of arrays, where stretches of them that are in use begin, and how long these are."""
     used = int(np.flatnonzero(pools.level.numpy() != kernels.UNUSED)[-1]) + 1
     for name in (*OF_TETRAHEDRA, *CARRIED_BY_TETRAHEDRA):

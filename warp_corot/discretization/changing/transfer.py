@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -170,12 +169,12 @@ class Carriage:
         inverse[free] = 1.0 / masses[free]
         self.arrays.inverse_mass.assign(inverse.astype(np.float32))
 
-    def _of_elements(self, leaves: np.ndarray, values: np.ndarray, count: int, dtype: Any) -> wp.array:
+    def _of_elements(self, leaves: np.ndarray, values: np.ndarray, count: int, dtype: type) -> wp.array:
         spread = np.zeros(count, wp.dtype_to_numpy(dtype))
         spread[leaves] = values
         return wp.array(spread, dtype=dtype, device=self.device)
 
-    def _table(self, leaves: np.ndarray, given: Mapping[str, npt.ArrayLike], count: int, dtype: Any) -> wp.array:
+    def _table(self, leaves: np.ndarray, given: Mapping[str, npt.ArrayLike], count: int, dtype: type) -> wp.array:
         table = np.zeros((count, len(given)), wp.dtype_to_numpy(dtype))
         for column, (name, value) in zip(table.T, given.items(), strict=True):
             column[leaves] = _of_leaves(name, value, len(leaves))

@@ -178,10 +178,10 @@ class PlanArrays:
             return _first(nodes[begin : begin + 10 * room].reshape((10, room)), count, axis=1)
         return nodes[begin : begin + 10 * count].reshape((count, 10))
 
-    def _zeros(self, shape: int | tuple[int, int], dtype: Any = wp.int32) -> wp.array:
+    def _zeros(self, shape: int | tuple[int, int], dtype: type = wp.int32) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=self.device)
 
-    def _empty(self, count: int, dtype: Any = wp.int32) -> wp.array:
+    def _empty(self, count: int, dtype: type = wp.int32) -> wp.array:
         return wp.empty(count, dtype=dtype, device=self.device)
 
 

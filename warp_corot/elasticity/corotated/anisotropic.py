@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import warp as wp
 
-from warp_corot.discretization.elements import E
+from warp_corot.discretization.elements import E, copied
 from warp_corot.elasticity.model import ForceField
 from warp_corot.elasticity.paths.lanes import Lanes, as_general
 from warp_corot.elasticity.stiffness import ElementStiffness
@@ -119,7 +119,6 @@ class AnisotropicLanesField(AnisotropicField):
 
 def _first(elements: E, count: int) -> E:
     """The first elements of either kind."""
-    some: Any = type(elements)()
-    some.assign(elements)
+    some = copied(elements)
     some.nodes = some.targets = elements.nodes[:count]
     return some

@@ -176,7 +176,7 @@ class Growth:
         if counts[kernels.DEEPEST] >= MAX_LEVEL:
             raise InputError(f"a tetrahedron is already at level {MAX_LEVEL}, the deepest that the lattice can hold")
 
-    def _on_device(self, values: Any, dtype: Any) -> wp.array:
+    def _on_device(self, values: Any, dtype: type) -> wp.array:
         kind = np.uint8 if dtype is wp.uint8 else np.int32
         return wp.array(np.asarray(values, kind), dtype=dtype, device=self.device, copy=True)
 
