@@ -273,3 +273,14 @@ def test_the_haptic_loop_is_timed(tmp_path):
     assert 0.0 < found["period"] <= found["period_99"] <= found["period_most"]
     assert found["delay"] > 0.0
     assert all(word in done.stdout for word in ("median", "99 %", "longest", "delay"))
+
+
+def test_preconditioners_are_compared(tmp_path):
+    path = tmp_path / "solvers.json"
+    done = run("solvers.py", "--device", "cpu", "--levels", 5, "--poisson", 0.3, "--json", path)
+    assert done.returncode == 0, done.stderr
+    found = {(row["body"], row["preconditioner"]): row for row in json.loads(path.read_text(encoding="utf-8"))["rows"]}
+    for body in ("beam", "balls"):
+        counts = [found[body, name]["iterations"] for name in ("none", "diagonal", "multigrid")]
+        assert counts[0] > counts[1] > 2 * counts[2] > 0
+        assert all(found[body, name]["error"] < 1e-3 for name in ("none", "diagonal", "multigrid"))

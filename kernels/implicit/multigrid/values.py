@@ -93,6 +93,7 @@ def gather_leaves(
     lam: wp.array[float],
     stride: int,
     scales: wp.array[float],
+    stiffening: float,
     upper: wp.array[wp.vec2i],
     starts: wp.array[wp.int32],
     codes: wp.array[wp.int32],
@@ -100,7 +101,8 @@ def gather_leaves(
     # Out
     blocks: wp.array[wp.mat33],
 ):
-    """The entries off the diagonal; ``gradients`` are those of ``tables.shapes``, [shape, node]."""
+    """The entries off the diagonal; ``gradients`` are those of ``tables.shapes``, [shape, node]; viscous damping counts
+    as ``stiffening`` b K."""
     world, u = wp.tid()
     if upper[u][0] == upper[u][1]:
         return
@@ -119,7 +121,7 @@ def gather_leaves(
         total[0, 0] += d
         total[1, 1] += d
         total[2, 2] += d
-    total = scales[2] * total
+    total = (scales[2] + scales[1] * stiffening) * total
     where = places[u]
     blocks[world * entries + where[0]] = wp.transpose(total)
     blocks[world * entries + where[1]] = total
@@ -139,6 +141,14 @@ def inverse_block(a: wp.mat33):
     return result
 
 
+@wp.func
+def semidefinite(a: wp.mat33):
+    """A symmetric block without its negative eigenvalues."""
+    q, values = wp.eig3(0.5 * (a + wp.transpose(a)))
+    kept = wp.vec3(wp.max(values[0], 0.0), wp.max(values[1], 0.0), wp.max(values[2], 0.0))
+    return q * wp.diag(kept) * wp.transpose(q)
+
+
 @wp.kernel(enable_backward=False)
 def finish_leaves(
     # In
@@ -152,13 +162,14 @@ def finish_leaves(
     starts: wp.array[wp.int32],
     columns: wp.array[wp.int32],
     diagonal: wp.array[wp.int32],
+    others: wp.array[wp.mat33],
     # In and out
     blocks: wp.array[wp.mat33],
     # Out
     inverses: wp.array[wp.mat33],
 ):
-    """The finest level's diagonal: stiffness does not answer to translation, so that its rows' blocks sum to zero, and
-    mass; and zeros where nodes are held."""
+    """The finest level's diagonal: stiffness does not answer to translation, so that its rows' blocks sum to zero;
+    mass; and blocks of other forces, if there are any. Zeros where nodes are held."""
     world, i = wp.tid()
     first = world * entries
     own = diagonal[i]
@@ -175,6 +186,10 @@ def finish_leaves(
         if node < mesh_nodes:
             mass = scales[0] / inverse_mass[world * mesh_nodes + node]
             total += mass * wp.identity(n=3, dtype=float)
+            if others.shape[0] > 1:
+                block = others[world * mesh_nodes + node]
+                if wp.trace(block) != 0.0:
+                    total += scales[2] * semidefinite(block)
         inverse = inverse_block(total)
     else:
         total = wp.mat33()

@@ -256,6 +256,50 @@ def test_shared_dilatation_is_preconditioned_by_plain_elements(device):
     assert count <= 40
 
 
+class Ground:
+    """Stiff springs from nodes to the ground along y, one of which pushes."""
+
+    def __init__(self, nodes, stiffness, device):
+        blocks = np.zeros((len(nodes), 3, 3), np.float32)
+        blocks[nodes, 1, 1] = stiffness
+        blocks[np.flatnonzero(nodes)[0], 1, 1] = -1e-3 * stiffness
+        self.blocks = wp.array(blocks, dtype=wp.mat33, device=device)
+
+    def add_stiffness(self, body, p, y):
+        values = y.numpy()
+        values[:, :3] += np.einsum("nij,nj->ni", self.blocks.numpy(), p.numpy()[:, :3])
+        y.assign(values)
+
+    def add_diagonal(self, body, blocks):
+        blocks.assign(blocks.numpy() + self.blocks.numpy())
+
+
+def test_other_forces_count_with_their_diagonal(device, rng):
+    """On the finest level, without what is negative."""
+    mesh = mixed_forest(level=4)
+    operator = operator_of(mesh, device)
+    nodes = mesh.points[:, 2] < 1e-9
+    plain = dense(multigrid_of(operator).levels[0])
+    stiffness = 1e3 * plain.diagonal().max()
+    operator.stiff_forces = (Ground(nodes, stiffness, device),)
+    multigrid = multigrid_of(operator)
+    added = dense(multigrid.levels[0]) - plain
+    expected = np.zeros((len(nodes), 3))
+    expected[nodes, 1] = stiffness
+    expected[np.flatnonzero(nodes)[0]] = 0.0
+    expected[operator.inverse_mass.numpy() == 0.0] = 0.0
+    expected = np.diag(expected[mesh_nodes(multigrid)].ravel())
+    np.testing.assert_allclose(added, expected, rtol=0, atol=1e-4 * stiffness)
+
+
+def test_viscosity_counts_as_stiffness(device):
+    operator = operator_of(uniform(), device)
+    plain = dense(multigrid_of(operator).levels[0])
+    operator.set_scales(0.0, 20.0, 1.0)
+    viscous = dense(multigrid_of(operator, stiffening=0.05).levels[0])
+    np.testing.assert_allclose(viscous, 2.0 * plain, rtol=0, atol=1e-5 * np.abs(plain).max())
+
+
 def test_worlds_do_not_touch(device, rng):
     """A cycle in three worlds is, in each, that of the world alone."""
     mesh = mixed_forest(level=4)

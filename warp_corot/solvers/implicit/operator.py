@@ -57,6 +57,11 @@ class LinearOperator(Protocol):
         """Launch the 3x3 blocks on the diagonal of A, and give their array, mat33 [worlds * nodes]."""
         ...
 
+    def other_blocks(self) -> wp.array:
+        """Launch the 3x3 blocks on K's diagonal of forces besides elasticity, and give their array, mat33
+        [worlds * nodes], which ``diagonal_blocks`` may use, too; an array of one entry if there are none."""
+        ...
+
 
 class Preconditioner(Protocol):
     """An approximate inverse B of an operator: linear, symmetric and positive definite.

@@ -16,7 +16,8 @@ from .tangent import TangentOperator
 
 
 def _multigrid(operator: TangentOperator) -> Multigrid:
-    return Multigrid(operator.body, is_turned=not operator.field.is_linear)
+    stiffening = 0.0 if operator.viscosity is None else operator.viscosity.seconds
+    return Multigrid(operator.body, is_turned=not operator.field.is_linear, stiffening=stiffening)
 
 
 #: By name.

@@ -45,6 +45,7 @@ class TangentOperator:
         self.tangent = field.tangent(exact=exact)
         self.scales = wp.array([0.0, 0.0, 1.0], dtype=wp.float32, device=self.device)
         self._none = wp.zeros(1, dtype=wp.vec4, device=self.device)
+        self._no_blocks = wp.zeros(1, dtype=wp.mat33, device=self.device)
         self._blocks = wp.zeros(0, dtype=wp.mat33, device=self.device)
         self.prepare()
 
@@ -101,6 +102,14 @@ class TangentOperator:
         stiffening = 0.0 if self.viscosity is None else self.viscosity.seconds
         self._launch(finish_blocks, [self.scales, conditions.mass, conditions.inverse_mass, stiffening], [blocks])
         return blocks
+
+    def other_blocks(self) -> wp.array:
+        if not self.stiff_forces:
+            return self._no_blocks
+        self._blocks.zero_()
+        for forces in self.stiff_forces:
+            forces.add_diagonal(self.body, self._blocks)
+        return self._blocks
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         wp.launch(kernel, self.body.sizes.launch_nodes, inputs, outputs, device=self.device)

@@ -49,6 +49,7 @@ class Multigrid:
         is_turned: Whether elements turn; False: linear elasticity.
         stride: Number of bisections from one level to the next, 1 to 3.
         degree: Of the smoother, before and after.
+        stiffening: Viscous over elastic stress at one strain [s], as in the operator's D.
 
     Attributes:
         discretization: The body's.
@@ -58,13 +59,21 @@ class Multigrid:
         InputError: The mesh is no forest, or a stride or degree is out of its range.
     """
 
-    def __init__(self, body: Discretized | Discretization, *, is_turned: bool = True, stride: int = 3, degree: int = 3):
+    def __init__(
+        self,
+        body: Discretized | Discretization,
+        *,
+        is_turned: bool = True,
+        stride: int = 3,
+        degree: int = 3,
+        stiffening: float = 0.0,
+    ):
         if stride not in (1, 2, 3):
             raise InputError(f"stride is {stride!r}; it must be 1, 2 or 3")
         if degree < 1:
             raise InputError(f"degree is {degree!r}; it must be 1 or more")
         self.discretization = discretization_of(body)
-        self.is_turned, self.stride, self.degree = is_turned, stride, degree
+        self.is_turned, self.stride, self.degree, self.stiffening = is_turned, stride, degree, stiffening
         self.revision, self._version = -1, -1
         self.follow()
 
@@ -94,11 +103,11 @@ class Multigrid:
         wp.launch(kernel, dim=leaves, inputs=inputs, outputs=[self._frames], device=self.device)
         found = finest.pattern
         inputs = [discretization.sizes.world_elements, found.entries, elements, self._frames, self._gradients]
-        inputs += [discretization.mu, discretization.lam, discretization.material_stride, scales]
+        inputs += [discretization.mu, discretization.lam, discretization.material_stride, scales, self.stiffening]
         inputs += [found.upper, found.sum_starts, found.codes, found.places]
         finest.launch(values.gather_leaves, len(found.upper), inputs, [finest.blocks])
         inputs = [self.count, self._mesh_nodes, found.entries, self._nodes, inverse_mass, scales, self._free]
-        inputs += [found.starts, found.columns, found.diagonal]
+        inputs += [found.starts, found.columns, found.diagonal, operator.other_blocks()]
         finest.launch(values.finish_leaves, self.count, inputs, [finest.blocks, finest.inverses])
         for transfer in self._transfers:
             transfer.coarse.gather_from(transfer.fine)
