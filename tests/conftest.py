@@ -1,6 +1,11 @@
 """Fixtures: a test that takes ``device`` runs on every device of the machine."""
 
+# ruff: noqa: E402
 import os
+
+# Each worker has a core: threads of linear algebra would wait for one another. NumPy reads this when it is imported.
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
 
 import pytest
 import warp as wp
