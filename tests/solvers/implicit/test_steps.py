@@ -1,8 +1,11 @@
 """Implicit steps: orders against exact motions, supports, worlds, states that they keep, and what they refuse."""
 
+from dataclasses import replace
+
 import numpy as np
 import oracle
 import pytest
+import warp as wp
 from beams import beam, stretched
 from cases import oracle_mesh
 from scipy.linalg import eigh
@@ -275,6 +278,61 @@ def test_quasi_static_steps_are_static_answers(device):
     free = wc.SoftBody(body.mesh, wc.Isotropic(YOUNG, POISSON, DENSITY), device=device)
     with pytest.raises(wc.InputError, match="no node of the body is held"):
         wc.Simulation(free, integrator=wc.QuasiStatic(dt=0.25))
+
+
+class Springs:
+    """Springs from nodes to where these are at rest [N/m]; what they put in counts by itself."""
+
+    def __init__(self, body, nodes, stiffness):
+        self.body, self.stiffness = body, stiffness
+        at_nodes = np.zeros(body.node_count, np.float32)
+        at_nodes[nodes] = stiffness
+        self._of_nodes = wp.array(at_nodes, dtype=wp.float32, device=body.device)
+
+    def add_forces(self):
+        self._add(self.body.state.displacements, self.body.state.forces, -1.0)
+
+    def add_stiffness(self, body, p, y):
+        self._add(p, y, 1.0)
+
+    def add_diagonal(self, body, blocks):
+        wp.launch(add_spring_blocks, body.node_count, [self._of_nodes], [blocks], device=body.device)
+
+    def _add(self, u, f, sign):
+        wp.launch(add_springs, self.body.node_count, [self._of_nodes, sign, u], [f], device=self.body.device)
+
+
+@wp.kernel(enable_backward=False)
+def add_springs(stiffness: wp.array[wp.float32], sign: float, u: wp.array[wp.vec4], f: wp.array[wp.vec4]):
+    i = wp.tid()
+    f[i] = f[i] + sign * stiffness[i] * u[i]
+
+
+@wp.kernel(enable_backward=False)
+def add_spring_blocks(stiffness: wp.array[wp.float32], blocks: wp.array[wp.mat33]):
+    i = wp.tid()
+    blocks[i] = blocks[i] + stiffness[i] * wp.identity(3, dtype=wp.float32)
+
+
+@pytest.mark.parametrize("preconditioner", [None, "diagonal"])
+@pytest.mark.parametrize(
+    "integrator", [wc.BackwardEuler(dt=0.1, damping=10.0), wc.BDF2(dt=0.1, damping=10.0), wc.QuasiStatic(dt=1.0)]
+)
+def test_stiff_springs_are_in_the_tangent(integrator, preconditioner, device):
+    """Springs far stiffer than the body, which steps of this length would make explode without their stiffness: the end
+    that they hold comes to rest where its springs carry what a support there would."""
+    integrator = replace(integrator, preconditioner=preconditioner)
+    body, held = beam(device), beam(device)
+    end = np.flatnonzero(body.mesh.points[:, 2] > 0.19)
+    sim = wc.Simulation(body, integrator=integrator, gravity=(0, -9.8, 0))
+    sim.add_forces(Springs(body, end, 1e5))
+    sim.advance(4.0)
+    held.fix(end)
+    assert wc.solve_static(held, gravity=(0, -9.8, 0)).converged
+    u = body.displacements.numpy().astype(float)
+    assert np.abs(u - held.displacements.numpy()).max() < 1e-4
+    carried = held.reactions.numpy()[end].astype(float)
+    assert (-1e5 * u[end]).sum(0) == pytest.approx(carried.sum(0), abs=0.02 * np.abs(carried).sum())
 
 
 def test_contact_and_remeshing_are_refused():
