@@ -340,3 +340,9 @@ def test_contact_and_remeshing_are_refused():
         wc.Simulation(beam(), integrator=wc.BackwardEuler(), obstacles=wc.Ground())
     with pytest.raises(wc.InputError, match="Newmark knows no remeshing"):
         wc.Simulation(beam(), integrator=wc.Newmark(), remesh=wc.OnlineRemesh())
+
+
+def test_a_page_with_hands_is_refused():
+    pytest.importorskip("viser")
+    with pytest.raises(wc.InputError, match="hands on the page need explicit steps; the integrator is BackwardEuler"):
+        wc.view(wc.Simulation(beam(), integrator=wc.BackwardEuler()), port=0, wait=False)

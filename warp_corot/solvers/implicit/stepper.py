@@ -60,6 +60,7 @@ class ImplicitStepper(Stepper):
 
     def steps(self, count: int, *, forces_known: bool = False) -> None:
         for offset in range(count):
+            self.system.offset = offset
             if forces_known and offset == 0:
                 self.forget_forces()
             for body in self._bodies:
