@@ -10,10 +10,11 @@ from pairs import add_forces
 
 import warp_corot as wc
 from warp_corot.discretization.clusters.pairing import paired
-from warp_corot.discretization.clusters.single import changing_clusters, find_tables, isotropic_material
+from warp_corot.discretization.clusters.single import changing_clusters, find_tables
 from warp_corot.discretization.elements import device_elements
 from warp_corot.discretization.plan import LeafCounts
 from warp_corot.elasticity.paths.clusters import ChangingClusterScatter, ClusterScatter
+from warp_corot.elasticity.structs import isotropic_material
 from warp_corot.kernels.clusters.elements import (
     AlignedElements,
     element_forces,

@@ -14,12 +14,12 @@ from pairs import add_forces
 from thousands import FORESTS, TOLERANCE, materials, meshed, turned
 
 import warp_corot as wc
-from warp_corot.discretization.clusters.single import isotropic_material
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.elasticity.corotated.anisotropic import AnisotropicField
 from warp_corot.elasticity.corotated.anisotropic_general import GeneralAnisotropicField
 from warp_corot.elasticity.corotated.anisotropic_subtrees import as_bytes
 from warp_corot.elasticity.paths.clusters import ClusterScatter
+from warp_corot.elasticity.structs import isotropic_material
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial, fibre_stress
 from warp_corot.kernels.corotated.definite import quaternions_of

@@ -12,9 +12,9 @@ from cases import edge_scale, mixed_forest, oracle_mesh
 from left_out_launches import Launches
 
 import warp_corot as wc
-from warp_corot.discretization.clusters.single import isotropic_material
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.elasticity.corotated.left_out import LeftOutLeaves
+from warp_corot.elasticity.structs import isotropic_material
 from warp_corot.kernels.subtrees.repair import COUNT_STRIDE, LISTS
 
 TOLERANCE = 1e-5  # of the largest force, as in test_miscompile

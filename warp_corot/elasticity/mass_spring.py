@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
-from warp_corot.discretization.clusters.single import isotropic_material
-from warp_corot.discretization.discretization import discretization_of
+from warp_corot.discretization.discretization import Discretization, Discretized, discretization_of
 from warp_corot.discretization.elements import in_worlds, repeated
 from warp_corot.discretization.plan import Plan
 from warp_corot.discretization.slots import Slots
@@ -21,10 +19,7 @@ from warp_corot.kernels.tables.shapes import EDGES
 
 from .dilatation import ELEMENT, refuse_shared
 from .model import ForceField, Model
-
-if TYPE_CHECKING:
-    from warp_corot.discretization.clusters.single import isotropic_material
-from warp_corot.discretization.discretization import Discretization, Discretized
+from .structs import isotropic_material
 
 
 @dataclass(frozen=True)

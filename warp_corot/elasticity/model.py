@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.discretization.clusters.single import isotropic_material
 from warp_corot.discretization.discretization import Discretization, Discretized, discretization_of
 from warp_corot.discretization.plan import FlatLeaves, Plan
 from warp_corot.discretization.subtrees import chosen
@@ -27,7 +26,7 @@ from warp_corot.kernels.elements.forces import (
 from warp_corot.kernels.elements.stiffness_products import law_differential
 
 from .stiffness import ElementStiffness
-from .structs import Kept
+from .structs import Kept, isotropic_material
 from .tangent import Tangent
 
 if TYPE_CHECKING:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+
 S = TypeVar("S")
 
 
@@ -24,3 +26,10 @@ class Kept(Generic[S]):
         if self._struct is None or any(a is not b for a, b in zip(values, self._values, strict=True)):
             self._values, self._struct = values, self._make(*values)
         return self._struct
+
+
+def isotropic_material(given: list) -> IsotropicMaterial:
+    """``kernels.elements.constitutive.IsotropicMaterial`` of mu, lambda and their stride."""
+    material = IsotropicMaterial()
+    material.mu, material.lam, material.stride = given
+    return material

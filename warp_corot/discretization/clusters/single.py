@@ -9,7 +9,6 @@ import warp as wp
 from warp_corot.kernels.clusters.elements import BACKWARDS, SWAPS
 from warp_corot.kernels.clusters.single import Clusters, vec2ul
 from warp_corot.kernels.clusters.tables import find_clusters
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.tables.cluster_layout import DEFAULT_LAYOUT, ClusterLayout
 from warp_corot.kernels.tables.shapes import SQRT2
 
@@ -92,13 +91,6 @@ def _node_count(tets: npt.NDArray[np.int32], layout: ClusterLayout) -> int:
         return 0
     nodes = np.sort(tets[:whole].reshape(-1, layout.corners), axis=1)
     return int((np.diff(nodes, axis=1) != 0).sum())
-
-
-def isotropic_material(given: list) -> IsotropicMaterial:
-    """``kernels.elements.constitutive.IsotropicMaterial`` of mu, lambda and their stride."""
-    material = IsotropicMaterial()
-    material.mu, material.lam, material.stride = given
-    return material
 
 
 def axis_words(frames: npt.NDArray[np.float64]) -> npt.NDArray[np.int32]:
