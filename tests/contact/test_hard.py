@@ -1,0 +1,118 @@
+"""Hard cases: many bodies at once, a sheet folded onto itself, thin things that are fast, tools at random."""
+
+import numpy as np
+import pytest
+
+import warp_corot as wc
+
+DOWN = (0.0, 0.0, -9.81)
+
+
+def turned(rng):
+    """A rotation at random, by quaternions."""
+    w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+@pytest.mark.parametrize("count", [12, pytest.param(1000, marks=pytest.mark.slow)])
+def test_bodies_poured_into_a_bowl_stay_in_it(device, rng, count):
+    """Cubes of 8 mm, each turned as it likes and all of one mesh; the bowl carries their weight in the end."""
+    size = 0.01
+    side = max(int(np.ceil((count / 2) ** (1 / 3))), 2)
+    places = np.array([(i, j, k) for k in range(4 * side) for i in range(side) for j in range(side)][:count])
+    places = 1.5 * size * places + rng.uniform(-1e-3, 1e-3, places.shape)
+    radius = 1.1 * size * side + 0.02
+    places -= [*(0.5 * places.max(axis=0)[:2]), 0.5 * side * size - radius]
+
+    def distance(points):
+        r = np.linalg.norm(points - (0.0, 0.0, radius), axis=1)
+        return np.maximum(np.maximum(radius - r, r - 1.2 * radius), points[:, 2] - radius)
+
+    lower, upper = (-1.4 * radius, -1.4 * radius, -0.4 * radius), (1.4 * radius,) * 3
+    bowl = wc.SignedDistance(distance, lower=lower, upper=upper, resolution=48)
+    cube = wc.TetForest.box(cells=(1, 1, 1), cell_size=0.8 * size, level=0)
+    corners = cube.points - cube.points.mean(axis=0)
+    points = np.concatenate([corners @ turned(rng).T + place for place in places])
+    tets = np.concatenate([cube.tets + k * len(corners) for k in range(count)])
+    body = wc.SoftBody(wc.TetMesh(points, tets), wc.Isotropic(2e4, 0.4, 1000.0), device=device)
+    contact = wc.Contact(self_contact=True)
+    integrator = wc.SymplecticEuler(viscosity=1e-3)
+    sim = wc.Simulation(body, obstacles=bowl, contact=contact, gravity=DOWN, integrator=integrator)
+    sim.advance(0.3 if count < 100 else 0.6)
+    carried = []
+    for _ in range(10):
+        sim.advance(0.01)
+        carried.append(-bowl.wrench.numpy()[0, 2] / (9.81 * body.masses.sum()))
+    now = body.positions.numpy().astype(float)
+    inside = now[now[:, 2] < radius]
+    assert np.linalg.norm(inside - (0.0, 0.0, radius), axis=1).max() < radius + 2e-4
+    assert now[:, 2].min() > -2e-4
+    assert np.mean(carried) == pytest.approx(1.0, rel=0.2)
+    # No cube is in another: they are as far apart as their insides.
+    centres = now.reshape(count, -1, 3).mean(axis=1)
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)[np.triu_indices(count, 1)]
+    assert apart.min() > 0.6 * size
+
+
+@pytest.mark.parametrize("itself", [True, False])
+def test_a_folded_sheet_lies_on_itself(device, itself):
+    """A sheet of 2 mm, whose outer faces are brought to 3 mm from one another; without contact its halves cross."""
+    mesh = wc.TetForest.box(cells=(20, 3, 1), cell_size=0.002, level=0, origin=(-0.02, -0.003, -0.001))
+    body = wc.SoftBody(mesh, wc.Isotropic(5e4, 0.3, 1000.0), device=device)
+    x = mesh.points
+    shares = np.linspace(0.0, 1.0, 17)
+    for sign in (-1.0, 1.0):
+        for s in np.unique(np.round(x[sign * x[:, 0] > 0.0139, 0], 9)):
+            nodes = np.flatnonzero((np.abs(x[:, 0] - s) < 1e-6) & (x[:, 2] < 0.0))
+            angle = 0.5 * np.pi * shares
+            along, up = abs(s) * np.cos(angle) + 0.001 * np.sin(angle), abs(s) * np.sin(angle) - 0.001 * np.cos(angle)
+            way = np.column_stack(
+                [sign * (along + 0.0005 * shares) - s, np.zeros_like(angle), up + 0.001 - 0.003 * shares]
+            )
+            body.prescribe(nodes, times=0.1 * shares, displacements=way)
+    contact = wc.Contact(self_contact=itself)
+    sim = wc.Simulation(body, contact=contact, gravity=(0.0, 0.0, 0.0), integrator=wc.SymplecticEuler(viscosity=1e-4))
+    sim.advance(0.12)
+    now = body.positions.numpy().astype(float)
+    # What lay at x lies before what lay at -x.
+    left = np.flatnonzero((np.abs(x[:, 2] - 0.001) < 1e-6) & (x[:, 0] < -0.0139))
+    right = [int(np.argmin(np.linalg.norm(x - x[k] * (-1.0, 1.0, 1.0), axis=1))) for k in left]
+    crossing = (now[left, 0] - now[right, 0]).max()
+    if itself:
+        assert crossing < 5e-5
+        forces = body.contact_forces.numpy().astype(float)
+        assert np.abs(forces).max() > 1e-3
+        np.testing.assert_allclose(forces.sum(axis=0), 0.0, atol=1e-4 * np.abs(forces).sum())
+    else:
+        assert crossing > 5e-4
+
+
+@pytest.mark.parametrize("speed", [1.0, 10.0, pytest.param(50.0, marks=pytest.mark.slow)])
+def test_a_thrown_sheet_does_not_pass_a_sheet(device, speed):
+    """Two sheets of 2 mm; waves run at 7 m/s in one that is soft, and at 71 m/s in a stiffer one."""
+    material = wc.Isotropic(5e4 if speed < 5.0 else 5e6, 0.3, 1000.0)
+    low, high = (
+        wc.SoftBody(
+            wc.TetForest.box(cells=(6, 6, 1), cell_size=0.002, level=1, origin=(at, at, z)), material, device=device
+        )
+        for at, z in ((0.0, 0.0), (0.0007, 0.0025))
+    )
+    low.fix("(x < xmin + 1e-6) | (x > xmax - 1e-6)")
+    high.velocities = np.tile((0.0, 0.0, -speed), (high.node_count, 1))
+    sim = wc.Simulation([low, high], contact=wc.Contact(), gravity=(0.0, 0.0, 0.0))
+    start = sim.energy().total
+    touched, centre = 0.0, np.abs(low.mesh.points[:, :2] - 0.006).max(axis=1) < 0.003
+    over = np.abs(high.mesh.points[:, :2] - 0.006).max(axis=1) < 0.003
+    for _ in range(12):
+        sim.advance(0.0005 / speed)
+        touched = max(touched, float(high.contact_forces.numpy()[:, 2].sum()))
+        heights = [each.positions.numpy()[near, 2].mean() for each, near in ((low, centre), (high, over))]
+        assert heights[1] - heights[0] > 0.001
+        assert sim.energy().total <= 1.02 * start
+    assert touched > 0.0
