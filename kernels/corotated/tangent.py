@@ -88,3 +88,48 @@ def exact_differential(rotation: wp.Function) -> wp.Function:
         return r * (turning * hooke(strain, mu, lam) + hooke(symmetric(b - turning * strain), mu, lam))
 
     return exact_differential
+
+
+@wp.struct
+class KeptStrains:
+    """Lamé's parameters, and what ``exact_differential`` finds of each element, kept for many products."""
+
+    isotropic: IsotropicMaterial
+    rotations: wp.array[wp.mat33]
+    strains: wp.array[wp.mat33]
+
+
+@functools.cache
+def keep_strains(Elements: type, rotation: wp.Function) -> wp.Kernel:
+    """Write each element's own rotation and strain."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def keep_strains(
+        # In
+        elements: Elements,
+        u: wp.array[wp.vec4],
+        # Out
+        rotations: wp.array[wp.mat33],
+        strains: wp.array[wp.mat33],
+    ):
+        t = wp.tid()
+        q = frame(elements, t)
+        g = local_gradient(elements, t, u)
+        r = rotation(q + g)
+        rotations[t] = r
+        strains[t] = corotated_strain(g, q, r)
+
+    return keep_strains
+
+
+@wp.func
+def kept_differential(elements: Any, t: int, material: KeptStrains, u: wp.array[wp.vec4], dg: wp.mat33):
+    """As ``exact_differential``, with what was kept."""
+    i = t * material.isotropic.stride
+    mu = material.isotropic.mu[i]
+    lam = material.isotropic.lam[i]
+    r = material.rotations[t]
+    strain = material.strains[t]
+    b = wp.transpose(r) * dg
+    turning = wp.skew(rotation_differential(strain, b))
+    return r * (turning * hooke(strain, mu, lam) + hooke(symmetric(b - turning * strain), mu, lam))

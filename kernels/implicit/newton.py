@@ -40,6 +40,8 @@ SHORTEST = wp.constant(wp.float64(1e-7))
 LOOSEST, TIGHTEST = wp.constant(wp.float64(0.1)), wp.constant(wp.float64(1e-5))
 #: The tolerance to which a step is solved for whose size may end the iteration.
 TRUSTED = wp.constant(wp.float64(1e-3))
+#: Relative size of a whole step after which the next one may be the last, and is solved for well.
+NEAR = wp.constant(wp.float64(1e-3))
 
 
 @wp.kernel(enable_backward=False)
@@ -247,7 +249,7 @@ def judge_residual(
                 # No better than what ends the iteration.
                 useful = wp.float64(0.3) * tolerance * compared / now
                 wanted = wp.max(wp.max(wanted, wp.min(useful, LOOSEST)), TIGHTEST)
-                if iterations[world] > 0 and scalars[world, CORRECTION] <= tolerance:
+                if iterations[world] > 0 and scalars[world, CORRECTION] <= NEAR:
                     wanted = wp.min(wanted, TRUSTED)
                 scalars[world, SOLVED_TO] = wanted
                 solve_tolerance[world] = wanted

@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_corot.discretization.elements import Elements
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial
+from warp_corot.kernels.corotated.tangent import KeptStrains
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.stiffness_products import add_stiffness_diagonal, add_stiffness_product
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 #: Structs of materials.
-ElementMaterial: TypeAlias = "IsotropicMaterial | RotatedMaterial | FibreMaterial"
+ElementMaterial: TypeAlias = "IsotropicMaterial | RotatedMaterial | KeptStrains | FibreMaterial"
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,8 @@ from warp_corot.kernels.elements.forces import element_energies, element_von_mis
 from warp_corot.kernels.elements.general_cpu import scatter_law_elements
 from warp_corot.kernels.math.rotation import byers_xu
 
+from .tangents import ExactTangent, RotatedTangent
+
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
 
@@ -184,7 +186,8 @@ class CorotatedField(ForceField):
     def tangent(self, *, exact: bool = False) -> Tangent:
         """As for every field; the rotations are found once. With shared rotations K is never the exact derivative."""
         if exact and self.model.rotation_level is None:
-            return Tangent(self, exact=True)
+            rotation = byers_xu if self.model.rotation == "warm" else self.model.own_rotation
+            return ExactTangent(self, rotation)
         return RotatedTangent(self)
 
     def write_rotations(self, u: wp.array, rotations: wp.array) -> None:
@@ -242,37 +245,6 @@ class CorotatedField(ForceField):
         shared = self._sharing()
         material = self._rotated(isotropic, shared.rotations, shared.units.unit)
         self.launch(kernel, self.element_count, [self.elements, material, u], [output])
-
-
-class RotatedTangent(Tangent):
-    """The paper's R K R^T with rotations that are found once.
-
-    Attributes:
-        rotations: Of the units, mat33 [units].
-    """
-
-    field: CorotatedField
-
-    def __init__(self, field: CorotatedField):
-        super().__init__(field)
-        self.rotations = wp.zeros(0, dtype=wp.mat33, device=field.device)
-
-    def prepare(self, u: wp.array) -> None:
-        super().prepare(u)
-        if len(self.rotations) != self.field.unit_count:
-            self.rotations = wp.zeros(self.field.unit_count, dtype=wp.mat33, device=self.field.device)
-
-    def take(self, u: wp.array) -> None:
-        super().take(u)
-        self.field.write_rotations(u, self.rotations)
-
-    def add_product(self, p: wp.array, y: wp.array) -> None:
-        stiffness, material = self.field.stiffness_with(self.rotations)
-        stiffness.add_product(self.field.elements, material, self.displacements, p, y)
-
-    def add_diagonal(self, blocks: wp.array) -> None:
-        stiffness, material = self.field.stiffness_with(self.rotations)
-        stiffness.add_diagonal(self.field.elements, material, self.displacements, blocks)
 
 
 class LeafField(CorotatedField):
