@@ -266,7 +266,7 @@ def test_dragging_changes_patches_and_no_recording():
 
 
 def test_the_haptic_loop_is_timed(tmp_path):
-    done = run("haptics.py", "--device", "cpu", "--level", "3", "--seconds", "3", "--json", tmp_path / "a.json")
+    done = run("haptics.py", "--device", "cpu", "--level", "3", "--seconds", "1", "--json", tmp_path / "a.json")
     assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "a.json").read_text(encoding="utf-8"))
     assert found["readings"] > 10

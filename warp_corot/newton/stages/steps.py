@@ -24,8 +24,10 @@ from warp_corot.newton.solver import SolverCorotated
 from .stage import StageOptions, stage_model
 from .start import warn_of_overlaps
 
-#: Maximum number of steps that are recorded together, with one measurement; a frame is a whole number of chunks.
+#: Maximum number of steps that are recorded together, with one measurement; a frame is a whole number of chunks. On the
+#: CPU recording a step takes as long as ten steps.
 CHUNK = INTERVAL
+CPU_CHUNK = 16
 #: Solvers of rigid bodies.
 RIGID = ("semi-implicit", "xpbd", "none")
 #: Pairs of soft bodies are searched within this many times their thickness beyond it, and so far pushed out.
@@ -240,7 +242,7 @@ class StageSimulation:
     def _record_steps(self) -> None:
         """Record a chunk of steps that are safe in the current state, if their number has changed."""
         count = steps_per_frame(self.fps, self._longest_step())
-        chunks = -(-count // CHUNK)
+        chunks = -(-count // (CPU_CHUNK if self.parts.model.device.is_cpu else CHUNK))
         self._chunk = -(-count // chunks)
         count = chunks * self._chunk
         if count != self.steps:
