@@ -77,7 +77,8 @@ def report_of(level: int, device: wp.Device, deterministic: bool) -> dict[str, A
     wp.synchronize_device(device)
     ready = time.perf_counter()
     after = used_memory(device)
-    node_bytes = size(device_arrays({k: v for k, v in vars(body).items() if k.startswith("node_")}, set()))
+    of_nodes = [array for array in vars(body.conditions).values() if isinstance(array, wp.array)]
+    node_bytes = size(device_arrays([body.state, of_nodes], set()))
     total = size(device_arrays([body, sim.fields], set()))
     count, nodes = len(mesh.tets), len(mesh.points)
     found = {
