@@ -187,7 +187,7 @@ def test_smoothing_bound_holds(device, rng):
         assert np.linalg.eigvalsh(0.5 * (scaled + scaled.T))[-1] < 4.0
 
 
-@pytest.mark.parametrize(("poisson", "most"), [(0.3, 12), (0.45, 16), (0.49, 32)])
+@pytest.mark.parametrize(("poisson", "most"), [(0.3, 8), (0.45, 10), (0.49, 18)])
 def test_iterations_hardly_grow_with_the_level(poisson, most, device):
     """A clamped beam at levels 6 and 9: to 1e-5; block diagonal preconditioning takes twice as many at each halving."""
     counts = []
@@ -199,13 +199,13 @@ def test_iterations_hardly_grow_with_the_level(poisson, most, device):
     diagonal.update(operator)
     plain = solve(operator, diagonal)
     print(f"Poisson's ratio {poisson}: {counts} iterations, {plain} with block diagonal at the finer level")
-    assert counts[-1] <= counts[0] + 6
+    assert counts[-1] <= counts[0] + 3
     assert max(counts) <= most
     assert plain > 6 * counts[-1]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("poisson", "most"), [(0.3, 12), (0.45, 18), (0.49, 36)])
+@pytest.mark.parametrize(("poisson", "most"), [(0.3, 8), (0.45, 11), (0.49, 24)])
 def test_iterations_at_more_levels(poisson, most, device):
     for level in (6, 9, 12, 15):
         mesh = wc.TetForest.box((1, 1, 3), 0.064, level)
@@ -224,12 +224,12 @@ def test_iterations_on_an_adaptive_organ(case, device, rng):
     options = {"filled to 2 %": {}, "stiffness jumps": {"young": young}, "held inside": {"fixed": fixed}}[case]
     count = iterations(operator_of(mesh, device, poisson=0.45, **options))
     print(f"{case}: {count} iterations")
-    assert count <= {"filled to 2 %": 16, "stiffness jumps": 24, "held inside": 18}[case]
+    assert count <= {"filled to 2 %": 10, "stiffness jumps": 15, "held inside": 10}[case]
 
 
 def test_mass_of_a_step_makes_it_easier(device):
     operator = operator_of(ball(), device, poisson=0.45, mass=60.0**2)
-    assert iterations(operator) <= 10
+    assert iterations(operator) <= 7
 
 
 def test_a_large_grid_of_cubes_has_no_inverse(device):

@@ -12,18 +12,14 @@ from .pattern import Midpoints, Pattern
 
 #: A bound on the eigenvalues of D^-1 A: every part of A is positive semidefinite and couples four nodes.
 LARGEST_EIGENVALUE = 4.0
-#: Over how large a range of these the smoother works.
-SMOOTHED_RANGE = 20.0
 
 
-def smoothing_factors(degree: int, range_: float) -> list[tuple[float, float]]:
+def smoothing_factors(degree: int) -> list[tuple[float, float]]:
     """How much of the preconditioned residual, and of the step before, each step of Chebyshev's iteration takes.
 
-    Args:
-        degree: Number of steps.
-        range_: The largest eigenvalue of D^-1 A over the least that is damped well.
+    It works over the upper part of the eigenvalues of D^-1 A, a part that is larger for more steps.
     """
-    largest, least = LARGEST_EIGENVALUE, LARGEST_EIGENVALUE / range_
+    largest, least = LARGEST_EIGENVALUE, LARGEST_EIGENVALUE / max(2.0 * degree**2, 4.0)
     middle, half = 0.5 * (largest + least), 0.5 * (largest - least)
     factors, rho = [(1.0 / middle, 0.0)], half / middle
     for _ in range(degree - 1):
@@ -41,7 +37,7 @@ class Level:
         worlds: Copies.
         ranks: Nodes of all levels, M.
         free: Which nodes are free, by rank, uint8 [worlds * M].
-        degree, range_: Of the smoother.
+        degree: Of the smoother.
 
     Attributes:
         blocks: Values of the entries, transposed, mat33 [worlds * entries + 1].
@@ -50,7 +46,7 @@ class Level:
         factors: Of the smoother's steps.
     """
 
-    def __init__(self, pattern: Pattern, worlds: int, ranks: int, free: wp.array, degree: int, range_: float):
+    def __init__(self, pattern: Pattern, worlds: int, ranks: int, free: wp.array, degree: int):
         self.pattern, self.worlds, self.ranks, self.free = pattern, worlds, ranks, free
         self.device = pattern.starts.device
         self.count = pattern.count
@@ -60,7 +56,7 @@ class Level:
         self.r, self.z, self.other = (
             wp.zeros(worlds * self.count, dtype=wp.vec4, device=self.device) for _ in range(3)
         )
-        self.factors = smoothing_factors(degree, range_)
+        self.factors = smoothing_factors(degree)
 
     @property
     def matrix(self) -> list[Any]:

@@ -17,15 +17,17 @@ from warp_corot.kernels.tables.shapes import GRADIENT
 from warp_corot.solvers.implicit.operator import LinearOperator
 
 from .coarsest import DenseInverse
-from .level import SMOOTHED_RANGE, Level
+from .level import Level
 from .pattern import Midpoints, Pattern, PatternFinder
 
 #: Levels of more nodes than this are made coarser, while there are coarser ones.
 FEW_NODES = 64
 #: The largest coarsest level that is inverted [nodes].
 MOST_DENSE = 64
-#: The smoother's degree and range on a coarsest level that is larger, as of a grid of many cubes.
-COARSEST_SMOOTHER = (32, 1000.0)
+#: By how much the smoother's degree rises from a level to the next coarser one, which costs little.
+MORE = 2
+#: The smoother's degree on a coarsest level that is not inverted, as of a grid of many cubes.
+COARSEST_DEGREE = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +50,7 @@ class Multigrid:
         body: A body on a forest, or its discretization.
         is_turned: Whether elements turn; False: linear elasticity.
         stride: Number of bisections from one level to the next, 1 to 3.
-        degree: Of the smoother, before and after.
+        degree: Of the smoother on the finest level, before and after.
         stiffening: Viscous over elastic stress at one strain [s], as in the operator's D.
 
     Attributes:
@@ -65,7 +67,7 @@ class Multigrid:
         *,
         is_turned: bool = True,
         stride: int = 3,
-        degree: int = 3,
+        degree: int = 5,
         stiffening: float = 0.0,
     ):
         if stride not in (1, 2, 3):
@@ -160,8 +162,9 @@ class Multigrid:
 
     def _level(self, found: Pattern, counts: list[int]) -> Level:
         """A level with its smoother; the coarsest one's is only used where it is not inverted."""
-        smoother = COARSEST_SMOOTHER if found.count == counts[-1] else (self.degree, SMOOTHED_RANGE)
-        return Level(found, self.discretization.worlds, self.count, self._free, *smoother)
+        k = counts.index(found.count)
+        degree = COARSEST_DEGREE if k == len(counts) - 1 else self.degree + MORE * k
+        return Level(found, self.discretization.worlds, self.count, self._free, degree)
 
     def _counts(self, levels: Levels) -> list[int]:
         """Numbers of nodes of the levels that the cycle has, finest first."""
