@@ -91,7 +91,7 @@ def close_surface(points: np.ndarray, triangles: np.ndarray) -> ClosedSurface:
     if not volume > 0.5 * THINNEST * size * area:
         raise InputError(
             f"the surface encloses no volume ({volume / size**3:.2g} of its length cubed): it has zero thickness, "
-            f"or as much of it is inside out as not"
+            f"or as much of it faces inwards as outwards"
         )
     pieces = int(all_parts.max()) + 1 - cavities
     return ClosedSurface(

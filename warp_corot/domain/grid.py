@@ -43,7 +43,7 @@ def placed_grid(scan: Volume, spacing: Any, origin: Any, affine: Any, unit: str 
     """
     notes: list[str] = []
     if affine is not None and (spacing is not None or origin is not None):
-        raise InputError("both affine and spacing or origin are given; the affine says all of it")
+        raise InputError("affine is given with spacing or origin; it must be given alone, since it contains both")
     if isinstance(scan, str | PathLike | LoadedVolume):
         loaded = scan if isinstance(scan, LoadedVolume) else load_volume(scan)
         values, given, notes, source = loaded.values, loaded.affine, list(loaded.notes), f"{loaded.source}: "
@@ -152,12 +152,12 @@ def _whole(values: np.ndarray) -> np.ndarray:
     if values.dtype.kind in "iu":
         return values
     if values.dtype.kind != "f":
-        raise InputError(f"the volume has dtype {values.dtype}; labels are whole numbers")
+        raise InputError(f"the volume has dtype {values.dtype}; labels must be integers")
     bad = ~(np.isfinite(values) & (values == np.round(values)))
     if bad.any():
         voxel = np.unravel_index(int(np.argmax(bad)), values.shape)
         raise InputError(
-            f"voxel {tuple(map(int, voxel))} of the volume is {values[voxel]:g}; labels are whole numbers "
+            f"voxel {tuple(map(int, voxel))} of the volume is {values[voxel]:g}; labels must be integers "
             f"(probability maps: Domain.from_probabilities)"
         )
     return values.astype(np.int64)
@@ -190,10 +190,10 @@ def labels_from_probabilities(maps: Mapping[str, npt.ArrayLike], *, certain: flo
     for place, (name, values) in enumerate(arrays.items(), start=1):
         if values.shape != first.shape:
             raise InputError(
-                f"the map {name!r} has shape {values.shape} and {first_name!r} {first.shape}; not the same"
+                f"the map {name!r} has shape {values.shape} and {first_name!r} {first.shape}; all must have the same"
             )
         if values.dtype.kind not in "fiu":
-            raise InputError(f"the map {name!r} has dtype {values.dtype}; probabilities are numbers")
+            raise InputError(f"the map {name!r} has dtype {values.dtype}; probabilities must be numbers")
         low, high = values.min(initial=0), values.max(initial=0)
         if not (low >= -1e-6 * certain and high <= certain * (1.0 + 1e-6)):
             raise InputError(f"the map {name!r} runs from {low:g} to {high:g}; it must be within 0 to {certain:g}")

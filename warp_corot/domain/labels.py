@@ -203,7 +203,7 @@ def _extent(inside: np.ndarray) -> np.ndarray:
     for axis in range(3):
         taken = np.flatnonzero(inside.any(axis=tuple({0, 1, 2} - {axis})))
         if not len(taken):
-            raise InputError("the volume is empty: no voxel bears a label")
+            raise InputError("the volume is empty: no voxel has a label")
         lows.append(taken[0])
         highs.append(taken[-1] + 1)
     return np.array([lows, highs])

@@ -80,10 +80,10 @@ def in_units(given: str | float, unit: str) -> float:
     if isinstance(given, int | float | np.number) and not isinstance(given, bool):
         return float(given)
     if not isinstance(given, str):
-        raise InputError(f"{given!r} is no number with or without a unit")
+        raise InputError(f"{given!r} is not a number, with or without a unit")
     match = _NUMBER.match(given)
     if not match:
-        raise InputError(f"{given.strip()!r} is no number with or without a unit")
+        raise InputError(f"{given.strip()!r} is not a number, with or without a unit")
     number, words = float(match[0]), given[match.end() :].strip()
     return number * _factor(words, unit, given) if words else number
 
@@ -97,11 +97,11 @@ def _factor(words: str, unit: str, given: str) -> float:
     text = re.sub(r"(?<=[A-Za-zµ])([23])(?![\w.])", r"^\1", text)
     # Pint evaluates what looks like a formula; names, powers, products and quotients are enough.
     if not re.fullmatch(r"(?:1|[A-Za-zµΩ_]+)(?:\^-?[1-4])?(?:\s*[*/ ]\s*[A-Za-zµΩ_]+(?:\^-?[1-4])?)*", text):
-        raise InputError(f"{given.strip()!r}: {words!r} is no unit")
+        raise InputError(f"{given.strip()!r}: {words!r} is not a unit")
     try:
         return float(_registry().Quantity(1.0, text).to(unit).magnitude)
     except pint.DimensionalityError:
-        raise InputError(f"{given.strip()!r}: {words!r} is no unit like {unit}") from None
+        raise InputError(f"{given.strip()!r}: {words!r} is not a unit like {unit}") from None
     except Exception:
         raise InputError(f"{given.strip()!r}: the unit {words!r} is not known{meant(words, USUAL)}") from None
 
@@ -151,12 +151,12 @@ def check_float32(bounds: np.ndarray) -> None:
     least, most = FLOAT32_SIZES
     if not least <= size <= most:
         raise InputError(
-            f"the body is {size:.3g} m long; float32, in which all is computed, wants {least:g} to {most:g} m"
+            f"the body is {size:.3g} m long; it must be {least:g} to {most:g} m long, since it is computed in float32"
         )
     if far > FLOAT32_DISTANCE * size:
         raise InputError(
-            f"the body is {length(size)} long and reaches {length(far)} from the origin; float32, in which all is "
-            f"computed, wants it within {FLOAT32_DISTANCE:g} times its length: move it nearer"
+            f"the body is {length(size)} long and reaches {length(far)} from the origin; it must be within "
+            f"{FLOAT32_DISTANCE:g} times its length, since it is computed in float32: move it nearer"
         )
 
 

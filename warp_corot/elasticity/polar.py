@@ -26,7 +26,7 @@ def rotation_function(method: str, iterations: int | None = None) -> wp.Function
     """
     if iterations is not None:
         if method != "byers-xu":
-            raise InputError(f"iterations is {iterations}; only 'byers-xu' takes a fixed number, not {method!r}")
+            raise InputError(f"iterations is {iterations}; it must be None for the method {method!r}")
         if isinstance(iterations, bool) or iterations != int(iterations) or not 2 <= iterations <= MAX_ITERATIONS:
             raise InputError(f"iterations is {iterations}; it must be None or an integer from 2 to {MAX_ITERATIONS}")
         return byers_xu_fixed(int(iterations))
@@ -68,7 +68,7 @@ def polar_rotation(
     if matrices.shape[-2:] != (3, 3) or matrices.ndim not in (2, 3):
         raise InputError(f"F has shape {matrices.shape}; it must be [n, 3, 3]")
     if guess is not None and method != "warm":
-        raise InputError(f"guess goes with the method 'warm', not {method!r}")
+        raise InputError(f"a guess is given; the method must be 'warm', not {method!r}")
     where = checked_device(device)
     with np.errstate(over="ignore"):
         flat = np.ascontiguousarray(matrices.reshape(-1, 3, 3), dtype=np.float32)

@@ -30,23 +30,23 @@ if TYPE_CHECKING:
 
 Floats = npt.NDArray[np.float64]
 
-#: Speed [m/s] and rate of turning [rad/s] of a hand that the bound on energy counts with.
+#: Speed [m/s] and angular speed [rad/s] of a hand that the bound on energy assumes.
 SPEED, TURN_RATE = 1.0, 10.0
-#: A force is kept this long without a new state of the simulation, and fades in the same time after that [s].
+#: Without a new state of the simulation, a force stays for this time and then fades in the same time [s].
 PATIENCE = 0.25
-#: Threads that run Python code let the loop's thread go first after so long [s].
+#: Python threads yield to the loop's thread after this time [s].
 SWITCH = 2e-4
 #: Time between two publications of ``run`` [s].
 EVERY = 0.002
 
 
 class HapticLoop:
-    """Runs a haptic device against a tool of a simulation, from a thread of its own.
+    """Connects a haptic device to a tool of a simulation, in its own thread.
 
     The loop reads the device, lets the tool follow it, takes the newest state of the tool that the simulation has
     published, without waiting, and writes the force of a local model (`local_model`), bounded in energy
-    (`passivity`). Meanwhile somebody steps the simulation: ``run``, or any loop of ``sim.advance``. The force of a
-    simulation that stops fades.
+    (`passivity`). Meanwhile the caller steps the simulation, by ``run`` or by calls of ``sim.advance``. When the
+    simulation stops, the force fades.
 
     Args:
         sim: The simulation, of one world, with the tool among its obstacles.
@@ -84,7 +84,7 @@ class HapticLoop:
         if not any(each is tool for each in given):
             raise InputError(f"tool is {shown(tool)}; it must be a Tool among the simulation's obstacles")
         if sim.worlds > 1:
-            raise InputError(f"the simulation has {sim.worlds} worlds; a hand is in one")
+            raise InputError(f"the simulation has {sim.worlds} worlds; it must have one")
         if not isinstance(device, Device):
             raise InputError(f"device is {shown(device)}; it must have the methods read() and write(force, torque)")
         self.period = 1.0 / _positive(rate, "rate", "1/s")

@@ -90,7 +90,7 @@ class TetForest(ForestArrays):
             raise InputError(f"origin is {origin}; it must be three finite coordinates in metres")
         count = 6 * math.prod(cells) << level
         if count > MAX_LEAVES:
-            raise InputError(f"level is {level}: that is {count} tetrahedra; there can be {MAX_LEAVES} at most")
+            raise InputError(f"level is {level}, which gives {count} tetrahedra; there must be at most {MAX_LEAVES}")
         lattice, ends, tets = uniform_leaves(cells, level)
         lattice <<= LATTICE_BITS - halvings(level)
         x, y, z = (float(c) for c in corners)

@@ -73,7 +73,7 @@ class TetMesh:
         if given.ndim != 2 or given.shape[1] != 4 or not len(given):
             raise InputError(f"tets has shape {given.shape}; it must be [T, 4] with at least one tetrahedron")
         if not np.issubdtype(given.dtype, np.integer):
-            raise InputError(f"tets has dtype {given.dtype}; node indices are whole numbers")
+            raise InputError(f"tets has dtype {given.dtype}; node indices must be integers")
         if up_axis not in ("X", "Y", "Z"):
             raise InputError(f"up_axis is {up_axis!r}; it must be 'X', 'Y' or 'Z'")
         if not 0 < checked_number(scale, "scale") < np.inf:

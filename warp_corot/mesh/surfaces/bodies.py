@@ -38,7 +38,7 @@ def surface(forest: ForestArrays) -> SurfaceMesh:
 def separating_surface(forest: ForestArrays) -> SurfaceMesh:
     """See `TetForest.separating_surface`."""
     if forest.phi is None or forest.node_labels is None:
-        raise InputError("this mesh has no labels; they come from a domain that has")
+        raise InputError("this mesh has no labels; it must be made from a domain that has labels")
     if forest.detail is not None:
         return _embedded(forest, forest.detail.separating_surface())
     return _on_nodes(forest, separated(forest.lattice_points, _all_cut(forest), forest.phi, forest.node_labels))
