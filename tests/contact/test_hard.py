@@ -116,3 +116,40 @@ def test_a_thrown_sheet_does_not_pass_a_sheet(device, speed):
         assert heights[1] - heights[0] > 0.001
         assert sim.energy().total <= 1.02 * start
     assert touched > 0.0
+
+
+@pytest.mark.parametrize("seconds", [0.15, pytest.param(5.0, marks=pytest.mark.slow)])
+def test_a_tool_at_random_leaves_an_organ_whole(device, rng, seconds):
+    """A ball of 12 mm presses and shears a body of 60 mm at up to 1 m/s, and then goes away."""
+    mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.03, device=device), target_elements=1500, device=device)
+    points = mesh.points
+    size = np.ptp(points[:, 2])
+    body = wc.SoftBody(mesh, wc.Isotropic(2e4, 0.45, 1000.0), device=device)
+    body.fix(np.flatnonzero(points[:, 2] < points[:, 2].min() + 0.3 * size))
+    count = int(seconds / 0.05) + 1
+    toward = rng.normal(size=(count, 3))
+    toward[:, 2] = np.abs(toward[:, 2]) + 0.3
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    far = rng.uniform(0.35, 0.7, (count, 1)) * size
+    far[0], far[-1] = 0.9 * size, 2.0 * size
+    tool = wc.Tool(wc.Sphere(0.006))
+    tool.follow(0.05 * np.arange(count), toward * far)
+    contact = wc.Contact(friction=0.5, self_contact=seconds > 1.0)
+    integrator = wc.SymplecticEuler(viscosity=2e-3)
+    sim = wc.Simulation(body, obstacles=tool, contact=contact, gravity=(0.0, 0.0, 0.0), integrator=integrator)
+    felt, outside = 0.0, np.unique(body.surface_triangles)
+    while sim.time < seconds - 1e-9:
+        sim.advance(0.01)
+        x = body.positions.numpy().astype(float)
+        pose = sim.contact.obstacles.poses()[0, 0, :3]
+        assert np.linalg.norm(x[outside] - pose, axis=1).min() > 0.0059
+        felt = max(felt, float(np.linalg.norm(tool.wrench.numpy()[0][:3])))
+    sim.advance(0.1)
+    assert felt > 0.05
+    now = body.positions.numpy().astype(float)
+    volumes = [
+        np.linalg.det(np.stack([x[mesh.tets[:, k]] - x[mesh.tets[:, 0]] for k in (1, 2, 3)], axis=1))
+        for x in (now, points)
+    ]
+    assert (volumes[0] / volumes[1]).min() > 0.0
+    assert np.linalg.norm(now - points, axis=1).max() < 0.1 * size
