@@ -42,7 +42,7 @@ class Load:
         kind: "pull", "twist" or "press".
         patch: The expression.
         values: Displacement [m], angle [degrees] or pressure [Pa].
-        times: Increasing [s]; () for a ramp as long as is said elsewhere.
+        times: Increasing [s]; () for a ramp whose length is given elsewhere.
         shares: Fractions of the values at these times; linear in between, constant before and after.
         axis: Axis of a twist; None: the mean normal of the patch's surface.
     """

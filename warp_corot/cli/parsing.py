@@ -7,7 +7,7 @@ from typing import Any
 
 
 class StrictParser(argparse.ArgumentParser):
-    """Accepts neither abbreviations nor ``--`` as a value, of which argparse makes an empty list."""
+    """Accepts neither abbreviations nor ``--`` as a value, which argparse turns into an empty list."""
 
     def __init__(self, **options: Any):
         options.setdefault("allow_abbrev", False)

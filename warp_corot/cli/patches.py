@@ -1,4 +1,4 @@
-"""Parts of a body that options name: expressions, regions of every body, and those of ``--patch``."""
+"""Parts of a body that options name: expressions, regions of every body, and patches of ``--patch``."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class _Parser(StrictParser):
 
 
 def bodies_of(args: argparse.Namespace) -> list[argparse.Namespace]:
-    """The options of each body: the command's, or those of the run file with the command's added.
+    """The options of each body: the command's, or the run file's with the command's added.
 
     Raises:
         InputError: No such file, not TOML, or a key that is not an option.

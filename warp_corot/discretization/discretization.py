@@ -156,7 +156,7 @@ class Discretized(Protocol):
 
 
 def discretization_of(body: Discretized | Discretization) -> Discretization:
-    """A body's discretization, or one given as such."""
+    """The discretization of a body, or the given discretization itself."""
     return body if isinstance(body, Discretization) else body.discretization
 
 
@@ -189,7 +189,7 @@ class FixedMesh(Discretization):
 
     @classmethod
     def of_lame(cls, mesh: Mesh, mu: npt.ArrayLike, lam: npt.ArrayLike, worlds: int, device: wp.Device) -> FixedMesh:
-        """One of which nothing is known but Lamé's parameters [Pa], numbers or [worlds, T]: enough for forces."""
+        """Make one from Lamé's parameters alone [Pa], numbers or [worlds, T]: enough for forces."""
         made = cls.__new__(cls)
         made._material = None
         made._fill_in(mesh, mu, lam, worlds, device)

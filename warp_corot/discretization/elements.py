@@ -49,7 +49,7 @@ def in_worlds(indices: np.ndarray, worlds: int, count: int) -> np.ndarray:
     Args:
         indices: int32 [n, …].
         worlds: How many worlds.
-        count: How many things, of which these are indices, there are in one world.
+        count: Number of things in one world that the indices refer to.
 
     Returns:
         int32 [worlds * n, …].

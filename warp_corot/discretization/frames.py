@@ -1,4 +1,4 @@
-"""All local frames that tetrahedra of a forest can have, and those of the children and parents of each."""
+"""All local frames that tetrahedra of a forest can have, and the frames of their children and parents."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class TreeNodes:
 
     @classmethod
     def of_mesh(cls, mesh: Mesh, device: wp.Device) -> TreeNodes:
-        """Those of a mesh on the host.
+        """The levels of a mesh on the host.
 
         Raises:
             InputError: A general mesh.
@@ -118,7 +118,7 @@ class Levels:
 
         Args:
             x: vec4 [worlds * M], changed in place at nodes of the levels coarse + 1 … fine.
-            coarse: The level of which all nodes have values.
+            coarse: The level at which all nodes have values.
             fine: The level up to which values are found; None: the finest.
 
         Raises:

@@ -38,7 +38,7 @@ class Domain(SignedFunction):
         """The domain of one label alone.
 
         Raises:
-            InputError: No such label; the message lists those there are.
+            InputError: The domain has no label of this name; the message lists its labels.
         """
         return _Made(super().part(name))
 

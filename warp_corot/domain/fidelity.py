@@ -209,7 +209,7 @@ def _distances(surface: SurfaceMesh, points: np.ndarray, device: wp.Device) -> n
 
 
 def _lost_pieces(mesh: Any, points: np.ndarray, piece: np.ndarray, distances: np.ndarray) -> int:
-    """Pieces of the body of which no point is in an element."""
+    """Pieces of the body with no point in an element."""
     near = np.unique(piece, return_index=True)[1]
     if not hasattr(mesh, "embed") or len(near) == 1:
         return 0

@@ -138,7 +138,7 @@ def _bounds_around(own: int, holders: list[np.ndarray], outward: np.ndarray) -> 
 
 
 def _crossings(points: np.ndarray, triangles: np.ndarray, part: np.ndarray, device: wp.Device) -> np.ndarray:
-    """Pairs of parts of which an edge of one goes through a triangle of the other [n, 2]."""
+    """Pairs of parts where an edge of one passes through a triangle of the other [n, 2]."""
     edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     edges, first = np.unique(edges, axis=0, return_index=True)
     own = part[first // 3]

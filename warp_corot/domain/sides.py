@@ -19,7 +19,7 @@ ASIDE, LEAST_ASIDE = 1.0e-3, 2.0e-6
 MESSY = 2.0e-3
 #: Two triangles whose unit normals add up to less lie on one another, nearly.
 FOLDED = 0.05
-#: Patches of which winding numbers are looked at; more are not worth it.
+#: Winding numbers are computed for this number of patches; more are not worth the time.
 MOST_PATCHES = 20_000
 #: Points near the surface at which what was found is tried.
 TRIED = 4096

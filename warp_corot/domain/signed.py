@@ -108,7 +108,7 @@ class SignedFunction:
         """The domain of one label alone.
 
         Raises:
-            InputError: No such label; the message lists those there are.
+            InputError: The domain has no label of this name; the message lists its labels.
         """
         there = ", ".join(self.label_names) or "none"
         raise InputError(f"there is no label {name!r} in this domain; its labels: {there}")
@@ -133,7 +133,7 @@ class SignedFunction:
         raise NotImplementedError
 
     def _labels(self, points: wp.array) -> wp.array:
-        """Labels int32 [n] on the points' device; outside the body those of the nearest part."""
+        """Labels int32 [n] on the points' device; outside the body the labels of the nearest part."""
         raise NotImplementedError
 
     def _thickness(self, points: wp.array, along: wp.array, reach: float, side: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Quantities with units, a guess at a unit that nobody names, and a word on bodies of unlikely size."""
+"""Quantities with units, a guess at a unit that is not named, and warnings about bodies of unlikely size."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from warp_corot.errors import InputError
 from warp_corot.inputs.likely import meant
 
-#: Units that somebody may have meant.
+#: Units that a user may have meant.
 USUAL = (
     "Pa",
     "kPa",
@@ -35,9 +35,9 @@ USUAL = (
 UNITS = {"m": 1.0, "cm": 1.0e-2, "mm": 1.0e-3}
 #: What a number looks like at the beginning of a quantity.
 _NUMBER = re.compile(r"\s*[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|inf(?![a-z])|nan(?![a-z]))")
-#: Bodies and scans this long in their unit are taken to be in mm where nobody names one: organs, limbs, people.
+#: Bodies and scans of this length are assumed to be in mm if no unit is named: organs, limbs, people.
 SMALLEST_IN_MM, SMALLEST_SCAN, LARGEST_IN_MM = 50.0, 10.0, 2500.0
-#: Bodies outside this range [m] are probably given in another unit than is said.
+#: Bodies outside this range [m] are probably given in a different unit.
 SMALLEST, LARGEST = 1.0e-3, 100.0
 #: Lengths [m], and distances from the origin in lengths, that float32 computes with.
 FLOAT32_SIZES = 1.0e-6, 1.0e6

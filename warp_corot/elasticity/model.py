@@ -49,7 +49,7 @@ class ForceField(ABC):
         is_linear: Whether forces are linear in displacements.
 
     Raises:
-        InputError: The body's material is anisotropic and the field does not know such.
+        InputError: The body's material is anisotropic, and the field supports only isotropic ones.
     """
 
     takes_anisotropic: ClassVar[bool] = False
@@ -195,13 +195,13 @@ class ForceField(ABC):
 
     @property
     def isotropic(self) -> IsotropicMaterial:
-        """Lamé's parameters for forces and energies: those of what elements hold of the body."""
+        """Lamé's parameters for forces and energies, scaled by the filled share of each element."""
         discretization = self.discretization
         return self._isotropic(discretization.mu, discretization.lam, discretization.material_stride)
 
     @property
     def isotropic_shown(self) -> IsotropicMaterial:
-        """The same for stresses: those of the material."""
+        """Lamé's parameters for stresses: the material's own."""
         return isotropic_material(list(self.discretization.lame))
 
     def isotropic_of(self, flat: FlatLeaves) -> IsotropicMaterial:

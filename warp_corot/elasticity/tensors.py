@@ -49,7 +49,7 @@ def has_tensor(model: Model, material: object) -> bool:
 
 
 def cauchy_stress(model: Model, f: Tensors, young: npt.ArrayLike, poisson: npt.ArrayLike) -> Tensors:
-    """Cauchy stress [Pa], [T, 3, 3], of which `Simulation.von_mises` is the equivalent stress.
+    """Cauchy stress [Pa], [T, 3, 3]; `Simulation.von_mises` is its equivalent stress.
 
     Of Corotated it is the stress of the law, R (2 mu e + lambda tr(e) I) R^T with e = sym(R^T F) - I, of Linear that of
     small strains: both without the factor 1 / J.

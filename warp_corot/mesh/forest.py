@@ -172,7 +172,8 @@ class TetForest(ForestArrays):
 
         A leaf with an active midpoint on any edge must be bisected itself, until none has (the closure of the set of
         midpoints). Nodes keep their numbers; new ones are appended. What was void stays void, the surface stays where
-        it is, and both halves of a leaf have its share of the body and its label: for more detail mesh the domain anew.
+        it is, and both halves of a leaf have its share of the body and its label; for more detail, mesh
+        the domain again.
 
         Args:
             leaves: Mask bool [T] or indices into the leaves.

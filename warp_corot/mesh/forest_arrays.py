@@ -88,7 +88,7 @@ class ForestArrays:
         """Leaves whose label this is, bool [T].
 
         Raises:
-            InputError: No such label.
+            InputError: The mesh has no label of this name.
         """
         if label not in self.label_names or self.labels is None:
             raise InputError(f"there is no label {label!r}; there are: {', '.join(self.label_names) or 'none'}")
@@ -98,7 +98,7 @@ class ForestArrays:
         """Nodes of the leaves whose label this is, bool [N]; nodes on a border belong to both sides.
 
         Raises:
-            InputError: No such label.
+            InputError: The mesh has no label of this name.
         """
         found = np.zeros(self.node_count, bool)
         found[self.tets[self.elements_of(label)]] = True

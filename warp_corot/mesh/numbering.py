@@ -68,6 +68,6 @@ def pruned(tree: Tree, empty: np.ndarray) -> tuple[Tree, np.ndarray]:
 
 
 def live_or_void(tree: Tree, live: np.ndarray) -> Tree:
-    """The tree with those of its leaves live that are in a mask bool [M]."""
+    """The tree in which the leaves in a mask bool [M] are live."""
     leaf = np.where(live, np.int32(LIVE), np.int32(VOID))
     return Tree(tree.tets, tree.level, tree.parent, np.where(tree.first_child < 0, leaf, tree.first_child))

@@ -153,7 +153,7 @@ class TetMesh:
         """Tetrahedra of a region, bool [T].
 
         Raises:
-            InputError: No such region.
+            InputError: The mesh has no region of this name.
         """
         if label not in self.label_names or self.labels is None:
             raise InputError(f"there is no label {label!r}; there are: {', '.join(self.label_names) or 'none'}")
@@ -163,7 +163,7 @@ class TetMesh:
         """Nodes of the tetrahedra of a region, bool [N]; nodes on a border belong to both sides.
 
         Raises:
-            InputError: No such region.
+            InputError: The mesh has no region of this name.
         """
         found = np.zeros(len(self.points), bool)
         found[self.tets[self.elements_of(label)]] = True

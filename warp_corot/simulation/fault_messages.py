@@ -1,4 +1,4 @@
-"""What is said of a state that has gone wrong."""
+"""Messages about a state that has gone wrong."""
 
 from __future__ import annotations
 

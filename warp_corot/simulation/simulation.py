@@ -189,12 +189,12 @@ class Simulation:
     def step(self) -> None:
         """Advance by one time step.
 
-        Inside somebody else's capture on this device the step's launches are recorded, nothing else: no hooks are
-        called, nothing is checked, and the step has the length that the last run left. On CUDA the call does not wait
-        for the device unless hooks are set or bodies are remeshed.
+        Inside a caller's capture on this device only the step's launches are recorded: no hooks are called, nothing is
+        checked, and the step has the length that the last run left. On CUDA the call does not wait for the device
+        unless hooks are set or bodies are remeshed.
 
         Raises:
-            InputError: Somebody is capturing, and there are bodies to be remeshed; or a ``wp.Tape`` is recording, since
+            InputError: The caller is capturing, and bodies are to be remeshed; or a ``wp.Tape`` is recording, since
                 steps have no adjoint.
             UnstableError: On the CPU: the state is not finite any more, or nodes are far beyond reach, which is looked
                 at every few hundred steps. No step is made again here, as ``advance`` does, and energies are not looked
@@ -262,7 +262,7 @@ class Simulation:
     def reset(self, worlds: npt.ArrayLike | wp.array | None = None) -> None:
         """Put worlds back to their initial state: rest, or what ``SoftBody.set_initial_state`` took as such.
 
-        Their prescribed motions begin anew; materials, loads and held nodes stay as they are. A body that is remeshed
+        Their prescribed motions begin again; materials, loads and held nodes stay as they are. A body that is remeshed
         goes back to the mesh of that state, with the loads and held nodes that this mesh had last. The clock goes on
         unless all worlds are reset by ``reset()``.
 
@@ -373,7 +373,7 @@ class Simulation:
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _find_stable_steps(self) -> list[float]:
-        """The largest stable step of each body at rest [s], of which ``stable_dt`` is the smallest."""
+        """The largest stable step of each body at rest [s]; ``stable_dt`` is the smallest of them."""
         if self.integrator.is_implicit:
             self.stable_dt = math.inf
             return [math.inf] * len(self.bodies)
@@ -423,7 +423,7 @@ class Simulation:
             self._control_step()
 
     def _control_step(self) -> None:
-        """Find the stable step anew where the elements that limit it are others now."""
+        """Find the stable step again if other elements limit it now."""
         if not self.remeshing.step_may_change():
             return
         stable = self._find_stable_steps()

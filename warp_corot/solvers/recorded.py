@@ -65,7 +65,7 @@ class Segment:
         return replace(self, begins=begins, publishes=ends, ends=ends, whole=whole)
 
     def pieces(self, longest: int, *, edges: bool = False) -> Iterator[Segment]:
-        """The same in pieces of a power of two steps, at most ``longest``, of which there are few different ones.
+        """The same in pieces of a power of two steps, at most ``longest``, so that few pieces differ.
 
         With ``edges`` the first and the last piece are single steps: they have most of the differences.
         """
@@ -129,7 +129,7 @@ class RecordedSteps:
         return (BLOCK_INTERVAL if self.in_blocks else INTERVAL) * (2 if self.calm == CALM_CHECKS else 1)
 
     def launch(self, segment: Segment) -> None:
-        """Launch a segment; somebody else may be recording."""
+        """Launch a segment; the caller may be recording."""
         if segment.begins:
             self._guard.launch_begin()
         if segment.adopts:

@@ -219,7 +219,7 @@ class System:
                 complete()
 
     def adopt_positions(self) -> None:
-        """Take over what somebody wrote to positions since they were published."""
+        """Take over positions that a user wrote since they were published."""
         for body in self.bodies:
             body.state.adopt_positions()
 

@@ -133,7 +133,7 @@ class Range:
         self.highest = 0.0
 
     def follow(self, largest: float) -> float:
-        """The highest value of the range, after values of which this is the largest."""
+        """The upper end of the range, after values with this maximum."""
         if largest > self.highest or largest < self.highest / TOO_WIDE:
             self.highest = round_limit(largest)
         return self.highest

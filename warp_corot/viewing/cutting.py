@@ -148,7 +148,7 @@ def _facing(
     mesh: Any,
     beyond: npt.NDArray[np.float64],
 ) -> npt.NDArray[np.integer]:
-    """Triangles of the section wound so that they face what was taken away, without those of no area."""
+    """Triangles of the section, wound to face the removed part, without triangles of zero area."""
     far, near = mesh.points[np.argmax(beyond)], mesh.points[np.argmin(beyond)]
     a, b, c = np.moveaxis(points[faces], 1, 0)
     normal = np.cross(b - a, c - a)

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 STEPPING = 0.4
 #: A frame is not to be longer than this many times its period, whatever was late.
 MOST_LATE = 2.0
-#: Time goes by slowly below this share of what was asked for.
+#: Time counts as slow below this share of the requested speed.
 SLOW = 0.9
 
 
 @dataclass
 class Pace:
-    """How fast simulated time goes by.
+    """The speed of simulated time.
 
     Attributes:
         rate: Simulated seconds a second of stepping, lately.
@@ -41,7 +41,7 @@ class Pace:
         return min(asked, most)
 
     def is_slow(self, speed: float) -> bool:
-        """Whether less time goes by than was asked for."""
+        """Whether simulated time is slower than requested."""
         return 0.0 < self.ratio < SLOW * speed
 
     def took(self, simulated: float, stepping: float, rest: float) -> None:

@@ -147,7 +147,7 @@ class Panel:
 
 
 def state_words(frame: Frame, session: Session) -> str:
-    """Time, how fast it goes by, what colours mean, and what the person should know."""
+    """The time, its speed, the meaning of colours, and notes for the visitor."""
     controls = session.controls
     pace = "time stands still"
     if controls.running:

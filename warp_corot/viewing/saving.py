@@ -34,7 +34,7 @@ FPS, SECONDS = 24.0, 4.0
 
 
 class Cancelled(Exception):
-    """The visitor wants no more of it."""
+    """The visitor has cancelled."""
 
 
 class Saving:

@@ -89,7 +89,7 @@ class Springs:
         return self._bodies[body].hold(patch, rigid, strength)
 
     def refit(self) -> None:
-        """Find the stiffness anew where meshes, or their nodes' masses, are others now."""
+        """Find the stiffness again if the meshes or their nodes' masses have changed."""
         for springs in self._bodies.values():
             springs.refit()
 

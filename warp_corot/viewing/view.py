@@ -88,7 +88,7 @@ class View:
         return self.session.sim
 
     def run(self) -> None:
-        """Let time go on, until ``close`` or an exception such as Ctrl-C's."""
+        """Run until ``close`` or an exception, for example Ctrl-C's."""
         while not self._over.is_set():
             started = time.perf_counter()
             with self._lock:

@@ -83,7 +83,7 @@ class RemeshPass:
         """Change the mesh by marks instead of the criterion.
 
         Args:
-            marks: 1 for leaves to be bisected, -1 for such as may be given up, 0 for the others, [T].
+            marks: 1 for leaves to bisect, -1 for leaves that may be merged, 0 for the others, [T].
 
         Raises:
             InputError: Not one of these for each leaf.
@@ -98,7 +98,7 @@ class RemeshPass:
         self._replay(marked=True)
 
     def launch(self, *, marked: bool = False) -> None:
-        """Launch a pass, or record it within somebody else's capture; ``marked``: the marks are there already."""
+        """Launch a pass, or record it within the caller's capture; ``marked``: the marks exist already."""
         forest = self.forest
         pools, carried, edges, removal = forest.pools, forest.carriage.arrays, self._edges, self._removal
         self._once(pool_kernels.begin_pass, pools)

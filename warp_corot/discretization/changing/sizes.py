@@ -9,7 +9,7 @@ SLACK = 0.8
 def launch_size(count: int, present: int, granule: int = 1, limit: int | None = None) -> int:
     """A size for launches over ``count`` things and some padding, seldom another one than the present.
 
-    A size that is found anew is at most a sixteenth, or one granule, too large.
+    A new size is too large by at most a sixteenth or one granule.
 
     Args:
         count: How many things there are.

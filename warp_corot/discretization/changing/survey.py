@@ -1,4 +1,4 @@
-"""When the stable step of a mesh that changes must be found anew."""
+"""When the stable step of a changing mesh must be found again."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Survey:
         self.last.changes += 1
 
     def step_may_change(self) -> bool:
-        """Whether the stable step is to be found anew; to be asked once a pass."""
+        """Whether the stable step must be found again; call it once a pass."""
         last = self.last
         softer = self._stiffness < (1.0 - ALIKE) * last.stiffness
         last.softer_for = last.softer_for + 1 if softer else 0

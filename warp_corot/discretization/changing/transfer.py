@@ -154,7 +154,7 @@ class Carriage:
             self._update_inverse_mass()
 
     def values(self, name: str) -> npt.NDArray[np.float32]:
-        """A quantity of all places for tetrahedra; those of leaves count."""
+        """A quantity at all places for tetrahedra; only the values of leaves count."""
         return self.arrays.values.numpy()[:, self.names.index(name)]
 
     @property

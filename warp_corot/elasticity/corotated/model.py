@@ -52,7 +52,7 @@ class Corotated(Model):
             tolerance [rad] up to which the rotation of the ancestor three levels up may stand for the own rotations of
             its leaves, decided for each subtree at every evaluation from its displacements alone; "auto": 0.1. Where
             it does, an element's rotation is off by w <= 2 tolerance and its stress by at most
-            (2 mu + 3 lambda) (3 w |U - I| + w^2 |U|); energies are those of own rotations.
+            (2 mu + 3 lambda) (3 w |U - I| + w^2 |U|); energies use own rotations.
         rotation: "byers-xu" (the paper's), "svd" (McAdams et al. 2011) or "warm" (a quaternion kept from step to step).
         iterations: For "byers-xu": None iterates to the paper's tolerance 3.85e-5, an int 2 to 12 that often.
         stiffness: "factored" (sums and differences), "sparse" (the paper's explicit K_T by type, zeros skipped) or

@@ -34,7 +34,7 @@ class OwnLaunches:
         changing: What adds the forces of all leaves in clusters where the mesh changes.
 
     Attributes:
-        batches: The subtrees that go as such.
+        batches: The subtrees that are launched as subtrees.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class OwnLaunches:
         self.batches = tuple(batches)
         self._rows, self._blocks = _stretches(batches, None if self._clusters is not None else plan.flat)
         self._stretches = wp.array(self._rows, dtype=Stretch, device=self._device) if self._rows else None
-        #: How many subtrees and single leaves there are, with gaps, some of which may be left out.
+        #: Number of subtrees and single leaves, with gaps; some of them may be left out.
         self.places = self._blocks * BLOCK
 
     @staticmethod

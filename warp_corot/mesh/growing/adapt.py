@@ -209,7 +209,7 @@ class Growing:
         return Grown(self.cells, self.origin, lattice, ends, tree, phi, need, wished, growth)
 
     def chosen(self, wished: wp.array) -> wp.array:
-        """Those of the elements that are to be bisected for which there is room, the neediest."""
+        """The elements that need bisection most, as many as there is room for."""
         growth, judge = self.growth, self.judge
         if self.room is None:
             return wished

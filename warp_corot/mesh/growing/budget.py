@@ -132,7 +132,7 @@ def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Devi
 
 
 def predicted_cell_size(domain: Domain, target: int) -> float:
-    """The edge [m] of cubes of which a body takes as many as suits a number of elements."""
+    """The edge [m] of cubes that fill a body with about this number of elements."""
     from warp_corot.domain.reference import extent_of
 
     volume, area = extent_of(domain)

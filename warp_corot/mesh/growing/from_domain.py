@@ -27,7 +27,7 @@ from .resolved import LEAST, MOST_POINTS, Resolved, points_within
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
 
-#: How often a cube is bisected where nothing is said.
+#: How often a cube is bisected by default.
 MAX_LEVEL_BY_DEFAULT = 12
 #: With more root cubes in the body's box for each element that is allowed, no body fits.
 CUBES_PER_ELEMENT = 1000

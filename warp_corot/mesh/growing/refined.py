@@ -1,4 +1,4 @@
-"""A forest of which some leaves are bisected."""
+"""Bisection of some leaves of a forest."""
 
 from __future__ import annotations
 

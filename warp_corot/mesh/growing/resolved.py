@@ -31,7 +31,7 @@ BELOW = -3
 LEAST_PIECE, MOST_PIECES = 1.0e-4, 16
 #: About so many points in all.
 MOST_POINTS = 250_000
-#: What at least is taken to be in a leaf of which a corner is inside, as a share of it.
+#: A leaf with a corner inside the body counts as filled to at least this share.
 LEAST = 1.0e-6
 
 

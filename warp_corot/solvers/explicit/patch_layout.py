@@ -147,7 +147,7 @@ def patch_of_nodes(points: np.ndarray, weight: np.ndarray, count: int) -> np.nda
             continue
         x = points[chosen]
         axes = np.argsort(-np.ptp(x, axis=0))
-        # Points of one plane, of which lattices have many, in the order of the other axes.
+        # Points in one plane are ordered by the other axes; lattices have many such points.
         chosen = chosen[np.lexsort(x[:, axes[::-1]].T)]
         left = parts // 2
         share = np.cumsum(weight[chosen]) / weight[chosen].sum()

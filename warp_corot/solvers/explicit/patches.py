@@ -97,7 +97,7 @@ class PatchSteps:
 
     @property
     def is_prepared(self) -> bool:
-        """Whether the keyframes on the device are the body's; not if others came while somebody records."""
+        """Whether the keyframes on the device are the body's; not if others came during a recording."""
         return self._trajectories == self.body.conditions.trajectories
 
     def launch(self, count: int, damping: float, system: System) -> None:

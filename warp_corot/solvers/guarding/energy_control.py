@@ -67,7 +67,7 @@ class EnergyControl:
             self._look(schedule if schedule.intervals else schedule._replace(calm=UNKNOWN, intervals=CLOSE_INTERVALS))
 
     def go_on(self, steps: int) -> None:
-        """Go on with steps that nobody checks, after so many; for these nothing waits."""
+        """Go on with unchecked steps after so many; nothing waits for them."""
         if steps >= CLOSE_INTERVALS * FIRST_INTERVAL and self._recorded.calm == UNKNOWN:
             self._recorded.calm = 0
 

@@ -295,7 +295,7 @@ class Guard:
         # Said once: who sets a good state again may go on.
         self.system.bad_step.fill_(NEVER)
         bad = self._not_finite_worlds()
-        # Somebody may have set a good state before anybody looked.
+        # The user may have set a good state before the check.
         return Fault("the state is not finite", bad, step) if len(bad) else None
 
     def _not_finite_worlds(self) -> npt.NDArray[np.intp]:

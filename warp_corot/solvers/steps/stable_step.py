@@ -52,7 +52,7 @@ def largest_frequency(body: SoftBody, field: SmallForces) -> float:
 def largest_eigenvalue(
     forces: SmallForces, inverse_mass: wp.array, smallest_volume: float, nodes: int, launch_nodes: int | None = None
 ) -> float:
-    """The largest eigenvalue of M^-1 K [1/s^2], with K what gives such forces of small displacements from rest.
+    """The largest eigenvalue of M^-1 K [1/s^2], where K gives the forces of small displacements from rest.
 
     Lanczos' iteration on M^-1/2 K M^-1/2, where K is applied as the forces themselves do it, so that whatever model and
     elements there are is what is measured. The Ritz value's residual is added to it. Zero if no node is free to move.
