@@ -25,9 +25,6 @@ BORDER = wp.constant(0.02)
 #: taken for parallel.
 ENDS = wp.constant(1.0e-3)
 PARALLEL = wp.constant(0.05)
-#: Share of the last step's force from which rounds begin: with more, contacts that share nodes chatter; with less,
-#: they give way a little.
-WARMTH = wp.constant(0.9)
 
 
 @wp.struct
@@ -183,7 +180,8 @@ def locate_row(row: int, surface: Surface, meeting: Meeting, rows: Rows, added: 
         rows.shares[row] = wp.vec4()
         return
     n = rows.normal[row]
-    normal_force = WARMTH * wp.max(wp.dot(was, n), 0.0)
+    # The whole of it: if a part were lost in each step, surfaces would sink in by what brings it back, and creep.
+    normal_force = wp.max(wp.dot(was, n), 0.0)
     if normal_force > 0.0:
         force = normal_force * n + held_back(across(was, n), normal_force, meeting.friction)
         rows.force[row] = force

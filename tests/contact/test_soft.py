@@ -37,6 +37,94 @@ def test_a_block_on_a_block_carries_its_weight(device, alike):
     np.testing.assert_allclose(force_on(low) + force_on(high) + on_ground, 0.0, atol=1e-6 * weight(low))
 
 
+def pressure_loads(body, pressure):
+    """Consistent forces of a pressure on the upper side."""
+    x, corners = body.mesh.points, body.surface_triangles
+    corners = corners[(x[corners][:, :, 2] > x[:, 2].max() - 1e-9).all(axis=1)]
+    sides = x[corners[:, 1:]] - x[corners[:, :1]]
+    forces = np.zeros_like(x)
+    np.add.at(
+        forces[:, 2], corners, -pressure / 6.0 * np.linalg.norm(np.cross(*np.moveaxis(sides, 1, 0)), axis=1)[:, None]
+    )
+    return forces
+
+
+@pytest.mark.parametrize(
+    ("cells", "level", "error"), [((2, 2, 1), 3, 1e-5), ((3, 3, 1), 3, 1e-4), ((3, 3, 2), 1, 0.05)]
+)
+def test_pressure_goes_through_a_contact_evenly(device, cells, level, error):
+    """The patch test: uniaxial stress in both blocks. It is passed to rounding if forces of the nodes of both sides,
+    which can only push, can be those of an even pressure; on the last pair of meshes they cannot."""
+    pressure, young, poisson = 200.0, 2e4, 0.3
+    size = 0.04 / cells[0]
+    meshes = [
+        wc.TetForest.box(cells, size, level),
+        wc.TetForest.box((2, 2, 1), 0.02, 3, origin=(0, 0, cells[2] * size)),
+    ]
+    low, high = (wc.SoftBody(mesh, wc.Isotropic(young, poisson, 1000.0), device=device) for mesh in meshes)
+    high.load(np.arange(high.node_count), pressure_loads(high, pressure))
+    sim = wc.Simulation(
+        [low, high],
+        model=wc.Linear(),
+        obstacles=wc.Ground(),
+        contact=wc.Contact(friction=0.0),
+        gravity=(0.0, 0.0, 0.0),
+        integrator=wc.SymplecticEuler(viscosity=2e-3, damping=60.0),
+    )
+    sim.advance(0.3)
+    for body in (low, high):
+        np.testing.assert_allclose(sim.von_mises(body), pressure, rtol=error)
+        x, u = body.mesh.points, body.displacements.numpy().astype(float)
+        strained = u[:, 2] + pressure / young * x[:, 2]
+        assert np.ptp(strained) < error * pressure / young * 0.02
+
+
+@pytest.mark.parametrize("seconds", [1.0, pytest.param(120.0, marks=pytest.mark.slow)])
+def test_a_soft_block_rests_on_a_soft_slope(device, seconds):
+    """At 0.95 of the angle of friction, on a mesh unlike its own."""
+    angle = 0.95 * np.arctan(0.4)
+    low, high = block(device, 0.0), block(device, 0.0200005, cells=(1, 1, 1), at=0.0107)
+    low.fix("z == zmin")
+    sim = wc.Simulation(
+        [low, high],
+        contact=wc.Contact(friction=0.4),
+        gravity=(9.81 * np.sin(angle), 0.0, -9.81 * np.cos(angle)),
+        integrator=wc.SymplecticEuler(viscosity=2e-3, damping=2.0),
+    )
+    sim.advance(0.6)
+    before = high.positions.numpy().astype(float)
+    sim.advance(seconds)
+    assert np.abs(high.positions.numpy() - before).max() < 1e-6
+    along = force_on(high)[0] / force_on(high)[2]
+    assert along == pytest.approx(-np.tan(angle), rel=1e-3)
+
+
+@pytest.mark.parametrize("count", [5, pytest.param(20, marks=pytest.mark.slow)])
+def test_a_stack_stands(device, count):
+    """Slabs of two sizes of elements, each a little beside the one below it."""
+    beside = np.random.default_rng(0).uniform(-5e-4, 5e-4, (count, 2))
+    slabs = []
+    for k in range(count):
+        mesh = wc.TetForest.box((4, 4, 1), 0.01, k % 2, origin=(*beside[k], 0.01002 * k))
+        slabs.append(wc.SoftBody(mesh, wc.Isotropic(2e5, 0.3, 1000.0), device=device))
+    contact = wc.Contact(friction=0.5)
+    sim = wc.Simulation(
+        slabs,
+        obstacles=wc.Ground(),
+        contact=contact,
+        gravity=DOWN,
+        integrator=wc.SymplecticEuler(viscosity=1e-3, damping=2.0),
+    )
+    sim.advance(0.05 * count)
+    centres = [slab.positions.numpy().astype(float).mean(axis=0) for slab in slabs]
+    sim.advance(0.2)
+    for slab, mesh, centre in zip(slabs, (each.mesh for each in slabs), centres, strict=True):
+        now = slab.positions.numpy().astype(float).mean(axis=0)
+        assert force_on(slab)[2] == pytest.approx(weight(slab), rel=0.01)
+        assert np.abs(now - centre).max() < 1e-3
+        assert np.abs(now - mesh.points.mean(axis=0))[:2].max() < 2e-3
+
+
 def test_worlds_do_not_meet(device):
     """Blocks of several worlds lie in the same place."""
     low, high = block(device, 0.0, worlds=2), block(device, 0.0202, worlds=2)
