@@ -167,9 +167,15 @@ def move_obstacles(motions: Motions, pace: Pace, world_starts: wp.array[wp.float
 
 @wp.kernel(enable_backward=False)
 def take_targets(given: wp.array[wp.transform], o: int, target: wp.array2d[wp.transform]):
-    """Where somebody wants a tool to be: in each world, or in all alike."""
+    """Where somebody wants a tool to be: in each world, or in all alike. What is no pose is passed over."""
     world = wp.tid()
-    target[world, o] = given[wp.min(world, given.shape[0] - 1)]
+    pose = given[wp.min(world, given.shape[0] - 1)]
+    p = wp.transform_get_translation(pose)
+    q = wp.transform_get_rotation(pose)
+    length = wp.length(q)
+    # False where anything is NaN or infinite.
+    if wp.abs(p[0]) + wp.abs(p[1]) + wp.abs(p[2]) <= 3.0e38 and length > 0.0 and length <= 3.0e38:
+        target[world, o] = wp.transformation(p, q / length)
 
 
 @wp.kernel(enable_backward=False)

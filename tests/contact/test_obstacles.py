@@ -250,6 +250,18 @@ def test_a_tool_follows_an_array_on_the_device(device):
     np.testing.assert_allclose(tool.present_pose[:, 2], (1.5, 2.5), atol=1e-6)
 
 
+@pytest.mark.parametrize("wrong", [(np.nan, 0, 2, 0, 0, 0, 1), (0, 0, np.inf, 0, 0, 0, 1), (0, 0, 2, 0, 0, 0, 0)])
+def test_what_is_no_pose_is_passed_over(device, wrong):
+    body, tool = block(device), wc.Tool(wc.Sphere(0.01, position=(0.0, 0.0, 1.0)), speed=100.0)
+    poses = wp.array([[0, 0, 1.1, 0, 0, 0, 2]], dtype=wp.transform, device=device)
+    tool.use_poses(poses)
+    sim = wc.Simulation(body, obstacles=[tool], gravity=(0.0, 0.0, 0.0))
+    for pose, height in (((0, 0, 1.1, 0, 0, 0, 2), 1.1), (wrong, 1.1), ((0, 0, 1.2, 0, 0, 0, 1), 1.2)):
+        poses.assign(np.array([pose], np.float32))
+        sim.advance(0.01)
+        np.testing.assert_allclose(tool.present_pose[0], (0, 0, height, 0, 0, 0, 1), atol=1e-6)
+
+
 def test_worlds_have_tools_of_their_own(device):
     body, ground = block(device, worlds=2), wc.Ground()
     tool = wc.Tool(wc.Sphere(0.01), speed=100.0)

@@ -95,6 +95,8 @@ class Tool:
     def use_poses(self, poses: wp.array) -> None:
         """Go where an array on the device says, which every step reads, at no more than ``speed``.
 
+        A pose that is not finite, or whose quaternion is zero, is passed over: the tool goes on to the last good one.
+
         Args:
             poses: ``wp.transform`` [1], or [worlds] with one for each.
 
