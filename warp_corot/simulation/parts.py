@@ -83,11 +83,16 @@ def checked_contact(
     return given, Contact() if contact is None else contact
 
 
-def check_implicit(integrator: Integrator, *, touches: bool, remeshes: bool) -> None:
+def check_implicit(integrator: Integrator, *, touches: bool, remeshes: bool, ordered: bool) -> None:
     """See that an implicit integrator can make the steps that are asked for.
 
+    Args:
+        integrator: Any integrator.
+        touches, remeshes: Whether bodies touch something, or are remeshed.
+        ordered: Whether sums must have one order on a device that has none, which products with the stiffness lack.
+
     Raises:
-        InputError: Bodies touch something, or are remeshed.
+        InputError: It cannot.
     """
     if not integrator.is_implicit:
         return
@@ -96,6 +101,8 @@ def check_implicit(integrator: Integrator, *, touches: bool, remeshes: bool) -> 
         raise InputError(f"{name} knows no contact; with obstacles or contact the integrator must be SymplecticEuler")
     if remeshes:
         raise InputError(f"{name} knows no remeshing; with remesh the integrator must be SymplecticEuler")
+    if ordered:
+        raise InputError(f"{name} is not reproducible on CUDA; with deterministic=True it must be SymplecticEuler")
 
 
 def check_constraints(system: System, stepper: Stepper, integrator: Integrator) -> None:

@@ -61,7 +61,6 @@ def solve_static(
     iterations: int = 100,
     load_steps: int = 1,
     preconditioner: str | None = None,
-    deterministic: bool = False,
 ) -> StaticReport:
     """Move a body to where it is at rest under gravity and its loads, by Newton's method.
 
@@ -83,7 +82,6 @@ def solve_static(
             grows where there are several states of rest.
         preconditioner: Of conjugate gradients: "multigrid" on the levels of a forest, "diagonal" with each node's own
             3x3 block, or None: multigrid for forests, the diagonal for general meshes.
-        deterministic: Whether forces must come out the same bit by bit every time also on CUDA.
 
     Raises:
         InputError: Something is no body, model or number as described, the model does not go with the mesh, the body is
@@ -105,7 +103,7 @@ def solve_static(
         raise InputError(f"all {body.node_count} nodes of the body are held; at least one must be free to move")
 
     body.state.adopt_positions()
-    field = law.bind(body, deterministic=deterministic)
+    field = law.bind(body)
     answer = _Answer(body, field, down)
     if answer.falls():
         message = "no node is held, and the loads do not balance: the body has no state of rest; fix some nodes"
