@@ -239,7 +239,7 @@ def test_what_a_user_may_not_have_meant_is_noted(bar, capsys):
 
 
 REFUSED = [
-    (["--pull", "x == xmax", "0", "0", "up"], "'up' is no number"),
+    (["--pull", "x == xmax", "0", "0", "up"], "'up' is not a number"),
     (["--pull", "x > 9", "0", "0", "1"], "--pull 'x > 9': there are no nodes in it"),
     (["--pull", "x > 0.1", "0", "0", "1", "--twist", "top", "9"], "of its nodes are moved by another option"),
     (["--pull", "all", "0", "0", "1"], "all nodes are moved"),
