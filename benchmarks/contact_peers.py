@@ -1,0 +1,143 @@
+#!/usr/bin/env python3
+"""The same press here and in MuJoCo's flex: time, how deep the tool sinks in, and what it feels; one CPU core.
+
+    python benchmarks/contact_peers.py [--level 9] [--json FILE]
+
+A rigid ball of 30 mm radius goes 10 mm into the upper face of a cube of 0.1 m, 5 kPa, that is held below, in 0.1 s, and
+stays there until 0.3 s; no friction. What is told is the mean force of the last 25 ms and the deepest node at the end.
+Elastic laws differ: corotated here, St. Venant-Kirchhoff on edges there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import warp as wp
+from measure import machine, number, table
+
+import warp_corot as wc
+
+HEADER = ("program", "elements", "seconds", "steps", "force N", "deepest mm")
+SIZE, RADIUS, DEPTH, GAP = 0.1, 0.03, 0.01, 1e-3
+YOUNG, POISSON = 5e3, 0.3
+ARRIVES, ENDS, LOOKED = 0.1, 0.3, 0.025
+HIGH, LOW = SIZE + RADIUS + GAP, SIZE + RADIUS - DEPTH
+#: Radius of its nodes, with which they touch [m].
+SKIN = 5e-4
+
+XML = """
+<mujoco>
+  <option timestep="{dt}" integrator="{integrator}" gravity="0 0 0"/>
+  <worldbody>
+    <body mocap="true" pos="{middle} {middle} {high}"><geom type="sphere" size="{radius}"/></body>
+    <flexcomp name="body" type="direct" dim="3" mass="1" radius="{skin}" point="{points}" element="{tets}">
+      <contact selfcollide="none" condim="1"/>
+      <edge equality="false"/>
+      <pin id="{held}"/>
+      <elasticity young="{young}" poisson="{poisson}" damping="0.005"/>
+    </flexcomp>
+  </worldbody>
+</mujoco>"""
+
+
+def deepest(points: np.ndarray, radius: float) -> float:
+    """How deep nodes are in the ball [m]; negative for the gap of the closest."""
+    return float(radius - np.linalg.norm(points - (0.5 * SIZE, 0.5 * SIZE, LOW), axis=1).min())
+
+
+def ours(mesh: wc.TetForest) -> tuple[float, int, float, float]:
+    """Seconds, steps, force [N] and depth [m]."""
+    body = wc.SoftBody(mesh, wc.Isotropic(YOUNG, POISSON, 1000.0), device="cpu")
+    body.fix("z < 1e-9")
+    tool = wc.Tool(wc.Sphere(RADIUS))
+    tool.follow([0.0, ARRIVES], [(0.5 * SIZE, 0.5 * SIZE, height) for height in (HIGH, LOW)])
+    contact, integrator = wc.Contact(friction=0.0), wc.SymplecticEuler(viscosity=1e-3, damping=20.0)
+    sim = wc.Simulation(body, obstacles=tool, contact=contact, gravity=(0.0, 0.0, 0.0), integrator=integrator)
+    sim.advance(0.01)
+    started = time.process_time()
+    sim.advance(ENDS - LOOKED - sim.time)
+    forces = []
+    for _ in range(10):
+        sim.advance(0.1 * LOOKED)
+        forces.append(tool.wrench.numpy()[0, 2])
+    taken = time.process_time() - started
+    return taken, sim.steps, float(np.mean(forces)), deepest(body.positions.numpy().astype(float), RADIUS)
+
+
+def flex(mesh: wc.TetForest, integrator: str, dt: float) -> tuple[float, int, float, float]:
+    """The same of MuJoCo."""
+    held = mesh.points[:, 2] < 1e-9
+    text = XML.format(
+        dt=dt,
+        integrator=integrator,
+        middle=0.5 * SIZE,
+        high=HIGH,
+        radius=RADIUS,
+        skin=SKIN,
+        points=_joined(mesh.points),
+        tets=_joined(wc.TetMesh(mesh.points, mesh.tets).tets),
+        held=_joined(np.flatnonzero(held)),
+        young=YOUNG,
+        poisson=POISSON,
+    )
+    model = mujoco.MjModel.from_xml_string(text)
+    masses = wc.SoftBody(mesh, wc.Isotropic(YOUNG, POISSON, 1000.0), device="cpu").masses
+    model.body_mass[model.flex_vertbodyid[~held]] = masses[~held]
+    data = mujoco.MjData(model)
+    mujoco.mj_setConst(model, data)
+    steps, forces = 0, []
+    started = time.process_time()
+    while data.time < ENDS:
+        data.mocap_pos[0, 2] = HIGH + (LOW - HIGH) * min(data.time / ARRIVES, 1.0)
+        mujoco.mj_step(model, data)
+        steps += 1
+        if data.time > ENDS - LOOKED:
+            forces.append(_force_on_tool(model, data))
+    taken = time.process_time() - started
+    return taken, steps, float(np.mean(forces)), deepest(data.flexvert_xpos, RADIUS + SKIN)
+
+
+def _force_on_tool(model: mujoco.MjModel, data: mujoco.MjData) -> float:
+    total, wrench = 0.0, np.zeros(6)
+    for k in range(data.ncon):
+        mujoco.mj_contactForce(model, data, k, wrench)
+        total += (data.contact[k].frame.reshape(3, 3).T @ wrench[:3])[2]
+    return abs(total)
+
+
+def _joined(values: np.ndarray) -> str:
+    return " ".join(map(repr, values.ravel().tolist()))
+
+
+def main() -> None:
+    """Print the table."""
+    of = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    of.add_argument("--level", type=int, default=9, help="level of the bisected cube")
+    of.add_argument("--json", type=Path, metavar="FILE", help="write everything to this file, too")
+    options = of.parse_args()
+    mesh = wc.TetForest.box((1, 1, 1), SIZE, options.level)
+    flexed = f"MuJoCo {mujoco.__version__}, flex"
+    found = {
+        "warp-corot": ours(mesh),
+        f"{flexed}, discrete, 1 ms": flex(mesh, "discrete", 1e-3),
+        f"{flexed}, Euler, 0.2 ms": flex(mesh, "Euler", 2e-4),
+    }
+    rows = [[name, len(mesh.tets), *row[:3], 1e3 * row[3]] for name, row in found.items()]
+    about = machine(wp.get_device("cpu"))
+    print(f"{about['name']}, Warp {about['warp']}")
+    print(
+        table(
+            HEADER, [[number(each) if isinstance(each, float) else str(each) for each in row] for row in rows], left=1
+        )
+    )
+    if options.json:
+        options.json.write_text(json.dumps({**about, "rows": [dict(zip(HEADER, row, strict=True)) for row in rows]}))
+
+
+if __name__ == "__main__":
+    main()
