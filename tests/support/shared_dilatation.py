@@ -20,25 +20,36 @@ def of_nodes(mesh):
 
 
 def of_forest(forest):
-    """Eights where a complete subtree of three levels is, nodes of the other elements elsewhere, [groups, T]."""
-    tree, levels = forest.tree, np.asarray(forest.levels)
-    above = np.asarray(tree.above(tree.leaves, 3))
-    _, group, count = np.unique(above, return_inverse=True, return_counts=True)
-    deep = np.full(len(count), np.inf)
-    np.minimum.at(deep, group, levels)
-    level_of = np.asarray(levels)
-    same = np.ones(len(count), bool)
-    np.logical_and.at(same, group, level_of == deep[group])
-    complete = ((count == 8) & same)[group] & (above >= 0)
-    eights = coo_matrix((complete * 1.0, (group, np.arange(len(levels))))).tocsr()
-    nodes = of_nodes(forest) @ diags(1.0 - complete)
-    return vstacked(eights, nodes)
+    """Groups from the bottom of the tree upwards, leaf by leaf as one would do it by hand, [groups, T]."""
+    tree = forest.tree
+    leaf_of = {int(element): k for k, element in enumerate(tree.leaves)}
+    groups = []
 
+    def left_below(element):
+        if element in leaf_of:
+            left = [leaf_of[element]]
+        elif tree.first_child[element] < 0:
+            left = []
+        else:
+            first = int(tree.first_child[element])
+            left = left_below(first) + left_below(first + 1)
+        if len(left) >= 8:
+            groups.append(left)
+            left = []
+        return left
 
-def vstacked(*parts):
-    from scipy.sparse import vstack
-
-    return vstack(parts).tocsr()
+    of_cube = {}
+    for root in np.flatnonzero(np.asarray(tree.parent) < 0):
+        left = left_below(int(root))
+        if len(left) >= 4:
+            groups.append(left)
+        elif left:
+            centre = np.asarray(forest.points)[tree.tets[root]].mean(axis=0)
+            of_cube.setdefault(tuple(np.floor(centre / forest.cell_size).astype(int)), []).extend(left)
+    groups.extend(of_cube.values())
+    rows = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+    columns = np.concatenate([np.array(group) for group in groups])
+    return coo_matrix((np.ones(len(columns)), (rows, columns)), (len(groups), len(tree.leaves))).tocsr()
 
 
 MEASURES = {

@@ -51,6 +51,7 @@ class FlatLeaves:
         unit: Which of ``Units`` each uses where rotations are shared, int32 [n], else None.
         general: The same leaves as general elements, if that is known, else None.
         material: Their Lamé parameters mu and lambda [Pa] where these vary and are known, float32 [n] each, else None.
+        live: How many there are where launches go through more, int32 [1] on the device, else None.
     """
 
     leaves: wp.array
@@ -58,6 +59,7 @@ class FlatLeaves:
     unit: wp.array | None = None
     general: GeneralElements | None = None
     material: tuple[wp.array, wp.array] | None = None
+    live: wp.array | None = None
 
     def __len__(self) -> int:
         return len(self.leaves)

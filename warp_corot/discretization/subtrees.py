@@ -39,6 +39,7 @@ class Batch:
         unit: Which of ``Units`` each uses where leaves share one from further up, int32 [count], else None.
         flagged: Set by the kernel: bit k of a subtree's byte where its leaf k, in tree order, was left out; uint8
             [count, rounded up to eights].
+        live: How many there are where launches go through more, int32 [1] on the device, else None.
     """
 
     shape: int
@@ -49,6 +50,7 @@ class Batch:
     roots: ForestElements | None
     unit: wp.array | None
     flagged: wp.array
+    live: wp.array | None = None
 
     @property
     def flags_by_eights(self) -> wp.array:

@@ -1,0 +1,431 @@
+"""Kernels of a dilatation that elements share; see ``dilatation``.
+
+They go in three passes. The first measures elements: theta, and its change along a direction where there is one. The
+second replaces these by what the law makes of the shared ones, of groups or at nodes. The third, a thread an element
+again, adds forces, products or energies. Between them stands one vec4 an element: (theta, change, 0, 0) and then
+(w, w', w'' change, w''), at the elements' places in the mesh.
+
+Launches may go through more than there is: ``live`` says how many there are, and nothing of it that all are.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.math.rotation import identity3
+
+from .constitutive import IsotropicMaterial
+from .dilatation import Dilatation, mean_of
+from .elements import add_force, gradient_of, nodal_forces, rest_volume
+from .forces import in_local_frame, own_gradient
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def place_of(places: wp.array[wp.int32], t: int):
+    """Where in the mesh element t is; no places: there."""
+    place = t
+    if places.shape[0] > 0:
+        place = places[t]
+    return place
+
+
+@wp.func
+def is_live(live: wp.array[wp.int32], t: int):
+    if live.shape[0] > 0:
+        return t < live[0]
+    return True
+
+
+@functools.cache
+def law_at(of: Dilatation) -> wp.Function:
+    """What the third pass needs of a shared dilatation and its change."""
+    energy_of, slope_of, curvature_of = of.energy, of.slope, of.curvature
+
+    @wp.func
+    def law_at(theta: float, change: float):
+        curvature = curvature_of(theta)
+        return wp.vec4(energy_of(theta), slope_of(theta), curvature * change, curvature)
+
+    return law_at
+
+
+# --- the first pass ---------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def measure_elements(Elements: type, of: Dilatation) -> wp.Kernel:
+    measure = of.measure
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def measure_elements(
+        # In
+        elements: Elements,
+        places: wp.array[wp.int32],
+        live: wp.array[wp.int32],
+        u: wp.array[wp.vec4],
+        p: wp.array[wp.vec4],
+        # Out
+        shared: wp.array[wp.vec4],
+    ):
+        t = wp.tid()
+        if not is_live(live, t):
+            return
+        theta, slope = measure(own_gradient(elements, t, u))
+        change = float(0.0)
+        if p.shape[0] > 0:
+            change = wp.ddot(slope, own_gradient(elements, t, p))
+        shared[place_of(places, t)] = wp.vec4(theta, change, 0.0, 0.0)
+
+    return measure_elements
+
+
+# --- the second pass: groups ------------------------------------------------------------------------------------------
+
+
+@wp.func
+def range_of(starts: wp.array[wp.int32], members: wp.array[wp.int32], g: int):
+    """The range of a group in its members, or, where there are none, of a subtree's leaves in the mesh."""
+    begin = starts[g]
+    end = begin + 8
+    if members.shape[0] > 0:
+        end = starts[g + 1]
+    return begin, end
+
+
+@functools.cache
+def share_in_groups(Elements: type, of: Dilatation) -> wp.Kernel:
+    """A thread a group; see ``range_of`` for what a group is."""
+    law = law_at(of)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def share_in_groups(
+        # In
+        starts: wp.array[wp.int32],
+        members: wp.array[wp.int32],
+        live: wp.array[wp.int32],
+        elements: Elements,
+        material: IsotropicMaterial,
+        # In and out
+        shared: wp.array[wp.vec4],
+    ):
+        g = wp.tid()
+        if not is_live(live, g):
+            return
+        begin, end = range_of(starts, members, g)
+        theta = float(0.0)
+        change = float(0.0)
+        total = float(0.0)
+        for i in range(begin, end):
+            t = place_of(members, i)
+            weight = material.lam[t * material.stride] * rest_volume(elements, t)
+            theta += weight * shared[t][0]
+            change += weight * shared[t][1]
+            total += weight
+        value = law(mean_of(theta, total), mean_of(change, total))
+        for i in range(begin, end):
+            shared[place_of(members, i)] = value
+
+    return share_in_groups
+
+
+# --- the second pass: nodes -------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def add_to_nodes(Elements: type) -> wp.Kernel:
+    """Add lambda V / 4 times an element's dilatation, one, and the change to the sums of its nodes."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add_to_nodes(
+        # In
+        elements: Elements,
+        places: wp.array[wp.int32],
+        live: wp.array[wp.int32],
+        material: IsotropicMaterial,
+        shared: wp.array[wp.vec4],
+        # In and out
+        sums: wp.array[wp.vec4],
+    ):
+        t = wp.tid()
+        if not is_live(live, t):
+            return
+        place = place_of(places, t)
+        weight = 0.25 * material.lam[place * material.stride] * rest_volume(elements, t)
+        own = shared[place]
+        part = weight * wp.vec3(own[0], 1.0, own[1])
+        targets = elements.targets[t]
+        for n in range(4):
+            add_force(sums, targets[n], part)
+
+    return add_to_nodes
+
+
+@functools.cache
+def share_at_nodes(Elements: type, of: Dilatation) -> wp.Kernel:
+    """The mean of what the law makes of an element's four nodes, from their sums."""
+    law = law_at(of)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def share_at_nodes(
+        # In
+        elements: Elements,
+        places: wp.array[wp.int32],
+        live: wp.array[wp.int32],
+        sums: wp.array[wp.vec4],
+        # Out
+        shared: wp.array[wp.vec4],
+    ):
+        t = wp.tid()
+        if not is_live(live, t):
+            return
+        nodes = elements.nodes[t]
+        value = wp.vec4()
+        n = int(0)
+        # Not unrolled: the law is compiled once.
+        while n < 4:
+            sum = sums[nodes[n]]
+            value += 0.25 * law(mean_of(sum[0], sum[1]), mean_of(sum[2], sum[1]))
+            n += 1
+        shared[place_of(places, t)] = value
+
+    return share_at_nodes
+
+
+# --- the third pass ---------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def scatter(elements: Any, targets: wp.vec4i, t: int, stress: wp.mat33, f: wp.array[wp.vec4]):
+    f0, f1, f2, f3 = nodal_forces(elements, t, in_local_frame(elements, t, stress))
+    add_force(f, targets[0], f0)
+    add_force(f, targets[1], f1)
+    add_force(f, targets[2], f2)
+    add_force(f, targets[3], f3)
+
+
+@functools.cache
+def scatter_pressures(Elements: type, of: Dilatation) -> wp.Kernel:
+    """Add forces."""
+    measure = of.measure
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def scatter_pressures(
+        # In
+        elements: Elements,
+        places: wp.array[wp.int32],
+        live: wp.array[wp.int32],
+        material: IsotropicMaterial,
+        u: wp.array[wp.vec4],
+        shared: wp.array[wp.vec4],
+        # Out
+        f: wp.array[wp.vec4],
+    ):
+        t = wp.tid()
+        if not is_live(live, t):
+            return
+        _theta, slope = measure(own_gradient(elements, t, u))
+        place = place_of(places, t)
+        stress = (material.lam[place * material.stride] * shared[place][1]) * slope
+        scatter(elements, elements.targets[t], t, stress, f)
+
+    return scatter_pressures
+
+
+@functools.cache
+def add_product(Elements: type, of: Dilatation) -> wp.Kernel:
+    """y += K p; without ``turning``, the part of K that is positive semidefinite."""
+    measure, turning_of = of.measure, of.turning
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add_product(
+        # In
+        elements: Elements,
+        material: IsotropicMaterial,
+        u: wp.array[wp.vec4],
+        p: wp.array[wp.vec4],
+        shared: wp.array[wp.vec4],
+        turning: float,
+        # In and out
+        y: wp.array[wp.vec4],
+    ):
+        t = wp.tid()
+        a = own_gradient(elements, t, u)
+        _theta, slope = measure(a)
+        law = shared[t]
+        stress = law[2] * slope + (turning * law[1]) * turning_of(a, own_gradient(elements, t, p))
+        scatter(elements, elements.nodes[t], t, -material.lam[t * material.stride] * stress, y)
+
+    return add_product
+
+
+@functools.cache
+def add_energies(Elements: type) -> wp.Kernel:
+    """Add each element's share of the energy [J]."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add_energies(
+        # In
+        elements: Elements,
+        material: IsotropicMaterial,
+        shared: wp.array[wp.vec4],
+        # In and out
+        energies: wp.array[wp.float64],
+    ):
+        t = wp.tid()
+        energy = wp.float64(material.lam[t * material.stride] * shared[t][0]) * wp.float64(rest_volume(elements, t))
+        energies[t] = energies[t] + energy
+
+    return add_energies
+
+
+# --- diagonal blocks --------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def hat_gradient(elements: Any, t: int, n: int):
+    """The gradient of the n-th node's hat function in the frame of ``own_gradient`` (columns)."""
+    x = wp.vec3(1.0, 0.0, 0.0)
+    o = wp.vec3()
+    unit = gradient_of(
+        elements, t, wp.where(n == 0, x, o), wp.where(n == 1, x, o), wp.where(n == 2, x, o), wp.where(n == 3, x, o)
+    )
+    return wp.vec3(unit[0, 0], unit[0, 1], unit[0, 2])
+
+
+@wp.func
+def row_of(elements: Any, t: int, slope: wp.mat33, hat: wp.vec3):
+    """d theta_e / d u of a node: (d theta_e / dF) grad N, in world space."""
+    return in_local_frame(elements, t, slope) * hat
+
+
+@functools.cache
+def turning_block(Elements: type, of: Dilatation) -> wp.Function:
+    """The part of a diagonal block that the turning of d theta / dF gives, over lambda V w'."""
+    turning_of = of.turning
+
+    @wp.func
+    def turning_block(elements: Elements, t: int, a: wp.mat33, hat: wp.vec3):
+        block = wp.mat33()
+        axis = int(0)
+        while axis < 3:
+            e = wp.vec3(float(axis == 0), float(axis == 1), float(axis == 2))
+            d = turning_of(a, wp.transpose(in_local_frame(elements, t, identity3())) * wp.outer(e, hat))
+            block += wp.outer(in_local_frame(elements, t, d) * hat, e)
+            axis += 1
+        return block
+
+    return turning_block
+
+
+@functools.cache
+def add_diagonal(Elements: type, of: Dilatation) -> wp.Kernel:
+    """Add diagonal blocks of which those of K are no more: each element's as if its dilatation were its own."""
+    measure, turning_of = of.measure, turning_block(Elements, of)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add_diagonal(
+        # In
+        elements: Elements,
+        places: wp.array[wp.int32],
+        live: wp.array[wp.int32],
+        material: IsotropicMaterial,
+        u: wp.array[wp.vec4],
+        shared: wp.array[wp.vec4],
+        turning: float,
+        # In and out
+        blocks: wp.array[wp.mat33],
+    ):
+        t = wp.tid()
+        if not is_live(live, t):
+            return
+        place = place_of(places, t)
+        law = shared[place]
+        a = own_gradient(elements, t, u)
+        _theta, slope = measure(a)
+        weight = material.lam[place * material.stride] * rest_volume(elements, t)
+        n = int(0)
+        while n < 4:
+            hat = hat_gradient(elements, t, n)
+            row = row_of(elements, t, slope, hat)
+            block = law[3] * wp.outer(row, row) + (turning * law[1]) * turning_of(elements, t, a, hat)
+            wp.atomic_add(blocks, elements.nodes[t][n], weight * block)
+            n += 1
+
+    return add_diagonal
+
+
+@functools.cache
+def add_diagonal_of_groups(Elements: type, of: Dilatation) -> wp.Kernel:
+    """Add the diagonal blocks of K; a thread a group."""
+    measure, turning_of = of.measure, turning_block(Elements, of)
+
+    @wp.func
+    def weight_of(elements: Elements, t: int, material: IsotropicMaterial):
+        return material.lam[t * material.stride] * rest_volume(elements, t)
+
+    @wp.func
+    def row_at(
+        elements: Elements,
+        material: IsotropicMaterial,
+        u: wp.array[wp.vec4],
+        members: wp.array[wp.int32],
+        begin: int,
+        end: int,
+        node: int,
+    ):
+        """The sum of lambda V d theta_e / du of a node over the group."""
+        row = wp.vec3()
+        for i in range(begin, end):
+            t = place_of(members, i)
+            n = int(0)
+            while n < 4:
+                if elements.nodes[t][n] == node:
+                    _theta, slope = measure(own_gradient(elements, t, u))
+                    row += weight_of(elements, t, material) * row_of(elements, t, slope, hat_gradient(elements, t, n))
+                n += 1
+        return row
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add_diagonal_of_groups(
+        # In
+        starts: wp.array[wp.int32],
+        members: wp.array[wp.int32],
+        live: wp.array[wp.int32],
+        elements: Elements,
+        material: IsotropicMaterial,
+        u: wp.array[wp.vec4],
+        shared: wp.array[wp.vec4],
+        turning: float,
+        # In and out
+        blocks: wp.array[wp.mat33],
+    ):
+        g = wp.tid()
+        if not is_live(live, g):
+            return
+        begin, end = range_of(starts, members, g)
+        total = float(0.0)
+        for i in range(begin, end):
+            total += weight_of(elements, place_of(members, i), material)
+        share = mean_of(1.0, total)
+        for i in range(begin, end):
+            t = place_of(members, i)
+            law = shared[t]
+            a = own_gradient(elements, t, u)
+            _theta, slope = measure(a)
+            weight = weight_of(elements, t, material)
+            n = int(0)
+            while n < 4:
+                node = elements.nodes[t][n]
+                hat = hat_gradient(elements, t, n)
+                row = weight * row_of(elements, t, slope, hat)
+                whole = row_at(elements, material, u, members, begin, end, node)
+                block = (law[3] * share) * wp.outer(row, whole)
+                if turning != 0.0:
+                    block += (turning * weight * law[1]) * turning_of(elements, t, a, hat)
+                wp.atomic_add(blocks, node, block)
+                n += 1
+
+    return add_diagonal_of_groups

@@ -1,0 +1,75 @@
+"""Groups of leaves of a forest that share something where they are in no complete subtree.
+
+Groups are found from the bottom of the tree upwards: the leaves below an element make one as soon as there are eight or
+more that are in none yet, which are 14 at most. So a complete subtree of three levels is a group whatever is around
+it. What is left of a root are fewer than eight leaves: four make a group, and fewer join with those of the other roots
+of their cube.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.mesh import TetForest
+
+#: Leaves that make a group below an element of the tree, and in what is left of a root.
+LEAST, LEAST_OF_ROOT = 8, 4
+#: Lattice intervals of a cube's edge are two to this power.
+CUBE_BITS = 16
+
+
+@dataclass(frozen=True)
+class Groups:
+    """Groups of a mesh's elements on the device, world after world.
+
+    Attributes:
+        starts: Where in ``members`` each group begins, and where the last one ends, int32 [count + 1].
+        members: The elements, group after group, int32.
+    """
+
+    starts: wp.array
+    members: wp.array
+
+    def __len__(self) -> int:
+        return len(self.starts) - 1
+
+    @classmethod
+    def of_leaves(cls, forest: TetForest, leaves: npt.NDArray[np.integer], device: wp.Device, worlds: int) -> Groups:
+        """The groups of some leaves, int [n], of a forest in each of so many worlds."""
+        group = group_numbers(forest, leaves)
+        order = np.argsort(group, kind="stable")
+        sizes = np.tile(np.bincount(group), worlds)
+        members = np.asarray(leaves)[order] + len(forest.tets) * np.arange(worlds)[:, None]
+        starts = np.concatenate([[0], np.cumsum(sizes)])
+        return cls(*(wp.array(values.ravel(), dtype=wp.int32, device=device) for values in (starts, members)))
+
+
+def group_numbers(forest: TetForest, leaves: npt.NDArray[np.integer]) -> npt.NDArray[np.int32]:
+    """The group of each of some leaves of a forest, from 0; int32 [n]."""
+    group = np.full(len(leaves), -1, np.int32)
+    above = forest.tree.leaves[leaves]
+    level = np.array(forest.levels, dtype=np.int32)[leaves]
+    count = 0
+    for depth in range(int(level.max(initial=0)), -1, -1):
+        here = np.flatnonzero((level == depth) & (group < 0))
+        _, element, sizes = np.unique(above[here], return_inverse=True, return_counts=True)
+        makes_one = sizes >= (LEAST if depth else LEAST_OF_ROOT)
+        number = np.cumsum(makes_one, dtype=np.int32) - 1 + count
+        grouped = makes_one[element]
+        group[here[grouped]] = number[element[grouped]]
+        count += int(makes_one.sum())
+        if depth:
+            rest = here[~grouped]
+            above[rest] = forest.tree.above(above[rest], 1)
+            level[rest] = depth - 1
+    rest = np.flatnonzero(group < 0)
+    if len(rest):
+        corners, _ = forest.tree.rows(above[rest])
+        cubes = np.asarray(forest.lattice)[corners].min(axis=1) >> CUBE_BITS
+        _, of_cube = np.unique(cubes, axis=0, return_inverse=True)
+        group[rest] = count + of_cube.ravel()
+    return group

@@ -1,0 +1,198 @@
+"""The force field of a law whose elements share their dilatation; see ``kernels.elements.dilatation``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import warp as wp
+
+from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.plan import Plan
+from warp_corot.discretization.shear_only import ShearOnly
+from warp_corot.elasticity.model import ForceField
+from warp_corot.kernels.elements import shared_dilatation as kernels
+from warp_corot.kernels.elements.dilatation import VOLUME, Dilatation
+from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.subtrees import dilatation as subtrees
+from warp_corot.kernels.subtrees.cuda import BLOCK
+from warp_corot.mesh import TetForest
+
+from .others import Others
+
+
+class DilatationField(ForceField):
+    """A law's force field without lambda's part, and that part with a dilatation that elements share.
+
+    In a forest the eight leaves of each complete subtree share one, and so do groups of the other leaves. Where there
+    is no tree, or where it changes, these have one at each node. The von Mises stress is each element's own.
+
+    Args:
+        discretization: The mesh and the material.
+        bind: Makes the law's field of a discretization.
+        of: What is shared.
+        deterministic: As for every field.
+
+    Attributes:
+        shear: The law's field without lambda's part.
+    """
+
+    def __init__(
+        self,
+        discretization: Discretization,
+        bind: Callable[[Discretization], ForceField],
+        of: Dilatation,
+        deterministic: bool = False,
+    ):
+        self.shear = bind(ShearOnly(discretization))
+        super().__init__(discretization, deterministic)
+        self._of = of
+        self._all, self._still = (wp.empty(0, dtype=kind, device=self.device) for kind in (wp.int32, wp.vec4))
+        self._shared = wp.empty(0, dtype=wp.vec4, device=self.device)
+        self._others = Others(discretization, self.plan, of)
+
+    def plan_of(self, discretization: Discretization) -> Plan:
+        """The same plan where that has subtrees, and where the mesh changes: one plan is kept up to date there."""
+        plan = self.shear.plan
+        if plan.kinds or plan.counts is not None or not isinstance(discretization.mesh, TetForest):
+            return plan
+        return discretization.plan(deterministic=self.deterministic)
+
+    def load_kernels(self) -> None:
+        self.shear.load_kernels()
+        for shape, grouped, _sharing in self.plan.kinds:
+            wp.load_module(self._kernel(shape, grouped).module, self.device, block_dim=self._block)
+        for kernel in self._others.kernels:
+            wp.load_module(kernel.module, self.device, block_dim=256)
+
+    def derive(self) -> None:
+        self.shear.derive()
+
+    def follow(self) -> None:
+        self.shear.follow()
+        self._others.follow()
+
+    @property
+    def state(self) -> dict[str, wp.array]:
+        return self.shear.state
+
+    def reset(self, chosen: wp.array) -> None:
+        self.shear.reset(chosen)
+
+    # --- forces ------------------------------------------------------------------------------------------------------
+
+    def add_forces(self, u: wp.array, f: wp.array) -> None:
+        self.shear.add_forces(u, f)
+        if self.slots is None:
+            self._scatter(u, f)
+        else:
+            self.slots.values.zero_()
+            self._scatter(u, self.slots.values)
+            self.slots.gather(f)
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        self.shear.scatter_forces(u, f)
+        self._scatter(u, f)
+
+    def _scatter(self, u: wp.array, f: wp.array) -> None:
+        for batch in self.plan.batches:
+            kernel, subtree = self._kernel(batch.shape, batch.grouped), batch.subtrees
+            if self.device.is_cuda:
+                inputs = [subtree, self.discretization.lam, u]
+                wp.launch(kernel, batch.count, inputs, [f], device=self.device, block_dim=BLOCK)
+            else:
+                inputs = [subtree, batch.count, self.isotropic, u]
+                self.launch(kernel, -(-batch.count // LANES), inputs, [f, batch.flagged])
+        if self._others.count:
+            self._others.scatter(self.isotropic, u, self._room(), f)
+
+    def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
+        if self.device.is_cuda:
+            return subtrees.scatter_dilatation(shape, grouped, self.discretization.material_stride == 0, self._of)
+        return subtrees.scatter_in_lanes(shape, self._of)
+
+    @property
+    def _block(self) -> int:
+        return BLOCK if self.device.is_cuda else 256
+
+    # --- stiffness ---------------------------------------------------------------------------------------------------
+
+    def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array, *, exact: bool | None = None) -> None:
+        """Add K(u) p to y [N].
+
+        Args:
+            u, p, y: As for every field.
+            exact: None: the law's own K. Of corotated that is the paper's: without the turning of the rotations, and
+                without the turning of the gradient of J, which is positive semidefinite; True: the derivative.
+        """
+        self._law("add_stiffness", exact)(u, p, y)
+        inputs = [self.elements, self.isotropic, u, p, self._share(u, p), self._turning(exact)]
+        self.launch(kernels.add_product(self._kind, self._of), self.element_count, inputs, [y])
+
+    def add_diagonal(self, u: wp.array, blocks: wp.array, *, exact: bool | None = None) -> None:
+        """Add the 3x3 blocks on the diagonal of the same K(u) to those of the nodes [N/m]; see ``add_stiffness``.
+
+        Where dilatations are at nodes the blocks are larger than those of K.
+        """
+        self._law("add_diagonal", exact)(u, blocks)
+        turning, shared = self._turning(exact), self._share(u, self._still)
+        kernel = kernels.add_diagonal_of_groups(self._kind, self._of)
+        for starts, members, live, count in self._groups():
+            inputs = [starts, members, live, self.elements, self.isotropic, u, shared, turning]
+            self.launch(kernel, count, inputs, [blocks])
+        self._others.add_nodal_diagonal(self.isotropic, u, shared, turning, blocks)
+
+    def _law(self, name: str, exact: bool | None) -> Callable[..., None]:
+        method = getattr(self.shear, name)
+        if exact is None or not self._has_rotations:
+            return method
+        return lambda *arrays: method(*arrays, exact=exact)
+
+    def _turning(self, exact: bool | None) -> float:
+        return 0.0 if self._has_rotations and not exact else 1.0
+
+    @property
+    def _has_rotations(self) -> bool:
+        """Whether the law's K is not the exact derivative unless that is asked for."""
+        return self._of is VOLUME
+
+    # --- energies and stresses ---------------------------------------------------------------------------------------
+
+    def write_energies(self, u: wp.array, energies: wp.array) -> None:
+        self.shear.write_energies(u, energies)
+        inputs = [self.elements, self.isotropic, self._share(u, self._still)]
+        self.launch(kernels.add_energies(self._kind), self.element_count, inputs, [energies])
+
+    @property
+    def energy_count(self) -> int:
+        return self.shear.energy_count
+
+    def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
+        self.shear.write_von_mises(u, stress)
+
+    # --- what is shared ----------------------------------------------------------------------------------------------
+
+    @property
+    def _kind(self) -> type:
+        return self.discretization.element_kind
+
+    def _room(self) -> wp.array:
+        """What passes leave to one another of all elements."""
+        if len(self._shared) < self.element_count:
+            self._shared = wp.zeros(self.element_count, dtype=wp.vec4, device=self.device)
+        return self._shared
+
+    def _groups(self) -> list[tuple[wp.array, wp.array, wp.array, int]]:
+        """Subtrees and other groups, as ``kernels.share_in_groups`` takes them, and how many."""
+        of_subtrees = [(b.subtrees.first, self._all, b.live or self._all, b.count) for b in self.plan.batches]
+        return of_subtrees + self._others.groups
+
+    def _share(self, u: wp.array, p: wp.array) -> wp.array:
+        """The second pass of ``kernels.elements.shared_dilatation``, of all elements."""
+        shared = self._room()
+        measure = kernels.measure_elements(self._kind, self._of)
+        self.launch(measure, self.element_count, [self.elements, self._all, self._all, u, p], [shared])
+        kernel = kernels.share_in_groups(self._kind, self._of)
+        for starts, members, live, count in self._groups():
+            self.launch(kernel, count, [starts, members, live, self.elements, self.isotropic], [shared])
+        self._others.share_at_nodes(self.isotropic, len(u), shared)
+        return shared

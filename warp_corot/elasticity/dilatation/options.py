@@ -1,0 +1,75 @@
+"""The option ``dilatation`` of models: whether elements share theirs, and the field that follows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from warp_corot.discretization.discretization import Discretization, discretization_of
+from warp_corot.elasticity.model import ForceField
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import shown
+from warp_corot.kernels.elements.dilatation import Dilatation
+
+from .field import DilatationField
+
+if TYPE_CHECKING:
+    from warp_corot.discretization.discretization import Discretized
+
+ELEMENT, SHARED = "element", "shared"
+
+
+def check_dilatation(dilatation: str) -> None:
+    """Check the option of a model.
+
+    Raises:
+        InputError: It is none of the values.
+    """
+    if dilatation not in (ELEMENT, SHARED):
+        raise InputError(f"dilatation is {shown(dilatation)}; it must be {ELEMENT!r} or {SHARED!r}")
+
+
+def refuse_shared(dilatation: str, model: str) -> None:
+    """Check the option of a model of springs, which has no dilatation to share.
+
+    Raises:
+        InputError: It is not "element".
+    """
+    if dilatation != ELEMENT:
+        raise InputError(f"dilatation is {shown(dilatation)}; for {model}, which has springs, it must be {ELEMENT!r}")
+
+
+def shares_dilatation(dilatation: str, discretization: Discretization) -> bool:
+    """Whether the elements of a discretization share their dilatation under an option of the model.
+
+    Raises:
+        InputError: They should, and the material is anisotropic.
+    """
+    if dilatation == SHARED and discretization.is_anisotropic:
+        name = type(discretization.material).__name__
+        raise InputError(f"dilatation is {SHARED!r} and the material is {name}; it must be {ELEMENT!r}")
+    return dilatation == SHARED
+
+
+def bind_law(
+    bind: Callable[[Discretization, bool], ForceField],
+    of: Dilatation,
+    dilatation: str,
+    body: Discretized | Discretization,
+    deterministic: bool,
+) -> ForceField:
+    """The field of a law on a body, with a dilatation of each element or a shared one.
+
+    Args:
+        bind: Makes the law's field of a discretization; the other argument is ``deterministic``.
+        of: What is shared.
+        dilatation: The option of the model.
+        body, deterministic: As for every field.
+
+    Raises:
+        InputError: The dilatation should be shared, and the material is anisotropic.
+    """
+    discretization = discretization_of(body)
+    if shares_dilatation(dilatation, discretization):
+        return DilatationField(discretization, lambda part: bind(part, deterministic), of, deterministic)
+    return bind(discretization, deterministic)

@@ -1,0 +1,127 @@
+"""Elements in no complete subtree, which share their dilatation in groups or at nodes."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.groups import Groups
+from warp_corot.discretization.plan import Plan
+from warp_corot.elasticity.paths.lanes import as_general
+from warp_corot.kernels.elements import dilatation_lanes as lanes
+from warp_corot.kernels.elements import shared_dilatation as kernels
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.dilatation import Dilatation
+from warp_corot.kernels.elements.elements import GeneralElements
+from warp_corot.kernels.elements.general_cpu import rest_matrices
+from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.mesh import TetForest
+
+
+class Others:
+    """The elements of a plan that are in no complete subtree.
+
+    In a forest that stays as it is they are in groups. Groups would have to be found anew on the device where a forest
+    changes; there, and in a general mesh, they have their dilatation at nodes.
+
+    Args:
+        discretization: The mesh.
+        plan: What the field goes through.
+        of: What is shared.
+    """
+
+    def __init__(self, discretization: Discretization, plan: Plan, of: Dilatation):
+        self._discretization, self._plan, self._of = discretization, plan, of
+        self._device, self._kind = discretization.device, discretization.element_kind
+        self._none = wp.empty(0, dtype=wp.int32, device=self._device)
+        self._still = wp.empty(0, dtype=wp.vec4, device=self._device)
+        self._sums = wp.empty(0, dtype=wp.vec4, device=self._device)
+        self._slot_sums = None if plan.slots is None else wp.zeros_like(plan.slots.values)
+        self._groups: Groups | None = None
+        mesh = discretization.mesh
+        if plan.counts is None and isinstance(mesh, TetForest) and (plan.kinds or len(plan.flat)):
+            leaves = plan.flat.leaves.numpy()
+            leaves = leaves[: len(leaves) // discretization.worlds]
+            self._groups = Groups.of_leaves(mesh, leaves, self._device, discretization.worlds)
+        self.follow()
+
+    def follow(self) -> None:
+        """Take the elements of the plan as it is now."""
+        plan, flat = self._plan, self._plan.flat
+        self._places, live = self._none, None
+        if plan.kinds or len(flat):
+            self.count, self._elements, self._places, live = len(flat), flat.elements, flat.leaves, flat.live
+        else:
+            self.count, self._elements = self._discretization.sizes.launch_elements, plan.elements
+            live = plan.counts.now if plan.counts is not None else None
+        self._live = self._none if live is None else live
+        self._general = None
+        if self.count and not self._device.is_cuda:
+            self._general = self._elements if self._kind is GeneralElements else flat.general
+            self._general = self._general or as_general(self._elements, rest_matrices, [self._elements])
+
+    @property
+    def kernels(self) -> list[wp.Kernel]:
+        """All that forces may launch."""
+        if self._device.is_cuda:
+            passes = [kernels.measure_elements(self._kind, self._of), kernels.scatter_pressures(self._kind, self._of)]
+        else:
+            passes = [lanes.measure_in_lanes(self._of), lanes.scatter_in_lanes(self._of)]
+        if self._groups is not None:
+            return [*passes, kernels.share_in_groups(self._kind, self._of)]
+        return [*passes, kernels.add_to_nodes(self._kind), kernels.share_at_nodes(self._kind, self._of)]
+
+    def scatter(self, material: IsotropicMaterial, u: wp.array, shared: wp.array, f: wp.array) -> None:
+        """Add the forces of displacements u to f; ``shared`` has room for all elements of the mesh."""
+        if self._general is None:
+            where = [self._elements, self._places, self._live]
+            self._launch(kernels.measure_elements(self._kind, self._of), [*where, u, self._still], [shared])
+        else:
+            blocks, where = -(-self.count // LANES), [self._general, self.count, self._places, self._live]
+            self._launch(lanes.measure_in_lanes(self._of), [*where, u], [shared], blocks)
+        if self._groups is not None:
+            starts, members, live, count = self.groups[0]
+            inputs = [starts, members, live, self._plan.elements, material]
+            self._launch(kernels.share_in_groups(self._kind, self._of), inputs, [shared], count)
+        else:
+            self.share_at_nodes(material, len(u), shared)
+        if self._general is None:
+            kernel = kernels.scatter_pressures(self._kind, self._of)
+            self._launch(kernel, [*where, material, u, shared], [f])
+        else:
+            self._launch(lanes.scatter_in_lanes(self._of), [*where, material, u, shared], [f], blocks)
+
+    @property
+    def groups(self) -> list[tuple[wp.array, wp.array, wp.array, int]]:
+        """The groups as ``kernels.share_in_groups`` takes them, and how many; none where there are none."""
+        if self._groups is None or not len(self._groups):
+            return []
+        return [(self._groups.starts, self._groups.members, self._none, len(self._groups))]
+
+    def share_at_nodes(self, material: IsotropicMaterial, nodes: int, shared: wp.array) -> None:
+        """The second pass of the elements that are in no group, of a mesh of so many nodes."""
+        if self._groups is not None or not self.count:
+            return
+        if len(self._sums) < nodes:
+            self._sums = wp.zeros(nodes, dtype=wp.vec4, device=self._device)
+        sums = self._sums[:nodes]
+        sums.zero_()
+        to = sums if self._slot_sums is None else self._slot_sums
+        to.zero_()
+        where = [self._elements, self._places, self._live]
+        self._launch(kernels.add_to_nodes(self._kind), [*where, material, shared], [to])
+        if self._slot_sums is not None:
+            assert self._plan.slots is not None
+            self._plan.slots.gather(sums, self._slot_sums)
+        self._launch(kernels.share_at_nodes(self._kind, self._of), [*where, sums], [shared])
+
+    def add_nodal_diagonal(
+        self, material: IsotropicMaterial, u: wp.array, shared: wp.array, turning: float, blocks: wp.array
+    ) -> None:
+        """Add the diagonal blocks of the elements that are in no group."""
+        if self._groups is None and self.count:
+            inputs = [self._elements, self._places, self._live, material, u, shared, turning]
+            self._launch(kernels.add_diagonal(self._kind, self._of), inputs, [blocks])
+
+    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list, count: int | None = None) -> None:
+        wp.launch(kernel, self.count if count is None else count, inputs, outputs, device=self._device)
