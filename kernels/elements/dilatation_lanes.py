@@ -12,8 +12,10 @@ from .lanes import COMPILER_FLAGS, ISOTROPIC, constants, native, on_cpu
 wp.set_module_options({"enable_backward": False})
 
 
-def law_of(of: Dilatation) -> str:
-    """The native code of a law's dilatation."""
+def law_of(of: Dilatation, has_log: bool = False) -> str:
+    """The native code of a law's dilatation; ``has_log``: after neo-Hookean's, which has the logarithm already."""
+    if has_log:
+        return native(*(name for name in of.lanes if name != "log"))
     return constants(CONTINUED_BELOW=CONTINUED_BELOW) + native(*of.lanes)
 
 

@@ -1,5 +1,5 @@
 // Forces of all leaves by themselves, for lanes that are not ``done``. In: x, leaf_axes; ``find_strain`` and
-// ``stress`` of a law. Out: g and left_out.
+// ``stress`` of a law; ``join``, which adds to stresses of all lanes. Out: g and left_out.
 #pragma clang loop unroll(disable)
 for (int leaf = 0; leaf < 8; ++leaf) {
     material_of(leaf);
@@ -11,6 +11,7 @@ for (int leaf = 0; leaf < 8; ++leaf) {
     find_strain(a, q, e, f_);
     const masks8 sound = stress(f_, e, hand[leaf][0] * mirror, m * area, k * area, p);
     for (int j = 0; j < 3; ++j) p[j] = chosen(done, nothing, p[j]);
+    join(leaf, a, q, p);
     left_out |= ~sound & ~done & (1 << leaf);
     add_leaf(g, nodes_of[leaf], p);
 }

@@ -13,6 +13,8 @@ import warp as wp
 
 from warp_corot.kernels.corotated.tangent import RotatedMaterial
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.dilatation import Dilatation
+from warp_corot.kernels.elements.dilatation_lanes import law_of
 from warp_corot.kernels.elements.elements import Subtrees
 from warp_corot.kernels.elements.lanes import ISOTROPIC, ISOTROPIC_PART, native, scatter_lanes
 from warp_corot.kernels.elements.law_lanes import LAWS, ROTATION
@@ -30,12 +32,33 @@ class NearMaterial:
     tolerance: float
 
 
+@wp.struct
+class DilatingMaterial:
+    """A material whose lambda the leaves of a subtree share: ``isotropic`` has none. And the tolerance as above."""
+
+    isotropic: IsotropicMaterial
+    tolerance: float
+    lam: wp.array[wp.float32]
+
+
+def joining(law: str, shared: Dilatation | None) -> str:
+    """Native code for what joins leaves of a law: the dilatation that they share, if they do."""
+    if shared is None:
+        return native("own_leaves")
+    return law_of(shared, has_log=law == "neo-hookean") + "const auto& dilating = material.lam;\n" + native("shared_dilatation")
+
+
 @functools.cache
-def scatter_law_subtrees(shape: int, law: str = "corotated") -> wp.Kernel:
-    """Forces of subtrees under a law of ``elements.law_lanes``, every leaf by itself; a thread is eight subtrees."""
+def scatter_law_subtrees(shape: int, law: str = "corotated", shared: Dilatation | None = None) -> wp.Kernel:
+    """Forces of subtrees under a law of ``elements.law_lanes``, every leaf by itself; a thread is eight subtrees.
+
+    With a shared dilatation the material is a ``DilatingMaterial``.
+    """
     flags = ["left_out_leaves"] if law == "corotated" else []
-    leaves = "const masks8 done = {};\n" + native("leaves", "subtree_forces", *flags)
-    return scatter_lanes(LAWS[law] + ISOTROPIC + begin(shape) + leaves, Subtrees, IsotropicMaterial, wp.uint8)
+    leaves = joining(law, shared) + "const masks8 done = {};\n" + native("leaves", "subtree_forces", *flags)
+    if shared is None:
+        return scatter_lanes(LAWS[law] + ISOTROPIC + begin(shape) + leaves, Subtrees, IsotropicMaterial, wp.uint8)
+    return scatter_lanes(LAWS[law] + ISOTROPIC_PART + begin(shape) + leaves, Subtrees, DilatingMaterial, wp.uint8)
 
 
 @functools.cache
@@ -48,14 +71,17 @@ def scatter_subtrees_shared(shape: int, given: bool) -> wp.Kernel:
 
 
 @functools.cache
-def scatter_subtrees_near(shape: int) -> wp.Kernel:
+def scatter_subtrees_near(shape: int, shared: Dilatation | None = None) -> wp.Kernel:
     """Corotated forces of subtrees; a thread is eight subtrees.
 
     With their root's rotation where it is near those of the leaves: where the displacement gradient E that it leaves
     in each has |skew E| <= tolerance [rad] and |sym E| <= 1/2, and the subtree as one element is strained by no more
     either. The stress is then wrong by no more than ``forces.shared_forces`` says. Elsewhere every leaf has its
-    own rotation, and the forces are those of ``scatter_law_subtrees`` to the bit.
+    own rotation, and the forces are those of ``scatter_law_subtrees`` to the bit. With a shared dilatation the material
+    is a ``DilatingMaterial``.
     """
     code = LAWS["corotated"] + native("rotation") + ISOTROPIC_PART + begin(shape) + product(shape) + near_test(shape)
-    code += native("shared_rotation", "near_leaves") + f"if (any(~done)) {{\n{native('leaves')}}}\n"
-    return scatter_lanes(code + native("subtree_forces", "left_out_leaves"), Subtrees, NearMaterial, wp.uint8)
+    code += joining("corotated", shared) + native("shared_rotation", "near_leaves") + f"if (any(~done)) {{\n{native('leaves')}}}"
+    code += "\n" if shared is None else f" else {{\n{native('dilatation')}}}\n"
+    material = NearMaterial if shared is None else DilatingMaterial
+    return scatter_lanes(code + native("subtree_forces", "left_out_leaves"), Subtrees, material, wp.uint8)

@@ -29,7 +29,8 @@ wp.set_module_options({"enable_backward": False})
 @functools.cache
 def scatter_in_lanes(shape: int, of: Dilatation) -> wp.Kernel:
     """Forces of the shared dilatation of subtrees on the CPU; a thread is eight subtrees."""
-    code = law_of(of) + ISOTROPIC + begin(shape) + native("dilatation", "subtree_forces")
+    code = ISOTROPIC + begin(shape) + law_of(of) + "const auto& dilating = isotropic.lam;\n"
+    code += native("shared_dilatation", "dilatation", "subtree_forces")
     return scatter_lanes(code, Subtrees, IsotropicMaterial, wp.uint8)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, ClassVar
 
@@ -16,6 +16,7 @@ from warp_corot.discretization.plan import FlatLeaves, Plan
 from warp_corot.discretization.subtrees import chosen
 from warp_corot.errors import InputError
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.forces import (
     element_energies,
     element_von_mises,
@@ -128,6 +129,18 @@ class ForceField(ABC):
 
         Called where plans change, before steps are recorded, whenever a size is another one.
         """
+
+    def share_dilatation(self, of: Dilatation, lam: Callable[[], wp.array]) -> bool:
+        """Add from now on the forces of a dilatation that the leaves of complete subtrees share, if the field can.
+
+        Args:
+            of: What is shared.
+            lam: Gives lambda [Pa] as elements hold it.
+
+        Returns:
+            Whether it can.
+        """
+        return False
 
     @abstractmethod
     def write_energies(self, u: wp.array, energies: wp.array) -> None:

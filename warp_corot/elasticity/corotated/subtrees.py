@@ -14,12 +14,14 @@ import warp as wp
 from warp_corot.discretization.plan import FlatLeaves
 from warp_corot.discretization.subtrees import Batch, Sharing
 from warp_corot.elasticity.paths.clusters import ChangingClusterScatter
+from warp_corot.elasticity.paths.dilating import Dilating
 from warp_corot.elasticity.paths.lanes import Lanes, as_general
 from warp_corot.elasticity.structs import Kept
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
 from warp_corot.kernels.corotated.near_rotations import share_near_rotations
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
+from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.elements.general_cpu import rest_matrices, scatter_law_elements
 from warp_corot.kernels.elements.lanes import LANES
@@ -43,7 +45,9 @@ if TYPE_CHECKING:
 
 
 #: What kernels of lanes read.
-LanesMaterial: TypeAlias = "IsotropicMaterial | RotatedMaterial | subtree_cpu.NearMaterial"
+LanesMaterial: TypeAlias = (
+    "IsotropicMaterial | RotatedMaterial | subtree_cpu.NearMaterial | subtree_cpu.DilatingMaterial"
+)
 
 
 class SubtreeField(CorotatedField):
@@ -54,6 +58,7 @@ class SubtreeField(CorotatedField):
     def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
         super().__init__(discretization, model, deterministic)
         self._uniform = discretization.material_stride == 0
+        self._dilating: Dilating | None = None
         #: What adds the forces of all leaves, whatever they come to be.
         self._clusters: ChangingClusterScatter | None = None
         if self._listed and self.rotation_level is None:
@@ -79,6 +84,13 @@ class SubtreeField(CorotatedField):
             LeftOutLeaves.load(self.device)
         if one_launch:
             OwnLaunches.load(self._uniform, self.model.tolerance, self.device)
+
+    def share_dilatation(self, of: Dilatation, lam: Callable[[], wp.array]) -> bool:
+        if self.device.is_cuda or any(sharing is not Sharing.OWN for _shape, _grouped, sharing in self.plan.kinds):
+            return False
+        self._dilating = Dilating(of, lam, self.model.tolerance)
+        self.follow()
+        return True
 
     @property
     def _block(self) -> int:
@@ -163,8 +175,10 @@ class SubtreeField(CorotatedField):
                 )
             return subtree_cuda.scatter_subtrees_shared(shape, grouped, self._uniform, given, self._listed)
         if sharing is Sharing.OWN:
-            near = self.model.tolerance is not None
-            return subtree_cpu.scatter_subtrees_near(shape) if near else subtree_cpu.scatter_law_subtrees(shape)
+            dilatation = None if self._dilating is None else self._dilating.of
+            if self.model.tolerance is not None:
+                return subtree_cpu.scatter_subtrees_near(shape, dilatation)
+            return subtree_cpu.scatter_law_subtrees(shape, shared=dilatation)
         return subtree_cpu.scatter_subtrees_shared(shape, given)
 
     def _material(self, batch: Batch) -> Callable[[], LanesMaterial]:
@@ -172,6 +186,9 @@ class SubtreeField(CorotatedField):
         if batch.sharing is not Sharing.OWN:
             rotated, unit = Kept(rotated_material), self._no_unit if batch.unit is None else batch.unit
             return lambda: rotated(self.isotropic, self._rotations, unit)
+        if self._dilating is not None:
+            dilating = self._dilating
+            return lambda: dilating.material(self.isotropic)
         if self.model.tolerance is not None:
             near, tolerance = Kept(near_material), self.model.tolerance
             return lambda: near(self.isotropic, tolerance)

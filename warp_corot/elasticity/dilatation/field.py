@@ -49,6 +49,8 @@ class DilatationField(ForceField):
         self._all, self._still = (wp.empty(0, dtype=kind, device=self.device) for kind in (wp.int32, wp.vec4))
         self._shared = wp.empty(0, dtype=wp.vec4, device=self.device)
         self._others = Others(discretization, self.plan, of)
+        #: Whether the law's own launches add the forces of subtrees.
+        self._joined = self.plan is self.shear.plan and self.shear.share_dilatation(of, lambda: discretization.lam)
 
     def plan_of(self, discretization: Discretization) -> Plan:
         """The same plan where that has subtrees, and where the mesh changes: one plan is kept up to date there."""
@@ -59,7 +61,7 @@ class DilatationField(ForceField):
 
     def load_kernels(self) -> None:
         self.shear.load_kernels()
-        for shape, grouped, _sharing in self.plan.kinds:
+        for shape, grouped, _sharing in [] if self._joined else self.plan.kinds:
             wp.load_module(self._kernel(shape, grouped).module, self.device, block_dim=self._block)
         for kernel in self._others.kernels:
             wp.load_module(kernel.module, self.device, block_dim=256)
@@ -94,7 +96,7 @@ class DilatationField(ForceField):
         self._scatter(u, f)
 
     def _scatter(self, u: wp.array, f: wp.array) -> None:
-        for batch in self.plan.batches:
+        for batch in () if self._joined else self.plan.batches:
             kernel, subtree = self._kernel(batch.shape, batch.grouped), batch.subtrees
             if self.device.is_cuda:
                 inputs = [subtree, self.discretization.lam, u]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
@@ -9,11 +10,13 @@ import warp as wp
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.model import LawField
+from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.general_cpu import rest_matrices, scatter_law_elements
 from warp_corot.kernels.elements.lanes import LANES
 from warp_corot.kernels.subtrees.cpu import scatter_law_subtrees
 from warp_corot.mesh import TetForest
 
+from .dilating import Dilating
 from .lanes import Lanes, as_general
 
 if TYPE_CHECKING:
@@ -33,6 +36,7 @@ class LawLanesField(LawField):
         super().__init__(discretization, **functions)
         self._law = law
         self._lanes: Lanes | None = None
+        self._dilating: Dilating | None = None
         self._lanes_material = self.isotropic
         if not isinstance(discretization.mesh, TetForest):
             self._lanes = Lanes(self.elements, self.elements, scatter=scatter_law_elements(law))
@@ -43,14 +47,24 @@ class LawLanesField(LawField):
         return discretization.plan()
 
     def load_kernels(self) -> None:
-        kernels = [scatter_law_subtrees(shape, self._law) for shape, _grouped, _sharing in self.plan.kinds]
+        kernels = [self._kernel(shape) for shape, _grouped, _sharing in self.plan.kinds]
         for kernel in (*kernels, scatter_law_elements(self._law)):
             wp.load_module(kernel.module, self.device, block_dim=256)
 
+    def _kernel(self, shape: int) -> wp.Kernel:
+        return scatter_law_subtrees(shape, self._law, None if self._dilating is None else self._dilating.of)
+
+    def share_dilatation(self, of: Dilatation, lam: Callable[[], wp.array]) -> bool:
+        self._dilating = Dilating(of, lam)
+        return True
+
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        material: Any = self.isotropic
+        if self._dilating is not None:
+            material = self._dilating.material(material)
         for batch in self.plan.batches:
-            inputs, threads = [batch.subtrees, batch.count, self.isotropic, u], -(-batch.count // LANES)
-            self.launch(scatter_law_subtrees(batch.shape, self._law), threads, inputs, [f, batch.flagged])
+            inputs, threads = [batch.subtrees, batch.count, material, u], -(-batch.count // LANES)
+            self.launch(self._kernel(batch.shape), threads, inputs, [f, batch.flagged])
         if self._lanes is not None:
             self._lanes.scatter_forces(self._lanes_material, u, f)
 
