@@ -45,7 +45,11 @@ def joining(law: str, shared: Dilatation | None) -> str:
     """Native code for what joins leaves of a law: the dilatation that they share, if they do."""
     if shared is None:
         return native("own_leaves")
-    return law_of(shared, has_log=law == "neo-hookean") + "const auto& dilating = material.lam;\n" + native("shared_dilatation")
+    return (
+        law_of(shared, has_log=law == "neo-hookean")
+        + "const auto& dilating = material.lam;\n"
+        + native("shared_dilatation")
+    )
 
 
 @functools.cache
@@ -81,7 +85,11 @@ def scatter_subtrees_near(shape: int, shared: Dilatation | None = None) -> wp.Ke
     is a ``DilatingMaterial``.
     """
     code = LAWS["corotated"] + native("rotation") + ISOTROPIC_PART + begin(shape) + product(shape) + near_test(shape)
-    code += joining("corotated", shared) + native("shared_rotation", "near_leaves") + f"if (any(~done)) {{\n{native('leaves')}}}"
+    code += (
+        joining("corotated", shared)
+        + native("shared_rotation", "near_leaves")
+        + f"if (any(~done)) {{\n{native('leaves')}}}"
+    )
     code += "\n" if shared is None else f" else {{\n{native('dilatation')}}}\n"
     material = NearMaterial if shared is None else DilatingMaterial
     return scatter_lanes(code + native("subtree_forces", "left_out_leaves"), Subtrees, material, wp.uint8)

@@ -69,7 +69,12 @@ def group_numbers(forest: TetForest, leaves: npt.NDArray[np.integer]) -> npt.NDA
     rest = np.flatnonzero(group < 0)
     if len(rest):
         corners, _ = forest.tree.rows(above[rest])
-        cubes = np.asarray(forest.lattice)[corners].min(axis=1) >> CUBE_BITS
-        _, of_cube = np.unique(cubes, axis=0, return_inverse=True)
+        _, of_cube = np.unique(cubes_of(forest, corners), axis=0, return_inverse=True)
         group[rest] = count + of_cube.ravel()
     return group
+
+
+def cubes_of(forest: TetForest, roots: npt.NDArray[np.integer]) -> npt.NDArray[np.int32]:
+    """The cubes of some roots, given by their nodes, int [n, 4]: which along x, y and z, int32 [n, 3]."""
+    corners: npt.NDArray[np.int32] = np.asarray(forest.lattice)[roots].min(axis=1) >> CUBE_BITS
+    return corners

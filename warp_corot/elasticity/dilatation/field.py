@@ -23,8 +23,8 @@ from .others import Others
 class DilatationField(ForceField):
     """A law's force field without lambda's part, and that part with a dilatation that elements share.
 
-    In a forest the eight leaves of each complete subtree share one, and so do groups of the other leaves. Where there
-    is no tree, or where it changes, these have one at each node. The von Mises stress is each element's own.
+    In a forest the eight leaves of each complete subtree share one, and so do groups of the other leaves. In a
+    general mesh there is one at each node. The von Mises stress is each element's own.
 
     Args:
         discretization: The mesh and the material.
@@ -68,6 +68,7 @@ class DilatationField(ForceField):
 
     def derive(self) -> None:
         self.shear.derive()
+        self._others.derive()
 
     def follow(self) -> None:
         self.shear.follow()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import warp as wp
 
+from warp_corot.discretization.changing.groups import ChangingGroups
+from warp_corot.discretization.changing.plan import DevicePlan
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.groups import Groups
 from warp_corot.discretization.plan import Plan
@@ -21,8 +23,8 @@ from warp_corot.mesh import TetForest
 class Others:
     """The elements of a plan that are in no complete subtree.
 
-    In a forest that stays as it is they are in groups. Groups would have to be found anew on the device where a forest
-    changes; there, and in a general mesh, they have their dilatation at nodes.
+    In a forest they are in groups, which are found anew where it changes. In a general mesh, and in a forest of a plan
+    without subtrees, they have their dilatation at nodes.
 
     Args:
         discretization: The mesh.
@@ -37,13 +39,21 @@ class Others:
         self._still = wp.empty(0, dtype=wp.vec4, device=self._device)
         self._sums = wp.empty(0, dtype=wp.vec4, device=self._device)
         self._slot_sums = None if plan.slots is None else wp.zeros_like(plan.slots.values)
-        self._groups: Groups | None = None
+        self._groups: Groups | ChangingGroups | None = None
         mesh = discretization.mesh
-        if plan.counts is None and isinstance(mesh, TetForest) and (plan.kinds or len(plan.flat)):
+        if isinstance(plan, DevicePlan):
+            self._groups = ChangingGroups(plan) if plan.kinds else None
+        elif isinstance(mesh, TetForest) and (plan.kinds or len(plan.flat)):
             leaves = plan.flat.leaves.numpy()
             leaves = leaves[: len(leaves) // discretization.worlds]
             self._groups = Groups.of_leaves(mesh, leaves, self._device, discretization.worlds)
+        self.derive()
         self.follow()
+
+    def derive(self) -> None:
+        """Launch what finds the groups where the mesh changes; may be recorded."""
+        if isinstance(self._groups, ChangingGroups):
+            self._groups.launch()
 
     def follow(self) -> None:
         """Take the elements of the plan as it is now."""
@@ -94,9 +104,12 @@ class Others:
     @property
     def groups(self) -> list[tuple[wp.array, wp.array, wp.array, int]]:
         """The groups as ``kernels.share_in_groups`` takes them, and how many; none where there are none."""
-        if self._groups is None or not len(self._groups):
+        groups = self._groups
+        if groups is None or not self.count:
             return []
-        return [(self._groups.starts, self._groups.members, self._none, len(self._groups))]
+        if isinstance(groups, ChangingGroups):
+            return [(groups.starts, groups.members, groups.live, self.count)]
+        return [(groups.starts, groups.members, self._none, len(groups))]
 
     def share_at_nodes(self, material: IsotropicMaterial, nodes: int, shared: wp.array) -> None:
         """The second pass of the elements that are in no group, of a mesh of so many nodes."""
