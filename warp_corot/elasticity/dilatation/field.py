@@ -10,6 +10,7 @@ from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.plan import Plan
 from warp_corot.discretization.shear_only import ShearOnly
 from warp_corot.elasticity.model import ForceField
+from warp_corot.elasticity.tangent import Tangent
 from warp_corot.kernels.elements import shared_dilatation as kernels
 from warp_corot.kernels.elements.dilatation import VOLUME, Dilatation
 from warp_corot.kernels.elements.lanes import LANES
@@ -128,6 +129,10 @@ class DilatationField(ForceField):
                 without the turning of the gradient of J, which is positive semidefinite; True: the derivative.
         """
         self._law("add_stiffness", exact)(u, p, y)
+        self.add_shared_product(u, p, y, exact)
+
+    def add_shared_product(self, u: wp.array, p: wp.array, y: wp.array, exact: bool | None = None) -> None:
+        """The part of ``add_stiffness`` that comes from the shared dilatation."""
         inputs = [self.elements, self.isotropic, u, p, self._share(u, p), self._turning(exact)]
         self.launch(kernels.add_product(self._kind, self._of), self.element_count, inputs, [y])
 
@@ -137,12 +142,19 @@ class DilatationField(ForceField):
         Where dilatations are at nodes the blocks are larger than those of K.
         """
         self._law("add_diagonal", exact)(u, blocks)
+        self.add_shared_diagonal(u, blocks, exact)
+
+    def add_shared_diagonal(self, u: wp.array, blocks: wp.array, exact: bool | None = None) -> None:
+        """The part of ``add_diagonal`` that comes from the shared dilatation."""
         turning, shared = self._turning(exact), self._share(u, self._still)
         kernel = kernels.add_diagonal_of_groups(self._kind, self._of)
         for starts, members, live, count in self._groups():
             inputs = [starts, members, live, self.elements, self.isotropic, u, shared, turning]
             self.launch(kernel, count, inputs, [blocks])
         self._others.add_nodal_diagonal(self.isotropic, u, shared, turning, blocks)
+
+    def tangent(self, *, exact: bool = False) -> Tangent:
+        return SharedTangent(self, exact)
 
     def _law(self, name: str, exact: bool | None) -> Callable[..., None]:
         method = getattr(self.shear, name)
@@ -178,6 +190,11 @@ class DilatationField(ForceField):
     def _kind(self) -> type:
         return self.discretization.element_kind
 
+    def prepare_room(self, u: wp.array) -> None:
+        """Make room for what passes leave to one another at displacements u; not while launches are recorded."""
+        self._room()
+        self._others.prepare_sums(len(u))
+
     def _room(self) -> wp.array:
         """What passes leave to one another of all elements."""
         if len(self._shared) < self.element_count:
@@ -199,3 +216,35 @@ class DilatationField(ForceField):
             self.launch(kernel, count, [starts, members, live, self.elements, self.isotropic], [shared])
         self._others.share_at_nodes(self.isotropic, len(u), shared)
         return shared
+
+
+class SharedTangent(Tangent):
+    """K of a field with a shared dilatation.
+
+    Args:
+        field: The field.
+        exact: As for ``ForceField.tangent``.
+    """
+
+    field: DilatationField
+
+    def __init__(self, field: DilatationField, exact: bool):
+        super().__init__(field)
+        self.shear, self._exact = field.shear.tangent(exact=exact), exact
+
+    def prepare(self, u: wp.array) -> None:
+        super().prepare(u)
+        self.shear.prepare(u)
+        self.field.prepare_room(u)
+
+    def take(self, u: wp.array) -> None:
+        super().take(u)
+        self.shear.take(u)
+
+    def add_product(self, p: wp.array, y: wp.array) -> None:
+        self.shear.add_product(p, y)
+        self.field.add_shared_product(self.displacements, p, y, self._exact)
+
+    def add_diagonal(self, blocks: wp.array) -> None:
+        self.shear.add_diagonal(blocks)
+        self.field.add_shared_diagonal(self.displacements, blocks, self._exact)

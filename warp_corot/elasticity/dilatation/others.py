@@ -111,12 +111,16 @@ class Others:
             return [(groups.starts, groups.members, groups.live, self.count)]
         return [(groups.starts, groups.members, self._none, len(groups))]
 
+    def prepare_sums(self, nodes: int) -> None:
+        """Make room for sums at so many nodes; not while launches are recorded."""
+        if self._groups is None and len(self._sums) < nodes:
+            self._sums = wp.zeros(nodes, dtype=wp.vec4, device=self._device)
+
     def share_at_nodes(self, material: IsotropicMaterial, nodes: int, shared: wp.array) -> None:
         """The second pass of the elements that are in no group, of a mesh of so many nodes."""
         if self._groups is not None or not self.count:
             return
-        if len(self._sums) < nodes:
-            self._sums = wp.zeros(nodes, dtype=wp.vec4, device=self._device)
+        self.prepare_sums(nodes)
         sums = self._sums[:nodes]
         sums.zero_()
         to = sums if self._slot_sums is None else self._slot_sums
