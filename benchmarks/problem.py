@@ -29,7 +29,8 @@ except ImportError as error:
 #: Nodal displacements are uniform up to this fraction of the edge length, in both directions along each axis.
 JITTER = 0.05
 SAMPLE_NODES = 1000
-MATERIAL = {"young": 1e6, "poisson": 0.45, "density": 1000.0}
+#: Poisson's ratio is as large as it may be for each element to have a dilatation of its own by default.
+MATERIAL = {"young": 1e6, "poisson": 0.44, "density": 1000.0}
 
 #: Levels of the subtrees that are computed together, and of groups of eight of them.
 SUBTREE_LEVELS = 3

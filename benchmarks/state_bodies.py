@@ -18,8 +18,8 @@ from measure import kind
 import warp_corot as wc
 from warp_corot.experiments import paper
 
-#: A soft tissue; Young's modulus [Pa], density [kg/m^3].
-MATERIAL = {"young": 5e3, "poisson": 0.45, "density": 1000.0}
+#: A soft tissue whose elements have a dilatation each by default; Young's modulus [Pa], density [kg/m^3].
+MATERIAL = {"young": 5e3, "poisson": 0.44, "density": 1000.0}
 GRAVITY = (0.0, -9.81, 0.0)
 #: Time of motion before bodies are measured [s].
 LOADED_SECONDS = 0.5

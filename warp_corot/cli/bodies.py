@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.elasticity import MODELS, Corotated, Model
-from warp_corot.elasticity.dilatation import ELEMENT
 from warp_corot.errors import InputError
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.remesh.online import OnlineRemesh
@@ -65,7 +65,7 @@ class Body:
 
 def asked_bodies(args: argparse.Namespace) -> list[Body]:
     """The bodies of an input, with their options checked as far as possible without meshes."""
-    model = _model(args.model, args.rotation_level, args.dilatation or ELEMENT)
+    model = _model(args.model, args.rotation_level, args.dilatation)
     opened = open_input(args.input)
     refuse_options(args, opened)
     remesh, loads = remesh_of(args, opened.kind), loads_of(args)
@@ -142,12 +142,13 @@ def gravity_of(args: argparse.Namespace, subject: Subject) -> np.ndarray:
     return np.array(checked_gravity(given, subject.mesh.up_axis))
 
 
-def _model(name: str, rotation_level: int | float | str | None, dilatation: str) -> Model:
+def _model(name: str, rotation_level: int | float | str | None, dilatation: str | None) -> Model:
+    options: dict[str, Any] = {} if dilatation is None else {"dilatation": dilatation}
     if rotation_level is None:
-        return MODELS[name](dilatation=dilatation)  # type: ignore[call-arg]
+        return MODELS[name](**options)
     if name != "corotated":
         raise InputError(f"--rotation-level is {rotation_level}, but only --model corotated has rotations, not {name}")
-    return Corotated(rotation_level=rotation_level, dilatation=dilatation)
+    return Corotated(rotation_level=rotation_level, **options)
 
 
 def _material(

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_corot.elasticity import MODELS
-from warp_corot.elasticity.dilatation import ELEMENT, SHARED
+from warp_corot.elasticity.dilatation import ELEMENT
+from warp_corot.elasticity.dilatation.options import shares_dilatation
 from warp_corot.holding.choice import NAMED
 from warp_corot.mesh import TetForest
 from warp_corot.solvers import INTEGRATORS
@@ -90,7 +91,7 @@ def _of_body(body: Body) -> list[tuple[str, str]]:
     model = next(name for name, kind in MODELS.items() if type(body.model) is kind)
     level = getattr(body.model, "rotation_level", None)
     words = [model] if level is None else [model, f"rotations of level {level}"]
-    if getattr(body.model, "dilatation", ELEMENT) == SHARED:
+    if shares_dilatation(getattr(body.model, "dilatation", ELEMENT), body.soft.discretization):
         words.append("shared dilatation")
     rows = [
         *_body(body.subject),

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_corot.elasticity import MODELS
+from warp_corot.elasticity.dilatation import AUTO
 from warp_corot.errors import InputError
 from warp_corot.materials.isotropic import Isotropic
 
@@ -136,7 +137,8 @@ def run_text(asked: Sequence[argparse.Namespace], sim: Simulation) -> bytes:
         model, remesh = sim.models[0], sim.remesh[0]
         now.model = next(name for name, kind in MODELS.items() if type(model) is kind)
         now.rotation_level = getattr(model, "rotation_level", None)
-        now.dilatation = getattr(model, "dilatation", None)
+        dilatation = getattr(model, "dilatation", AUTO)
+        now.dilatation = None if dilatation == AUTO else dilatation
         now.remesh = remesh is not None
         if not now.remesh:
             now.refine_above = now.simplify_below = now.remesh_levels = now.remesh_every = now.capacity = None

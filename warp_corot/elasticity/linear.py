@@ -14,7 +14,7 @@ from warp_corot.kernels.elements.constitutive import (
 )
 from warp_corot.kernels.elements.dilatation import SMALL
 
-from .dilatation import ELEMENT, bind_law, check_dilatation
+from .dilatation import AUTO, bind_law, check_dilatation
 from .model import ForceField, Model
 
 if TYPE_CHECKING:
@@ -27,12 +27,13 @@ class Linear(Model):
 
     Attributes:
         dilatation: "element": each element has its own, and nearly incompressible tissue is too stiff. "shared":
-            elements share it, see ``elasticity.dilatation``; slower.
+            elements share it, see ``elasticity.dilatation``; slower. "auto": they do where Poisson's ratio is 0.45 or
+            more in any element, and the material is isotropic.
     """
 
     strained_safety: ClassVar[float] = 0.9  # its stiffness never changes
 
-    dilatation: str = ELEMENT
+    dilatation: str = AUTO
 
     def __post_init__(self) -> None:
         check_dilatation(self.dilatation)

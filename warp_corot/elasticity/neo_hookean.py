@@ -14,7 +14,7 @@ from warp_corot.kernels.elements.constitutive import (
 )
 from warp_corot.kernels.elements.dilatation import LOG_VOLUME
 
-from .dilatation import ELEMENT, bind_law, check_dilatation
+from .dilatation import AUTO, bind_law, check_dilatation
 from .model import ForceField, Model
 
 if TYPE_CHECKING:
@@ -35,10 +35,11 @@ class NeoHookean(Model):
 
     Attributes:
         dilatation: "element": each element has its own, and nearly incompressible tissue is too stiff. "shared":
-            elements share it, see ``elasticity.dilatation``; slower.
+            elements share it, see ``elasticity.dilatation``; slower. "auto": they do where Poisson's ratio is 0.45 or
+            more in any element, and the material is isotropic.
     """
 
-    dilatation: str = ELEMENT
+    dilatation: str = AUTO
 
     def __post_init__(self) -> None:
         check_dilatation(self.dilatation)

@@ -18,6 +18,7 @@ import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.elasticity import Corotated, Linear, Model, NeoHookean, StVenantKirchhoff
+from warp_corot.elasticity.dilatation import ELEMENT
 from warp_corot.errors import InputError
 from warp_corot.inputs.device import checked_device
 from warp_corot.materials.isotropic import Isotropic
@@ -104,12 +105,14 @@ class Case:
 
 def cases(level: int) -> list[Case]:
     """The models for a mesh of that level, the reference first."""
+    own = ELEMENT  # as the paper has it
+    levels = [Corotated(rotation_level=k, dilatation=own) for k in range(level + 1)]
     return [
-        Case(REFERENCE, "St. Venant–Kirchhoff", StVenantKirchhoff()),
-        Case("neo-hookean", "neo-Hookean", NeoHookean()),
-        Case(PEER, "linear", Linear()),
-        *(Case(f"{OWN}-{k}", f"corotated, level {k}", Corotated(rotation_level=k), k) for k in range(level + 1)),
-        Case(OWN, "corotated, own", Corotated()),
+        Case(REFERENCE, "St. Venant–Kirchhoff", StVenantKirchhoff(dilatation=own)),
+        Case("neo-hookean", "neo-Hookean", NeoHookean(dilatation=own)),
+        Case(PEER, "linear", Linear(dilatation=own)),
+        *(Case(f"{OWN}-{k}", f"corotated, level {k}", model, k) for k, model in enumerate(levels)),
+        Case(OWN, "corotated, own", Corotated(dilatation=own)),
     ]
 
 

@@ -10,6 +10,7 @@ import warp as wp
 
 from warp_corot.discretization.discretization import FixedMesh
 from warp_corot.elasticity import Corotated
+from warp_corot.elasticity.dilatation import ELEMENT
 from warp_corot.kernels.newton.particles import add_nodes, gather_nodes
 from warp_corot.mesh import TetForest
 
@@ -66,7 +67,7 @@ class ForestGroup:
         share = mesh_fill(self.forest)
         own_mu, own_lam = (_squeezed(a[self.tets].reshape(self.copies, -1) / share) for a in (mu, lam))
         made_of = FixedMesh.of_lame(self.forest, own_mu, own_lam, self.copies, self.device)
-        self._field = Corotated(rotation_level=self.rotation_level).bind(made_of)
+        self._field = Corotated(rotation_level=self.rotation_level, dilatation=ELEMENT).bind(made_of)
 
     def add_forces(self, x: wp.array, u: wp.array, f: wp.array) -> None:
         """Add the elastic forces of particles at x, displaced by u, to f, all vec4 [P].

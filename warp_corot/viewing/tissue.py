@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warp_corot.elasticity import MODELS, Corotated, EdgeStVK, MassSpring, Model
-from warp_corot.elasticity.dilatation import ELEMENT, SHARED
+from warp_corot.elasticity.dilatation import AUTO
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest
 from warp_corot.remesh.online import OnlineRemesh
@@ -79,8 +79,10 @@ def model_of(law: str, rotations: str, former: Model | None = None) -> Model:
         former: The one before, whose dilatation goes on.
     """
     kind = MODELS[law]
-    shared = getattr(former, "dilatation", ELEMENT) == SHARED and kind not in (EdgeStVK, MassSpring)
-    options: dict[str, Any] = {"dilatation": SHARED} if shared else {}
+    options: dict[str, Any] = {}
+    springs = (EdgeStVK, MassSpring)
+    if kind not in springs and not isinstance(former, springs):
+        options["dilatation"] = getattr(former, "dilatation", AUTO)
     if kind is Corotated and rotations != OWN:
         options["rotation_level"] = _number(rotations)
     return kind(**options)

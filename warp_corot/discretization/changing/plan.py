@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import warp as wp
@@ -167,8 +169,13 @@ class DevicePlan:
     def _refit(self) -> None:
         """``batches`` and ``flat`` of the present sizes."""
         sizes, classes = self._sizes, self._plan.classes
-        self.batches = tuple(self._made.batch(c, sizes[c]) for c in range(classes) if sizes[c])
-        self.flat = self._made.flat(sizes[classes])
+        found = ((c, self._made.batch(c, sizes[c])) for c in range(classes) if sizes[c])
+        self.batches = tuple(replace(batch, live=self._live(c)) for c, batch in found)
+        self.flat = replace(self._made.flat(sizes[classes]), live=self._live(classes))
+
+    def _live(self, row: int) -> wp.array:
+        """How many there are of a class, or of leaves in none."""
+        return self._plan.counts[row : row + 1]
 
     # --- pieces ------------------------------------------------------------------------------------------------------
 

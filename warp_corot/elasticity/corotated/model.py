@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warp_corot.elasticity.dilatation import ELEMENT, bind_law, check_dilatation
+from warp_corot.elasticity.dilatation import AUTO, bind_law, check_dilatation
 from warp_corot.elasticity.model import ForceField, Model
 from warp_corot.elasticity.paths.general import CorotatedGeneralField
 from warp_corot.elasticity.polar import METHODS, rotation_function
@@ -60,6 +60,7 @@ class Corotated(Model):
         subtrees: False: leaf by leaf also where the fast path could be taken, as the paper has it; for comparison.
         dilatation: "element": each element has its own, tr(R^T F) - 3, as the paper has it, and nearly incompressible
             tissue is too stiff. "shared": elements share theirs, J - 1 of each, see ``elasticity.dilatation``; slower.
+            "auto": they do where Poisson's ratio is 0.45 or more in any element, and the material is isotropic.
 
     Raises:
         InputError: An option is none of these.
@@ -70,7 +71,7 @@ class Corotated(Model):
     iterations: int | None = None
     stiffness: str = "factored"
     subtrees: bool = True
-    dilatation: str = ELEMENT
+    dilatation: str = AUTO
 
     def __post_init__(self) -> None:
         check_dilatation(self.dilatation)

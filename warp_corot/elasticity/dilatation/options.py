@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from warp_corot.discretization.discretization import Discretization, discretization_of
 from warp_corot.elasticity.model import ForceField
 from warp_corot.errors import InputError
@@ -16,7 +18,10 @@ from .field import DilatationField
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretized
 
-ELEMENT, SHARED = "element", "shared"
+AUTO, ELEMENT, SHARED = "auto", "element", "shared"
+
+#: Poisson's ratio, of any element, from which "auto" stands for "shared".
+SHARED_FROM = 0.45
 
 
 def check_dilatation(dilatation: str) -> None:
@@ -25,8 +30,8 @@ def check_dilatation(dilatation: str) -> None:
     Raises:
         InputError: It is none of the values.
     """
-    if dilatation not in (ELEMENT, SHARED):
-        raise InputError(f"dilatation is {shown(dilatation)}; it must be {ELEMENT!r} or {SHARED!r}")
+    if dilatation not in (AUTO, ELEMENT, SHARED):
+        raise InputError(f"dilatation is {shown(dilatation)}; it must be {AUTO!r}, {ELEMENT!r} or {SHARED!r}")
 
 
 def refuse_shared(dilatation: str, model: str) -> None:
@@ -47,8 +52,11 @@ def shares_dilatation(dilatation: str, discretization: Discretization) -> bool:
     """
     if dilatation == SHARED and discretization.is_anisotropic:
         name = type(discretization.material).__name__
-        raise InputError(f"dilatation is {SHARED!r} and the material is {name}; it must be {ELEMENT!r}")
-    return dilatation == SHARED
+        raise InputError(f"dilatation is {SHARED!r} and the material is {name}; it must be {AUTO!r} or {ELEMENT!r}")
+    if dilatation != AUTO or discretization.is_anisotropic:
+        return dilatation == SHARED
+    # As float32 has it, too.
+    return float(np.max(discretization.material.poisson)) > SHARED_FROM - 1e-6
 
 
 def bind_law(
