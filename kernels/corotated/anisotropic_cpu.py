@@ -13,7 +13,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements, frame, rest_volume
 from warp_corot.kernels.elements.general_cpu import rest_inverse_of
-from warp_corot.kernels.elements.lanes import constants, native, scatter_lanes
+from warp_corot.kernels.elements.lanes import ELEMENTS, constants, native, scatter_lanes
 from warp_corot.kernels.elements.law_lanes import ROTATION
 
 from .anisotropic import FibreMaterial, OrthotropicMaterial, axes_of, filled
@@ -28,7 +28,7 @@ NEARLY_INDEFINITE = 0.41
 scatter_anisotropic_lanes = scatter_lanes(
     constants(NEARLY_INDEFINITE=(2 * NEARLY_INDEFINITE) ** 2)
     + ROTATION
-    + native("elements", "orthotropic", "element_forces", "left_out_elements"),
+    + native(*ELEMENTS, "orthotropic", "element_forces", "left_out_elements"),
     GeneralElements,
     FibreMaterial,
     wp.int32,

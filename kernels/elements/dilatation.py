@@ -30,6 +30,10 @@ from .constitutive import (
 wp.set_module_options({"enable_backward": False})
 
 
+#: Elements in a group at most: what is left of the six roots of a cube, three of each.
+MOST = 18
+
+
 class Dilatation(NamedTuple):
     """What a law has in the place of lambda times half the square of a trace; functions of device code.
 

@@ -1,13 +1,20 @@
-"""The passes of ``shared_dilatation`` that go through elements on the CPU, eight to the lanes of vector registers."""
+"""Shared dilatations on the CPU, eight elements to the lanes of vector registers.
+
+Where it is shared at nodes, the passes of ``shared_dilatation`` that go through elements. Where groups share it,
+elements stand group after group, and one launch does all that a law and the shared dilatation ask: a thread is a few
+groups.
+"""
 
 import functools
 
 import warp as wp
 
 from .constitutive import CONTINUED_BELOW, IsotropicMaterial
-from .dilatation import Dilatation
-from .elements import GeneralElements
-from .lanes import COMPILER_FLAGS, ISOTROPIC, constants, native, on_cpu
+from .dilatation import MOST, Dilatation
+from .elements import ForestElements, GeneralElements, frame, rest_volume
+from .general_cpu import rest_inverse_of
+from .lanes import COMPILER_FLAGS, ELEMENTS, ISOTROPIC, ISOTROPIC_PART, constants, native, on_cpu, scatter_lanes
+from .law_lanes import LAWS
 
 wp.set_module_options({"enable_backward": False})
 
@@ -22,7 +29,7 @@ def law_of(of: Dilatation, has_log: bool = False) -> str:
 @functools.cache
 def measure_in_lanes(of: Dilatation) -> wp.Kernel:
     """``measure_elements`` without a direction; a thread is eight elements."""
-    code = on_cpu(law_of(of) + native("elements", "element_dilatation", "store_dilatation"))
+    code = on_cpu(law_of(of) + native(*ELEMENTS, "element_dilatation", "store_dilatation"))
 
     @wp.func_native(code)
     def measure_eight(
@@ -54,7 +61,7 @@ def measure_in_lanes(of: Dilatation) -> wp.Kernel:
 @functools.cache
 def scatter_in_lanes(of: Dilatation) -> wp.Kernel:
     """``scatter_pressures``; a thread is eight elements."""
-    passes = native("elements", "element_dilatation", "dilatation_stresses", "element_forces")
+    passes = native(*ELEMENTS, "element_dilatation", "dilatation_stresses", "element_forces")
 
     @wp.func_native(on_cpu(law_of(of) + ISOTROPIC + passes))
     def scatter_eight(
@@ -85,3 +92,60 @@ def scatter_in_lanes(of: Dilatation) -> wp.Kernel:
         scatter_eight(units, wp.tid(), count, places, live, material, u, shared, f)
 
     return scatter_in_lanes
+
+
+# --- groups -----------------------------------------------------------------------------------------------------------
+
+#: Groups of a thread.
+GROUPS = 4
+
+
+@wp.struct
+class GroupedMaterial:
+    """Elements group after group, and their material, whose lambda the groups share: ``isotropic`` has none."""
+
+    isotropic: IsotropicMaterial
+    lam: wp.array[wp.float32]
+    starts: wp.array[wp.int32]  # [groups + 1] the first element of each group
+    live: wp.array[wp.int32]  # [1] how many groups there are; empty: all
+
+
+@functools.cache
+def scatter_grouped_elements(law: str, of: Dilatation) -> wp.Kernel:
+    """Forces of a law of ``law_lanes`` with a shared dilatation; a thread is ``GROUPS`` groups.
+
+    The corotated law lists what it leaves out.
+    """
+    leaves_out = ["left_out_elements"] if law == "corotated" else []
+    code = LAWS[law] + law_of(of, has_log=law == "neo-hookean") + ISOTROPIC_PART
+    code += constants(GROUPS=GROUPS, MOST=MOST) + native("group_dilatations", "rest_elements", "elements")
+    code += native("group_pressures", "rest_elements", "grouped_elements", "element_forces", *leaves_out) + "}\n"
+    return scatter_lanes(code, GeneralElements, GroupedMaterial, wp.int32)
+
+
+@wp.kernel(enable_backward=False)
+def order_elements(
+    # In
+    elements: ForestElements,
+    material: IsotropicMaterial,
+    lam: wp.array[wp.float32],
+    members: wp.array[wp.int32],
+    live: wp.array[wp.int32],
+    # In and out
+    general: GeneralElements,
+    grouped: GroupedMaterial,
+):
+    """Elements in the order of their groups."""
+    k = wp.tid()
+    last = members.shape[0]
+    if live.shape[0] > 0:
+        last = grouped.starts[live[0]]
+    if k >= last:
+        return
+    t = members[k]
+    general.nodes[k] = elements.nodes[t]
+    general.rest_inverse[k] = rest_inverse_of(elements, t, wp.transpose(frame(elements, t)))
+    general.volume[k] = rest_volume(elements, t)
+    if material.stride > 0:
+        grouped.isotropic.mu[k] = material.mu[t]
+        grouped.lam[k] = lam[t]

@@ -13,7 +13,7 @@ import warp as wp
 
 from .constitutive import IsotropicMaterial
 from .elements import ForestElements, GeneralElements, frame, gradient_of, rest_volume
-from .lanes import ISOTROPIC, native, scatter_lanes
+from .lanes import ELEMENTS, ISOTROPIC, native, scatter_lanes
 from .law_lanes import LAWS
 
 wp.set_module_options({"enable_backward": False})
@@ -23,7 +23,7 @@ wp.set_module_options({"enable_backward": False})
 def scatter_law_elements(law: str) -> wp.Kernel:
     """Forces of a law of ``law_lanes``; a thread is eight elements. The corotated law lists what it leaves out."""
     leaves_out = ["left_out_elements"] if law == "corotated" else []
-    forces = native("elements", "isotropic_elements", "element_forces", *leaves_out)
+    forces = native(*ELEMENTS, "isotropic_elements", "element_forces", *leaves_out)
     return scatter_lanes(LAWS[law] + ISOTROPIC + forces, GeneralElements, IsotropicMaterial, wp.int32)
 
 

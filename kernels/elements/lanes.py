@@ -26,6 +26,10 @@ LANES = 8
 NATIVE = Path(__file__).parents[1] / "native"
 
 
+#: Eight elements, of which more follows.
+ELEMENTS = ("eights", "rest_elements", "elements")
+
+
 @functools.cache
 def native(*names: str) -> str:
     """The native code of some files, in this order."""

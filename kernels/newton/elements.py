@@ -18,7 +18,7 @@ from warp_corot.kernels.elements.general_cuda import (
     load_four,
     rest_inverse_of,
 )
-from warp_corot.kernels.elements.lanes import ISOTROPIC, native, scatter_lanes
+from warp_corot.kernels.elements.lanes import ELEMENTS, ISOTROPIC, native, scatter_lanes
 from warp_corot.kernels.elements.law_lanes import LAWS
 from warp_corot.kernels.math.rotation import byers_xu, cofactor, identity3, warm_rotation
 
@@ -141,7 +141,7 @@ def scatter_posed_warm(
 
 #: Corotated forces, each element with its own rotation.
 scatter_posed_lanes = scatter_lanes(
-    LAWS["corotated"] + ISOTROPIC + native("elements", "posed_elements", "element_forces", "left_out_elements"),
+    LAWS["corotated"] + ISOTROPIC + native(*ELEMENTS, "posed_elements", "element_forces", "left_out_elements"),
     GeneralElements,
     IsotropicMaterial,
     wp.int32,

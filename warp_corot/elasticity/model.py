@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, ClassVar
 
@@ -16,7 +16,6 @@ from warp_corot.discretization.plan import FlatLeaves, Plan
 from warp_corot.discretization.subtrees import chosen
 from warp_corot.errors import InputError
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
-from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.forces import (
     element_energies,
     element_von_mises,
@@ -32,6 +31,8 @@ from .tangent import Tangent
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
+
+    from .paths.dilating import Dilating
 
 
 class ForceField(ABC):
@@ -130,15 +131,10 @@ class ForceField(ABC):
         Called where plans change, before steps are recorded, whenever a size is another one.
         """
 
-    def share_dilatation(self, of: Dilatation, lam: Callable[[], wp.array]) -> bool:
-        """Add from now on the forces of a dilatation that the leaves of complete subtrees share, if the field can.
+    def share_dilatation(self, dilating: Dilating) -> bool:
+        """Add from now on the forces of a dilatation that subtrees and groups share, if the field can; whether it can.
 
-        Args:
-            of: What is shared.
-            lam: Gives lambda [Pa] as elements hold it.
-
-        Returns:
-            Whether it can.
+        Called again where groups are other ones.
         """
         return False
 

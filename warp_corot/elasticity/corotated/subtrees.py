@@ -15,13 +15,13 @@ from warp_corot.discretization.plan import FlatLeaves
 from warp_corot.discretization.subtrees import Batch, Sharing
 from warp_corot.elasticity.paths.clusters import ChangingClusterScatter
 from warp_corot.elasticity.paths.dilating import Dilating
+from warp_corot.elasticity.paths.grouped import GroupedLanes
 from warp_corot.elasticity.paths.lanes import Lanes, as_general
 from warp_corot.elasticity.structs import Kept
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
 from warp_corot.kernels.corotated.near_rotations import share_near_rotations
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
-from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.elements.general_cpu import rest_matrices, scatter_law_elements
 from warp_corot.kernels.elements.lanes import LANES
@@ -67,6 +67,8 @@ class SubtreeField(CorotatedField):
         self.derive()
 
     def derive(self) -> None:
+        if self._dilating is not None:
+            self._dilating.derive(self.isotropic)
         if self._clusters is not None:
             self._clusters.derive()
 
@@ -76,7 +78,9 @@ class SubtreeField(CorotatedField):
             kernel = self._kernel(shape, grouped, sharing)
             wp.load_module(kernel.module, self.device, block_dim=self._block)
         single = [self._forces, self._own, self._extract, repair_own]
-        if self.device.is_cpu:
+        if self._groups is not None:
+            single += [self._groups.kernel("corotated"), repair_elements()]
+        elif self.device.is_cpu:
             single += [scatter_law_elements("corotated"), repair_elements()]
         for kernel in single:
             wp.load_module(kernel.module, self.device)
@@ -85,12 +89,18 @@ class SubtreeField(CorotatedField):
         if one_launch:
             OwnLaunches.load(self._uniform, self.model.tolerance, self.device)
 
-    def share_dilatation(self, of: Dilatation, lam: Callable[[], wp.array]) -> bool:
+    def share_dilatation(self, dilating: Dilating) -> bool:
         if self.device.is_cuda or any(sharing is not Sharing.OWN for _shape, _grouped, sharing in self.plan.kinds):
             return False
-        self._dilating = Dilating(of, lam, self.model.tolerance)
+        self._dilating = dilating
+        self.derive()
         self.follow()
         return True
+
+    @property
+    def _groups(self) -> GroupedLanes | None:
+        """The leaves in no subtree where these share their dilatation in groups."""
+        return None if self._dilating is None else self._dilating.groups
 
     @property
     def _block(self) -> int:
@@ -118,7 +128,7 @@ class SubtreeField(CorotatedField):
         self._materials = [self._material(batch) for batch in plan.batches]
         self._flat_rotated = Kept(rotated_material)
         self._flat_lanes: Lanes | None = None
-        if len(plan.flat):
+        if len(plan.flat) and self._groups is None:
             self._prepare_flat(plan.flat)
 
     def _prepare_flat(self, flat: FlatLeaves) -> None:
@@ -143,7 +153,9 @@ class SubtreeField(CorotatedField):
         for batch, kernel, material in zip(self.plan.batches, self._kernels, self._materials, strict=True):
             self._launch_batch(batch, kernel, material, u, f)
         flat = self.plan.flat
-        if len(flat):
+        if self._groups is not None:
+            self._groups.scatter_forces("corotated", u, f, repair_elements())
+        elif len(flat):
             isotropic = self._flat_material
             if self._flat_lanes is not None:
                 self._flat_lanes.scatter_forces(isotropic, u, f)
@@ -188,7 +200,7 @@ class SubtreeField(CorotatedField):
             return lambda: rotated(self.isotropic, self._rotations, unit)
         if self._dilating is not None:
             dilating = self._dilating
-            return lambda: dilating.material(self.isotropic)
+            return lambda: dilating.material(self.isotropic, self.model.tolerance)
         if self.model.tolerance is not None:
             near, tolerance = Kept(near_material), self.model.tolerance
             return lambda: near(self.isotropic, tolerance)

@@ -10,6 +10,7 @@ from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.plan import Plan
 from warp_corot.discretization.shear_only import ShearOnly
 from warp_corot.elasticity.model import ForceField
+from warp_corot.elasticity.paths.dilating import Dilating
 from warp_corot.elasticity.tangent import Tangent
 from warp_corot.kernels.elements import shared_dilatation as kernels
 from warp_corot.kernels.elements.dilatation import VOLUME, Dilatation
@@ -50,8 +51,9 @@ class DilatationField(ForceField):
         self._all, self._still = (wp.empty(0, dtype=kind, device=self.device) for kind in (wp.int32, wp.vec4))
         self._shared = wp.empty(0, dtype=wp.vec4, device=self.device)
         self._others = Others(discretization, self.plan, of)
-        #: Whether the law's own launches add the forces of subtrees.
-        self._joined = self.plan is self.shear.plan and self.shear.share_dilatation(of, lambda: discretization.lam)
+        #: Whether the law's own launches add the forces of subtrees and of groups.
+        self._joined = False
+        self.join_launches()
 
     def plan_of(self, discretization: Discretization) -> Plan:
         """The same plan where that has subtrees, and where the mesh changes: one plan is kept up to date there."""
@@ -59,6 +61,13 @@ class DilatationField(ForceField):
         if plan.kinds or plan.counts is not None or not isinstance(discretization.mesh, TetForest):
             return plan
         return discretization.plan(deterministic=self.deterministic)
+
+    def join_launches(self) -> None:
+        """Let the law's own launches add all forces if they can."""
+        if self.plan is self.shear.plan:
+            dilating = Dilating(self._of, lambda: self.discretization.lam, self._others.grouped)
+            self._joined = self.shear.share_dilatation(dilating)
+        self._others.are_joined = self._joined and self._others.grouped is not None
 
     def load_kernels(self) -> None:
         self.shear.load_kernels()
@@ -68,12 +77,12 @@ class DilatationField(ForceField):
             wp.load_module(kernel.module, self.device, block_dim=256)
 
     def derive(self) -> None:
-        self.shear.derive()
         self._others.derive()
+        self.shear.derive()
 
     def follow(self) -> None:
-        self.shear.follow()
         self._others.follow()
+        self.shear.follow()
 
     @property
     def state(self) -> dict[str, wp.array]:
@@ -106,7 +115,7 @@ class DilatationField(ForceField):
             else:
                 inputs = [subtree, batch.count, self.isotropic, u]
                 self.launch(kernel, -(-batch.count // LANES), inputs, [f, batch.flagged])
-        if self._others.count:
+        if self._others.count and not self._others.are_joined:
             self._others.scatter(self.isotropic, u, self._room(), f)
 
     def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:

@@ -9,6 +9,7 @@ from warp_corot.discretization.changing.plan import DevicePlan
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.groups import Groups
 from warp_corot.discretization.plan import Plan
+from warp_corot.elasticity.paths.grouped import GroupedLanes
 from warp_corot.elasticity.paths.lanes import as_general
 from warp_corot.kernels.elements import dilatation_lanes as lanes
 from warp_corot.kernels.elements import shared_dilatation as kernels
@@ -30,6 +31,11 @@ class Others:
         discretization: The mesh.
         plan: What the field goes through.
         of: What is shared.
+
+    Attributes:
+        count: How many elements launches go through.
+        grouped: Those in groups on the CPU, for the law's own launches.
+        are_joined: Whether these add their forces.
     """
 
     def __init__(self, discretization: Discretization, plan: Plan, of: Dilatation):
@@ -47,6 +53,12 @@ class Others:
             leaves = plan.flat.leaves.numpy()
             leaves = leaves[: len(leaves) // discretization.worlds]
             self._groups = Groups.of_leaves(mesh, leaves, self._device, discretization.worlds)
+        self.grouped: GroupedLanes | None = None
+        self.are_joined = False
+        groups = self._groups
+        if groups is not None and not self._device.is_cuda:
+            live = groups.live if isinstance(groups, ChangingGroups) else self._none
+            self.grouped = GroupedLanes(plan, of, groups.starts, groups.members, live)
         self.derive()
         self.follow()
 
@@ -65,14 +77,18 @@ class Others:
             self.count, self._elements = self._discretization.sizes.launch_elements, plan.elements
             live = plan.counts.now if plan.counts is not None else None
         self._live = self._none if live is None else live
+        if self.grouped is not None:
+            self.grouped.count = sum(count for *_, count in self.groups)
         self._general = None
-        if self.count and not self._device.is_cuda:
+        if self.count and not self.are_joined and not self._device.is_cuda:
             self._general = self._elements if self._kind is GeneralElements else flat.general
             self._general = self._general or as_general(self._elements, rest_matrices, [self._elements])
 
     @property
     def kernels(self) -> list[wp.Kernel]:
         """All that forces may launch."""
+        if self.are_joined:
+            return []
         if self._device.is_cuda:
             passes = [kernels.measure_elements(self._kind, self._of), kernels.scatter_pressures(self._kind, self._of)]
         else:

@@ -1,4 +1,4 @@
-"""Materials of subtrees whose leaves share their dilatation, for launches that add its forces with a law's."""
+"""A dilatation that elements share, for launches on the CPU that add its forces with a law's."""
 
 from __future__ import annotations
 
@@ -11,27 +11,39 @@ from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.subtrees.cpu import DilatingMaterial
 
+from .grouped import GroupedLanes
+
 
 class Dilating:
-    """What the leaves of subtrees share, and the struct that kernels read.
+    """What elements share, and the structs that kernels read.
 
     Args:
         of: What is shared.
         lam: Gives lambda [Pa] as elements hold it.
-        tolerance: Of the corotated law, how near the root's rotation must be to be used [rad]; None: it never is.
+        groups: Leaves in no subtree, where these share it in groups.
     """
 
-    def __init__(self, of: Dilatation, lam: Callable[[], wp.array], tolerance: float | None = None):
-        self.of, self._lam = of, lam
-        self._made = Kept(lambda isotropic, lam: _material(isotropic, lam, tolerance or 0.0))
+    def __init__(self, of: Dilatation, lam: Callable[[], wp.array], groups: GroupedLanes | None):
+        self.of, self.groups, self._lam = of, groups, lam
+        self._made = Kept(_material)
 
-    def material(self, isotropic: IsotropicMaterial) -> DilatingMaterial:
-        """The struct of a material that has no lambda of its own."""
-        made: DilatingMaterial = self._made(isotropic, self._lam())
+    def material(self, isotropic: IsotropicMaterial, tolerance: float | None = None) -> DilatingMaterial:
+        """The struct of subtrees.
+
+        Args:
+            isotropic: The material, without lambda.
+            tolerance: Of the corotated law, how near the root's rotation must be to be used [rad]; None: it never is.
+        """
+        made: DilatingMaterial = self._made(isotropic, self._lam(), tolerance)
         return made
 
+    def derive(self, isotropic: IsotropicMaterial) -> None:
+        """Launch what puts the leaves of groups in order; may be recorded."""
+        if self.groups is not None:
+            self.groups.derive(isotropic, self._lam())
 
-def _material(isotropic: IsotropicMaterial, lam: wp.array, tolerance: float) -> DilatingMaterial:
+
+def _material(isotropic: IsotropicMaterial, lam: wp.array, tolerance: float | None) -> DilatingMaterial:
     material = DilatingMaterial()
-    material.isotropic, material.lam, material.tolerance = isotropic, lam, tolerance
+    material.isotropic, material.lam, material.tolerance = isotropic, lam, tolerance or 0.0
     return material

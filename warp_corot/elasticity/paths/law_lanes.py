@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
@@ -10,7 +9,6 @@ import warp as wp
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.model import LawField
-from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.general_cpu import rest_matrices, scatter_law_elements
 from warp_corot.kernels.elements.lanes import LANES
 from warp_corot.kernels.subtrees.cpu import scatter_law_subtrees
@@ -48,15 +46,26 @@ class LawLanesField(LawField):
 
     def load_kernels(self) -> None:
         kernels = [self._kernel(shape) for shape, _grouped, _sharing in self.plan.kinds]
-        for kernel in (*kernels, scatter_law_elements(self._law)):
+        dilating, of_leaves = self._dilating, scatter_law_elements(self._law)
+        if dilating is not None and dilating.groups is not None:
+            of_leaves = dilating.groups.kernel(self._law)
+        for kernel in (*kernels, of_leaves):
             wp.load_module(kernel.module, self.device, block_dim=256)
 
     def _kernel(self, shape: int) -> wp.Kernel:
         return scatter_law_subtrees(shape, self._law, None if self._dilating is None else self._dilating.of)
 
-    def share_dilatation(self, of: Dilatation, lam: Callable[[], wp.array]) -> bool:
-        self._dilating = Dilating(of, lam)
+    def share_dilatation(self, dilating: Dilating) -> bool:
+        if not isinstance(self.discretization.mesh, TetForest):
+            return False
+        self._dilating = dilating
+        self.derive()
+        self.follow()
         return True
+
+    def derive(self) -> None:
+        if self._dilating is not None:
+            self._dilating.derive(self.isotropic)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         material: Any = self.isotropic
@@ -67,10 +76,14 @@ class LawLanesField(LawField):
             self.launch(self._kernel(batch.shape), threads, inputs, [f, batch.flagged])
         if self._lanes is not None:
             self._lanes.scatter_forces(self._lanes_material, u, f)
+        if self._dilating is not None and self._dilating.groups is not None:
+            self._dilating.groups.scatter_forces(self._law, u, f)
 
     def follow(self) -> None:
         flat = self.plan.flat
         self._lanes = None
+        if self._dilating is not None and self._dilating.groups is not None:
+            return
         if len(flat):
             self._lanes_material = self.isotropic_of(flat)
             general = flat.general or as_general(flat.elements, rest_matrices, [flat.elements])

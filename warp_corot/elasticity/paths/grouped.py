@@ -1,0 +1,80 @@
+"""Leaves of a forest that share their dilatation in groups, on the CPU: group after group in the lanes."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warp_corot.discretization.clusters.single import isotropic_material
+from warp_corot.discretization.plan import Plan
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.dilatation import Dilatation
+from warp_corot.kernels.elements.dilatation_lanes import (
+    GROUPS,
+    GroupedMaterial,
+    order_elements,
+    scatter_grouped_elements,
+)
+from warp_corot.kernels.elements.elements import GeneralElements
+
+
+class GroupedLanes:
+    """Launches that add the forces of leaves in groups under a law, with the dilatation that groups share.
+
+    Args:
+        plan: Of whose leaves groups are.
+        of: What is shared.
+        starts, members, live: The groups, as ``kernels.elements.shared_dilatation.share_in_groups`` takes them.
+
+    Attributes:
+        count: How many groups launches go through.
+    """
+
+    def __init__(self, plan: Plan, of: Dilatation, starts: wp.array, members: wp.array, live: wp.array):
+        self.count = 0
+        self._plan, self._of = plan, of
+        self._members, self._live, most = members, live, len(members)
+        general = self._general = GeneralElements()
+        general.nodes = general.targets = wp.zeros(most, dtype=wp.vec4i, device="cpu")
+        general.rest_inverse = wp.zeros(most, dtype=wp.mat33, device="cpu")
+        general.volume = wp.zeros(most, dtype=wp.float32, device="cpu")
+        self._material = GroupedMaterial()
+        self._material.starts, self._material.live = starts, live
+        #: How many, then which.
+        self._left_out = wp.zeros(most + 1, dtype=wp.int32, device="cpu")
+
+    def derive(self, material: IsotropicMaterial, lam: wp.array) -> None:
+        """Launch what puts leaves in order; may be recorded.
+
+        Args:
+            material: Of all leaves, without lambda.
+            lam: Lambda [Pa], as ``material`` has mu.
+        """
+        grouped, most = self._material, len(self._members)
+        if grouped.lam is None or (material.stride and len(grouped.lam) != most):
+            mu = none = material.mu
+            if material.stride:
+                mu, none, lam_here = (wp.zeros(most, dtype=wp.float32, device="cpu") for _ in range(3))
+            else:
+                none, lam_here = material.lam, lam
+            grouped.isotropic = isotropic_material([mu, none, material.stride])
+            grouped.lam = lam_here
+        inputs = [self._plan.elements, material, lam, self._members, self._live]
+        wp.launch(order_elements, most, inputs, [self._general, grouped], device="cpu")
+
+    def kernel(self, law: str) -> wp.Kernel:
+        """What adds the forces under a law."""
+        return scatter_grouped_elements(law, self._of)
+
+    def scatter_forces(self, law: str, u: wp.array, f: wp.array, repair: wp.Kernel | None = None) -> None:
+        """Add the forces of displacements u to f, both vec4 [N].
+
+        Args:
+            law: A key of ``kernels.elements.law_lanes.LAWS``.
+            repair: Does the leaves that the law leaves out, if it does.
+        """
+        if not self.count:
+            return
+        inputs = [self._general, self.count, self._material, u]
+        wp.launch(self.kernel(law), -(-self.count // GROUPS), inputs, [f, self._left_out], device="cpu")
+        if repair is not None:
+            wp.launch(repair, 1, [self._general, self._material.isotropic, u], [self._left_out, f], device="cpu")
