@@ -34,7 +34,7 @@ OWN = {
 
 
 def bound(mesh, device, **options):
-    return wc.Corotated(**options).bind(wc.SoftBody(mesh, wc.Isotropic(**MATERIAL), device=device))
+    return wc.Corotated(dilatation="element", **options).bind(wc.SoftBody(mesh, wc.Isotropic(**MATERIAL), device=device))
 
 
 def turned(mesh, rng, amount):

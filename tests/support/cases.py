@@ -1,20 +1,22 @@
 """Meshes, models and states that the tests of laws share."""
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import oracle
 
 import warp_corot as wc
 
 CUBE = 0.064  # edge of a root cube [m]
-#: Of elements that have a dilatation each.
-MATERIAL = {"young": 500.0, "poisson": 0.44, "density": 10.0}
+MATERIAL = {"young": 500.0, "poisson": 0.49, "density": 10.0}  # the paper's
 
-# the solver's model for each of the oracle's
+# the solver's model for each of the oracle's, in which every element has a dilatation of its own
 MODELS = {
-    "linear": wc.Linear,
-    "corotated": wc.Corotated,
-    "stvk": wc.StVenantKirchhoff,
-    "neo_hookean": wc.NeoHookean,
+    "linear": partial(wc.Linear, dilatation="element"),
+    "corotated": partial(wc.Corotated, dilatation="element"),
+    "stvk": partial(wc.StVenantKirchhoff, dilatation="element"),
+    "neo_hookean": partial(wc.NeoHookean, dilatation="element"),
     "edge_stvk": wc.EdgeStVK,
     "edge_stvk_quadratic": lambda: wc.EdgeStVK(springs="quadratic"),
     "mass_spring": wc.MassSpring,
@@ -63,11 +65,14 @@ def random_displacement(mesh, rng, amount):
 
 
 def simulation(mesh, model, device, *, dt=1e-4, damping=0.0, gravity=(0, 0, 0), material=None, fixed=None):
-    """One body of the paper's material under a model (a name of MODELS, or a model)."""
+    """One body of the paper's material under a model (a name of MODELS, or a model).
+
+    Every element has a dilatation of its own.
+    """
     body = wc.SoftBody(mesh, wc.Isotropic(**(MATERIAL if material is None else material)), device=device)
     if fixed is not None:
         body.fix(fixed)
-    model = MODELS[model]() if isinstance(model, str) else model
+    model = MODELS[model]() if isinstance(model, str) else replace(model, dilatation="element")
     sim = wc.Simulation(body, model=model, integrator=wc.SymplecticEuler(dt=dt, damping=damping), gravity=gravity)
     return sim, body
 
