@@ -6,7 +6,12 @@ elements share it. A group of elements, such as the eight leaves of a subtree, h
 lambda and volume, and the energy
     W = sum over e of lambda_e V_e w(theta),  theta = sum of lambda_e V_e theta_e / sum of lambda_e V_e.
 Where there is no tree to tell groups there is one theta at each node, the mean of the elements around it, and each
-element has the mean of w at its four nodes. Forces are exact derivatives: P_e = lambda_e w'(theta) d theta_e / dF.
+element has the mean of w at its four nodes.
+
+Nothing of this keeps an element of a group from turning over while the others grow, which elements of crushed tissue do.
+So where theta_e is J - 1, and beyond a half, W has lambda_e V_e h(theta_e) of each element besides, with
+    h(theta) = (|theta| - 1/2)^2 / 2 where |theta| > 1/2, else 0.
+Forces are exact derivatives: P_e = lambda_e (w'(theta) + h'(theta_e)) d theta_e / dF.
 
 Functions here take the displacement gradient A as ``constitutive`` has it. The kernels are in ``shared_dilatation``,
 those of subtrees' forces in ``subtrees.dilatation``.
@@ -30,6 +35,8 @@ from .constitutive import (
 wp.set_module_options({"enable_backward": False})
 
 
+#: |J - 1| of an element up to which it is free to differ from its group's.
+FREE = wp.constant(0.5)
 #: Elements in a group at most: what is left of the six roots of a cube, three of each.
 MOST = 18
 
@@ -42,6 +49,7 @@ class Dilatation(NamedTuple):
         measure: theta and d theta / dF of A.
         turning: The differential of d theta / dF at A in a direction dA.
         energy, slope, curvature: w and its derivatives, of theta.
+        holding: h and its derivatives, of theta_e.
     """
 
     lanes: tuple[str, ...]
@@ -50,6 +58,7 @@ class Dilatation(NamedTuple):
     energy: wp.Function
     slope: wp.Function
     curvature: wp.Function
+    holding: wp.Function
 
 
 @wp.func
@@ -115,11 +124,22 @@ def log_curvature(theta: float):
     return volumetric_curvature(theta, 0.0, 1.0)
 
 
+@wp.func
+def held(theta: float):
+    beyond = wp.max(wp.abs(theta) - FREE, 0.0)
+    return wp.vec3(0.5 * beyond * beyond, wp.sign(theta) * beyond, wp.where(beyond > 0.0, 1.0, 0.0))
+
+
+@wp.func
+def not_held(theta: float):
+    return wp.vec3()
+
+
 _SQUARE = (square_energy, square_slope, square_curvature)
 #: tr e of linear elasticity, tr E of St. Venant-Kirchhoff, J - 1 of corotated and, in the logarithm, of neo-Hookean.
-SMALL = Dilatation(("dilatation_small",), small_dilatation, small_turning, *_SQUARE)
-GREEN = Dilatation(("dilatation_green",), green_dilatation, green_turning, *_SQUARE)
-VOLUME = Dilatation(("dilatation_of_volume", "dilatation_volume"), volume_dilatation, volume_turning, *_SQUARE)
+SMALL = Dilatation(("dilatation_small",), small_dilatation, small_turning, *_SQUARE, not_held)
+GREEN = Dilatation(("dilatation_green",), green_dilatation, green_turning, *_SQUARE, not_held)
+VOLUME = Dilatation(("dilatation_of_volume", "dilatation_volume"), volume_dilatation, volume_turning, *_SQUARE, held)
 LOG_VOLUME = Dilatation(
     ("log", "dilatation_of_volume", "dilatation_log_volume"),
     volume_dilatation,
@@ -127,6 +147,7 @@ LOG_VOLUME = Dilatation(
     log_energy,
     log_slope,
     log_curvature,
+    held,
 )
 
 

@@ -209,7 +209,7 @@ def scatter(elements: Any, targets: wp.vec4i, t: int, stress: wp.mat33, f: wp.ar
 @functools.cache
 def scatter_pressures(Elements: type, of: Dilatation) -> wp.Kernel:
     """Add forces."""
-    measure = of.measure
+    measure, holding = of.measure, of.holding
 
     @wp.kernel(module="unique", enable_backward=False)
     def scatter_pressures(
@@ -226,9 +226,9 @@ def scatter_pressures(Elements: type, of: Dilatation) -> wp.Kernel:
         t = wp.tid()
         if not is_live(live, t):
             return
-        _theta, slope = measure(own_gradient(elements, t, u))
+        theta, slope = measure(own_gradient(elements, t, u))
         place = place_of(places, t)
-        stress = (material.lam[place * material.stride] * shared[place][1]) * slope
+        stress = (material.lam[place * material.stride] * (shared[place][1] + holding(theta)[1])) * slope
         scatter(elements, elements.targets[t], t, stress, f)
 
     return scatter_pressures
@@ -237,7 +237,7 @@ def scatter_pressures(Elements: type, of: Dilatation) -> wp.Kernel:
 @functools.cache
 def add_product(Elements: type, of: Dilatation) -> wp.Kernel:
     """y += K p; without ``turning``, the part of K that is positive semidefinite."""
-    measure, turning_of = of.measure, of.turning
+    measure, turning_of, holding = of.measure, of.turning, of.holding
 
     @wp.kernel(module="unique", enable_backward=False)
     def add_product(
@@ -253,29 +253,35 @@ def add_product(Elements: type, of: Dilatation) -> wp.Kernel:
     ):
         t = wp.tid()
         a = own_gradient(elements, t, u)
-        _theta, slope = measure(a)
-        law = shared[t]
-        stress = law[2] * slope + (turning * law[1]) * turning_of(a, own_gradient(elements, t, p))
+        theta, slope = measure(a)
+        held = holding(theta)
+        d = own_gradient(elements, t, p)
+        change = shared[t][2] + held[2] * wp.ddot(slope, d)
+        stress = change * slope + (turning * (shared[t][1] + held[1])) * turning_of(a, d)
         scatter(elements, elements.nodes[t], t, -material.lam[t * material.stride] * stress, y)
 
     return add_product
 
 
 @functools.cache
-def add_energies(Elements: type) -> wp.Kernel:
+def add_energies(Elements: type, of: Dilatation) -> wp.Kernel:
     """Add each element's share of the energy [J]."""
+    measure, holding = of.measure, of.holding
 
     @wp.kernel(module="unique", enable_backward=False)
     def add_energies(
         # In
         elements: Elements,
         material: IsotropicMaterial,
+        u: wp.array[wp.vec4],
         shared: wp.array[wp.vec4],
         # In and out
         energies: wp.array[wp.float64],
     ):
         t = wp.tid()
-        energy = wp.float64(material.lam[t * material.stride] * shared[t][0]) * wp.float64(rest_volume(elements, t))
+        theta, _slope = measure(own_gradient(elements, t, u))
+        density = material.lam[t * material.stride] * (shared[t][0] + holding(theta)[0])
+        energy = wp.float64(density) * wp.float64(rest_volume(elements, t))
         energies[t] = energies[t] + energy
 
     return add_energies
@@ -323,7 +329,7 @@ def turning_block(Elements: type, of: Dilatation) -> wp.Function:
 @functools.cache
 def add_diagonal(Elements: type, of: Dilatation) -> wp.Kernel:
     """Add diagonal blocks of which those of K are no more: each element's as if its dilatation were its own."""
-    measure, turning_of = of.measure, turning_block(Elements, of)
+    measure, turning_of, holding = of.measure, turning_block(Elements, of), of.holding
 
     @wp.kernel(module="unique", enable_backward=False)
     def add_diagonal(
@@ -344,13 +350,15 @@ def add_diagonal(Elements: type, of: Dilatation) -> wp.Kernel:
         place = place_of(places, t)
         law = shared[place]
         a = own_gradient(elements, t, u)
-        _theta, slope = measure(a)
+        theta, slope = measure(a)
+        pressure = turning * (law[1] + holding(theta)[1])
+        curvature = law[3] + holding(theta)[2]
         weight = material.lam[place * material.stride] * rest_volume(elements, t)
         n = int(0)
         while n < 4:
             hat = hat_gradient(elements, t, n)
             row = row_of(elements, t, slope, hat)
-            block = law[3] * wp.outer(row, row) + (turning * law[1]) * turning_of(elements, t, a, hat)
+            block = curvature * wp.outer(row, row) + pressure * turning_of(elements, t, a, hat)
             wp.atomic_add(blocks, elements.nodes[t][n], weight * block)
             n += 1
 
@@ -360,7 +368,7 @@ def add_diagonal(Elements: type, of: Dilatation) -> wp.Kernel:
 @functools.cache
 def add_diagonal_of_groups(Elements: type, of: Dilatation) -> wp.Kernel:
     """Add the diagonal blocks of K; a thread a group."""
-    measure, turning_of = of.measure, turning_block(Elements, of)
+    measure, turning_of, holding = of.measure, turning_block(Elements, of), of.holding
 
     @wp.func
     def weight_of(elements: Elements, t: int, material: IsotropicMaterial):
@@ -414,17 +422,18 @@ def add_diagonal_of_groups(Elements: type, of: Dilatation) -> wp.Kernel:
             t = place_of(members, i)
             law = shared[t]
             a = own_gradient(elements, t, u)
-            _theta, slope = measure(a)
+            theta, slope = measure(a)
+            held = holding(theta)
             weight = weight_of(elements, t, material)
             n = int(0)
             while n < 4:
                 node = elements.nodes[t][n]
                 hat = hat_gradient(elements, t, n)
-                row = weight * row_of(elements, t, slope, hat)
+                row = row_of(elements, t, slope, hat)
                 whole = row_at(elements, material, u, members, begin, end, node)
-                block = (law[3] * share) * wp.outer(row, whole)
+                block = weight * wp.outer(row, law[3] * share * whole + held[2] * row)
                 if turning != 0.0:
-                    block += (turning * weight * law[1]) * turning_of(elements, t, a, hat)
+                    block += (turning * weight * (law[1] + held[1])) * turning_of(elements, t, a, hat)
                 wp.atomic_add(blocks, node, block)
                 n += 1
 

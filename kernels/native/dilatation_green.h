@@ -7,3 +7,4 @@ const auto slopes_of = [&](const triple* a, const triple* q, const lanes8&, trip
     for (int j = 0; j < 3; ++j) p[j] = q[j] + a[j];
 };
 const auto pressure_of = [&](const lanes8& theta) { return theta; };
+const auto holding_of = [&](const lanes8&) { return spread(0.0f); };

@@ -10,3 +10,7 @@ const auto slopes_of = [&](const triple* a, const triple* q, const lanes8& hande
     p[1] = cross(f2, f0) * handedness;
     p[2] = cross(f0, f1) * handedness;
 };
+const auto holding_of = [&](const lanes8& theta) {
+    const lanes8 above = theta - FREE, below = theta + FREE;
+    return above > 0.0f ? above : (below < 0.0f ? below : spread(0.0f));
+};

@@ -11,7 +11,10 @@ for (int group = first_group; group < last_group; ++group) {
         weight += share;
     }
     const lanes8 slope = pressure_of(spread(weight != 0.0f ? sum / weight : 0.0f));
-    for (int t = starts[group]; t < starts[group + 1]; ++t) pressures[t - begin] = lambda_of(t) * slope[0];
+    for (int t = starts[group]; t < starts[group + 1]; ++t) {
+        const lanes8 own = holding_of(spread(pressures[t - begin]));
+        pressures[t - begin] = lambda_of(t) * (slope[0] + own[0]);
+    }
 }
 for (int first_element = begin, eight = 0; first_element < stop; first_element += 8, ++eight) {
     const int count = stop;

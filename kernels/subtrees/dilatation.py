@@ -37,7 +37,7 @@ def scatter_in_lanes(shape: int, of: Dilatation) -> wp.Kernel:
 @functools.cache
 def dilatation_forces_of(shape: int, uniform: bool, of: Dilatation) -> wp.Function:
     """Forces of the shared dilatation from ten displacements, in the frame that ``laws.turn_in`` turns them to."""
-    measure, slope_of = of.measure, of.slope
+    measure, slope_of, holding = of.measure, of.slope, of.holding
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
     leaves, volume = LEAVES[shape], VOLUME[shape]
     into_leaf, out_of_leaf = turns_of(shape)
@@ -60,8 +60,9 @@ def dilatation_forces_of(shape: int, uniform: bool, of: Dilatation) -> wp.Functi
             theta, _slope = measure(into_leaf(leaf, wp.matrix_from_cols(b0, b1, b2)))
             sum += k * theta
             weight += k
-        # P V / h.
-        pressure = wp.static(volume) * h * h * slope_of(mean_of(sum, weight))
+        pressure = slope_of(mean_of(sum, weight))
+        # P V / h is the stress times this.
+        area = wp.static(volume) * h * h
         g = mat10()
         for leaf in range(8):
             if wp.static(not uniform):
@@ -72,8 +73,8 @@ def dilatation_forces_of(shape: int, uniform: bool, of: Dilatation) -> wp.Functi
                 y[wp.static(leaves[leaf][2])],
                 y[wp.static(leaves[leaf][3])],
             )
-            _theta, slope = measure(into_leaf(leaf, wp.matrix_from_cols(b0, b1, b2)))
-            p = out_of_leaf(leaf, (k * pressure) * slope)
+            theta, slope = measure(into_leaf(leaf, wp.matrix_from_cols(b0, b1, b2)))
+            p = out_of_leaf(leaf, (k * area * (pressure + holding(theta)[1])) * slope)
             f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
             g[wp.static(leaves[leaf][0])] += f0
             g[wp.static(leaves[leaf][1])] += f1

@@ -34,7 +34,8 @@ OWN = {
 
 
 def bound(mesh, device, **options):
-    return wc.Corotated(dilatation="element", **options).bind(wc.SoftBody(mesh, wc.Isotropic(**MATERIAL), device=device))
+    body = wc.SoftBody(mesh, wc.Isotropic(**MATERIAL), device=device)
+    return wc.Corotated(dilatation="element", **options).bind(body)
 
 
 def turned(mesh, rng, amount):

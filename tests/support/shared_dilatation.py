@@ -67,7 +67,8 @@ def energy(law, mesh, groups, lam, u):
     weights = groups @ (lam * reference.volumes)
     mean = np.divide(groups @ (lam * reference.volumes * theta), weights, out=np.zeros_like(weights), where=weights > 0)
     density = 0.5 * (np.log1p(mean) if law == "neo_hookean" else mean) ** 2
-    return float(np.sum(weights * density))
+    held = 0.5 * np.maximum(np.abs(theta) - 0.5, 0.0) ** 2 if law in ("neo_hookean", "corotated") else 0.0
+    return float(np.sum(weights * density) + np.sum(lam * reference.volumes * held))
 
 
 def linear_sag(mesh, groups, young, poisson, density, gravity, fixed):

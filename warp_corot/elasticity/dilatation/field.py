@@ -183,8 +183,8 @@ class DilatationField(ForceField):
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         self.shear.write_energies(u, energies)
-        inputs = [self.elements, self.isotropic, self._share(u, self._still)]
-        self.launch(kernels.add_energies(self._kind), self.element_count, inputs, [energies])
+        inputs = [self.elements, self.isotropic, u, self._share(u, self._still)]
+        self.launch(kernels.add_energies(self._kind, self._of), self.element_count, inputs, [energies])
 
     @property
     def energy_count(self) -> int:
