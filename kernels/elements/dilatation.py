@@ -8,9 +8,9 @@ lambda and volume, and the energy
 Where there is no tree to tell groups there is one theta at each node, the mean of the elements around it, and each
 element has the mean of w at its four nodes.
 
-Nothing of this keeps an element of a group from turning over while the others grow, which elements of crushed tissue do.
-So where theta_e is J - 1, and beyond a half, W has lambda_e V_e h(theta_e) of each element besides, with
-    h(theta) = (|theta| - 1/2)^2 / 2 where |theta| > 1/2, else 0.
+Nothing of this keeps an element of a group from turning over while others grow, which elements of crushed tissue do. So
+where theta_e is J - 1, W has lambda_e V_e h(theta_e) of each element besides. h is zero up to |theta| = ``FREE``; from
+there on h'' grows from 0 to 1 over ``RAMP``.
 Forces are exact derivatives: P_e = lambda_e (w'(theta) + h'(theta_e)) d theta_e / dF.
 
 Functions here take the displacement gradient A as ``constitutive`` has it. The kernels are in ``shared_dilatation``,
@@ -36,7 +36,9 @@ wp.set_module_options({"enable_backward": False})
 
 
 #: |J - 1| of an element up to which it is free to differ from its group's.
-FREE = wp.constant(0.5)
+FREE = wp.constant(0.25)
+#: Past that, over which its stiffness grows to lambda.
+RAMP = wp.constant(0.5)
 #: Elements in a group at most: what is left of the six roots of a cube, three of each.
 MOST = 18
 
@@ -127,7 +129,11 @@ def log_curvature(theta: float):
 @wp.func
 def held(theta: float):
     beyond = wp.max(wp.abs(theta) - FREE, 0.0)
-    return wp.vec3(0.5 * beyond * beyond, wp.sign(theta) * beyond, wp.where(beyond > 0.0, 1.0, 0.0))
+    near = wp.min(beyond, RAMP)
+    far = beyond - near
+    slope = 0.5 * near * near / RAMP
+    energy = near * slope / 3.0 + far * (slope + 0.5 * far)
+    return wp.vec3(energy, wp.sign(theta) * (slope + far), near / RAMP)
 
 
 @wp.func

@@ -10,7 +10,7 @@ import functools
 import warp as wp
 
 from .constitutive import CONTINUED_BELOW, IsotropicMaterial
-from .dilatation import FREE, MOST, Dilatation
+from .dilatation import FREE, MOST, RAMP, Dilatation
 from .elements import ForestElements, GeneralElements, frame, rest_volume
 from .general_cpu import rest_inverse_of
 from .lanes import COMPILER_FLAGS, ELEMENTS, ISOTROPIC, ISOTROPIC_PART, constants, native, on_cpu, scatter_lanes
@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False})
 
 def law_of(of: Dilatation, has_log: bool = False) -> str:
     """The native code of a law's dilatation; ``has_log``: after neo-Hookean's, which has the logarithm already."""
-    free = constants(FREE=float(FREE))
+    free = constants(FREE=float(FREE), RAMP=float(RAMP))
     if has_log:
         return free + native(*(name for name in of.lanes if name != "log"))
     return free + constants(CONTINUED_BELOW=CONTINUED_BELOW) + native(*of.lanes)

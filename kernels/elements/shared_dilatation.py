@@ -287,6 +287,26 @@ def add_energies(Elements: type, of: Dilatation) -> wp.Kernel:
     return add_energies
 
 
+@functools.cache
+def unshare(Elements: type, of: Dilatation) -> wp.Kernel:
+    """Put what w' of an element's own dilatation is beyond that of the shared one in the latter's place."""
+    measure, slope_of = of.measure, of.slope
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def unshare(
+        # In
+        elements: Elements,
+        u: wp.array[wp.vec4],
+        # In and out
+        shared: wp.array[wp.vec4],
+    ):
+        t = wp.tid()
+        theta, _slope = measure(own_gradient(elements, t, u))
+        shared[t] = wp.vec4(0.0, slope_of(theta) - shared[t][1], 0.0, 0.0)
+
+    return unshare
+
+
 # --- diagonal blocks --------------------------------------------------------------------------------------------------
 
 

@@ -11,6 +11,7 @@ const auto slopes_of = [&](const triple* a, const triple* q, const lanes8& hande
     p[2] = cross(f0, f1) * handedness;
 };
 const auto holding_of = [&](const lanes8& theta) {
-    const lanes8 above = theta - FREE, below = theta + FREE;
-    return above > 0.0f ? above : (below < 0.0f ? below : spread(0.0f));
+    const lanes8 size = theta < 0.0f ? -theta : theta, beyond = size > FREE ? size - FREE : spread(0.0f);
+    const lanes8 near = beyond < RAMP ? beyond : spread(RAMP), slope = (0.5f / RAMP) * near * near + (beyond - near);
+    return theta < 0.0f ? -slope : slope;
 };

@@ -67,8 +67,15 @@ def energy(law, mesh, groups, lam, u):
     weights = groups @ (lam * reference.volumes)
     mean = np.divide(groups @ (lam * reference.volumes * theta), weights, out=np.zeros_like(weights), where=weights > 0)
     density = 0.5 * (np.log1p(mean) if law == "neo_hookean" else mean) ** 2
-    held = 0.5 * np.maximum(np.abs(theta) - 0.5, 0.0) ** 2 if law in ("neo_hookean", "corotated") else 0.0
-    return float(np.sum(weights * density) + np.sum(lam * reference.volumes * held))
+    held = sum(lam * reference.volumes * holding(theta)) if law in ("neo_hookean", "corotated") else 0.0
+    return float(np.sum(weights * density) + held)
+
+
+def holding(theta):
+    """What holds an element: its second derivative is 0 up to |theta| = 1/4, grows to 1 at 3/4, and stays."""
+    beyond = np.maximum(np.abs(theta) - 0.25, 0.0)
+    far = np.maximum(beyond - 0.5, 0.0)
+    return (beyond**3 - far**3) / 3.0
 
 
 def linear_sag(mesh, groups, young, poisson, density, gravity, fixed):

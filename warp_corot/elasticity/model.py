@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, ClassVar
+from contextlib import AbstractContextManager, contextmanager
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,18 @@ if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
 
     from .paths.dilating import Dilating
+
+
+class SmallForces(Protocol):
+    """Forces of small displacements, whatever they come from."""
+
+    def add_forces(self, u: wp.array, f: wp.array) -> None:
+        """Add the forces [N] of displacements u to f; both vec4, a place for each node."""
+        ...
+
+    def state_kept(self) -> AbstractContextManager[None]:
+        """Whatever is launched inside leaves no trace in the state that steps go on from."""
+        ...
 
 
 class ForceField(ABC):
@@ -137,6 +149,11 @@ class ForceField(ABC):
         Called again where groups are other ones.
         """
         return False
+
+    @property
+    def stiffest(self) -> SmallForces:
+        """Forces near rest that bound the step: these, or stiffer ones if the field becomes so where it is strained."""
+        return self
 
     @abstractmethod
     def write_energies(self, u: wp.array, energies: wp.array) -> None:

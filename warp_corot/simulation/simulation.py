@@ -378,7 +378,7 @@ class Simulation:
         if self.integrator.is_implicit:
             self.stable_dt = math.inf
             return [math.inf] * len(self.bodies)
-        frequencies = [largest_frequency(body, f) for body, f in zip(self.bodies, self.fields, strict=True)]
+        frequencies = [largest_frequency(body, f.stiffest) for body, f in zip(self.bodies, self.fields, strict=True)]
         added = sum(getattr(each, "curvature", 0.0) for each in self.system.forces)
         steps = [self.integrator.stable_step(math.sqrt(frequency**2 + added)) for frequency in frequencies]
         self.stable_dt = min(steps)

@@ -9,7 +9,7 @@ import warp as wp
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.plan import Plan
 from warp_corot.discretization.shear_only import ShearOnly
-from warp_corot.elasticity.model import ForceField
+from warp_corot.elasticity.model import ForceField, SmallForces
 from warp_corot.elasticity.paths.dilating import Dilating
 from warp_corot.elasticity.tangent import Tangent
 from warp_corot.kernels.elements import shared_dilatation as kernels
@@ -179,6 +179,17 @@ class DilatationField(ForceField):
         """Whether the law's K is not the exact derivative unless that is asked for."""
         return self._of is VOLUME
 
+    @property
+    def stiffest(self) -> SmallForces:
+        return Unshared(self)
+
+    def unshare(self, u: wp.array, f: wp.array) -> None:
+        """Add to forces f of displacements u what makes each element's dilatation its own."""
+        shared = self._share(u, self._still)
+        self.launch(kernels.unshare(self._kind, self._of), self.element_count, [self.elements, u], [shared])
+        inputs = [self.elements, self._all, self._all, self.isotropic, u, shared]
+        self.launch(kernels.scatter_pressures(self._kind, self._of), self.element_count, inputs, [f])
+
     # --- energies and stresses ---------------------------------------------------------------------------------------
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
@@ -225,6 +236,23 @@ class DilatationField(ForceField):
             self.launch(kernel, count, [starts, members, live, self.elements, self.isotropic], [shared])
         self._others.share_at_nodes(self.isotropic, len(u), shared)
         return shared
+
+
+class Unshared:
+    """A law as if every element had a dilatation of its own: at rest it is at least as stiff, and in crushed states the
+    field becomes so, too.
+
+    Args:
+        field: The field that shares it.
+    """
+
+    def __init__(self, field: DilatationField):
+        self._field, self.state_kept = field, field.state_kept
+
+    def add_forces(self, u: wp.array, f: wp.array) -> None:
+        """Add the forces [N] of displacements u to f; both vec4 [worlds * N]."""
+        self._field.add_forces(u, f)
+        self._field.unshare(u, f)
 
 
 class SharedTangent(Tangent):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.elasticity.model import SmallForces
 from warp_corot.kernels.stepping import lanczos
 
 if TYPE_CHECKING:
@@ -20,18 +20,6 @@ LAST_STEPS = 8
 
 # Probing displacements as a share of the smallest element's size: small enough to be linear, large enough for float32.
 PROBE = 1e-3
-
-
-class SmallForces(Protocol):
-    """Forces of small displacements, whatever they come from."""
-
-    def add_forces(self, u: wp.array, f: wp.array) -> None:
-        """Add the forces [N] of displacements u to f; both vec4, a place for each node."""
-        ...
-
-    def state_kept(self) -> AbstractContextManager[None]:
-        """Whatever is launched inside leaves no trace in the state that steps go on from."""
-        ...
 
 
 def largest_frequency(body: SoftBody, field: SmallForces) -> float:
