@@ -92,7 +92,7 @@ MATERIALS = {
 }
 
 
-@pytest.mark.parametrize("model", [wc.Corotated(), wc.MassSpring()], ids=repr)
+@pytest.mark.parametrize("model", [wc.Corotated(dilatation="element"), wc.MassSpring()], ids=repr)
 @pytest.mark.parametrize("form", MATERIALS)
 def test_material_of_worlds_and_elements(form, model, device, rng):
     """All forms broadcast as in NumPy; masses are a quarter of each element's at each of its nodes."""

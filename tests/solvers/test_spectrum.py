@@ -8,7 +8,7 @@ import spectrum
 
 import warp_corot as wc
 
-TISSUE = wc.Isotropic(young=5e3, poisson=0.45, density=1000.0)
+TISSUE = wc.Isotropic(young=5e3, poisson=0.44, density=1000.0)
 
 MESHES = {"mixed levels": lambda: cases.mixed_forest(passes=1), "general": cases.jittered}
 

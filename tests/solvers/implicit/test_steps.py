@@ -18,7 +18,7 @@ SCHEMES = {
     "bdf2": (wc.BDF2, 2),
     "generalized-alpha": (wc.GeneralizedAlpha, 2),
 }
-YOUNG, POISSON, DENSITY = 5e3, 0.45, 1000.0
+YOUNG, POISSON, DENSITY = 5e3, 0.44, 1000.0
 
 
 @pytest.fixture(scope="module")
