@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from warp_corot.discretization.clusters.single import isotropic_material
 from warp_corot.discretization.plan import Plan
+from warp_corot.elasticity.structs import isotropic_material
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.dilatation_lanes import (
