@@ -61,7 +61,7 @@ def test_options_reach_the_simulation(folder, capsys):
 @pytest.mark.parametrize("model", MODELS)
 def test_every_model(folder, model, capsys):
     assert simulate("box", "-o", "a.usd", "--model", model, *SHORT) == 0
-    assert re.search(rf"model +{model}\n", capsys.readouterr().out)
+    assert re.search(rf"model +{model}[,\n]", capsys.readouterr().out)
 
 
 def test_rotation_level(folder, capsys):
