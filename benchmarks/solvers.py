@@ -93,7 +93,7 @@ class Problem:
         self.mesh, self.free = mesh, ~fixed
         self.body = wc.SoftBody(mesh, wc.Isotropic(YOUNG, poisson, DENSITY), device=device)
         self.body.fix(fixed)
-        self.operator = TangentOperator(self.body, wc.Linear().bind(self.body))
+        self.operator = TangentOperator(self.body, wc.Linear(dilatation="element").bind(self.body))
         self.right = np.where(fixed[:, None], 0.0, self.body.masses[:, None] * DOWN)
         reference, fill = oracle.Mesh(mesh.points, mesh.tets), 1.0 if mesh.fill is None else mesh.fill
         mu, lam = (value * fill for value in oracle.lame(YOUNG, poisson))

@@ -61,6 +61,7 @@ class ForceField(ABC):
         plan: What launches go through.
         elements: All of its elements.
         is_linear: Whether forces are linear in displacements.
+        shares_dilatation: Whether elements share their dilatation.
 
     Raises:
         InputError: The body's material is anisotropic, and the field supports only isotropic ones.
@@ -68,6 +69,7 @@ class ForceField(ABC):
 
     takes_anisotropic: ClassVar[bool] = False
     is_linear: bool = False
+    shares_dilatation: ClassVar[bool] = False
 
     def __init__(self, body: Discretized | Discretization, deterministic: bool = False):
         discretization = discretization_of(body)

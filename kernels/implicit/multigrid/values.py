@@ -94,6 +94,7 @@ def gather_leaves(
     stride: int,
     scales: wp.array[float],
     stiffening: float,
+    most_lambda: float,
     upper: wp.array[wp.vec2i],
     starts: wp.array[wp.int32],
     codes: wp.array[wp.int32],
@@ -102,7 +103,7 @@ def gather_leaves(
     blocks: wp.array[wp.mat33],
 ):
     """The entries off the diagonal; ``gradients`` are those of ``tables.shapes``, [shape, node]; viscous damping counts
-    as ``stiffening`` b K."""
+    as ``stiffening`` b K, and lambda as ``most_lambda`` mu at most."""
     world, u = wp.tid()
     if upper[u][0] == upper[u][1]:
         return
@@ -116,7 +117,7 @@ def gather_leaves(
         a = q * gradients[row + ((code >> 2) & 3)]
         b = q * gradients[row + (code & 3)]
         m = mu[t * stride]
-        total += wp.outer(lam[t * stride] * a, b) + wp.outer(m * b, a)
+        total += wp.outer(wp.min(lam[t * stride], most_lambda * m) * a, b) + wp.outer(m * b, a)
         d = m * wp.dot(a, b)
         total[0, 0] += d
         total[1, 1] += d

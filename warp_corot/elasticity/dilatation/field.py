@@ -38,6 +38,8 @@ class DilatationField(ForceField):
         shear: The law's field without lambda's part.
     """
 
+    shares_dilatation = True
+
     def __init__(
         self,
         discretization: Discretization,

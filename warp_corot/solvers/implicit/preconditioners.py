@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
 from warp_corot.kernels.elements.elements import ForestElements
@@ -14,10 +16,14 @@ from .multigrid import Multigrid
 from .operator import Preconditioner
 from .tangent import TangentOperator
 
+#: Plain elements lock where those that share their dilatation do not: these are preconditioned by compressible ones.
+MOST_LAMBDA = 9.0
+
 
 def _multigrid(operator: TangentOperator) -> Multigrid:
     stiffening = 0.0 if operator.viscosity is None else operator.viscosity.seconds
-    return Multigrid(operator.body, is_turned=not operator.field.is_linear, stiffening=stiffening)
+    most = MOST_LAMBDA if operator.field.shares_dilatation else np.inf
+    return Multigrid(operator.body, is_turned=not operator.field.is_linear, stiffening=stiffening, most_lambda=most)
 
 
 #: By name.

@@ -52,6 +52,7 @@ class Multigrid:
         stride: Number of bisections from one level to the next, 1 to 3.
         degree: Of the smoother on the finest level, before and after.
         stiffening: Viscous over elastic stress at one strain [s], as in the operator's D.
+        most_lambda: Up to how many times mu lambda counts.
 
     Attributes:
         discretization: The body's.
@@ -69,6 +70,7 @@ class Multigrid:
         stride: int = 3,
         degree: int = 5,
         stiffening: float = 0.0,
+        most_lambda: float = np.inf,
     ):
         if stride not in (1, 2, 3):
             raise InputError(f"stride is {stride!r}; it must be 1, 2 or 3")
@@ -76,6 +78,7 @@ class Multigrid:
             raise InputError(f"degree is {degree!r}; it must be 1 or more")
         self.discretization = discretization_of(body)
         self.is_turned, self.stride, self.degree, self.stiffening = is_turned, stride, degree, stiffening
+        self.most_lambda = most_lambda
         self.revision, self._version = -1, -1
         self.follow()
 
@@ -106,6 +109,7 @@ class Multigrid:
         found = finest.pattern
         inputs = [discretization.sizes.world_elements, found.entries, elements, self._frames, self._gradients]
         inputs += [discretization.mu, discretization.lam, discretization.material_stride, scales, self.stiffening]
+        inputs += [self.most_lambda]
         inputs += [found.upper, found.sum_starts, found.codes, found.places]
         finest.launch(values.gather_leaves, len(found.upper), inputs, [finest.blocks])
         inputs = [self.count, self._mesh_nodes, found.entries, self._nodes, inverse_mass, scales, self._free]
