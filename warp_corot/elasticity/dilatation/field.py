@@ -70,6 +70,7 @@ class DilatationField(ForceField):
             dilating = Dilating(self._of, lambda: self.discretization.lam, self._others.grouped)
             self._joined = self.shear.share_dilatation(dilating)
         self._others.are_joined = self._joined and self._others.grouped is not None
+        self._others.follow()
 
     def load_kernels(self) -> None:
         self.shear.load_kernels()

@@ -27,6 +27,8 @@ class Others:
     In a forest they are in groups, which are found anew where it changes. In a general mesh, and in a forest of a plan
     without subtrees, they have their dilatation at nodes.
 
+    Call ``follow`` before anything is launched, once it is known whether they are joined.
+
     Args:
         discretization: The mesh.
         plan: What the field goes through.
@@ -54,13 +56,12 @@ class Others:
             leaves = leaves[: len(leaves) // discretization.worlds]
             self._groups = Groups.of_leaves(mesh, leaves, self._device, discretization.worlds)
         self.grouped: GroupedLanes | None = None
-        self.are_joined = False
+        self.count, self.are_joined = 0, False
         groups = self._groups
         if groups is not None and not self._device.is_cuda:
             live = groups.live if isinstance(groups, ChangingGroups) else self._none
             self.grouped = GroupedLanes(plan, of, groups.starts, groups.members, live)
         self.derive()
-        self.follow()
 
     def derive(self) -> None:
         """Launch what finds the groups where the mesh changes; may be recorded."""
@@ -99,7 +100,7 @@ class Others:
 
     def scatter(self, material: IsotropicMaterial, u: wp.array, shared: wp.array, f: wp.array) -> None:
         """Add the forces of displacements u to f; ``shared`` has room for all elements of the mesh."""
-        if self._general is None:
+        if self._device.is_cuda:
             where = [self._elements, self._places, self._live]
             self._launch(kernels.measure_elements(self._kind, self._of), [*where, u, self._still], [shared])
         else:
@@ -111,7 +112,7 @@ class Others:
             self._launch(kernels.share_in_groups(self._kind, self._of), inputs, [shared], count)
         else:
             self.share_at_nodes(material, len(u), shared)
-        if self._general is None:
+        if self._device.is_cuda:
             kernel = kernels.scatter_pressures(self._kind, self._of)
             self._launch(kernel, [*where, material, u, shared], [f])
         else:
