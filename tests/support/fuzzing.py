@@ -218,9 +218,10 @@ def said_by_all():
 
 
 def files_in(folder: Path) -> dict[str, tuple[int, int]]:
-    """All files, with their sizes and times."""
+    """All files, with their sizes and times, but what Warp's compiler keeps until the process ends."""
     found = {}
-    for below, _, names in os.walk(folder):
+    for below, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith("wp_pch_")]
         for name in names:
             path = os.path.join(below, name)
             about = os.stat(path)
