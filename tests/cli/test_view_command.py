@@ -95,7 +95,7 @@ def test_ctrl_c_ends_it_quietly(number, status, tmp_path):
         assert connection.getresponse().status == 200
         connection.close()
         process.send_signal(number)
-        out, err = process.communicate(timeout=30)
+        out, err = process.communicate(timeout=120)
     finally:
         process.kill()
     assert process.returncode == status
