@@ -85,7 +85,14 @@ def test_ctrl_c_ends_it_quietly(number, status, tmp_path):
     pytest.importorskip("viser")
     command = [sys.executable, "-m", "warp_corot", "view", "box", "--port", "0", "--device", "cpu"]
     process = subprocess.Popen(
-        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=dict(os.environ)
+        command,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=dict(os.environ),
+        # Jobs in the background ignore Ctrl-C, and so would their children.
+        preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),
     )
     try:
         assert process.stdout is not None
