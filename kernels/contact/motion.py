@@ -167,7 +167,7 @@ def move_obstacles(motions: Motions, pace: Pace, world_starts: wp.array[wp.float
 
 @wp.kernel(enable_backward=False)
 def take_targets(given: wp.array[wp.transform], o: int, target: wp.array2d[wp.transform]):
-    """Where somebody wants a tool to be: in each world, or in all alike. What is no pose is passed over."""
+    """Where somebody wants a tool to be: in each world, or in all alike. A pose that is not one is skipped."""
     world = wp.tid()
     pose = given[wp.min(world, given.shape[0] - 1)]
     p = wp.transform_get_translation(pose)

@@ -42,7 +42,7 @@ class Meeting:
 
 @wp.struct
 class Rows:
-    """Pairs that are near, [P]; those of one node or edge, of S + E, follow one another, in order of the other."""
+    """Pairs that are near, [P], sorted by the first of the two, a node or an edge of S + E, and then by the other."""
 
     total: wp.array[wp.int32]  # [1] how many there are, or were if there were room
     starts: wp.array[wp.int32]  # [S + E]

@@ -26,7 +26,7 @@ LANES = 8
 NATIVE = Path(__file__).parents[1] / "native"
 
 
-#: Eight elements, of which more follows.
+#: Native code that gathers eight elements.
 ELEMENTS = ("eights", "rest_elements", "elements")
 
 

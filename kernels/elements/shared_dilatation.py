@@ -13,11 +13,9 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.math.rotation import identity3
-
 from .constitutive import IsotropicMaterial
 from .dilatation import Dilatation, mean_of
-from .elements import add_force, gradient_of, nodal_forces, rest_volume
+from .elements import add_force, nodal_forces, rest_volume
 from .forces import in_local_frame, own_gradient
 
 wp.set_module_options({"enable_backward": False})
@@ -164,9 +162,25 @@ def add_to_nodes(Elements: type) -> wp.Kernel:
 
 
 @functools.cache
-def share_at_nodes(Elements: type, of: Dilatation) -> wp.Kernel:
-    """The mean of what the law makes of an element's four nodes, from their sums."""
+def law_at_nodes(of: Dilatation) -> wp.Kernel:
+    """What the law makes of the sums at nodes, in their place; a thread a node."""
     law = law_at(of)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def law_at_nodes(
+        # In and out
+        sums: wp.array[wp.vec4],
+    ):
+        i = wp.tid()
+        sum = sums[i]
+        sums[i] = law(mean_of(sum[0], sum[1]), mean_of(sum[2], sum[1]))
+
+    return law_at_nodes
+
+
+@functools.cache
+def share_at_nodes(Elements: type) -> wp.Kernel:
+    """The mean of what the law makes of an element's four nodes."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def share_at_nodes(
@@ -174,7 +188,7 @@ def share_at_nodes(Elements: type, of: Dilatation) -> wp.Kernel:
         elements: Elements,
         places: wp.array[wp.int32],
         live: wp.array[wp.int32],
-        sums: wp.array[wp.vec4],
+        nodal: wp.array[wp.vec4],
         # Out
         shared: wp.array[wp.vec4],
     ):
@@ -182,14 +196,8 @@ def share_at_nodes(Elements: type, of: Dilatation) -> wp.Kernel:
         if not is_live(live, t):
             return
         nodes = elements.nodes[t]
-        value = wp.vec4()
-        n = int(0)
-        # Not unrolled: the law is compiled once.
-        while n < 4:
-            sum = sums[nodes[n]]
-            value += 0.25 * law(mean_of(sum[0], sum[1]), mean_of(sum[2], sum[1]))
-            n += 1
-        shared[place_of(places, t)] = value
+        value = nodal[nodes[0]] + nodal[nodes[1]] + nodal[nodes[2]] + nodal[nodes[3]]
+        shared[place_of(places, t)] = 0.25 * value
 
     return share_at_nodes
 
@@ -305,156 +313,3 @@ def unshare(Elements: type, of: Dilatation) -> wp.Kernel:
         shared[t] = wp.vec4(0.0, slope_of(theta) - shared[t][1], 0.0, 0.0)
 
     return unshare
-
-
-# --- diagonal blocks --------------------------------------------------------------------------------------------------
-
-
-@wp.func
-def hat_gradient(elements: Any, t: int, n: int):
-    """The gradient of the n-th node's hat function in the frame of ``own_gradient`` (columns)."""
-    x = wp.vec3(1.0, 0.0, 0.0)
-    o = wp.vec3()
-    unit = gradient_of(
-        elements, t, wp.where(n == 0, x, o), wp.where(n == 1, x, o), wp.where(n == 2, x, o), wp.where(n == 3, x, o)
-    )
-    return wp.vec3(unit[0, 0], unit[0, 1], unit[0, 2])
-
-
-@wp.func
-def row_of(elements: Any, t: int, slope: wp.mat33, hat: wp.vec3):
-    """d theta_e / d u of a node: (d theta_e / dF) grad N, in world space."""
-    return in_local_frame(elements, t, slope) * hat
-
-
-@functools.cache
-def turning_block(Elements: type, of: Dilatation) -> wp.Function:
-    """The part of a diagonal block that the turning of d theta / dF gives, over lambda V w'."""
-    turning_of = of.turning
-
-    @wp.func
-    def turning_block(elements: Elements, t: int, a: wp.mat33, hat: wp.vec3):
-        block = wp.mat33()
-        axis = int(0)
-        while axis < 3:
-            e = wp.vec3(float(axis == 0), float(axis == 1), float(axis == 2))
-            d = turning_of(a, wp.transpose(in_local_frame(elements, t, identity3())) * wp.outer(e, hat))
-            block += wp.outer(in_local_frame(elements, t, d) * hat, e)
-            axis += 1
-        return block
-
-    return turning_block
-
-
-@functools.cache
-def add_diagonal(Elements: type, of: Dilatation) -> wp.Kernel:
-    """Add diagonal blocks of which those of K are no more: each element's as if its dilatation were its own."""
-    measure, turning_of, holding = of.measure, turning_block(Elements, of), of.holding
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def add_diagonal(
-        # In
-        elements: Elements,
-        places: wp.array[wp.int32],
-        live: wp.array[wp.int32],
-        material: IsotropicMaterial,
-        u: wp.array[wp.vec4],
-        shared: wp.array[wp.vec4],
-        turning: float,
-        # In and out
-        blocks: wp.array[wp.mat33],
-    ):
-        t = wp.tid()
-        if not is_live(live, t):
-            return
-        place = place_of(places, t)
-        law = shared[place]
-        a = own_gradient(elements, t, u)
-        theta, slope = measure(a)
-        pressure = turning * (law[1] + holding(theta)[1])
-        curvature = law[3] + holding(theta)[2]
-        weight = material.lam[place * material.stride] * rest_volume(elements, t)
-        n = int(0)
-        while n < 4:
-            hat = hat_gradient(elements, t, n)
-            row = row_of(elements, t, slope, hat)
-            block = curvature * wp.outer(row, row) + pressure * turning_of(elements, t, a, hat)
-            wp.atomic_add(blocks, elements.nodes[t][n], weight * block)
-            n += 1
-
-    return add_diagonal
-
-
-@functools.cache
-def add_diagonal_of_groups(Elements: type, of: Dilatation) -> wp.Kernel:
-    """Add the diagonal blocks of K; a thread a group."""
-    measure, turning_of, holding = of.measure, turning_block(Elements, of), of.holding
-
-    @wp.func
-    def weight_of(elements: Elements, t: int, material: IsotropicMaterial):
-        return material.lam[t * material.stride] * rest_volume(elements, t)
-
-    @wp.func
-    def row_at(
-        elements: Elements,
-        material: IsotropicMaterial,
-        u: wp.array[wp.vec4],
-        members: wp.array[wp.int32],
-        begin: int,
-        end: int,
-        node: int,
-    ):
-        """The sum of lambda V d theta_e / du of a node over the group."""
-        row = wp.vec3()
-        for i in range(begin, end):
-            t = place_of(members, i)
-            n = int(0)
-            while n < 4:
-                if elements.nodes[t][n] == node:
-                    _theta, slope = measure(own_gradient(elements, t, u))
-                    row += weight_of(elements, t, material) * row_of(elements, t, slope, hat_gradient(elements, t, n))
-                n += 1
-        return row
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def add_diagonal_of_groups(
-        # In
-        starts: wp.array[wp.int32],
-        members: wp.array[wp.int32],
-        live: wp.array[wp.int32],
-        elements: Elements,
-        material: IsotropicMaterial,
-        u: wp.array[wp.vec4],
-        shared: wp.array[wp.vec4],
-        turning: float,
-        # In and out
-        blocks: wp.array[wp.mat33],
-    ):
-        g = wp.tid()
-        if not is_live(live, g):
-            return
-        begin, end = range_of(starts, members, g)
-        total = float(0.0)
-        for i in range(begin, end):
-            total += weight_of(elements, place_of(members, i), material)
-        share = mean_of(1.0, total)
-        for i in range(begin, end):
-            t = place_of(members, i)
-            law = shared[t]
-            a = own_gradient(elements, t, u)
-            theta, slope = measure(a)
-            held = holding(theta)
-            weight = weight_of(elements, t, material)
-            n = int(0)
-            while n < 4:
-                node = elements.nodes[t][n]
-                hat = hat_gradient(elements, t, n)
-                row = row_of(elements, t, slope, hat)
-                whole = row_at(elements, material, u, members, begin, end, node)
-                block = weight * wp.outer(row, law[3] * share * whole + held[2] * row)
-                if turning != 0.0:
-                    block += (turning * weight * (law[1] + held[1])) * turning_of(elements, t, a, hat)
-                wp.atomic_add(blocks, node, block)
-                n += 1
-
-    return add_diagonal_of_groups

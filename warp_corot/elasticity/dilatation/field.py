@@ -12,6 +12,7 @@ from warp_corot.discretization.shear_only import ShearOnly
 from warp_corot.elasticity.model import ForceField, SmallForces
 from warp_corot.elasticity.paths.dilating import Dilating
 from warp_corot.elasticity.tangent import Tangent
+from warp_corot.kernels.elements import shared_diagonal
 from warp_corot.kernels.elements import shared_dilatation as kernels
 from warp_corot.kernels.elements.dilatation import VOLUME, Dilatation
 from warp_corot.kernels.elements.lanes import LANES
@@ -51,11 +52,11 @@ class DilatationField(ForceField):
         super().__init__(discretization, deterministic)
         self._of = of
         self._all, self._still = (wp.empty(0, dtype=kind, device=self.device) for kind in (wp.int32, wp.vec4))
-        self._shared = wp.empty(0, dtype=wp.vec4, device=self.device)
         self._others = Others(discretization, self.plan, of)
         #: Whether the law's own launches add the forces of subtrees and of groups.
         self._joined = False
         self.join_launches()
+        self._make_room()
 
     def plan_of(self, discretization: Discretization) -> Plan:
         """The same plan where that has subtrees, and where the mesh changes: one plan is kept up to date there."""
@@ -85,6 +86,7 @@ class DilatationField(ForceField):
 
     def follow(self) -> None:
         self._others.follow()
+        self._make_room()
         self.shear.follow()
 
     @property
@@ -119,7 +121,7 @@ class DilatationField(ForceField):
                 inputs = [subtree, batch.count, self.isotropic, u]
                 self.launch(kernel, -(-batch.count // LANES), inputs, [f, batch.flagged])
         if self._others.count and not self._others.are_joined:
-            self._others.scatter(self.isotropic, u, self._room(), f)
+            self._others.scatter(self.isotropic, u, self._shared, f)
 
     def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
         if self.device.is_cuda:
@@ -159,7 +161,7 @@ class DilatationField(ForceField):
     def add_shared_diagonal(self, u: wp.array, blocks: wp.array, exact: bool | None = None) -> None:
         """The part of ``add_diagonal`` that comes from the shared dilatation."""
         turning, shared = self._turning(exact), self._share(u, self._still)
-        kernel = kernels.add_diagonal_of_groups(self._kind, self._of)
+        kernel = shared_diagonal.add_diagonal_of_groups(self._kind, self._of)
         for starts, members, live, count in self._groups():
             inputs = [starts, members, live, self.elements, self.isotropic, u, shared, turning]
             self.launch(kernel, count, inputs, [blocks])
@@ -213,16 +215,13 @@ class DilatationField(ForceField):
     def _kind(self) -> type:
         return self.discretization.element_kind
 
-    def prepare_room(self, u: wp.array) -> None:
-        """Make room for what passes leave to one another at displacements u; not while launches are recorded."""
-        self._room()
+    def prepare_sums(self, u: wp.array) -> None:
+        """Make room for sums at the nodes of displacements u; not while launches are recorded."""
         self._others.prepare_sums(len(u))
 
-    def _room(self) -> wp.array:
-        """What passes leave to one another of all elements."""
-        if len(self._shared) < self.element_count:
-            self._shared = wp.zeros(self.element_count, dtype=wp.vec4, device=self.device)
-        return self._shared
+    def _make_room(self) -> None:
+        """Make room for what passes leave to one another of all elements."""
+        self._shared = wp.zeros(self.element_count, dtype=wp.vec4, device=self.device)
 
     def _groups(self) -> list[tuple[wp.array, wp.array, wp.array, int]]:
         """Subtrees and other groups, as ``kernels.share_in_groups`` takes them, and how many."""
@@ -231,7 +230,7 @@ class DilatationField(ForceField):
 
     def _share(self, u: wp.array, p: wp.array) -> wp.array:
         """The second pass of ``kernels.elements.shared_dilatation``, of all elements."""
-        shared = self._room()
+        shared = self._shared
         measure = kernels.measure_elements(self._kind, self._of)
         self.launch(measure, self.element_count, [self.elements, self._all, self._all, u, p], [shared])
         kernel = kernels.share_in_groups(self._kind, self._of)
@@ -275,7 +274,7 @@ class SharedTangent(Tangent):
     def prepare(self, u: wp.array) -> None:
         super().prepare(u)
         self.shear.prepare(u)
-        self.field.prepare_room(u)
+        self.field.prepare_sums(u)
 
     def take(self, u: wp.array) -> None:
         super().take(u)

@@ -12,6 +12,7 @@ from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.paths.grouped import GroupedLanes
 from warp_corot.elasticity.paths.lanes import as_general
 from warp_corot.kernels.elements import dilatation_lanes as lanes
+from warp_corot.kernels.elements import shared_diagonal
 from warp_corot.kernels.elements import shared_dilatation as kernels
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation
@@ -96,7 +97,8 @@ class Others:
             passes = [lanes.measure_in_lanes(self._of), lanes.scatter_in_lanes(self._of)]
         if self._groups is not None:
             return [*passes, kernels.share_in_groups(self._kind, self._of)]
-        return [*passes, kernels.add_to_nodes(self._kind), kernels.share_at_nodes(self._kind, self._of)]
+        at_nodes = [kernels.add_to_nodes(self._kind), kernels.law_at_nodes(self._of)]
+        return [*passes, *at_nodes, kernels.share_at_nodes(self._kind)]
 
     def scatter(self, material: IsotropicMaterial, u: wp.array, shared: wp.array, f: wp.array) -> None:
         """Add the forces of displacements u to f; ``shared`` has room for all elements of the mesh."""
@@ -147,7 +149,8 @@ class Others:
         if self._slot_sums is not None:
             assert self._plan.slots is not None
             self._plan.slots.gather(sums, self._slot_sums)
-        self._launch(kernels.share_at_nodes(self._kind, self._of), [*where, sums], [shared])
+        self._launch(kernels.law_at_nodes(self._of), [], [sums], nodes)
+        self._launch(kernels.share_at_nodes(self._kind), [*where, sums], [shared])
 
     def add_nodal_diagonal(
         self, material: IsotropicMaterial, u: wp.array, shared: wp.array, turning: float, blocks: wp.array
@@ -155,7 +158,7 @@ class Others:
         """Add the diagonal blocks of the elements that are in no group."""
         if self._groups is None and self.count:
             inputs = [self._elements, self._places, self._live, material, u, shared, turning]
-            self._launch(kernels.add_diagonal(self._kind, self._of), inputs, [blocks])
+            self._launch(shared_diagonal.add_diagonal(self._kind, self._of), inputs, [blocks])
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list, count: int | None = None) -> None:
         wp.launch(kernel, self.count if count is None else count, inputs, outputs, device=self._device)
