@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from warp_corot.elasticity.paths.laws import law_field
+from warp_corot.elasticity.paths.laws import Law
 from warp_corot.kernels.elements.constitutive import (
     neo_hookean_cauchy,
     neo_hookean_differential,
@@ -14,15 +13,11 @@ from warp_corot.kernels.elements.constitutive import (
 )
 from warp_corot.kernels.elements.dilatation import LOG_VOLUME
 
-from .dilatation import AUTO, bind_law, check_dilatation
-from .model import ForceField, Model
-
-if TYPE_CHECKING:
-    from warp_corot.discretization.discretization import Discretization, Discretized
+from .law_model import LawModel
 
 
 @dataclass(frozen=True)
-class NeoHookean(Model):
+class NeoHookean(LawModel):
     """W = V (mu/2 (tr F^T F - 3) - mu ln J + lambda/2 (ln J)^2), P = mu (F - F^-T) + lambda ln J F^-T.
 
     That is so where J >= 0.5, an element of at least half its volume. Below, the terms in J, U(J) = -mu ln J +
@@ -39,22 +34,5 @@ class NeoHookean(Model):
             more in any element, and the material is isotropic.
     """
 
-    dilatation: str = AUTO
-
-    def __post_init__(self) -> None:
-        check_dilatation(self.dilatation)
-
-    def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
-        return bind_law(_bind, LOG_VOLUME, self.dilatation, body, deterministic)
-
-
-def _bind(discretization: Discretization, deterministic: bool) -> ForceField:
-    return law_field(
-        "neo-hookean",
-        discretization,
-        stress=neo_hookean_stress,
-        differential=neo_hookean_differential,
-        energy=neo_hookean_energy,
-        cauchy=neo_hookean_cauchy,
-        deterministic=deterministic,
-    )
+    law = Law("neo-hookean", neo_hookean_stress, neo_hookean_differential, neo_hookean_energy, neo_hookean_cauchy)
+    shared = LOG_VOLUME

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from warp_corot.elasticity.paths.laws import law_field
+from warp_corot.elasticity.paths.laws import Law
 from warp_corot.kernels.elements.constitutive import (
     stvk_cauchy,
     stvk_differential,
@@ -14,15 +13,11 @@ from warp_corot.kernels.elements.constitutive import (
 )
 from warp_corot.kernels.elements.dilatation import GREEN
 
-from .dilatation import AUTO, bind_law, check_dilatation
-from .model import ForceField, Model
-
-if TYPE_CHECKING:
-    from warp_corot.discretization.discretization import Discretization, Discretized
+from .law_model import LawModel
 
 
 @dataclass(frozen=True)
-class StVenantKirchhoff(Model):
+class StVenantKirchhoff(LawModel):
     """W = V (mu E:E + lambda/2 tr(E)^2) with E = (F^T F - I)/2, in total-Lagrangian form.
 
     Stepped by explicit central differences (symplectic Euler is their leapfrog form) this is what the literature calls
@@ -34,22 +29,5 @@ class StVenantKirchhoff(Model):
             more in any element, and the material is isotropic.
     """
 
-    dilatation: str = AUTO
-
-    def __post_init__(self) -> None:
-        check_dilatation(self.dilatation)
-
-    def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
-        return bind_law(_bind, GREEN, self.dilatation, body, deterministic)
-
-
-def _bind(discretization: Discretization, deterministic: bool) -> ForceField:
-    return law_field(
-        "stvk",
-        discretization,
-        stress=stvk_stress,
-        differential=stvk_differential,
-        energy=stvk_energy,
-        cauchy=stvk_cauchy,
-        deterministic=deterministic,
-    )
+    law = Law("stvk", stvk_stress, stvk_differential, stvk_energy, stvk_cauchy)
+    shared = GREEN

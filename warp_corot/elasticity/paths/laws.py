@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import warp as wp
 
@@ -17,27 +17,33 @@ if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
 
 
-def law_field(
-    law: str,
-    discretization: Discretization,
-    *,
-    stress: wp.Function,
-    differential: wp.Function,
-    energy: wp.Function,
-    cauchy: wp.Function,
-    deterministic: bool = False,
-) -> LawField:
+class Law(NamedTuple):
+    """A constitutive law of the package.
+
+    Attributes:
+        lanes: Its name among the laws that run in lanes on the CPU, a key of ``kernels.elements.law_lanes.LAWS``.
+        stress, differential, energy, cauchy: Functions of ``kernels.elements.constitutive``.
+    """
+
+    lanes: str
+    stress: wp.Function
+    differential: wp.Function
+    energy: wp.Function
+    cauchy: wp.Function
+
+
+def law_field(law: Law, discretization: Discretization, deterministic: bool = False) -> LawField:
     """The fastest force field of a law on a discretization.
 
     Args:
-        law: Its name among those that run in lanes on the CPU, a key of ``kernels.elements.law_lanes.LAWS``.
+        law: The law.
         discretization: The mesh and the material.
-        stress, differential, energy, cauchy: The law, functions of ``kernels.elements.constitutive``.
         deterministic: As for every field.
     """
-    functions = {"stress": stress, "differential": differential, "energy": energy, "cauchy": cauchy}
+    functions = law._asdict()
+    lanes = functions.pop("lanes")
     if discretization.device.is_cpu:
-        return LawLanesField(discretization, law=law, **functions, deterministic=deterministic)
+        return LawLanesField(discretization, law=lanes, **functions, deterministic=deterministic)
     kind: type[LawField] = LawField
     if isinstance(discretization.mesh, TetForest) and (deterministic or discretization.prefers_subtrees):
         kind = LawSubtreeField
