@@ -93,3 +93,13 @@ def test_places_beyond_the_ends_of_a_changing_mesh(tmp_path, name, value):
     np.savez(path, **arrays)
     with pytest.raises(InputError, match="is not a complete checkpoint"):
         wc.Simulation.load(path, device="cpu")
+
+
+def test_a_nastran_file_that_ends_before_its_first_card(tmp_path):
+    """meshio by itself waits for a first card for ever."""
+    pytest.importorskip("meshio")
+    path = SEEDS["bdf"](tmp_path)
+    assert len(wc.TetMesh.load(path).tets) == 2
+    path.write_text("$ a comment\nBEGIN BULK\n$ nothing\n\n")
+    with pytest.raises(InputError, match="it ends before its first card"):
+        wc.TetMesh.load(path)

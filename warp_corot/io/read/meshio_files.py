@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,19 @@ RENAMED |= {"medit:ref": "entity"}
 ORDERS = {"tetra20": 3, "tetra35": 4, "hexahedron64": 3, "triangle10": 3, "quad16": 3}
 
 
+class _EndingText(io.StringIO):
+    """A text of which the end is given once; meshio's reader of Nastran waits for ever for a first card."""
+
+    ended = False
+
+    def readline(self, size: int | None = -1, /) -> str:
+        line = super().readline(-1 if size is None else size)
+        if not line and self.ended:
+            raise Unreadable("it ends before its first card")
+        self.ended = not line
+        return line
+
+
 def read(path: Path) -> FileMesh:
     """All cells of a file, with the arrays of whole numbers and the sets of its cells.
 
@@ -30,7 +44,8 @@ def read(path: Path) -> FileMesh:
     reasons = []
     for kind in _filetypes_from_path(path):
         try:
-            return _mesh(reader_map[kind](str(path)))
+            given = _EndingText(path.read_text()) if kind == "nastran" else str(path)
+            return _mesh(reader_map[kind](given))
         except meshio.ReadError as error:
             reasons.append(str(error) or f"it is not a {kind} file")
     raise Unreadable("; ".join(dict.fromkeys(reasons)))
