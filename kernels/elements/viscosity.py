@@ -19,8 +19,10 @@ from .elements import frame, local_gradient, scatter_stress
 
 wp.set_module_options({"enable_backward": False})
 
-#: Below this determinant of tr(U) I - U, which is 8 at rest, the turning of a crushed element is hardly determined: the
-#: symmetric part of A is taken for Udot there, which still takes power out.
+#: Below this determinant of tr(U) I - U, which is 8 at rest, the turning of a crushed element is hardly determined, and
+#: of one that is turned inside out neither: from stretches a > 0 > b it follows as Udot does, (a - b) / (a + b) times as
+#: fast as the nodes go, which no explicit step bears. The symmetric part of A is taken for Udot there, which still
+#: takes power out.
 LEAST = wp.constant(0.05)
 
 
@@ -28,7 +30,7 @@ LEAST = wp.constant(0.05)
 def viscous_stress(u: wp.mat33, a: wp.mat33, mu: float, lam: float):
     """R^T P of a stretch U, a rate A and viscosities [Pa s]."""
     m = wp.trace(u) * identity3() - u
-    if wp.determinant(m) < LEAST:
+    if wp.determinant(m) < LEAST or wp.determinant(u) < 0.0:
         return hooke(symmetric(a), mu, lam)
     inverse = wp.inverse(m)
     rate = symmetric(a - wp.skew(inverse * axial(a)) * u)

@@ -70,6 +70,20 @@ def test_crushed_elements_are_finite_and_lose_energy(device, rng):
         assert np.sum(f * v) < 0.0
 
 
+def test_no_strain_makes_it_stiffer_than_rates_are(device, rng):
+    """Elements turned inside out among them: power is at most (2 mu + 3 lambda) |A|^2 for a rate A, so that explicit
+    steps bear it."""
+    x, corners = BOX.points, BOX.tets
+    seconds, sides = 0.1, np.moveaxis(x[corners[:, 1:]] - x[corners[:, :1]], 1, 2)
+    volumes = np.abs(np.linalg.det(sides)) / 6.0
+    mu, lam = 1e5 / 2.6, 1e5 * 0.3 / (1.3 * 0.4)
+    for last in (-0.2, -0.45, -0.49, -1.01, -1.5):
+        u, v = x * [5.0, 0.5, last] - x, rng.normal(size=x.shape)
+        rates = np.moveaxis(v[corners[:, 1:]] - v[corners[:, :1]], 1, 2) @ np.linalg.inv(sides)
+        most = seconds * (2.0 * mu + 3.0 * lam) * np.sum(volumes * np.sum(rates**2, axis=(1, 2)))
+        assert 0.0 < -np.sum(forces(BOX, u, v, device, seconds) * v) < most
+
+
 def test_it_comes_out_the_same_in_one_order_and_in_all_worlds(device, rng):
     u, v = strained(BOX, rng), rng.normal(size=BOX.points.shape)
     expected = forces(BOX, u, v, device)
