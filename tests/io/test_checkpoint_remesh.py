@@ -122,7 +122,7 @@ def test_a_resumed_run_is_the_uninterrupted_one(device, tmp_path, case):
     for sim in (whole, resumed):
         sim.reset()
     assert_alike(whole.body, resumed.body)
-    assert resumed.total_time == pytest.approx(whole.total_time, rel=1e-3)
+    assert resumed.total_time == pytest.approx(whole.total_time, rel=1e-12 if whole.device.is_cpu else 1e-2)
     for sim in (whole, resumed):
         sim.advance_steps(17)
     assert_alike(whole.body, resumed.body)

@@ -45,7 +45,7 @@ def test_criteria_that_cannot_work_are_named(device):
         wc.Simulation(body, remesh=wc.OnlineRemesh(criterion=that_returns_nothing))
     if not body.device.is_cpu:
         remesh = wc.OnlineRemesh(criterion=nearness, parameters=numbers(8, "cpu"))
-        with pytest.raises(wc.InputError, match="parameters is on cpu; it must be on cuda"):
+        with pytest.raises(wc.InputError, match="parameters is on cpu; it must be on the body's device, cuda"):
             wc.Simulation(body, remesh=remesh)
     assert body.changing is None
 

@@ -163,13 +163,17 @@ def test_after_a_failure_the_end_of_the_last_call_is_the_last_good_state(device)
 
 
 def test_short_calls_take_the_same_steps_as_one(device):
-    """The steps have equal lengths except at the ends of calls."""
+    """The steps have equal lengths except at the ends of calls.
+
+    On CUDA forces are summed in any order, and the two runs find slightly different stable steps.
+    """
     short, long = (simulation(device) for _ in range(2))
     for _ in range(100):
         short.advance(0.5 * short.dt * INTERVAL)
     long.advance(short.total_time)
     assert short.time == pytest.approx(long.time, rel=1e-12)
-    assert long.steps <= short.steps <= 1.1 * long.steps
+    least = 1.0 if short.device.is_cpu else 0.95
+    assert least * long.steps <= short.steps <= 1.1 * long.steps
     size = np.abs(long.body.displacements.numpy()).max()
     assert size > 1e-4
     np.testing.assert_allclose(
