@@ -20,7 +20,7 @@ from warp_corot.viewing.view import view
 
 from . import haptics, remesh
 from .domain import Domain
-from .elasticity import Corotated, EdgeStVK, Linear, MassSpring, NeoHookean, StVenantKirchhoff
+from .elasticity import Corotated, EdgeStVK, Linear, MassSpring, NeoHookean, Ogden, StVenantKirchhoff
 from .errors import CapacityWarning, InputError, StabilityWarning, StaleViewError, UnstableError
 from .mesh import SurfaceMesh, TetForest, TetMesh
 from .solvers import BDF2, BackwardEuler, GeneralizedAlpha, Newmark, QuasiStatic, SymplecticEuler
@@ -47,6 +47,7 @@ __all__ = [
     "MassSpring",
     "NeoHookean",
     "Newmark",
+    "Ogden",
     "OnlineRemesh",
     "Orthotropic",
     "QuasiStatic",

@@ -7,6 +7,7 @@ from .linear import Linear
 from .mass_spring import MassSpring
 from .model import ForceField, Model
 from .neo_hookean import NeoHookean
+from .ogden import Ogden
 from .stvk import StVenantKirchhoff
 
 MODELS: dict[str, type[Model]] = {
@@ -14,6 +15,7 @@ MODELS: dict[str, type[Model]] = {
     "corotated": Corotated,
     "stvk": StVenantKirchhoff,
     "neo-hookean": NeoHookean,
+    "ogden": Ogden,
     "edge-stvk": EdgeStVK,
     "mass-spring": MassSpring,
 }
@@ -27,5 +29,6 @@ __all__ = [
     "MassSpring",
     "Model",
     "NeoHookean",
+    "Ogden",
     "StVenantKirchhoff",
 ]

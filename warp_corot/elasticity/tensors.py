@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from warp_corot.elasticity.corotated.model import Corotated
 from warp_corot.kernels.elements.constitutive import CONTINUED_BELOW
+from warp_corot.kernels.elements.ogden import part_of_volume, stretch_limits
 from warp_corot.materials.isotropic import Isotropic
 
 from .edge_stvk import EdgeStVK
@@ -14,6 +15,7 @@ from .linear import Linear
 from .mass_spring import MassSpring
 from .model import Model
 from .neo_hookean import NeoHookean
+from .ogden import Ogden
 from .stvk import StVenantKirchhoff
 
 Tensors = npt.NDArray[np.float64]
@@ -43,7 +45,7 @@ def green_strain(f: Tensors) -> Tensors:
 
 def has_tensor(model: Model, material: object) -> bool:
     """Whether `cauchy_stress` knows the law."""
-    known = (Linear, Corotated, StVenantKirchhoff, NeoHookean, EdgeStVK, MassSpring)
+    known = (Linear, Corotated, StVenantKirchhoff, NeoHookean, Ogden, EdgeStVK, MassSpring)
     shared = getattr(model, "rotation_level", None) is not None
     return type(model) in known and isinstance(material, Isotropic) and not shared
 
@@ -76,15 +78,37 @@ def cauchy_stress(model: Model, f: Tensors, young: npt.ArrayLike, poisson: npt.A
         return r @ hooke(0.5 * (stretch + np.swapaxes(stretch, 1, 2)) - np.eye(3)) @ np.swapaxes(r, 1, 2)
     det = np.linalg.det(f)[:, None, None]
     if isinstance(model, NeoHookean):
-        # P F^T = mu (F F^T - J I) + V'(J) J I with the volumetric energy's slope V', continued as there.
-        d = np.maximum(det, CONTINUED_BELOW)
-        slope = (lam * np.log(d) + mu * (d - 1.0)) / d
-        curvature = (mu + lam * (1.0 - np.log(CONTINUED_BELOW))) / CONTINUED_BELOW**2
-        slope = slope + np.minimum(det - CONTINUED_BELOW, 0.0) * curvature
-        piola = mu * (f @ np.swapaxes(f, 1, 2) - det * np.eye(3)) + slope * det * np.eye(3)
+        piola = _neo_hookean(f, det, mu, lam)
+    elif isinstance(model, Ogden):
+        part = sum(part_of_volume(*term) for term in model.terms)
+        piola = _neo_hookean(f, det, part * mu, lam) + mu * _ogden_excess(f, model.terms)
     else:
         piola = f @ hooke(green_strain(f)) @ np.swapaxes(f, 1, 2)
     return piola / np.maximum(np.abs(det), LEAST_J)
+
+
+def _neo_hookean(f: Tensors, det: Tensors, mu: Tensors, lam: Tensors) -> Tensors:
+    """P F^T = mu (F F^T - J I) + V'(J) J I with the volumetric energy's slope V', continued as in the kernels."""
+    d = np.maximum(det, CONTINUED_BELOW)
+    slope = (lam * np.log(d) + mu * (d - 1.0)) / d
+    curvature = (mu + lam * (1.0 - np.log(CONTINUED_BELOW))) / CONTINUED_BELOW**2
+    slope = slope + np.minimum(det - CONTINUED_BELOW, 0.0) * curvature
+    return mu * (f @ np.swapaxes(f, 1, 2) - det * np.eye(3)) + slope * det * np.eye(3)
+
+
+def _ogden_excess(f: Tensors, terms: tuple[tuple[float, float], ...]) -> Tensors:
+    """P F^T / mu of what Ogden's law has besides neo-Hookean; see ``kernels.elements.ogden``."""
+    squares, axes = np.linalg.eigh(np.swapaxes(f, 1, 2) @ f)
+    slope = np.zeros_like(squares)
+    for share, alpha in terms:
+        m, part = 2.0 * share / alpha, part_of_volume(share, alpha)
+        low, high = stretch_limits(alpha)
+        c = np.clip(squares, low**2, high**2)
+        power = c ** (0.5 * alpha - 1.0)
+        curvature = m * (0.5 * alpha - 1.0) * power / c + (m - part) / c**2
+        slope += m * (power - 1.0) - (m - part) * (1.0 / c - 1.0) + (squares - c) * curvature
+    turned = f @ axes
+    return (turned * slope[:, None, :]) @ np.swapaxes(turned, 1, 2)
 
 
 def _trace(a: Tensors) -> Tensors:
