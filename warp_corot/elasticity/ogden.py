@@ -64,9 +64,7 @@ class Ogden(Model):
                 raise InputError(f"mu is {shown(self.mu)}; each must be above zero, as a share of the shear modulus")
         for value in alpha:
             if not 0.05 <= abs(value) <= LARGEST_EXPONENT:
-                raise InputError(
-                    f"alpha is {shown(self.alpha)}; its size must be from 0.05 to {LARGEST_EXPONENT:g}"
-                )
+                raise InputError(f"alpha is {shown(self.alpha)}; its size must be from 0.05 to {LARGEST_EXPONENT:g}")
         object.__setattr__(self, "mu", mu)
         object.__setattr__(self, "alpha", alpha)
 
