@@ -23,6 +23,10 @@ UNSURE = wp.constant(0)
 BOUNDARY = wp.constant(1)
 BURIED = wp.constant(2)
 
+#: How many triangles a segment is followed through, and how far beyond each it goes on, as a share of its length.
+MOST_PASSED = wp.constant(8)
+PASSED = wp.constant(1.0e-4)
+
 
 @wp.kernel(enable_backward=False)
 def evaluate_sphere(
@@ -338,3 +342,43 @@ def evaluate_thickness(
                 at = reach
             else:
                 at += found.t + 1.0e-4 * reach
+
+
+@wp.kernel(enable_backward=False)
+def find_exits(
+    # In
+    starts: wp.array[wp.vec3],
+    along: wp.array[wp.vec3],
+    mesh: wp.uint64,
+    sides: wp.array[wp.uint8],
+    # Out
+    shares: wp.array[wp.float32],
+    normals: wp.array[wp.vec3],
+):
+    """Where segments from inside to outside leave the body, as a share of their length, and the normal there.
+
+    At the first triangle that bounds the body; at one that is unsure if it is the only one. -1 where neither is so.
+    """
+    i = wp.tid()
+    length = wp.length(along[i])
+    direction = wp.normalize(along[i])
+    at = float(0.0)
+    unsure = int(0)
+    share = float(-1.0)
+    for _ in range(MOST_PASSED):
+        if at < length:
+            found = wp.mesh_query_ray(mesh, starts[i] + at * direction, direction, length - at)
+            normal = wp.mesh_eval_face_normal(mesh, wp.max(found.face, 0))
+            at += found.t
+            if not found.result:
+                at = length
+            elif int(sides[found.face]) == BURIED:
+                at += PASSED * length
+            else:
+                leaves = wp.dot(normal, direction) > 0.0
+                share = wp.where(leaves and unsure == 0, wp.min(at / length, 1.0), -1.0)
+                normals[i] = normal
+                unsure += 1
+                at = wp.where(int(sides[found.face]) == BOUNDARY, length, at + PASSED * length)
+    # A segment with more triangles than can be passed is not followed to its end.
+    shares[i] = wp.where(at < length, -1.0, share)

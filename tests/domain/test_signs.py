@@ -66,3 +66,32 @@ def test_lines_through_points_in_which_many_triangles_meet_count_right(device):
             scale[axis] = share
             off = points[np.abs(points[:, axis]) > 0.1]
             assert (windings_of(mesh, lines, wp.array(off * scale, dtype=wp.vec3, device=device)) == expected).all()
+
+
+def test_segments_leave_the_body_where_it_ends(device):
+    """Balls that cross, one within another, and a box around: where the value changes its sign, with the normal."""
+    balls = [
+        trimesh.creation.icosphere(3, 0.5).apply_translation((0.7 * k, 0.013 * k, 0.0)).apply_scale(1.0 + 1e-3 * k)
+        for k in range(3)
+    ]
+    whole = trimesh.util.concatenate([*balls, trimesh.creation.icosphere(2, 0.2), box((-0.2, -0.8, -0.1), (2, 0, 0.1))])
+    domain = wc.Domain.from_surface((whole.vertices, whole.faces), device=device)
+    rng = np.random.default_rng(0)
+    points = rng.uniform(domain.bounds[0], domain.bounds[1], (4000, 3))
+    inside = domain.phi(points) < 0.0
+    starts = points[inside]
+    ends = points[~inside][: len(starts)]
+    starts = starts[: len(ends)]
+    shares, normals = domain.exits(starts, ends)
+    known = np.isfinite(shares)
+    assert known.mean() > 0.3
+    x, along = (starts + shares[:, None] * (ends - starts))[known], (ends - starts)[known]
+    normals = normals[known]
+    assert np.allclose(np.linalg.norm(normals, axis=1), 1.0)
+    assert (np.einsum("nc,nc->n", normals, along) > 0.0).all()
+    assert np.abs(domain.phi(x)).max() < 1e-5
+    # Grazing segments leave by less than the step.
+    steep = np.einsum("nc,nc->n", normals, along) > 0.2 * np.linalg.norm(along, axis=1)
+    step = 1e-3 * along[steep] / np.linalg.norm(along[steep], axis=1, keepdims=True)
+    signs = np.stack([domain.phi(x[steep] - step) < 0.0, domain.phi(x[steep] + step) > 0.0])
+    assert signs.mean() > 0.98

@@ -246,6 +246,9 @@ class _Made(Domain):
     def part(self, name: str) -> Domain:
         return _Made(self._kind.part(name))
 
+    def exits(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        return self._kind.exits(starts, ends)
+
     def point_in(self, name: str) -> np.ndarray | None:
         return self._kind.point_in(name)
 

@@ -104,6 +104,18 @@ class SignedFunction:
         given, directions = self._on_device(points), self._on_device(side * np.asarray(inward))
         return self._thickness(given, directions, float(reach), side).astype(np.float64)
 
+    def exits(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Where segments from inside to outside leave the body, by its triangles; None: it has none.
+
+        Args:
+            starts, ends: float64 [n, 3] [m].
+
+        Returns:
+            The way from the starts as a share of the segments, NaN where triangles do not tell, float64 [n]; and unit
+            normals there [n, 3].
+        """
+        return None
+
     def part(self, name: str) -> SignedFunction:
         """The domain of one label alone.
 

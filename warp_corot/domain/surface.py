@@ -66,10 +66,8 @@ class SurfaceDomain(SignedFunction):
 
     def _phi(self, points: wp.array) -> wp.array:
         phi = wp.empty(points.size, wp.float32, device=points.device)
-        mesh, key = self._mesh(points.device), str(points.device)
-        if key not in self._sides:
-            self._sides[key] = self.sides.arrays(points.device)
-        inputs = [mesh.id, mesh.indices, self.lines, *self._sides[key]]
+        mesh = self._mesh(points.device)
+        inputs = [mesh.id, mesh.indices, self.lines, *self._sides_on(points.device)]
 
         def evaluate(start: int, stop: int) -> None:
             part = [points[start:stop], *inputs]
@@ -77,6 +75,20 @@ class SurfaceDomain(SignedFunction):
 
         in_parts(points.device, points.size, evaluate)
         return phi
+
+    def exits(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        given, along = self._on_device(starts), self._on_device(ends - starts)
+        shares, normals = (wp.empty(given.size, kind, device=self.device) for kind in (wp.float32, wp.vec3))
+        mesh, sides = self._mesh(self.device), self._sides_on(self.device)[0]
+
+        def find(start: int, stop: int) -> None:
+            part = [given[start:stop], along[start:stop], mesh.id, sides]
+            outputs = [shares[start:stop], normals[start:stop]]
+            wp.launch(kernels.find_exits, stop - start, part, outputs, device=self.device)
+
+        in_parts(self.device, given.size, find)
+        found = shares.numpy().astype(np.float64)
+        return np.where(found < 0.0, np.nan, found), normals.numpy().astype(np.float64)
 
     @property
     def has_pieces(self) -> bool:
@@ -106,6 +118,12 @@ class SurfaceDomain(SignedFunction):
 
         in_parts(self.device, placed.size, measure)
         return lengths.numpy()
+
+    def _sides_on(self, device: wp.Device) -> list[wp.array]:
+        key = str(device)
+        if key not in self._sides:
+            self._sides[key] = self.sides.arrays(device)
+        return self._sides[key]
 
     def _mesh(self, device: wp.Device) -> wp.Mesh:
         key = str(device)

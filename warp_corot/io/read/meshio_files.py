@@ -24,8 +24,8 @@ class _EndingText(io.StringIO):
 
     ended = False
 
-    def readline(self, size: int | None = -1, /) -> str:
-        line = super().readline(-1 if size is None else size)
+    def readline(self, size: int = -1, /) -> str:  # type: ignore[override]
+        line = super().readline(size)
         if not line and self.ended:
             raise Unreadable("it ends before its first card")
         self.ended = not line

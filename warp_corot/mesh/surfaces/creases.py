@@ -47,9 +47,9 @@ def sharpened(points: Array, tets: Array, values: Array, domain: Domain) -> tupl
         domain: The body.
     """
     ends, polygons, cells = crossing_polygons(points, tets, values)
-    x = _crossings(points, ends, values, domain)
+    x, normals = _crossings(points, ends, values, domain)
     whole = (ends[:, 0] != ends[:, 1])[polygons].all(axis=1)
-    chosen, apexes = _apexes(x, polygons, whole, points[tets[cells]], domain)
+    chosen, apexes = _apexes(x, normals, polygons, whole, points[tets[cells]], domain)
     triangles = plain_triangles(np.delete(polygons, chosen, axis=0), ends)
     numbers = len(x) + np.arange(len(chosen))
     x = np.concatenate([x, apexes])
@@ -62,40 +62,61 @@ def _phi(domain: Domain, points: Array) -> Array:
     return np.asarray(domain.phi(points.reshape(-1, 3)), np.float64).reshape(points.shape[:-1])
 
 
-def _crossings(points: Array, ends: Array, values: Array, domain: Domain) -> Array:
-    """Where the surface crosses edges from a node inside to one outside, by false position (Illinois)."""
+def _crossings(points: Array, ends: Array, values: Array, domain: Domain) -> tuple[Array, Array]:
+    """Where the surface crosses edges from a node inside to one outside [V, 3], and its unit normals there, NaN where
+    these are not known: by the body's triangles, else by false position (Illinois)."""
     a, along = points[ends[:, 0]], points[ends[:, 1]] - points[ends[:, 0]]
+    share, normals = np.zeros(len(ends)), np.full((len(ends), 3), np.nan)
+    going = np.flatnonzero(ends[:, 0] != ends[:, 1])
+    found = domain.exits(a[going], points[ends[going, 1]])
+    if found is not None:
+        known = np.isfinite(found[0])
+        share[going[known]], normals[going[known]] = found[0][known], found[1][known]
+        going = going[~known]
     low, high = np.zeros(len(ends)), np.ones(len(ends))
     below, above = values[ends[:, 0]].astype(np.float64), values[ends[:, 1]].astype(np.float64)
-    share, close = np.zeros(len(ends)), OFF * np.linalg.norm(along, axis=1)
-    going = np.flatnonzero(ends[:, 0] != ends[:, 1])
+    close = OFF * np.linalg.norm(along, axis=1)
     for _ in range(STEPS):
         b, c = below[going], above[going]
         share[going] = low[going] + (high[going] - low[going]) * b / np.minimum(b - c, -1e-300)
-        found = _phi(domain, a[going] + share[going, None] * along[going])
-        inside = found < 0.0
+        off = _phi(domain, a[going] + share[going, None] * along[going])
+        inside = off < 0.0
         inner, outer = going[inside], going[~inside]
-        low[inner], below[inner] = share[inner], found[inside]
+        low[inner], below[inner] = share[inner], off[inside]
         above[inner] *= 0.5
-        high[outer], above[outer] = share[outer], found[~inside]
+        high[outer], above[outer] = share[outer], off[~inside]
         below[outer] *= 0.5
-        going = going[np.abs(found) > close[going]]
-    return a + share[:, None] * along
+        going = going[np.abs(off) > close[going]]
+    return a + share[:, None] * along, normals
 
 
-def _apexes(x: Array, polygons: Array, whole: Array, corners: Array, domain: Domain) -> tuple[Array, Array]:
-    """Polygons through which a crease goes, indices [m], and where the tangent planes at their vertices meet [m, 3]."""
-    at = x[polygons]
+def _apexes(
+    x: Array, known: Array, polygons: Array, whole: Array, corners: Array, domain: Domain
+) -> tuple[Array, Array]:
+    """Polygons through which a crease goes, indices [m], and where the tangent planes at their vertices meet [m, 3].
+
+    Args:
+        x: Vertices [V, 3].
+        known: Normals there, NaN where they are not known [V, 3].
+        polygons: Their vertices [P, 4].
+        whole: Which have all of their vertices on edges [P].
+        corners: Of their elements [P, 4, 3].
+        domain: The body.
+    """
+    # What is not known may be bent.
+    bent = np.flatnonzero(whole & ~(_least_cosine(known[polygons]) >= np.cos(np.radians(ANGLE))))
+    at = x[polygons[bent]]
     middle = at.mean(axis=1)
     size = np.linalg.norm(at - middle[:, None], axis=2).max(axis=1)
     off = np.abs(_phi(domain, middle))
-    chosen = np.flatnonzero(whole & (off > NEAR * size))
+    away = off > NEAR * size
+    chosen, at, middle, size, off = bent[away], at[away], middle[away], size[away], off[away]
     if not len(chosen):
         return chosen, np.empty((0, 3))
-    normals = _normals(x, polygons[chosen], size[chosen], domain)
-    bent = np.einsum("pic,pjc->pij", normals, normals).min(axis=(1, 2)) < np.cos(np.radians(ANGLE))
-    chosen, normals = chosen[bent], normals[bent]
-    at, middle, size, off = at[chosen], middle[chosen], size[chosen], off[chosen]
+    normals = _normals(x, known, polygons[chosen], size, domain)
+    bends = _least_cosine(normals) < np.cos(np.radians(ANGLE))
+    chosen, normals = chosen[bends], normals[bends]
+    at, middle, size, off = at[bends], middle[bends], size[bends], off[bends]
     heights = np.einsum("pic,pic->pi", normals, at - middle[:, None])
     u, s, v = np.linalg.svd(normals, full_matrices=False)
     inverse = np.where(s > RANK * s[:, :1], 1.0 / np.maximum(s, 1e-300), 0.0)
@@ -106,14 +127,21 @@ def _apexes(x: Array, polygons: Array, whole: Array, corners: Array, domain: Dom
     return chosen[good], apexes[good]
 
 
-def _normals(x: Array, polygons: Array, size: Array, domain: Domain) -> Array:
-    """The surface's unit normals at the vertices of polygons [P, 4, 3], from differences over a share of the size of
-    the largest polygon at each vertex."""
+def _least_cosine(normals: Array) -> Array:
+    """Of the angles between the normals of each polygon [P, 4, 3]; NaN with one that is not known."""
+    return np.min([np.einsum("pc,pc->p", normals[:, i], normals[:, j]) for i in range(4) for j in range(i)], axis=0)
+
+
+def _normals(x: Array, known: Array, polygons: Array, size: Array, domain: Domain) -> Array:
+    """The surface's unit normals at the vertices of polygons [P, 4, 3]: where they are not known, from differences over
+    a share of the size of the largest polygon at each vertex."""
     used, vertices = np.unique(polygons, return_inverse=True)
     apart = np.zeros(len(used))
     np.maximum.at(apart, vertices.ravel(), np.repeat(APART * size, polygons.shape[1]))
-    normals = _phi(domain, x[used][:, None] + apart[:, None, None] * _AROUND) @ _AROUND
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    normals = known[used]
+    sought = np.flatnonzero(np.isnan(normals[:, 0]))
+    found = _phi(domain, x[used[sought]][:, None] + apart[sought, None, None] * _AROUND) @ _AROUND
+    normals[sought] = found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-300)
     return normals[vertices.reshape(polygons.shape)]
 
 
