@@ -1,4 +1,4 @@
-"""The clock of a simulation, as those below it read it."""
+"""The clock of a simulation, as lower rooms read it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What forces read of a body: its mesh and material on a device, whether the mesh stays as it is or changes."""
+"""What forces read of a body: its mesh, which may change, and its material, on a device."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ MOST_ELEMENTS = 2**31 - 1
 
 
 class Discretization(ABC):
-    """A mesh on a device, with its material: all that forces read of a body but where its nodes are.
+    """A mesh on a device, with its material: all that forces read of a body, except the positions of its nodes.
 
     Attributes:
-        worlds, device: Copies of the body, and where they are.
+        worlds, device: The number of copies of the body, and their device.
         sizes: How many nodes and elements there are.
-        element_kind: The struct that the elements are in, ``ForestElements`` or ``GeneralElements``.
+        element_kind: The struct of the elements, ``ForestElements`` or ``GeneralElements``.
         elements: The elements, world after world.
-        fill: The share of each element that the body takes up, [T] as the mesh had it at first; None: all of it.
+        fill: The share of each element that is inside the body, [T] in the original mesh; None: all of it.
         lame: Lamé's parameters of the material [Pa], and their stride, 0 or 1: for stresses.
-        mu, lam, material_stride: The same times the filled share: for forces and energies.
-        activation: Active stress of elements [Pa], float32; one place until there is any.
-        has_activation: Whether there is any.
-        smallest_volume: Of an element [m^3].
+        mu, lam, material_stride: The same, multiplied by the filled share: for forces and energies.
+        activation: Active stress of elements [Pa], float32; one entry until a stress is set.
+        has_activation: Whether an active stress was set.
+        smallest_volume: The volume of the smallest element [m^3].
     """
 
     worlds: int
@@ -84,21 +84,21 @@ class Discretization(ABC):
 
     @abstractmethod
     def plan(self, rotation_level: int | None = None, *, subtrees: bool = True, deterministic: bool = False) -> Plan:
-        """What a force field goes through.
+        """The units of work of a force field.
 
         Where the mesh changes, the field is told by ``ForceField.derive`` and ``follow``.
 
         Args:
             rotation_level: Level of the tree at which rotations are shared; None: not shared.
-            subtrees: Whether complete subtrees go as units; False: the field goes leaf by leaf.
+            subtrees: Whether complete subtrees are units; False: the field goes leaf by leaf.
             deterministic: Whether every unit has slots of its own for its forces.
         """
 
     def levels(self) -> Levels:
-        """The nodes by tree level, and transfers between levels: of the present mesh, found when first asked for.
+        """The nodes of the present mesh by tree level, and transfers between levels; found at the first call.
 
         Raises:
-            InputError: A general mesh, which has no tree.
+            InputError: The mesh is a general one, which has no tree.
         """
         if self._levels is None or self._levels.version != self.sizes.version:
             self._levels = Levels(self._tree_nodes(), cast("ForestElements", self.elements), self.sizes)
@@ -123,13 +123,13 @@ class Discretization(ABC):
 
     @property
     def is_uniform(self) -> bool:
-        """Whether the elements of a world are all alike in what forces are made of."""
+        """Whether all elements of a world have the same elastic constants and are filled."""
         isotropic = self.material.isotropic
         shapes = [np.shape(value) for value in (isotropic.young, isotropic.poisson)]
         return self.fill is None and all(not shape or shape[-1] == 1 for shape in shapes)
 
     def make_activation(self) -> bool:
-        """See that there is an active stress for every element; whether there was none."""
+        """Make an active stress for every element if there is none; returns whether there was none."""
         if self.has_activation:
             return False
         if len(self.activation) < self.sizes.elements:
@@ -139,13 +139,13 @@ class Discretization(ABC):
 
 
 class MeshChanges(Protocol):
-    """What changes the mesh of a body, as the body calls it; arrays are of the present nodes."""
+    """What changes the mesh of a body, as the body calls it; arrays have the present nodes."""
 
     def remember(self) -> None:
-        """Make the present mesh and state what ``reset`` goes back to."""
+        """Keep the present mesh and state for ``reset``."""
 
     def reset(self, chosen: wp.array, clock: Clock) -> None:
-        """Go back to that, if the world is chosen; int32 [1]."""
+        """Return to the state that was kept, if the world is chosen, int32 [1]."""
 
 
 class Discretized(Protocol):
@@ -167,10 +167,10 @@ class FixedMesh(Discretization):
         mesh: The mesh.
         material: The material; functions of the rest position are evaluated at the elements' centroids.
         worlds: How many copies of the body there are.
-        device: Where.
+        device: The device.
 
     Raises:
-        InputError: Too many elements, a material array of another shape, or values that float32 does not hold.
+        InputError: There are too many elements, a material array has the wrong shape, or float32 cannot hold a value.
     """
 
     def __init__(self, mesh: Mesh, material: Material, worlds: int, device: wp.Device):
@@ -189,7 +189,7 @@ class FixedMesh(Discretization):
 
     @classmethod
     def of_lame(cls, mesh: Mesh, mu: npt.ArrayLike, lam: npt.ArrayLike, worlds: int, device: wp.Device) -> FixedMesh:
-        """Make one from Lamé's parameters alone [Pa], numbers or [worlds, T]: enough for forces."""
+        """A mesh with Lamé's parameters [Pa] in place of a material, numbers or [worlds, T]: enough for forces."""
         made = cls.__new__(cls)
         made._material = None
         made._fill_in(mesh, mu, lam, worlds, device)
@@ -293,7 +293,7 @@ def centroids(mesh: Mesh) -> npt.NDArray[np.float64]:
 
 
 def lumped_masses(mesh: Mesh, material: Material, worlds: int = 1) -> npt.NDArray[np.float64]:
-    """A quarter of the mass that each element holds, at each of its nodes [kg], float64 [worlds * N]."""
+    """Nodal masses: a quarter of each element's mass at each of its nodes [kg], float64 [worlds * N]."""
     fill = getattr(mesh, "fill", None)
     density = np.atleast_2d(material.density)
     masses = np.zeros((len(density), len(mesh.points)))

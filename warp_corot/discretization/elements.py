@@ -66,7 +66,7 @@ def repeated(values: np.ndarray, worlds: int) -> np.ndarray:
 
 
 def with_targets(elements: E, targets: wp.array) -> E:
-    """The same elements with their forces added elsewhere, vec4i [T]."""
+    """The same elements, whose forces are added at other places, vec4i [T]."""
     other = copied(elements)
     other.targets = targets
     return other
@@ -80,7 +80,7 @@ def copied(struct: S) -> S:
 
 
 class Assigned(Protocol):
-    """What every Warp struct can do besides."""
+    """What every Warp struct can do."""
 
     def assign(self, other: object) -> None: ...
 

@@ -18,7 +18,7 @@ PART = 1 << 16
 
 
 def parts(count: int) -> Iterator[slice]:
-    """The elements a part at a time: what is made on the way stays in the cache, and little memory is asked for."""
+    """The elements a part at a time, so that intermediate arrays stay in the cache and take little memory."""
     return (slice(start, min(start + PART, count)) for start in range(0, count, PART))
 
 
@@ -44,7 +44,7 @@ def frame_keys(lattice: np.ndarray, tets: np.ndarray, level: np.ndarray) -> np.n
 
 
 def frame_table(used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Frames of these keys, ascending: what each puts into a shape code, by key, int32; and the proper frames Q."""
+    """For frames with these ascending keys: the part of a shape code by key, int32; and the proper frames Q."""
     frames = ((used[:, None] // 3 ** np.arange(9)) % 3 - 1.0).reshape(-1, 3, 3)
     frames /= np.linalg.norm(frames, axis=1, keepdims=True)
     mirrored = np.linalg.det(frames) < 0
@@ -70,7 +70,7 @@ class FrameTable(NamedTuple):
     of_parents: npt.NDArray[np.int32]
 
     def codes(self, lattice: np.ndarray, tets: np.ndarray, level: np.ndarray) -> npt.NDArray[np.int32]:
-        """What sets forest elements apart besides size and nodes: the local frame each was born with.
+        """The shape codes of forest elements: level, and the local frame that bisection gave each.
 
         Args:
             lattice: Lattice coordinates of the mesh's nodes, int32 [N, 3].
@@ -88,7 +88,7 @@ class FrameTable(NamedTuple):
 
 @functools.cache
 def all_frames() -> FrameTable:
-    """The frames of all descendants of a cube: bisected, one of each frame and type, until none is new."""
+    """The frames of all descendants of a cube: one element of each frame and type is bisected until no frame is new."""
     lattice = np.indices((2, 2, 2), np.int32).reshape(3, -1).T << LATTICE_BITS
     tets = path_tetrahedra((1, 1, 1), (2, 2, 2))
     key = _keys(lattice, tets, 0)
@@ -126,7 +126,7 @@ class DeviceFrames(NamedTuple):
 
 
 def device_frames(device: wp.Device) -> DeviceFrames:
-    """The tables on a device; all forests there share them."""
+    """The tables on a device. All its forests share them."""
     return _device_frames(device.alias)
 
 

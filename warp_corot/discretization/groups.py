@@ -1,9 +1,8 @@
-"""Groups of leaves of a forest that share something where they are in no complete subtree.
+"""Groups of leaves that share a dilatation, in a forest whose leaves are not all in complete subtrees.
 
-Groups are found from the bottom of the tree upwards: the leaves below an element make one as soon as there are eight or
-more that are in none yet, which are 14 at most. So a complete subtree of three levels is a group whatever is around
-it. What is left of a root are fewer than eight leaves: four make a group, and fewer join with those of the other roots
-of their cube.
+Groups are found from the bottom of the tree upwards. As soon as eight or more leaves below an element are in no group
+yet (there are at most 14), they make one. So a complete subtree of three levels is always a group. Fewer than eight
+leaves of a root remain: four or more make a group; fewer join the rest of the other roots of their cube.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import warp as wp
 
 from warp_corot.mesh import TetForest
 
-#: Leaves that make a group below an element of the tree, and in what is left of a root.
+#: How many leaves make a group below an element of the tree, and among the remaining leaves of a root.
 LEAST, LEAST_OF_ROOT = 8, 4
 #: Lattice intervals of a cube's edge are two to this power.
 CUBE_BITS = 16
@@ -39,7 +38,7 @@ class Groups:
 
     @classmethod
     def of_leaves(cls, forest: TetForest, leaves: npt.NDArray[np.integer], device: wp.Device, worlds: int) -> Groups:
-        """The groups of some leaves, int [n], of a forest in each of so many worlds."""
+        """The groups of some leaves of a forest, int [n], in each world."""
         group = group_numbers(forest, leaves)
         order = np.argsort(group, kind="stable")
         sizes = np.tile(np.bincount(group), worlds)
@@ -49,7 +48,7 @@ class Groups:
 
 
 def group_numbers(forest: TetForest, leaves: npt.NDArray[np.integer]) -> npt.NDArray[np.int32]:
-    """The group of each of some leaves of a forest, from 0; int32 [n]."""
+    """The group of each given leaf of a forest, from 0; int32 [n]."""
     group = np.full(len(leaves), -1, np.int32)
     above = forest.tree.leaves[leaves]
     level = np.array(forest.levels, dtype=np.int32)[leaves]
@@ -75,6 +74,6 @@ def group_numbers(forest: TetForest, leaves: npt.NDArray[np.integer]) -> npt.NDA
 
 
 def cubes_of(forest: TetForest, roots: npt.NDArray[np.integer]) -> npt.NDArray[np.int32]:
-    """The cubes of some roots, given by their nodes, int [n, 4]: which along x, y and z, int32 [n, 3]."""
+    """The cubes of roots that are given by their nodes, int [n, 4]: their numbers along x, y and z, int32 [n, 3]."""
     corners: npt.NDArray[np.int32] = np.asarray(forest.lattice)[roots].min(axis=1) >> CUBE_BITS
     return corners

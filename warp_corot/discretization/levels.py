@@ -30,14 +30,14 @@ LEVEL_BITS = MAX_LEVEL.bit_length()
 
 @dataclass(frozen=True, eq=False)
 class TreeNodes:
-    """The nodes of a forest as the mesh numbers them: 0 … N - 1 are those that leaves name.
+    """The nodes of a forest as the mesh numbers them: leaves name the nodes 0 … N - 1.
 
     Attributes:
         lattice: Lattice points, vec3i.
         ends: The two ends of the edge whose midpoint each node is, vec2i; -1, -1 for corners of roots.
         mesh_nodes: N.
-        first_other: Where the nodes begin that no leaf names.
-        other_count: How many of them there are.
+        first_other: The first node that no leaf names.
+        other_count: How many nodes no leaf names.
     """
 
     lattice: wp.array
@@ -66,8 +66,8 @@ class Levels:
     The mesh's nodes keep their numbers 0 … N - 1. Where parts of the forest are void, ancestors of leaves may have
     corners that no leaf names: these follow, and are unknowns of coarse levels only.
 
-    A cycle over levels of its choice, all or every third, needs values of a level's nodes beside those of finer ones:
-    ``nodes[: starts[level + 1]]`` are the nodes up to a level, so that what is kept for each level takes its own room.
+    A multigrid cycle over some levels, all or every third, keeps values of a level's nodes apart from those of finer
+    levels: ``nodes[: starts[level + 1]]`` are the nodes up to a level.
 
     Args:
         tree: The nodes.
@@ -75,8 +75,8 @@ class Levels:
         sizes: How many leaves there are in one world, and how many worlds.
 
     Attributes:
-        version: The version in ``sizes`` of the mesh that these are the levels of.
-        worlds, device: Copies of the mesh that nodal arrays hold, and where they are.
+        version: ``sizes.version`` of the mesh whose levels these are.
+        worlds, device: The number of copies of the mesh in nodal arrays, and their device.
         mesh_nodes: N, the nodes that leaves name.
         node_count: All nodes, M.
         depth: The finest level of a node.
@@ -112,7 +112,7 @@ class Levels:
         return f"Levels({self.node_count} nodes of levels 0 to {self.depth} on {self.device})"
 
     def prolongate(self, x: wp.array, coarse: int = 0, fine: int | None = None) -> None:
-        """Continue a function of the nodes up to a level linearly: to each finer node the mean of its edge's ends.
+        """Continue a function linearly from the nodes up to a level: a finer node gets the mean of its edge's ends.
 
         May be recorded.
 
@@ -122,7 +122,7 @@ class Levels:
             fine: The level up to which values are found; None: the finest.
 
         Raises:
-            InputError: Levels that are not in order, or an array with too few nodes.
+            InputError: The levels are not in order, or the array has too few nodes.
         """
         for level in self._levels_between(x, "x", coarse, fine):
             part = slice(self.starts[level], self.starts[level + 1])
@@ -130,13 +130,13 @@ class Levels:
             self._launch(average_ends, (self.worlds, part.stop - part.start), inputs, [x])
 
     def restrict(self, y: wp.array, coarse: int = 0, fine: int | None = None) -> None:
-        """The transpose of ``prolongate``: add what is at finer nodes to the nodes up to a level, finest level first.
+        """The transpose of ``prolongate``: add values at finer nodes to the nodes up to a level, finest level first.
 
-        Sums have one order, so that they come out the same bit by bit. May be recorded.
+        Sums have a fixed order, so that they are the same bit by bit. May be recorded.
 
         Args:
             y: vec4 [worlds * M], changed in place at nodes up to the level fine - 1. The result is at the nodes up to
-                the level coarse; what is left at finer ones is the part that went on from there.
+                the level coarse; values that remain at finer nodes are intermediate sums.
             coarse, fine: As for ``prolongate``.
 
         Raises:
@@ -174,8 +174,8 @@ class Levels:
         return places, sums
 
     def _sort_nodes(self, tree: TreeNodes) -> tuple[wp.array, wp.array]:
-        """Find the order of the nodes, and where levels begin; their levels in that order, and the latter for every
-        level that there may be."""
+        """Find the order of the nodes and where levels begin. Returns their levels in that order, and the beginnings of
+        all possible levels."""
         count = self.node_count
         # Sorting needs twice the room.
         level, nodes = self._ints(2 * count), self._ints(2 * count)
@@ -191,7 +191,7 @@ class Levels:
         return level, starts
 
     def _sort_ends(self, tree: TreeNodes, level: wp.array, numbers: wp.array) -> wp.array:
-        """Find the ends, and the midpoints of each level and end; level and end of each of these as a key."""
+        """Find the ends, and the midpoints by level and end. Returns the level and end of each midpoint as a key."""
         count, roots = self.node_count, self.starts[1]
         pairs = 2 * (count - roots)
         self.ends = wp.empty(count, dtype=wp.vec2i, device=self.device)

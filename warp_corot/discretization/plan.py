@@ -1,7 +1,7 @@
-"""What a force evaluation goes through: complete subtrees in batches of one type, and the leaves left over.
+"""The force plan: complete subtrees in batches of one type, and the remaining leaves.
 
-The tree is what meshing edits; the plan is derived from it on the device and is all that stepping reads: once where
-the mesh stays as it is (``planning.fixed``), and after each pass where it changes (``changing.plan``).
+Meshing edits the tree. The plan is derived from the tree on the device, and steps read only the plan. It is derived
+once if the mesh never changes (``planning.fixed``), otherwise after each pass (``changing.plan``).
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ __all__ = ["Batch", "FlatLeaves", "LeafCounts", "Plan", "Sharing", "Units"]
 
 @dataclass(frozen=True)
 class Units:
-    """Tetrahedra, leaves or above these, of which rotations are found.
+    """Tetrahedra, leaves or ancestors of leaves, whose rotations are computed.
 
     Attributes:
         elements: ``kernels.elements.elements.ForestElements``, or general ones where there is no tree.
         count: How many one launch goes through.
-        unit: Which of them each of the mesh's elements uses, int32 [T].
+        unit: The unit whose rotation each of the mesh's elements uses, int32 [T].
     """
 
     elements: Elements
@@ -37,7 +37,7 @@ class Units:
 
     @classmethod
     def own(cls, elements: Elements, count: int) -> Units:
-        """Each element by itself."""
+        """Every element is its own unit."""
         return cls(elements, count, wp.array(np.arange(count), dtype=wp.int32, device=elements.nodes.device))
 
 
@@ -46,12 +46,12 @@ class FlatLeaves:
     """Leaves that are in no subtree, as elements of their own, world after world.
 
     Attributes:
-        leaves: Which of the mesh's elements they are, int32 [n]; ``len`` is how many one launch goes through.
+        leaves: Their numbers among the mesh's elements, int32 [n]; ``len`` is how many one launch goes through.
         elements: ``kernels.elements.elements.ForestElements``.
-        unit: Which of ``Units`` each uses where rotations are shared, int32 [n], else None.
-        general: The same leaves as general elements, if that is known, else None.
-        material: Their Lamé parameters mu and lambda [Pa] where these vary and are known, float32 [n] each, else None.
-        live: How many there are where launches go through more, int32 [1] on the device, else None.
+        unit: The one of ``Units`` that each uses if rotations are shared, int32 [n], else None.
+        general: The same leaves as general elements, if these exist, else None.
+        material: Their Lamé parameters mu and lambda [Pa] if these vary and are kept, float32 [n] each, else None.
+        live: How many there are, if launches go through more, int32 [1] on the device, else None.
     """
 
     leaves: wp.array
@@ -67,13 +67,13 @@ class FlatLeaves:
 
 @dataclass(frozen=True)
 class LeafCounts:
-    """How many leaves there are where their number changes, for launches that derive something of each.
+    """The number of leaves of a changing mesh, for launches that derive something for each leaf.
 
     Attributes:
-        most: How many there may be, padding included.
-        now, before: How many there are, and were when the plan was last derived; int32 [1] on the device.
+        most: The largest possible number, with padding.
+        now, before: The present number, and the number when the plan was last derived; int32 [1] on the device.
         goes: Whether the plan has just been derived, int32 [1] on the device.
-        threads: Threads of a launch that goes through all of them.
+        threads: Threads of a launch over all leaves.
     """
 
     most: int
@@ -84,15 +84,15 @@ class LeafCounts:
 
 
 class Plan(Protocol):
-    """What a force field goes through, however it came about.
+    """The units of work of a force field, for any mesh.
 
     Attributes:
         elements: All leaves, ``ForestElements`` or, of a general mesh, ``GeneralElements`` of ``kernels.elements``;
             their forces go to the slots if there are any.
-        batches: Subtrees by type, grouped or not, and sharing; none where the field goes leaf by leaf.
+        batches: Subtrees by type, grouped or not, and sharing; none if the field goes leaf by leaf.
         flat: The other leaves.
-        slots: Where forces go first if their sums must have one order, else None.
-        counts: How many leaves there are, if that changes, else None.
+        slots: Where kernels first add forces if sums must have a fixed order, else None.
+        counts: The number of leaves, if it changes, else None.
     """
 
     @property
@@ -106,17 +106,17 @@ class Plan(Protocol):
 
     @property
     def units(self) -> Units | None:
-        """What rotations are found of if some batch or flat leaf asks for that, else None."""
+        """The units, if a batch or a flat leaf uses their rotations, else None."""
         ...
 
     @property
     def all_units(self) -> Units:
-        """What rotations are found of, whether a launch of forces asks for it or not; only where they are shared."""
+        """The units, also if no launch of forces uses them; only if rotations are shared."""
         ...
 
     @property
     def kinds(self) -> list[tuple[int, bool, Sharing]]:
-        """Shape, whether in groups, and sharing of all batches that there may ever be."""
+        """Shape, whether in groups, and sharing of all possible batches."""
         ...
 
     @property

@@ -1,4 +1,4 @@
-"""A discretization whose elements do not resist changes of volume: a law's forces without what lambda multiplies."""
+"""A discretization whose elements do not resist changes of volume: a law's forces without the terms in lambda."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from .plan import FlatLeaves, Plan
 
 
 class ShearOnly(Discretization):
-    """Another discretization with zero in the place of lambda, and all else as it is, also where it changes.
+    """Another discretization with zero in place of lambda. All else is shared and follows its changes.
 
     Args:
-        whole: The other one.
+        whole: The other discretization.
     """
 
     def __init__(self, whole: Discretization):

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 @dataclass
 class Sizes:
-    """Counts of a mesh on the device; those of a mesh that changes follow it.
+    """Counts of a mesh on the device. They follow a mesh that changes.
 
     Attributes:
         worlds: Copies of the body.
         world_nodes, world_elements: In one copy.
         launch_nodes, launch_elements: How many launches go through; those beyond the counts do nothing.
-        version: Changes whenever the mesh does.
-        revision: Changes whenever launches go through other arrays or other numbers of things.
+        version: A counter of changes of the mesh.
+        revision: A counter of changes of the arrays, or the sizes, of launches.
     """
 
     worlds: int
@@ -27,7 +27,7 @@ class Sizes:
 
     @classmethod
     def of(cls, worlds: int, nodes: int, elements: int) -> Sizes:
-        """Of so many copies of a mesh that stays as it is."""
+        """The sizes of copies of a mesh that never changes."""
         return cls(worlds, nodes, elements, worlds * nodes, worlds * elements)
 
     @property
@@ -41,16 +41,16 @@ class Sizes:
         return self.worlds * self.world_elements
 
     def mesh_changed(self, nodes: int, elements: int) -> None:
-        """The mesh has changed, and has so many nodes and elements now."""
+        """Note that the mesh has changed, with its new numbers of nodes and elements."""
         self.world_nodes, self.world_elements = nodes, elements
         self.version += 1
 
     def set_launches(self, nodes: int, elements: int) -> bool:
-        """Go through so many nodes and elements from now on; whether these are other numbers than before."""
+        """Set how many nodes and elements launches go through; returns whether the numbers changed."""
         before = self.launch_nodes, self.launch_elements
         self.launch_nodes, self.launch_elements = nodes, elements
         return before != (nodes, elements)
 
     def relaunch(self) -> None:
-        """Launches of a step are others from now on."""
+        """Note that the launches of a step have changed."""
         self.revision += 1

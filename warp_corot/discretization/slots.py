@@ -1,4 +1,4 @@
-"""A place of its own for every force that a unit of work adds to a node; see ``kernels.elements.reproducible``."""
+"""Slots: one place for every force that a unit of work adds to a node; see ``kernels.elements.reproducible``."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ class Slots:
         """Slots by the node that each belongs to.
 
         Args:
-            nodes: Nodes of the slots of one world, ``node_count`` for slots that are not used, and as many places more,
-                int32 [2 * per_world]; what it holds is lost.
+            nodes: Nodes of the slots of one world, ``node_count`` for unused slots, and as many further places, int32
+                [2 * per_world]. It is overwritten.
             per_world: How many slots there are in a world.
-            used: How many of these are used.
+            used: How many slots are used.
             node_count: Number of nodes of one world.
         """
         device = nodes.device
@@ -60,7 +60,7 @@ class Slots:
     def of_units(
         cls, units: npt.NDArray[np.int32], node_count: int, device: wp.Device, worlds: int = 1
     ) -> tuple[Slots, npt.NDArray[np.int32]]:
-        """Slots for units of work that have as many nodes each.
+        """Slots for units of work that all have the same number of nodes.
 
         Args:
             units: Their nodes, of one world, [n, m].
@@ -70,7 +70,7 @@ class Slots:
             The slots, and their numbers in the same places in all worlds, int32 [worlds * n, m].
 
         Raises:
-            InputError: More slots than can be numbered.
+            InputError: There are more slots than can be numbered.
         """
         check_slots(worlds * units.size)
         nodes = wp.empty(2 * units.size, dtype=wp.int32, device=device)
@@ -86,10 +86,10 @@ class Slots:
 
 
 def check_slots(count: int) -> None:
-    """See that so many slots can be numbered.
+    """Check that the slots can be numbered.
 
     Raises:
-        InputError: They cannot.
+        InputError: There are too many.
     """
     if count > MOST_SLOTS:
         raise InputError(

@@ -1,7 +1,7 @@
 """Complete subtrees of a forest, the units of work of the fast force path, in batches.
 
-On an adaptive forest every stretch of equal levels profits: eight leaves under one ancestor three levels up make a
-subtree, eight such subtrees under one ancestor a group (CUDA), and what is neither goes leaf by leaf.
+In an adaptive forest, every stretch of equal levels benefits: eight leaves under one ancestor three levels up make a
+subtree, and eight of these subtrees under one ancestor make a group (CUDA). Other leaves go one by one.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import ForestElements, Subtrees
 
-#: Leaves in groups from which these have a launch of their own: what that takes off the time is more than it costs.
+#: With at least this many leaves in groups, a launch for groups saves more time than it costs.
 GROUPED_LEAVES = 1 << 16
 
 
@@ -36,10 +36,10 @@ class Batch:
         sharing: Whose rotation their leaves use.
         subtrees: ``kernels.elements.elements.Subtrees``.
         roots: Their roots as forest elements where leaves share the root's rotation, else None.
-        unit: Which of ``Units`` each uses where leaves share one from further up, int32 [count], else None.
-        flagged: Set by the kernel: bit k of a subtree's byte where its leaf k, in tree order, was left out; uint8
+        unit: The one of ``Units`` that each uses if leaves share a rotation from further up, int32 [count], else None.
+        flagged: Set by the kernel: bit k of a subtree's byte if its leaf k, in tree order, was left out; uint8
             [count, rounded up to eights].
-        live: How many there are where launches go through more, int32 [1] on the device, else None.
+        live: How many there are, if launches go through more, int32 [1] on the device, else None.
     """
 
     shape: int
@@ -59,5 +59,5 @@ class Batch:
 
 
 def chosen(values: wp.array, places: wp.array) -> wp.array:
-    """Some values of an array, by their places."""
+    """The values of an array at chosen places."""
     return wp.array(values.numpy()[places.numpy()], dtype=values.dtype, device=values.device)

@@ -1,4 +1,4 @@
-"""What keyframes of nodes and of elements have in common."""
+"""Checks that keyframes of nodes and of elements share."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def checked_times(times: npt.ArrayLike) -> npt.NDArray[np.float64]:
 def staying(
     followers: npt.NDArray[np.integer], chosen: npt.NDArray[np.integer], values: npt.NDArray[np.floating]
 ) -> tuple[npt.NDArray[np.integer], npt.NDArray[np.floating]] | None:
-    """Those that follow keyframes and are not among the chosen, with their values; None if all stay.
+    """The followers of keyframes that are not among the chosen, with their values; None if all stay.
 
     Args:
         followers: [n].

@@ -1,4 +1,4 @@
-"""Pools put in the order of the leaves: what is near in the mesh is near in memory again."""
+"""Reorder the pools by the leaves, so that neighbours in the mesh are neighbours in memory again."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ def compact(forest: DeviceForest) -> None:
         _rename(array, node_number)
     for array in (pools.parent, pools.first_child, pools.leaves[:leaves], pools.void_leaves):
         _rename(array, element_number)
-    # What is free are the last places now, and the lowest of them are taken first.
+    # The free places are now the last ones; the lowest of them are used first.
     free_pairs = forest.free_leaves
     if free_pairs:
         first = forest.tree_capacity - 2 * free_pairs
         pools.free_pairs[:free_pairs].assign(np.arange(free_pairs, dtype=np.int32)[::-1] * 2 + first)
-    # Rounds compare with what nodes were touched in; none of it counts after a pass.
+    # A round compares with the round in which a node was last touched; after a pass these numbers mean nothing.
     pools.touched.zero_()
 
 
 def _nodes_in_order(forest: DeviceForest) -> Index:
-    """All places for nodes: those that leaves name as they first do; the others stay where they are."""
+    """All places for nodes: nodes of leaves in the order in which leaves name them; the others keep their places."""
     nodes, first = np.unique(forest.leaf_tets.ravel(), return_index=True)
     others = np.arange(len(nodes), forest.node_capacity)
     return np.concatenate([nodes[np.argsort(first)], others]).astype(np.int32)
@@ -71,7 +71,7 @@ def _elements_in_order(forest: DeviceForest) -> Index:
 
 
 def _numbering(order: Index) -> tuple[Index, Index]:
-    """The order, and each one's number in it; at the end -1 and -2 for themselves."""
+    """The order, and each place's number in it; -1 and -2 at the end stand for themselves."""
     number = np.empty(len(order) + 2, np.int32)
     number[order] = np.arange(len(order), dtype=np.int32)
     number[-1], number[-2] = -1, -2
@@ -85,5 +85,5 @@ def _permute(array: wp.array, order: Index) -> None:
 
 
 def _rename(array: wp.array, number: Index) -> None:
-    """Replace indices, negative ones but for themselves."""
+    """Replace indices; negative ones stay."""
     array.assign(number[array.numpy()])

@@ -43,9 +43,9 @@ def exported(device: DeviceForest) -> TetForest:
 
 
 def _without_doubles(order: np.ndarray, lattice: np.ndarray, real: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes without those that only void tetrahedra name where leaves name another one, and what stands for each.
+    """Merge doubled nodes: the nodes that stay, and which of them stands for each.
 
-    A node that is made in the mesh does not look for one that void tetrahedra have there; here they become one.
+    A new node of a leaf does not look for a node that void tetrahedra have at the same point; here the two are merged.
     """
     stands_for = np.arange(len(lattice), dtype=np.int32)
     is_real = np.zeros(len(lattice), bool)
@@ -69,7 +69,7 @@ def _same_points(points: np.ndarray, among: np.ndarray) -> np.ndarray:
 
 
 def _from_ends(values: np.ndarray, known: np.ndarray, ends: np.ndarray, *, first: bool) -> np.ndarray:
-    """Values where points are known, elsewhere the mean of both ends, or what the first end has."""
+    """Values at known points; elsewhere the mean of both ends, or the first end's value."""
     found = np.zeros(len(known), values.dtype)
     there = known >= 0
     found[there] = values[known[there]]

@@ -5,7 +5,7 @@ import numpy.typing as npt
 
 from warp_corot.kernels.remesh.pools import SINKS
 
-#: Of ``kernels.remesh.pools.Pools``; what a pass leaves behind unused is left out.
+#: Arrays of ``kernels.remesh.pools.Pools``, without those that mean nothing after a pass.
 OF_NODES: tuple[str, ...] = ("lattice", "ends", "valence")
 OF_TETRAHEDRA: tuple[str, ...] = ("tets", "level", "parent", "first_child", "code")
 

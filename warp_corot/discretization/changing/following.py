@@ -11,18 +11,18 @@ from warp_corot.kernels.remesh.pools import Pools
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.surfaces.bound import BoundPoints, DeviceBinding
 
-#: How far from the border of its element the place is that decides which element a point goes along with, as a share.
+#: Before a point follows a child of its element, it is moved this share of the way from the element's border inwards.
 INWARD = 1e-3
 
 
 class FollowingBinding(DeviceBinding):
-    """Points bound to a mesh that may change: after each pass they are bound to the elements that hold them then.
+    """Points bound to a mesh that may change: each pass binds them to the elements that hold them afterwards.
 
     Args:
         bound: Bound to the nodes of ``mesh``.
         mesh: As it is now.
         leaves: The leaf that each point is bound to, int32 [V].
-        device: Where the body is.
+        device: The body's device.
     """
 
     def __init__(self, bound: BoundPoints, mesh: TetForest, leaves: npt.NDArray[np.integer], device: wp.Device):
@@ -38,7 +38,7 @@ class FollowingBinding(DeviceBinding):
         self._points = wp.array(_coordinates(corners, bound.points), dtype=wp.vec4d, device=device)
 
     def rebind(self, pools: Pools) -> None:
-        """Bind the points to what the leaves are now, in ``kernels.remesh.pools.Pools``."""
+        """Bind the points to the present leaves of ``kernels.remesh.pools.Pools``."""
         inputs = [self._roots, self._inside, self._points, pools]
         wp.launch(bind_points, len(self.rest), inputs, [self.nodes, self.weights], device=self.device)
 

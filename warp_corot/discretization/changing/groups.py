@@ -1,4 +1,4 @@
-"""Groups of the leaves in no subtree, found anew on the device whenever the mesh has changed; see ``groups``."""
+"""Groups of the leaves in no subtree, found again on the device whenever the mesh has changed; see ``groups``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class ChangingGroups:
     """Groups of the leaves that a plan has in no subtree.
 
     Args:
-        plan: The plan, after which ``launch`` comes.
+        plan: The plan; launch ``launch`` after it.
 
     Attributes:
         starts, members: As in ``groups.Groups``, with room for as many as there may ever be.

@@ -28,8 +28,8 @@ from .pools import DeviceForest
 class RemeshPass:
     """A criterion and two thresholds, turned into launches that can be recorded.
 
-    A leaf is bisected where the criterion is above one threshold and given up, with its sibling, where it is below the
-    other: once a pass, but that conformity may bisect larger neighbours too. Between the two nothing happens.
+    A leaf is bisected where the criterion is above one threshold, and merged with its sibling where it is below the
+    other. Between the two it stays. A pass bisects a leaf once; conformity may bisect larger neighbours too.
 
     Args:
         forest: What to change.
@@ -41,7 +41,7 @@ class RemeshPass:
         lame: Lamé's parameters for the criterion [Pa], or what elements carry them as.
 
     Raises:
-        InputError: Thresholds that cannot both hold, levels out of order or beyond the lattice's depth.
+        InputError: The thresholds contradict each other, or the levels are out of order or beyond the lattice's depth.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class RemeshPass:
         self._graphs: dict[bool, wp.Graph] = {}
 
     def run(self) -> None:
-        """Mark the leaves by the criterion and change the mesh, from a recording that is made the first time."""
+        """Mark the leaves by the criterion and change the mesh. The first call records the launches; others replay."""
         self._replay(marked=False)
 
     def apply(self, marks: npt.ArrayLike) -> None:
@@ -86,7 +86,7 @@ class RemeshPass:
             marks: 1 for leaves to bisect, -1 for leaves that may be merged, 0 for the others, [T].
 
         Raises:
-            InputError: Not one of these for each leaf.
+            InputError: The marks have other values or another number.
         """
         given = np.asarray(marks)
         count = self.forest.leaf_count
@@ -160,7 +160,7 @@ class RemeshPass:
         wp.launch(kernel, dim=1, inputs=list(arguments), device=self.device)
 
     def _many(self, kernel: wp.Kernel, *arguments: Any) -> None:
-        """Launch a kernel that goes through as many things as there are."""
+        """Launch a kernel in which each thread goes through a stretch of the things that there are."""
         threads = self.forest.threads
         wp.launch(kernel, dim=threads, inputs=[threads, *arguments], device=self.device)
 
@@ -184,7 +184,7 @@ class RemeshPass:
         edges.born = wp.full(size, int(remesh_edges.NEVER), dtype=wp.int32, device=self.device)
         edges.ring, edges.agreed, edges.pairs = (wp.zeros(size, dtype=wp.int32, device=self.device) for _ in range(3))
         edges.head, edges.node = (wp.full(size, -1, dtype=wp.int32, device=self.device) for _ in range(2))
-        # Threads that want an edge at the same time may go beyond it, but never fill the table.
+        # Threads that add an edge at the same time may exceed the limit, but never fill the table.
         edges.most = size // 2
         edges.wanted = wp.empty(size, dtype=wp.int32, device=self.device)
         return edges

@@ -30,19 +30,19 @@ from .sizes import launch_size
 class DevicePlan:
     """The ``plan.Plan`` of a forest that changes, derived from its leaves by launches.
 
-    Everything stands in arrays as large as it may ever get, with padding beyond what there is, so that launches may go
-    through more than that. Forces need not have one order.
+    All arrays have room for the largest mesh and are padded, so that launches may go through more than there is now.
+    The order of sums of forces is not fixed.
 
     Args:
         forest: The pools.
         rotation_level: Level of the tree at which rotations are shared; None: not shared.
-        subtrees: False: all leaves go one by one, for models that know no subtrees.
-        grouped: Whether complete subtrees go in groups where they can, as launches on CUDA alone do; None: there.
+        subtrees: False: all leaves go one by one, for models without subtree kernels.
+        grouped: Whether complete subtrees go in groups where they can; None: only on CUDA.
 
     Attributes:
         elements: The leaves as ``kernels.elements.elements.ForestElements``.
         values: What leaves carry by name, float32 [capacity + LEAF_PADDING] each; zero beyond the leaves.
-        class_counts: What ``refresh`` wants, int32 on the device.
+        class_counts: The counts that ``refresh`` takes, int32 on the device.
         batches, flat, units, counts: As in ``plan.Plan``.
         slots: None.
     """
@@ -102,23 +102,23 @@ class DevicePlan:
             planner.pad_units()
 
     def outdate(self) -> None:
-        """Let the next launches derive the plan also if the last pass has changed nothing, as after ``restart``."""
+        """Make the next launches derive the plan even if the last pass changed nothing, as after ``restart``."""
         self._plan.stale.fill_(1)
 
     def derive(self) -> bool:
-        """Derive the plan now, whatever the last pass was, and wait for it; returns what ``refresh`` does."""
+        """Derive the plan now, whether or not the last pass changed the mesh, wait for it, and ``refresh`` it."""
         self.outdate()
         self.launch()
         return self.refresh(self.class_counts.numpy())
 
     def refresh(self, counts: npt.NDArray[np.int32]) -> bool:
-        """Fit the sizes of launches to what there is.
+        """Fit the sizes of launches to the present counts.
 
         Args:
             counts: A copy of ``class_counts``.
 
         Returns:
-            Whether ``batches``, ``flat`` or ``units`` are other ones now, so that launches must be made anew.
+            Whether ``batches``, ``flat`` or ``units`` were replaced, so that launches must be made again.
         """
         classes = self._plan.classes
         limits = [self._most_subtrees] * classes + [self.counts.most] * 2
@@ -133,7 +133,7 @@ class DevicePlan:
         return True
 
     def values_row(self, name: str) -> int:
-        """Where leaves' values of a name stand in ``arrays.values``; -1 if they carry none."""
+        """The row of ``arrays.values`` with the leaves' values of a name; -1 if there is none."""
         names = self.forest.carriage.names
         return names.index(name) if name in names else -1
 
@@ -144,7 +144,7 @@ class DevicePlan:
 
     @property
     def kinds(self) -> list[tuple[int, bool, Sharing]]:
-        """Shape, whether in groups, and sharing of all batches that there may ever be."""
+        """Shape, whether in groups, and sharing of all possible batches."""
         if not self._with_subtrees:
             return []
         members = (True, False) if self._plan.members == 2 else (False,)
@@ -163,7 +163,7 @@ class DevicePlan:
 
     @property
     def all_units(self) -> Units:
-        """What rotations are found of, whether a launch of forces asks for it or not; the first is padding."""
+        """All units, also those that no launch of forces uses; the first is padding."""
         return self._made.units(self._sizes[-1])
 
     def _refit(self) -> None:
@@ -174,13 +174,13 @@ class DevicePlan:
         self.flat = replace(self._made.flat(sizes[classes]), live=self._live(classes))
 
     def _live(self, row: int) -> wp.array:
-        """How many there are of a class, or of leaves in none."""
+        """How many subtrees of a class there are, or leaves in no subtree."""
         return self._plan.counts[row : row + 1]
 
     # --- pieces ------------------------------------------------------------------------------------------------------
 
     def _leaves(self, count: int) -> ForestElements:
-        """The leaves, with places for their codes."""
+        """The leaves, with room for their codes."""
         forest, elements = self.forest, ForestElements()
         elements.nodes = elements.targets = forest.pools.leaf_tets
         elements.code = wp.empty(count, dtype=wp.int32, device=self.device)
@@ -188,7 +188,7 @@ class DevicePlan:
         return elements
 
     def _fill_in(self, most_leaves: int) -> None:
-        """What only a plan that changes has; and counts as if all places were taken, so that all becomes padding."""
+        """Fill in what only a changing plan has. Counts begin as if all places were used, so that all become padding."""
         plan, leaves, names = self._plan, self._made.leaves, self.forest.carriage.names
         plan.first_unit = 1
         plan.stale, plan.goes = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
@@ -200,7 +200,7 @@ class DevicePlan:
         if "mu" in names:
             leaves.mu_row, leaves.lam_row = (names.index(name) for name in ("mu", "lam"))
             leaves.mu, leaves.lam = (wp.zeros(count, dtype=wp.float32, device=self.device) for _ in range(2))
-        # Eight elements at a time, on the CPU, want to have their own rotations.
+        # The CPU computes eight elements at a time, from rest matrices.
         if self.device.is_cpu and not self.rotation_shared and count:
             leaves.rest_inverse = wp.empty(count, dtype=wp.mat33, device=self.device)
             leaves.volume = wp.empty(count, dtype=wp.float32, device=self.device)

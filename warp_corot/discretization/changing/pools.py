@@ -24,12 +24,12 @@ from .transfer import Carriage, Column, Numbers
 
 
 class PassCounts(NamedTuple):
-    """What the host asks for after a pass.
+    """The counts that the host reads after a pass.
 
     Attributes:
         leaves, nodes: How many there are; nodes that only void tetrahedra name are not counted.
-        added, removed: Nodes made and removed in the last pass. If both are zero the mesh is what it was.
-        full: Whether a refinement ever had to be left out for want of room.
+        added, removed: Nodes made and removed in the last pass. If both are zero, the mesh did not change.
+        full: Whether a refinement was ever left out because the pools were full.
     """
 
     leaves: int
@@ -51,20 +51,22 @@ class PassCounts(NamedTuple):
 class DeviceForest:
     """A forest in pools of fixed capacity.
 
-    The N nodes that leaves name are 0 … N - 1 after every pass. Those that only void tetrahedra name stand at the end
-    of the pool and stay there. Numbers of nodes stay theirs but in passes that remove some, where the last ones move
-    into the gaps; numbers of tetrahedra stay theirs as long as they are in use. Beyond N nodal arrays are zero, and
-    beyond the count ``pools.leaf_tets`` names sinks, places past the last node, so that a launch may go through more
+    The N nodes that leaves name are 0 … N - 1 after every pass. Nodes that only void tetrahedra name stand at the end
+    of the pool and stay there. Nodes keep their numbers, except in passes that remove some: then the last ones move
+    into the gaps. Tetrahedra keep their numbers as long as they are in use. Nodal arrays are zero beyond N, and
+    ``pools.leaf_tets`` names sinks, places past the last node, beyond the last leaf. So a launch may go through more
     nodes, up to ``node_capacity``, and more leaves, up to ``capacity + LEAF_PADDING``, than there are.
 
     Args:
         forest: The mesh to begin with. Its void tetrahedra stay as they are.
         capacity: How many leaves there may ever be.
-        density: Mass per rest volume [kg/m^3], a number or one for each leaf [T]; the forest's filled share comes on
-            top.
-        values: Other quantities of leaves by name, [T] each, that are per full rest volume, as Lamé's parameters times
-            the filled share: children have their parent's, a parent its children's mean or what a ``Column`` says.
-        node_capacity: How many nodes; None: one for every two more leaves, where five or six a node are usual.
+        density: Mass per rest volume [kg/m^3], a number or one for each leaf [T], to be multiplied by the forest's
+            filled share.
+        values: Other quantities of leaves by name, [T] each, per full rest volume, as Lamé's parameters times the
+            filled share. Children have their parent's value; a parent has its children's mean, or what a ``Column``
+            says.
+        node_capacity: How many nodes there may be; None: one more for every two more leaves. Meshes usually have five
+            or six leaves a node.
         device: "cpu", "cuda:0", …; None for Warp's default.
 
     Attributes:
@@ -72,12 +74,12 @@ class DeviceForest:
         carriage: What nodes and tetrahedra carry.
         source: The forest that this began as.
         capacity, node_capacity, tree_capacity: Places for leaves, nodes, and tetrahedra of all levels.
-        remembered: What ``restart`` goes back to.
+        remembered: The state to which ``restart`` returns.
         virtual_count: Nodes that only void tetrahedra name.
         threads: Threads of a launch.
 
     Raises:
-        InputError: Not a forest, a capacity below what there is, or more than can be numbered.
+        InputError: The mesh is not a forest, the capacity is below its size, or larger than can be numbered.
     """
 
     def __init__(
@@ -130,16 +132,16 @@ class DeviceForest:
 
     @property
     def free_leaves(self) -> int:
-        """By how many the leaves may still grow."""
+        """How many more leaves there is room for."""
         return self.count(kernels.FREE_PAIRS)
 
     @property
     def is_full(self) -> bool:
-        """Whether a refinement ever had to be left out for want of room."""
+        """Whether a refinement was ever left out because the pools were full."""
         return bool(self.count(kernels.FULL))
 
     def counts(self) -> PassCounts:
-        """What the last pass came to, by one readback."""
+        """The counts after the last pass, by one readback."""
         return PassCounts.of(self.pools.counts.numpy())
 
     def count(self, which: int) -> int:
@@ -163,7 +165,7 @@ class DeviceForest:
         return self.pools.leaf_tets.numpy()[: self.leaf_count]
 
     def tree(self) -> tuple[Tree, npt.NDArray[np.intp]]:
-        """The tree without unused places, nodes still by their places in the pool, and where each of it stands."""
+        """The tree without unused places, its nodes by their places in the pool; and where its tetrahedra stand."""
         pools = self.pools
         level = pools.level.numpy()
         used = np.flatnonzero(level != kernels.UNUSED)
@@ -177,28 +179,28 @@ class DeviceForest:
     def to_forest(self) -> TetForest:
         """The present mesh on the host, its leaves as here in tree order.
 
-        Node i is node i here for all that leaves name. Of a domain's mesh the function's values at new nodes
-        are means, as in ``TetForest.refine``; ``fill`` and ``labels`` are what the leaves carry.
+        All nodes that leaves name keep their numbers. In a domain's mesh, the function's values at new nodes are means,
+        as in ``TetForest.refine``; ``fill`` and ``labels`` are those that the leaves carry.
         """
         from .export import exported
 
         return exported(self)
 
     def compact(self) -> None:
-        """Number nodes and tetrahedra anew in the order of the leaves, which are in tree order after every pass.
+        """Renumber nodes and tetrahedra in the order of the leaves, which are in tree order after every pass.
 
-        For memory that has become scattered. Arrays stay the same, but numbers of nodes held elsewhere are void.
+        This helps when memory has become scattered. Arrays stay the same; node numbers kept elsewhere become invalid.
         """
         from .compaction import compact
 
         compact(self)
 
     def remember(self) -> None:
-        """Keep the present mesh and all that it carries, for ``restart``; it is done once when this is made."""
+        """Keep the present mesh and all that it carries for ``restart``. The constructor does this once."""
         self.remembered = Snapshot.of(self.pools, self.carriage.arrays)
 
     def restart(self) -> None:
-        """Go back to what was kept last. Arrays stay the same, so that recorded passes and steps stay valid."""
+        """Return to the state kept last. Arrays stay the same, so that recorded passes and steps stay valid."""
         self.remembered.restore(self.pools, self.carriage.arrays)
 
     # --- pieces ----------------------------------------------------------------------------------------------------

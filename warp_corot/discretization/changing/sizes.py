@@ -14,11 +14,11 @@ def launch_size(count: int, present: int, granule: int = 1, limit: int | None = 
     Args:
         count: How many things there are.
         present: The present size, or 0.
-        granule: A power of two that the size is to be a multiple of.
-        limit: Places that there are; a multiple of the granule where that matters.
+        granule: A power of two; the size is a multiple of it.
+        limit: How many places there are; a multiple of the granule where that matters.
 
     Returns:
-        At least ``count``; 0 for none at all.
+        At least ``count``; 0 if that is 0.
     """
     if SLACK * present <= count <= present:
         return present

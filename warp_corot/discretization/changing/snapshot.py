@@ -17,7 +17,7 @@ from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 
 from .fields import CARRIED_BY_NODES, CARRIED_BY_TETRAHEDRA, OF_NODES, OF_TETRAHEDRA, padding
 
-#: What places hold where there is nothing, if it is not zero.
+#: What unused places hold, if it is not zero.
 _UNUSED = {"level": int(kernels.UNUSED), "row": int(NO_ROW)}
 
 _CARRIED = (*CARRIED_BY_NODES, *CARRIED_BY_TETRAHEDRA, "impulse")
@@ -55,7 +55,7 @@ class Snapshot:
         return cls(counts, tuple(pieces))
 
     def restore(self, pools: kernels.Pools, carried: Carried) -> None:
-        """Write it back into the same arrays."""
+        """Write the state back into the same arrays."""
         present = pools.counts.numpy()
         leaves, known = int(present[kernels.LEAVES]), int(self.counts[kernels.LEAVES])
         if leaves > known:
@@ -65,7 +65,7 @@ class Snapshot:
         for name, start, values in self.pieces:
             array_of(pools, carried, name)[start : start + len(values)].assign(values)
         counts = self.counts.copy()
-        # Rounds are counted on, so that what was touched in later ones is not taken for new.
+        # The count of rounds continues, so that nodes touched in later rounds do not look newly touched.
         counts[kernels.STAMP] = present[kernels.STAMP]
         pools.counts.assign(counts)
 
@@ -73,15 +73,15 @@ class Snapshot:
 def check_places(
     pools: kernels.Pools, carried: Carried, counts: npt.NDArray[np.int32], pieces: dict[str, npt.NDArray[Any]]
 ) -> None:
-    """See that kernels that are given stretches of arrays stay within these.
+    """Check that the stretches lie within the arrays.
 
     Args:
-        pools, carried: Where they are to go.
+        pools, carried: Where the stretches are to go.
         counts: ``Pools.counts``.
         pieces: Values, by the name of their array and, after a dot, where the stretch begins.
 
     Raises:
-        ValueError: A place that there is not, in one line.
+        ValueError: A stretch goes beyond an array; in one line.
     """
     levels = len(carried.volume)
     places, nodes, named = len(pools.level), len(pools.lattice), len(carried.rest)
@@ -103,12 +103,12 @@ def check_places(
 
 
 def array_of(pools: kernels.Pools, carried: Carried, name: str) -> wp.array:
-    """An array of the pools or of what is carried."""
+    """An array of the pools or of the carried state."""
     return getattr(carried if name in _CARRIED else pools, name)
 
 
 def _in_use(pools: kernels.Pools, carried: Carried, counts: npt.NDArray[np.int32]) -> Iterator[tuple[str, int, int]]:
-    """Names of arrays, where stretches of them that are in use begin, and how long these are."""
+    """The stretches in use: names of arrays, where each stretch begins, and how long it is."""
     used = int(np.flatnonzero(pools.level.numpy() != kernels.UNUSED)[-1]) + 1
     for name in (*OF_TETRAHEDRA, *CARRIED_BY_TETRAHEDRA):
         if array_of(pools, carried, name).size:

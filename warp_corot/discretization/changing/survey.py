@@ -13,23 +13,23 @@ from warp_corot.kernels.remesh import survey as kernels
 
 from .pools import DeviceForest
 
-#: Passes for which the stiffest elements must have been softer ones before a longer step is looked for.
+#: A longer step is sought only after the stiffest element has been softer for this many passes.
 PATIENCE = 10
-#: Growth of the number of finest elements, and passes with changes, after which the step is found anew in any case. An
-#: element among its like vibrates up to half again as fast as one among larger ones.
+#: Growth of the number of finest elements, and passes with changes, after which the step is found again in any case. An
+#: element among equal ones vibrates up to half again as fast as one among larger ones.
 GROWTH = 1.5
 MOST_CHANGES = 50
-#: Stiffnesses that differ by less are the same.
+#: Stiffnesses that differ by less than this share count as equal.
 ALIKE = 1e-3
 
 
 @dataclass
 class Findings:
-    """The mesh when its step was found last, and what has been since.
+    """The mesh when its step was found last, and the passes since then.
 
     Attributes:
         stiffness: Of the stiffest element, (2 mu + lambda) / (density volume^(2/3)) [1/s^2].
-        finest: How many elements are of the finest level.
+        finest: How many elements have the finest level.
         softer_for: Passes in which the stiffest element was softer.
         changes: Passes that changed something.
     """
@@ -45,12 +45,12 @@ class Survey:
 
     Args:
         forest: The pools.
-        modulus: 2 mu + lambda [Pa] of all elements, if they are alike; else elements carry "mu" and "lam".
+        modulus: 2 mu + lambda [Pa], if all elements have the same; else elements carry "mu" and "lam".
 
     Attributes:
         found: What launches have found, int32, for ``read``.
         last: The mesh when its step was found last.
-        finest_level: Of the present mesh.
+        finest_level: The finest level of the present mesh.
     """
 
     def __init__(self, forest: DeviceForest, modulus: float):
@@ -92,5 +92,5 @@ class Survey:
         return True
 
     def settle(self) -> None:
-        """The step has been found for the mesh as it is."""
+        """Note that the step has been found for the present mesh."""
         self.last = Findings(self._stiffness, self._finest)

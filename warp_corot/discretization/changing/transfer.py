@@ -1,4 +1,4 @@
-"""What nodes and tetrahedra of a changing forest carry, as the host sees it."""
+"""The state and material that nodes and tetrahedra of a changing forest carry: the host's side."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from warp_corot.mesh.lattice import MAX_LEVEL, volume_shares
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """Values of leaves, [T] or one for all, and what a parent has of its children's: see ``kernels.remesh.state``."""
+    """Values of leaves, [T] or one for all, and the rule for a parent's value; see ``kernels.remesh.state``."""
 
     values: npt.ArrayLike
     merging: int = int(MEAN)
@@ -28,7 +28,7 @@ class Column:
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """Whole numbers of leaves, [T] or one for all; a parent has its first child's."""
+    """Whole numbers of leaves, [T] or one for all; a parent gets its first child's."""
 
     values: npt.ArrayLike
 
@@ -37,10 +37,10 @@ class Carriage:
     """State of nodes and material of tetrahedra, in arrays as large as the pools.
 
     A new node is the midpoint of its deformed edge, so that children have their parent's deformation gradient. Mass is
-    lumped, a quarter of each leaf's at its nodes, and moves with its momentum; what a held node cannot take up of it is
-    counted in ``support_impulse``. A node between two held ones is held. A load stays where it is; that of a removed
-    node goes to both ends by halves. Children have their parent's density and values; a parent has its children's mean,
-    or what a ``Column`` says.
+    lumped, a quarter of each leaf's at its nodes, and carries its momentum along; momentum that a held node cannot take
+    up is counted in ``support_impulse``. A node between two held ones is held. Loads stay where they are; half of a
+    removed node's load goes to each end of its edge. Children have their parent's density and values; a parent has its
+    children's mean, or what a ``Column`` says.
 
     Args:
         source: The forest to begin with.
@@ -126,10 +126,10 @@ class Carriage:
             held: Which are fixed or prescribed, bool [n].
             rows: Which row of keyframes held nodes follow, -1 for none, int32 [n]. A node that is made between two held
                 ones has the row of both; -2 if they follow different ones.
-            nodes: Places in the pool [n]; None: those of the forest that this began as, before any pass.
+            nodes: Places in the pool [n]; None: the nodes of the original forest, before any pass.
 
         Raises:
-            InputError: Wrong shapes.
+            InputError: An array has the wrong shape.
         """
         places = np.arange(self._first_nodes) if nodes is None else np.asarray(nodes)
         for name, given in (("u", displacements), ("v", velocities), ("load", loads)):
@@ -159,7 +159,7 @@ class Carriage:
 
     @property
     def support_impulse(self) -> npt.NDArray[np.float64]:
-        """What supports have given in all passes, as mass came to and from held nodes [N s], float64 [3]."""
+        """Impulse of the supports in all passes, as mass came to and left held nodes [N s], float64 [3]."""
         return self.arrays.impulse.numpy()[0]
 
     def _update_inverse_mass(self) -> None:

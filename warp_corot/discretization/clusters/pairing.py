@@ -16,20 +16,20 @@ from warp_corot.kernels.clusters.pair_elements import (
     vec4u,
 )
 
-#: How far apart in the list of those without a partner elements may be to be paired.
+#: Elements are paired if they are no farther apart in the list of those without a partner.
 REACH = 6
-#: The four nodes in an order that begins with those of a face, by the node that is not of it.
+#: The four nodes in an order that begins with a face's three, for each node opposite the face.
 _OPPOSITE = np.array([[1, 2, 3, 0], [0, 2, 3, 1], [0, 1, 3, 2], [0, 1, 2, 3]])
 
 
 def paired(tets: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
-    """Pairs of elements that share a face and stand near one another in a list, and what is left as pairs with nobody.
+    """Pairs of elements that share a face and are near one another in a list; the others are pairs without a second.
 
     Args:
         tets: Nodes of elements, int32 [T, 4].
 
     Returns:
-        Places in the list, in its order by the first of each, int32 [pairs, 2]; the second -1 where there is none.
+        Places in the list, ordered by the first of each pair, int32 [pairs, 2]; the second is -1 where there is none.
     """
     left = np.arange(len(tets), dtype=np.int32)
     found = [np.empty((0, 2), np.int32)]
@@ -58,10 +58,10 @@ def _share_a_face(
 
 
 def _every_other(fits: npt.NDArray[np.bool_], step: int) -> npt.NDArray[np.int64]:
-    """Places i where i and i + step make a pair, of those where they fit, so that none is in two."""
+    """Places i where i and i + step make a pair, chosen so that no element is in two pairs."""
     places = np.flatnonzero(fits)
     places = places[np.lexsort((places, places % step))]
-    # Of a chain i, i + step, i + 2 step, ... the first, the third and so on.
+    # In a chain i, i + step, i + 2 step, ..., these are the first, the third and so on.
     begins = np.flatnonzero(np.diff(places, prepend=-2 * step - 1) != step)
     in_chain = np.arange(len(places)) - np.repeat(begins, np.diff(begins, append=len(places)))
     return np.sort(places[in_chain % 2 == 0])
@@ -81,7 +81,7 @@ def roles_of(
     shared[alone] = [True, True, True, False]
     order = _OPPOSITE[np.argmin(shared, axis=1)]
     nodes = np.take_along_axis(first, order, axis=1)
-    # Where the second element has a, b and c, and what is left of 0 + 1 + 2 + 3.
+    # Where the second element has a, b and c; the remaining place follows from 0 + 1 + 2 + 3.
     at = np.argmax(second[:, None, :] == nodes[:, :3, None], axis=2)
     apex = 6 - at.sum(axis=1, keepdims=True)
     apex[alone] = 0
@@ -116,8 +116,8 @@ def device_pairs(
     Args:
         corners: Where nodes a to e stand in bytes, [pairs, 5].
         gradients: B of both elements, [pairs, 2, 3, 3].
-        volumes: Of both, zero where there is none, [pairs, 2].
-        cell: Edge length of a forest's root cubes, or None: not of a forest.
+        volumes: Volumes of both, zero where there is no second, [pairs, 2].
+        cell: Edge length of a forest's root cubes; None for a general mesh.
     """
     count, words = len(corners), GENERAL_WORDS if cell is None else LATTICE_WORDS
     records = np.zeros((count, words), "<u4")
@@ -132,7 +132,7 @@ def device_pairs(
         pairs.inverse_cell, pairs.scale = 1.0 / cell, cell * cell / 6.0
         whole = np.round(gradients.reshape(count, 18) * cell).astype("<f4")
         halves[:, 2 * FIRST_MATRIX : 2 * FIRST_MATRIX + 18] = whole.view("<u4") >> 16
-        # Six volumes over that of a root cube are powers of two; what counts are their exponents as float32 has them.
+        # Six volumes over a root cube's volume are a power of two; the kernels read its exponent as float32 stores it.
         sixths = (volumes * (6.0 / cell**3)).astype("<f4")
         exponents = np.where(sixths > 0, np.round(np.log2(np.maximum(sixths, 1e-30))) + 127, 0).astype(np.uint16)
         halves[:, 5] = exponents[:, 0] | exponents[:, 1] << 8

@@ -27,13 +27,13 @@ def pairs_in_clusters(
     cell: float | None,
     layout: PairLayout,
 ) -> tuple[PairClusters, LatticePairs | GeneralPairs, int]:
-    """Clusters of some of a mesh's elements in pairs, which follow one another as they are given.
+    """Clusters of paired elements, in the given order of the elements.
 
     Args:
         chosen: The elements, int32 [n].
         nodes: Nodes of all elements, int32 [T, 4].
         general: All of them as ``kernels.elements.elements.GeneralElements``.
-        cell: Edge length of a forest's root cubes [m], or None: not of a forest.
+        cell: Edge length of a forest's root cubes [m]; None for a general mesh.
         layout: What the kernel is generated for.
 
     Returns:
@@ -44,7 +44,7 @@ def pairs_in_clusters(
     pairs = paired(tets)
     of_pairs, roles = roles_of(tets, pairs)
     begins = _cut(of_pairs, layout.threads)
-    # Where each pair stands, and what stands there.
+    # The place of each pair, and the pair at each place.
     count = len(begins) - 1
     cluster = np.repeat(np.arange(count), np.diff(begins))
     thread = layout.threads * cluster + np.arange(len(pairs)) - begins[cluster]
@@ -64,7 +64,7 @@ def pairs_in_clusters(
 
 
 def _cut(of_pairs: npt.NDArray[np.int32], threads: int) -> npt.NDArray[np.int32]:
-    """Where clusters begin, and the last ends, so that none has more pairs or tasks than threads."""
+    """Where each cluster begins and the last one ends; no cluster has more pairs or tasks than threads."""
     nodes = int(of_pairs.max(initial=0)) + 1
     cluster_of, degree = wp.full(nodes, -1, dtype=wp.int32, device="cpu"), wp.zeros(nodes, dtype=wp.int32, device="cpu")
     begins, count = (wp.zeros(n, dtype=wp.int32, device="cpu") for n in (len(of_pairs), 1))
@@ -86,7 +86,7 @@ def _tasks(
 
     Args:
         of_pairs: The pairs' nodes, [pairs, 5].
-        cluster, thread: Where pairs stand, [pairs].
+        cluster, thread: The place of each pair, [pairs].
     """
     key = (cluster[:, None] * (int(of_pairs.max(initial=0)) + 1) + of_pairs).ravel()
     # In ``order`` the corners on one node of a cluster follow one another.
@@ -94,8 +94,8 @@ def _tasks(
     starts = np.flatnonzero(np.diff(key[order], prepend=-1))
     degree = np.diff(starts, append=len(key))
     owner = cluster[order[starts] // CORNERS]
-    # A node's first task is its place, so first tasks come first, busy ones at their head: then the threads of a warp
-    # have about as much to add up.
+    # A node's first task is its place, so first tasks come first, the longest of them ahead: then the threads of a warp
+    # have about equally long sums.
     pieces = -(-degree // PAIR_TASK_SLOTS)
     node = np.repeat(np.arange(len(starts)), pieces)
     piece = np.arange(len(node)) - np.repeat(np.cumsum(pieces) - pieces, pieces)

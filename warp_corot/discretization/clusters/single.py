@@ -41,7 +41,7 @@ def changing_clusters(most: int, count: wp.array, layout: ClusterLayout = DEFAUL
 def find_tables(
     clusters: Clusters, places: int, nodes: wp.array, goes: wp.array, layout: ClusterLayout = DEFAULT_LAYOUT
 ) -> None:
-    """Launch what finds the tables of elements of these nodes, vec4i, if ``goes`` says so, int32 [1]."""
+    """Find the tables for elements with these nodes, vec4i, by launches, if ``goes``, int32 [1], is not zero."""
     lanes = layout.threads if goes.device.is_cuda else 1
     wp.launch(
         find_clusters(layout),
@@ -56,7 +56,7 @@ def find_tables(
 def order_in_clusters(
     points: npt.NDArray[np.float64], tets: npt.NDArray[np.int32], layout: ClusterLayout = DEFAULT_LAYOUT
 ) -> npt.NDArray[np.int32]:
-    """A mesh's elements in an order in which neighbours follow one another, int32 [T]: as they are, if they do so.
+    """An order of a mesh's elements in which neighbours follow one another, int32 [T]; the given one if it does.
 
     Args:
         points: Rest positions, [N, 3].
@@ -64,13 +64,13 @@ def order_in_clusters(
     """
     given = np.arange(len(tets), dtype=np.int32)
     along_curve = np.argsort(_morton(points[tets].mean(axis=1)), kind="stable").astype(np.int32)
-    # With the nodes of clusters falls what is read and added up.
+    # The fewer nodes clusters have, the less is read and added up.
     counts = [_node_count(tets[order], layout) for order in (given, along_curve)]
     return given if counts[0] <= counts[1] else along_curve
 
 
 def _morton(x: npt.NDArray[np.float64]) -> npt.NDArray[np.uint64]:
-    """Places of points [n, 3] on a curve that leaves no octant of a cube before it has been through."""
+    """Places of points [n, 3] on a curve that goes through each octant of a cube before it enters the next."""
     low = x.min(axis=0)
     cells = ((x - low) * (((1 << 20) - 1) / max(float(np.ptp(x, axis=0).max()), 1e-300))).astype(np.uint64)
     for shift, mask in (
@@ -85,7 +85,7 @@ def _morton(x: npt.NDArray[np.float64]) -> npt.NDArray[np.uint64]:
 
 
 def _node_count(tets: npt.NDArray[np.int32], layout: ClusterLayout) -> int:
-    """How many nodes the clusters of elements in this order have, all together."""
+    """How many nodes all clusters have together if the elements have this order."""
     whole = len(tets) // layout.elements * layout.elements
     if whole == 0:
         return 0
@@ -97,7 +97,7 @@ def axis_words(frames: npt.NDArray[np.float64]) -> npt.NDArray[np.int32]:
     """The integers of elements without their halvings, by frame, mirrored or not, and type: int32 [n, 2, 3].
 
     Args:
-        frames: Proper local frames, [n, 3, 3]; where one does not go with a type its integer has no meaning.
+        frames: Proper local frames, [n, 3, 3]; where a frame does not occur with a type, its integer has no meaning.
     """
     words = np.zeros((len(frames), 2, 3), np.int32)
     orders = _orders()
@@ -116,7 +116,7 @@ def axis_words(frames: npt.NDArray[np.float64]) -> npt.NDArray[np.int32]:
 
 
 def _orders() -> dict[tuple[int, int, int], int]:
-    """For each order of the three components, the swaps that bring it about."""
+    """For each order of the three components, the swaps that produce it."""
     found: dict[tuple[int, int, int], int] = {}
     for bits in range(8):
         x, y, z = 0, 1, 2

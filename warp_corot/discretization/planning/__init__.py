@@ -1,1 +1,1 @@
-"""Force plans, derived by launches: of forests that stay as they are and, with ``changing``, of those that change."""
+"""Force plans, derived by launches: for fixed forests and, with ``changing``, for forests that change."""

@@ -1,4 +1,4 @@
-"""The arrays that a plan stands in, and what launches of forces see of them."""
+"""The arrays of a plan, and the parts of them that launches of forces read."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Room:
     Attributes:
         subtrees: For subtrees of each class.
         flat: For leaves in no subtree.
-        units: For units; 0: they are not listed.
+        units: For units; 0 if they are not listed.
         leaves: For leaves.
     """
 
@@ -46,7 +46,7 @@ class PlanArrays:
     """The arrays of a plan, without values to begin with.
 
     Args:
-        tree: What the plan is derived from.
+        tree: The tree that the plan is derived from.
         elements: The leaves, in one world or more. Other elements have the same frames and edge lengths.
         rotation_level: Level of the tree at which rotations are shared; None: not shared.
         subtrees: False: all leaves go one by one.
@@ -79,7 +79,7 @@ class PlanArrays:
         """Make the arrays.
 
         Raises:
-            InputError: More nodes of subtrees than can be numbered.
+            InputError: The subtrees have more nodes than can be numbered.
         """
         plan, batches, leaves = self.plan, self.batches, self.leaves
         begin, node_begin = [0], [0]
@@ -111,7 +111,7 @@ class PlanArrays:
         self._flagged = wp.zeros(begin[-1], dtype=wp.uint8, device=self.device)
 
     def is_grouped(self, row: int) -> bool:
-        """Whether subtrees of a class come in groups."""
+        """Whether subtrees of a class are in groups."""
         return self.plan.members == 2 and row % 2 == 0
 
     @property
@@ -170,7 +170,7 @@ class PlanArrays:
         return elements
 
     def _nodes(self, nodes: wp.array, row: int, count: int) -> wp.array:
-        """Nodes of the first subtrees of a class, or what stands like these."""
+        """Nodes of the first subtrees of a class, from any array of the same layout."""
         begin, room = self._node_begin[row], self._room.subtrees[row]
         if self.is_grouped(row):
             return nodes[begin : begin + 5 * count].reshape((count // 8, GROUP_NODES))

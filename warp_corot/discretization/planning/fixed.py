@@ -1,4 +1,4 @@
-"""The force plan of a mesh that stays as it is."""
+"""The force plan of a mesh that never changes."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ForcePlan:
-    """The ``Plan`` of a mesh that stays as it is.
+    """The ``Plan`` of a mesh that never changes.
 
     Attributes:
-        find_units: Makes ``all_units`` of a forest whose rotations are shared.
+        find_units: Makes ``all_units`` for a forest whose rotations are shared.
     """
 
     elements: Elements
@@ -75,11 +75,11 @@ class ForcePlan:
             rotation_level: Level of the tree at which rotations are shared; None: not shared.
             worlds: How many copies of the body there are.
             elements: All leaves, if they are on the device already.
-            grouped: Whether complete subtrees go in groups where they can, as launches on CUDA alone do; None: there.
+            grouped: Whether complete subtrees go in groups where they can; None: only on CUDA.
             deterministic: Whether every unit of work has slots of its own for its forces.
 
         Raises:
-            InputError: More slots, or nodes of subtrees, than can be numbered.
+            InputError: There are more slots, or nodes of subtrees, than can be numbered.
         """
         if elements is None:
             elements = device_elements(forest, device, worlds)
@@ -104,7 +104,7 @@ class ForcePlan:
 
 
 def units_of(forest: TetForest, elements: Elements, rotation_level: int, worlds: int) -> Units:
-    """The highest tetrahedra that are not above a level and stand on nodes, each once; in tree order.
+    """The highest tetrahedra that are not above a level and whose corners are nodes, each once; in tree order.
 
     Args:
         elements: The forest's leaves, in all worlds.
@@ -114,13 +114,13 @@ def units_of(forest: TetForest, elements: Elements, rotation_level: int, worlds:
 
 
 def pays_in_groups(forest: TetForest, elements: Elements, worlds: int) -> bool:
-    """Whether so many leaves are in groups that launches of subtrees are faster than one of single elements (CUDA)."""
+    """Whether enough leaves are in groups to make launches of subtrees faster than one of single elements (CUDA)."""
     found = _Found(forest, elements, None, worlds, grouped=True)
     return worlds * 8 * sum(found.subtrees[::2]) >= GROUPED_LEAVES
 
 
 class _Found:
-    """How many subtrees of each class, leaves in none and units a world has; and the arrays with all of them."""
+    """A world's numbers of subtrees of each class, leaves in no subtree, and units; and the arrays with all of them."""
 
     def __init__(
         self,

@@ -25,7 +25,7 @@ class Planner:
     """Derives a plan, in steps that may be recorded.
 
     Args:
-        arrays: What the plan stands in; ``find`` needs no more than ``plan.marks``.
+        arrays: The plan's arrays; ``find`` needs only ``plan.marks``.
         threads: Threads of a launch.
     """
 
@@ -42,7 +42,7 @@ class Planner:
         self._launch(lists.count_rows, self._rows, threads, self._ends, made.plan)
 
     def list(self) -> None:
-        """List them."""
+        """List the leaves and the units."""
         made, threads = self._arrays, self._threads
         self._launch(lists.list_leaves, threads, threads, made.tree, self._ends, made.plan)
 

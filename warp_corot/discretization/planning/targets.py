@@ -22,17 +22,17 @@ class SubtreeTargets:
 
     Args:
         made: The plan's arrays, filled.
-        subtrees, flat: How many there are in a world: subtrees of each class, and leaves in none.
+        subtrees, flat: How many subtrees of each class a world has, and how many leaves in none.
         elements: The leaves, in all worlds.
 
     Attributes:
         slots: The slots.
         of_subtrees: Where forces of subtrees are added, as ``made.batches.nodes``.
         of_leaves: Where forces of all leaves are added, vec4i [worlds * T].
-        of_flat: The same of those in no subtree.
+        of_flat: The same for leaves in no subtree.
 
     Raises:
-        InputError: More slots than can be numbered.
+        InputError: There are more slots than can be numbered.
     """
 
     def __init__(self, made: PlanArrays, subtrees: Sequence[int], flat: int, elements: Elements, worlds: int):

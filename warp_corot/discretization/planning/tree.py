@@ -19,12 +19,12 @@ from warp_corot.mesh.tree import UniformTree
 
 
 def tree_of(forest: TetForest, elements: ForestElements, rotation_level: int | None) -> Tree:
-    """A forest that stays as it is, read in place as far as the device can.
+    """A forest that never changes, read in place as far as the device can.
 
     Args:
         elements: Its leaves on the device, in one world or more.
-        rotation_level: Level at which rotations are shared; None: nothing is read of elements above the leaves but who
-            they are.
+        rotation_level: Level at which rotations are shared; None: kernels read only the identity of elements above the
+            leaves.
     """
     device, source = elements.nodes.device, forest.tree
     tree = Tree()
@@ -48,12 +48,12 @@ def tree_of(forest: TetForest, elements: ForestElements, rotation_level: int | N
 
 
 class Places(NamedTuple):
-    """Which node of which leaf stands where, by shape; see ``kernels.tables.subtree``.
+    """Which node of which leaf stands at which place, by shape; see ``kernels.tables.subtree``.
 
     Attributes:
         subtree, group: Leaf and its node for each node of a subtree or group, negative past the last, vec2i [3, 10] and
             [3, 40].
-        leaves, group_leaves: The opposite, vec4i [3, 8] and [3, 64].
+        leaves, group_leaves: The inverse tables, vec4i [3, 8] and [3, 64].
     """
 
     subtree: wp.array
@@ -64,7 +64,7 @@ class Places(NamedTuple):
 
 @functools.cache
 def places_on(alias: str) -> Places:
-    """The tables on a device; all plans there share them."""
+    """The tables on a device. All its plans share them."""
     group = np.full((3, GROUP_NODES, 2), -1)
     for shape in range(3):
         given = group_nodes(shape)
@@ -85,6 +85,6 @@ def subtree_nodes(shape: int) -> list[tuple[int, int]]:
 
 
 def _read(values: npt.NDArray[np.integer], dtype: type, device: wp.Device) -> wp.array:
-    """Integers that launches only read: on the CPU the very same memory."""
+    """Integers that launches only read; on the CPU they share the array's memory."""
     values = np.ascontiguousarray(values, dtype=np.int32)
     return wp.array(values, dtype=dtype, device=device, copy=not values.flags.writeable)
