@@ -277,7 +277,7 @@ MISTAKES = {
     "reset by name": (lambda b: simulated(b).reset("all"), "world indices have dtype"),
     "reset by a short array": (lambda b: simulated(b).reset(int32(2)), r"int32 \[2\] on cpu; it must be int32 \[3\]"),
     "reset by floats": (lambda b: simulated(b).reset(wp.zeros(3, dtype=float, device="cpu")), r"worlds is float32 \[3"),
-    "bodies of other numbers": (lambda b: simulated([b, beam("cpu", worlds=2)]), "bodies are in 3 and 2 worlds"),
+    "bodies of other numbers": (lambda b: simulated([b, beam("cpu", worlds=2)]), "bodies have 3 and 2 worlds"),
 }
 
 

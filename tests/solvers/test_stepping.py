@@ -150,7 +150,7 @@ def test_a_state_gone_wrong_is_made_again_with_half_the_step(device):
     start = sim.energy().total
     until = sim.total_time + 0.1
     with pytest.warns(
-        wc.StabilityWarning, match=r"went wrong by t = .* goes on from t = .* with half the step"
+        wc.StabilityWarning, match=r"went wrong by t = .* continues from t = .* with half the step"
     ) as said:
         sim.advance(0.1)
     assert len(said) == 1

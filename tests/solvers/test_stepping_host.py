@@ -156,7 +156,7 @@ def test_after_a_failure_the_end_of_the_last_call_is_the_last_good_state(device)
     stretched(sim.body, 0.02)
     sim.body.velocities = velocities
     began, steps = sim.time, sim.steps
-    with pytest.warns(wc.StabilityWarning, match=rf"goes on from t = {began:.4g} s with half the step"):
+    with pytest.warns(wc.StabilityWarning, match=rf"continues from t = {began:.4g} s with half the step"):
         sim.advance(0.1)
     assert sim.time == pytest.approx(began + 0.1)
     assert sim.steps > steps

@@ -1,4 +1,4 @@
-"""Bodies in motion: what a user steps."""
+"""Simulations: bodies in motion."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -10,7 +10,7 @@ __all__ = ["Simulation"]
 
 
 def __getattr__(name: str) -> Any:
-    """The class is imported when it is asked for, since its parts lie in this folder too."""
+    """Import the class on first use, because its parts are in this folder, too."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(".simulation", __name__), name)

@@ -26,7 +26,7 @@ class Energy(NamedTuple):
 
 
 class WorldEnergies(NamedTuple):
-    """The same of each world, float64 [worlds] [J]."""
+    """The energies of each world [J], float64 [worlds]."""
 
     kinetic: npt.NDArray[np.float64]
     elastic: npt.NDArray[np.float64]
@@ -48,7 +48,7 @@ def find_energies(
     """Energies of bodies in their present state; waits for the device.
 
     Args:
-        bodies, fields: All in as many worlds.
+        bodies, fields: The bodies, all with the same number of worlds, and the force field of each.
         gravity: [m/s^2].
     """
     worlds = bodies[0].worlds

@@ -1,4 +1,4 @@
-"""Messages about a state that has gone wrong."""
+"""Messages about a state that went wrong."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class Stepped(Protocol):
-    """What a message names of a simulation."""
+    """The part of a simulation that a message reads."""
 
     worlds: int
     models: tuple[Any, ...]
@@ -30,7 +30,7 @@ class Stepped(Protocol):
 
 
 def fault_message(sim: Stepped, fault: Fault, returns: int) -> str:
-    """What has gone wrong, since when, and what would help; after so many times with half the step."""
+    """What went wrong, when, and what would help; after the step was halved this many times."""
     more = f" and {len(fault.worlds) - 3} more" if len(fault.worlds) > 3 else ""
     where = f" in world {', '.join(map(str, fault.worlds[:3]))}{more}" if sim.worlds > 1 else ""
     if fault.step is None:

@@ -1,4 +1,4 @@
-"""What a simulation is made of, checked."""
+"""Checks of a simulation's arguments."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ def checked_bodies(given: SoftBody | Sequence[SoftBody]) -> tuple[SoftBody, ...]
     """One or several bodies that can be stepped together.
 
     Raises:
-        InputError: None, one given twice, on different devices or in different numbers of worlds, one without a free
-            node, or something else.
+        InputError: There is no body, one is given twice, they have different devices or numbers of worlds, one has no
+            free node, or one is something else.
     """
     bodies = checked_things(given, SoftBody, "body", "a SoftBody")
     if not bodies:
         raise InputError("a simulation needs at least one body")
     if len(set(bodies)) < len(bodies):
-        raise InputError("a body is given twice; each can be stepped once only")
+        raise InputError("a body is given twice; each must be given once")
     first = bodies[0]
     for body in bodies:
         if body.worlds != first.worlds:
-            raise InputError(f"bodies are in {first.worlds} and {body.worlds} worlds; they must be in as many")
+            raise InputError(f"bodies have {first.worlds} and {body.worlds} worlds; all must have the same number")
         if body.device != first.device:
             raise InputError(f"bodies are on {first.device} and {body.device}; they must be on one device")
         if not (body.conditions.inverse_mass.numpy() > 0).any():
@@ -43,16 +43,16 @@ def checked_bodies(given: SoftBody | Sequence[SoftBody]) -> tuple[SoftBody, ...]
 
 
 def checked_models(given: Model | Sequence[Model], count: int) -> tuple[Model, ...]:
-    """A model for each body; one given alone is everybody's.
+    """A model for each body; a single model is used for all.
 
     Raises:
-        InputError: Another number of models, or something else.
+        InputError: The number of models is wrong, or one is something else.
     """
     models = checked_things(given, Model, "model", "a model such as Corotated()")
     if isinstance(given, Model):
         models *= count
     if len(models) != count:
-        raise InputError(f"there are {len(models)} models for {count} bodies")
+        raise InputError(f"there are {len(models)} models for {count} bodies; there must be one, or one for each")
     return models
 
 
@@ -60,7 +60,7 @@ def checked_integrator(given: Any) -> Integrator:
     """A time integrator.
 
     Raises:
-        InputError: Something else.
+        InputError: It is something else.
     """
     if not isinstance(given, Integrator):
         raise InputError(f"integrator is {given!r}; it must be an integrator such as SymplecticEuler()")
@@ -70,10 +70,10 @@ def checked_integrator(given: Any) -> Integrator:
 def checked_contact(
     obstacles: Obstacle | Sequence[Obstacle], contact: Contact | None
 ) -> tuple[tuple[Obstacle, ...], Contact] | None:
-    """What bodies touch, and how; None if nothing touches.
+    """What bodies touch, and how; None if there is no contact.
 
     Raises:
-        InputError: Something that is no obstacle, or no ``Contact``.
+        InputError: Something is no obstacle, or no ``Contact``.
     """
     given = checked_things(obstacles, Shape | Tool, "an obstacle", "a shape such as Ground() or a Tool")
     if contact is not None and not isinstance(contact, Contact):
@@ -84,15 +84,15 @@ def checked_contact(
 
 
 def check_implicit(integrator: Integrator, *, touches: bool, remeshes: bool, ordered: bool) -> None:
-    """See that an implicit integrator can make the steps that are asked for.
+    """Check that an implicit integrator supports what the simulation needs.
 
     Args:
         integrator: Any integrator.
         touches, remeshes: Whether bodies touch something, or are remeshed.
-        ordered: Whether sums must have one order on a device that has none, which products with the stiffness lack.
+        ordered: Whether sums must have a fixed order on CUDA, which products with the stiffness do not have.
 
     Raises:
-        InputError: It cannot.
+        InputError: It does not.
     """
     if not integrator.is_implicit:
         return
@@ -106,10 +106,10 @@ def check_implicit(integrator: Integrator, *, touches: bool, remeshes: bool, ord
 
 
 def check_constraints(system: System, stepper: Stepper, integrator: Integrator) -> None:
-    """See that steps answer to what the bodies touch.
+    """Check that the integrator supports contact.
 
     Raises:
-        InputError: The integrator does not.
+        InputError: It does not.
     """
     if system.constraints and not stepper.resolves_constraints:
         raise InputError(f"{type(integrator).__name__} knows no contact; it must be SymplecticEuler")
@@ -119,7 +119,7 @@ def checked_gravity(gravity: npt.ArrayLike | None, up_axis: str) -> tuple[float,
     """A vector [m/s^2], by default 9.81 against the up axis.
 
     Raises:
-        InputError: Not three finite numbers.
+        InputError: It is not three finite numbers.
     """
     if gravity is None:
         down = np.zeros(3)

@@ -1,4 +1,4 @@
-"""Bars on terminals for whoever waits in Python for a simulation to advance."""
+"""Progress bars on terminals, for calls from Python that advance a simulation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-#: What passes without a bar [s].
+#: Time before a bar appears [s].
 SILENT = 2.0
 
 _shown = True
@@ -17,20 +17,20 @@ _shown = True
 def show_progress(shown: bool) -> None:
     """Whether terminals show a bar while ``Simulation.advance`` or ``record`` takes more than two seconds.
 
-    They do unless this is called with False. Where stderr is no terminal nothing is shown.
+    They do unless this is called with False. Nothing is shown where stderr is no terminal.
     """
     global _shown
     _shown = bool(shown)
 
 
 def is_shown() -> bool:
-    """Whether there is a terminal to show a bar on, and it is wanted."""
+    """Whether there is a terminal for a bar and bars are not turned off."""
     return _shown and sys.stderr is not None and sys.stderr.isatty()
 
 
 @contextmanager
 def hidden() -> Iterator[None]:
-    """No bars but the caller's own inside."""
+    """Show no bars inside, except the caller's own."""
     global _shown
     before, _shown = _shown, False
     try:
@@ -41,14 +41,14 @@ def hidden() -> Iterator[None]:
 
 @contextmanager
 def bar_of(total: float, unit: str) -> Iterator[Callable[[float], None]]:
-    """A bar that appears when what it tells of has taken two seconds, and goes with the block.
+    """A bar that appears when the work has taken two seconds, and disappears at the end of the block.
 
     Args:
-        total: What there is to do.
-        unit: In what: "s", "steps".
+        total: The amount of work.
+        unit: Its unit: "s", "steps".
 
     Yields:
-        To be called with how much is done.
+        A function to be called with the amount that is done.
     """
     began = time.perf_counter()
     bar: Any = None

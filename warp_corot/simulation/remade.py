@@ -1,4 +1,4 @@
-"""A simulation made again from its present state, with other laws, materials or remeshing."""
+"""A new simulation from the present state of another, with other laws, materials or remeshing."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ def remade(
     materials: Sequence[Material] | None = None,
     remesh: Sequence[OnlineRemesh | None] | None = None,
 ) -> Simulation:
-    """Another simulation that goes on where this one is: new bodies of the present meshes, states, loads, supports and
-    motions, at the same time. The given one is left as it is, and must not be stepped any further.
+    """A new simulation that continues this one: new bodies with the present meshes, states, loads, supports and
+    motions, at the same time. The given simulation is not changed, and must not be stepped any further.
 
-    Hooks are not carried over, nor is what contact remembers of the steps before, as where things stick.
+    Hooks are not carried over, nor is the memory of contact, such as where things stick.
 
     Args:
-        models: Of each body; None: as they are.
-        materials: Of the present elements of each body; None: as they are.
+        models: The model of each body; None: the present ones.
+        materials: Materials of the present elements of each body; None: the present ones.
         remesh: How each body is remeshed from now on; None: not at all.
 
     Raises:
-        InputError: There are tools, or a body is remeshed and follows keyframes; or as ``Simulation``. The given one is
-            as it was.
+        InputError: There are tools, or a body is remeshed and follows keyframes; or as ``Simulation``. The given
+            simulation is unchanged.
     """
     obstacles = () if sim.contact is None else sim.contact.obstacles.given
     if any(isinstance(each, Tool) for each in obstacles):

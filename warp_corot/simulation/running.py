@@ -1,8 +1,8 @@
-"""Runs of a simulation: how many steps come before something else is due, and what becomes of a state gone wrong.
+"""Runs of a simulation: how many steps come before something else is due, and the repair of a state that went wrong.
 
-``Simulation.advance`` asks for steps until a time. They are made in runs, which end where a check, a hook or a pass of
-remeshing is due. The host plans a run from what the device last reported, launches it (``solvers.recorded``), and waits
-once, for the report at its end (``solvers.guard``): the ordinary call of ``advance`` is one run.
+``Simulation.advance`` makes steps until a time. It makes them in runs, which end where a check, a hook or a pass of
+remeshing is due. The host plans a run from the device's last report, launches it (``solvers.recorded``), and waits
+once, for the report at its end (``solvers.guarding``). Most calls of ``advance`` are one run.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from .progress import bar_of
 if TYPE_CHECKING:
     from .simulation import Simulation
 
-#: How often the step is halved to come over one place.
+#: How often the step is halved to get past one time.
 MOST_RETURNS = 6
-#: How often it is halved for a little energy from nowhere, as comes with crushed elements also of the shortest steps.
+#: How often it is halved because of a little energy from nowhere, which crushed elements make at any step.
 STRICT_RETURNS = 4
-#: Steps made one at a time from one look at where nodes are to the next.
+#: Single steps between two checks of the nodes' positions.
 LOOK_STEPS = 256
-#: Steps after which a state is judged by elastic energies, which take as long as some steps, where a run ends; bodies
-#: that were not found calm sooner.
+#: After this many steps, elastic energies are checked at the end of a run; they cost as much as some steps. Bodies that
+#: are not calm are checked sooner.
 JUDGED_STEPS = 64
 JUDGED_STRAINED = 16
-#: Longer runs are looked after in between.
+#: Longer runs are divided.
 MOST_INTERVALS = 1000
-#: A step that was less than this share of the longest may have grown after some measurements.
+#: A step below this share of the longest may have grown after some measurements.
 GROWN = 0.98
-#: What a measurement is expected to leave of the step of a strained body, which the state tells by this share of the
-#: longest step.
+#: A measurement is expected to reduce the step of a strained body to this share. A body counts as strained below this
+#: share of the longest step.
 SHRINKING = 0.95
 
 
@@ -56,18 +56,18 @@ class Running:
         self._sim = sim
         self._energies = EnergyControl(sim.guard, sim.recorded, sim.safe_step)
         self._returns = 0
-        #: The time at which the state was found to be wrong, while it has not been passed.
+        #: The time at which the state was found to be wrong, until steps have passed it.
         self._wrong_until = -math.inf
         self._has_warned = False
         self._steps_called = 0
-        #: Whether the last run may have ended with steps shorter than what the state allows.
+        #: Whether the last run may have ended with shorter steps than the state allows.
         self._shortened = True
         self._steps_made = 0
-        #: Steps done when elastic energies were last looked at.
+        #: Steps done at the last check of elastic energies.
         self._judged = 0
 
     def step(self) -> None:
-        """Make one step, with a measurement before it where one is due."""
+        """Make one step, after a measurement if one is due."""
         sim = self._sim
         position = sim.steps if sim.device.is_cpu else self._steps_made
         self._steps_made = position + 1
@@ -81,7 +81,7 @@ class Running:
         recorded.replay(segment)
 
     def make(self, count: int) -> None:
-        """Make so many steps, with hooks and passes."""
+        """Make a number of steps, with hooks and passes."""
         sim = self._sim
         end = sim.total_steps + count
         self._energies.begin()
@@ -91,7 +91,7 @@ class Running:
                 show(count - (end - sim.total_steps))
 
     def make_until(self, total_time: float) -> None:
-        """Make steps until a time [s], exactly; only if the step is the simulation's to choose."""
+        """Make steps until exactly a time [s]; only if the simulation chooses the step."""
         sim = self._sim
         self._energies.begin()
         start = sim.total_time
@@ -106,10 +106,10 @@ class Running:
         return nullcontext(lambda _: None) if self._sim.hook_intervals else bar_of(total, unit)
 
     def look(self) -> None:
-        """See that the state is finite, and now and then that nodes are within reach.
+        """Check that the state is finite and, every few hundred steps, that nodes are within reach.
 
         Raises:
-            UnstableError: They are not.
+            UnstableError: It is not, or they are not.
         """
         sim = self._sim
         fault = sim.guard.not_finite()
@@ -121,7 +121,7 @@ class Running:
     # --- one run ---------------------------------------------------------------------------------------------------
 
     def _run(self, most: int, end: float | None) -> bool:
-        """Make steps until something is due, and do it; whether the end is reached."""
+        """Make steps until something is due, and do that; returns whether the end is reached."""
         sim = self._sim
         if not sim.guard.has_begun and sim.contact is not None:
             sim.contact.check_start()
@@ -140,7 +140,7 @@ class Running:
         self._judged = sim.steps if judged or now < self._judged else self._judged
         if sim.guard.was_given:
             self._energies.begin_anew()
-        # Where short runs end does not count: the same run in one would take other steps.
+        # The ends of short runs do not count: one long run over the same time would take other steps.
         if whole or not passed:
             self._energies.choose_intervals(checked=passed)
         if not passed:
@@ -155,7 +155,7 @@ class Running:
         return reached
 
     def _is_to_be_judged(self, steps: int) -> bool:
-        """Whether to look at elastic energies, only to see whether the state is good, after so many steps."""
+        """Whether to check elastic energies after these steps, only to see whether the state is good."""
         sim = self._sim
         if sim.safe_step is None:
             return False
@@ -176,11 +176,11 @@ class Running:
     # --- what a run is to be ---------------------------------------------------------------------------------------
 
     def _plan(self, done: int, most: int, end: float | None) -> tuple[list[Segment], int]:
-        """At most so many steps, and how many are done when they end in time.
+        """Plan a run of at most a number of steps; also how many steps are done if the run ends in time.
 
-        The last steps before ``end`` are as many as they would be of the length that the device reported last. Where a
-        measurement within the run allows longer ones they are shorter than that; where it allows only shorter ones the
-        run ends before ``end``, and another one follows.
+        The number of the last steps before ``end`` follows from the step that the device last reported. If a
+        measurement within the run allows longer steps, they stay shorter; if it allows only shorter ones, the run ends
+        before ``end``, and another one follows.
         """
         sim = self._sim
         if sim.safe_step is None:
@@ -212,8 +212,8 @@ class Running:
         return segments, stop
 
     def _steps_for(self, left: float, before: int) -> float:
-        """Steps for some time that is left [s], as far as can be known ``before`` so many steps, when they are measured
-        again."""
+        """An estimate of the steps for the remaining time [s], made ``before`` so many steps, after which the step is
+        measured again."""
         safe = self._sim.safe_step
         assert safe is not None
         if math.isinf(left):
@@ -224,7 +224,7 @@ class Running:
         return steps if steps <= before else before + _steps(left - before * allowed, expected)
 
     def _sure_intervals(self, left: float) -> int:
-        """Whole intervals after which there is still some time left, even if the step grows as fast as it may."""
+        """Whole intervals after which some time is left, even if the step grows as fast as it can."""
         safe = self._sim.safe_step
         assert safe is not None
         if math.isinf(left):
@@ -241,7 +241,7 @@ class Running:
         return count
 
     def _may_have_grown(self) -> bool:
-        """Whether steps may have become much longer since the device reported, so that fewer do."""
+        """Whether steps may have become much longer since the device's last report, so that fewer are enough."""
         safe = self._sim.safe_step
         assert safe is not None
         share, allowed, at_rest = safe.shares
@@ -250,8 +250,8 @@ class Running:
     # --- what became of it -----------------------------------------------------------------------------------------
 
     def _check(self, now: int, whole: bool, judged: bool) -> bool:
-        """Check the state, by elastic energies too if these were found, which count if asked to; False if it was put
-        back."""
+        """Check the state, also by elastic energies if these were found, which count if asked to; False if the state
+        was put back."""
         sim = self._sim
         strict = sim.safe_step is not None and self._returns < STRICT_RETURNS
         fault = sim.guard.check(whole=judged, counts=whole, strict=strict, lenient=sim.safe_step is not None)
@@ -265,10 +265,10 @@ class Running:
         return True
 
     def _go_back(self, fault: Fault) -> None:
-        """Go on from the last good state with half the step.
+        """Continue from the last good state with half the step.
 
         Raises:
-            UnstableError: The step was given, or no shorter one helps.
+            UnstableError: The user gave the step, or no shorter one helps.
         """
         sim = self._sim
         if fault.is_want_of_room:
@@ -292,8 +292,8 @@ class Running:
         if not self._has_warned and not fault.is_slight:
             self._has_warned = True
             message = (
-                f"the state went wrong by t = {self._wrong_until:.4g} s ({fault.what}); the simulation goes on from "
-                f"t = {sim.time:.4g} s with half the step, and does the same without a word if that happens again"
+                f"the state went wrong by t = {self._wrong_until:.4g} s ({fault.what}); the simulation continues from "
+                f"t = {sim.time:.4g} s with half the step, and will do so again without a warning"
             )
             warnings.warn(message, StabilityWarning, stacklevel=depth_of_user())
 

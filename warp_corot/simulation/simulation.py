@@ -60,16 +60,16 @@ class Simulation:
         model: Elastic model, or one for each body.
         integrator: Time integrator, ``SymplecticEuler()`` if none is given, or an implicit one such as
             ``BackwardEuler(dt=0.01)``. With ``dt=None`` the step follows the state: it is measured again during the
-            run, and a state that goes wrong all the same is made again with half the step. A step that is given stays,
-            and a run in which it is too long ends with an error.
-        gravity: [m/s^2]; None for 9.81 down the up axis of the first body's mesh.
-        deterministic: Whether a run must come out the same bit by bit every time. On the CPU it always does; on CUDA
-            forces are then added up in one order, which takes time and memory (``benchmarks/README.md``).
-        remesh: How the bodies' meshes follow their motion; for several bodies also one each, None for those that stay
-            as they are.
-        obstacles: Rigid things that bodies touch: shapes such as ``Ground`` and ``Box`` where they are, and tools,
-            which move.
-        contact: How things touch; None: as ``Contact()`` if there are obstacles, else nothing touches.
+            run, and if the state still goes wrong, the run is repeated with half the step. A given step stays; if it is
+            too long, the run ends with an error.
+        gravity: [m/s^2]; None for 9.81 against the up axis of the first body's mesh.
+        deterministic: Whether every run must give the same result bit by bit. The CPU always does; on CUDA, forces are
+            then added up in a fixed order, which takes time and memory (``benchmarks/README.md``).
+        remesh: How the bodies' meshes follow their motion; for several bodies also one each, None for meshes that
+            never change.
+        obstacles: Rigid things that bodies touch: shapes at rest, such as ``Ground`` and ``Box``, and tools, which
+            move.
+        contact: How things touch; None: ``Contact()`` if there are obstacles, else there is no contact.
 
     Attributes:
         bodies: Tuple of the bodies.
@@ -79,14 +79,14 @@ class Simulation:
         gravity: Tuple [m/s^2].
 
     Raises:
-        InputError: No body, one given twice, bodies on different devices or of different numbers of worlds, a number of
-            models that is not the number of bodies, a body of which no node is free to move, non-finite gravity, a
-            model that does not go with its mesh, something that is none of these, or bodies that cannot be remeshed as
-            asked (see ``OnlineRemesh``); obstacles that are none, or an integrator that knows no contact or remeshing.
+        InputError: There is no body, one is given twice, bodies have different devices or numbers of worlds, the number
+            of models is not the number of bodies, a body has no free node, gravity is not finite, a model does not
+            support its mesh, an argument has another type, a body cannot be remeshed this way (see ``OnlineRemesh``),
+            or the integrator does not support contact or remeshing.
 
     Warns:
         StabilityWarning: The given step is larger than ``stable_dt``.
-        CapacityWarning: A mesh has no room left for what should be refined; once.
+        CapacityWarning: A mesh has no room left for refinement; once.
     """
 
     def __init__(
@@ -122,20 +122,20 @@ class Simulation:
         self.pace = Pace(ANY_STEP if given is None else float(given), self.device)
         self.system = System(self.bodies, self.fields, self.pace, self.gravity)
         stable = self._find_stable_steps()
-        #: What keeps bodies out of obstacles and of one another; None where nothing touches.
+        #: Keeps bodies out of obstacles and out of one another; None without contact.
         self.contact: Contacts | None = None
         if touching is not None:
             self.contact = Contacts(
                 self.system, *touching, stable_dt=self.stable_dt, dt=given, deterministic=self.deterministic
             )
             self.system.constraints.append(self.contact)
-        #: What chooses the step, if none was given.
+        #: Chooses the step, if none was given.
         self.safe_step = SafeStep(self.system, self.models, stable) if given is None else None
         self.guard = Guard(self.system)
         self.stepper = stepper = self.integrator.bind(self.system)
         check_constraints(self.system, stepper, self.integrator)
         self.recorded = RecordedSteps(self.system, stepper, self.guard, self.safe_step)
-        #: What is to be kept besides the states of bodies and fields for a run to go on as it would have.
+        #: Everything that a checkpoint keeps besides the states of bodies and fields, so that a run continues the same.
         self.kept = self.pace.state | ({} if self.safe_step is None else self.safe_step.state) | stepper.kept
         self._running = Running(self)
 
@@ -148,7 +148,7 @@ class Simulation:
 
     @property
     def remesh(self) -> tuple[OnlineRemesh | None, ...]:
-        """How each body is remeshed, with numbers in place of None; the arrays of parameters are the live ones."""
+        """How each body is remeshed, with numbers in place of None; arrays of parameters are live."""
         return tuple(None if each is None else each.options for each in self.remeshing.changing)
 
     @property
@@ -163,43 +163,43 @@ class Simulation:
 
     @property
     def solves(self) -> Solves | None:
-        """What the steps of an implicit integrator took to solve so far; None for others. Waits for the device."""
+        """The cost of an implicit integrator's solves so far; None for others. Waits for the device."""
         totals = getattr(self.stepper, "totals", None)
         return None if totals is None else Solves(*(int(total) for total in totals.numpy()))
 
     @property
     def steps(self) -> int:
-        """Time steps done, since the last ``reset()`` if there was one."""
+        """Time steps since the last ``reset()``, or since the beginning."""
         return self.pace.steps
 
     @property
     def total_steps(self) -> int:
-        """Time steps done, whatever has been reset since."""
+        """Time steps since the beginning; resets do not change it."""
         return self.steps_before_reset + self.steps
 
     @property
     def time(self) -> float:
-        """Simulated time [s], since the last ``reset()`` if there was one."""
+        """Simulated time since the last ``reset()``, or since the beginning [s]."""
         return self.pace.time
 
     @property
     def total_time(self) -> float:
-        """Simulated time [s], whatever has been reset since."""
+        """Simulated time since the beginning [s]; resets do not change it."""
         return self.time_before_reset + self.time
 
     def step(self) -> None:
         """Advance by one time step.
 
-        Inside a caller's capture on this device only the step's launches are recorded: no hooks are called, nothing is
-        checked, and the step has the length that the last run left. On CUDA the call does not wait for the device
+        If the caller is capturing on this device, only the step's launches are recorded: no hooks are called, nothing
+        is checked, and the step has the length that the last run left. On CUDA the call does not wait for the device
         unless hooks are set or bodies are remeshed.
 
         Raises:
-            InputError: The caller is capturing, and bodies are to be remeshed; or a ``wp.Tape`` is recording, since
-                steps have no adjoint.
-            UnstableError: On the CPU: the state is not finite any more, or nodes are far beyond reach, which is looked
-                at every few hundred steps. No step is made again here, as ``advance`` does, and energies are not looked
-                at, since users may write to the state between steps.
+            InputError: The caller is capturing and bodies are remeshed; or a ``wp.Tape`` is recording, because steps
+                have no adjoint.
+            UnstableError: On the CPU: the state is no longer finite, or nodes are far beyond reach, which is checked
+                every few hundred steps. Unlike ``advance``, this call repeats no step and checks no energies, because
+                users may write to the state between steps.
         """
         refuse_tape()
         if self.device.is_capturing:
@@ -216,18 +216,18 @@ class Simulation:
             self.call_hooks()
 
     def advance(self, seconds: float) -> None:
-        """Advance by ``seconds``; the state is there when the call returns.
+        """Advance by ``seconds``; the state is ready when the call returns.
 
-        Exactly, in steps that are a little shorter at the end; if the step was given, by the whole number of steps that
-        comes nearest.
+        The end is exact: the last steps are a little shorter. With a given step, the nearest whole number of steps is
+        made.
 
         Raises:
-            InputError: Negative or non-finite time, or a ``wp.Tape`` is recording.
-            UnstableError: The state went wrong: it is not finite, or it has energy that nothing put in. If no step was
-                given: and shorter ones did not help.
+            InputError: The time is negative or not finite, or a ``wp.Tape`` is recording.
+            UnstableError: The state went wrong: it is not finite, or it has energy from nowhere. If no step was given,
+                shorter steps did not help.
 
         Warns:
-            StabilityWarning: The state went wrong, and was made again with half the step; once.
+            StabilityWarning: The state went wrong, and the run was repeated with half the step; once.
         """
         if not 0 <= checked_number(seconds, "seconds", "s") < math.inf:
             raise InputError(f"cannot advance by {seconds} s; it must be zero or a positive time")
@@ -236,7 +236,7 @@ class Simulation:
         self.advance_until(self.total_time + seconds)
 
     def advance_until(self, total_time: float) -> None:
-        """Advance until ``total_time`` [s], nowhere if that is past; as ``advance``."""
+        """Advance until ``total_time`` [s], like ``advance``; do nothing if that time is past."""
         refuse_tape()
         if not checked_number(total_time, "total_time", "s") < math.inf:
             raise InputError(f"cannot advance until {total_time} s; it must be a finite time")
@@ -246,7 +246,7 @@ class Simulation:
             self._running.make(max(round((total_time - self.total_time) / self.dt), 0))
 
     def advance_steps(self, count: int) -> None:
-        """Advance by ``count`` time steps; as ``advance``. Steps that a hook makes count."""
+        """Advance by ``count`` time steps, like ``advance``. Steps that a hook makes count."""
         refuse_tape()
         self._running.make(checked_count(count, "count", least=0))
 
@@ -254,25 +254,25 @@ class Simulation:
         """Call ``callback(sim)`` after every ``every``-th step, counted from the beginning of the simulation.
 
         Raises:
-            InputError: ``every`` is not a positive whole number, or the callback cannot be called.
+            InputError: ``every`` is not a positive whole number, or the callback is not callable.
         """
         if not callable(callback):
             raise InputError(f"callback is {callback!r}; it must be a function of the simulation")
         self._hooks.append(_Hook(callback, checked_count(every, "every", least=1)))
 
     def reset(self, worlds: npt.ArrayLike | wp.array | None = None) -> None:
-        """Put worlds back to their initial state: rest, or what ``SoftBody.set_initial_state`` took as such.
+        """Put worlds back to their initial state: rest, or the state at ``SoftBody.set_initial_state``.
 
-        Their prescribed motions begin again; materials, loads and held nodes stay as they are. A body that is remeshed
-        goes back to the mesh of that state, with the loads and held nodes that this mesh had last. The clock goes on
-        unless all worlds are reset by ``reset()``.
+        Their prescribed motions begin again; materials, loads and held nodes stay. A remeshed body returns to the mesh
+        of its initial state, with the loads and held nodes that this mesh had last. The clock continues unless
+        ``reset()`` resets all worlds.
 
         Args:
             worlds: None for all; an index, indices or a mask bool [worlds]; or a Warp array int32 [worlds] on the
-                device, not zero for worlds to be reset, for which nothing waits or comes back to the host.
+                device, nonzero for worlds to be reset; then the host does not wait for the device.
 
         Raises:
-            InputError: There is no such world, or an array of another type, length or device.
+            InputError: There is no such world, or the array has another type, length or device.
         """
         if isinstance(worlds, wp.array):
             if worlds.dtype != wp.int32 or worlds.shape != (self.worlds,) or worlds.device != self.device:
@@ -306,11 +306,11 @@ class Simulation:
         return self.world_energies().together
 
     def world_energies(self) -> WorldEnergies:
-        """The same of each world [J], float64 [worlds]."""
+        """The energies of each world [J], float64 [worlds]."""
         return find_energies(self.bodies, self.fields, self.gravity)
 
     def forces(self, body: SoftBody | None = None) -> wp.array:
-        """Elastic nodal forces in the present state [N], vec3 [worlds * N]; of the first body or the one named."""
+        """Elastic nodal forces in the present state [N], vec3 [worlds * N], of the first or the given body."""
         chosen = self._index(body)
         self.bodies[chosen].state.adopt_positions()
         forces = self.fields[chosen].elastic_forces(self.bodies[chosen].state.displacements)
@@ -333,16 +333,16 @@ class Simulation:
         return tuple(each for each in self.system.constraints if isinstance(each, Grasp))
 
     def contacts(self) -> list[ContactPoint]:
-        """Where bodies were touched in the last step, with normals, gaps and forces; waits for the device."""
+        """Where bodies touched something in the last step, with normals, gaps and forces; waits for the device."""
         return [] if self.contact is None else contact_points(self.contact)
 
     # --- keeping ---------------------------------------------------------------------------------------------------
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write everything needed to go on to one file (.npz, no pickle), whole or not at all; hooks are not kept.
+        """Write everything needed to continue to one file (.npz, no pickle), whole or not at all; hooks are not saved.
 
         Raises:
-            InputError: The folder is not there or cannot be written to.
+            InputError: The folder does not exist or is not writable.
         """
         from warp_corot.io.checkpoint.archive import save_checkpoint
 
@@ -356,16 +356,16 @@ class Simulation:
         device: str | wp.Device | None = None,
         remesh: OnlineRemesh | Sequence[OnlineRemesh | None] | None = None,
     ) -> Simulation:
-        """Go on from a saved simulation; on the CPU bit by bit as if it had never stopped.
+        """Continue a saved simulation; on the CPU bit by bit as if it had never stopped.
 
         Args:
             path: A file that ``save`` wrote.
-            device: Where to go on; None: where it was saved.
-            remesh: In place of what was saved, which does not hold a criterion of your own; the capacity stays.
+            device: The device; None: the one on which it was saved.
+            remesh: Replaces the saved options, which do not include a criterion of your own; the capacity stays.
 
         Raises:
-            InputError: No such file, not a checkpoint, one of a newer version, no such device, or a criterion that is
-                missing.
+            InputError: The file does not exist, is no checkpoint or was written by a newer version, the device does not
+                exist, or a criterion is missing.
         """
         from warp_corot.io.checkpoint.archive import load_checkpoint
 
@@ -392,19 +392,19 @@ class Simulation:
         return steps
 
     def add_forces(self, forces: Forces) -> None:
-        """Have something besides elasticity push the nodes from the next step on, as a part of every recorded step.
+        """Add forces besides elasticity to every step from now on.
 
-        Its work counts in the balance of energy. If it has a number ``curvature``, the most that its stiffness over
-        a node's mass can be [1/s^2], the stable step is found again with it.
+        The forces are a part of recorded steps, and their work counts in the balance of energy. If they have a number
+        ``curvature``, the largest stiffness over a node's mass [1/s^2], the stable step is found again with it.
 
         Args:
-            forces: Something with a method ``add_forces``; see ``solvers.system.Forces``.
+            forces: An object with a method ``add_forces``; see ``solvers.system.Forces``.
 
         Raises:
-            InputError: Something else, or a curvature that is negative or not finite.
+            InputError: It has no such method, or its curvature is negative or not finite.
 
         Warns:
-            StabilityWarning: The given step is larger than the stable one now.
+            StabilityWarning: The given step is now larger than the stable one.
         """
         if not callable(getattr(forces, "add_forces", None)):
             raise InputError(f"forces is {shown(forces)}; it must have a method add_forces that launches them")
@@ -419,12 +419,12 @@ class Simulation:
                 self.safe_step.find_rest(stable)
 
     def follow_motion(self) -> None:
-        """Let the meshes follow the motion, and the step the meshes, where that is due."""
+        """Remesh where that is due, and adapt the step to the new meshes."""
         if self.remeshing.run(self.steps):
             self._control_step()
 
     def _control_step(self) -> None:
-        """Find the stable step again if other elements limit it now."""
+        """Find the stable step again if other elements now limit it."""
         if not self.remeshing.step_may_change():
             return
         stable = self._find_stable_steps()

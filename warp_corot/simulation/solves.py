@@ -1,4 +1,4 @@
-"""What implicit steps took to solve."""
+"""The cost of the solves of implicit steps."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 
 class Solves(NamedTuple):
-    """Sums over all steps and bodies since the beginning; in each step of the world that needed most.
+    """Sums over all steps and bodies since the beginning; each step counts the world that needed most.
 
     Attributes:
         steps: Steps, once for each body.
-        iterations: Of Newton's method.
-        linear_iterations: Of conjugate gradients.
-        unfinished: Steps that did not come within the tolerance.
+        iterations: Iterations of Newton's method.
+        linear_iterations: Iterations of conjugate gradients.
+        unfinished: Steps that did not reach the tolerance.
     """
 
     steps: int

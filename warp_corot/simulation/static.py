@@ -18,21 +18,21 @@ from warp_corot.solvers.implicit.static import StaticSolver, status_words
 
 from .parts import checked_gravity, checked_models
 
-#: Loads on a body that nothing holds are in balance if their sum is less than this share of the sum of their sizes.
+#: Loads on a free body balance if their sum is less than this share of the sum of their magnitudes.
 BALANCED = 1e-5
 
 
 @dataclass(frozen=True)
 class StaticReport:
-    """What ``solve_static`` found.
+    """The result of ``solve_static``.
 
     Attributes:
         converged: Whether every world is at rest.
         message: What happened, in one line.
         iterations: Newton's iterations.
-        linear_iterations: Iterations of conjugate gradients in all of these together.
-        residual: The norm of the forces that are out of balance over that of external and reaction forces: of the last
-            iteration of the world with the largest. Rounding of float32 leaves some 1e-5 of it on fine meshes.
+        linear_iterations: Iterations of conjugate gradients in all of Newton's iterations together.
+        residual: The norm of the unbalanced forces over that of external and reaction forces, in the last iteration of
+            the world where it is largest. Rounding of float32 leaves some 1e-5 on fine meshes.
         correction: The largest displacement of the last iteration over the largest displacement.
         energy: Elastic energy minus the work of loads and gravity from the rest shape, of all worlds [J].
         time: Wall time [s].
@@ -62,14 +62,13 @@ def solve_static(
     load_steps: int = 1,
     preconditioner: str | None = None,
 ) -> StaticReport:
-    """Move a body to where it is at rest under gravity and its loads, by Newton's method.
+    """Find the state in which a body is at rest under gravity and its loads, by Newton's method.
 
-    The search begins at the body's displacements, and held nodes stay where these put them: set ``body.displacements``
-    to prescribe others. Each iteration solves for a step by preconditioned conjugate gradients with the exact
-    derivative of the forces, and a line search on the energy shortens the step where that is needed. Where the method
-    does not converge, loads and gravity are added in smaller and smaller parts. The state that is left is the last one
-    at rest, with the share of the load that it carries in the report; it is the beginning where there is none. Then
-    velocities are zero.
+    The search begins at the body's displacements, and held nodes stay there: set ``body.displacements`` to prescribe
+    others. Each iteration solves for a step by preconditioned conjugate gradients with the exact derivative of the
+    forces; a line search on the energy shortens the step if necessary. If the method does not converge, loads and
+    gravity are added in smaller and smaller parts. The body ends in the last state of rest that was found, or where it
+    began, with zero velocities; the report says which share of the load that state carries.
 
     Args:
         body: The body.
@@ -77,15 +76,15 @@ def solve_static(
         gravity: [m/s^2]; None for 9.81 down the up axis of the mesh.
         tolerance: A world is at rest where its residual is below this, or the last whole step moves no node by more
             than this share of the largest displacement.
-        iterations: Newton's iterations for each part of the load at most.
-        load_steps: Equal parts in which loads and gravity are added; more than one leads along the path of a load that
-            grows where there are several states of rest.
+        iterations: The most iterations of Newton's method for each part of the load.
+        load_steps: Equal parts in which loads and gravity are added. If there are several states of rest, more parts
+            follow the path of a growing load.
         preconditioner: Of conjugate gradients: "multigrid" on the levels of a forest, "diagonal" with each node's own
             3x3 block, or None: multigrid for forests, the diagonal for general meshes.
 
     Raises:
-        InputError: Something is no body, model or number as described, the model does not go with the mesh, the body is
-            remeshed, or all its nodes are held.
+        InputError: An argument has another type or is out of its range, the model does not support the mesh, the body
+            is remeshed, or all its nodes are held.
     """
     refuse_tape()
     began = time.perf_counter()
@@ -127,7 +126,7 @@ def solve_static(
 
 
 class _Answer:
-    """The loads of a body, and what is left of a solve."""
+    """The loads of a body, and the state that a solve ends in."""
 
     def __init__(self, body: SoftBody, field: ForceField, gravity: tuple[float, float, float]):
         self.body, self.field = body, field

@@ -1,4 +1,4 @@
-"""What forces besides elasticity put in and take out, node by node."""
+"""The work of forces besides elasticity, node by node."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class ForcesWork:
-    """Counts the work of the forces of a system, and that of its constraints.
+    """Counts the work of a system's forces and constraints.
 
     Args:
         bodies, pace, gravity: The system's.
@@ -23,9 +23,9 @@ class ForcesWork:
     Attributes:
         accounts: The work of forces on the nodes of each body, and the sum of its absolute values [J]: float64 [2, n],
             world after world.
-        of_constraints: The same of constraints, by the number of the body; of bodies that have been touched. What a
-            constraint has done stays when it is taken away.
-        others: All that acted besides elasticity in the last step [N], vec4, for each body.
+        of_constraints: The work of constraints on bodies that were touched, by the number of the body. It stays when a
+            constraint is removed.
+        others: All forces besides elasticity in the last step [N], vec4, for each body.
     """
 
     def __init__(self, bodies: Sequence[SoftBody], pace: Pace, gravity: wp.vec3):
@@ -54,18 +54,18 @@ class ForcesWork:
         self.accounts = [wp.zeros((2, n), dtype=wp.float64, device=device) for n in lengths]
 
     def launch_begin(self) -> None:
-        """Launch that the forces so far are elastic ones."""
+        """Launch the copy of the forces so far, which are elastic."""
         for body, elastic in zip(self._bodies, self._elastic, strict=True):
             wp.copy(elastic, body.state.forces)
 
     def launch_separation(self) -> None:
-        """Launch that those since then are others."""
+        """Launch the difference since then: the other forces."""
         for body, elastic, others in zip(self._bodies, self._elastic, self.others, strict=True):
             inputs = [elastic, body.state.forces]
             wp.launch(separate_forces, body.sizes.launch_nodes, inputs, [others], device=body.device)
 
     def launch_count(self, offset: int, damping: float) -> None:
-        """Launch their work, after the forces of constraints, which change the motion."""
+        """Launch the sum of their work, after the forces of constraints, which change the motion."""
         for k, body in enumerate(self._bodies):
             state, conditions = body.state, body.conditions
             inputs = [damping, self._gravity, conditions.inverse_mass, int(conditions.has_loads), conditions.loads]
@@ -74,7 +74,7 @@ class ForcesWork:
             wp.launch(COUNT_WORK[conditions.loads.dtype], body.sizes.launch_nodes, inputs, outputs, device=body.device)
 
     def launch_constraints(self, offset: int, damping: float) -> None:
-        """Launch the work of constraints, when all of them have added their forces."""
+        """Launch the sum of the constraints' work, after all of them have added their forces."""
         for k, account in self.of_constraints.items():
             body = self._bodies[k]
             state, conditions = body.state, body.conditions

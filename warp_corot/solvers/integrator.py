@@ -1,4 +1,4 @@
-"""What every time integrator is: a small description, and the stepper that it becomes for a system of bodies."""
+"""Time integrators: a small description each, and the stepper that it becomes for a system of bodies."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ class Stepper(ABC):
 
     #: Whether steps launch the forces of the system's constraints.
     resolves_constraints = False
-    #: How many steps one recording has at most.
+    #: The most steps of one recording.
     graph_steps = GRAPH_STEPS
 
     @property
     def kept(self) -> dict[str, wp.array]:
-        """What a step leaves for the next one besides the state of bodies and fields, by name."""
+        """Arrays that a step leaves for the next one besides the state of bodies and fields, by name."""
         return {}
 
     @property
@@ -34,7 +34,7 @@ class Stepper(ABC):
         return False
 
     def prepare(self) -> None:  # noqa: B027 (most need nothing)
-        """Bring up to date what launches read of the bodies' conditions; called before steps are recorded."""
+        """Update what launches read of the bodies' conditions; called before steps are recorded."""
 
     @abstractmethod
     def forces(self, offset: int = 0) -> None:

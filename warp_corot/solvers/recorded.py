@@ -1,4 +1,4 @@
-"""Time steps of several bodies, recorded in graphs and replayed, so that Python is out of the loop."""
+"""Time steps of several bodies, recorded in graphs and replayed, so that Python does not run in every step."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from .integrator import Stepper
 from .subnormals import FlushedSubnormals
 from .system import System
 
-#: Steps recorded in one graph: on the CPU, where a replay costs next to nothing and recording a step takes as long as
-#: ten steps, if that is fewer than ``Stepper.graph_steps``; and where one launch makes many steps.
+#: The most steps recorded in one graph: on the CPU, where a replay costs almost nothing and recording a step takes as
+#: long as ten steps; and where one launch makes many steps. ``Stepper.graph_steps`` limits both.
 CPU_GRAPH_STEPS = 8
 BLOCK_STEPS = 1024
-#: Steps up to which what is asked for twice is recorded as it is: recording takes longer than many replays.
+#: A segment of up to this many steps is recorded whole when it comes a second time: recording costs many replays.
 SHORT = 8
-#: Graphs that are kept at most.
+#: The most graphs that are kept.
 MOST_GRAPHS = 256
 
 
@@ -40,10 +40,10 @@ class Segment:
 
     Attributes:
         begins: Whether a run begins, for the guard.
-        adopts: Whether positions are taken over without one.
-        resumes: Whether the step that the state allows is taken again, after shorter ones at the end of a run.
-        measured: If it is measured how long a step may be: for how many steps. Else zero.
-        fits: Whether the steps that are left of the run end in time.
+        adopts: Whether positions are adopted without the beginning of a run.
+        resumes: Whether the allowed step is taken again after shorter ones at the end of a run.
+        measured: The number of steps for which the stable step is measured first; zero: it is not measured.
+        fits: Whether the remaining steps are fitted to the end of the run.
         count: How many steps.
         publishes: Whether positions are published.
         ends: Whether a run ends, for the guard.
@@ -61,13 +61,13 @@ class Segment:
     whole: bool = False
 
     def placed(self, *, begins: bool, ends: bool, whole: bool) -> Segment:
-        """The same as the first one of a run, or the last."""
+        """The same segment as the first of a run, or the last."""
         return replace(self, begins=begins, publishes=ends, ends=ends, whole=whole)
 
     def pieces(self, longest: int, *, edges: bool = False) -> Iterator[Segment]:
-        """The same in pieces of a power of two steps, at most ``longest``, so that few pieces differ.
+        """The segment in pieces of a power of two steps, at most ``longest``, so that there are few different pieces.
 
-        With ``edges`` the first and the last piece are single steps: they have most of the differences.
+        With ``edges`` the first and the last piece are single steps, which have most of the differences.
         """
         sizes = [1, *powers(self.count - 2, longest), 1] if edges and self.count > 2 else powers(self.count, longest)
         piece = replace(self, publishes=False, ends=False, whole=False)
@@ -78,7 +78,7 @@ class Segment:
 
 
 def powers(count: int, longest: int) -> list[int]:
-    """Powers of two that add up to this, at most ``longest`` each, from the largest down; of zero, zero."""
+    """Powers of two that add up to a number, at most ``longest`` each, from the largest down; for zero, zero."""
     found = [longest] * (count // longest)
     found += [1 << bit for bit in reversed(range(longest.bit_length())) if count % longest >> bit & 1]
     return found or [0]
@@ -89,9 +89,9 @@ class RecordedSteps:
 
     Args:
         system: The bodies, and their clock.
-        stepper: Of their integrator.
-        guard: Looks at where runs begin and end.
-        safe_step: What measures how long a step may be, if none was given.
+        stepper: The stepper of their integrator.
+        guard: The guard, which acts where runs begin and end.
+        safe_step: Measures how long a step may be; None if the user gave the step.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class RecordedSteps:
 
     @property
     def in_blocks(self) -> bool:
-        """Whether many steps are one launch."""
+        """Whether one launch makes many steps."""
         return self._stepper.many_a_launch
 
     @property
@@ -174,11 +174,11 @@ class RecordedSteps:
             self._replay_recording(piece)
 
     def replay_many(self, count: int) -> None:
-        """Replay any number of steps, and nothing else."""
+        """Replay any number of steps without anything before or after them."""
         self.replay(Segment(count))
 
     def _follow_bodies(self) -> None:
-        """Forget recordings where the bodies' launches have changed."""
+        """Forget the recordings if the bodies' launches have changed."""
         self._system.prepare()
         revision = self._system.launch_revision
         if (self._guard.revision, revision) == self._revisions:

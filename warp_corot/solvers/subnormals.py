@@ -1,4 +1,4 @@
-"""Launches between which the CPU takes subnormal numbers for zero; see ``kernels.stepping.subnormals``."""
+"""Launches between which the CPU treats subnormal numbers as zero; see ``kernels.stepping.subnormals``."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from warp_corot.kernels.stepping.subnormals import flush_subnormals, restore_sub
 
 
 class FlushedSubnormals:
-    """Keeps the mode of the thread for the length of some launches. Nothing on CUDA.
+    """Sets the mode of the thread during launches, and restores it afterwards. It does nothing on CUDA.
 
-    One for each place that launches: where two are nested, each puts back what it found.
+    Each place that launches has its own, so that nested ones restore what they found.
     """
 
     def __init__(self, device: wp.Device):
         self._device = device
         if device.is_cpu:
             self._mode = wp.zeros(1, dtype=wp.uint32, device=device)
-            # Recorded, a launch costs a quarter of what it costs through Python's checks.
+            # A recorded launch costs a quarter of a launch through Python's checks.
             self._begin, self._end = (
                 wp.launch(kernel, dim=1, inputs=[self._mode], device=device, record_cmd=True)
                 for kernel in (flush_subnormals, restore_subnormals)
@@ -28,7 +28,7 @@ class FlushedSubnormals:
 
     @contextmanager
     def __call__(self) -> Iterator[None]:
-        """For the launches inside, also when they are recorded; the mode is back however they end."""
+        """Set the mode for the launches inside, also if they are recorded; it is restored even if they fail."""
         if not self._device.is_cpu:
             yield
             return

@@ -1,4 +1,4 @@
-"""What is stepped together: bodies, their elastic forces, other forces, and the clock."""
+"""The system that steps together: bodies, their elastic forces, other forces, and the clock."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ from .forces_work import ForcesWork
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
 
-#: No step: later than all.
+#: No step: a number after all steps.
 NEVER = np.iinfo(np.int64).max
 
 
 class Forces(Protocol):
-    """Something besides elasticity that pushes nodes of one body or of several, such as damping or springs.
+    """Forces besides elasticity on the nodes of one or several bodies, such as damping or springs.
 
-    What it puts in and takes out counts in the balance of energy. Two kinds of forces see to that themselves. Forces
-    that only ever take energy out say ``is_dissipative = True``. Others add what they put in to ``support_work`` of the
-    system and have a method ``complete_work``, which launches what brings that up to the present state.
+    Their work counts in the balance of energy. Two kinds of forces do their own accounting. Forces that only take
+    energy out say ``is_dissipative = True``. Others add their work to ``support_work`` of the system and have a method
+    ``complete_work``, which launches the work up to the present state.
 
     Forces whose launches may change have an attribute ``revision`` that changes with them. ``curvature`` may say how
     stiff a force is; see ``Simulation.add_forces``.
     """
 
     def add_forces(self) -> None:
-        """Launch what adds the forces in the present state to ``state.forces`` of the bodies concerned [N]."""
+        """Launch the kernels that add the forces in the present state to the bodies' ``state.forces`` [N]."""
         ...
 
 
 class Constraint(Protocol):
-    """Something that answers to the motion that all other forces would lead to in a step, such as contact.
+    """Forces that react to the motion that all other forces would cause in a step, such as contact.
 
     Its forces are part of ``state.forces`` and, alone, of ``state.contact_forces``, from which their work is counted.
 
     Attributes:
         launch_revision: Changes whenever its launches do, so that steps must be recorded again.
-        state: Other arrays from which it goes on, by name; they are kept and put back with the state of the bodies.
+        state: Arrays from which it continues, by name; they are kept and restored with the state of the bodies.
     """
 
     @property
@@ -57,38 +57,38 @@ class Constraint(Protocol):
         ...
 
     def launch(self, offset: int, damping: float) -> None:
-        """Launch what adds its forces to ``state.forces`` and ``state.contact_forces`` of the bodies, after all other
-        forces, and after prescribed nodes have got the velocities of the step.
+        """Launch the kernels that add its forces to ``state.forces`` and ``state.contact_forces`` of the bodies, after
+        all other forces, and after prescribed nodes have the velocities of the step.
 
         Args:
-            offset: How many steps are launched that the clock does not count yet.
+            offset: How many launched steps the clock does not count yet.
             damping: Rate of mass-proportional damping of the step [1/s].
         """
         ...
 
     @property
     def is_full(self) -> bool:
-        """Whether the run that was just made needed more room than there is, so that forces are missing."""
+        """Whether the last run needed more room than there is, so that forces are missing."""
         ...
 
     def grow(self) -> None:
-        """Make room for what the last run needed."""
+        """Make the room that the last run needed."""
         ...
 
     def forget(self) -> None:
-        """Forget what the last steps have left: they are taken back."""
+        """Forget what the last steps left, because they are taken back."""
         ...
 
     def measure(self) -> None:
-        """Launch what finds how fast things move for their size, as ``System.motion_rates`` says."""
+        """Launch the measurement of how fast things move for their size; see ``System.motion_rates``."""
         ...
 
     def publish(self) -> None:
-        """Launch what users read after a run of steps."""
+        """Launch the update of what users read after a run of steps."""
         ...
 
     def reset(self, chosen: wp.array) -> None:
-        """Forget what belongs to the worlds that are put back to their beginning, not zero in int32 [worlds]."""
+        """Forget what belongs to worlds that are reset, nonzero in int32 [worlds]."""
         ...
 
 
@@ -102,16 +102,16 @@ class System:
         gravity: [m/s^2].
 
     Attributes:
-        forces: What pushes nodes besides elasticity.
-        constraints: What answers to the motion that all these forces lead to, in this order.
-        changes: To be counted up by who adds to these lists or takes from them after the first step.
-        motion_rates: How often in a second things pass the thinnest of what they may touch, as it was known before the
-            run and as it was measured [1/s], float32 [2]. A step lasts a small share of that time.
-        device, worlds: Of all bodies.
-        support_work: What moving supports, and forces that say so, have put in, and the sum of its absolute values [J],
-            float64 [2].
-        offset: Which step since the clock was last advanced is being launched.
-        lag: How far velocities are behind displacements, in halves of a step: 1 for symplectic Euler.
+        forces: Forces besides elasticity.
+        constraints: Forces that react to the motion from all these forces, in this order.
+        changes: A counter; increment it after adding to these lists or removing from them after the first step.
+        motion_rates: How many times per second things would pass the thinnest thing that they may touch: as known
+            before the run and as measured [1/s], float32 [2]. A step lasts a small share of that time.
+        device, worlds: The device, and the number of worlds of all bodies.
+        support_work: Work of moving supports, and of forces that do their own accounting, and the sum of its absolute
+            values [J], float64 [2].
+        offset: The number of the step being launched, since the clock was last advanced.
+        lag: How far velocities are behind displacements, in half steps: 1 for symplectic Euler.
         histories: Arrays that a step leaves for the next one besides the state of bodies and fields.
         bad_step: The first step after which something was not finite, int64 [1] on the device.
     """
@@ -131,7 +131,7 @@ class System:
 
     @property
     def launch_revision(self) -> int:
-        """Changes whenever the launches of a step do, so that steps must be recorded again."""
+        """Changes whenever the launches of a step change, so that steps must be recorded again."""
         others = sum(each.launch_revision for each in self.constraints) + self.changes + len(self.forces)
         others += sum(getattr(each, "revision", 0) for each in self.forces)
         return sum(body.launch_revision for body in self.bodies) + others
@@ -143,33 +143,33 @@ class System:
 
     @property
     def state(self) -> list[wp.array]:
-        """All arrays of constraints from which they go on, accounts among them."""
+        """All arrays from which constraints continue, with the accounts."""
         others = [array for each in self.constraints for array in each.state.values()]
         return self.accounts + others + [body.state.contact_forces for body in self.bodies if body.state.is_touched]
 
     def prepare(self) -> None:
-        """Bring up to date what constraints know of the bodies; not while launches are recorded."""
+        """Update what constraints know of the bodies; not while launches are recorded."""
         for each in self.constraints:
             each.prepare()
         self._work.prepare(bool(self.counted))
 
     @property
     def counted(self) -> list[Forces]:
-        """The forces whose work is counted for them."""
+        """The forces that do not do their own accounting."""
         return [each for each in self.forces if not _counts_itself(each)]
 
     def add_other_forces(self, offset: int, damping: float, moving: Sequence[int]) -> None:
-        """Launch all that acts besides elasticity: forces, and then constraints; see ``Constraint.launch``.
+        """Launch forces besides elasticity, and then constraints; see ``Constraint.launch``.
 
         Args:
-            offset, damping: As there.
+            offset, damping: As for ``Constraint.launch``.
             moving: The bodies whose prescribed nodes get the velocities of the step here.
         """
         self.offset = offset
         for forces in self.forces:
             if _counts_itself(forces):
                 forces.add_forces()
-        # A support pays for what has been added so far, and not for what is counted below.
+        # The work of supports includes the forces so far, but not those that are counted below.
         for k in moving:
             self.bodies[k].conditions.follow_trajectories(self.pace, offset, self.support_work)
         counted = self.counted
@@ -185,9 +185,9 @@ class System:
         self._work.launch_constraints(offset, damping)
 
     def pushing(self, k: int) -> wp.array | None:
-        """What acted on a body besides elasticity in the last step [N], vec4, as the balance of energy must know it.
+        """Forces on a body besides elasticity in the last step [N], vec4, for the balance of energy.
 
-        None for nothing.
+        None if there were none.
         """
         if self.counted:
             return self._work.others[k]
@@ -202,7 +202,7 @@ class System:
 
     @property
     def rewritten(self) -> int:
-        """Changes whenever keyframes do that launches go on with."""
+        """Changes whenever keyframes change that existing launches read."""
         return sum(body.conditions.rewritten for body in self.bodies)
 
     def add_elastic_forces(self, k: int, offset: int = 0) -> None:
@@ -212,19 +212,19 @@ class System:
         field.add_forces(state.displacements, state.forces)
 
     def complete_work(self) -> None:
-        """Launch that ``support_work`` is that of the present state."""
+        """Launch the update of ``support_work`` to the present state."""
         for each in self.forces:
             complete = getattr(each, "complete_work", None)
             if complete is not None:
                 complete()
 
     def adopt_positions(self) -> None:
-        """Take over positions that a user wrote since they were published."""
+        """Adopt positions that a user wrote since they were published."""
         for body in self.bodies:
             body.state.adopt_positions()
 
     def publish_positions(self) -> None:
-        """Write positions from displacements, and what users read of constraints."""
+        """Write positions from displacements, and what users read about constraints."""
         for body in self.bodies:
             body.state.publish_positions()
         for each in self.constraints:

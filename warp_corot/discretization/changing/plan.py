@@ -188,7 +188,7 @@ class DevicePlan:
         return elements
 
     def _fill_in(self, most_leaves: int) -> None:
-        """Fill in what only a changing plan has. Counts begin as if all places were used, so that all become padding."""
+        """Fill in what only a changing plan has. Counts begin as if all places were used, so all become padding."""
         plan, leaves, names = self._plan, self._made.leaves, self.forest.carriage.names
         plan.first_unit = 1
         plan.stale, plan.goes = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))

@@ -1,1 +1,1 @@
-"""Explicit integrators, and the ways to make many of their steps in one launch."""
+"""Explicit integrators, and launches that make many steps."""

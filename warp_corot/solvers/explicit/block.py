@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 class BlockSteps:
     """Symplectic Euler steps of a body that fits into a block.
 
-    Made by ``of``, which knows whether it does.
+    ``of`` makes it if the body fits.
     """
 
     def __init__(self, body: SoftBody, batch: Batch, layout: Layout, slots: list[list[int]]):
@@ -55,7 +55,7 @@ class BlockSteps:
 
     @classmethod
     def of(cls, body: SoftBody, field: ForceField) -> BlockSteps | None:
-        """A body's steps in blocks, or None: not on CUDA, too large, or not made of subtrees of one type alone."""
+        """A body's steps in blocks; None if it is not on CUDA, too large, or has more than subtrees of one type."""
         if body.changing is not None or not body.device.is_cuda:
             return None
         if not isinstance(field, SubtreeField) or not isinstance(body.mesh, TetForest):
@@ -107,10 +107,10 @@ class BlockSteps:
 
 
 def _layouts(body: SoftBody, shape: int, shared: bool, subtrees: int, tolerance: float | None = None) -> list[Layout]:
-    """The ways to deal a body out, the fastest first.
+    """The layouts of a body in a block, the fastest first.
 
-    A world is soonest done with the leaves of a subtree dealt to two threads; where there are more worlds than
-    multiprocessors, whole subtrees take less work.
+    A single world is fastest with the leaves of a subtree split between two threads. With more worlds than
+    multiprocessors, a thread for a whole subtree takes less work.
     """
     parts = (2, 1) if body.worlds <= body.device.sm_count else (1,)
     capacity = -(-subtrees // WARP) * WARP
@@ -121,7 +121,7 @@ def _layouts(body: SoftBody, shape: int, shared: bool, subtrees: int, tolerance:
 
 
 def _tasks(layout: Layout, slots: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
-    """What threads add up: up to eight slots of one node each, a node's threads next to one another in one warp.
+    """The sums of threads: up to eight slots of one node each. The threads of a node are neighbours in one warp.
 
     Returns:
         The tasks, int32 [n], and the places of their slots, uint64 [2, n]; n is a multiple of a warp's threads.
@@ -133,7 +133,7 @@ def _tasks(layout: Layout, slots: list[list[int]]) -> tuple[np.ndarray, np.ndarr
         tasks.extend([NO_NODE] * count)
         numbers.extend([[]] * count)
 
-    # Nodes of many slots first, so that warps are alike and hardly a place is left out.
+    # Nodes with many slots first, so that the threads of a warp have equal work and few places stay unused.
     for node in sorted(range(len(slots)), key=lambda n: -len(slots[n])):
         of_node = [slots[node][at : at + TASK_SLOTS] for at in range(0, len(slots[node]), TASK_SLOTS)]
         of_node = of_node or [[]]
@@ -163,7 +163,7 @@ def _slots_by_node(layout: Layout, nodes: np.ndarray, count: int) -> list[list[i
     """The slots that each node adds up, in order of subtrees and parts.
 
     Args:
-        nodes: Of the subtrees, [10, S].
+        nodes: Nodes of the subtrees, [10, S].
         count: Number of nodes.
     """
     slots: list[list[int]] = [[] for _ in range(count)]

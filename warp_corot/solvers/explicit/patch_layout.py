@@ -1,8 +1,8 @@
-"""Patches of a mesh: compact sets of nodes, each with every element that touches it, for thread blocks that stay.
+"""Patches of a mesh: compact sets of nodes, each with all elements that touch it, for thread blocks that stay resident.
 
-Plain NumPy. A patch owns its nodes and computes every element that has a corner there, so that its forces are whole
-without another patch's help; elements between patches are computed by each of them. What a patch must be told in every
-step are the positions of its halo, the other corners of its elements.
+Plain NumPy. A patch owns its nodes and computes every element with a corner there, so that it needs no forces from
+other patches; each patch computes the elements between patches for itself. In every step a patch needs only the
+positions of its halo, the other corners of its elements.
 """
 
 from __future__ import annotations
@@ -13,31 +13,31 @@ import numpy as np
 
 WARP = 32
 
-#: The slot of a corner that another patch owns.
+#: The slot number of corners that another patch owns.
 NO_SLOT = 0xFFFF
 
-#: Threads that add up one node at most: a node has two dozen elements.
+#: The most threads that add up one node: a node has two dozen elements.
 MOST_LANES = 8
 
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Who computes what; ``*_start`` arrays tell where each patch's part begins, int32 [patches + 1].
+    """The nodes and elements of each patch; ``*_start`` arrays say where each patch's part begins, int32 [patches + 1].
 
-    Within a patch, nodes are numbered from 0: its own, most elements first, then its halo. Each own node is summed up
-    by ``lanes`` neighbouring threads. The slots that the 32 threads of a warp read at once lie side by side: slot
-    ``base + 32 row + thread``, where a warp has as many rows as its busiest thread needs and other places stay zero.
+    Within a patch, nodes are numbered from 0: first its own, those with the most elements first, then its halo.
+    ``lanes`` neighbouring threads add up each own node. The slots that the 32 threads of a warp read at once lie side
+    by side: slot ``base + 32 row + thread``. A warp has as many rows as its busiest thread needs; unused places stay
+    zero.
 
     Attributes:
         lanes: Threads that add up one node: 1, 2, 4, 8, 16 or 32.
         own, own_start: Nodes that patches own, int32 [N].
-        halo, halo_start: Nodes that patches read of others, int32 [H].
+        halo, halo_start: Nodes of other patches that patches read, int32 [H].
         elements, element_start: Elements that patches compute, those without halo first, int32 [E].
         interior: How many elements of each patch have no corner in the halo, int32 [patches].
-        corners: The four nodes of each of these, numbered in the patch, int32 [E, 4].
-        slots: Where each corner's force goes; ``NO_SLOT`` at corners of the halo; int32 [E, 4].
-        bases, base_start: Where each warp's slots begin, and past its last warp's the number of the patch's slots,
-            int32.
+        corners: The four nodes of each element, numbered in the patch, int32 [E, 4].
+        slots: The slot of each corner's force; ``NO_SLOT`` at corners of the halo; int32 [E, 4].
+        bases, base_start: Where each warp's slots begin, and after a patch's last warp the number of its slots, int32.
     """
 
     lanes: int
@@ -55,13 +55,13 @@ class Patches:
 
     @classmethod
     def of(cls, points: np.ndarray, tets: np.ndarray, count: int, threads: int) -> Patches:
-        """Patches of about the same number of corners.
+        """Patches with about equal numbers of corners.
 
         Args:
             points: Rest positions, float64 [N, 3].
             tets: int32 [T, 4].
-            count: How many patches, at most as many as nodes.
-            threads: Of a block; they set how many add up one node.
+            count: How many patches, at most the number of nodes.
+            threads: Threads of a block; they determine how many add up one node.
         """
         n = len(points)
         valence = np.bincount(tets.ravel(), minlength=n)
@@ -112,32 +112,32 @@ class Patches:
 
     @property
     def most_own(self) -> int:
-        """Own nodes of the patch that has most."""
+        """The most own nodes of a patch."""
         return int(np.diff(self.own_start).max())
 
     @property
     def most_halo(self) -> int:
-        """Nodes in the largest halo."""
+        """The most nodes of a halo."""
         return int(np.diff(self.halo_start).max())
 
     @property
     def most_nodes(self) -> int:
-        """Nodes of the largest patch, own and of the halo."""
+        """The most nodes of a patch, its own and its halo's."""
         return int((np.diff(self.own_start) + np.diff(self.halo_start)).max())
 
     @property
     def most_slots(self) -> int:
-        """Slots of the patch that has most."""
+        """The most slots of a patch."""
         return int(self.bases[self.base_start[1:] - 1].max())
 
     @property
     def most_elements(self) -> int:
-        """Elements of the largest patch."""
+        """The most elements of a patch."""
         return int(np.diff(self.element_start).max())
 
 
 def patch_of_nodes(points: np.ndarray, weight: np.ndarray, count: int) -> np.ndarray:
-    """Split points across the longest extent, and so on, into parts of about the same weight: int64 [N]."""
+    """Split points across the longest extent, and the parts again, into patches of about equal weight: int64 [N]."""
     patch = np.zeros(len(points), np.int64)
     waiting = [(np.arange(len(points)), 0, count)]
     while waiting:
@@ -158,8 +158,8 @@ def patch_of_nodes(points: np.ndarray, weight: np.ndarray, count: int) -> np.nda
 
 
 def _elements_by_patch(owners: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Each patch with each element that has a corner there, patch by patch, inner ones first: both [E]; where each
-    patch begins, and how many are inner ones.
+    """Pairs of a patch and an element with a corner there, patch by patch, inner elements first: both [E]; where each
+    patch begins, and how many inner elements it has.
 
     Args:
         owners: The patches of the elements' nodes, [T, 4].
@@ -180,7 +180,7 @@ def _slot_bases(valence: np.ndarray, own_start: np.ndarray, lanes: int) -> tuple
     """``bases`` and ``base_start``.
 
     Args:
-        valence: Elements of each node, in the order of ``own``, so falling within a patch.
+        valence: Elements of each node, in the order of ``own``; they decrease within a patch.
     """
     each = WARP // lanes
     own = np.diff(own_start)
@@ -195,7 +195,7 @@ def _slot_bases(valence: np.ndarray, own_start: np.ndarray, lanes: int) -> tuple
 
 
 def _rank(nodes: np.ndarray, valence: np.ndarray) -> np.ndarray:
-    """How many times the same node came before, for each of a list of all nodes' corners."""
+    """For each entry of a list of nodes, how often the same node came before."""
     order = np.argsort(nodes, kind="stable")
     start = _starts(valence)
     rank = np.empty(len(nodes), np.int64)

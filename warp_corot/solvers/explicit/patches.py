@@ -1,4 +1,4 @@
-"""Organs on CUDA: many steps a launch, a thread block for each patch of the mesh; see ``kernels.stepping.patches``."""
+"""Organs on CUDA: many steps in a launch, one thread block for each patch; see ``kernels.stepping.patches``."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ if TYPE_CHECKING:
     from warp_corot.elasticity.corotated.elements import CorotatedField
     from warp_corot.solvers.system import System
 
-#: Elements of the bodies for which it pays: below, a launch has nothing to spread; above, patches outgrow their blocks.
+#: The sizes of bodies that become faster, in elements: smaller ones need few blocks; patches of larger ones do not fit.
 FEWEST, MOST = 500, 150_000
-#: Elements of a patch at least: with fewer, blocks of the smallest bodies only wait for one another.
+#: The fewest elements of a patch: with fewer, the blocks of small bodies mostly wait for one another.
 PATCH_ELEMENTS = 32
-#: Threads a block, each up to so many elements of the largest patch; more threads have fewer registers.
+#: Threads of a block, each for patches of at most this many elements; more threads have fewer registers.
 THREADS = ((256, 512), (512, 1024), (384, 1536), (512, 2048))
-#: Elements whose constants a thread keeps in registers, and nodes of the halo that it waits for.
+#: How many elements' constants a thread keeps in registers, and how many nodes of the halo it waits for.
 MOST_ELEMENTS, MOST_HALO = 4, 3
-#: The first cards that read and write 16 bytes at once for all to see.
+#: The first architecture whose reads and writes of 16 bytes are atomic.
 LEAST_ARCH = 70
-#: What Warp keeps of a block's shared memory for its tiles.
+#: Bytes of a block's shared memory that Warp reserves for its tiles.
 TILE_BYTES = 8192
-#: Kernels are made for rooms of whole multiples, so that bodies share them.
+#: Room in kernels is a multiple of this, so that bodies share kernels.
 NODE_ROOM, SLOT_ROOM = 128, 512
 
 
 class PatchSteps:
-    """Symplectic Euler steps of a body whose patches are all on the card at once.
+    """Symplectic Euler steps of a body whose patches are all resident on the GPU at once.
 
-    Made by ``of``, which knows whether that can be.
+    ``of`` makes it if that is possible.
     """
 
     def __init__(self, body: SoftBody, patches: Patches, layout: Layout):
@@ -61,12 +61,12 @@ class PatchSteps:
     def of(
         cls, body: SoftBody, field: ForceField, *, count: int | None = None, threads: int | None = None
     ) -> PatchSteps | None:
-        """A body's steps by patches, or None: not on CUDA, too small or large, or not of the corotated model with own
-        rotations.
+        """A body's steps by patches; None if it is not on CUDA, is too small or large, or has another model than the
+        corotated one with own rotations.
 
         Args:
-            count: Patches, at most as many as multiprocessors; None: as many, or fewer of small bodies.
-            threads: A block; None: as many as suit its elements.
+            count: Patches, at most the number of multiprocessors; None: that many, or fewer for small bodies.
+            threads: Threads of a block; None: chosen by its elements.
         """
         if not _suits(body, field):
             return None
@@ -81,7 +81,7 @@ class PatchSteps:
         return None
 
     def prepare(self) -> None:
-        """Copy the body's keyframes to the device, if they are others now; not while launches are recorded."""
+        """Copy the body's keyframes to the device if they have changed; not while launches are recorded."""
         before, now = self._trajectories, list(self.body.conditions.trajectories)
         if now == before:
             return
@@ -97,7 +97,7 @@ class PatchSteps:
 
     @property
     def is_prepared(self) -> bool:
-        """Whether the keyframes on the device are the body's; not if others came during a recording."""
+        """Whether the keyframes on the device are the body's; they are not if they changed during a recording."""
         return self._trajectories == self.body.conditions.trajectories
 
     def launch(self, count: int, damping: float, system: System) -> None:
@@ -131,7 +131,7 @@ class PatchSteps:
 
 
 def layout_of(patches: Patches, threads: int, most_bytes: int) -> Layout | None:
-    """What the kernel for these patches is generated for, or None if they do not fit into blocks of so much memory."""
+    """The layout for which the kernel is generated; None if the patches do not fit into the memory of a block."""
     elements = -(-patches.most_elements // threads)
     halo = max(-(-patches.most_halo // threads), 1)
     nodes = -(-patches.most_nodes // NODE_ROOM) * NODE_ROOM
@@ -152,7 +152,7 @@ def _suits(body: SoftBody, field: ForceField) -> bool:
 
 
 def _has_own_rotations(field: ForceField) -> bool:
-    """Whether it is the corotated model on a fast path, with the rotation of each element."""
+    """Whether the model is the corotated one on a fast path, with a rotation of each element."""
     if not isinstance(field, (SubtreeField, CorotatedGeneralField)):
         return False
     of_model: CorotatedField = field
@@ -161,7 +161,7 @@ def _has_own_rotations(field: ForceField) -> bool:
 
 
 def _device_patches(body: SoftBody, patches: Patches, layout: Layout) -> PatchBody:
-    """The patches as the kernel reads them, still without keyframes."""
+    """The patches as the kernel reads them, without keyframes."""
     device = body.device
     tables = PatchBody()
     for name in (
@@ -185,7 +185,7 @@ def _device_patches(body: SoftBody, patches: Patches, layout: Layout) -> PatchBo
 
 
 def rest_rows(points: np.ndarray, tets: np.ndarray) -> np.ndarray:
-    """The inverses of the rest edges, row by row, and the volumes of elements, either way wound: float32 [10, T]."""
+    """The inverse rest edges, row by row, and the volumes of elements of either orientation: float32 [10, T]."""
     x = points[tets]
     edges = np.swapaxes(x[:, 1:] - x[:, :1], 1, 2)
     inverse = np.linalg.inv(edges).reshape(-1, 9)
@@ -194,12 +194,12 @@ def rest_rows(points: np.ndarray, tets: np.ndarray) -> np.ndarray:
 
 
 def _packed(places: np.ndarray) -> np.ndarray:
-    """Four 16-bit numbers to a word, uint64 [E]."""
+    """Four 16-bit numbers in a word, uint64 [E]."""
     return np.ascontiguousarray(places.astype("<u2")).view("<u8").ravel()
 
 
 def _set_keyframes(tables: PatchBody, trajectories: Sequence[Trajectory], body: SoftBody) -> None:
-    """Put the keyframes of all trajectories one after another; a node follows the last that names it."""
+    """Put the keyframes of all trajectories one after another; a node follows the last one that names it."""
     follows, place = np.full(body.node_count, -1), np.zeros(body.node_count)
     times, values, columns = [np.zeros(0)], [np.zeros((0, 3))], []
     for k, trajectory in enumerate(trajectories):
@@ -222,7 +222,7 @@ def _set_keyframes(tables: PatchBody, trajectories: Sequence[Trajectory], body: 
 
 
 def _rewrite_keyframes(tables: PatchBody, trajectories: Sequence[Trajectory]) -> None:
-    """Copy times and displacements of trajectories whose nodes and numbers are those that were put there before."""
+    """Copy times and displacements of trajectories whose nodes and numbers of keyframes have not changed."""
     key = value = 0
     for trajectory in trajectories:
         displacements = trajectory.displacements.flatten()

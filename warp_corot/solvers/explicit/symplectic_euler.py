@@ -1,4 +1,4 @@
-"""Symplectic Euler: explicit, first order, without drift of energy."""
+"""Symplectic Euler: explicit, first order, without energy drift."""
 
 from __future__ import annotations
 
@@ -33,13 +33,14 @@ class SymplecticEuler(Integrator):
 
     Attributes:
         dt: Time step [s]; None: one that is stable, found again during the run.
-        damping: Rate of mass-proportional damping >= 0 [1/s], taken implicitly, so that it never limits the step.
-        viscosity: Viscous over elastic stress at one strain >= 0 [s], stiffness-proportional damping that leaves the
-            motion of a body as a whole alone: a vibration of angular frequency w decays by viscosity * w^2 / 2. Taken
-            explicitly: the stable step becomes sqrt(viscosity^2 + 4 / w^2) - viscosity for the largest w.
+        damping: Rate of mass-proportional damping >= 0 [1/s], integrated implicitly, so that it never limits the step.
+        viscosity: Stiffness-proportional damping >= 0 [s], which does not act on rigid motions: the viscous stress is
+            the elastic stress of viscosity times the strain rate. A vibration of angular frequency w decays at the rate
+            viscosity * w^2 / 2. It is integrated explicitly: the stable step becomes
+            sqrt(viscosity^2 + 4 / w^2) - viscosity for the largest w.
 
     Raises:
-        InputError: A value out of its range.
+        InputError: A value is out of its range.
     """
 
     dt: float | None = None
@@ -58,8 +59,8 @@ class SymplecticEuler(Integrator):
             raise InputError(f"viscosity is {self.viscosity}; it must be zero or a positive time in seconds")
 
     def stable_step(self, frequency: float) -> float:
-        """As ``Integrator``. With damping c = viscosity w^2, taken from the velocities before the step, central
-        differences are stable while dt^2 w^2 + 2 dt c < 4."""
+        """See ``Integrator``. With damping c = viscosity w^2 at the velocities before the step, central differences are
+        stable while dt^2 w^2 + 2 dt c < 4."""
         elastic = super().stable_step(frequency)
         # The positive root without cancellation.
         return elastic**2 / (self.viscosity + math.hypot(self.viscosity, elastic)) if frequency > 0.0 else elastic
@@ -84,7 +85,7 @@ class SymplecticEulerStepper(Stepper):
         return all(self._launched(k) is not None for k in range(len(self._many)))
 
     def _launched(self, k: int) -> BlockSteps | PatchSteps | None:
-        """What makes many steps of a body in one launch, if anything does."""
+        """The launches that make many steps of a body, or None."""
         many = self._many[k]
         follows = isinstance(many, BlockSteps) and self.system.bodies[k].conditions.trajectories
         return None if follows or self.system.forces or self.system.constraints else many

@@ -1,1 +1,1 @@
-"""Whether a state can be true, and the way back to the last one that was."""
+"""Checks of the state, and the return to the last good one."""

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from .copies import Copies
 
-#: Nodes that a thread adds up, and warps of threads of all worlds at most; a CPU has one thread a world.
+#: How many nodes a thread adds up, and the most warps of all worlds; a CPU has one thread for each world.
 NODES = 4
 WARPS = 2048
 WARP = 32
@@ -32,14 +32,14 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Energies:
-    """What free nodes have at one time, of each world [worlds].
+    """The energies of free nodes at one time, for each world [worlds].
 
     Attributes:
         kinetic, gravitational: [J]; gravitational about the rest shape.
         elastic: [J]; zero if not asked for.
-        exact: With symplectic Euler's own kinetic energy, velocities behind times those ahead, and the elastic energy:
-            what a linear body keeps to rounding [J]; means nothing if elastic energies were not asked for.
-        untimely: What the kinetic energy at the time of the displacements has more than that of ``exact`` [J].
+        exact: The elastic energy plus symplectic Euler's own kinetic energy, of the velocities half a step behind times
+            those half a step ahead: a linear body keeps this sum to rounding [J]. Meaningless without elastic energies.
+        untimely: The kinetic energy at the time of the displacements minus that in ``exact`` [J].
         loads: Work of loads since the last good state [J].
         supports: Work of all moving supports, and of the world's constraints, since the beginning [J].
         supports_absolute: The sum of its absolute values [J].
@@ -59,12 +59,12 @@ class Energies:
 
 @dataclass(frozen=True)
 class Report:
-    """What the device has found at the end of a run.
+    """The device's findings at the end of a run.
 
     Attributes:
-        energies: Of the state then.
-        has_changed: Whether the state was another at the beginning than at the end of the run before.
-        bad_step: The first step after which something was not finite, NEVER if there was none.
+        energies: The energies of the state at that time.
+        has_changed: Whether the state was changed between the run before and this one.
+        bad_step: The first step after which something was not finite, or NEVER.
     """
 
     energies: Energies
@@ -76,8 +76,8 @@ class Balance:
     """Adds up energies, world by world, and reports them with the clock.
 
     Args:
-        system: The simulation's.
-        copies: Of its state.
+        system: The simulation's system.
+        copies: The copies of its state.
     """
 
     def __init__(self, system: System, copies: Copies):
@@ -97,7 +97,7 @@ class Balance:
 
     @property
     def is_closed(self) -> bool:
-        """Whether nothing but gravity, loads and supports puts work in: active stress does."""
+        """Whether only gravity, loads and supports do work; active stress does work, too."""
         return not any(body.discretization.has_activation for body in self.bodies)
 
     def prepare(self) -> None:
@@ -121,11 +121,11 @@ class Balance:
         """Launch sums and their report; may be recorded.
 
         Args:
-            whole: Whether elastic energies are wanted, which take as long as some steps.
-            keeps: Whether the state is kept in passing.
+            whole: Whether to compute elastic energies, which takes as long as some steps.
+            keeps: Whether the same launches keep the state.
             at: Displacements and velocities of each body in place of the present ones.
-            seconds: Of the clock, in place of the present ones [3].
-            accounts: Of the work of constraints, in place of the present ones.
+            seconds: Times of the clock in place of the present ones [3].
+            accounts: Accounts of the constraints' work in place of the present ones.
         """
         system, copies = self.system, self._copies
         pace = system.pace.arrays
@@ -151,7 +151,7 @@ class Balance:
         wp.launch(kernels.report, dim, inputs, [self._totals, self._numbers], device=self.device)
 
     def wait(self) -> Report:
-        """What was reported; waits for the device, once."""
+        """The report; waits for the device once."""
         wp.synchronize_stream(self.device)
         numbers = self._mapped.values[self.worlds * kernels.COLUMNS :]
         total = self._mapped.values[: self.worlds * kernels.COLUMNS].reshape(self.worlds, kernels.COLUMNS).copy()
@@ -177,7 +177,7 @@ class Balance:
         )
 
     def rounding(self) -> Floats:
-        """Energies that float32 cannot tell from none [J], of each world: of strains of about 4e-4."""
+        """Energies that float32 cannot distinguish from zero, for each world [J]: those of strains of about 4e-4."""
         found = np.zeros(self.worlds)
         for body in self.bodies:
             stiffness = 2.0 * float(body.discretization.mu.numpy().mean()) + float(
@@ -187,7 +187,7 @@ class Balance:
         return found
 
     def _add_elastic(self, k: int, body: SoftBody, field: ForceField, u: wp.array) -> None:
-        """Strain energies to the sums, and elastic forces to ``node_forces``."""
+        """Add strain energies to the sums, and elastic forces to ``node_forces``."""
         energies, kept = self._energies[k], self._field_states[k]
         energies.zero_()
         for name, array in field.state.items():

@@ -9,15 +9,15 @@ from warp_corot.solvers.system import System
 
 
 class Copies:
-    """Displacements, velocities and what fields and constraints keep, twice.
+    """Displacements, velocities and the state of fields and constraints, twice.
 
     Args:
-        system: The simulation's; the orders of its clock name the last good copy.
+        system: The simulation's system; the orders of its clock name the last good copy.
 
     Attributes:
         slot: Which copy is the last good one.
-        changed: Whether the state at the beginning of a run was another than that, int32 [1].
-        revision: Changes whenever the arrays are others.
+        changed: Whether the state at the beginning of a run differed from that copy, int32 [1].
+        revision: Changes whenever the arrays are replaced.
     """
 
     def __init__(self, system: System):
@@ -33,7 +33,7 @@ class Copies:
         self._places: list[tuple[int, int]] = []
 
     def prepare(self) -> None:
-        """Make room for what there is now; not while launches are recorded."""
+        """Make room for the present arrays; not while launches are recorded."""
         arrays = [array for field in self._fields for array in field.state.values()] + self._system.state
         words = [_words(array) for array in arrays]
         places = [(array.ptr, len(array)) for array in words]
@@ -48,7 +48,7 @@ class Copies:
         self.revision += 1
 
     def take(self) -> None:
-        """Let the present state be the last good one."""
+        """Make the present state the last good one."""
         self.prepare()
         for body, u, v, mass in zip(self._bodies, self.u, self.v, self._inverse_mass, strict=True):
             wp.copy(u[self.slot], body.state.displacements)
@@ -58,7 +58,7 @@ class Copies:
             wp.copy(kept[self.slot], words)
 
     def put_back(self) -> None:
-        """Let the last good state be the present one."""
+        """Restore the last good state."""
         for body, u, v in zip(self._bodies, self.u, self.v, strict=True):
             wp.copy(body.state.displacements, u[self.slot])
             wp.copy(body.state.velocities, v[self.slot])
@@ -81,12 +81,12 @@ class Copies:
         return found
 
     def flip(self) -> None:
-        """The other copy, which the last run has written, is the last good one from here on."""
+        """Make the other copy, which the last run has written, the last good one."""
         self.slot = 1 - self.slot
 
     def launch_take_over(self) -> None:
-        """Launch the beginning of a run: the last good state is what is there now, and ``changed`` says whether it was
-        before. Positions are adopted."""
+        """Launch the beginning of a run: the present state becomes the last good one, and ``changed`` says whether it
+        differed. Positions are adopted."""
         for body, u, v, mass in zip(self._bodies, self.u, self.v, self._inverse_mass, strict=True):
             inputs = [body.state.rest, body.state.positions, body.conditions.inverse_mass, self._pace.orders]
             inputs += [body.state.velocities]
@@ -96,7 +96,7 @@ class Copies:
         self._launch_words(beside=False)
 
     def launch_keep(self) -> None:
-        """Launch the end of a run for what fields keep; nodes are kept as their energies are summed."""
+        """Launch the copies of the fields' state at the end of a run; nodes are copied as their energies are summed."""
         self._launch_words(beside=True)
 
     def _launch_words(self, *, beside: bool) -> None:
@@ -106,6 +106,6 @@ class Copies:
 
 
 def _words(array: wp.array) -> wp.array:
-    """The same memory in pieces of four bytes."""
+    """The same memory as words of four bytes."""
     count = array.size * wp.types.type_size_in_bytes(array.dtype) // 4
     return wp.array(ptr=array.ptr, shape=count, dtype=wp.uint32, device=array.device)

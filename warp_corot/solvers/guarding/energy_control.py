@@ -1,5 +1,5 @@
-"""What energy from nowhere does to the step: shorter where there was some, longer again where there was none, and how
-often that is looked at."""
+"""The control of the step by energy from nowhere: the step becomes shorter if there is some and grows again if there is
+none. Also how often that is checked."""
 
 from __future__ import annotations
 
@@ -11,43 +11,43 @@ from warp_corot.solvers.steps.safe_step import CALM_CHECKS, FIRST_INTERVAL, LIVE
 
 from .guard import Guard
 
-#: Measurements from one check with elastic energies to the next: for a body that stays as stiff as at rest, for one
-#: that is strained so that its step is less than a share of that at rest, and while less than what is stable is taken
-#: or a strained body errs by more than QUIET of what is let pass.
+#: Measurements between two checks with elastic energies: for a body that is as stiff as at rest; for a body that is
+#: strained, so that its step is below a share of the one at rest; and while the step is shorter than the stable one, or
+#: a strained body's error is more than QUIET of what is tolerated.
 CHECK_INTERVALS = 16
 STRAINED_INTERVALS = 4
 CLOSE_INTERVALS = 2
 STRAINED = 0.7
 QUIET = 0.25
-#: Bodies are calm if the step is this share of the one at rest, or more, and change fast if it has fallen to less than
-#: this share of what it was at the check before.
+#: Bodies are calm if the step is at least this share of the one at rest. They change fast if it has fallen below this
+#: share of the step at the check before.
 CALM = 0.95
 FALLING = 0.9
-#: Energy from nowhere that is let pass between two checks, as a share of what gravity, loads and supports have moved:
-#: the step is made shorter for more. It is less the more came lately, down to this share.
+#: Tolerated energy from nowhere between two checks, as a share of the energy that gravity, loads and supports have
+#: moved; beyond it the step becomes shorter. The more energy came lately, the less is tolerated, down to this share.
 GAIN = 0.001
 LEAST_LEAVE = 0.2
-#: The same of what came lately (``guard.MEMORY``): from the first on the step is made shorter while there is more and
-#: more of it, from one window of time to the next, the more the nearer it is to the second, and slowly longer while
-#: there is not.
+#: The same for the energy that came lately (``guard.MEMORY``). Above the first share, the step becomes shorter while
+#: this energy grows from one window of time to the next, and faster the nearer it is to the second share. Otherwise the
+#: step slowly grows.
 SURPLUS, MOST_SURPLUS = 0.004, 0.008
 LEAST_CUT, MOST_CUT = 0.95, 0.7
 SLOW_RECOVERY = 1.1
-#: The step is made shorter where what fast vibrations err by is more than this share.
+#: The step becomes shorter if the error of fast vibrations is more than this share.
 UNTIMELY = 0.004
-#: What vibrations err by at any one time does not add up: it alone makes the share no smaller than this.
+#: The errors of vibrations at different times do not add up, so they alone make the share no smaller than this.
 RINGING = 0.3
-#: Growth of the step's share from one measurement to the next: from a half to the whole in 35 of them.
+#: Growth of the step's share from one measurement to the next: from a half to one in 35 measurements.
 RECOVERY = 1.02
 
 
 class EnergyControl:
-    """Chooses the share of the step that is taken of what the state allows.
+    """Chooses which share of the allowed step is taken.
 
     Args:
         guard: Finds energy from nowhere.
-        recorded: Whose measurements it makes fewer or more.
-        safe_step: The step; None if one was given, which stays.
+        recorded: The recorded steps, whose interval between measurements it sets.
+        safe_step: The step; None if the user gave one, which stays.
     """
 
     def __init__(self, guard: Guard, recorded: RecordedSteps, safe_step: SafeStep | None):
@@ -61,26 +61,26 @@ class EnergyControl:
         return self._intervals * self._recorded.interval
 
     def begin(self) -> None:
-        """Go on as the device has it, which a checkpoint may have brought."""
+        """Continue with the values on the device, which may come from a checkpoint."""
         if self._safe_step is not None:
             schedule = self._safe_step.schedule
             self._look(schedule if schedule.intervals else schedule._replace(calm=UNKNOWN, intervals=CLOSE_INTERVALS))
 
     def go_on(self, steps: int) -> None:
-        """Go on with unchecked steps after so many; nothing waits for them."""
+        """Continue unchecked after a number of steps, without waiting for the device."""
         if steps >= CLOSE_INTERVALS * FIRST_INTERVAL and self._recorded.calm == UNKNOWN:
             self._recorded.calm = 0
 
     def begin_anew(self) -> None:
-        """A user has written to the state: it may change fast."""
+        """Begin again after a user has written to the state, which may now change fast."""
         if self._safe_step is not None:
             self._choose(self._safe_step.schedule._replace(calm=UNKNOWN, intervals=CLOSE_INTERVALS))
 
     def follow(self, steps: int) -> None:
-        """Make the step shorter where energy came from nowhere, and longer again where none did.
+        """Make the step shorter if energy came from nowhere, and longer again if none did.
 
         Args:
-            steps: Done at the check that was made.
+            steps: Steps done at the check.
         """
         if self._safe_step is None:
             return
@@ -104,13 +104,13 @@ class EnergyControl:
             self._take_share(share)
 
     def halve(self, steps: int) -> None:
-        """Take half the share, after going back to where so many steps were done."""
+        """Take half the share, after going back to the state with this number of steps."""
         assert self._safe_step is not None
         self._safe_step.schedule = self._safe_step.schedule._replace(steps=steps)
         self._take_share(0.5 * self._safe_step.share)
 
     def choose_intervals(self, *, checked: bool) -> None:
-        """Look more often where a body is strained, less often where checks on elastic energies have found it calm."""
+        """Check more often if a body is strained, and less often if checks of elastic energies found it calm."""
         if self._safe_step is None:
             return
         guard = self._guard
@@ -136,12 +136,12 @@ class EnergyControl:
         self._look(schedule)
 
     def _look(self, schedule: Schedule) -> None:
-        """Measure and check as often as a schedule says."""
+        """Measure and check at the intervals of a schedule."""
         self._intervals = schedule.intervals
         self._recorded.calm = schedule.calm
 
     def _take_share(self, share: float) -> None:
-        """Take another share of the step that the state allows from here on."""
+        """Set the share of the allowed step from here on."""
         assert self._safe_step is not None
         self._safe_step.share = max(share, float(LEAST))
         self._safe_step.resume()

@@ -1,8 +1,7 @@
-"""Whether a state can be true, and the last one that could: finite, within reach, and without energy from nowhere.
+"""Checks of the state, which must be finite, within reach, and without energy from nowhere; and the last good state.
 
 Every run of steps begins with ``launch_begin`` and ends with ``launch_end``, both recorded with the steps. The last
-good state is the one at the end of the last run that ``check`` found nothing wrong with, or what a user has made of it
-since.
+good state is the one at the end of the last run that ``check`` accepted, with what a user has written to it since.
 """
 
 from __future__ import annotations
@@ -21,40 +20,40 @@ from warp_corot.solvers.system import NEVER, System
 from .balance import Balance, Energies, Floats
 from .copies import Copies
 
-#: Energy that may come from nowhere between two checks, and in all, as shares of the most that gravity, loads and
-#: supports ever moved or a user gave. A stable step errs by less than a tenth, and by up to a half while elements are
-#: crushed and turned over; one that is not stable by more and more, many times within tens of steps.
+#: Energy that may come from nowhere between two checks, and in all, as shares of the most energy that gravity, loads
+#: and supports ever moved or a user gave. The error of a stable step is less than a tenth, and up to a half while
+#: elements are crushed and inverted. The error of an unstable step multiplies within tens of steps.
 GAIN = 0.25
 DRIFT = 0.5
-#: By how much the kinetic energy may exceed the whole, since fast vibrations are not in time with their displacements;
-#: and from which excess on elastic energies are looked at.
+#: By how much the kinetic energy may exceed the total, because the velocities of fast vibrations are half a step late;
+#: and the excess above which elastic energies are checked.
 MOTION = 0.5
 LITTLE = 0.1
-#: So much of it is let pass where the step may be made shorter.
+#: The share that is tolerated if the step can be made shorter.
 STRICT = 0.02
-#: What fast vibrations may err by where the step may be made shorter: a shorter one would keep it.
+#: The tolerated error of fast vibrations if the step can be made shorter: a shorter step would keep the error.
 RINGING = 0.01
-#: After so long a time energy from nowhere counts for a third where the step is chosen [s]: what is left of it by then
-#: cannot be undone, and a step that is short for good would not make up for it.
+#: If the simulation chooses the step, energy from nowhere counts for a third after this time [s]: it cannot be undone
+#: by then, and a permanently short step would not make up for it.
 MEMORY = 10.0
-#: Time over which it is found whether there is more and more of it [s]: crushed elements take energy and give it back.
+#: Window of time over which its growth is found [s]: crushed elements take energy and give it back.
 WINDOW = 0.1
-#: So many times as much is let pass where rotations are shared, which have no energy.
+#: Factor on what is tolerated if rotations are shared: their forces have no energy.
 SHARED = 4.0
-#: Displacements beyond so many sizes of the body leave no digit of float32 for its strains.
+#: Beyond this many sizes of the body, displacements leave no digit of float32 for its strains.
 REACH = 1e6
 
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a state.
+    """A fault of a state.
 
     Attributes:
-        what: In words.
-        worlds: In which worlds.
+        what: The fault in words.
+        worlds: The worlds that have it.
         step: The first step after which it was seen, if that is known.
-        is_slight: Whether the state may still be true, roughly.
-        is_want_of_room: Whether nothing is wrong but that forces were left out for want of room.
+        is_slight: Whether the state may still be roughly right.
+        is_want_of_room: Whether the only fault is that forces were left out because an array was full.
     """
 
     what: str
@@ -68,7 +67,7 @@ class Guard:
     """Checks states against the last good one, which it keeps on the device.
 
     Args:
-        system: The simulation's.
+        system: The simulation's system.
     """
 
     def __init__(self, system: System):
@@ -80,18 +79,18 @@ class Guard:
         self._good: Known | None = None
         shared = any(getattr(field, "rotation_level", None) is not None for field in system.fields)
         self._leave = SHARED if shared else 1.0
-        #: Energy from nowhere between the last two checks on elastic energies, and lately, as shares of what was moved;
-        #: of the world that has most; and the same for what fast vibrations err by at any one time. Infinite while no
-        #: check has found them.
+        #: Energy from nowhere between the last two checks of elastic energies, and lately, as shares of the energy that
+        #: was moved, of the world with the most; and the same for the error of fast vibrations at any one time.
+        #: Infinite until a check has found them.
         self.gain = self.surplus = self.untimely = np.inf
-        #: What came lately has grown by so much within the last window of time; None while none has just ended.
+        #: Growth of the energy that came lately within the window of time that has just ended; None during a window.
         self.trend: float | None = None
         #: Whether a user had written to the state before the last run that was checked.
         self.was_given = False
         self.restart()
 
     def restart(self) -> None:
-        """Forget all: the next state is taken for good."""
+        """Forget everything: the next state counts as good."""
         self._reference = None
         self._scale, self._drift, self._lately, self._loads = (np.zeros(self.worlds) for _ in range(4))
         self._counted_at = self._window_at = self.system.pace.time
@@ -103,45 +102,45 @@ class Guard:
         self._floor: Floats | None = None
 
     def forget(self) -> None:
-        """The next state is taken for good: it does not follow from the last one."""
+        """Let the next state count as good, because it does not follow from the last one."""
         self._reference = None
 
     # --- on the device ---------------------------------------------------------------------------------------------
 
     @property
     def revision(self) -> int:
-        """Changes whenever launches that were recorded are valid no more."""
+        """Changes whenever recorded launches become invalid."""
         return self._copies.revision
 
     def prepare(self) -> None:
-        """Bring up to date what launches use; not while they are recorded."""
+        """Update what launches use; not while they are recorded."""
         self.system.prepare()
         self._copies.prepare()
         self._balance.prepare()
 
     def order(self, end: float | None = None, stop: int = 0) -> None:
-        """Say when the next run ends [s], if it has an end, and the steps done by then."""
+        """Set when the next run ends [s], if it has an end, and the steps done by then."""
         self.system.pace.order(end=end, stop=stop, slot=self._copies.slot)
 
     def launch_begin(self) -> None:
-        """Launch the beginning of a run: what a user has written since the last one is a new state."""
+        """Launch the beginning of a run: a state that a user has written since the last one is a new state."""
         self.system.pace.launch_orders(self._copies.changed)
         self._copies.launch_take_over()
 
     def launch_end(self, *, whole: bool) -> None:
-        """Launch the end of a run: the state is kept beside the last good one, and what ``check`` wants is reported."""
+        """Launch the end of a run: keep the state beside the last good one, and report what ``check`` reads."""
         self._copies.launch_keep()
         self._balance.launch(whole=whole, keeps=True)
 
     @property
     def has_begun(self) -> bool:
-        """Whether there is a good state to which others are compared."""
+        """Whether there is a good state with which others are compared."""
         return self._reference is not None
 
     # --- on the host -----------------------------------------------------------------------------------------------
 
     def begin(self) -> bool:
-        """Take the present state for good if no run has led to it; whether a user may have written to it."""
+        """Accept the present state as good if no run has led to it; returns whether a user may have written to it."""
         given = False
         if self._reference is None:
             self.prepare()
@@ -154,15 +153,15 @@ class Guard:
         return given
 
     def check(self, *, whole: bool, counts: bool = True, strict: bool = False, lenient: bool = False) -> Fault | None:
-        """Look at the state to which a run has led; a good one is kept. Waits for the device, once if all is well and
-        nobody has written to the state before the run.
+        """Check the state at the end of a run, and keep it if it is good. Waits for the device: once, if the state is
+        good and no user wrote to it before the run.
 
         Args:
-            strict: Whether less energy from nowhere is let pass than would be taken for an error.
-            lenient: Whether energy from nowhere since the beginning is let pass, since a shorter step will do.
-            whole: Whether elastic energies were found too. Without them the sum of the others must not exceed what
-                there was and came in: elastic energies are never negative.
-            counts: Whether energies are counted from this state on if they were found. Else it is only judged by them.
+            strict: Whether to tolerate less energy from nowhere than an error would need.
+            lenient: Whether to tolerate energy from nowhere since the beginning, because a shorter step will help.
+            whole: Whether elastic energies were found, too. Without them, the sum of the others must not exceed what
+                there was and what came in, because elastic energies are never negative.
+            counts: Whether energies are counted from this state on, if they were found. Otherwise they only judge it.
         """
         report = self._balance.wait()
         self.was_given = report.has_changed
@@ -174,7 +173,7 @@ class Guard:
         if fault is not None:
             return fault
         found = report.energies
-        # What is looked at besides, at the end of a short run, must not change where that run was made in one.
+        # An extra check at the end of a short run must not make its state differ from that of one long run.
         leave = self._leave * (STRICT if strict and whole else 1.0)
         fault = self._beyond_reach(found) or self._from_nowhere(found, whole, leave, lenient)
         if fault is not None and not whole:
@@ -186,7 +185,7 @@ class Guard:
         return fault
 
     def go_back(self) -> None:
-        """Put the last good state back."""
+        """Restore the last good state."""
         assert self._good is not None
         self._copies.put_back()
         self.system.pace.put_back(self._good)
@@ -196,25 +195,25 @@ class Guard:
         for each in self.system.constraints:
             each.forget()
         self.system.bad_step.fill_(NEVER)
-        # What came from nowhere before that state is not forgotten with what came after it.
+        # Energy from nowhere before that state still counts.
         self._count(self._find(whole=True), whole=True)
 
     def settle(self) -> None:
-        """Count from the present energies, whose kinetic one depends on the step, which is another now."""
+        """Count from the present energies: the kinetic energy depends on the step, which has changed."""
         self._copies.take()
         self._reference = self._find(whole=True)
 
     def not_finite(self) -> Fault | None:
-        """Whether the state is not finite: the least that there is to look at."""
+        """Whether the state is not finite: the cheapest check."""
         return self._not_finite(int(self.system.bad_step.numpy()[0]))
 
     def beyond_reach(self) -> Fault | None:
-        """Whether nodes are where they cannot be: what can be seen of a state that users may write to."""
+        """Whether nodes are beyond reach: the only check of a state that users may write to."""
         return self._beyond_reach(self._find(whole=False))
 
     @property
     def state(self) -> dict[str, Floats]:
-        """What a run that goes on needs besides the present state."""
+        """What a run needs besides the present state to continue."""
         counted = np.full((8, self.worlds), np.nan)
         before = self._reference
         if before is not None and not self._has_changed():
@@ -227,7 +226,7 @@ class Guard:
         return {"scale": self._scale, "drift": self._drift, "lately": lately, "counted": counted}
 
     def resume(self, *, scale: Floats, drift: Floats, lately: Floats, counted: Floats) -> None:
-        """Go on from what ``state`` gave."""
+        """Continue from what ``state`` gave."""
         self._scale, self._drift = np.array(scale, float), np.array(drift, float)
         self._lately, self._lately_before = np.array(lately[0], float), np.array(lately[1], float)
         self._counted_at, self._window_at = float(lately[2, 0]), float(lately[3, 0])
@@ -238,7 +237,7 @@ class Guard:
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _begin_from(self, found: Energies) -> None:
-        """Count from the energies of a state that was given."""
+        """Count from the energies of a given state."""
         if self._counted is not None:
             exact, gravitational, supports, self._loads_since, self._height, self._loads = self._counted[:6]
             untimely, self._absolute_base = self._counted[6], -self._counted[7]
@@ -246,17 +245,17 @@ class Guard:
         else:
             self._loads, self._height = np.zeros(self.worlds), found.gravitational
             self._loads_since = np.zeros(self.worlds)
-        # A world that begins wrong may be set right later.
+        # A user may correct a bad world later.
         known = np.where(np.isfinite(found.exact), np.abs(found.exact), 0.0)
         self._scale = np.maximum(self._scale, known)
         self._counted = None
         self._reference = found
 
     def _begin_before(self) -> None:
-        """Count from the state at the beginning of the run, which a user has written; waits for the device."""
+        """Count from the state at the beginning of the run, which a user wrote; waits for the device."""
         assert self._good is not None
         pace = self.system.pace
-        # A user's velocities belong to no step.
+        # A user's velocities belong to the time of the displacements.
         self._good = replace(self._good, seconds=(*self._good.seconds[:2], 0.0))
         now = pace.known
         copies = self._copies
@@ -292,7 +291,7 @@ class Guard:
     def _not_finite(self, step: int) -> Fault | None:
         if step == NEVER:
             return None
-        # Said once: who sets a good state again may go on.
+        # Reported once: after setting a good state again, a user may continue.
         self.system.bad_step.fill_(NEVER)
         bad = self._not_finite_worlds()
         # The user may have set a good state before the check.
@@ -313,14 +312,13 @@ class Guard:
         return Fault(f"nodes are {found.reach[bad].max():.3g} m from where they were at rest", bad)
 
     def _given(self, found: Energies) -> tuple[Floats, Floats, Floats]:
-        """The energy that there should be, the most that was ever moved, and the work of loads since what is counted
-        from [J]."""
+        """The expected energy, the most that was ever moved, and the work of loads since counting began [J]."""
         before = self._reference
         assert before is not None
         fallen = before.gravitational - found.gravitational
         loads = self._loads_since + found.loads
         given = before.exact + fallen + loads + found.supports - before.supports
-        # What has come from nowhere is no measure of what may.
+        # Energy from nowhere does not raise the tolerance.
         moved = np.abs(self._height - found.gravitational) + np.abs(self._loads + loads)
         return given, np.maximum(self._scale, moved + found.supports_absolute - self._absolute_base), loads
 
@@ -350,7 +348,7 @@ class Guard:
         return Fault(f"{gain[worst]:.3g} J of energy came from nowhere ({most})", worlds, is_slight=is_slight)
 
     def _count(self, found: Energies, *, whole: bool) -> None:
-        """Go on from a good state; if its whole energies count, from these."""
+        """Continue from a good state, and from its total energies if these count."""
         given, self._scale, self._loads_since = self._given(found)
         before = self._reference
         assert before is not None

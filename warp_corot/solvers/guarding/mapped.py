@@ -1,4 +1,4 @@
-"""Numbers that the host and the device share: memory of the host that kernels read and write."""
+"""Numbers that the host and the device share: host memory that kernels read and write."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import warp as wp
 
 
 class Mapped:
-    """Some float64 in one place for host and device.
+    """float64 numbers in memory that host and device share.
 
-    What a kernel has written is there for the host once the stream has come so far; few threads should use it.
+    The host sees what a kernel wrote once the stream has finished it. Few threads should use this memory.
 
     Args:
-        count: How many.
-        device: Which device.
+        count: How many numbers.
+        device: The device.
 
     Attributes:
         values: For the host, float64 [count].
@@ -26,5 +26,5 @@ class Mapped:
         self.values: npt.NDArray[np.float64] = self._memory.numpy()
         self.array = self._memory
         if device.is_cuda:
-            # The same memory: what is pinned has one address everywhere.
+            # The same memory: pinned memory has one address on host and device.
             self.array = wp.array(ptr=self._memory.ptr, shape=count, dtype=wp.float64, device=device)

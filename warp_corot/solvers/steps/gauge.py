@@ -1,4 +1,4 @@
-"""How large a step may be about the present state of a body; see ``kernels.stepping.gauge``."""
+"""A measurement of the stable step in the present state of a body; see ``kernels.stepping.gauge``."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
     from warp_corot.elasticity import ForceField
 
-#: Turns of the directions after which the largest curvature at rest is taken. It is found to 1 % by then, and one that
-#: is too small makes later steps shorter, not longer.
+#: Iterations to find the largest curvature at rest. They find it to 1 %; a value that is too small makes later steps
+#: shorter, not longer.
 REST_TURNS = 32
 
 
@@ -27,7 +27,7 @@ class Gauge:
     Args:
         body: The body.
         field: Its force field.
-        found: Where to, float32 [2], zero before: ``CURVATURE`` and ``STRAIN`` of ``kernels.stepping.pace``.
+        found: The result, float32 [2], zero before: ``CURVATURE`` and ``STRAIN`` of ``kernels.stepping.pace``.
     """
 
     def __init__(self, body: SoftBody, field: ForceField, found: wp.array):
@@ -38,25 +38,25 @@ class Gauge:
         self.directions = wp.zeros(places, dtype=wp.vec4, device=body.device)
         self._probed, self._forces = (wp.zeros(places, dtype=wp.vec4, device=body.device) for _ in range(2))
         self._rest_directions = self.directions
-        #: Of the probing motion, float32 [1].
+        #: The size of the probing motion, float32 [1].
         self.scale = wp.zeros(1, dtype=wp.float32, device=body.device)
         self.rescale()
         # Loading within a recording would end it on some drivers.
         wp.load_module(kernels.find_strains(body.discretization.element_kind).module, body.device)
 
     def rescale(self) -> None:
-        """Fit the probing motion to the present mesh: the lightest free node moves a share of the smallest element."""
+        """Scale the probing motion to the mesh: the lightest free node moves a share of the smallest element."""
         inverse = self.body.conditions.inverse_mass[: self.body.node_count].numpy()
         lightest = float(inverse.max())
         size = self.body.discretization.smallest_volume ** (1.0 / 3.0)
         self.scale.fill_(PROBE * size / np.sqrt(lightest) if lightest > 0 else 0.0)
 
     def restart(self) -> None:
-        """Go on from the directions that were found at rest."""
+        """Continue from the directions that were found at rest."""
         wp.copy(self.directions, self._rest_directions)
 
     def launch(self, pace: Pace, ahead: int) -> None:
-        """Measure about the present state, whose elastic forces are in ``body.state.forces``.
+        """Measure in the present state, whose elastic forces are in ``body.state.forces``.
 
         Args:
             pace: The length of the steps to come.

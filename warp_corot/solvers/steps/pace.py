@@ -19,7 +19,7 @@ class Known:
     """What the host knows of the clock.
 
     Attributes:
-        counts, seconds, control, work: As the arrays of ``Pace`` have them.
+        counts, seconds, control, work: The values of the arrays of ``Pace``.
     """
 
     counts: tuple[int, int]
@@ -31,18 +31,18 @@ class Known:
 class Pace:
     """Steps done, their length and the time now, kept on the device.
 
-    The host knows what the device last reported, and asks only where something has been launched since then.
+    The host knows the device's last report, and reads the device only if something was launched since then.
 
     Args:
         dt: Length of a step [s].
-        device: Where.
+        device: The device.
 
     Attributes:
-        arrays: What kernels take.
-        control: What sets the length of steps, if none was given; see ``kernels.stepping.pace``.
-        support_work: What moving supports have put in, and the sum of its absolute values [J], float64 [2].
-        orders: What the host asked of the present run, float64 [ORDERS].
-        is_shared: Whether others may launch steps that they have recorded, so that the host never knows.
+        arrays: The arguments of kernels.
+        control: Numbers that set the length of steps, if none was given; see ``kernels.stepping.pace``.
+        support_work: Work of moving supports, and the sum of its absolute values [J], float64 [2].
+        orders: The host's orders for the present run, float64 [ORDERS].
+        is_shared: Whether users may launch steps that they have recorded, without the host's knowledge.
     """
 
     def __init__(self, dt: float, device: wp.Device):
@@ -68,23 +68,23 @@ class Pace:
         return self._known
 
     def saw(self, numbers: npt.NDArray[np.float64]) -> None:
-        """Take what ``kernels.stepping.balance.report`` has written."""
+        """Take over the report of ``kernels.stepping.balance.report``."""
         steps, then, dt, time, before, work, absolute = numbers[: int(balance.WORK_ABSOLUTE) + 1].tolist()
         control = numbers[int(balance.CONTROL) :].copy()
         self._known = Known((int(steps), int(then)), (dt, time, before), control, (work, absolute))
 
     def take_given(self) -> None:
-        """Let velocities belong to steps of any length: a user gave them."""
+        """Note that a user gave the velocities, so that they belong to the time of the displacements."""
         known = self.known
         self.arrays.seconds[int(kernels.BEFORE) : int(kernels.BEFORE) + 1].fill_(0.0)
         self._known = replace(known, seconds=(*known.seconds[:2], 0.0))
 
     def forget(self) -> None:
-        """Something has been launched that changes the clock, and reports nothing."""
+        """Note a launch that changes the clock without a report."""
         self._known = None
 
     def put_back(self, known: Known) -> None:
-        """Let the clock be what it was."""
+        """Restore an earlier clock."""
         self.arrays.counts.assign(np.array(known.counts, np.int64))
         self.arrays.seconds.assign(np.array(known.seconds))
         self.control.assign(known.control)
@@ -92,29 +92,29 @@ class Pace:
         self._known = known
 
     def write_control(self, control: npt.NDArray[np.float64]) -> None:
-        """Let ``control`` be this."""
+        """Write ``control``."""
         self.control.assign(control)
         self._known = replace(self.known, control=np.array(control))
 
     def note_control(self, places: Sequence[int], values: Sequence[float]) -> None:
-        """Something has been launched that writes these numbers to ``control``."""
+        """Note a launch that writes these numbers to ``control``."""
         if self._known is not None:
             control = self._known.control.copy()
             control[list(places)] = values
             self._known = replace(self._known, control=control)
 
     def order(self, *, end: float | None, stop: int, slot: int) -> None:
-        """Say what is asked of the next run, which begins with ``launch_orders``; no other may be under way.
+        """Write the orders for the next run, which begins with ``launch_orders``; no other run may be under way.
 
         Args:
             end: When it ends [s], if it has an end.
             stop: The steps done by then.
-            slot: Which copy of the state is the last good one.
+            slot: The copy of the state that is the last good one.
         """
         self._given.values[:] = kernels.NEVER if end is None else end, stop, slot
 
     def launch_orders(self, changed: wp.array) -> None:
-        """Launch that the device takes its orders."""
+        """Launch the copy of the orders to the device."""
         wp.launch(kernels.take_orders, dim=1, inputs=[self._given.array, self.orders, changed], device=self.device)
 
     @property
@@ -133,7 +133,7 @@ class Pace:
         return self.time_at(self.steps)
 
     def time_at(self, steps: int) -> float:
-        """The time after so many steps in all, if no step after the last change of their length is left out [s]."""
+        """The time after a total number of steps, if their length has not changed since the last report [s]."""
         dt, then, _ = self.known.seconds
         return then + (steps - self.known.counts[1]) * dt
 
@@ -150,10 +150,10 @@ class Pace:
             self._known = replace(self._known, work=(0.0, 0.0))
 
     def advance(self, steps: int) -> None:
-        """Launch that so many steps have been made."""
+        """Launch the advance of the clock by a number of steps."""
         wp.launch(kernels.advance_clock, dim=1, inputs=[steps, self.arrays], device=self.device)
 
     @property
     def state(self) -> dict[str, wp.array]:
-        """Arrays from which it goes on."""
+        """Arrays from which the clock continues."""
         return {"counts": self.arrays.counts, "seconds": self.arrays.seconds}

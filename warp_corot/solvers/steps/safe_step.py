@@ -1,4 +1,4 @@
-"""A step that stays stable by itself: it follows what gauges find of the bodies, on the device."""
+"""A step that stays stable: it follows the gauges' measurements of the bodies, on the device."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ if TYPE_CHECKING:
     from warp_corot.elasticity import Model
     from warp_corot.solvers.system import System
 
-#: Steps from one measurement to the next, and the same where many steps are one launch, which is cut short by it; of
-#: bodies that change fast; and while nothing is known of how they move. A measurement takes about as long as a step.
+#: Steps between two measurements: usually; if one launch makes many steps, which a measurement interrupts; for bodies
+#: that change fast; and while nothing is known of their motion. A measurement takes about as long as a step.
 INTERVAL, BLOCK_INTERVAL = 32, 128
 LIVELY_INTERVAL, LIVELY_BLOCK_INTERVAL = 8, 32
 FIRST_INTERVAL = 8
 _SCHEDULE = [int(place) for place in (kernels.CALM, kernels.CLOSENESS, kernels.FOLLOWED, kernels.CHECKED)]
-#: The step where nothing can vibrate [s].
+#: The step if nothing can vibrate [s].
 ANY_STEP = 1e-3
 
 
-#: What a check may find in place of calm bodies: some that change fast; and what there is before the first one.
+#: In place of a number of calm checks: some bodies change fast; there was no check yet.
 LIVELY, UNKNOWN = -1, -2
-#: So many checks in a row make bodies calm, so that a measurement is needed half as often.
+#: After this many calm checks in a row, measurements are half as frequent.
 CALM_CHECKS = 2
 
 
 class Schedule(NamedTuple):
-    """When energies are checked, and what the last check has found.
+    """When energies are checked, and the result of the last check.
 
     Attributes:
         calm: How many checks in a row found the bodies calm, or LIVELY or UNKNOWN.
-        intervals: Measurements from one check to the next; zero if none was chosen.
-        steps: Steps done at the last one.
+        intervals: Measurements between two checks; zero if not chosen yet.
+        steps: Steps done at the last check.
         allowed: The step that the state allowed then [s].
     """
 
@@ -50,12 +50,12 @@ class Schedule(NamedTuple):
 
 
 class SafeStep:
-    """The step of a simulation that was given none.
+    """The step of a simulation whose user gave none.
 
     Args:
-        system: The simulation's, whose step it sets.
-        models: Of its bodies.
-        stable: The largest stable step of each body at rest [s], infinite where nothing can vibrate.
+        system: The simulation's system, whose step it sets.
+        models: The models of its bodies.
+        stable: The largest stable step of each body at rest [s]; infinite if it cannot vibrate.
     """
 
     def __init__(
@@ -76,29 +76,29 @@ class SafeStep:
 
     @property
     def allowed(self) -> float:
-        """The step that is taken while no end of a run shortens it [s]."""
+        """The step, except where the end of a run shortens it [s]."""
         control = self.pace.known.control
         return float(control[kernels.SHARE] * control[kernels.ALLOWED])
 
     @property
     def at_rest(self) -> float:
-        """The longest step there is, that of the bodies at rest [s]."""
+        """The longest step: that of the bodies at rest [s]."""
         return float(self.pace.known.control[kernels.AT_REST])
 
     @property
     def range(self) -> tuple[float, float]:
-        """The shortest and the longest of the steps that were allowed so far [s]."""
+        """The shortest and the longest allowed step so far [s]."""
         control = self.pace.known.control
         return float(control[kernels.SHORTEST]), float(control[kernels.LONGEST])
 
     @property
     def is_shortened(self) -> bool:
-        """Whether the step is another than what the state allows, as at the end of a run in time."""
+        """Whether the step differs from the allowed one, as at the end of a run."""
         control = self.pace.known.control
         return self.pace.dt != max(self.allowed, float(kernels.LEAST) * control[kernels.AT_REST])
 
     def find_rest(self, stable: Sequence[float]) -> None:
-        """Take the largest stable steps of the bodies at rest [s] for what measurements are compared with."""
+        """Set the stable steps of the bodies at rest [s], with which measurements are compared."""
         rows = []
         for gauge, model, step in zip(self.gauges, self._models, stable, strict=True):
             gauge.rescale()
@@ -132,7 +132,7 @@ class SafeStep:
         self.pace.take_given()
 
     def launch(self, ahead: int) -> None:
-        """Measure, and take a step that is safe for ``ahead`` steps; may be recorded.
+        """Measure, and set a step that is safe for ``ahead`` steps; may be recorded.
 
         The elastic forces of the present displacements are in ``node_forces`` of each body.
         """
@@ -144,7 +144,7 @@ class SafeStep:
         wp.launch(kernels.take_safe_step, dim=1, inputs=inputs, device=self.device)
 
     def resume(self) -> None:
-        """Take the step that the state allows, after one that ended a run in time."""
+        """Take the allowed step again, after shorter ones at the end of a run."""
         self.launch_resumption()
         self.pace.forget()
 
@@ -153,13 +153,13 @@ class SafeStep:
         wp.launch(kernels.resume_step, dim=1, inputs=[self._control, self.pace.arrays], device=self.device)
 
     def launch_fit(self) -> None:
-        """Launch that the steps that are left end in time, as ``pace.order`` has said; may be recorded."""
+        """Launch the fit of the remaining steps to the end that ``pace.order`` has set; may be recorded."""
         inputs = [self.pace.orders, self._control, self.pace.arrays]
         wp.launch(kernels.fit_step, dim=1, inputs=inputs, device=self.device)
 
     @property
     def share(self) -> float:
-        """The share of what the state allows that is taken after going back."""
+        """The share of the allowed step that is taken after going back."""
         return float(self.pace.known.control[kernels.SHARE])
 
     @share.setter
@@ -171,7 +171,7 @@ class SafeStep:
 
     @property
     def shares(self) -> tuple[float, float, float]:
-        """``share``, the step that the state allows and that at rest [s]."""
+        """``share``, the allowed step and the step at rest [s]."""
         control = self.pace.known.control
         return float(control[kernels.SHARE]), float(control[kernels.ALLOWED]), float(control[kernels.AT_REST])
 
@@ -189,7 +189,7 @@ class SafeStep:
 
     @property
     def state(self) -> dict[str, wp.array]:
-        """Arrays from which it goes on."""
+        """Arrays from which the control of the step continues."""
         gauges = {
             f"{name}{k}": array
             for k, gauge in enumerate(self.gauges)

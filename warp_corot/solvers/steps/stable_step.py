@@ -1,4 +1,4 @@
-"""How large an explicit step may be: the largest frequency of the body about its rest shape."""
+"""The largest stable explicit step, from the largest frequency of the body about its rest shape."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
 
 LANCZOS_STEPS = 30
-#: Of how many steps the best one is taken.
+#: The best of the last steps is taken, of this many.
 LAST_STEPS = 8
 
 # Probing displacements as a share of the smallest element's size: small enough to be linear, large enough for float32.
@@ -42,15 +42,15 @@ def largest_eigenvalue(
 ) -> float:
     """The largest eigenvalue of M^-1 K [1/s^2], where K gives the forces of small displacements from rest.
 
-    Lanczos' iteration on M^-1/2 K M^-1/2, where K is applied as the forces themselves do it, so that whatever model and
-    elements there are is what is measured. The Ritz value's residual is added to it. Zero if no node is free to move.
+    Lanczos' iteration on M^-1/2 K M^-1/2. The forces themselves apply K, so that the actual model and elements are
+    measured. The Ritz value's residual is added to the result. Zero if no node is free to move.
 
     Args:
         forces: The forces.
-        inverse_mass: Of the nodes [1/kg], float32, zero for those that are held; nodal arrays are as long.
-        smallest_volume: Of an element [m^3], which says what is small.
+        inverse_mass: Inverse masses of the nodes [1/kg], float32, zero for held ones; nodal arrays are equally long.
+        smallest_volume: The volume of the smallest element [m^3], which sets the size of small displacements.
         nodes: How many nodes there are.
-        launch_nodes: How many launches go through; None: as many.
+        launch_nodes: How many nodes launches go through; None: ``nodes``.
     """
     free = int((inverse_mass[:nodes].numpy() > 0).sum())
     if not free:
@@ -64,8 +64,8 @@ def largest_eigenvalue(
 
 
 def _largest_value(diagonal: npt.NDArray[np.float64], off: npt.NDArray[np.float64]) -> float:
-    """The largest Ritz value with its residual, of the last step or of one shortly before where that is less: rounding
-    brings copies of values that are found already, and with them residuals that mean nothing."""
+    """The largest Ritz value plus its residual, the smallest of the last few steps: rounding produces copies of values
+    that were already found, with meaningless residuals."""
     bounds = []
     for size in range(max(len(diagonal) - LAST_STEPS, 0) + 1, len(diagonal) + 1):
         tridiagonal = np.diag(diagonal[:size]) + np.diag(off[1:size], 1) + np.diag(off[1:size], -1)
@@ -75,7 +75,7 @@ def _largest_value(diagonal: npt.NDArray[np.float64], off: npt.NDArray[np.float6
 
 
 class _Lanczos:
-    """The iteration's vectors on the device, vec4, as long as launches: the present one, the one before, the next."""
+    """The iteration's vectors on the device, vec4, as long as launches: the present, the previous and the next one."""
 
     def __init__(self, forces: SmallForces, inverse_mass: wp.array, probe: float, count: int):
         self.forces, self.inverse_mass, self.probe, self.count = forces, inverse_mass, probe, count
@@ -94,12 +94,12 @@ class _Lanczos:
         self._normalise(self.q, 0)
 
     def find_rest_forces(self) -> None:
-        """What forces there are without displacements, by active stress: of those with any, only the rest counts."""
+        """Find the forces at rest, which active stress makes; they are subtracted from those of displacements."""
         self.forces.add_forces(self.u, self._rest)
         self._launch(lanczos.scale_by, [-1.0, self._rest])
 
     def launch(self, step: int) -> None:
-        """Launch a step; each is one after the last."""
+        """Launch the next step of the iteration."""
         inverse_mass = self.inverse_mass
         self._launch(lanczos.largest_motions, [inverse_mass, self.q, self._parts], len(self._parts))
         self._launch(lanczos.fold, [self._parts, self._sums, self._largest], lanczos.FOLDED)
@@ -116,7 +116,7 @@ class _Lanczos:
         self._steps = step + 1
 
     def coefficients(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Diagonal and off-diagonal entries [1/s^2], of these one more at either end; of steps that mean something.
+        """Diagonal and off-diagonal entries of the meaningful steps [1/s^2], with one more off-diagonal at either end.
 
         Waits for the device.
         """
@@ -126,7 +126,7 @@ class _Lanczos:
         return diagonal[:size], off[: size + 1]
 
     def _normalise(self, a: wp.array, place: int) -> None:
-        """Divide a vector by its length, which goes into its place among off-diagonal entries."""
+        """Divide a vector by its length, which becomes an off-diagonal entry."""
         self._sum(a, a, self._off, place, root=True)
         self._launch(lanczos.divide_by, [self._off, place, a])
 
