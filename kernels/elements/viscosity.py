@@ -19,10 +19,9 @@ from .elements import frame, local_gradient, scatter_stress
 
 wp.set_module_options({"enable_backward": False})
 
-#: Below this determinant of tr(U) I - U, which is 8 at rest, the turning of a crushed element is hardly determined, and
-#: of one that is turned inside out neither: from stretches a > 0 > b it follows as Udot does, (a - b) / (a + b) times as
-#: fast as the nodes go, which no explicit step bears. The symmetric part of A is taken for Udot there, which still
-#: takes power out.
+#: Below this determinant of tr(U) I - U, which is 8 at rest, the turning of a crushed or inverted element is hardly
+#: determined. With stretches a > 0 > b it is (a - b) / (a + b) times Udot and so faster than the nodes, which no
+#: explicit step survives. Below, the symmetric part of A stands for Udot, which still takes power out.
 LEAST = wp.constant(0.05)
 
 
