@@ -8,6 +8,7 @@ from warp_corot.contact.sampled import SignedDistance, TriangleMesh
 from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Sphere
 from warp_corot.contact.tool import Tool
 from warp_corot.elasticity.polar import polar_rotation
+from warp_corot.gradients.static import StaticGradient, static_gradient
 from warp_corot.io.write.animate import record
 from warp_corot.materials.anisotropic import Orthotropic, TransverselyIsotropic
 from warp_corot.materials.isotropic import Isotropic
@@ -21,7 +22,7 @@ from warp_corot.viewing.view import view
 from . import haptics, remesh
 from .domain import Domain
 from .elasticity import Corotated, EdgeStVK, Linear, MassSpring, NeoHookean, Ogden, StVenantKirchhoff
-from .errors import CapacityWarning, InputError, StabilityWarning, StaleViewError, UnstableError
+from .errors import CapacityWarning, ConvergenceError, InputError, StabilityWarning, StaleViewError, UnstableError
 from .mesh import SurfaceMesh, TetForest, TetMesh
 from .solvers import BDF2, BackwardEuler, GeneralizedAlpha, Newmark, QuasiStatic, SymplecticEuler
 
@@ -33,6 +34,7 @@ __all__ = [
     "CapacityWarning",
     "Capsule",
     "Contact",
+    "ConvergenceError",
     "Corotated",
     "Cylinder",
     "Domain",
@@ -58,6 +60,7 @@ __all__ = [
     "StVenantKirchhoff",
     "StabilityWarning",
     "StaleViewError",
+    "StaticGradient",
     "StaticReport",
     "SurfaceMesh",
     "SymplecticEuler",
@@ -74,5 +77,6 @@ __all__ = [
     "remesh",
     "show_progress",
     "solve_static",
+    "static_gradient",
     "view",
 ]

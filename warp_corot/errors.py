@@ -16,6 +16,10 @@ class UnstableError(RuntimeError):
     """The state is no longer finite: the message names the step at which this was found."""
 
 
+class ConvergenceError(RuntimeError):
+    """A solve whose answer is needed did not converge: the message says which."""
+
+
 class StabilityWarning(UserWarning):
     """The time step is larger than the explicit integrator's stability limit."""
 

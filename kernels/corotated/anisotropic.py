@@ -16,7 +16,7 @@ from typing import Any
 import warp as wp
 
 from warp_corot.kernels.elements.constitutive import corotated_strain, hooke, stretch_strain
-from warp_corot.kernels.elements.elements import frame, local_gradient
+from warp_corot.kernels.elements.elements import frame, local_gradient, rest_volume
 from warp_corot.kernels.math.rotation import cofactor, column, identity3, largest_entry
 
 wp.set_module_options({"enable_backward": False})
@@ -227,3 +227,26 @@ def fibre_cauchy(rotation: wp.Function) -> wp.Function:
         return stress
 
     return fibre_cauchy
+
+
+@functools.cache
+def add_active_energies(Elements: type) -> wp.Kernel:
+    """Add what each element's active stress s would have for an energy if s stayed: V s (|F d|^2 - 1) / 2."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add_active_energies(
+        # In
+        elements: Elements,
+        material: FibreMaterial,
+        u: wp.array[wp.vec4],
+        # In and out
+        energies: wp.array[wp.float64],
+    ):
+        t = wp.tid()
+        m = axes_of(material.passive, t)
+        g, _turn = material_gradient(elements, t, m, u)
+        d = column(g, 0)
+        density = filled(material.passive, t) * material.activation[t] * wp.dot(column(m, 0) + 0.5 * d, d)
+        energies[t] = energies[t] + wp.float64(density) * wp.float64(rest_volume(elements, t))
+
+    return add_active_energies

@@ -50,6 +50,19 @@ def law_at(of: Dilatation) -> wp.Function:
     return law_at
 
 
+@functools.cache
+def weight_law_at(of: Dilatation) -> wp.Function:
+    """The same for derivatives with respect to elements' weights, with w'' theta times the change in the place of w."""
+    slope_of, curvature_of = of.slope, of.curvature
+
+    @wp.func
+    def weight_law_at(theta: float, change: float):
+        curvature = curvature_of(theta) * change
+        return wp.vec4(curvature * theta, slope_of(theta), curvature, 0.0)
+
+    return weight_law_at
+
+
 # --- the first pass ---------------------------------------------------------------------------------------------------
 
 
@@ -94,9 +107,8 @@ def range_of(starts: wp.array[wp.int32], members: wp.array[wp.int32], g: int):
 
 
 @functools.cache
-def share_in_groups(Elements: type, of: Dilatation) -> wp.Kernel:
+def share_in_groups(Elements: type, law: wp.Function) -> wp.Kernel:
     """A thread a group; see ``range_of`` for what a group is."""
-    law = law_at(of)
 
     @wp.kernel(module="unique", enable_backward=False)
     def share_in_groups(
@@ -162,9 +174,8 @@ def add_to_nodes(Elements: type) -> wp.Kernel:
 
 
 @functools.cache
-def law_at_nodes(of: Dilatation) -> wp.Kernel:
+def law_at_nodes(law: wp.Function) -> wp.Kernel:
     """What the law makes of the sums at nodes, in their place; a thread a node."""
-    law = law_at(of)
 
     @wp.kernel(module="unique", enable_backward=False)
     def law_at_nodes(

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from warp_corot.discretization.discretization import discretization_of
 from warp_corot.errors import InputError
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, stvk_cauchy
-from warp_corot.kernels.elements.forces import element_von_mises, law_value
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, stvk_cauchy, stvk_stress
+from warp_corot.kernels.elements.forces import element_von_mises, law_stress, law_value
 from warp_corot.kernels.elements.spring_stiffness import edge_stvk_differential
 from warp_corot.kernels.elements.springs import edge_stvk_energies, scatter_edge_stvk
 
@@ -46,5 +46,6 @@ class EdgeStVK(Model):
             energies=edge_stvk_energies(kind, biquadratic),
             von_mises=element_von_mises(kind, IsotropicMaterial, law_value(stvk_cauchy)),
             differential=edge_stvk_differential(biquadratic),
+            stress=law_stress(stvk_stress) if biquadratic else None,
             deterministic=deterministic,
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, ClassVar, Protocol
 
@@ -26,6 +26,7 @@ from warp_corot.kernels.elements.forces import (
 from warp_corot.kernels.elements.stiffness_products import law_differential
 
 from .stiffness import ElementStiffness
+from .stress_law import StressLaw
 from .structs import Kept, isotropic_material
 from .tangent import Tangent
 
@@ -161,9 +162,19 @@ class ForceField(ABC):
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         """Write the strain energies [J] that make up the whole, world after world; float64."""
 
+    def write_potentials(self, u: wp.array, energies: wp.array) -> None:
+        """Write the energies [J] whose derivative forces are, as ``write_energies``: these, and of active stress that
+        which it has while it stays as it is."""
+        self.write_energies(u, energies)
+
     @abstractmethod
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
         """Write the von Mises stress of each element [Pa], float32 [T]."""
+
+    @property
+    def stress_law(self) -> StressLaw | None:
+        """The law's stress in each element, for derivatives; None where forces are not made of any."""
+        return None
 
     @property
     def element_count(self) -> int:
@@ -206,9 +217,16 @@ class ForceField(ABC):
 
     def elastic_energies(self, u: wp.array) -> npt.NDArray[np.float64]:
         """Strain energy of the body in each world [J], float64 [worlds]."""
+        return self._sums(self.write_energies, u)
+
+    def potentials(self, u: wp.array) -> npt.NDArray[np.float64]:
+        """The energy of ``write_potentials`` in each world [J], float64 [worlds]."""
+        return self._sums(self.write_potentials, u)
+
+    def _sums(self, write: Callable[[wp.array, wp.array], None], u: wp.array) -> npt.NDArray[np.float64]:
         energies = wp.zeros(self.energy_count, dtype=wp.float64, device=self.device)
         with self.state_kept():
-            self.write_energies(u, energies)
+            write(u, energies)
         return energies.numpy().reshape(self.discretization.worlds, -1).sum(axis=1)
 
     def von_mises(self, u: wp.array) -> npt.NDArray[np.float32]:
@@ -281,6 +299,7 @@ class ElementField(ForceField):
         body, deterministic: As for every field.
         forces, energies, von_mises: The kernels.
         differential: The stress's, a device function of ``kernels.elements.stiffness_products``.
+        stress: The stress, one of ``kernels.elements.forces``, if the law has one.
     """
 
     def __init__(
@@ -291,6 +310,7 @@ class ElementField(ForceField):
         energies: wp.Kernel,
         von_mises: wp.Kernel,
         differential: wp.Function,
+        stress: wp.Function | None = None,
         deterministic: bool = False,
     ):
         super().__init__(body, deterministic)
@@ -298,6 +318,11 @@ class ElementField(ForceField):
         self._stiffness = ElementStiffness(self.discretization, differential)
         self._energies = energies
         self._von_mises = von_mises
+        self._stress_function = stress
+
+    @property
+    def stress_law(self) -> StressLaw | None:
+        return self._stress_function and StressLaw(self._stress_function, self._stiffness.differential, self.isotropic)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         self.launch(self._forces, self.element_count, [self.elements, self.isotropic, u], [f])
@@ -341,4 +366,5 @@ class LawField(ElementField):
             energies=element_energies(kind, IsotropicMaterial, law_value(energy)),
             von_mises=element_von_mises(kind, IsotropicMaterial, law_value(cauchy)),
             differential=law_differential(differential),
+            stress=law_stress(stress),
         )

@@ -10,10 +10,12 @@ from warp_corot.discretization.elements import E, copied
 from warp_corot.elasticity.model import ForceField
 from warp_corot.elasticity.paths.lanes import Lanes, as_general
 from warp_corot.elasticity.stiffness import ElementStiffness
+from warp_corot.elasticity.stress_law import StressLaw
 from warp_corot.elasticity.structs import Kept
 from warp_corot.kernels.corotated.anisotropic import (
     FibreMaterial,
     OrthotropicMaterial,
+    add_active_energies,
     fibre_cauchy,
     fibre_density,
     fibre_stress,
@@ -52,6 +54,7 @@ class AnisotropicField(ForceField):
     def __init__(self, discretization: Discretization, rotation: wp.Function, deterministic: bool):
         super().__init__(discretization, deterministic)
         kind = discretization.element_kind
+        self._rotation = rotation
         self._forces = scatter_forces(kind, FibreMaterial, fibre_stress(rotation))
         self._energies = element_energies(kind, FibreMaterial, fibre_density(rotation))
         self._von_mises = element_von_mises(kind, FibreMaterial, fibre_cauchy(rotation))
@@ -68,8 +71,19 @@ class AnisotropicField(ForceField):
     def add_diagonal(self, u: wp.array, blocks: wp.array) -> None:
         self._stiffness.add_diagonal(self.elements, self.fibres, u, blocks)
 
+    @property
+    def stress_law(self) -> StressLaw | None:
+        differential = anisotropic_differential(self._rotation)
+        return StressLaw(fibre_stress(self._rotation), differential, self.fibres, FibreMaterial)
+
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         self.launch(self._energies, self.element_count, [self.elements, self.fibres, u], [energies])
+
+    def write_potentials(self, u: wp.array, energies: wp.array) -> None:
+        self.write_energies(u, energies)
+        if self.discretization.has_activation:
+            kernel = add_active_energies(self.discretization.element_kind)
+            self.launch(kernel, self.element_count, [self.elements, self.fibres, u], [energies])
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
         self.launch(self._von_mises, self.element_count, [self.elements, self.fibres, u], [stress])

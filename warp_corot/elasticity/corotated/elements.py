@@ -13,6 +13,7 @@ from warp_corot.discretization.plan import Plan, Units
 from warp_corot.elasticity.model import ForceField
 from warp_corot.elasticity.paths.lanes import Lanes
 from warp_corot.elasticity.stiffness import ElementStiffness
+from warp_corot.elasticity.stress_law import StressLaw
 from warp_corot.elasticity.structs import Kept
 from warp_corot.elasticity.tangent import Tangent
 from warp_corot.errors import InputError
@@ -219,6 +220,14 @@ class CorotatedField(ForceField):
         if self.model.rotation_level is None and not is_warm:
             return ElementStiffness(self.discretization, own_differential(self.model.own_rotation)), isotropic
         return self.stiffness_with(self.used_rotations(u))
+
+    @property
+    def stress_law(self) -> StressLaw | None:
+        """As for every field; none with shared rotations."""
+        if self.model.rotation_level is not None:
+            return None
+        rotation = byers_xu if self.model.rotation == "warm" else self.model.own_rotation
+        return StressLaw(own_stress(rotation), exact_differential(rotation), self.isotropic)
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         self.extract_rotations(u)

@@ -37,6 +37,7 @@ class DilatationField(ForceField):
 
     Attributes:
         shear: The law's field without lambda's part.
+        of: What is shared.
     """
 
     shares_dilatation = True
@@ -50,7 +51,7 @@ class DilatationField(ForceField):
     ):
         self.shear = bind(ShearOnly(discretization))
         super().__init__(discretization, deterministic)
-        self._of = of
+        self.of = of
         self._all, self._still = (wp.empty(0, dtype=kind, device=self.device) for kind in (wp.int32, wp.vec4))
         self._others = Others(discretization, self.plan, of)
         #: Whether the law's own launches add the forces of subtrees and of groups.
@@ -68,7 +69,7 @@ class DilatationField(ForceField):
     def join_launches(self) -> None:
         """Let the law's own launches add all forces if they can."""
         if self.plan is self.shear.plan:
-            dilating = Dilating(self._of, lambda: self.discretization.lam, self._others.grouped)
+            dilating = Dilating(self.of, lambda: self.discretization.lam, self._others.grouped)
             self._joined = self.shear.share_dilatation(dilating)
         self._others.are_joined = self._joined and self._others.grouped is not None
         self._others.follow()
@@ -125,8 +126,8 @@ class DilatationField(ForceField):
 
     def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
         if self.device.is_cuda:
-            return subtrees.scatter_dilatation(shape, grouped, self.discretization.material_stride == 0, self._of)
-        return subtrees.scatter_in_lanes(shape, self._of)
+            return subtrees.scatter_dilatation(shape, grouped, self.discretization.material_stride == 0, self.of)
+        return subtrees.scatter_in_lanes(shape, self.of)
 
     @property
     def _block(self) -> int:
@@ -148,7 +149,7 @@ class DilatationField(ForceField):
     def add_shared_product(self, u: wp.array, p: wp.array, y: wp.array, exact: bool | None = None) -> None:
         """The part of ``add_stiffness`` that comes from the shared dilatation."""
         inputs = [self.elements, self.isotropic, u, p, self._share(u, p), self._turning(exact)]
-        self.launch(kernels.add_product(self._kind, self._of), self.element_count, inputs, [y])
+        self.launch(kernels.add_product(self._kind, self.of), self.element_count, inputs, [y])
 
     def add_diagonal(self, u: wp.array, blocks: wp.array, *, exact: bool | None = None) -> None:
         """Add the 3x3 blocks on the diagonal of the same K(u) to those of the nodes [N/m]; see ``add_stiffness``.
@@ -161,7 +162,7 @@ class DilatationField(ForceField):
     def add_shared_diagonal(self, u: wp.array, blocks: wp.array, exact: bool | None = None) -> None:
         """The part of ``add_diagonal`` that comes from the shared dilatation."""
         turning, shared = self._turning(exact), self._share(u, self._still)
-        kernel = shared_diagonal.add_diagonal_of_groups(self._kind, self._of)
+        kernel = shared_diagonal.add_diagonal_of_groups(self._kind, self.of)
         for starts, members, live, count in self._groups():
             inputs = [starts, members, live, self.elements, self.isotropic, u, shared, turning]
             self.launch(kernel, count, inputs, [blocks])
@@ -182,7 +183,7 @@ class DilatationField(ForceField):
     @property
     def _has_rotations(self) -> bool:
         """Whether the law's K is not the exact derivative unless that is asked for."""
-        return self._of is VOLUME
+        return self.of is VOLUME
 
     @property
     def stiffest(self) -> SmallForces:
@@ -191,16 +192,16 @@ class DilatationField(ForceField):
     def unshare(self, u: wp.array, f: wp.array) -> None:
         """Add to forces f of displacements u what makes each element's dilatation its own."""
         shared = self._share(u, self._still)
-        self.launch(kernels.unshare(self._kind, self._of), self.element_count, [self.elements, u], [shared])
+        self.launch(kernels.unshare(self._kind, self.of), self.element_count, [self.elements, u], [shared])
         inputs = [self.elements, self._all, self._all, self.isotropic, u, shared]
-        self.launch(kernels.scatter_pressures(self._kind, self._of), self.element_count, inputs, [f])
+        self.launch(kernels.scatter_pressures(self._kind, self.of), self.element_count, inputs, [f])
 
     # --- energies and stresses ---------------------------------------------------------------------------------------
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         self.shear.write_energies(u, energies)
         inputs = [self.elements, self.isotropic, u, self._share(u, self._still)]
-        self.launch(kernels.add_energies(self._kind, self._of), self.element_count, inputs, [energies])
+        self.launch(kernels.add_energies(self._kind, self.of), self.element_count, inputs, [energies])
 
     @property
     def energy_count(self) -> int:
@@ -228,15 +229,20 @@ class DilatationField(ForceField):
         of_subtrees = [(b.subtrees.first, self._all, b.live or self._all, b.count) for b in self.plan.batches]
         return of_subtrees + self._others.groups
 
-    def _share(self, u: wp.array, p: wp.array) -> wp.array:
+    def share_weights(self, u: wp.array, p: wp.array) -> wp.array:
+        """What derivatives with respect to elements' weights need of the shared dilatation, vec4 [T]; see
+        ``kernels.elements.shared_dilatation.weight_law_at``."""
+        return self._share(u, p, kernels.weight_law_at(self.of))
+
+    def _share(self, u: wp.array, p: wp.array, law: wp.Function | None = None) -> wp.array:
         """The second pass of ``kernels.elements.shared_dilatation``, of all elements."""
-        shared = self._shared
-        measure = kernels.measure_elements(self._kind, self._of)
+        shared, law = self._shared, law or kernels.law_at(self.of)
+        measure = kernels.measure_elements(self._kind, self.of)
         self.launch(measure, self.element_count, [self.elements, self._all, self._all, u, p], [shared])
-        kernel = kernels.share_in_groups(self._kind, self._of)
+        kernel = kernels.share_in_groups(self._kind, law)
         for starts, members, live, count in self._groups():
             self.launch(kernel, count, [starts, members, live, self.elements, self.isotropic], [shared])
-        self._others.share_at_nodes(self.isotropic, len(u), shared)
+        self._others.share_at_nodes(self.isotropic, len(u), shared, law)
         return shared
 
 

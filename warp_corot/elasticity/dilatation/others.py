@@ -96,7 +96,7 @@ class Others:
         else:
             passes = [lanes.measure_in_lanes(self._of), lanes.scatter_in_lanes(self._of)]
         if self._groups is not None:
-            return [*passes, kernels.share_in_groups(self._kind, self._of)]
+            return [*passes, kernels.share_in_groups(self._kind, kernels.law_at(self._of))]
         at_nodes = [kernels.add_to_nodes(self._kind), kernels.law_at_nodes(self._of)]
         return [*passes, *at_nodes, kernels.share_at_nodes(self._kind)]
 
@@ -111,7 +111,7 @@ class Others:
         if self._groups is not None:
             starts, members, live, count = self.groups[0]
             inputs = [starts, members, live, self._plan.elements, material]
-            self._launch(kernels.share_in_groups(self._kind, self._of), inputs, [shared], count)
+            self._launch(kernels.share_in_groups(self._kind, kernels.law_at(self._of)), inputs, [shared], count)
         else:
             self.share_at_nodes(material, len(u), shared)
         if self._device.is_cuda:
@@ -135,7 +135,9 @@ class Others:
         if self._groups is None and len(self._sums) < nodes:
             self._sums = wp.zeros(nodes, dtype=wp.vec4, device=self._device)
 
-    def share_at_nodes(self, material: IsotropicMaterial, nodes: int, shared: wp.array) -> None:
+    def share_at_nodes(
+        self, material: IsotropicMaterial, nodes: int, shared: wp.array, law: wp.Function | None = None
+    ) -> None:
         """The second pass of the elements that are in no group, of a mesh of so many nodes."""
         if self._groups is not None or not self.count:
             return
@@ -149,7 +151,7 @@ class Others:
         if self._slot_sums is not None:
             assert self._plan.slots is not None
             self._plan.slots.gather(sums, self._slot_sums)
-        self._launch(kernels.law_at_nodes(self._of), [], [sums], nodes)
+        self._launch(kernels.law_at_nodes(law or kernels.law_at(self._of)), [], [sums], nodes)
         self._launch(kernels.share_at_nodes(self._kind), [*where, sums], [shared])
 
     def add_nodal_diagonal(

@@ -164,7 +164,7 @@ class Newton:
 
     def _launch_energies(self) -> None:
         self._energies.zero_()
-        self.field.write_energies(self.body.state.displacements, self._energies)
+        self.field.write_potentials(self.body.state.displacements, self._energies)
         sums = self._sums
         inputs = [self._energies, len(self._energies) // self.worlds, *sums.sizes[1:]]
         wp.launch(kernels.sum_energies, sums.shape, inputs, [sums.parts], device=self.device)

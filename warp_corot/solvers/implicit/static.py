@@ -142,7 +142,7 @@ class StaticSolver:
         """Strain energy minus the work of loads and gravity [J], of all worlds."""
         state, count = self.body.state, self.body.sizes.nodes
         u = state.displacements.numpy()[:count, :3].astype(np.float64)
-        return self.field.elastic_energy(state.displacements) - float(np.sum(self._loads() * u))
+        return float(self.field.potentials(state.displacements).sum()) - float(np.sum(self._loads() * u))
 
     def _loads(self) -> npt.NDArray[np.float64]:
         """Loads and weight [N], [worlds * N, 3]."""
@@ -168,7 +168,7 @@ class StaticSolver:
         """Record an iteration, once all that it uses is there."""
         newton, u = self.newton, self.body.state.displacements
         self.field.elastic_forces(u)
-        self.field.elastic_energies(u)
+        self.field.potentials(u)
         self.operator.take(u)
         with wp.ScopedCapture(device=self.body.device) as capture:
             newton.launch_iteration()

@@ -132,7 +132,7 @@ class BodySteps:
             self.newton.solver.tolerance.fill_(self.stepper.integrator.linear_tolerance)
         u = self.body.state.displacements
         self.field.elastic_forces(u)
-        self.field.elastic_energies(u)
+        self.field.potentials(u)
 
     def launch(self, offset: int) -> None:
         """Launch the ``offset``-th step since the clock was last advanced."""

@@ -1,0 +1,1 @@
+"""What an adjoint solution says of each element's material, active stress and rest shape."""

@@ -1,0 +1,310 @@
+"""Gradients of static answers against differences of Newton's method on the float64 oracle."""
+
+import numpy as np
+import oracle
+import pytest
+import shared_dilatation
+import warp as wp
+from cases import CUBE, MODELS, jittered
+
+import warp_corot as wc
+from warp_corot.gradients.element_work import ElementWork
+
+GRAVITY = np.array([0.0, -9.8, 0.0])
+NAMES = ("young", "poisson", "density", "loads", "boundary", "rest", "gravity")
+LAWS = (
+    "corotated",
+    pytest.param("neo_hookean", marks=pytest.mark.slow),
+    pytest.param("stvk", marks=pytest.mark.slow),
+    pytest.param("linear", marks=pytest.mark.slow),
+)
+#: Of a derivative along a random direction, over what its entries' sizes would make of it.
+TOLERANCE = 1e-4
+
+
+class Case:
+    """A body under random loads and its weight, held at one end, and J = sum of w . x with random w."""
+
+    def __init__(self, mesh, law, device, seed=0):
+        self.mesh, self.law, self.rng = mesh, law, np.random.default_rng(seed)
+        count, nodes = len(mesh.tets), len(mesh.points)
+        end = mesh.points[:, 2].min() if isinstance(mesh, wc.TetForest) else np.sort(mesh.points[:, 2])[nodes // 5]
+        self.fixed = mesh.points[:, 2] <= end
+        self.given = {
+            "young": 500.0 * self.rng.uniform(0.5, 2.0, count),
+            "poisson": 0.4,
+            "density": 10.0,
+            "loads": 1e-4 * self.rng.standard_normal((nodes, 3)),
+            "boundary": np.zeros((nodes, 3)),
+            "rest": np.asarray(mesh.points),
+            "gravity": GRAVITY,
+        }
+        self.weights = self.rng.standard_normal((nodes, 3))
+        material = wc.Isotropic(self.given["young"], self.given["poisson"], self.given["density"])
+        self.body = wc.SoftBody(mesh, material, device=device)
+        self.body.fix(self.fixed)
+        self.body.load(np.arange(nodes), self.given["loads"])
+
+    def gradient(self, **options):
+        def objective(x):
+            return float((self.weights * x.numpy()).sum()), self.weights
+
+        return wc.static_gradient(self.body, objective, model=MODELS[self.law](), gravity=GRAVITY, **options)
+
+    def value(self, **changed):
+        """J by the oracle, with some of what is given changed."""
+        given = self.given | changed
+        mesh = oracle.Mesh(given["rest"], self.mesh.tets)
+        loads = given["loads"] + mesh.masses(given["density"])[:, None] * given["gravity"]
+        lame = oracle.lame(given["young"], given["poisson"])
+        start = given["rest"] + given["boundary"]
+        x = oracle.equilibrium(self.law, mesh, *lame, self.fixed, loads, increments=1, tolerance=1e-12, start=start)
+        return float((self.weights * x).sum())
+
+    def direction(self, name):
+        size = {"boundary": 1e-2 * CUBE, "rest": 1e-2 * CUBE, "loads": 1e-4}.get(name)
+        given = np.asarray(self.given[name])
+        way = self.rng.standard_normal(given.shape) * (np.abs(given) if size is None else size)
+        if name == "gravity":
+            way = self.rng.standard_normal(3)
+        return way * self.fixed[:, None] if name == "boundary" else way
+
+    def difference(self, name, way, step):
+        """The derivative along a direction, of fourth order."""
+        near, far = (
+            self.value(**{name: self.given[name] + k * step * way})
+            - self.value(**{name: self.given[name] - k * step * way})
+            for k in (1, 2)
+        )
+        return (8.0 * near - far) / (12.0 * step)
+
+
+def check(case, found, names, step=1e-3):
+    for name in names:
+        way = case.direction(name)
+        along, right = float(np.sum(found[name] * way)), case.difference(name, way, step)
+        error = abs(along - right) / max(abs(right), np.linalg.norm(found[name] * way))
+        print(f"{name}: {along:.8g} against {right:.8g}, off by {error:.1e}")
+        assert error < TOLERANCE
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_all_derivatives_of_a_forest(law, device):
+    case = Case(wc.TetForest.box((1, 1, 3), CUBE, 3), law, device)
+    found = case.gradient(wrt=NAMES)
+    assert found.value == pytest.approx(case.value(), abs=1e-6)
+    assert found.report.converged
+    assert found.adjoint_residual < 1e-4
+    assert found.loads.shape == found.boundary.shape == found.rest.shape == case.mesh.points.shape
+    assert not found.loads[case.fixed].any()
+    assert not found.boundary[~case.fixed].any()
+    check(case, found, NAMES)
+
+
+@pytest.mark.parametrize("law", [pytest.param("corotated", marks=pytest.mark.slow), "neo_hookean"])
+def test_derivatives_of_a_general_mesh(law, device):
+    case = Case(jittered(cells=(1, 1, 2), level=3), law, device, seed=3)
+    names = ("young", "loads", "rest", "boundary")
+    check(case, case.gradient(wrt=names), names)
+
+
+@wp.kernel(enable_backward=True)
+def add_squares(x: wp.array[wp.vec3], loss: wp.array[float]):
+    i = wp.tid()
+    wp.atomic_add(loss, 0, wp.dot(x[i], x[i]))
+
+
+def test_objectives_of_both_kinds_agree(device):
+    """A tape's, and a pair of value and gradient."""
+    body = wc.SoftBody(wc.TetForest.box((1, 1, 1), CUBE, 3), wc.Isotropic(500.0, 0.4, 10.0), device=device)
+    body.fix(body.mesh.points[:, 2] < 1e-9)
+
+    def taped(x):
+        loss = wp.zeros(1, dtype=float, device=device, requires_grad=True)
+        wp.launch(add_squares, len(x), [x], [loss], device=device)
+        return loss
+
+    def paired(x):
+        return float((x.numpy().astype(float) ** 2).sum()), 2.0 * x.numpy()
+
+    options = {"wrt": ("young", "loads"), "model": MODELS["corotated"](), "gravity": GRAVITY}
+    first, second = (wc.static_gradient(body, objective, **options) for objective in (taped, paired))
+    assert first.value == pytest.approx(second.value, rel=1e-5)
+    assert isinstance(first.young, float)
+    assert first.young == pytest.approx(second.young, rel=1e-4)
+    assert first.loads == pytest.approx(second.loads, abs=1e-5 * np.abs(second.loads).max())
+
+
+def test_worlds_are_each_their_own(device):
+    """Shapes follow the material's; each world's gradient is that of the body alone."""
+    mesh = wc.TetForest.box((1, 1, 1), CUBE, 3)
+    young = np.array([[400.0], [900.0]])
+    weights = np.random.default_rng(1).standard_normal((2, len(mesh.points), 3))
+
+    def gradient(body, w):
+        body.fix(mesh.points[:, 2] < 1e-9)
+        options = {"wrt": ("young", "density", "rest"), "model": MODELS["corotated"](), "gravity": GRAVITY}
+        return wc.static_gradient(body, lambda x: (0.0, w.reshape(-1, 3)), **options)
+
+    both = gradient(wc.SoftBody(mesh, wc.Isotropic(young, 0.4, 10.0), worlds=2, device=device), weights)
+    assert both.young.shape == (2, 1)
+    assert isinstance(both.density, float)
+    for world in range(2):
+        alone = gradient(wc.SoftBody(mesh, wc.Isotropic(young[world, 0], 0.4, 10.0), device=device), weights[world])
+        assert both.young[world, 0] == pytest.approx(alone.young, rel=1e-4)
+        rest = both.rest.reshape(2, -1, 3)[world]
+        assert rest == pytest.approx(alone.rest, abs=1e-4 * np.abs(alone.rest).max())
+
+
+# --- a dilatation that elements share ---------------------------------------------------------------------------------
+
+
+def work_by_differences(law, mesh, groups, u, motion):
+    """The work of forces in a motion, as a function of lambda [T] and of rest positions, by the oracle's energy."""
+
+    def energy(lam, rest, x):
+        other = oracle.Mesh(rest, mesh.tets)
+        return shared_dilatation.energy(law, other, groups, lam, x - rest)
+
+    def work(lam, rest):
+        x, step = mesh.points + u, 2e-5
+        near, far = (
+            energy(lam, rest, x + k * step * motion) - energy(lam, rest, x - k * step * motion) for k in (1, 2)
+        )
+        return -(8.0 * near - far) / (12.0 * step)
+
+    return work
+
+
+@pytest.mark.parametrize(
+    ("law", "mesh"),
+    [
+        ("corotated", "forest"),
+        ("neo_hookean", "general"),
+        *(
+            pytest.param(law, mesh, marks=pytest.mark.slow)
+            for law, mesh in (
+                ("linear", "forest"),
+                ("stvk", "forest"),
+                ("neo_hookean", "forest"),
+                ("corotated", "general"),
+                ("stvk", "general"),
+            )
+        ),
+    ],
+)
+def test_work_of_a_shared_dilatation(law, mesh, device):
+    """With a shear modulus of almost nothing; of groups in a forest, of nodes in a general mesh."""
+    rng = np.random.default_rng(5)
+    if mesh == "forest":
+        mesh = wc.TetForest.box((1, 1, 3), CUBE, 3).refine(np.arange(144) % 17 == 0)
+        groups = shared_dilatation.of_forest(mesh)
+    else:
+        mesh = jittered()
+        groups = shared_dilatation.of_nodes(mesh)
+    young = 1000.0 * rng.uniform(0.5, 2.0, len(mesh.tets))
+    body = wc.SoftBody(mesh, wc.Isotropic(young, 0.4999995, 10.0), device=device)
+    lam = body.discretization.lam.numpy().astype(float)
+    u, motion = (scale * rng.standard_normal(mesh.points.shape).astype(np.float32) for scale in (0.0005, 1.0))
+    body.displacements = u
+    model = {"linear": wc.Linear, "stvk": wc.StVenantKirchhoff, "neo_hookean": wc.NeoHookean, "corotated": wc.Corotated}
+    work = ElementWork(model[law](dilatation="shared").bind(body), {"lame", "rest"})
+    padded = np.pad(motion, ((0, 0), (0, 1))).astype(np.float32)
+    work.add(body.state.displacements, wp.array(padded, dtype=wp.vec4, device=device))
+    right = work_by_differences(law, mesh, groups, u.astype(float), motion.astype(float))
+    rest = np.asarray(mesh.points)
+    cases = {
+        "lambda": (work.of_lame()[1], lam * rng.standard_normal(lam.shape), lambda s: right(lam + s, rest), 1e-2),
+        "rest": (work.of_rest(), 1e-3 * rng.standard_normal(u.shape), lambda s: right(lam, rest + s), 1e-2),
+    }
+    for name, (found, way, of, step) in cases.items():
+        near, far = (of(k * step * way) - of(-k * step * way) for k in (1, 2))
+        difference = (8.0 * near - far) / (12.0 * step)
+        error = abs(np.sum(found * way) - difference) / np.linalg.norm(found * way)
+        print(f"{name}: {np.sum(found * way):.7g} against {difference:.7g}, off by {error:.1e}")
+        assert error < 2e-5
+
+
+def test_the_default_of_nearly_incompressible_bodies(device):
+    """Against differences of static answers of float32 themselves, whose rounding leaves 1e-3."""
+    mesh = wc.TetForest.box((1, 1, 3), CUBE, 3)
+    tip = mesh.points[:, 2] > 3 * CUBE - 1e-9
+    weights = np.zeros_like(mesh.points)
+    weights[tip, 1] = 1.0 / tip.sum()
+
+    def sag(young):
+        body = wc.SoftBody(mesh, wc.Isotropic(young, 0.49, 10.0), device=device)
+        body.fix(mesh.points[:, 2] < 1e-9)
+        options = {"wrt": ("young", "gravity"), "gravity": GRAVITY}
+        return wc.static_gradient(body, lambda x: (float((weights * x.numpy()).sum()), weights), **options)
+
+    found = sag(500.0)
+    difference = (sag(510.0).value - sag(490.0).value) / 20.0
+    print(f"{found.young:.6g} against {difference:.6g}")
+    assert found.young == pytest.approx(difference, rel=1e-3)
+
+
+# --- muscles ----------------------------------------------------------------------------------------------------------
+
+
+def test_active_stress(device):
+    """dJ/ds along a direction against differences of static answers, and loads' by the way."""
+    mesh = wc.TetForest.box((1, 1, 2), CUBE, 3)
+    muscle = wc.TransverselyIsotropic(3e4, 8e3, 0.4, 0.3, 4e3, direction=(0.2, 0.1, 1.0), density=1000.0)
+    rng = np.random.default_rng(2)
+    weights, way = rng.standard_normal(mesh.points.shape), 500.0 * rng.uniform(0.5, 1.5, len(mesh.tets))
+
+    def at(stress):
+        body = wc.SoftBody(mesh, muscle, device=device)
+        body.fix(mesh.points[:, 2] < 1e-9)
+        body.activate(stress)
+        options = {"wrt": ("activation", "rest"), "gravity": GRAVITY}
+        return wc.static_gradient(body, lambda x: (float((weights * x.numpy()).sum()), weights), **options)
+
+    stress = np.full(len(mesh.tets), 2000.0)
+    found = at(stress)
+    difference = at(stress + way).value - at(stress - way).value
+    along = 2.0 * float(np.sum(found.activation[0] * way))
+    print(f"{along:.6g} against {difference:.6g}")
+    assert found.activation.shape == (1, len(mesh.tets))
+    assert along == pytest.approx(difference, rel=2e-3)
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+
+def test_refusals(device):
+    mesh = wc.TetForest.box((1, 1, 1), CUBE, 3)
+    body = wc.SoftBody(mesh, wc.Isotropic(500.0, 0.4, 10.0), device=device)
+
+    def nothing(x):
+        return 0.0, np.zeros((len(x), 3))
+
+    with pytest.raises(wc.InputError, match="no node is held; a body that may be anywhere"):
+        wc.static_gradient(body, nothing)
+    body.fix(mesh.points[:, 2] < 1e-9)
+    for options, message in (
+        ({"wrt": "colour"}, "wrt has 'colour'; it must be one or several of 'young'"),
+        ({"wrt": ()}, "wrt is empty"),
+        ({"wrt": "activation"}, "the material has no fibres"),
+        ({"model": wc.Corotated(rotation_level=0)}, "the model shares rotations"),
+        ({"model": wc.EdgeStVK(springs="quadratic")}, "have no derivative with respect to moduli"),
+        ({"adjoint_tolerance": 2.0}, "adjoint_tolerance is 2.0; it must be between 0 and 1"),
+    ):
+        with pytest.raises(wc.InputError, match=message):
+            wc.static_gradient(body, nothing, **options)
+    for objective, message in (
+        (3.0, "objective is 3.0; it must be a function"),
+        (lambda x: 1.0, "objective gives 1.0; it must give a wp.array"),
+        (lambda x: (1.0, np.zeros(3)), r"has shape \(3,\); it must be \[27, 3\]"),
+        (lambda x: (np.nan, np.zeros((len(x), 3))), "not finite"),
+        (lambda x: wp.zeros(1, dtype=float, device=device), "requires_grad=False"),
+    ):
+        with pytest.raises(wc.InputError, match=message):
+            wc.static_gradient(body, objective)
+    with pytest.raises(wc.ConvergenceError, match="there is no gradient: not converged"):
+        wc.static_gradient(body, nothing, iterations=1, tolerance=1e-12, gravity=(0, -1e5, 0))
+    found = wc.static_gradient(body, lambda x: (1.0, np.ones((len(mesh.points), 3))))
+    assert found["young"] == found.young
+    with pytest.raises(wc.InputError, match="'loads' is not among"):
+        found["loads"]

@@ -1,0 +1,29 @@
+"""The device functions of a field's law, for those that differentiate it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import warp as wp
+
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+
+from .stiffness import ElementMaterial
+
+
+@dataclass(frozen=True)
+class StressLaw:
+    """First Piola-Kirchhoff stress of a law in each element.
+
+    Attributes:
+        stress: Device function (elements, t, material, u) -> P, as ``kernels.elements.forces`` takes it.
+        differential: Its exact derivative (elements, t, material, u, dg) -> dP, as
+            ``kernels.elements.stiffness_products`` takes it.
+        material: The struct that both read.
+        Material: Its type; where that is ``IsotropicMaterial`` the stress is linear in Lamé's parameters.
+    """
+
+    stress: wp.Function
+    differential: wp.Function
+    material: ElementMaterial
+    Material: type = IsotropicMaterial

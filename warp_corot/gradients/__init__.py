@@ -1,0 +1,1 @@
+"""Gradients of quantities of a body's motion or rest, by adjoint solves."""

@@ -1,0 +1,87 @@
+"""From derivatives with respect to what kernels read to those with respect to what users gave."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+
+Array = npt.NDArray[np.float64]
+
+#: What each of these needs of ``ElementWork``.
+NEEDS = {
+    "young": "lame",
+    "poisson": "lame",
+    "rest": "rest",
+    "activation": "activation",
+    "density": None,
+    "loads": None,
+    "boundary": None,
+    "gravity": None,
+}
+
+
+def of_young(body: SoftBody, of_mu: Array, of_lam: Array) -> Array | float:
+    """The derivative with respect to Young's modulus, of the shape that the material has it in."""
+    _, nu = _young_and_poisson(body)
+    d_mu, d_lam = 1.0 / (2.0 * (1.0 + nu)), nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
+    return _of_shape(body, "young", d_mu * _filled(body, of_mu) + d_lam * _filled(body, of_lam))
+
+
+def of_poisson(body: SoftBody, of_mu: Array, of_lam: Array) -> Array | float:
+    """The derivative with respect to Poisson's ratio, of the shape that the material has it in."""
+    young, nu = _young_and_poisson(body)
+    d_mu = -young / (2.0 * (1.0 + nu) ** 2)
+    d_lam = young * (1.0 + 2.0 * nu**2) / ((1.0 + nu) * (1.0 - 2.0 * nu)) ** 2
+    return _of_shape(body, "poisson", d_mu * _filled(body, of_mu) + d_lam * _filled(body, of_lam))
+
+
+def of_density(body: SoftBody, work: Array) -> Array | float:
+    """The derivative with respect to density, of the shape that the material has it in.
+
+    Args:
+        work: What accelerations of the nodes do in the adjoint motion for each unit of mass, [worlds * N].
+    """
+    return _of_shape(body, "density", _filled(body, body.mesh.volumes * means_of_elements(body, work)))
+
+
+def weight_densities(body: SoftBody, work: Array) -> Array:
+    """The work of ``of_density`` for each unit of elements' volume, [worlds * T]."""
+    density = np.broadcast_to(np.asarray(body.material.density), (body.worlds, len(body.mesh.tets)))
+    return np.asarray(_filled(body, density * means_of_elements(body, work))).ravel()
+
+
+def means_of_elements(body: SoftBody, values: Array) -> Array:
+    """Means of nodal values, [worlds * N], over elements, [worlds, T]."""
+    return np.asarray(values.reshape(body.worlds, -1)[:, body.mesh.tets].mean(axis=2))
+
+
+def _young_and_poisson(body: SoftBody) -> tuple[Array, Array]:
+    material = body.material.isotropic
+    return np.asarray(material.young, np.float64), np.asarray(material.poisson, np.float64)
+
+
+def _filled(body: SoftBody, values: Array) -> Array:
+    """Values of elements times their filled share, [worlds, T]."""
+    fill = body.discretization.fill
+    of_worlds = values.reshape(body.worlds, -1)
+    return of_worlds if fill is None else of_worlds * fill
+
+
+def _of_shape(body: SoftBody, name: str, values: Array) -> Array | float:
+    """Values of elements, [worlds, T], summed to the shape of a field of the material: of one value for many elements
+    the derivative is the sum of theirs."""
+    shape = np.shape(getattr(body.material, name))
+    if shape == ():
+        return float(values.sum())
+    if len(shape) == 1:
+        values = values.sum(axis=0)
+        return values if shape == values.shape else values.sum(keepdims=True)
+    for axis, count in enumerate(shape):
+        if count == 1:
+            values = values.sum(axis=axis, keepdims=True)
+    return values
