@@ -84,10 +84,10 @@ def draw_body(
         _fill(ax, outline[None], "none", _GHOST_LINE, width=1.0, order=1)
         ax.update_datalim(outline)
     if x_rest is not None:
-        _draw_silhouette(ax, x_rest[tri], camera)
+        _draw_silhouette(ax, x_rest, tri, camera)
 
     cut, normals, values = _cut(x, tri, _values(scalars, len(x), tri), pieces)
-    _fill(ax, camera.project(x[tri][camera.sees_outside(x[tri])])[0], INK, INK, width=1.6, order=3)
+    _draw_outline(ax, x, tri, INK, camera, width=1.6, order=3)
     front = camera.sees_outside(cut)
     cut, normals = cut[front], normals[front]
     flat, depth = camera.project(cut)
@@ -206,10 +206,32 @@ def _shade(base: Array, normals: Array, rays: Array, camera: Camera) -> Array:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def _draw_silhouette(ax: "Axes", triangles: Array, camera: Camera) -> None:
-    flat, _ = camera.project(triangles[camera.sees_outside(triangles)])
-    _fill(ax, flat, _GHOST, _GHOST_LINE, width=2.2, order=1)
-    _fill(ax, flat, _GHOST, _GHOST, width=0.3, order=2)
+def _draw_silhouette(ax: "Axes", x: Array, tri: NDArray[np.int64], camera: Camera) -> None:
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    _draw_outline(ax, x, tri, _GHOST_LINE, camera, width=2.2, order=1)
+    # One path of triangles that turn the same way is filled as a whole, without seams.
+    flat, _ = camera.project(x[tri][camera.sees_outside(x[tri])])
+    closed = np.concatenate([flat, flat[:, :1]], axis=1)
+    codes = np.tile([Path.MOVETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY], len(flat)).astype(Path.code_type)
+    filled = Path(closed.reshape(-1, 2), codes)
+    ax.add_artist(PathPatch(filled, facecolor=_GHOST, edgecolor=_GHOST, linewidth=0.3, zorder=2))
+
+
+def _draw_outline(
+    ax: "Axes", x: Array, tri: NDArray[np.int64], color: Any, camera: Camera, *, width: float, order: int
+) -> None:
+    """Draw lines along edges that one face alone has among those that face the viewer; inner ones are drawn over."""
+    from matplotlib.collections import LineCollection
+
+    front = tri[camera.sees_outside(x[tri])]
+    ends = np.sort(front[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    keys, count = np.unique(ends[:, 0] * len(x) + ends[:, 1], return_counts=True)
+    alone = keys[count == 1]
+    lines, _ = camera.project(x[np.stack([alone // len(x), alone % len(x)], axis=1)])
+    drawn = LineCollection(lines, colors=color, linewidth=width, capstyle="round", zorder=order)
+    ax.add_collection(drawn, autolim=False)
 
 
 def _draw_edges(ax: "Axes", triangles: Array, camera: Camera) -> None:
@@ -221,7 +243,7 @@ def _fill(ax: "Axes", polygons: Array, face: Any, edge: Any, *, width: float, or
     from matplotlib.collections import PolyCollection
 
     collection = PolyCollection(
-        list(polygons), facecolor=face, edgecolor=edge, linewidth=width, joinstyle="round", zorder=order
+        polygons, facecolor=face, edgecolor=edge, linewidth=width, joinstyle="round", zorder=order
     )
     ax.add_collection(collection, autolim=False)
 

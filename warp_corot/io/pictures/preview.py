@@ -1,6 +1,5 @@
 """Pictures of deformed bodies as PNG files: one body, or several side by side."""
 
-import io
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -194,7 +193,7 @@ def draw_strip(
     rows = -(-len(pictures) // columns)
     width, height = size or (600 * columns, 600 * rows)
     figure = Figure(dpi=150, facecolor="white")
-    FigureCanvasAgg(figure)
+    canvas = FigureCanvasAgg(figure)
     figure.set_size_inches(width / 150.0, height / 150.0)
     legend = bar = None
     if with_scalars and value_range is not None:
@@ -238,10 +237,9 @@ def draw_strip(
         x_middle = (width - (bar or 0)) / (2.0 * width)
         text = figure.text(x_middle, 1.0 - 14 / height, title, ha="center", va="top", fontsize=13, color=INK)
         fit_line(text, width - (bar or 0) - 16)
-    drawn = io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=fineness * figure.dpi)
-    with Image.open(drawn) as fine:
-        return fine.convert("RGB").reduce(fineness)
+    figure.set_dpi(fineness * figure.dpi)
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).reduce(fineness)
 
 
 def check_picture_path(path: str | Path, suffixes: Sequence[str] = (".png",)) -> Path:

@@ -20,7 +20,7 @@ def draw_shadow(ax: "Axes", triangles: Array, camera: Camera, height: float, cel
     up = camera.world_up
     right = camera.axes[0]
     back = np.cross(up, right)  # with ``right`` it spans the ground
-    bary = np.random.default_rng(0).dirichlet((1.0, 1.0, 1.0), size=max(4, 200_000 // len(triangles)))
+    bary = np.random.default_rng(0).dirichlet((1.0, 1.0, 1.0), size=max(4, 100_000 // len(triangles)))
     points = np.einsum("sb,fbx->fsx", bary, triangles).reshape(-1, 3)
     dropped = dropped_shadow(points, camera, height)
     flat = np.stack([dropped @ right, dropped @ back], axis=1)
