@@ -40,7 +40,7 @@ wp.set_module_options({"enable_backward": False})
 
 BLOCK = 128
 #: Blocks that a multiprocessor's registers must have room for, by type.
-RESIDENT = (6, 5, 5)
+RESIDENT = (5, 5, 5)
 #: What ``Stretch.shape`` is for leaves in no subtree.
 FLAT = 3
 

@@ -3,6 +3,9 @@
 Smoothing is Chebyshev's iteration with the inverse diagonal blocks. It needs a bound on the largest eigenvalue of
 D^-1 A. The matrix of each element, and of each ancestor, is positive semidefinite and couples four nodes, so it is at
 most four times its own diagonal blocks: 4 is a bound on all levels.
+
+A row of a matrix is one thread's on a CPU. On CUDA it is several lanes': they read neighbouring entries together, and a
+small level takes no longer than its longest sum.
 """
 
 import warp as wp
@@ -15,8 +18,23 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
+    const unsigned int first = threadIdx.x & 31 & ~(lanes - 1);
+    const unsigned int together = (lanes < 32 ? (1u << lanes) - 1u : ~0u) << first;
+    for (int step = lanes / 2; step > 0; step /= 2)
+        for (int a = 0; a < 3; ++a) part[a] += __shfl_xor_sync(together, part[a], step);
+#endif
+    return part;
+""")
+def sum_over_lanes(part: wp.vec3, lanes: int) -> wp.vec3:
+    """The sum of neighbouring threads' parts, a power of two of them up to 32, all of which get it; on a CPU there is
+    one."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
     wp::vec_t<3, wp::float32> total;
-    for (int p = begin; p < end; ++p) {
+    for (int p = begin + lane; p < end; p += lanes) {
         const float* m = &wp::index(blocks, first_entry + p).data[0][0];
         const float4 v = *reinterpret_cast<const float4*>(&wp::index(x, first_node + wp::index(columns, p)));
         total[0] += m[0] * v.x + m[3] * v.y + m[6] * v.z;
@@ -40,6 +58,8 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_
 #endif
 """)
 def row_product(
+    lane: int,
+    lanes: int,
     begin: int,
     end: int,
     first_entry: int,
@@ -48,8 +68,11 @@ def row_product(
     blocks: wp.array[wp.mat33],
     x: wp.array[wp.vec4],
 ) -> wp.vec3:
-    """The product of a row with x. Entries are transposed, so that four lanes add up columns; of the last one they read
-    a number past its end."""
+    """The product of a row with x, of which each of ``lanes`` neighbouring threads on CUDA has a part.
+
+    Entries are transposed, so that on a CPU four lanes of a vector add up columns; of the last one they read a number
+    past its end.
+    """
     ...
 
 
@@ -106,6 +129,7 @@ def hand_out(
 @wp.kernel(enable_backward=False)
 def smooth(
     # In
+    lanes: int,
     count: int,
     entries: int,
     alpha: float,
@@ -121,9 +145,13 @@ def smooth(
     other: wp.array[wp.vec4],
 ):
     """One step: ``other`` has the values before z, which are taken as zero if told so, and gets those after it."""
-    world, i = wp.tid()
+    world, thread = wp.tid()
+    i, lane = thread / lanes, thread % lanes
     at = world * count + i
-    product = row_product(starts[i], starts[i + 1], world * entries, world * count, columns, blocks, z)
+    part = row_product(lane, lanes, starts[i], starts[i + 1], world * entries, world * count, columns, blocks, z)
+    product = sum_over_lanes(part, lanes)
+    if lane > 0:
+        return
     now = load_node(z, at)
     step = alpha * (inverses[at] * (load_node(r, at) - product))
     if beta != 0.0:
@@ -137,6 +165,7 @@ def smooth(
 @wp.kernel(enable_backward=False)
 def find_residual(
     # In
+    lanes: int,
     count: int,
     entries: int,
     starts: wp.array[wp.int32],
@@ -148,9 +177,13 @@ def find_residual(
     residual: wp.array[wp.vec4],
 ):
     """r - A z."""
-    world, i = wp.tid()
+    world, thread = wp.tid()
+    i, lane = thread / lanes, thread % lanes
     at = world * count + i
-    product = row_product(starts[i], starts[i + 1], world * entries, world * count, columns, blocks, z)
+    part = row_product(lane, lanes, starts[i], starts[i + 1], world * entries, world * count, columns, blocks, z)
+    product = sum_over_lanes(part, lanes)
+    if lane > 0:
+        return
     store_node(residual, at, load_node(r, at) - product)
 
 

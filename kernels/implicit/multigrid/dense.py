@@ -6,6 +6,8 @@ from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.elements.lanes import COMPILER_FLAGS
 from warp_corot.kernels.stepping.block import synchronize_block
 
+from .cycle import sum_over_lanes
+
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_FLAGS})
 
 #: What is added to the diagonal, scaled to one: the inverse stays finite where nothing holds a body.
@@ -52,22 +54,32 @@ def fill_dense(
 @wp.func_native("""
 const double* row = &wp::index(rows, world, 0);
 double* a = &wp::index(matrix, world, i, 0);
-for (int j = 0; j <= i; ++j) a[j] -= factor * row[j];
+for (int j = lane; j <= i; j += lanes) a[j] -= factor * row[j];
 """)
 def subtract_row(
-    matrix: wp.array3d[wp.float64], rows: wp.array2d[wp.float64], world: int, i: int, factor: wp.float64
-): ...
+    matrix: wp.array3d[wp.float64],
+    rows: wp.array2d[wp.float64],
+    world: int,
+    i: int,
+    lane: int,
+    lanes: int,
+    factor: wp.float64,
+):
+    """Subtract a multiple of the pivot's row from row i of the lower triangle; its lanes take every so many entries."""
+    ...
 
 
 @wp.kernel(enable_backward=False)
 def invert_dense(
+    # In
+    lanes: int,
     # In and out
     matrix: wp.array3d[wp.float64],
     # Out
     rows: wp.array2d[wp.float64],
 ):
     """Minus the inverse of each world's matrix, in its lower triangle, by symmetric sweeps; one block a world, which
-    keeps the row of each pivot in ``rows``."""
+    keeps the row of each pivot in ``rows``. ``lanes`` of its threads share a row of the matrix."""
     thread = wp.tid()
     threads = wp.block_dim()
     world = thread / threads
@@ -84,16 +96,19 @@ def invert_dense(
                 rows[world, j] = wp.float64(0.0)
         synchronize_block()
         inverse = wp.float64(1.0) / pivot
-        for i in range(lane, size, threads):
+        part = lane % lanes
+        for i in range(lane / lanes, size, threads / lanes):
             if i != k:
                 factor = rows[world, i] * inverse
-                subtract_row(matrix, rows, world, i, factor)
-                if i > k:
+                subtract_row(matrix, rows, world, i, part, lanes, factor)
+                # The pivot's column is the row's own entry k, which is written by the lane that has subtracted from it.
+                if i > k and part == k % lanes:
                     matrix[world, i, k] = factor
             else:
-                for j in range(k):
+                for j in range(part, k, lanes):
                     matrix[world, k, j] = rows[world, j] * inverse
-                matrix[world, k, k] = -inverse
+                if part == 0:
+                    matrix[world, k, k] = -inverse
         synchronize_block()
 
 
@@ -113,17 +128,22 @@ def store_inverse(
 @wp.kernel(enable_backward=False)
 def apply_dense(
     # In
+    lanes: int,
     count: int,
     inverse: wp.array3d[float],
     r: wp.array[wp.vec4],
     # Out
     z: wp.array[wp.vec4],
 ):
-    world, i = wp.tid()
+    """z = inverse r; ``lanes`` neighbouring threads share the three rows of a node."""
+    world, thread = wp.tid()
+    i, lane = thread / lanes, thread % lanes
     total = wp.vec3()
-    for j in range(count):
+    for j in range(lane, count, lanes):
         value = load_node(r, world * count + j)
         for a in range(3):
             for b in range(3):
                 total[a] += inverse[world, 3 * i + a, 3 * j + b] * value[b]
-    store_node(z, world * count + i, total)
+    total = sum_over_lanes(total, lanes)
+    if lane == 0:
+        store_node(z, world * count + i, total)

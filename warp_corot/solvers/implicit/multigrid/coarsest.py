@@ -8,8 +8,8 @@ from warp_corot.kernels.implicit.multigrid import dense as kernels
 
 from .level import Level
 
-#: Threads of the block that inverts a world's matrix on CUDA.
-BLOCK = 256
+#: Threads of the block that inverts a world's matrix on CUDA, and those that share one of its rows.
+BLOCK, LANES = 1024, 8
 
 
 class DenseInverse:
@@ -27,9 +27,11 @@ class DenseInverse:
         level, pattern = self.level, self.level.pattern
         inputs = [pattern.entries, pattern.starts, pattern.columns, pattern.diagonal, level.blocks]
         level.launch(kernels.fill_dense, level.count, inputs, [self._matrix, self._scale])
-        threads = level.worlds * (BLOCK if level.device.is_cuda else 1)
+        block, lanes = (BLOCK, LANES) if level.device.is_cuda else (1, 1)
         outputs = [self._matrix, self._rows]
-        wp.launch(kernels.invert_dense, dim=threads, outputs=outputs, device=level.device, block_dim=BLOCK)
+        wp.launch(
+            kernels.invert_dense, level.worlds * block, [lanes], outputs, device=level.device, block_dim=block
+        )
         shape = self.inverse.shape
         inputs = [self._matrix, self._scale]
         wp.launch(kernels.store_inverse, dim=shape, inputs=inputs, outputs=[self.inverse], device=level.device)
@@ -37,4 +39,5 @@ class DenseInverse:
     def solve(self) -> None:
         """Launch z = inverse r."""
         level = self.level
-        level.launch(kernels.apply_dense, level.count, [level.count, self.inverse, level.r], [level.z])
+        inputs = [level.lanes, level.count, self.inverse, level.r]
+        level.launch(kernels.apply_dense, level.count * level.lanes, inputs, [level.z])

@@ -12,6 +12,8 @@ from .pattern import Midpoints, Pattern
 
 #: A bound on the eigenvalues of D^-1 A: every part of A is positive semidefinite and couples four nodes.
 LARGEST_EIGENVALUE = 4.0
+#: Lanes that share a row of a matrix on CUDA: of levels with many rows, which keep the card busy, and of others.
+MANY_ROWS, LANES, MOST_LANES = 50_000, 8, 32
 
 
 def smoothing_factors(degree: int) -> list[tuple[float, float]]:
@@ -44,6 +46,7 @@ class Level:
         inverses: Of the diagonal blocks, mat33 [worlds * n].
         r, z, other: Residual, correction, and a vector to work with, vec4 [worlds * n].
         factors: Of the smoother's steps.
+        lanes: How many threads share a row.
     """
 
     def __init__(self, pattern: Pattern, worlds: int, ranks: int, free: wp.array, degree: int):
@@ -57,6 +60,8 @@ class Level:
             wp.zeros(worlds * self.count, dtype=wp.vec4, device=self.device) for _ in range(3)
         )
         self.factors = smoothing_factors(degree)
+        few = LANES if worlds * self.count > MANY_ROWS else MOST_LANES
+        self.lanes = 1 if self.device.is_cpu else few
 
     @property
     def matrix(self) -> list[Any]:
@@ -67,9 +72,9 @@ class Level:
         """Go on with ``z`` from a step of the smoother."""
         for step in range(from_step, len(self.factors)):
             alpha, beta = self.factors[step]
-            inputs = [self.count, self.pattern.entries, alpha, beta if step else 0.0, step == from_step]
+            inputs = [self.lanes, self.count, self.pattern.entries, alpha, beta if step else 0.0, step == from_step]
             inputs += [*self.matrix, self.inverses, self.r, self.z]
-            self.launch(cycle.smooth, self.count, inputs, [self.other])
+            self.launch(cycle.smooth, self.count * self.lanes, inputs, [self.other])
             self.z, self.other = self.other, self.z
 
     def gather_from(self, fine: Level) -> None:
@@ -81,8 +86,8 @@ class Level:
 
     def restrict_from(self, fine: Level, midpoints: Midpoints) -> None:
         """Take over the finer level's residual, and make the smoother's first step."""
-        inputs = [fine.count, fine.pattern.entries, *fine.matrix, fine.r, fine.z]
-        fine.launch(cycle.find_residual, fine.count, inputs, [fine.other])
+        inputs = [fine.lanes, fine.count, fine.pattern.entries, *fine.matrix, fine.r, fine.z]
+        fine.launch(cycle.find_residual, fine.count * fine.lanes, inputs, [fine.other])
         inputs = [self.ranks, self.count, fine.count, self.factors[0][0], self.free]
         inputs += [midpoints.starts, midpoints.midpoints, self.inverses, fine.other]
         self.launch(cycle.restrict_residual, self.count, inputs, [self.r, self.z])
