@@ -153,3 +153,105 @@ def test_a_tool_at_random_leaves_an_organ_whole(device, rng, seconds):
     ]
     assert (volumes[0] / volumes[1]).min() > 0.0
     assert np.linalg.norm(now - points, axis=1).max() < 0.1 * size
+
+
+#: Thin and sharp tools along the z axis, of a radius or half a width [m].
+SHARP = {
+    "capsule": lambda r: wc.Capsule(r, 0.06),
+    "box": lambda r: wc.Box((2 * r, 2 * r, 0.06)),
+    "cylinder": lambda r: wc.Cylinder(r, 0.06),
+    "mesh": lambda r: wc.TriangleMesh(*square_rod(r, 0.03)),
+}
+
+
+def square_rod(r, half):
+    points = np.array([[x, y, z] for x in (-r, r) for y in (-r, r) for z in (-half, half)])
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return points, np.array([(a, b, c) for a, b, c, d in sides] + [(a, c, d) for a, b, c, d in sides])
+
+
+@pytest.mark.filterwarnings("ignore::warp_corot.StabilityWarning")
+@pytest.mark.parametrize(
+    ("kind", "radius", "speed", "seed"),
+    [("capsule", 0.003, 10.0, 2)]
+    + [
+        pytest.param(kind, radius, speed, seed, marks=pytest.mark.slow)
+        for kind, radius in (("capsule", 5e-4), ("capsule", 3e-3), ("capsule", 5e-3), *((k, 3e-3) for k in SHARP))
+        for speed in (0.1, 1.0, 10.0, 50.0)
+        for seed in (0, 1)
+    ],
+)
+def test_a_thin_tool_stabs_an_organ(device, kind, radius, speed, seed):
+    """24 mm deep into a ball of 60 mm of elements larger than the tool, whose elements it turns inside out: the run
+    goes on, nothing is thrown, and the body is whole once the tool has gone."""
+    mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.03, device=device), target_elements=1500, device=device)
+    points = mesh.points
+    body = wc.SoftBody(mesh, wc.Isotropic(2e4, 0.4, 1000.0), device=device)
+    body.fix(np.flatnonzero(points[:, 2] < -0.012))
+    way = np.random.default_rng(seed).normal(size=3)
+    way[2] = abs(way[2]) + 0.3
+    way /= np.linalg.norm(way)
+    tool = wc.Tool(SHARP[kind](radius))
+    begins, ends = 0.083 + radius, 0.036 + radius
+    taken = (begins - ends) / speed
+    turn = np.append(np.cross((0.0, 0.0, 1.0), way), 1.0 + way[2])
+    tool.follow([0.0, taken, taken + 0.01, 2 * taken + 0.02], np.outer((begins, ends, ends, begins), way), turn)
+    integrator = wc.SymplecticEuler(viscosity=2e-3)
+    sim = wc.Simulation(body, obstacles=tool, gravity=(0.0, 0.0, 0.0), integrator=integrator)
+    felt = 0.0
+    for _ in range(10):
+        sim.advance(0.1 * (taken + 0.01))
+        felt = max(felt, float(np.linalg.norm(tool.wrench.numpy()[0][:3])))
+        if kind == "capsule":
+            outside = np.unique(body.surface_triangles)
+            assert closest_to_rod(body.positions.numpy().astype(float)[outside], tool, 0.03) > 0.95 * radius
+    assert 0.1 < felt < 1e3
+    sim.advance(taken + 0.2)
+    assert np.linalg.norm(body.positions.numpy() - points, axis=1).max() < 2e-3
+    assert volume_ratios(mesh, body).min() > 0.5
+
+
+def closest_to_rod(points, tool, half):
+    """How far points are from the axis of a rod at most [m]."""
+    pose = tool.present_pose[0]
+    x, y, z, w = pose[3:]
+    axis = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+    along = np.clip((points - pose[:3]) @ axis, -half, half)
+    return np.linalg.norm(points - pose[:3] - along[:, None] * axis, axis=1).min()
+
+
+def volume_ratios(mesh, body):
+    """Of each element now to that at rest."""
+    now, rest = (
+        np.linalg.det(x[mesh.tets[:, 1:]] - x[mesh.tets[:, :1]])
+        for x in (body.positions.numpy().astype(float), mesh.points)
+    )
+    return now / rest
+
+
+def test_elements_turned_inside_out_are_said(device):
+    """Once; the run goes on."""
+    body = wc.SoftBody(wc.TetForest.box((2, 2, 1), 0.02, 4), wc.Isotropic(2e4, 0.4, 1000.0), device=device)
+    body.fix("z == zmin")
+    tool = wc.Tool(wc.Capsule(1e-3, 0.04))
+    tool.follow([0.0, 0.016], [(0.0213, 0.0207, 0.0415), (0.0213, 0.0207, 0.0255)])
+    sim = wc.Simulation(body, obstacles=tool, gravity=(0.0, 0.0, 0.0), integrator=wc.SymplecticEuler(viscosity=2e-3))
+    with pytest.warns(wc.StabilityWarning, match=r"elements are turned inside out at t = .* NeoHookean") as said:
+        sim.advance(0.03)
+    assert len(said) == 1
+
+
+def test_overlaps_at_the_start_are_said(device):
+    """Of two bodies, and of a needle that lies in one between its nodes."""
+    low, high = (
+        wc.SoftBody(
+            wc.TetForest.box((2, 2, 1), 0.02, 1, origin=(0, 0, z)), wc.Isotropic(2e4, 0.4, 1000.0), device=device
+        )
+        for z in (0.0, 0.0195)
+    )
+    needle = wc.Tool(wc.Capsule(2e-4, 0.005, position=(0.0213, 0.0207, 0.009)))
+    sim = wc.Simulation([low, high], obstacles=needle, gravity=(0.0, 0.0, 0.0))
+    with pytest.warns(wc.StabilityWarning) as said:
+        sim.advance_steps(2)
+    assert any("begin inside another soft body, by up to 0.5 mm" in str(each.message) for each in said)
+    assert any("a capsule begins inside a soft body" in str(each.message) for each in said)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
 
-from warp_corot.errors import InputError, StabilityWarning, depth_of_user
+from warp_corot.errors import InputError
 from warp_corot.kernels.contact import motion, sums
 from warp_corot.kernels.contact.law import Law
 from warp_corot.solvers.system import System
@@ -20,13 +19,12 @@ from .rigid_forces import RigidForces
 from .search import Search
 from .surface import ContactSurface
 from .tool import Obstacle
+from .warned import OVERLAP, warn_of_crushed, warn_of_overlaps
 
 #: Gaps that rounding leaves, in roundings of the largest coordinate.
 ROUNDINGS = 16.0
 #: Things that overlap are pushed apart at this share of the speed of waves.
 RECOVERY = 0.05
-#: Overlaps at the start that are said, as a share of the smallest element's size.
-OVERLAP = 0.01
 #: Rounds in which obstacles between the nodes are held off.
 ROUNDS = 3
 #: Warps that add up a wrench.
@@ -81,6 +79,7 @@ class Contacts:
                 )
             self.pairs = Pairs(self.surface, self.search, options.friction, options.self_contact)
         self._revision = 0
+        self._is_looked_at = self._has_crushed = False
         self._make_arrays()
 
     # --- as a constraint -------------------------------------------------------------------------------------------
@@ -121,26 +120,23 @@ class Contacts:
             self.pairs.forget()
 
     def check_start(self) -> None:
-        """See whether nodes begin inside obstacles, which push them out slowly.
+        """See once what begins inside something else; what overlaps is pushed apart slowly.
 
         Warns:
-            StabilityWarning: Some do.
+            StabilityWarning: Something does.
         """
-        if not self.obstacles.count:
-            return
-        self._predict(0, 0.0)
-        inputs = [self.obstacles.shapes, self.obstacles.motions, self.surface.arrays]
-        depths = wp.zeros(self.surface.count, dtype=wp.float32, device=self.device)
-        self._launch(sums.find_depths, self.surface.count, inputs, [depths])
-        deep = depths.numpy()
-        count = int((deep > OVERLAP * self._smallest).sum())
-        if count:
-            warnings.warn(
-                f"{count} surface nodes begin inside obstacles, by up to {1e3 * deep.max():.3g} mm; they are "
-                f"pushed out at no more than {self.law.recovery:.2g} m/s",
-                StabilityWarning,
-                stacklevel=depth_of_user(),
-            )
+        if not self._is_looked_at:
+            self._is_looked_at = True
+            self._predict(0, 0.0)
+            warn_of_overlaps(self, OVERLAP * self._smallest)
+
+    def look(self) -> None:
+        """See whether elements are turned inside out, until some were; waits for the device.
+
+        Warns:
+            StabilityWarning: Some are.
+        """
+        self._has_crushed = self._has_crushed or warn_of_crushed(self)
 
     def launch(self, offset: int, damping: float) -> None:
         system, surface = self.system, self.surface
@@ -191,6 +187,7 @@ class Contacts:
             self.rigid.forget()
         self.forget()
         self.obstacles.reset(chosen)
+        self._is_looked_at = False
 
     def take_rooms(self, rooms: Sequence[Sequence[int]], room: int) -> None:
         """Have as much room as there was: ``surface.rooms``, and ``pairs.room`` if soft surfaces may touch."""

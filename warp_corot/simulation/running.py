@@ -262,6 +262,8 @@ class Running:
             self._returns = 0
         if whole:
             self._energies.follow(now)
+            if sim.contact is not None:
+                sim.contact.look()
         return True
 
     def _go_back(self, fault: Fault) -> None:

@@ -1,0 +1,138 @@
+"""What users are warned of: things that overlap before anything moves, and elements that tools turn inside out."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.errors import StabilityWarning, depth_of_user
+from warp_corot.kernels.contact import shapes as kinds
+from warp_corot.kernels.contact import sums
+from warp_corot.kernels.contact.crushed import count_crushed
+from warp_corot.kernels.contact.motion import Motions
+from warp_corot.kernels.contact.overlaps import find_gaps
+
+from .sampled import SignedDistance, TriangleMesh
+from .shapes import Capsule, Cylinder, Ground
+
+if TYPE_CHECKING:
+    from .contacts import Contacts
+    from .tool import Tool
+
+#: Overlaps that are told, as a share of the smallest element's size.
+OVERLAP = 0.01
+#: Points of a tool's axis that are looked for in bodies.
+ALONG = 9
+
+Floats = npt.NDArray[np.float64]
+
+
+def warn_of_overlaps(contacts: Contacts, least: float) -> None:
+    """See what begins in something else. Obstacles are looked at in all worlds, all else in the first.
+
+    Args:
+        contacts: Of a state that has not been stepped.
+        least: Overlaps that are told [m].
+
+    Warns:
+        StabilityWarning: Surface nodes begin inside obstacles or other bodies, or a tool in a body.
+    """
+    speed = f"pushed out at no more than {contacts.law.recovery:.2g} m/s"
+    if contacts.obstacles.count:
+        depths = wp.zeros(contacts.surface.count, dtype=wp.float32, device=contacts.device)
+        inputs = [contacts.obstacles.shapes, contacts.obstacles.motions, contacts.surface.arrays]
+        wp.launch(sums.find_depths, contacts.surface.count, inputs, [depths], device=contacts.device)
+        deep = depths.numpy()
+        count = int((deep > least).sum())
+        if count:
+            _warn(f"{count} surface nodes begin inside obstacles, by up to {1e3 * deep.max():.3g} mm; they are {speed}")
+    axes = [(tool, _axis(tool, contacts.obstacles.poses()[0, k])) for k, tool in enumerate(contacts.obstacles.tools)]
+    axes = [(tool, points) for tool, points in axes if len(points)]
+    if len(contacts.surface.parts) > 1 or axes:
+        _warn_of_what_bodies_hold(contacts, axes, least, speed)
+
+
+def warn_of_crushed(contacts: Contacts) -> bool:
+    """See whether elements are turned inside out now; waits for the device.
+
+    Warns:
+        StabilityWarning: Some are.
+    """
+    system = contacts.system
+    count = wp.zeros(1, dtype=wp.int32, device=contacts.device)
+    for body in system.bodies:
+        kernel = count_crushed(body.discretization.element_kind)
+        inputs = [body.discretization.elements, body.state.displacements]
+        wp.launch(kernel, body.sizes.launch_elements, inputs, [count], device=contacts.device)
+    crushed = int(count.numpy()[0])
+    if crushed:
+        _warn(
+            f"{crushed} elements are turned inside out at t = {system.pace.time:.4g} s: something presses harder than "
+            "they bear. Tissue would tear there, and contact forces are rough meanwhile; slower or blunter tools, "
+            "finer elements or the model NeoHookean help"
+        )
+    return crushed > 0
+
+
+# --- pieces ----------------------------------------------------------------------------------------------------------
+
+
+def _warn_of_what_bodies_hold(contacts: Contacts, axes: list[tuple[Tool, Floats]], least: float, speed: str) -> None:
+    """The same of the nodes of bodies, and of axes of tools, in other bodies."""
+    parts, places = contacts.surface.parts, contacts.surface.arrays.x.numpy().astype(float)
+    own = [places[part.start : part.start + len(part.skin.nodes)] for part in parts]
+    ends = np.cumsum([0, *(len(points) for points in own), *(len(points) for _, points in axes)])
+    points = np.concatenate(own + [each for _, each in axes])
+    deepest = np.zeros(len(points))
+    for k, part in enumerate(parts):
+        depths = _depths(own[k], part.skin.triangles, points, contacts.device)
+        depths[ends[k] : ends[k + 1]] = 0.0
+        deepest = np.maximum(deepest, depths)
+    deep = deepest[: ends[len(parts)]]
+    if count := int((deep > least).sum()):
+        _warn(
+            f"{count} surface nodes begin inside another soft body, by up to {1e3 * deep.max():.3g} mm; overlaps of up "
+            f"to a quarter of an element are {speed}, deeper ones stay"
+        )
+    for (tool, _), start, end in zip(axes, ends[len(parts) :], ends[len(parts) + 1 :], strict=False):
+        if (deepest[start:end] > least).any():
+            _warn(f"a {tool.shape!r} begins inside a soft body, where nothing pushes it out; begin outside of it")
+
+
+def _axis(tool: Tool, pose: Floats) -> Floats:
+    """Points inside a tool, which may lie between the nodes of a body, [n, 3]; none of what has no known middle."""
+    shape = tool.shape
+    if isinstance(shape, Ground | TriangleMesh | SignedDistance):
+        return np.zeros((0, 3))
+    half = shape.size[1] if isinstance(shape, Capsule | Cylinder) else 0.0
+    axis = np.asarray(wp.quat_rotate(wp.quat(*pose[3:]), wp.vec3(0.0, 0.0, 1.0)), float)
+    return pose[:3] + np.linspace(-half, half, ALONG if half else 1)[:, None] * axis
+
+
+def _depths(surface: Floats, triangles: npt.NDArray[np.int32], points: Floats, device: wp.Device) -> Floats:
+    """How deep points are inside a closed surface [m]; zero outside."""
+    reach = float(np.linalg.norm(np.ptp(surface, axis=0)))
+    inside = ((points >= surface.min(axis=0)) & (points <= surface.max(axis=0))).all(axis=1)
+    depths = np.zeros(len(points))
+    if not inside.any():
+        return depths
+    corners = wp.array(surface, dtype=wp.vec3, device=device)
+    mesh = wp.Mesh(corners, wp.array(triangles.ravel(), dtype=wp.int32, device=device))
+    shape, motions = kinds.Shapes(), Motions()
+    shape.kind = wp.array([int(kinds.MESH)], dtype=wp.int32, device=device)
+    shape.size = wp.array([[1e-6 * reach, 0.0, 0.0]], dtype=wp.vec3, device=device)
+    shape.source = wp.array([mesh.id], dtype=wp.uint64, device=device)
+    motions.later = wp.array([[[0, 0, 0, 0, 0, 0, 1]]], dtype=wp.transform, device=device)
+    found = wp.zeros((1, int(inside.sum())), dtype=wp.float32, device=device)
+    asked = wp.array(points[inside], dtype=wp.vec3, device=device)
+    wp.launch(find_gaps, found.shape, [shape, motions, asked, reach], [found], device=device)
+    depths[inside] = np.maximum(-found.numpy()[0], 0.0)
+    return depths
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, StabilityWarning, stacklevel=depth_of_user())
