@@ -23,6 +23,7 @@ from . import haptics, remesh
 from .domain import Domain
 from .elasticity import Corotated, EdgeStVK, Linear, MassSpring, NeoHookean, Ogden, StVenantKirchhoff
 from .errors import CapacityWarning, ConvergenceError, InputError, StabilityWarning, StaleViewError, UnstableError
+from .frameworks import jax, torch
 from .mesh import SurfaceMesh, TetForest, TetMesh
 from .solvers import BDF2, BackwardEuler, GeneralizedAlpha, Newmark, QuasiStatic, SymplecticEuler
 
@@ -72,11 +73,13 @@ __all__ = [
     "UnstableError",
     "WorldEnergies",
     "haptics",
+    "jax",
     "polar_rotation",
     "record",
     "remesh",
     "show_progress",
     "solve_static",
     "static_gradient",
+    "torch",
     "view",
 ]

@@ -30,7 +30,7 @@ FLOORS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("contact", ("contact",)),
     ("remesh", ("remesh",)),
     ("simulation", ("simulation",)),
-    ("gradients", ("gradients",)),
+    ("gradients", ("gradients", "frameworks")),
     ("io, newton, experiments, haptics", ("io", "newton", "experiments", "haptics")),
     ("viewing", ("viewing",)),
     ("cli", ("cli", "api", "__init__", "__main__")),

@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_corot.discretization.nodal import padded
 from warp_corot.elasticity import ForceField
-from warp_corot.errors import ConvergenceError
+from warp_corot.errors import ConvergenceError, InputError
 from warp_corot.solvers.implicit.conjugate_gradients import ConjugateGradients
 from warp_corot.solvers.implicit.preconditioners import preconditioner_of
 from warp_corot.solvers.implicit.tangent import TangentOperator
@@ -60,6 +60,9 @@ class StaticAdjoint:
         """
         body = self.body
         held = body.conditions.held_mask()
+        if derivative.shape != (body.sizes.nodes, 3):
+            raise InputError(f"the derivative has shape {derivative.shape}; it must be [{body.sizes.nodes}, 3]")
+        self.iterations = 0
         right = np.where(held[:, None], 0.0, derivative).reshape(body.worlds, -1)
         scale = np.abs(right).max(axis=1)
         scale = np.where(scale > 0.0, scale, 1.0)

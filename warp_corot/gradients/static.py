@@ -11,16 +11,14 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
-from warp_corot.elasticity import Corotated, ForceField, Model
-from warp_corot.errors import ConvergenceError, InputError
-from warp_corot.inputs.checks import checked_number, shown
-from warp_corot.simulation.parts import checked_gravity, checked_models
-from warp_corot.simulation.static import StaticReport, solve_static
+from warp_corot.elasticity import Model
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import shown
+from warp_corot.simulation.static import StaticReport
 
 from . import parameters
-from .adjoint import StaticAdjoint
-from .element_work import ElementWork, add_weight_to_rest
 from .objective import Objective, value_and_derivative
+from .rest_state import RestState
 
 Array = npt.NDArray[np.float64]
 
@@ -101,86 +99,20 @@ def static_gradient(
             converge.
     """
     names = checked_names(wrt)
-    if not isinstance(body, SoftBody):
-        raise InputError(f"body is {shown(body)}; it must be a SoftBody")
-    check_held(body)
-    if not 0.0 < checked_number(adjoint_tolerance, "adjoint_tolerance") < 1.0:
-        raise InputError(f"adjoint_tolerance is {adjoint_tolerance}; it must be between 0 and 1")
-    (law,) = checked_models(Corotated() if model is None else model, 1)
-    forces, work = bound(body, law, names)
-    report = solve_static(
+    solved = RestState(
         body,
-        model=law,
+        model=model,
         gravity=gravity,
+        names=names,
+        adjoint_tolerance=adjoint_tolerance,
+        preconditioner=preconditioner,
         tolerance=tolerance,
         iterations=iterations,
         load_steps=load_steps,
-        preconditioner=preconditioner,
     )
-    if not report.converged:
-        raise ConvergenceError(f"there is no gradient: {report.message}")
     value, derivative = value_and_derivative(objective, wp.clone(body.positions))
-    adjoint = StaticAdjoint(body, forces, preconditioner, adjoint_tolerance)
-    motion, boundary = adjoint.solve(derivative)
-    down = np.array(checked_gravity(gravity, body.mesh.up_axis))
-    return StaticGradient(
-        value,
-        report,
-        adjoint.iterations,
-        adjoint.residual,
-        **static_derivatives(body, forces, work, names, motion, boundary, down),
-    )
-
-
-def static_derivatives(
-    body: SoftBody,
-    forces: ForceField,
-    work: ElementWork,
-    names: Sequence[str],
-    motion: wp.array,
-    boundary: Array,
-    gravity: Array,
-) -> dict[str, Any]:
-    """The derivatives of these names from an adjoint motion, vec4, and the derivative with respect to the boundary."""
-    moved = motion.numpy()[: body.sizes.nodes, :3].astype(np.float64)
-    work.add(body.state.displacements, motion)
-    found: dict[str, Any] = {}
-    for name in names:
-        if name == "loads":
-            found[name] = moved
-        elif name == "boundary":
-            found[name] = boundary
-        elif name == "gravity":
-            found[name] = body.masses @ moved
-        elif name == "young":
-            found[name] = parameters.of_young(body, *work.of_lame())
-        elif name == "poisson":
-            found[name] = parameters.of_poisson(body, *work.of_lame())
-        elif name == "density":
-            found[name] = parameters.of_density(body, moved @ gravity)
-        elif name == "activation":
-            found[name] = work.of_activation().reshape(body.worlds, -1)
-        elif name == "rest":
-            weights = wp.zeros_like(motion)
-            add_weight_to_rest(forces, parameters.weight_densities(body, moved @ gravity), weights)
-            # Held nodes keep their displacements, so that their places follow the rest shape.
-            found[name] = work.of_rest() + weights.numpy()[:, :3] + boundary
-    return found
-
-
-def bound(body: SoftBody, law: Model, names: Sequence[str]) -> tuple[ForceField, ElementWork]:
-    """A law's forces, and what sums their derivatives.
-
-    Raises:
-        InputError: The law or the material has no such derivative.
-    """
-    if getattr(law, "rotation_level", None) is not None:
-        raise InputError(
-            "the model shares rotations, and has no exact stiffness; for gradients each element needs its own"
-        )
-    forces = law.bind(body)
-    needs = {need for name in names if (need := parameters.NEEDS[name]) is not None}
-    return forces, ElementWork(forces, needs)
+    found = solved.pull_back(derivative, names)
+    return StaticGradient(value, solved.report, solved.adjoint_iterations, solved.adjoint_residual, **found)
 
 
 def checked_names(wrt: str | Sequence[str]) -> tuple[str, ...]:
@@ -197,15 +129,3 @@ def checked_names(wrt: str | Sequence[str]) -> tuple[str, ...]:
     if not names:
         raise InputError(f"wrt is empty; it must be one or several of {wanted}")
     return names
-
-
-def check_held(body: SoftBody) -> None:
-    """See that some nodes of each world are held.
-
-    Raises:
-        InputError: None are.
-    """
-    free = np.logical_not(body.conditions.held_mask().reshape(body.worlds, -1).any(axis=1))
-    if free.any():
-        where = f" in world {int(np.argmax(free))}" if body.worlds > 1 else ""
-        raise InputError(f"no node is held{where}; a body that may be anywhere has no gradient: fix some nodes")

@@ -1,0 +1,142 @@
+"""A body at rest, and what derivatives with respect to its positions say of what it was given."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.elasticity import Corotated, ForceField, Model
+from warp_corot.errors import ConvergenceError, InputError
+from warp_corot.inputs.checks import checked_number, shown
+from warp_corot.simulation.parts import checked_gravity, checked_models
+from warp_corot.simulation.static import solve_static
+
+from . import parameters
+from .adjoint import StaticAdjoint
+from .element_work import ElementWork, add_weight_to_rest
+
+Array = npt.NDArray[np.float64]
+
+
+class RestState:
+    """Moves a body to where it is at rest, and gives gradients there while it stays.
+
+    Args:
+        body: The body; some nodes of each world must be held.
+        model, gravity, preconditioner: As for ``solve_static``.
+        names: Of the derivatives that may be asked for, keys of ``parameters.NEEDS``.
+        adjoint_tolerance: As for ``static_gradient``.
+        options: Others of ``solve_static``.
+
+    Attributes:
+        report: Of the solve.
+        adjoint_iterations, adjoint_residual: Of the last adjoint solve.
+
+    Raises:
+        InputError, ConvergenceError: As ``static_gradient``.
+    """
+
+    def __init__(
+        self,
+        body: SoftBody,
+        *,
+        model: Model | None,
+        gravity: npt.ArrayLike | None,
+        names: Sequence[str],
+        adjoint_tolerance: float = 1e-6,
+        preconditioner: str | None = None,
+        **options: Any,
+    ):
+        if not isinstance(body, SoftBody):
+            raise InputError(f"body is {shown(body)}; it must be a SoftBody")
+        check_held(body)
+        if not 0.0 < checked_number(adjoint_tolerance, "adjoint_tolerance") < 1.0:
+            raise InputError(f"adjoint_tolerance is {adjoint_tolerance}; it must be between 0 and 1")
+        (law,) = checked_models(Corotated() if model is None else model, 1)
+        self.body, self._gravity = body, np.array(checked_gravity(gravity, body.mesh.up_axis))
+        self._field, needs = bound(body, law, names)
+        ElementWork(self._field, needs)
+        self.report = solve_static(body, model=law, gravity=gravity, preconditioner=preconditioner, **options)
+        if not self.report.converged:
+            raise ConvergenceError(f"there is no gradient: {self.report.message}")
+        self._preconditioner, self._tolerance = preconditioner, adjoint_tolerance
+        self._adjoint: StaticAdjoint | None = None
+        self.adjoint_iterations, self.adjoint_residual = 0, 0.0
+
+    def pull_back(self, derivative: Array, names: Sequence[str]) -> dict[str, Any]:
+        """Derivatives of J with respect to what these names stand for, as ``StaticGradient`` has them.
+
+        Args:
+            derivative: Of J with respect to positions [1/m], [worlds * N, 3].
+            names: Of the names that the state was made with.
+        """
+        if self._adjoint is None:
+            self._adjoint = StaticAdjoint(self.body, self._field, self._preconditioner, self._tolerance)
+        adjoint = self._adjoint
+        motion, boundary = adjoint.solve(np.asarray(derivative, np.float64))
+        self.adjoint_iterations, self.adjoint_residual = adjoint.iterations, adjoint.residual
+        return self._derivatives(names, motion, boundary)
+
+    def _derivatives(self, names: Sequence[str], motion: wp.array, boundary: Array) -> dict[str, Any]:
+        """The derivatives from an adjoint motion, vec4, and the derivative with respect to the boundary."""
+        body, gravity = self.body, self._gravity
+        moved = motion.numpy()[: body.sizes.nodes, :3].astype(np.float64)
+        work = ElementWork(self._field, needed(names))
+        work.add(body.state.displacements, motion)
+        found: dict[str, Any] = {}
+        for name in names:
+            if name == "loads":
+                found[name] = moved
+            elif name == "boundary":
+                found[name] = boundary
+            elif name == "gravity":
+                found[name] = body.masses @ moved
+            elif name == "young":
+                found[name] = parameters.of_young(body, *work.of_lame())
+            elif name == "poisson":
+                found[name] = parameters.of_poisson(body, *work.of_lame())
+            elif name == "density":
+                found[name] = parameters.of_density(body, moved @ gravity)
+            elif name == "activation":
+                found[name] = work.of_activation().reshape(body.worlds, -1)
+            elif name == "rest":
+                weights = wp.zeros_like(motion)
+                add_weight_to_rest(self._field, parameters.weight_densities(body, moved @ gravity), weights)
+                # Held nodes keep their displacements, so that their places follow the rest shape.
+                found[name] = work.of_rest() + weights.numpy()[:, :3] + boundary
+        return found
+
+
+def needed(names: Sequence[str]) -> set[str]:
+    """What ``ElementWork`` must sum for derivatives of these names."""
+    return {need for name in names if (need := parameters.NEEDS[name]) is not None}
+
+
+def bound(body: SoftBody, law: Model, names: Sequence[str]) -> tuple[ForceField, set[str]]:
+    """A law's forces, and what of them derivatives of these names need.
+
+    Raises:
+        InputError: The model shares rotations.
+    """
+    if getattr(law, "rotation_level", None) is not None:
+        raise InputError(
+            "the model shares rotations, and has no exact stiffness; for gradients each element needs its own"
+        )
+    return law.bind(body), needed(names)
+
+
+def check_held(body: SoftBody) -> None:
+    """See that some nodes of each world are held.
+
+    Raises:
+        InputError: None are.
+    """
+    free = np.logical_not(body.conditions.held_mask().reshape(body.worlds, -1).any(axis=1))
+    if free.any():
+        where = f" in world {int(np.argmax(free))}" if body.worlds > 1 else ""
+        raise InputError(f"no node is held{where}; a body that may be anywhere has no gradient: fix some nodes")
