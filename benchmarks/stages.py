@@ -24,6 +24,7 @@ from warp_corot.kernels.elements.elements import (
 from warp_corot.kernels.elements.shapes import rest_shape
 from warp_corot.kernels.elements.stiffness import stiffness_product, vec12
 from warp_corot.kernels.math.rotation import identity3
+from warp_corot.kernels.modules import unique_kernel
 
 wp.set_module_options({"enable_backward": False})
 
@@ -58,7 +59,7 @@ def square_product_forces(skip_zeros: bool) -> wp.Kernel:
     product1 = stiffness_product(1, skip_zeros)
     product2 = stiffness_product(2, skip_zeros)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def square_product_forces(
         # In
         elements: ForestElements,

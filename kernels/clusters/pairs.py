@@ -9,6 +9,7 @@ import functools
 
 import warp as wp
 
+from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.stepping.block import LOAD, STORE, synchronize_block
 from warp_corot.kernels.tables.cluster_layout import BANK_GROUPS, QUAD_BYTES, PairLayout
 
@@ -98,7 +99,7 @@ def scatter_pairs(Pairs: type, Material: type, law: wp.Function, layout: PairLay
     forces, sum_of = pair_forces(law), slot_sum(slot, zero)
 
     # What is out of line is rarely run, and shall not take registers from all.
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(threads, layout.resident))
+    @unique_kernel(grid_stride=False, launch_bounds=(threads, layout.resident))
     def scatter_pairs(
         # In
         clusters: PairClusters,

@@ -15,6 +15,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.elements import ADD_FORCE
+from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.stepping.block import LOAD, STORE, number_in, synchronize_block
 from warp_corot.kernels.tables.block_layout import NUMBERS
 from warp_corot.kernels.tables.cluster_layout import DEFAULT_LAYOUT, QUAD_BYTES, ClusterLayout
@@ -127,7 +128,7 @@ def scatter_clusters(law: wp.Function, layout: ClusterLayout = DEFAULT_LAYOUT) -
     sum_of = slot_sum(slot, corners)
 
     # What is out of line is rarely run, and shall not take registers from all.
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(threads, layout.resident))
+    @unique_kernel(grid_stride=False, launch_bounds=(threads, layout.resident))
     def scatter_clusters(
         # In
         clusters: Clusters,

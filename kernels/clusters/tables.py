@@ -9,6 +9,7 @@ import functools
 
 import warp as wp
 
+from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.block_layout import NUMBERS, TASK_SLOTS
 from warp_corot.kernels.tables.cluster_layout import QUAD_BYTES, ClusterLayout
 
@@ -122,7 +123,7 @@ def find_clusters(layout: ClusterLayout) -> wp.Kernel:
     @wp.func_native(_table_snippet(layout))
     def write_tables(cluster: int, count: int, nodes: wp.array[wp.vec4i], clusters: Clusters): ...
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @unique_kernel(grid_stride=False)
     def find_clusters(
         # In
         lanes: int,

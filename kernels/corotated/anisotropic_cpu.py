@@ -15,6 +15,7 @@ from warp_corot.kernels.elements.elements import ForestElements, GeneralElements
 from warp_corot.kernels.elements.general_cpu import rest_inverse_of
 from warp_corot.kernels.elements.lanes import ELEMENTS, constants, native, scatter_lanes
 from warp_corot.kernels.elements.law_lanes import ROTATION
+from warp_corot.kernels.modules import unique_kernel
 
 from .anisotropic import FibreMaterial, OrthotropicMaterial, axes_of, filled
 
@@ -51,7 +52,7 @@ def turn_element(
 def turn_elements(Elements: type) -> wp.Kernel:
     """Elements of either kind as ``scatter_anisotropic_lanes`` wants them: Dm^-1 M, and the filled volume."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def turn_elements(
         # In
         elements: Elements,
@@ -65,7 +66,7 @@ def turn_elements(Elements: type) -> wp.Kernel:
     return turn_elements
 
 
-@wp.kernel(module="unique", enable_backward=False)
+@unique_kernel()
 def turn_changed(
     # In
     threads: int,

@@ -31,6 +31,7 @@ from warp_corot.kernels.elements.elements import (
 from warp_corot.kernels.elements.shapes import rest_shape
 from warp_corot.kernels.elements.stiffness import stiffness_product, vec12
 from warp_corot.kernels.math.rotation import identity3, warm_rotation
+from warp_corot.kernels.modules import unique_kernel
 
 wp.set_module_options({"enable_backward": False})
 
@@ -89,7 +90,7 @@ def given_cauchy(elements: Any, t: int, material: RotatedMaterial, u: wp.array[w
 def extract_rotations(Elements: type, rotation: wp.Function) -> wp.Kernel:
     """The rotation R of each unit (an element or an ancestor) from rest space to world space."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def extract_rotations(
         # In
         units: Elements,
@@ -108,7 +109,7 @@ def extract_rotations(Elements: type, rotation: wp.Function) -> wp.Kernel:
 def extract_warm_rotations(Elements: type) -> wp.Kernel:
     """As ``extract_rotations``, from and into the unit's quaternion of the step before."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def extract_warm_rotations(
         # In
         units: Elements,
@@ -145,7 +146,7 @@ def scatter_matrix_product(skip_zeros: bool) -> wp.Kernel:
     product1 = stiffness_product(1, skip_zeros)
     product2 = stiffness_product(2, skip_zeros)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def scatter_matrix_product(
         # In
         elements: ForestElements,

@@ -18,6 +18,7 @@ from warp_corot.kernels.elements.elements import (
     local_gradient,
 )
 from warp_corot.kernels.math.rotation import quick_rotation
+from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.shapes import fingerprint
 from warp_corot.kernels.tables.subtree import LEAVES
 
@@ -32,7 +33,7 @@ def share_near_rotations(shape: int) -> wp.Kernel:
     # A leaf and its corner that stand on each of the root's four nodes.
     corners = [next((k, leaf.index(n)) for k, leaf in enumerate(LEAVES[shape]) if n in leaf) for n in range(4)]
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def share_near_rotations(
         # In
         roots: ForestElements,

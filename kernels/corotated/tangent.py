@@ -19,6 +19,7 @@ from warp_corot.kernels.elements.constitutive import (
 )
 from warp_corot.kernels.elements.elements import frame, local_gradient
 from warp_corot.kernels.math.matrices import axial, cofactor, column, identity3, largest_entry
+from warp_corot.kernels.modules import unique_kernel
 
 wp.set_module_options({"enable_backward": False})
 
@@ -103,7 +104,7 @@ class KeptStrains:
 def keep_strains(Elements: type, rotation: wp.Function) -> wp.Kernel:
     """Write each element's own rotation and strain."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def keep_strains(
         # In
         elements: Elements,

@@ -9,6 +9,8 @@ import functools
 
 import warp as wp
 
+from warp_corot.kernels.modules import unique_kernel
+
 from .constitutive import CONTINUED_BELOW, IsotropicMaterial
 from .dilatation import FREE, MOST, RAMP, Dilatation
 from .elements import ForestElements, GeneralElements, frame, rest_volume
@@ -43,7 +45,7 @@ def measure_in_lanes(of: Dilatation) -> wp.Kernel:
         shared: wp.array[wp.vec4],
     ): ...
 
-    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": COMPILER_FLAGS})
+    @unique_kernel(COMPILER_FLAGS)
     def measure_in_lanes(
         # In
         units: GeneralElements,
@@ -77,7 +79,7 @@ def scatter_in_lanes(of: Dilatation) -> wp.Kernel:
         f: wp.array[wp.vec4],
     ): ...
 
-    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": COMPILER_FLAGS})
+    @unique_kernel(COMPILER_FLAGS)
     def scatter_in_lanes(
         # In
         units: GeneralElements,

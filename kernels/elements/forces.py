@@ -11,6 +11,8 @@ from typing import Any
 
 import warp as wp
 
+from warp_corot.kernels.modules import unique_kernel
+
 from .constitutive import IsotropicMaterial
 from .elements import ForestElements, GeneralElements, frame, local_gradient, rest_volume, scatter_stress
 
@@ -83,7 +85,7 @@ def law_value(function: wp.Function) -> wp.Function:
 def scatter_forces(Elements: type, Material: type, stress: wp.Function) -> wp.Kernel:
     """Add the elastic nodal forces of a law to f; a thread an element."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def scatter_forces(
         # In
         elements: Elements,
@@ -102,7 +104,7 @@ def scatter_forces(Elements: type, Material: type, stress: wp.Function) -> wp.Ke
 def repair_forces(Elements: type, Material: type, stress: wp.Function) -> wp.Kernel:
     """The same of the elements on a list, by one thread, which empties the list: how many, then which."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def repair_forces(
         # In
         elements: Elements,
@@ -125,7 +127,7 @@ def repair_forces(Elements: type, Material: type, stress: wp.Function) -> wp.Ker
 def element_energies(Elements: type, Material: type, density: wp.Function) -> wp.Kernel:
     """Strain energy of each element [J], in float64 so that sums over millions keep their digits."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def element_energies(
         # In
         elements: Elements,
@@ -144,7 +146,7 @@ def element_energies(Elements: type, Material: type, density: wp.Function) -> wp
 def element_von_mises(Elements: type, Material: type, cauchy: wp.Function) -> wp.Kernel:
     """Von Mises stress of each element [Pa]."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def element_von_mises(
         # In
         elements: Elements,

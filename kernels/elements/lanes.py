@@ -16,6 +16,8 @@ from pathlib import Path
 
 import warp as wp
 
+from warp_corot.kernels.modules import unique_kernel
+
 #: The vectors are as wide as the machine at hand has them.
 COMPILER_FLAGS = "-march=native -ffp-contract=fast"
 
@@ -74,7 +76,7 @@ def scatter_lanes(code: str, Units: type, Material: type, missed_type: type) -> 
         missed: wp.array[missed_type],
     ): ...
 
-    @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": COMPILER_FLAGS})
+    @unique_kernel(COMPILER_FLAGS)
     def scatter_lanes(
         # In
         units: Units,

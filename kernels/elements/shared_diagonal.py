@@ -6,6 +6,7 @@ from typing import Any
 import warp as wp
 
 from warp_corot.kernels.math.rotation import identity3
+from warp_corot.kernels.modules import unique_kernel
 
 from .constitutive import IsotropicMaterial
 from .dilatation import Dilatation, mean_of
@@ -57,7 +58,7 @@ def add_diagonal(Elements: type, of: Dilatation) -> wp.Kernel:
     """Add diagonal blocks of which those of K are no more: each element's as if its dilatation were its own."""
     measure, turning_of, holding = of.measure, turning_block(Elements, of), of.holding
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def add_diagonal(
         # In
         elements: Elements,
@@ -122,7 +123,7 @@ def add_diagonal_of_groups(Elements: type, of: Dilatation) -> wp.Kernel:
                 n += 1
         return row
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def add_diagonal_of_groups(
         # In
         starts: wp.array[wp.int32],

@@ -13,6 +13,8 @@ from typing import Any
 
 import warp as wp
 
+from warp_corot.kernels.modules import unique_kernel
+
 from .constitutive import IsotropicMaterial
 from .dilatation import Dilatation, mean_of
 from .elements import add_force, nodal_forces, rest_volume
@@ -70,7 +72,7 @@ def weight_law_at(of: Dilatation) -> wp.Function:
 def measure_elements(Elements: type, of: Dilatation) -> wp.Kernel:
     measure = of.measure
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def measure_elements(
         # In
         elements: Elements,
@@ -110,7 +112,7 @@ def range_of(starts: wp.array[wp.int32], members: wp.array[wp.int32], g: int):
 def share_in_groups(Elements: type, law: wp.Function) -> wp.Kernel:
     """A thread a group; see ``range_of`` for what a group is."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def share_in_groups(
         # In
         starts: wp.array[wp.int32],
@@ -148,7 +150,7 @@ def share_in_groups(Elements: type, law: wp.Function) -> wp.Kernel:
 def add_to_nodes(Elements: type) -> wp.Kernel:
     """Add lambda V / 4 times an element's dilatation, one, and the change to the sums of its nodes."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def add_to_nodes(
         # In
         elements: Elements,
@@ -177,7 +179,7 @@ def add_to_nodes(Elements: type) -> wp.Kernel:
 def law_at_nodes(law: wp.Function) -> wp.Kernel:
     """What the law makes of the sums at nodes, in their place; a thread a node."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def law_at_nodes(
         # In and out
         sums: wp.array[wp.vec4],
@@ -193,7 +195,7 @@ def law_at_nodes(law: wp.Function) -> wp.Kernel:
 def share_at_nodes(Elements: type) -> wp.Kernel:
     """The mean of what the law makes of an element's four nodes."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def share_at_nodes(
         # In
         elements: Elements,
@@ -230,7 +232,7 @@ def scatter_pressures(Elements: type, of: Dilatation) -> wp.Kernel:
     """Add forces."""
     measure, holding = of.measure, of.holding
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def scatter_pressures(
         # In
         elements: Elements,
@@ -258,7 +260,7 @@ def add_product(Elements: type, of: Dilatation) -> wp.Kernel:
     """y += K p; without ``turning``, the part of K that is positive semidefinite."""
     measure, turning_of, holding = of.measure, of.turning, of.holding
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def add_product(
         # In
         elements: Elements,
@@ -287,7 +289,7 @@ def add_energies(Elements: type, of: Dilatation) -> wp.Kernel:
     """Add each element's share of the energy [J]."""
     measure, holding = of.measure, of.holding
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def add_energies(
         # In
         elements: Elements,
@@ -311,7 +313,7 @@ def unshare(Elements: type, of: Dilatation) -> wp.Kernel:
     """Put what w' of an element's own dilatation is beyond that of the shared one in the latter's place."""
     measure, slope_of = of.measure, of.slope
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def unshare(
         # In
         elements: Elements,

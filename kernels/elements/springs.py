@@ -10,6 +10,7 @@ import functools
 
 import warp as wp
 
+from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.shapes import FIRST_NODE, SECOND_NODE, edge_stiffness, fingerprint
 
 from .constitutive import IsotropicMaterial
@@ -147,7 +148,7 @@ def scatter_edge_stvk(Elements: type, biquadratic: bool) -> wp.Kernel:
     """Add the nodal forces of the six coupled springs of each element to f."""
     measures = edge_measures(biquadratic)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def scatter_edge_stvk(
         # In
         elements: Elements,
@@ -179,7 +180,7 @@ def edge_stvk_energies(Elements: type, biquadratic: bool) -> wp.Kernel:
     """D^T K D / 2 of each element [J]."""
     measures = edge_measures(biquadratic)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def edge_stvk_energies(
         # In
         elements: Elements,

@@ -11,6 +11,8 @@ from typing import Any
 
 import warp as wp
 
+from warp_corot.kernels.modules import unique_kernel
+
 from .constitutive import IsotropicMaterial
 from .elements import add_force, frame, gradient_of, local_gradient, nodal_forces, rest_volume
 
@@ -35,7 +37,7 @@ def law_differential(law: wp.Function) -> wp.Function:
 def add_stiffness_product(Elements: type, Material: type, differential: wp.Function) -> wp.Kernel:
     """y += K(u) p; a thread an element."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def add_stiffness_product(
         # In
         elements: Elements,
@@ -66,7 +68,7 @@ def where_is(chosen: bool, v: wp.vec3):
 def add_stiffness_diagonal(Elements: type, Material: type, differential: wp.Function) -> wp.Kernel:
     """Add the 3x3 blocks on K(u)'s diagonal to those of the nodes; a thread a node of an element."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def add_stiffness_diagonal(
         # In
         elements: Elements,

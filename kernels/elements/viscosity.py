@@ -13,6 +13,7 @@ import warp as wp
 
 from warp_corot.kernels.math.matrices import axial
 from warp_corot.kernels.math.rotation import byers_xu, identity3
+from warp_corot.kernels.modules import unique_kernel
 
 from .constitutive import IsotropicMaterial, corotated_strain, hooke, symmetric
 from .elements import frame, local_gradient, scatter_stress
@@ -41,7 +42,7 @@ def viscous_stress(u: wp.mat33, a: wp.mat33, mu: float, lam: float):
 def scatter_viscous(Elements: type) -> wp.Kernel:
     """Add viscous nodal forces to f: eta times the stiffness, for small motions."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def scatter_viscous(
         # In
         elements: Elements,

@@ -4,6 +4,8 @@ import functools
 
 import warp as wp
 
+from warp_corot.kernels.modules import unique_kernel
+
 from .rotation import warm_rotation
 
 wp.set_module_options({"enable_backward": False})
@@ -11,7 +13,7 @@ wp.set_module_options({"enable_backward": False})
 
 @functools.cache
 def rotate_all(rotation: wp.Function) -> wp.Kernel:
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def rotate_all(matrices: wp.array[wp.mat33], rotations: wp.array[wp.mat33]):
         i = wp.tid()
         rotations[i] = rotation(matrices[i])

@@ -11,6 +11,8 @@ import warp as wp
 from .bisection import refinement_end
 from .growth import LIVE, VOID
 
+wp.set_module_options({"enable_backward": False})
+
 #: Value in place of a first child: below the mesh.
 BELOW = wp.constant(-3)
 

@@ -5,7 +5,11 @@ Each kernel evaluates one kind of domain, with one thread for each point; sets o
 
 import warp as wp
 
+from warp_corot.kernels.modules import unique_kernel
+
 from .windings import Lines, winding_number
+
+wp.set_module_options({"enable_backward": False})
 
 #: Search radius for the closest triangle [m]: unlimited.
 FAR = 1.0e15
@@ -112,7 +116,7 @@ def clip_to_box(
 def sampler(function: wp.Function) -> wp.Kernel:
     """A kernel that evaluates a user's device function vec3 -> float."""
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @unique_kernel()
     def evaluate_function(
         # In
         points: wp.array[wp.vec3],

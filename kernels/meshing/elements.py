@@ -9,6 +9,8 @@ from warp_corot.kernels.tables.shapes import FIRST_NODE, SECOND_NODE
 
 from .growth import LIVE, VOID
 
+wp.set_module_options({"enable_backward": False})
+
 # State of a new element.
 DONE = wp.constant(0)
 SPLIT = wp.constant(1)

@@ -5,6 +5,8 @@ import warp as wp
 from .bisection import refinement_end
 from .growth import VOID
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.kernel(enable_backward=False)
 def move_points(

@@ -11,6 +11,8 @@ from warp_corot.kernels.tables.shapes import FIRST_NODE, SECOND_NODE
 
 from .bisection import first_half, halfway, refinement_end, second_half
 
+wp.set_module_options({"enable_backward": False})
+
 EMPTY = wp.constant(wp.int64(-1))
 LIVE = wp.constant(-1)
 VOID = wp.constant(-2)

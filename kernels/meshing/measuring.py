@@ -2,6 +2,8 @@
 
 import warp as wp
 
+wp.set_module_options({"enable_backward": False})
+
 #: Maximum number of triangles of its own part that an edge can pass.
 MOST_OWN_HITS = wp.constant(8)
 #: The same for triangles around its points, and how far beyond its ends to search, relative to its length.

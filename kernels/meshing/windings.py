@@ -9,6 +9,8 @@ line passes it.
 
 import warp as wp
 
+wp.set_module_options({"enable_backward": False})
+
 #: Inclination of lines: metres along the two other axes for each metre along their axis. A box around a line is wider
 #: by this share of its length and this share of the point's largest coordinate.
 ASLANT = wp.constant(wp.vec2d(1.2371e-5, 0.7193e-5))

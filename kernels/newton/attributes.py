@@ -8,6 +8,7 @@ from warp_corot.kernels.elements.constitutive import corotated_strain, hooke
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.forces import von_mises
 from warp_corot.kernels.math.rotation import byers_xu, identity3, warm_rotation
+from warp_corot.kernels.modules import unique_kernel
 
 from .elements import difference_gradient, place_in_model
 
@@ -42,7 +43,7 @@ def split_materials(
 def write_attributes(has_rotation: bool, has_stress: bool, has_von_mises: bool, is_warm: bool) -> wp.Kernel:
     """Write rotation and Cauchy stress of every element, as far as the state has attributes for them."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def write_attributes(
         # In
         elements: GeneralElements,

@@ -21,6 +21,7 @@ from warp_corot.kernels.elements.general_cuda import (
 from warp_corot.kernels.elements.lanes import ELEMENTS, ISOTROPIC, native, scatter_lanes
 from warp_corot.kernels.elements.law_lanes import LAWS
 from warp_corot.kernels.math.rotation import byers_xu, cofactor, identity3, warm_rotation
+from warp_corot.kernels.modules import unique_kernel
 
 wp.set_module_options({"enable_backward": False})
 
@@ -85,7 +86,7 @@ def scatter_posed(rotation: wp.Function, damped: bool, rounds: int = 1) -> wp.Ke
     ``stepping.activation``; ``rounds``: see ``add_four_forces``."""
     add = add_stress(rounds)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def scatter_posed(
         # In
         elements: PosedElements,
@@ -166,7 +167,7 @@ def scatter_damping_and_activation(damped: bool) -> wp.Kernel:
     A thread checks ``EACH`` of them, so that it waits for memory once if none is active or damped.
     """
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def scatter_damping_and_activation(
         # In
         elements: GeneralElements,

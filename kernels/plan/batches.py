@@ -13,6 +13,8 @@ from .lists import LEAVES_OF_SUBTREE
 from .plan import Plan, extent, flat_row, places_t
 from .tree import Tree, code_above, padding, sink
 
+wp.set_module_options({"enable_backward": False})
+
 # Nodes of a single subtree; places for nodes of a group.
 SINGLE_NODES = 10
 GROUP_NODES = 40

@@ -7,6 +7,8 @@ from warp_corot.kernels.remesh.pools import ADDED, LEAVES, REMOVED, Pools
 from .plan import Plan, extent, leaf_row
 from .tree import Tree
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.kernel(enable_backward=False)
 def begin_plan(

@@ -13,6 +13,8 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import LEVEL_MASK
 
+wp.set_module_options({"enable_backward": False})
+
 LOW_HALF = wp.constant(wp.int64((1 << 32) - 1))
 
 

@@ -15,6 +15,8 @@ from .plan import Plan, flat_row, level_of, places_t
 from .tree import Tree, above, element_of, parent_of, which_child
 from .units import begins_unit, list_unit
 
+wp.set_module_options({"enable_backward": False})
+
 #: Maximum number of classes: three shapes with own rotations, one with its root's, three with one from further up; on
 #: CUDA each in groups, then one by one.
 CLASSES = wp.constant(14)

@@ -20,6 +20,8 @@ from .lists import LEAVES_OF_SUBTREE
 from .plan import Plan, extent, flat_row, places_t
 from .tree import Tree
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.struct
 class Targets:

@@ -11,6 +11,8 @@ from warp_corot.kernels.elements.elements import LEVEL_MASK
 from .plan import Plan, extent, flat_row, level_of
 from .tree import Tree, code_above, element_of, padding, parent_of, which_child
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.func
 def on_nodes(e: int, tree: Tree):

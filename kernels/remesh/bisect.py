@@ -23,6 +23,8 @@ from .pools import (
 )
 from .state import Carried, copy_to_children, make_node, quarter_mass
 
+wp.set_module_options({"enable_backward": False})
+
 # The upper half of ``demand`` counts nodes, the lower half pairs.
 ONE_NODE = wp.constant(wp.int64(1 << 32))
 

@@ -7,6 +7,8 @@ import warp as wp
 
 from .pools import BIRTHS, LEAVES, NODE_TOP, STAMP, Pools
 
+wp.set_module_options({"enable_backward": False})
+
 #: Leaves in a block, and those that one thread visits.
 BLOCK = wp.constant(512)
 STRETCH = wp.constant(16)

@@ -10,6 +10,8 @@ import warp as wp
 from .pools import NODE_TOP, OLD_TOP, REMOVED, Pools
 from .state import Carried, move_node
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.struct
 class Moves:

@@ -31,6 +31,8 @@ from .pools import (
     Pools,
 )
 
+wp.set_module_options({"enable_backward": False})
+
 NEVER = wp.constant(0x7FFFFFFF)
 LOW_HALF = wp.constant(wp.int64((1 << 32) - 1))
 

@@ -6,6 +6,8 @@ from warp_corot.kernels.meshing.bisection import refinement_end
 
 from .pools import Pools
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.func
 def in_child(w: wp.vec4d, k: int, second: bool):

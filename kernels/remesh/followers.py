@@ -5,6 +5,8 @@ import warp as wp
 from .pools import NODE_TOP, Pools
 from .state import MIXED_ROWS, NO_ROW, Carried
 
+wp.set_module_options({"enable_backward": False})
+
 #: Counts: nodes that follow keyframes, and those among them whose row is not known yet.
 FOLLOWERS = wp.constant(0)
 MIXED = wp.constant(1)

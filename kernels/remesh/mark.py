@@ -7,6 +7,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node
 from warp_corot.kernels.meshing.bisection import refinement_end
+from warp_corot.kernels.modules import unique_kernel
 
 from .pools import LEAVES, REFINE, SIMPLIFY, Pools
 
@@ -102,7 +103,7 @@ def marking_kernel(criterion: Any) -> wp.Kernel:
     directions, so that one may be stretched and the other not.
     """
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @unique_kernel()
     def mark_leaves(
         # In
         threads: int,

@@ -9,6 +9,8 @@ import warp as wp
 from .dense import Moves, rename_upwards
 from .pools import ADDED, LEAVES, NEW_LEAVES, NODE_TOP, OLD_TOP, REMOVED, UNUSED, Pools, padding
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.func
 def next_leaf(e: int, top: int, pools: Pools):

@@ -15,6 +15,8 @@ import warp as wp
 
 from warp_corot.kernels.plan.tree import SINKS
 
+wp.set_module_options({"enable_backward": False})
+
 # Places in ``Pools.counts``.
 LEAVES = wp.constant(0)
 NODE_TOP = wp.constant(1)  # nodes that leaves name: all lower numbers

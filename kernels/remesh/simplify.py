@@ -12,6 +12,8 @@ from warp_corot.kernels.meshing.growth import LIVE
 from .pools import CANDIDATES, FREE_PAIRS, LEAVES, NODES_GIVEN, PAIRS_GIVEN, SIMPLIFY, UNUSED, Pools
 from .state import Carried, average_children, quarter_mass, unmake_node
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.struct
 class Removal:

@@ -15,6 +15,8 @@ from warp_corot.kernels.elements.elements import load_node, store_node
 
 from .pools import ADDED, GAINERS, NODE_TOP, REMOVED, Pools
 
+wp.set_module_options({"enable_backward": False})
+
 # Rows of keyframes for nodes that follow none, and for held nodes between nodes with different rows.
 NO_ROW = wp.constant(-1)
 MIXED_ROWS = wp.constant(-2)

@@ -9,6 +9,8 @@ import warp as wp
 from .pools import LEAVES, Pools
 from .state import Carried
 
+wp.set_module_options({"enable_backward": False})
+
 # Places in the result; from FINEST_COUNTS on there are partial sums.
 STIFFEST = wp.constant(0)
 FINEST_LEVEL = wp.constant(1)

@@ -17,6 +17,7 @@ from warp_corot.kernels.elements.constitutive import hooke, symmetric
 from warp_corot.kernels.elements.elements import FRAME_SHIFT, LEVEL_MASK, Subtrees, load_node, mirror_sign, store_node
 from warp_corot.kernels.math.matrices import column, identity3
 from warp_corot.kernels.math.quaternion import robust_rotation
+from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.subtrees.forces import columns_of, leaf_forces_of, mat10, near_forces, shared_forces
 from warp_corot.kernels.tables.block_layout import (
     FIRST_SHIFT,
@@ -315,9 +316,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
     slot = shared_vectors(zero_slot + 1, "forces")
     waiting, enlist, do_one, collect = _left_out_of(layout, displacement, slot)
 
-    @wp.kernel(
-        module="unique",
-        enable_backward=False,
+    @unique_kernel(
         grid_stride=False,
         launch_bounds=(threads, max(BUSY_THREADS // threads, 1)),
     )

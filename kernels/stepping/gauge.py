@@ -14,6 +14,7 @@ from typing import Any
 import warp as wp
 
 from warp_corot.kernels.elements.elements import frame, load_node, local_gradient, store_node
+from warp_corot.kernels.modules import unique_kernel
 
 from .pace import CURVATURE, DONE, DT, STRAIN, Pace
 
@@ -108,7 +109,7 @@ def find_strains(Elements: Any) -> wp.Kernel:
     One element of ``TURNS`` is looked at, others the next time: neighbours, which share nodes, are strained too.
     """
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def find_strains(
         # In
         elements: Elements,

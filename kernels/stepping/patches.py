@@ -18,6 +18,7 @@ import warp as wp
 from warp_corot.kernels.corotated.algebraic import stretch_stress, turned_stress
 from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.math.matrices import column, identity3
+from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.shapes import fingerprint
 
 from .block import LOAD, STORE, lowest_bit, number_in, shuffle_down, synchronize_any, synchronize_block
@@ -200,7 +201,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         slot(wp.static(STORE), number_in(targets, 2), f2)
         slot(wp.static(STORE), number_in(targets, 3), f3)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(threads, 1))
+    @unique_kernel(grid_stride=False, launch_bounds=(threads, 1))
     def step_patches(
         # In
         body: PatchBody,

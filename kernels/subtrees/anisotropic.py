@@ -21,6 +21,7 @@ from warp_corot.kernels.elements.elements import (
     scatter_stress,
 )
 from warp_corot.kernels.math.rotation import ITERATIONS, byers_xu, column, newton_rotation, quick_rotation
+from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
 from warp_corot.kernels.tables.subtree import FRAMES, HANDEDNESS, LEAVES
 
@@ -120,7 +121,7 @@ def scatter_anisotropic_subtrees(
 
     options = {"launch_bounds": (BLOCK, resident)} if resident else {}
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, **options)
+    @unique_kernel(grid_stride=False, **options)
     def scatter_anisotropic_subtrees(
         # In
         subtrees: Subtrees,
@@ -152,7 +153,7 @@ def scatter_anisotropic_subtrees(
 _robust_stress = listed_stress(byers_xu)
 
 
-@wp.kernel(module="unique", enable_backward=False)
+@unique_kernel()
 def repair_leaves(
     # In
     flagged: wp.array[wp.uint64],
@@ -181,7 +182,7 @@ def repair_leaves(
 _quick_stress = listed_stress(quick_rotation)
 
 
-@wp.kernel(module="unique", enable_backward=False)
+@unique_kernel()
 def scatter_flat(
     # In
     elements: ForestElements,

@@ -31,6 +31,7 @@ from warp_corot.kernels.elements.elements import (
     node_displacements,
 )
 from warp_corot.kernels.elements.merging import add_four_forces
+from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.subtree import GROUP_NODES, SLOT_STRIDE, group_slots, group_sources
 
 from .forces import leaf_stress, mat10, near_forces, shared_forces
@@ -192,9 +193,7 @@ def scatter_subtrees_own(
     forces = near_forces(shape, uniform, tolerance)
     resident = RESIDENT[shape] if uniform and tolerance is None else min(RESIDENT)
 
-    @wp.kernel(
-        module="unique",
-        enable_backward=False,
+    @unique_kernel(
         grid_stride=False,
         launch_bounds=(BLOCK, resident),
     )
@@ -246,7 +245,7 @@ def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: boo
     load, add = memory_of(shape, grouped)
     forces = shared_forces(shape, uniform, given)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @unique_kernel(grid_stride=False)
     def scatter_subtrees_shared(
         # In
         subtrees: Subtrees,
@@ -329,7 +328,7 @@ def scatter_stretches(uniform: bool, tolerance: float | None = None) -> wp.Kerne
     subtree0, subtree1, subtree2 = (_scatter_subtree(shape, uniform, tolerance) for shape in range(3))
     add_neighbours = add_four_forces(2)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, min(RESIDENT)))
+    @unique_kernel(grid_stride=False, launch_bounds=(BLOCK, min(RESIDENT)))
     def scatter_stretches(
         # In
         stretches: wp.array[Stretch],

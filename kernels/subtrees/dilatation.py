@@ -15,6 +15,7 @@ from warp_corot.kernels.elements.elements import FRAME_SHIFT, LEVEL_MASK, Subtre
 from warp_corot.kernels.elements.lanes import ISOTROPIC, native, scatter_lanes
 from warp_corot.kernels.elements.shapes import columns_of, leaf_forces_of
 from warp_corot.kernels.math.rotation import column
+from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
 from warp_corot.kernels.tables.subtree import LEAVES
 
@@ -91,7 +92,7 @@ def scatter_dilatation(shape: int, grouped: bool, uniform: bool, of: Dilatation)
     load, add = memory_of(shape, grouped)
     forces = dilatation_forces_of(shape, uniform, of)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @unique_kernel(grid_stride=False)
     def scatter_dilatation(
         # In
         subtrees: Subtrees,

@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import FRAME_SHIFT, LEVEL_MASK, Subtrees, mirror_sign
 from warp_corot.kernels.math.rotation import column
+from warp_corot.kernels.modules import unique_kernel
 
 from .cuda import memory_of
 from .forces import mat10, turned_forces_of
@@ -53,7 +54,7 @@ def scatter_subtrees(shape: int, grouped: bool, uniform: bool, stress: wp.Functi
     load, add = memory_of(shape, grouped)
     forces = turned_forces_of(shape, uniform, range(8), always_trusted(stress))
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False)
+    @unique_kernel(grid_stride=False)
     def scatter_subtrees(
         # In
         subtrees: Subtrees,

@@ -6,6 +6,8 @@ of the next finer level on others (Galerkin). Contributions are listed with the 
 
 import warp as wp
 
+wp.set_module_options({"enable_backward": False})
+
 
 @wp.func
 def key_of(i: int, j: int, bits: int):

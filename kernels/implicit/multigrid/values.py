@@ -22,6 +22,7 @@ from warp_corot.kernels.elements.elements import (
     shape_of,
 )
 from warp_corot.kernels.math.rotation import quick_rotation
+from warp_corot.kernels.modules import unique_kernel
 
 wp.set_module_options({"enable_backward": False})
 
@@ -63,7 +64,7 @@ def write_frames(is_turned: bool) -> wp.Kernel:
     """Each leaf's frame at displacements u, or at rest, times sqrt(V) / h; the third column of the Maubach frame."""
     frame_of = turned_frame if is_turned else rest_frame
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def write_frames(
         # In
         elements: ForestElements,
