@@ -18,6 +18,7 @@ import warp as wp
 from warp_corot.kernels.elements.constitutive import corotated_strain, hooke, stretch_strain
 from warp_corot.kernels.elements.elements import frame, local_gradient, rest_volume
 from warp_corot.kernels.math.rotation import cofactor, column, identity3, largest_entry
+from warp_corot.kernels.modules import unique_kernel
 
 wp.set_module_options({"enable_backward": False})
 
@@ -233,7 +234,7 @@ def fibre_cauchy(rotation: wp.Function) -> wp.Function:
 def add_active_energies(Elements: type) -> wp.Kernel:
     """Add what each element's active stress s would have for an energy if s stayed: V s (|F d|^2 - 1) / 2."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def add_active_energies(
         # In
         elements: Elements,
