@@ -5,6 +5,7 @@ import functools
 import warp as wp
 
 from warp_corot.kernels.elements.elements import frame, local_gradient
+from warp_corot.kernels.modules import unique_kernel
 
 wp.set_module_options({"enable_backward": False})
 
@@ -13,7 +14,7 @@ wp.set_module_options({"enable_backward": False})
 def count_crushed(Elements: type) -> wp.Kernel:
     """Count elements with det F < 0."""
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel()
     def count_crushed(elements: Elements, u: wp.array[wp.vec4], count: wp.array[wp.int32]):
         t = wp.tid()
         q = frame(elements, t)

@@ -29,9 +29,7 @@ class DenseInverse:
         level.launch(kernels.fill_dense, level.count, inputs, [self._matrix, self._scale])
         block, lanes = (BLOCK, LANES) if level.device.is_cuda else (1, 1)
         outputs = [self._matrix, self._rows]
-        wp.launch(
-            kernels.invert_dense, level.worlds * block, [lanes], outputs, device=level.device, block_dim=block
-        )
+        wp.launch(kernels.invert_dense, level.worlds * block, [lanes], outputs, device=level.device, block_dim=block)
         shape = self.inverse.shape
         inputs = [self._matrix, self._scale]
         wp.launch(kernels.store_inverse, dim=shape, inputs=inputs, outputs=[self.inverse], device=level.device)
