@@ -12,6 +12,7 @@ from warp_corot.gradients.static import StaticGradient, static_gradient
 from warp_corot.io.write.animate import record
 from warp_corot.materials.anisotropic import Orthotropic, TransverselyIsotropic
 from warp_corot.materials.isotropic import Isotropic
+from warp_corot.materials.reinforced import FibreReinforced
 from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.simulation.energy import Energy, WorldEnergies
 from warp_corot.simulation.progress import show_progress
@@ -21,7 +22,16 @@ from warp_corot.viewing.view import view
 
 from . import haptics, remesh
 from .domain import Domain
-from .elasticity import Corotated, EdgeStVK, Linear, MassSpring, NeoHookean, Ogden, StVenantKirchhoff
+from .elasticity import (
+    Corotated,
+    EdgeStVK,
+    HolzapfelGasserOgden,
+    Linear,
+    MassSpring,
+    NeoHookean,
+    Ogden,
+    StVenantKirchhoff,
+)
 from .errors import CapacityWarning, ConvergenceError, InputError, StabilityWarning, StaleViewError, UnstableError
 from .frameworks import jax, torch
 from .mesh import SurfaceMesh, TetForest, TetMesh
@@ -41,9 +51,11 @@ __all__ = [
     "Domain",
     "EdgeStVK",
     "Energy",
+    "FibreReinforced",
     "GeneralizedAlpha",
     "Grasp",
     "Ground",
+    "HolzapfelGasserOgden",
     "InputError",
     "Isotropic",
     "Linear",

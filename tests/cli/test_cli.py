@@ -10,7 +10,7 @@ from pxr import UsdGeom
 from stages import frames, opened
 
 import warp_corot as wc
-from warp_corot.elasticity import MODELS
+from warp_corot.cli.options import CHOICES
 
 CUBE = wc.TetForest.box((1, 1, 1), 0.1, 3)
 
@@ -58,7 +58,7 @@ def test_options_reach_the_simulation(folder, capsys):
     assert "0 0 -10 m/s^2, damping 1 /s" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", CHOICES)
 def test_every_model(folder, model, capsys):
     assert simulate("box", "-o", "a.usd", "--model", model, *SHORT) == 0
     assert re.search(rf"model +{model}[,\n]", capsys.readouterr().out)

@@ -13,7 +13,7 @@ from warp_corot.discretization.nodal import vec3_view
 from warp_corot.discretization.sizes import Sizes
 from warp_corot.errors import InputError
 from warp_corot.inputs.indices import checked_indices
-from warp_corot.materials.anisotropic import Anisotropic
+from warp_corot.materials.directional import Directional
 from warp_corot.materials.isotropic import Material
 
 from .activation import Activation, constant_stress
@@ -219,9 +219,9 @@ class Controls:
     def _make_activation(self) -> None:
         """Ensure that there is an active stress for every element."""
         conditions = self.conditions
-        if not conditions.discretization.has_activation and not isinstance(self.material, Anisotropic):
+        if not conditions.discretization.has_activation and not isinstance(self.material, Directional):
             raise InputError(
-                "activation needs a material with a direction, TransverselyIsotropic or Orthotropic; "
+                "activation needs a material with a direction, TransverselyIsotropic, Orthotropic or FibreReinforced; "
                 f"the body's is {type(self.material).__name__}"
             )
         conditions.make_activation()

@@ -35,6 +35,9 @@ from .touching import add_touch_options
 
 FPS = 24.0
 
+#: Models whose material the command line can give: fibres it has none of.
+CHOICES = [name for name in MODELS if name != "holzapfel-gasser-ogden"]
+
 
 def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
     """Add the command to ``warp-corot``."""
@@ -186,7 +189,7 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
     body.add_argument(
         "--regions-by", metavar="ARRAY", help="array of the file that numbers its regions (default: the likeliest one)"
     )
-    body.add_argument("--model", choices=MODELS, default="corotated", help="elastic model (default: corotated)")
+    body.add_argument("--model", choices=CHOICES, default="corotated", help="elastic model (default: corotated)")
     body.add_argument(
         "--rotation-level",
         type=rotation_level,

@@ -14,7 +14,7 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import check_float32
 from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial, vec9
 from warp_corot.kernels.elements.elements import ForestElements
-from warp_corot.materials.anisotropic import Anisotropic
+from warp_corot.materials.directional import Directional
 from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest
 
@@ -118,8 +118,8 @@ class Discretization(ABC):
 
     @property
     def is_anisotropic(self) -> bool:
-        """Whether the material is."""
-        return isinstance(self.material, Anisotropic)
+        """Whether the material has directions."""
+        return isinstance(self.material, Directional)
 
     @property
     def is_uniform(self) -> bool:
@@ -225,7 +225,7 @@ class FixedMesh(Discretization):
 
     @property
     def is_anisotropic(self) -> bool:
-        return isinstance(self._material, Anisotropic)
+        return isinstance(self._material, Directional)
 
     @property
     def prefers_subtrees(self) -> bool:
@@ -252,9 +252,9 @@ class FixedMesh(Discretization):
 
     def anisotropic_material(self) -> OrthotropicMaterial:
         given, fill = self._material, self.fill
-        assert isinstance(given, Anisotropic)
-        stiffness = given.stiffness()
-        check_float32(np.abs(stiffness[..., [0, 1, 2, 6, 7, 8]]).ravel(), "the stiffness", "Pa")
+        assert isinstance(given, Directional)
+        stiffness = given.entries()
+        check_float32(np.abs(stiffness[..., list(given.positive)]).ravel(), "the stiffness", "Pa")
         material = OrthotropicMaterial()
         material.axes, material.axes_stride = self._of_elements(given.frames(), 2, wp.mat33)
         material.stiffness, material.stride = self._of_elements(stiffness, 1, vec9)

@@ -3,6 +3,7 @@
 from warp_corot.elasticity.corotated.model import Corotated
 
 from .edge_stvk import EdgeStVK
+from .fibres import HolzapfelGasserOgden
 from .linear import Linear
 from .mass_spring import MassSpring
 from .model import ForceField, Model
@@ -16,6 +17,7 @@ MODELS: dict[str, type[Model]] = {
     "stvk": StVenantKirchhoff,
     "neo-hookean": NeoHookean,
     "ogden": Ogden,
+    "holzapfel-gasser-ogden": HolzapfelGasserOgden,
     "edge-stvk": EdgeStVK,
     "mass-spring": MassSpring,
 }
@@ -25,6 +27,7 @@ __all__ = [
     "Corotated",
     "EdgeStVK",
     "ForceField",
+    "HolzapfelGasserOgden",
     "Linear",
     "MassSpring",
     "Model",

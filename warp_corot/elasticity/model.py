@@ -76,7 +76,8 @@ class ForceField(ABC):
         discretization = discretization_of(body)
         if discretization.is_anisotropic and not self.takes_anisotropic:
             name = type(discretization.material).__name__
-            raise InputError(f"the material is {name}; only the model Corotated supports anisotropic materials")
+            only = "HolzapfelGasserOgden" if name == "FibreReinforced" else "Corotated"
+            raise InputError(f"the material is {name}; only the model {only} supports this material")
         self.discretization = discretization
         self.device = discretization.device
         #: On the CPU there is one thread, and nothing to settle.

@@ -11,6 +11,7 @@ from warp_corot.discretization.elements import Elements
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial
 from warp_corot.kernels.corotated.tangent import KeptStrains
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
+from warp_corot.kernels.elements.fibres import ReinforcedMaterial
 from warp_corot.kernels.elements.stiffness_products import add_stiffness_diagonal, add_stiffness_product
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 #: Structs of materials.
-ElementMaterial: TypeAlias = "IsotropicMaterial | RotatedMaterial | KeptStrains | FibreMaterial"
+ElementMaterial: TypeAlias = "IsotropicMaterial | RotatedMaterial | KeptStrains | FibreMaterial | ReinforcedMaterial"
 
 
 @dataclass(frozen=True)

@@ -2,5 +2,6 @@
 
 from .anisotropic import Orthotropic, TransverselyIsotropic
 from .isotropic import Isotropic
+from .reinforced import FibreReinforced
 
-__all__ = ["Isotropic", "Orthotropic", "TransverselyIsotropic"]
+__all__ = ["FibreReinforced", "Isotropic", "Orthotropic", "TransverselyIsotropic"]

@@ -11,19 +11,14 @@ import numpy.typing as npt
 
 from warp_corot.errors import InputError
 
-from .isotropic import Field, Isotropic, Material, place, set_checked
-
-Array = npt.NDArray[np.float64]
-
-#: The entries of ``Anisotropic.stiffness`` and of ``frames``, row by row, when elements carry them one by one.
-STIFFNESS_ENTRIES = tuple(f"stiffness{n}" for n in range(9))
-FRAME_ENTRIES = tuple(f"frame{n}" for n in range(9))
+from .directional import Array, Directional, any_across, unit
+from .isotropic import Field, Isotropic, place, set_checked
 
 # The largest cosine between two axes of a material, which limits how far they are from a right angle.
 _RIGHT_ANGLE = 1e-3
 
 
-class Anisotropic(Material):
+class Anisotropic(Directional):
     """A material with three axes of symmetry at right angles. In these axes its compliance is
 
         e_i = s_i / E_i - sum_(j != i) nu_ji / E_j s_j,    2 e_ij = s_ij / G_ij,    nu_ij / E_i = nu_ji / E_j,
@@ -34,22 +29,21 @@ class Anisotropic(Material):
     #: A quantity that must be positive, besides the moduli, for a positive definite stiffness; ``_margin`` is its
     #: value.
     condition: ClassVar[str]
+    positive: ClassVar[tuple[int, ...]] = (0, 1, 2, 6, 7, 8)
 
     @abstractmethod
     def constants(self) -> tuple[Array, Array, Array]:
         """E_1, E_2, E_3 [Pa]; nu_12, nu_13, nu_23; G_12, G_13, G_23 [Pa]; each [..., 3]."""
 
     @abstractmethod
-    def frames(self) -> Array:
-        """The axes in rest space as the columns of proper rotations, [..., 3, 3]."""
-
-    @abstractmethod
     def fields_of(self, constants: tuple[Array, Array, Array]) -> dict[str, Array]:
         """The fields that give these ``constants``, by name."""
 
-    @abstractmethod
-    def directions_of(self, frames: Array) -> dict[str, Array]:
-        """The field that gives these ``frames``, [..., 3, 3], by name."""
+    def entries(self) -> Array:
+        return self.stiffness()
+
+    def fields_of_entries(self, entries: Array) -> dict[str, Array]:
+        return self.fields_of(constants_of(entries))
 
     def stiffness(self) -> Array:
         """C_11, C_22, C_33, C_12, C_13, C_23, G_12, G_13, G_23 in the material's axes [Pa], [..., 9]."""
@@ -134,7 +128,7 @@ class TransverselyIsotropic(Anisotropic):
         set_checked(self, "direction", "", -np.inf, np.inf)
         set_checked(self, "density", "kg/m^3", 0.0, np.inf)
         if not callable(self.direction):
-            object.__setattr__(self, "direction", _unit(self.direction, "direction"))
+            object.__setattr__(self, "direction", unit(self.direction, "direction"))
         self._check_definite()
 
     def constants(self) -> tuple[Array, Array, Array]:
@@ -164,9 +158,7 @@ class TransverselyIsotropic(Anisotropic):
 
     def frames(self) -> Array:
         along = self.direction
-        # Any two directions across will do: the first is perpendicular to the axis that is farthest from the fibre.
-        across = np.cross(along, np.eye(3)[np.abs(along).argmin(axis=-1)])
-        across /= np.linalg.norm(across, axis=-1, keepdims=True)
+        across = any_across(along)  # any two directions across will do
         return np.stack([along, across, np.cross(along, across)], axis=-1)
 
 
@@ -210,7 +202,7 @@ class Orthotropic(Anisotropic):
         set_checked(self, "axes", "", -np.inf, np.inf)
         set_checked(self, "density", "kg/m^3", 0.0, np.inf)
         if not callable(self.axes):
-            object.__setattr__(self, "axes", _right_angled(_unit(self.axes, "axes")))
+            object.__setattr__(self, "axes", _right_angled(unit(self.axes, "axes")))
         self._check_definite()
 
     def constants(self) -> tuple[Array, Array, Array]:
@@ -253,20 +245,6 @@ def _symmetric_ratios(young: Array, poisson: Array) -> tuple[Array, Array, Array
 def _determinant(r12: Array, r13: Array, r23: Array) -> Array:
     """The determinant of the compliance scaled to a diagonal of ones."""
     return 1.0 - r12**2 - r13**2 - r23**2 - 2.0 * r12 * r13 * r23
-
-
-def _unit(vectors: Array, name: str) -> Array:
-    """Vectors [..., 3] of length one; those of length one are not changed, so that repetition changes nothing."""
-    largest = np.abs(vectors).max(axis=-1, keepdims=True)
-    zero = np.argwhere(largest[..., 0] == 0)
-    if len(zero):
-        rank = 1 if name == "direction" else 2
-        where = place(zero[0][: largest.ndim - rank], largest.shape[: largest.ndim - rank])
-        raise InputError(f"{name}{where} has length zero; it must have a nonzero length")
-    # Scaling comes first, so that no square overflows or underflows.
-    scaled = vectors / largest
-    norm = np.linalg.norm(scaled, axis=-1, keepdims=True)
-    return np.where(np.abs(largest * norm - 1.0) < 1e-14, vectors, scaled / norm)
 
 
 def _right_angled(axes: Array) -> Array:

@@ -17,7 +17,7 @@ from warp_corot.discretization.elements import copied
 from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial, vec9
 from warp_corot.kernels.remesh.anisotropic import assemble_materials
 from warp_corot.kernels.remesh.state import FIRST, MEAN_IF_ALIKE, MEAN_OF_CONTENTS, NO_ROW
-from warp_corot.materials.anisotropic import FRAME_ENTRIES, STIFFNESS_ENTRIES, Anisotropic, constants_of
+from warp_corot.materials.directional import FRAME_ENTRIES, STIFFNESS_ENTRIES, Directional
 from warp_corot.materials.isotropic import Isotropic, Material
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ ACTIVATION_ROW = "activation_row"
 
 def carried_material(former: Discretization) -> CarriedMaterial:
     """The material data that the body's elements carry."""
-    return (CarriedAnisotropic if isinstance(former.material, Anisotropic) else CarriedMaterial)(former)
+    return (CarriedAnisotropic if isinstance(former.material, Directional) else CarriedMaterial)(former)
 
 
 class CarriedMaterial:
@@ -110,7 +110,7 @@ class CarriedAnisotropic(CarriedMaterial):
     def __init__(self, former: Discretization):
         super().__init__(former)
         count = len(former.mesh.tets)
-        stiffness, frames = self.given.stiffness(), self.given.frames()
+        stiffness, frames = self.given.entries(), self.given.frames()
         self._stiffness_varies = stiffness.size > 9
         self._axes_vary = frames.size > 9
         if self._stiffness_varies:
@@ -129,7 +129,7 @@ class CarriedAnisotropic(CarriedMaterial):
     def serve(self, plan: DevicePlan, lame: tuple[wp.array, wp.array, int]) -> None:
         given, count = self._anisotropic, plan.counts.most
         material = copied(given)
-        material.mu, material.lam, material.stride = lame
+        material.mu, material.lam = lame[:2]
         if given.axes_stride:
             material.axes = wp.array(np.tile(np.eye(3), (count, 1, 1)), dtype=wp.mat33, device=plan.forest.device)
         if given.stride:
@@ -149,7 +149,7 @@ class CarriedAnisotropic(CarriedMaterial):
     def present(self, forest: DeviceForest) -> Material:
         changed: dict[str, Any] = {"density": self._present_density(forest)}
         if self._stiffness_varies:
-            changed |= self.given.fields_of(constants_of(_of_leaves(forest, STIFFNESS_ENTRIES)))
+            changed |= self.given.fields_of_entries(_of_leaves(forest, STIFFNESS_ENTRIES))
         if self._axes_vary:
             changed |= self.given.directions_of(_of_leaves(forest, FRAME_ENTRIES).reshape(-1, 3, 3))
         return replace(self.given, **changed)

@@ -12,7 +12,7 @@ from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.levels import TreeNodes
 from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial
-from warp_corot.materials.anisotropic import Anisotropic
+from warp_corot.materials.directional import Directional
 from warp_corot.mesh import TetForest
 
 from .carried_material import ACTIVATION, CarriedMaterial
@@ -67,7 +67,7 @@ class ChangingMesh(Discretization):
 
     @property
     def is_anisotropic(self) -> bool:
-        return isinstance(self._carried.given, Anisotropic)
+        return isinstance(self._carried.given, Directional)
 
     @property
     def prefers_subtrees(self) -> bool:

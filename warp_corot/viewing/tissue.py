@@ -90,7 +90,7 @@ def model_of(law: str, rotations: str, former: Model | None = None) -> Model:
 
 def changed(material: Any, scale: float, poisson: float | None) -> Any:
     """A material so many times as stiff, with another Poisson's ratio if one is given and it is isotropic."""
-    stiff = [name for name in vars(material) if name.startswith(("young", "shear"))]
+    stiff = [name for name in vars(material) if name.startswith(("young", "shear", "k1"))]
     values = {name: getattr(material, name) * scale for name in stiff}
     if poisson is not None and type(material) is Isotropic:
         values["poisson"] = poisson

@@ -15,6 +15,7 @@ from warp_corot.elasticity.polar import METHODS, rotation_function
 from warp_corot.errors import InputError
 from warp_corot.kernels.elements.dilatation import VOLUME
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
+from warp_corot.materials.anisotropic import Anisotropic
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.forest import MAX_LEVEL
 
@@ -123,6 +124,9 @@ class Corotated(Model):
         return LeafField(discretization, self, deterministic)
 
     def _bind_anisotropic(self, discretization: Discretization, deterministic: bool) -> AnisotropicField:
+        if not isinstance(discretization.material, Anisotropic):
+            name = type(discretization.material).__name__
+            raise InputError(f"the material is {name}; only the model HolzapfelGasserOgden supports this material")
         for name, given, wanted in (
             ("rotation_level", self.rotation_level, None),
             ("stiffness", self.stiffness, "factored"),

@@ -41,6 +41,7 @@ class DilatationField(ForceField):
     """
 
     shares_dilatation = True
+    takes_anisotropic = True  # the law has checked that
 
     def __init__(
         self,

@@ -12,6 +12,7 @@ from warp_corot.elasticity.model import ForceField
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
 from warp_corot.kernels.elements.dilatation import Dilatation
+from warp_corot.materials.anisotropic import Anisotropic
 
 from .field import DilatationField
 
@@ -50,10 +51,11 @@ def shares_dilatation(dilatation: str, discretization: Discretization) -> bool:
     Raises:
         InputError: They should, and the material is anisotropic.
     """
-    if dilatation == SHARED and discretization.is_anisotropic:
+    inseparable = isinstance(discretization.material, Anisotropic)
+    if dilatation == SHARED and inseparable:
         name = type(discretization.material).__name__
         raise InputError(f"dilatation is {SHARED!r} and the material is {name}; it must be {AUTO!r} or {ELEMENT!r}")
-    if dilatation != AUTO or discretization.is_anisotropic:
+    if dilatation != AUTO or inseparable:
         return dilatation == SHARED
     # As float32 has it, too.
     return float(np.max(discretization.material.poisson)) > SHARED_FROM - 1e-6

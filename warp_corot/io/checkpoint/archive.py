@@ -22,6 +22,7 @@ from warp_corot.io.files.quiet import bounded
 from warp_corot.io.files.whole import written_whole
 from warp_corot.materials.anisotropic import Orthotropic, TransverselyIsotropic
 from warp_corot.materials.isotropic import Isotropic
+from warp_corot.materials.reinforced import FibreReinforced
 from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import INTEGRATORS
@@ -41,7 +42,7 @@ FORMAT = "warp-corot checkpoint"
 #: last check. 7: contact. All are read.
 VERSION = 7
 
-MATERIALS = {kind.__name__: kind for kind in (Isotropic, TransverselyIsotropic, Orthotropic)}
+MATERIALS = {kind.__name__: kind for kind in (Isotropic, TransverselyIsotropic, Orthotropic, FibreReinforced)}
 
 
 def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:

@@ -13,7 +13,7 @@ from warp_corot.elasticity.corotated.subtrees import SubtreeField
 from warp_corot.elasticity.paths.general import CorotatedGeneralField
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.stepping.patches import Exchange, Layout, PatchBody, step_patches
-from warp_corot.materials.anisotropic import Anisotropic
+from warp_corot.materials.directional import Directional
 
 from .patch_layout import NO_SLOT, Patches
 
@@ -146,7 +146,7 @@ def _suits(body: SoftBody, field: ForceField) -> bool:
         return False
     if not body.device.is_cuda or body.device.arch < LEAST_ARCH:
         return False
-    if isinstance(body.material, Anisotropic) or field.deterministic:
+    if isinstance(body.material, Directional) or field.deterministic:
         return False
     return FEWEST <= len(body.mesh.tets) <= MOST and _has_own_rotations(field)
 

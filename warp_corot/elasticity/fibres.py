@@ -1,0 +1,109 @@
+"""The law of Holzapfel, Gasser and Ogden, for tissue with families of fibres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import warp as wp
+
+from warp_corot.discretization.discretization import Discretization, discretization_of
+from warp_corot.elasticity.stiffness import ElementStiffness
+from warp_corot.elasticity.structs import Kept
+from warp_corot.errors import InputError
+from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.dilatation import LOG_VOLUME
+from warp_corot.kernels.elements.fibres import (
+    ReinforcedMaterial,
+    reinforced_cauchy,
+    reinforced_density,
+    reinforced_differential,
+    reinforced_stress,
+)
+from warp_corot.kernels.elements.forces import element_energies, element_von_mises, scatter_forces
+from warp_corot.materials.reinforced import FibreReinforced
+
+from .dilatation import AUTO, bind_law, check_dilatation
+from .model import ForceField, Model
+
+if TYPE_CHECKING:
+    from warp_corot.discretization.discretization import Discretized
+
+
+@dataclass(frozen=True)
+class HolzapfelGasserOgden(Model):
+    """W = V (W_neo-Hookean + sum over families of k1 / (2 k2) (exp(k2 e^2) - 1)) for tissue with fibres.
+
+    The body's material must be ``FibreReinforced``: it has Young's modulus and Poisson's ratio of the matrix, and k1,
+    k2, the dispersion kappa and the directions a of the fibres. e = kappa (tr C - 3) + (1 - 3 kappa) (a . C a - 1),
+    C = F^T F; families with e < 0 bear nothing (Gasser, Ogden and Holzapfel 2006; with the whole C, so that fibres
+    feel changes of volume, as Nolan et al. 2014 recommend). The matrix is that of ``NeoHookean``, which bounds the
+    stiffness of crushed and turned-over elements; that of fibres is bounded at a thousand times k1 by a parabola beyond
+    e = sqrt(4.6 / k2).
+
+    Attributes:
+        dilatation: Of the matrix: "element", "shared" or "auto", as for ``NeoHookean``.
+    """
+
+    dilatation: str = AUTO
+
+    def __post_init__(self) -> None:
+        check_dilatation(self.dilatation)
+
+    def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
+        discretization = discretization_of(body)
+        if not isinstance(discretization.material, FibreReinforced):
+            name = type(discretization.material).__name__
+            raise InputError(f"the material is {name}; for HolzapfelGasserOgden it must be FibreReinforced")
+        return bind_law(ReinforcedField, LOG_VOLUME, self.dilatation, discretization, deterministic)
+
+
+class ReinforcedField(ForceField):
+    """Its forces, element by element."""
+
+    takes_anisotropic: ClassVar[bool] = True
+
+    def __init__(self, discretization: Discretization, deterministic: bool):
+        super().__init__(discretization, deterministic)
+        kind = discretization.element_kind
+        self._forces = scatter_forces(kind, ReinforcedMaterial, reinforced_stress)
+        self._energies = element_energies(kind, ReinforcedMaterial, reinforced_density)
+        self._von_mises = element_von_mises(kind, ReinforcedMaterial, reinforced_cauchy)
+        self._stiffness = ElementStiffness(discretization, reinforced_differential, ReinforcedMaterial)
+        self._fibres = discretization.anisotropic_material()
+        self._made = Kept(_material)
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        self.launch(self._forces, self.element_count, [self.elements, self.material, u], [f])
+
+    def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None:
+        self._stiffness.add_product(self.elements, self.material, u, p, y)
+
+    def add_diagonal(self, u: wp.array, blocks: wp.array) -> None:
+        self._stiffness.add_diagonal(self.elements, self.material, u, blocks)
+
+    def write_energies(self, u: wp.array, energies: wp.array) -> None:
+        self.launch(self._energies, self.element_count, [self.elements, self.material, u], [energies])
+
+    def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
+        shown = _material(self.isotropic_shown, self._fibres, *self._activation)
+        self.launch(self._von_mises, self.element_count, [self.elements, shown, u], [stress])
+
+    @property
+    def material(self) -> ReinforcedMaterial:
+        """The material with the present active stress."""
+        return self._made(self.isotropic, self._fibres, *self._activation)
+
+    @property
+    def _activation(self) -> list:
+        return [int(self.discretization.has_activation), self.discretization.activation]
+
+
+def _material(
+    matrix: IsotropicMaterial, fibres: OrthotropicMaterial, is_active: int, activation: wp.array
+) -> ReinforcedMaterial:
+    material = ReinforcedMaterial()
+    material.matrix, material.fibres = matrix, fibres
+    material.is_active, material.activation = is_active, activation
+    return material
