@@ -5,7 +5,7 @@ others are cut into pieces small enough for smooth shading, and each piece is fi
 """
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -230,7 +230,7 @@ def _draw_outline(
     keys, count = np.unique(ends[:, 0] * len(x) + ends[:, 1], return_counts=True)
     alone = keys[count == 1]
     lines, _ = camera.project(x[np.stack([alone // len(x), alone % len(x)], axis=1)])
-    drawn = LineCollection(lines, colors=color, linewidth=width, capstyle="round", zorder=order)
+    drawn = LineCollection(cast(Any, lines), colors=color, linewidth=width, capstyle="round", zorder=order)
     ax.add_collection(drawn, autolim=False)
 
 
@@ -243,7 +243,7 @@ def _fill(ax: "Axes", polygons: Array, face: Any, edge: Any, *, width: float, or
     from matplotlib.collections import PolyCollection
 
     collection = PolyCollection(
-        polygons, facecolor=face, edgecolor=edge, linewidth=width, joinstyle="round", zorder=order
+        cast(Any, polygons), facecolor=face, edgecolor=edge, linewidth=width, joinstyle="round", zorder=order
     )
     ax.add_collection(collection, autolim=False)
 
