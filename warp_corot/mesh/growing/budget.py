@@ -34,8 +34,12 @@ GAP_NEED = 0.5
 #: finer still; of many elements it is the mesh's own.
 FINER_SURFACE, FINER_FOREST = 0.3, 0.2
 #: Cubes are as large as gives this share of the elements when none is bisected: about six in a cube inside, four at the
-#: surface.
-UNBISECTED = 1.0 / 6.0
+#: surface. Of more elements the surface needs fewer, so that the share goes up, between two numbers of elements.
+UNBISECTED, UNBISECTED_OF_MANY = 1.0 / 6.0, 0.5
+FEWER, MORE = 50_000, 1_000_000
+#: Where nothing in the forest is left to bisect, smaller cubes are to give so many times the elements asked for: at half
+#: their size there are hardly four times as many.
+AMPLE, SLOW = 1.3, 2.0
 #: How often cubes are bisected for the surface's sake. Where it is most curved elements are a fifth of a cube long;
 #: finer ones would bring the rest of the surface little, and make the time step smaller. From so many elements on
 #: there are too few at the surface for that. Thin parts may have finer ones.
@@ -124,8 +128,9 @@ def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Devi
         if budget.surface_error and count <= budget.target:
             break
         ratio = count / (NEAR * budget.target)
+        factor = ratio ** (1.0 / 2.5) if meshes.has_more else (ratio / AMPLE) ** (1.0 / SLOW)
         # Cubes larger than the body would be the whole of it.
-        size = min(size * float(np.clip(ratio ** (1.0 / 2.5), 0.5, 2.0)), largest)
+        size = min(size * float(np.clip(factor, 0.5, 2.0)), largest)
     if best is None and given_up:
         best = _of_cubes(domain, budget, suits, suits, sliver, device)
     return best
@@ -136,12 +141,14 @@ def predicted_cell_size(domain: Domain, target: int) -> float:
     from warp_corot.domain.reference import extent_of
 
     volume, area = extent_of(domain)
+    way = float(np.clip(np.log(target / FEWER) / np.log(MORE / FEWER), 0.0, 1.0))
+    unbisected = target * (UNBISECTED + way * (UNBISECTED_OF_MANY - UNBISECTED))
     low, high = 1e-6, 1.0
     longest = float(np.ptp(domain.bounds, axis=0).max())
     for _ in range(60):
         share = np.sqrt(low * high)
         size = share * longest
-        if 6.0 * volume / size**3 + 4.0 * area / size**2 > UNBISECTED * target:
+        if 6.0 * volume / size**3 + 4.0 * area / size**2 > unbisected:
             low = share
         else:
             high = share
