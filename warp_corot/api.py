@@ -30,6 +30,7 @@ from .elasticity import (
     MassSpring,
     NeoHookean,
     Ogden,
+    Prony,
     StVenantKirchhoff,
 )
 from .errors import CapacityWarning, ConvergenceError, InputError, StabilityWarning, StaleViewError, UnstableError
@@ -65,6 +66,7 @@ __all__ = [
     "Ogden",
     "OnlineRemesh",
     "Orthotropic",
+    "Prony",
     "QuasiStatic",
     "SignedDistance",
     "Simulation",

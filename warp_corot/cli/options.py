@@ -35,8 +35,8 @@ from .touching import add_touch_options
 
 FPS = 24.0
 
-#: Models whose material the command line can give: fibres it has none of.
-CHOICES = [name for name in MODELS if name != "holzapfel-gasser-ogden"]
+#: Models that the command line has options for.
+CHOICES = [name for name in MODELS if name not in ("holzapfel-gasser-ogden", "prony")]
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:

@@ -9,6 +9,7 @@ from .mass_spring import MassSpring
 from .model import ForceField, Model
 from .neo_hookean import NeoHookean
 from .ogden import Ogden
+from .prony import Prony
 from .stvk import StVenantKirchhoff
 
 MODELS: dict[str, type[Model]] = {
@@ -18,6 +19,7 @@ MODELS: dict[str, type[Model]] = {
     "neo-hookean": NeoHookean,
     "ogden": Ogden,
     "holzapfel-gasser-ogden": HolzapfelGasserOgden,
+    "prony": Prony,
     "edge-stvk": EdgeStVK,
     "mass-spring": MassSpring,
 }
@@ -33,5 +35,6 @@ __all__ = [
     "Model",
     "NeoHookean",
     "Ogden",
+    "Prony",
     "StVenantKirchhoff",
 ]

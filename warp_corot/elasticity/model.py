@@ -32,6 +32,7 @@ from .tangent import Tangent
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
+    from warp_corot.kernels.stepping.pace import Pace
 
     from .paths.dilating import Dilating
 
@@ -191,6 +192,15 @@ class ForceField(ABC):
     def state(self) -> dict[str, wp.array]:
         """Arrays that must be kept for the steps to go on as they would have."""
         return {}
+
+    #: Seconds since the state that is kept was known, float32 [1], where forces depend on that; a stepper sets them.
+    elapsed: wp.array | None = None
+
+    def complete_step(self, u: wp.array, pace: Pace) -> None:  # noqa: B027 (most keep nothing)
+        """Launch that a step of the clock's length has ended at displacements u; may be recorded."""
+
+    def relax_fully(self) -> None:  # noqa: B027 (most keep nothing)
+        """Let forces from now on be those after an infinite time."""
 
     @contextmanager
     def state_kept(self) -> Iterator[None]:

@@ -12,6 +12,7 @@ from warp_corot.kernels.corotated.anisotropic import FibreMaterial
 from warp_corot.kernels.corotated.tangent import KeptStrains
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.fibres import ReinforcedMaterial
+from warp_corot.kernels.elements.prony import PronyMaterial
 from warp_corot.kernels.elements.stiffness_products import add_stiffness_diagonal, add_stiffness_product
 
 if TYPE_CHECKING:
@@ -19,7 +20,9 @@ if TYPE_CHECKING:
 
 
 #: Structs of materials.
-ElementMaterial: TypeAlias = "IsotropicMaterial | RotatedMaterial | KeptStrains | FibreMaterial | ReinforcedMaterial"
+ElementMaterial: TypeAlias = (
+    "IsotropicMaterial | RotatedMaterial | KeptStrains | FibreMaterial | ReinforcedMaterial | PronyMaterial"
+)
 
 
 @dataclass(frozen=True)

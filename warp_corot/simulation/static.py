@@ -103,6 +103,7 @@ def solve_static(
 
     body.state.adopt_positions()
     field = law.bind(body)
+    field.relax_fully()
     answer = _Answer(body, field, down)
     if answer.falls():
         message = "no node is held, and the loads do not balance: the body has no state of rest; fix some nodes"

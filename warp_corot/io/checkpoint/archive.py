@@ -301,8 +301,12 @@ def _unpack_state(body: SoftBody, described: dict[str, Any], prefix: str, arrays
 
 
 def _described(thing: Any, names: dict[str, Any]) -> dict[str, Any]:
-    """A listed dataclass of plain values for JSON: its name in the list and its values."""
-    return {"name": _name_of(thing, names), "values": dataclasses.asdict(thing)}
+    """A listed dataclass of plain values, and of others of its kind, for JSON: its name in the list and its values."""
+    values = dataclasses.asdict(thing)
+    for name in values:
+        if type(getattr(thing, name)) in names.values():
+            values[name] = _described(getattr(thing, name), names)
+    return {"name": _name_of(thing, names), "values": values}
 
 
 def _name_of(thing: Any, names: dict[str, Any]) -> str:
@@ -313,7 +317,9 @@ def _name_of(thing: Any, names: dict[str, Any]) -> str:
 
 
 def _rebuilt(described: dict[str, Any], names: dict[str, Any]) -> Any:
-    return names[described["name"]](**described["values"])
+    values = described["values"]
+    parts = {name: _rebuilt(value, names) for name, value in values.items() if isinstance(value, dict)}
+    return names[described["name"]](**(values | parts))
 
 
 def _write_whole(target: Path, arrays: dict[str, np.ndarray]) -> None:

@@ -117,7 +117,9 @@ class SymplecticEulerStepper(Stepper):
                     self.system.add_elastic_forces(k, offset)
             self.system.add_other_forces(offset, self.damping, one_by_one)
             for k in one_by_one:
-                self._move(self.system.bodies[k], offset)
+                body = self.system.bodies[k]
+                self._move(body, offset)
+                self.system.fields[k].complete_step(body.state.displacements, self.system.pace.arrays)
 
     def _move(self, body: SoftBody, offset: int) -> None:
         """Launch the motion of the ``offset``-th step since the clock was last advanced."""

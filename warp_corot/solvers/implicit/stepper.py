@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.elasticity.viscosity import Viscosity
+from warp_corot.kernels.elements.prony import set_elapsed
 from warp_corot.kernels.implicit import conjugate_gradients
 from warp_corot.kernels.implicit import newton as kernels_of_newton
 from warp_corot.kernels.implicit import steps as kernels
@@ -178,6 +179,9 @@ class BodySteps:
         inputs = [self._begins, self._table, options.damping]
         outputs = [self.operator.scales, newton.inertia]
         wp.launch(kernels.choose_scales, 1, inputs, outputs, device=self.device)
+        if self.field.elapsed is not None:
+            inputs = [self._begins, self._table, int(kernels.STAGE), options.dt]
+            wp.launch(set_elapsed, 1, inputs, [self.field.elapsed], device=self.device)
         inputs = [self._begins, self._table, options.dt, options.damping, conditions.inverse_mass]
         inputs += [state.velocities, *self._h]
         outputs = [state.displacements, newton.base, newton.increment, newton.pull, self._drift]
@@ -200,6 +204,7 @@ class BodySteps:
         inputs += [newton.base, newton.increment, system.pace.arrays, offset]
         outputs = [state.velocities, *self._h, state.displacements, *self._left, system.bad_step]
         self._launch(kernels.end_step, inputs, outputs)
+        self.field.complete_step(state.displacements, system.pace.arrays)
         if system.counted:
             self.stepper.add_counted_forces()
             account = system.accounts[self.k]

@@ -1,0 +1,205 @@
+"""Viscoelastic stresses of a Prony series: Maxwell elements beside the elastic law, in rest space.
+
+Element i has the shear modulus g_i mu and the relaxation time tau_i. Its overstrain s_i, symmetric and without trace,
+follows ds_i/dt = dE/dt - s_i / tau_i with E the deviator of Green's strain, and its second Piola-Kirchhoff stress is
+2 g_i mu s_i: nothing of that knows how the body has turned. If E grows evenly over a time t, then exactly
+    s_i(t) = exp(-t / tau_i) s_i(0) + phi (E(t) - E(0)),  phi = (1 - exp(-t / tau_i)) tau_i / t.
+So forces t after a known state are those of an elastic law with the energy density
+    sum_i g_i mu (phi |E - E(0)|^2 + 2 exp(-t / tau_i) s_i(0) : (E - E(0)) + exp(-t / tau_i) |s_i(0)|^2),
+which at t = 0 is the energy that the Maxwell elements hold.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.math.matrices import identity3
+from warp_corot.kernels.modules import unique_kernel
+from warp_corot.kernels.stepping.pace import DT, Pace
+
+from .constitutive import IsotropicMaterial, green_strain, symmetric
+from .elements import frame, local_gradient, rest_volume
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class PronyMaterial:
+    """The elastic material, the series, and what is known of each element.
+
+    ``known`` has blocks of six numbers a tensor, each of ``count`` elements: E(0), and the overstrains in their order.
+    """
+
+    isotropic: IsotropicMaterial
+    g: wp.array[wp.float32]  # [terms]
+    tau: wp.array[wp.float32]  # [terms] [s]
+    elapsed: wp.array[wp.float32]  # [1] t [s]
+    known: wp.array[wp.float32]  # [6 (terms + 1) count]
+    count: int
+
+
+@wp.func
+def deviator(a: wp.mat33):
+    return a - (wp.trace(a) / 3.0) * identity3()
+
+
+@wp.func
+def read_tensor(material: PronyMaterial, block: int, t: int):
+    first = 6 * block * material.count + t
+    n = material.count
+    xx = material.known[first]
+    yy = material.known[first + n]
+    zz = material.known[first + 2 * n]
+    xy = material.known[first + 3 * n]
+    xz = material.known[first + 4 * n]
+    yz = material.known[first + 5 * n]
+    return wp.mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
+
+
+@wp.func
+def write_tensor(material: PronyMaterial, block: int, t: int, a: wp.mat33):
+    first = 6 * block * material.count + t
+    n = material.count
+    material.known[first] = a[0, 0]
+    material.known[first + n] = a[1, 1]
+    material.known[first + 2 * n] = a[2, 2]
+    material.known[first + 3 * n] = a[0, 1]
+    material.known[first + 4 * n] = a[0, 2]
+    material.known[first + 5 * n] = a[1, 2]
+
+
+@wp.func
+def fading(time: float, tau: float):
+    """exp(-t / tau) and phi, to all their digits; also of an infinite time."""
+    x = time / tau
+    left = wp.exp(-x)
+    mean = 1.0 - 0.5 * x * (1.0 - x / 3.0 * (1.0 - 0.25 * x))
+    if x > 0.02:
+        mean = (1.0 - left) / x
+    return left, mean
+
+
+@wp.func
+def rest_gradient(elements: Any, t: int, u: wp.array[wp.vec4]):
+    """du/dX in the axes of rest space."""
+    return local_gradient(elements, t, u) * wp.transpose(frame(elements, t))
+
+
+@wp.func
+def second_stress(material: PronyMaterial, t: int, strain: wp.mat33):
+    """The second Piola-Kirchhoff stress of all terms, of E."""
+    change = strain - read_tensor(material, 0, t)
+    s = wp.mat33()
+    for i in range(material.g.shape[0]):
+        left, mean = fading(material.elapsed[0], material.tau[i])
+        s += material.g[i] * (left * read_tensor(material, i + 1, t) + mean * change)
+    return (2.0 * material.isotropic.mu[t * material.isotropic.stride]) * s
+
+
+@wp.func
+def prony_stress(elements: Any, t: int, material: PronyMaterial, u: wp.array[wp.vec4]):
+    a = rest_gradient(elements, t, u)
+    s = second_stress(material, t, deviator(green_strain(a)))
+    return (s + a * s) * frame(elements, t)
+
+
+@wp.func
+def prony_differential(elements: Any, t: int, material: PronyMaterial, u: wp.array[wp.vec4], dg: wp.mat33):
+    a = rest_gradient(elements, t, u)
+    da = dg * wp.transpose(frame(elements, t))
+    s = second_stress(material, t, deviator(green_strain(a)))
+    d_strain = deviator(symmetric(da + wp.transpose(a) * da))
+    stiffness = float(0.0)
+    for i in range(material.g.shape[0]):
+        _left, mean = fading(material.elapsed[0], material.tau[i])
+        stiffness += material.g[i] * mean
+    d_s = (2.0 * stiffness * material.isotropic.mu[t * material.isotropic.stride]) * d_strain
+    return (da * s + d_s + a * d_s) * frame(elements, t)
+
+
+@wp.func
+def prony_density(elements: Any, t: int, material: PronyMaterial, u: wp.array[wp.vec4]):
+    change = deviator(green_strain(rest_gradient(elements, t, u))) - read_tensor(material, 0, t)
+    density = float(0.0)
+    for i in range(material.g.shape[0]):
+        left, mean = fading(material.elapsed[0], material.tau[i])
+        s = read_tensor(material, i + 1, t)
+        own = mean * wp.ddot(change, change) + left * (2.0 * wp.ddot(s, change) + wp.ddot(s, s))
+        density += material.g[i] * own
+    return density * material.isotropic.mu[t * material.isotropic.stride]
+
+
+@functools.cache
+def add_prony_energies(Elements: type) -> wp.Kernel:
+    """Add the energy of the Maxwell elements of each element [J]."""
+
+    @unique_kernel()
+    def add_prony_energies(
+        # In
+        elements: Elements,
+        material: PronyMaterial,
+        u: wp.array[wp.vec4],
+        # In and out
+        energies: wp.array[wp.float64],
+    ):
+        t = wp.tid()
+        energies[t] += wp.float64(prony_density(elements, t, material, u)) * wp.float64(rest_volume(elements, t))
+
+    return add_prony_energies
+
+
+@functools.cache
+def relax(Elements: type) -> wp.Kernel:
+    """A step of the clock's length has ended at displacements u: that state is known now."""
+
+    @unique_kernel()
+    def relax(
+        # In
+        elements: Elements,
+        u: wp.array[wp.vec4],
+        pace: Pace,
+        # In and out
+        material: PronyMaterial,
+    ):
+        t = wp.tid()
+        strain = deviator(green_strain(rest_gradient(elements, t, u)))
+        change = strain - read_tensor(material, 0, t)
+        time = float(pace.seconds[DT])
+        for i in range(material.g.shape[0]):
+            left, mean = fading(time, material.tau[i])
+            write_tensor(material, i + 1, t, left * read_tensor(material, i + 1, t) + mean * change)
+        write_tensor(material, 0, t, strain)
+        if t == 0:
+            material.elapsed[0] = 0.0
+
+    return relax
+
+
+@wp.kernel(enable_backward=False)
+def set_elapsed(
+    # In
+    begins: wp.array[wp.int32],
+    shares: wp.array3d[wp.float32],
+    row: int,
+    dt: float,
+    # Out
+    elapsed: wp.array[wp.float32],
+):
+    """The time of the stage of an implicit step after its beginning [s]; see ``implicit.steps``."""
+    elapsed[0] = shares[begins[0], row, 0] * dt
+
+
+@wp.kernel(enable_backward=False)
+def forget(
+    # In
+    chosen: wp.array[wp.int32],
+    world_count: int,
+    count: int,
+    # Out
+    known: wp.array[wp.float32],
+):
+    """Let the chosen worlds be relaxed at rest."""
+    i = wp.tid()
+    if chosen[(i % count) // world_count] != 0:
+        known[i] = 0.0
