@@ -8,6 +8,7 @@ from warp_corot.contact.sampled import SignedDistance, TriangleMesh
 from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Sphere
 from warp_corot.contact.tool import Tool
 from warp_corot.elasticity.polar import polar_rotation
+from warp_corot.gradients.run import RunGradient, run_gradient
 from warp_corot.gradients.static import StaticGradient, static_gradient
 from warp_corot.io.write.animate import record
 from warp_corot.materials.anisotropic import Orthotropic, TransverselyIsotropic
@@ -68,6 +69,7 @@ __all__ = [
     "Orthotropic",
     "Prony",
     "QuasiStatic",
+    "RunGradient",
     "SignedDistance",
     "Simulation",
     "SoftBody",
@@ -91,6 +93,7 @@ __all__ = [
     "polar_rotation",
     "record",
     "remesh",
+    "run_gradient",
     "show_progress",
     "solve_static",
     "static_gradient",

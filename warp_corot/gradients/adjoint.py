@@ -1,4 +1,4 @@
-"""The adjoint of a state of rest: one linear solve with the stiffness in that state."""
+"""Adjoint motions: linear solves with the stiffness in a state, and inertia where a time step has it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_corot.discretization.nodal import padded
 from warp_corot.elasticity import ForceField
-from warp_corot.errors import ConvergenceError, InputError
+from warp_corot.errors import ConvergenceError
 from warp_corot.solvers.implicit.conjugate_gradients import ConjugateGradients
 from warp_corot.solvers.implicit.preconditioners import preconditioner_of
 from warp_corot.solvers.implicit.tangent import TangentOperator
@@ -24,18 +24,18 @@ REFINEMENTS, MOST = 3, 20000
 LARGEST_RESIDUAL = 1e-2
 
 
-class StaticAdjoint:
-    """Solves K a = g for the adjoint motion a, zero at held nodes, in a body's present state.
+class Adjoint:
+    """Solves (K + s M) a = g for the adjoint motion a, zero at held nodes.
 
     Args:
-        body: The body, at rest.
+        body: The body.
         field: Its elastic forces.
         preconditioner: As for ``solve_static``.
-        tolerance: Norm of g - K a over that of g.
+        tolerance: Norm of g - (K + s M) a over that of g.
 
     Attributes:
         iterations: Of conjugate gradients, of the world that needed most.
-        residual: g - K a over g, of the world with the largest.
+        residual: g - (K + s M) a over g, of the world with the largest.
     """
 
     def __init__(self, body: SoftBody, field: ForceField, preconditioner: str | None, tolerance: float):
@@ -44,32 +44,35 @@ class StaticAdjoint:
         u = body.state.displacements
         self._solver = ConjugateGradients(self.operator, len(u), most=MOST)
         self._solver.tolerance.fill_(tolerance)
-        self.operator.take(u)
-        self._preconditioner.update(self.operator)
+        self._held = body.conditions.held_mask()[:, None]
+        self._masses, self._share = body.masses[:, None], 0.0
         self.iterations, self.residual = 0, 0.0
 
-    def solve(self, derivative: npt.NDArray[np.float64]) -> tuple[wp.array, npt.NDArray[np.float64]]:
-        """The adjoint motion [1/N times the unit of J], vec4 [worlds * N], and the derivative with respect to where
-        held nodes are held, zero at others, float64 [worlds * N, 3].
+    def take(self, u: wp.array, share: float = 0.0) -> None:
+        """Take the stiffness at displacements u [m], vec4 [worlds * N], with this share s of the mass [1/s^2]."""
+        self._share = share
+        self.operator.set_scales(share, 0.0, 1.0)
+        self.operator.take(u)
+        self._preconditioner.update(self.operator)
+
+    def solve(self, right: npt.NDArray[np.float64]) -> tuple[wp.array, npt.NDArray[np.float64]]:
+        """The adjoint motion a, vec4 [worlds * N], and K a at all nodes, held ones too, float64 [worlds * N, 3].
 
         Args:
-            derivative: g, of J with respect to positions, [worlds * N, 3].
+            right: g, zero at held nodes, [worlds * N, 3].
 
         Raises:
-            ConvergenceError: K is not positive definite, or the solve did not converge.
+            ConvergenceError: K + s M is not positive definite, or the solve did not converge.
         """
         body = self.body
-        held = body.conditions.held_mask()
-        if derivative.shape != (body.sizes.nodes, 3):
-            raise InputError(f"the derivative has shape {derivative.shape}; it must be [{body.sizes.nodes}, 3]")
         self.iterations = 0
-        right = np.where(held[:, None], 0.0, derivative).reshape(body.worlds, -1)
-        scale = np.abs(right).max(axis=1)
+        of_worlds = right.reshape(body.worlds, -1)
+        scale = np.abs(of_worlds).max(axis=1)
         scale = np.where(scale > 0.0, scale, 1.0)
-        found = self._refined((right / scale[:, None]).reshape(-1, 3))
+        found = self._refined((of_worlds / scale[:, None]).reshape(-1, 3))
         adjoint = (found.reshape(body.worlds, -1) * scale[:, None]).reshape(-1, 3)
         motion = wp.array(padded(adjoint), dtype=wp.vec4, device=body.device)
-        return motion, np.where(held[:, None], derivative - self._product(motion), 0.0)
+        return motion, self._product(motion)
 
     def _refined(self, right: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """The solution, to the digits of K's products, in float64."""
@@ -77,18 +80,19 @@ class StaticAdjoint:
         x = wp.zeros(len(right), dtype=wp.vec4, device=device)
         solution, left = np.zeros_like(right), right
         wanted = np.linalg.norm(right.reshape(worlds, -1), axis=1)
-        held, best = self.body.conditions.held_mask()[:, None], np.inf
+        best = np.inf
         for _ in range(REFINEMENTS):
             self._solver.launch(self._preconditioner, wp.array(padded(left), dtype=wp.vec4, device=device), x)
             report = self._solver.report()
             if report.negative.any() or report.broken.any():
                 raise ConvergenceError(
-                    "the stiffness is not positive definite: the state of rest is not stable, and has no gradient"
+                    "the stiffness is not positive definite: the state is not stable, and has no gradient"
                 )
             self.iterations += int(report.iterations.max())
             trial = solution + x.numpy()[:, :3]
             rest = wp.array(padded(trial), dtype=wp.vec4, device=device)
-            left = np.where(held, 0.0, right - self._product(rest))
+            product = self._product(rest) + self._share * self._masses * trial
+            left = np.where(self._held, 0.0, right - product)
             norms = np.linalg.norm(left.reshape(worlds, -1), axis=1)
             residual = float((norms / np.where(wanted > 0.0, wanted, 1.0)).max())
             if not residual < best:

@@ -61,6 +61,11 @@ class ElementWork:
         if "rest" in self.names:
             self._add_rest(u, adjoint)
 
+    def clear(self) -> None:
+        """Begin the sums again."""
+        for array in (self._of_mu, self._of_lam, self._of_activation, self._of_rest):
+            array.zero_()
+
     def of_lame(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """The derivatives with respect to mu and lambda of forces, float64 [worlds * T]."""
         return self._of_mu.numpy(), self._of_lam.numpy()
@@ -71,7 +76,7 @@ class ElementWork:
 
     def of_rest(self) -> npt.NDArray[np.float64]:
         """The derivative with respect to rest positions, float64 [worlds * N, 3]."""
-        return np.asarray(self._of_rest.numpy()[:, :3], np.float64)
+        return np.asarray(self._of_rest.numpy()[: self.field.discretization.sizes.nodes, :3], np.float64)
 
     def _add_lame(self, u: wp.array, adjoint: wp.array, scale: float) -> None:
         kernel = kernels.add_stress_work(self._kind, IsotropicMaterial, self._law.stress)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +24,11 @@ NEEDS = {
     "boundary": None,
     "gravity": None,
 }
+
+
+def needed(names: Sequence[str]) -> set[str]:
+    """What ``ElementWork`` must sum for derivatives of these names."""
+    return {need for name in names if (need := NEEDS.get(name)) is not None}
 
 
 def of_young(body: SoftBody, of_mu: Array, of_lam: Array) -> Array | float:

@@ -17,8 +17,9 @@ from warp_corot.simulation.parts import checked_gravity, checked_models
 from warp_corot.simulation.static import solve_static
 
 from . import parameters
-from .adjoint import StaticAdjoint
-from .element_work import ElementWork, add_weight_to_rest
+from .adjoint import Adjoint
+from .element_work import ElementWork
+from .sums import derivatives
 
 Array = npt.NDArray[np.float64]
 
@@ -65,7 +66,7 @@ class RestState:
         if not self.report.converged:
             raise ConvergenceError(f"there is no gradient: {self.report.message}")
         self._preconditioner, self._tolerance = preconditioner, adjoint_tolerance
-        self._adjoint: StaticAdjoint | None = None
+        self._adjoint: Adjoint | None = None
         self.adjoint_iterations, self.adjoint_residual = 0, 0.0
 
     def pull_back(self, derivative: Array, names: Sequence[str]) -> dict[str, Any]:
@@ -76,9 +77,15 @@ class RestState:
             names: Of the names that the state was made with.
         """
         if self._adjoint is None:
-            self._adjoint = StaticAdjoint(self.body, self._field, self._preconditioner, self._tolerance)
-        adjoint = self._adjoint
-        motion, boundary = adjoint.solve(np.asarray(derivative, np.float64))
+            self._adjoint = Adjoint(self.body, self._field, self._preconditioner, self._tolerance)
+            self._adjoint.take(self.body.state.displacements)
+        adjoint, count = self._adjoint, self.body.sizes.nodes
+        given = np.asarray(derivative, np.float64)
+        if given.shape != (count, 3):
+            raise InputError(f"the derivative has shape {given.shape}; it must be [{count}, 3]")
+        held = self.body.conditions.held_mask()[:, None]
+        motion, product = adjoint.solve(np.where(held, 0.0, given))
+        boundary = np.where(held, given - product, 0.0)
         self.adjoint_iterations, self.adjoint_residual = adjoint.iterations, adjoint.residual
         return self._derivatives(names, motion, boundary)
 
@@ -86,35 +93,15 @@ class RestState:
         """The derivatives from an adjoint motion, vec4, and the derivative with respect to the boundary."""
         body, gravity = self.body, self._gravity
         moved = motion.numpy()[: body.sizes.nodes, :3].astype(np.float64)
-        work = ElementWork(self._field, needed(names))
+        work = ElementWork(self._field, parameters.needed(names))
         work.add(body.state.displacements, motion)
-        found: dict[str, Any] = {}
-        for name in names:
-            if name == "loads":
-                found[name] = moved
-            elif name == "boundary":
-                found[name] = boundary
-            elif name == "gravity":
-                found[name] = body.masses @ moved
-            elif name == "young":
-                found[name] = parameters.of_young(body, *work.of_lame())
-            elif name == "poisson":
-                found[name] = parameters.of_poisson(body, *work.of_lame())
-            elif name == "density":
-                found[name] = parameters.of_density(body, moved @ gravity)
-            elif name == "activation":
-                found[name] = work.of_activation().reshape(body.worlds, -1)
-            elif name == "rest":
-                weights = wp.zeros_like(motion)
-                add_weight_to_rest(self._field, parameters.weight_densities(body, moved @ gravity), weights)
-                # Held nodes keep their displacements, so that their places follow the rest shape.
-                found[name] = work.of_rest() + weights.numpy()[:, :3] + boundary
+        found = derivatives(body, self._field, work, names, moved, moved @ gravity)
+        if "rest" in names:
+            # Held nodes keep their displacements, so that their places follow the rest shape.
+            found["rest"] = found["rest"] + boundary
+        if "boundary" in names:
+            found["boundary"] = boundary
         return found
-
-
-def needed(names: Sequence[str]) -> set[str]:
-    """What ``ElementWork`` must sum for derivatives of these names."""
-    return {need for name in names if (need := parameters.NEEDS[name]) is not None}
 
 
 def bound(body: SoftBody, law: Model, names: Sequence[str]) -> tuple[ForceField, set[str]]:
@@ -127,7 +114,7 @@ def bound(body: SoftBody, law: Model, names: Sequence[str]) -> tuple[ForceField,
         raise InputError(
             "the model shares rotations, and has no exact stiffness; for gradients each element needs its own"
         )
-    return law.bind(body), needed(names)
+    return law.bind(body), parameters.needed(names)
 
 
 def check_held(body: SoftBody) -> None:

@@ -1,0 +1,115 @@
+"""Runs of explicit steps forwards and backwards, with states kept at the beginnings of segments."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from warp_corot.elasticity import ForceField
+from warp_corot.kernels.gradients import steps as kernels
+
+from .sums import StepSums
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.solvers import SymplecticEuler
+
+
+class ExplicitRun:
+    """Steps of symplectic Euler of one body, from its present state.
+
+    Only states at the beginnings of segments are kept. A segment's own states are found again when it is run backwards:
+    two runs forwards in all, and room for twice as many states as a segment and the run have parts.
+
+    Args:
+        body, field: The body and its elastic forces.
+        integrator: With a given step.
+        gravity: [m/s^2].
+        sums: What is summed over steps.
+        ends: The numbers of steps at which segments end, increasing, the last one the run's.
+
+    Attributes:
+        displacements, velocities: At the beginning, and at each of the ends, vec4 each.
+        of_displacements, of_velocities: The adjoint of the state that the run backwards has come to, vec4.
+    """
+
+    def __init__(
+        self,
+        body: SoftBody,
+        field: ForceField,
+        integrator: SymplecticEuler,
+        gravity: Sequence[float],
+        sums: StepSums,
+        ends: Sequence[int],
+    ):
+        self.body, self.field, self.sums, self.device = body, field, sums, body.device
+        self.lengths = np.diff([0, *ends]).tolist()
+        assert integrator.dt is not None
+        self._dt, self._damped = integrator.dt, 1.0 / (1.0 + integrator.dt * integrator.damping)
+        self._gravity, self._tangent = wp.vec3(*gravity), field.tangent(exact=True)
+        state = body.state
+        self._u, self._v = wp.clone(state.displacements), wp.clone(state.velocities)
+        self.of_displacements, self.of_velocities, self._p, self._product, self._f = (
+            wp.zeros_like(self._u) for _ in range(5)
+        )
+        self._kept = [wp.zeros_like(self._u) for _ in range(max(self.lengths))]
+        self.displacements, self.velocities = [wp.clone(self._u)], [wp.clone(self._v)]
+        self._graphs: dict[tuple[str, int], wp.Graph] = {}
+        self._tangent.prepare(self._u)
+
+    def forward(self) -> None:
+        """Run to the end, which the body has then."""
+        for length in self.lengths:
+            self._replay("forward", length, self._forward)
+            self.displacements.append(wp.clone(self._u))
+            self.velocities.append(wp.clone(self._v))
+        state = self.body.state
+        wp.copy(state.displacements, self._u)
+        wp.copy(state.velocities, self._v)
+        state.publish_positions()
+
+    def backward(self, segment: int) -> None:
+        """Run a segment backwards, after those that follow it."""
+        length = self.lengths[segment]
+        wp.copy(self._u, self.displacements[segment])
+        wp.copy(self._v, self.velocities[segment])
+        self._replay("forward", length, self._forward)
+        self._replay("backward", length, self._backward)
+
+    def _forward(self, length: int) -> None:
+        conditions = self.body.conditions
+        inputs = [self._dt, self._damped, self._gravity, conditions.inverse_mass, self.sums.loads]
+        for step in range(length):
+            wp.copy(self._kept[step], self._u)
+            self.field.add_forces(self._u, self._f)
+            self._launch(kernels.take_explicit_step, inputs, [self._f, self._u, self._v])
+
+    def _backward(self, length: int) -> None:
+        inputs = [self._dt, self._damped, self.body.conditions.inverse_mass, self.of_displacements]
+        outputs = [self.of_velocities, self.sums.of_loads, self._p]
+        for step in reversed(range(length)):
+            u = self._kept[step]
+            self._launch(kernels.begin_explicit_adjoint, inputs, outputs)
+            self.sums.add(u, self._p)
+            self._product.zero_()
+            self._tangent.take(u)
+            self._tangent.add_product(self._p, self._product)
+            self._launch(kernels.subtract, [self._product], [self.of_displacements])
+
+    def _replay(self, name: str, length: int, steps: Callable[[int], None]) -> None:
+        """Make the launches of so many steps, recorded once they have been made."""
+        graph = self._graphs.get((name, length))
+        if graph is not None:
+            wp.capture_launch(graph)
+            return
+        steps(length)
+        if self.lengths.count(length) > 1 or name == "forward":
+            with wp.ScopedCapture(device=self.device) as capture:
+                steps(length)
+            self._graphs[name, length] = capture.graph
+
+    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, self.body.sizes.launch_nodes, inputs, outputs, device=self.device)

@@ -1,0 +1,235 @@
+"""Gradients of runs of time steps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.discretization.nodal import padded
+from warp_corot.elasticity import Corotated, ForceField, Model
+from warp_corot.errors import InputError, UnstableError
+from warp_corot.inputs.checks import checked_count, refuse_tape, shown
+from warp_corot.simulation.parts import checked_gravity, checked_models
+from warp_corot.simulation.simulation import Simulation
+from warp_corot.solvers import QuasiStatic, SymplecticEuler
+from warp_corot.solvers.implicit.schemes import ImplicitIntegrator
+from warp_corot.solvers.integrator import Integrator
+
+from . import parameters
+from .explicit import ExplicitRun
+from .implicit import ImplicitRun
+from .objective import Objective, value_and_derivative
+from .rest_state import bound
+from .sums import StepSums
+
+Array = npt.NDArray[np.float64]
+
+#: What derivatives of runs may be asked for.
+NAMES = ("young", "poisson", "density", "loads", "gravity", "rest", "activation", "displacements", "velocities")
+
+
+@dataclass(frozen=True)
+class RunGradient:
+    """What ``run_gradient`` found. Derivatives are float64; those that were not asked for are None.
+
+    ``gradient["young"]`` is ``gradient.young``.
+
+    Attributes:
+        value: The objective J, or the sum of its values.
+        kept: How many states of the body were kept at once.
+        young, poisson, density, activation, gravity: As ``StaticGradient`` has them.
+        loads: dJ/df of each node's load, which is the same in all steps [1/N], [worlds * N, 3].
+        rest: dJ/dX of each node's rest position [1/m], [worlds * N, 3]. Displacements at the beginning, elements'
+            materials and the directions of fibres stay as they are.
+        displacements, velocities: dJ/du [1/m] and dJ/dv [s/m] of the state at the beginning, [worlds * N, 3].
+    """
+
+    value: float
+    kept: int
+    young: Array | float | None = None
+    poisson: Array | float | None = None
+    density: Array | float | None = None
+    loads: Array | None = None
+    gravity: Array | None = None
+    rest: Array | None = None
+    activation: Array | None = None
+    displacements: Array | None = None
+    velocities: Array | None = None
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in NAMES or getattr(self, name) is None:
+            raise InputError(f"{shown(name)} is not among what the gradient was asked for")
+        return getattr(self, name)
+
+
+def run_gradient(
+    body: SoftBody,
+    objective: Objective,
+    *,
+    integrator: Integrator,
+    steps: int,
+    wrt: str | Sequence[str] = ("young",),
+    model: Model | None = None,
+    gravity: npt.ArrayLike | None = None,
+    every: int | None = None,
+    adjoint_tolerance: float = 1e-6,
+) -> RunGradient:
+    """The derivatives of an objective of where time steps take a body, by running the adjoint of the steps backwards.
+
+    The body moves by ``steps`` steps from its present state, as a ``Simulation`` with nothing else would. Explicit runs
+    keep some sqrt(steps) states and find those between again; implicit ones keep all displacements.
+
+    Args:
+        body: The body. Its held nodes keep the velocities that they have.
+        objective: As for ``static_gradient``, a function of the positions at the end.
+        integrator: ``SymplecticEuler(dt)`` with a step, or an implicit one with a tolerance of Newton's method, to
+            which gradients are right then; without viscosity.
+        steps: How many.
+        wrt: Names of derivatives of ``RunGradient``.
+        model, gravity: As for ``Simulation``.
+        every: J is the sum of the objective's values after every so many steps; None: the value at the end.
+        adjoint_tolerance: Of the linear solve of each implicit step backwards.
+
+    Raises:
+        InputError: As ``static_gradient``, or the integrator is none of these, the body is remeshed, or nodes or active
+            stress follow keyframes.
+        UnstableError: The run does not stay finite.
+        ConvergenceError: An adjoint solve does not converge.
+    """
+    refuse_tape()
+    names = _checked(body, integrator, steps, wrt)
+    (law,) = checked_models(Corotated() if model is None else model, 1)
+    field, _needs = bound(body, law, [name for name in names if name in parameters.NEEDS])
+    down = checked_gravity(gravity, body.mesh.up_axis)
+    body.state.adopt_positions()
+    sums = StepSums(body, field, names)
+    marks = {steps} if every is None else {*range(checked_count(every, "every", least=1), steps + 1, every)}
+    if not marks:
+        raise InputError(f"every is {every}; the run has {steps} steps")
+    seen = _Values(body, objective)
+    if isinstance(integrator, SymplecticEuler):
+        kept, of_u, of_v = _explicit(body, field, integrator, down, sums, steps, marks, seen)
+    else:
+        assert isinstance(integrator, ImplicitIntegrator)
+        kept, of_u, of_v = _implicit(body, field, integrator, law, down, sums, steps, marks, seen, adjoint_tolerance)
+    found = sums.derivatives() | {"displacements": of_u, "velocities": of_v}
+    if "rest" in names:
+        found["rest"] = found["rest"] + of_u
+    return RunGradient(seen.value, kept, **{name: found[name] for name in names})
+
+
+def _explicit(
+    body: SoftBody,
+    field: ForceField,
+    integrator: SymplecticEuler,
+    gravity: tuple[float, float, float],
+    sums: StepSums,
+    steps: int,
+    marks: set[int],
+    seen: _Values,
+) -> tuple[int, Array, Array]:
+    """How many states were kept, and the adjoint of the beginning."""
+    length = math.isqrt(steps - 1) + 1
+    ends = sorted({*range(length, steps, length), *marks, steps})
+    run = ExplicitRun(body, field, integrator, gravity, sums, ends)
+    run.forward()
+    sums.clear()
+    check_finite(body)
+    count = body.sizes.nodes
+    for segment in reversed(range(len(ends))):
+        if ends[segment] in marks:
+            added = run.of_displacements.numpy()[:count, :3] + seen.derivative(run.displacements[segment + 1])
+            run.of_displacements[:count].assign(padded(added))
+        run.backward(segment)
+    of_u, of_v = (a.numpy()[:count, :3].astype(np.float64) for a in (run.of_displacements, run.of_velocities))
+    return len(run.displacements) + max(run.lengths), of_u, of_v
+
+
+def _implicit(
+    body: SoftBody,
+    field: ForceField,
+    integrator: ImplicitIntegrator,
+    law: Model,
+    gravity: tuple[float, float, float],
+    sums: StepSums,
+    steps: int,
+    marks: set[int],
+    seen: _Values,
+    tolerance: float,
+) -> tuple[int, Array, Array]:
+    """The same of implicit steps."""
+    sim = Simulation(body, model=law, integrator=integrator, gravity=gravity)
+    states = [wp.clone(body.state.displacements)]
+    for _ in range(steps):
+        sim.step()
+        states.append(wp.clone(body.state.displacements))
+    check_finite(body)
+    run = ImplicitRun(body, field, integrator, sums, states, tolerance)
+    for step in reversed(range(steps)):
+        if step + 1 in marks:
+            run.of_displacements = run.of_displacements + seen.derivative(states[step + 1])
+        run.backward(step)
+    return len(states), run.of_displacements, run.of_velocities
+
+
+class _Values:
+    """An objective's values, added up."""
+
+    def __init__(self, body: SoftBody, objective: Objective):
+        self.body, self.objective, self.value = body, objective, 0.0
+
+    def derivative(self, u: wp.array) -> Array:
+        """The derivative at displacements u, [worlds * N, 3]; the value is added to the sum."""
+        positions = self.body.rest_positions + u.numpy()[: self.body.sizes.nodes, :3]
+        on_device = wp.array(positions, dtype=wp.vec3, device=self.body.device)
+        value, derivative = value_and_derivative(self.objective, on_device)
+        self.value += value
+        return derivative
+
+
+def check_finite(body: SoftBody) -> None:
+    """See that a run has stayed finite.
+
+    Raises:
+        UnstableError: It has not.
+    """
+    if not np.isfinite(body.state.displacements.numpy()[: body.sizes.nodes]).all():
+        raise UnstableError("the run does not stay finite; take shorter steps")
+
+
+def _checked(body: SoftBody, integrator: Integrator, steps: int, wrt: str | Sequence[str]) -> tuple[str, ...]:
+    """The names of derivatives, once all else is as it must be."""
+    if not isinstance(body, SoftBody):
+        raise InputError(f"body is {shown(body)}; it must be a SoftBody")
+    if body.changing is not None:
+        raise InputError("the body is remeshed; gradients need a mesh that stays as it is")
+    if body.conditions.trajectories or body.conditions.activations:
+        raise InputError("nodes or active stress follow keyframes; runs with gradients have none")
+    checked_count(steps, "steps", least=1)
+    if isinstance(integrator, SymplecticEuler):
+        if integrator.dt is None:
+            raise InputError("dt of SymplecticEuler is None; for a gradient it must be a number of seconds")
+    elif not isinstance(integrator, ImplicitIntegrator) or isinstance(integrator, QuasiStatic):
+        raise InputError(
+            f"integrator is {shown(integrator)}; it must be SymplecticEuler or an implicit one with inertia"
+        )
+    elif integrator.tolerance is None:
+        raise InputError(
+            "tolerance of the integrator is None: one iteration of Newton's method does not solve a step; give a number"
+        )
+    if integrator.viscosity:
+        raise InputError(f"viscosity is {integrator.viscosity}; steps with gradients have none")
+    names = (wrt,) if isinstance(wrt, str) else tuple(wrt)
+    for name in names:
+        if name not in NAMES:
+            raise InputError(f"wrt has {shown(name)}; it must be one or several of {', '.join(map(repr, NAMES))}")
+    if not names:
+        raise InputError(f"wrt is empty; it must be one or several of {', '.join(map(repr, NAMES))}")
+    return names
