@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.ndimage
+import warp as wp
+
+from warp_corot.kernels.meshing import voxel_distances as kernels
+from warp_corot.mesh.side_by_side import in_parts
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -16,33 +19,52 @@ def signed_distance(inside: np.ndarray, spacing: np.ndarray) -> tuple[np.ndarray
     """Signed distances at voxel centres to a surface halfway between those inside and those outside.
 
     From a centre the nearest one on the other side is n steps away (n the largest difference of their indices) and the
-    surface half a step less: phi = distance * (1 - 1 / (2 n)), negative inside. The distances are exact, by the feature
-    transform of `scipy.ndimage.distance_transform_edt`.
+    surface half a step less: phi = distance * (1 - 1 / (2 n)), negative inside. The distances are exact.
 
     Args:
         inside: bool [nx, ny, nz], with some of both.
         spacing: Distance of voxel centres along each axis [m].
 
     Returns:
-        ``phi`` float32 [nx, ny, nz] [m], and ``nearest`` int32 [3, nx, ny, nz], the indices of the nearest voxel inside
+        ``phi`` float32 [nx, ny, nz] [m], and ``nearest`` int16 [3, nx, ny, nz], the indices of the nearest voxel inside
         (a voxel's own, inside).
     """
     # Of several nearest voxels the one taken should not hang on the last digits of the spacing.
     ratios = np.round(spacing / spacing.min(), 5)
+    cpu = wp.get_device("cpu")
+    given = wp.array(inside.astype(np.uint8), dtype=wp.uint8, device=cpu)
+    phi = wp.empty(inside.shape, dtype=wp.float32, device=cpu)
+    nearest = wp.empty((3, *inside.shape), dtype=wp.int16, device=cpu)
+    for wanted in (0, 1):
+        inputs = [given, wanted, *_nearest_of(given, wanted, ratios), wp.vec3(*spacing)]
+        _on_lines(kernels.take_distances, given.shape[0] * given.shape[1], inputs, [phi, nearest])
+    return phi.numpy(), nearest.numpy()
 
-    def nearest_zero(values: np.ndarray) -> np.ndarray:
-        return scipy.ndimage.distance_transform_edt(
-            values, sampling=ratios, return_distances=False, return_indices=True
-        )
 
-    # SciPy lets go of the interpreter meanwhile.
-    with ThreadPoolExecutor(2) as pool:
-        nearest, other = pool.map(nearest_zero, (~inside, inside))
-    phi = np.empty(inside.shape, np.float32)
-    for slab in _slabs(len(phi)):
-        # A voxel is its own nearest one on its side, so one of the two distances is always zero.
-        phi[slab] = _less_half_a_step(nearest, slab, spacing) - _less_half_a_step(other, slab, spacing)
-    return phi, nearest
+def _nearest_of(inside: wp.array, wanted: int, ratios: np.ndarray) -> list[wp.array]:
+    """The nearest voxels that are inside, or outside, by their place along each axis, int16 [nx, ny, nz] each.
+
+    The second place stands at the voxel that the first one leads to, and the third at the one that both lead to.
+    """
+    shape, cpu = inside.shape, inside.device
+    third, second, first, kept = (wp.empty(shape, dtype=wp.int16, device=cpu) for _ in range(4))
+    rows, layers = (wp.empty(shape, dtype=wp.float32, device=cpu) for _ in range(2))
+    inputs = [inside, wanted, float(ratios[2])]
+    _on_lines(kernels.find_nearest_in_rows, shape[0] * shape[1], inputs, [third, rows])
+    _on_lines(kernels.find_nearest_across, shape[0] * shape[2], [rows, float(ratios[1])], [kept, second, layers])
+    layers, rows, kept, turned = (array.transpose((1, 0, 2)) for array in (layers, rows, kept, first))
+    _on_lines(kernels.find_nearest_across, shape[1] * shape[2], [layers, float(ratios[0])], [kept, turned, rows])
+    return [first, second, third]
+
+
+def _on_lines(kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[wp.array]) -> None:
+    """Launch a kernel with a thread for each line of voxels."""
+    cpu = wp.get_device("cpu")
+
+    def work(start: int, stop: int) -> None:
+        wp.launch(kernel, stop - start, [*inputs, start], outputs, device=cpu)
+
+    in_parts(cpu, count, work)
 
 
 def steepest_slope(phi: np.ndarray, spacing: np.ndarray) -> float:
@@ -80,18 +102,6 @@ def pieces(inside: np.ndarray) -> np.ndarray:
 def piece_of_voxels(inside: np.ndarray) -> np.ndarray:
     """Which piece each voxel is in, from 1; 0 where it is outside. Voxels that touch, be it in a corner, are of one."""
     return scipy.ndimage.label(inside, np.ones((3, 3, 3)))[0]
-
-
-def _less_half_a_step(nearest: np.ndarray, slab: slice, spacing: np.ndarray) -> np.ndarray:
-    """Distances of voxel centres to the given voxels', less half a step on the way."""
-    squares = np.zeros(nearest[0, slab].shape, np.float32)
-    steps = np.ones(squares.shape, np.int32)
-    for axis in range(3):
-        own = np.arange(nearest.shape[axis + 1], dtype=np.int32)[slab if axis == 0 else slice(None)]
-        apart = np.abs(nearest[axis, slab] - own.reshape([-1 if k == axis else 1 for k in range(3)]))
-        np.maximum(steps, apart, out=steps)
-        squares += np.square(np.float32(spacing[axis]) * apart.astype(np.float32))
-    return np.sqrt(squares) * (np.float32(1.0) - np.float32(0.5) / steps.astype(np.float32))
 
 
 def _slabs(count: int, thickness: int = 32) -> Iterator[slice]:

@@ -37,8 +37,8 @@ FINER_SURFACE, FINER_FOREST = 0.3, 0.2
 #: surface. Of more elements the surface needs fewer, so that the share goes up, between two numbers of elements.
 UNBISECTED, UNBISECTED_OF_MANY = 1.0 / 6.0, 0.5
 FEWER, MORE = 50_000, 1_000_000
-#: Where nothing in the forest is left to bisect, smaller cubes are to give so many times the elements asked for: at half
-#: their size there are hardly four times as many.
+#: Where nothing in the forest is left to bisect, smaller cubes are to give so many times the elements asked for; there
+#: are hardly four times as many at half the size.
 AMPLE, SLOW = 1.3, 2.0
 #: How often cubes are bisected for the surface's sake. Where it is most curved elements are a fifth of a cube long;
 #: finer ones would bring the rest of the surface little, and make the time step smaller. From so many elements on
