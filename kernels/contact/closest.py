@@ -143,35 +143,43 @@ def deepest_on_triangle(shapes: Shapes, o: int, pose: wp.transform, most: float,
     """The corners' shares in the point of a triangle that is deepest in an obstacle, or closest to it.
 
     Frank and Wolfe's method: towards the corner that the distance falls to most steeply, as far as it falls. Exact in
-    the end for convex obstacles.
+    the end for convex obstacles; often that corner is the end.
     """
     w = wp.vec3(1.0, 1.0, 1.0) / 3.0
     corners = wp.matrix_from_rows(a, b, c)
-    # Loops that stay loops: unrolled, they would hold the distance 56 times, and take minutes to compile.
+    # Loops that stay loops: unrolled, they would hold the distance 64 times, and take minutes to compile.
     turns = int(0)
     while turns < TURNS:
         turns += 1
-        x = point_of(w, a, b, c)
-        _distance, n = distance_to(shapes, o, pose, x, most)
+        _distance, n = distance_to(shapes, o, pose, point_of(w, a, b, c), most)
         falls = corners * n
         k = int(0)
         if falls[1] < falls[k]:
             k = 1
         if falls[2] < falls[k]:
             k = 2
-        way = wp.vec3()
-        way[k] = 1.0
-        way = way - w
+        corner = wp.vec3()
+        corner[k] = 1.0
+        way = corner - w
         low = float(0.0)
         high = float(1.0)
+        # The corner itself is looked at first.
+        middle = float(1.0)
         halvings = int(0)
-        while halvings < HALVINGS:
+        if w[k] == 1.0:
+            halvings = HALVINGS + 1
+            turns = TURNS + 0
+        while halvings <= HALVINGS:
             halvings += 1
-            middle = 0.5 * (low + high)
             _there, m = distance_to(shapes, o, pose, point_of(w + middle * way, a, b, c), most)
             if wp.dot(m, point_of(way, a, b, c)) < 0.0:
                 low = middle
             else:
                 high = middle
-        w = w + 0.5 * (low + high) * way
+            if low == 1.0:
+                halvings = HALVINGS + 1
+            middle = 0.5 * (low + high)
+        w = w + middle * way
+        if low == 1.0:
+            w = corner
     return w

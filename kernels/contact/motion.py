@@ -152,11 +152,15 @@ def move_obstacles(motions: Motions, pace: Pace, world_starts: wp.array[wp.float
     mode = motions.mode[o]
     if mode == KEYED:
         t = time_after(pace, offset + 1) - world_starts[world]
-        first = motions.first[o]
-        last = first + motions.keys[o] - 1
-        key = first
-        while key < last - 1 and motions.times[key + 1] <= t:
-            key += 1
+        # The last key that is not after t, of all but the last one; the first one before them.
+        key = motions.first[o]
+        beyond = key + motions.keys[o] - 1
+        while beyond - key > 1:
+            middle = (key + beyond) // 2
+            if motions.times[middle] <= t:
+                key = middle
+            else:
+                beyond = middle
         share = (t - motions.times[key]) / (motions.times[key + 1] - motions.times[key])
         share = wp.clamp(share, wp.float64(0.0), wp.float64(1.0))
         motions.target[world, o] = between(motions.poses[key], motions.poses[key + 1], float(share))

@@ -20,9 +20,9 @@ def turned(rng):
     )
 
 
-@pytest.mark.parametrize("count", [12, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [30, pytest.param(1000, marks=pytest.mark.slow)])
 def test_bodies_poured_into_a_bowl_stay_in_it(device, rng, count):
-    """Cubes of 8 mm, each turned as it likes and all of one mesh; the bowl carries their weight in the end."""
+    """Cubes of 8 mm, each turned as it likes and all of one mesh: they come to rest, and the bowl carries them."""
     size = 0.01
     side = max(int(np.ceil((count / 2) ** (1 / 3))), 2)
     places = np.array([(i, j, k) for k in range(4 * side) for i in range(side) for j in range(side)][:count])
@@ -42,18 +42,18 @@ def test_bodies_poured_into_a_bowl_stay_in_it(device, rng, count):
     tets = np.concatenate([cube.tets + k * len(corners) for k in range(count)])
     body = wc.SoftBody(wc.TetMesh(points, tets), wc.Isotropic(2e4, 0.4, 1000.0), device=device)
     contact = wc.Contact(self_contact=True)
-    integrator = wc.SymplecticEuler(viscosity=1e-3)
+    integrator = wc.SymplecticEuler(viscosity=1e-3, damping=4.0)
     sim = wc.Simulation(body, obstacles=bowl, contact=contact, gravity=DOWN, integrator=integrator)
-    sim.advance(0.3 if count < 100 else 0.6)
+    sim.advance(0.5 if count < 100 else 1.0)
     carried = []
     for _ in range(10):
         sim.advance(0.01)
         carried.append(-bowl.wrench.numpy()[0, 2] / (9.81 * body.masses.sum()))
     now = body.positions.numpy().astype(float)
-    inside = now[now[:, 2] < 0.9 * radius]
-    assert np.linalg.norm(inside - (0.0, 0.0, radius), axis=1).max() < radius + 2e-4
-    assert now[:, 2].min() > -2e-4
-    assert np.mean(carried) == pytest.approx(1.0, rel=0.2)
+    assert now[:, 2].max() < radius
+    assert np.linalg.norm(now - (0.0, 0.0, radius), axis=1).max() < radius + 2e-4
+    assert np.mean(carried) == pytest.approx(1.0, rel=0.03)
+    assert np.linalg.norm(body.velocities.numpy(), axis=1).mean() < 0.03
     # No cube is in another: they are as far apart as their insides.
     centres = now.reshape(count, -1, 3).mean(axis=1)
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)[np.triu_indices(count, 1)]
@@ -176,9 +176,8 @@ def square_rod(r, half):
     [("capsule", 0.003, 10.0, 2)]
     + [
         pytest.param(kind, radius, speed, seed, marks=pytest.mark.slow)
-        for kind, radius in (("capsule", 5e-4), ("capsule", 3e-3), ("capsule", 5e-3), *((k, 3e-3) for k in SHARP))
-        for speed in (0.1, 1.0, 10.0, 50.0)
-        for seed in (0, 1)
+        for kind, radius in (("capsule", 5e-4), ("capsule", 5e-3), *((kind, 3e-3) for kind in SHARP))
+        for seed, speed in enumerate((0.1, 1.0, 10.0, 50.0))
     ],
 )
 def test_a_thin_tool_stabs_an_organ(device, kind, radius, speed, seed):

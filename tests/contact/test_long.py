@@ -1,0 +1,54 @@
+"""An hour of tools that press and shear an organ at random."""
+
+import numpy as np
+import pytest
+
+import warp_corot as wc
+
+#: From one place to the next [s].
+EVERY = 0.1
+
+
+def way_of(rng, third, count):
+    """Directions from above, in one third of the circle, so that tools do not meet, [count, 3]."""
+    angle = 2.0 * np.pi * (third + rng.uniform(0.0, 0.8, count)) / 3.0
+    height = rng.uniform(0.2, 1.0, count)
+    flat = np.sqrt(1.0 - height**2)
+    return np.stack([np.cos(angle) * flat, np.sin(angle) * flat, height], axis=1)
+
+
+@pytest.mark.filterwarnings("ignore::warp_corot.StabilityWarning")
+@pytest.mark.parametrize("seconds", [1.0, pytest.param(3600.0, marks=pytest.mark.slow)])
+def test_tools_at_random_leave_an_organ_whole(device, rng, seconds):
+    """A ball, a rod and a square bar, 6 to 12 mm thick, go up to 16 mm deep into a ball of 60 mm and across it, at
+    about 0.5 m/s, and crush some elements. The run goes on, and the body is whole in the end."""
+    mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.03, device=device), target_elements=250, device=device)
+    points = mesh.points
+    body = wc.SoftBody(mesh, wc.Isotropic(2e4, 0.45, 1000.0), device=device)
+    body.fix(np.flatnonzero(points[:, 2] < -0.012))
+    tools, count = [], int(seconds / EVERY) + 1
+    shapes = ((wc.Sphere(0.006), 0.006), (wc.Capsule(0.003, 0.05), 0.028), (wc.Box((0.008, 0.008, 0.05)), 0.025))
+    for third, (shape, half) in enumerate(shapes):
+        way = way_of(rng, third, count)
+        far = half + rng.uniform(0.018, 0.05, (count, 1))
+        far[[0, -1]] = half + 0.065
+        tools.append(wc.Tool(shape))
+        turns = np.hstack([np.cross((0.0, 0.0, 1.0), way), 1.0 + way[:, 2:]])
+        tools[-1].follow(EVERY * np.arange(count), far * way, turns)
+    integrator = wc.SymplecticEuler(viscosity=2e-3)
+    sim = wc.Simulation(
+        body, obstacles=tools, contact=wc.Contact(friction=0.5), gravity=(0.0, 0.0, 0.0), integrator=integrator
+    )
+    felt = 0.0
+    while sim.time < seconds - 1e-6:
+        sim.advance(0.05)
+        forces = [np.linalg.norm(tool.wrench.numpy()[0][:3]) for tool in tools]
+        felt = max(felt, *map(float, forces))
+        assert np.linalg.norm(body.positions.numpy() - points, axis=1).max() < 0.1
+    assert 0.1 < felt < 1e3
+    sim.advance(0.5)
+    assert np.linalg.norm(body.positions.numpy() - points, axis=1).max() < 1e-3
+    now, rest = (
+        np.linalg.det(x[mesh.tets[:, 1:]] - x[mesh.tets[:, :1]]) for x in (body.positions.numpy().astype(float), points)
+    )
+    assert (now / rest).min() > 0.9
