@@ -9,22 +9,14 @@ from .sums import add_up, dot64
 
 wp.set_module_options({"enable_backward": False})
 
-#: Columns of parts of sums: r . r, r . z and p . q.
-SQUARE, PRODUCT, CURVATURE = (wp.constant(k) for k in range(3))
-COLUMNS = 3
-#: Places in the scalars of a world: r . z, the factors alpha and beta, and r . r now, at first and at the end.
+#: Columns of parts of sums: r . r, r . z, p . q and b . b.
+SQUARE, PRODUCT, CURVATURE, RIGHT = (wp.constant(k) for k in range(4))
+COLUMNS = 4
+#: Places in the scalars of a world: r . z, the factors alpha and beta, and r . r now, b . b, and r . r at the end.
 RZ, ALPHA, BETA, RR, FIRST, END = (wp.constant(k) for k in range(6))
 SCALARS = 6
 #: How a world's solve stands.
 RUNNING, CONVERGED, NEGATIVE, LIMIT, BROKEN = (wp.constant(k) for k in range(5))
-
-
-@wp.kernel(enable_backward=False)
-def begin(b: wp.array[wp.vec4], x: wp.array[wp.vec4], r: wp.array[wp.vec4]):
-    """x = 0, r = b."""
-    i = wp.tid()
-    store_node(x, i, wp.vec3())
-    store_node(r, i, load_node(b, i))
 
 
 @wp.func
@@ -40,6 +32,96 @@ def stop(status: wp.array[wp.int32], running: wp.array[wp.int32], world: int, ho
 
 
 @wp.kernel(enable_backward=False)
+def measure_guess(
+    # In
+    b: wp.array[wp.vec4],
+    x: wp.array[wp.vec4],
+    q: wp.array[wp.vec4],
+    count: int,
+    threads: int,
+    lanes: int,
+    # Out
+    parts: wp.array3d[wp.float64],
+):
+    """Parts of b . x and x . q, q = A x, of a first guess."""
+    world, thread = wp.tid()
+    product = wp.float64(0.0)
+    curvature = wp.float64(0.0)
+    k = thread
+    while k < count:
+        i = world * count + k
+        guess = load_node(x, i)
+        product += dot64(load_node(b, i), guess)
+        curvature += dot64(load_node(q, i), guess)
+        k += threads
+    product = sum_of_lanes(product)
+    curvature = sum_of_lanes(curvature)
+    if thread % lanes == 0:
+        parts[world, thread / lanes, PRODUCT] = product
+        parts[world, thread / lanes, CURVATURE] = curvature
+
+
+@wp.kernel(enable_backward=False)
+def take_guess(parts: wp.array3d[wp.float64], lanes: int, scalars: wp.array2d[wp.float64]):
+    """alpha = b . x / x . q, the share of the guess with the least energy; zero of one that is of no use."""
+    world, lane = wp.tid()
+    product = add_up(parts, world, lane, lanes, PRODUCT)
+    curvature = add_up(parts, world, lane, lanes, CURVATURE)
+    if lane == 0:
+        alpha = wp.float64(0.0)
+        if curvature > wp.float64(0.0) and is_number(curvature) and is_number(product):
+            alpha = product / curvature
+        scalars[world, ALPHA] = alpha
+
+
+@wp.kernel(enable_backward=False)
+def begin(
+    # In
+    b: wp.array[wp.vec4],
+    like: wp.array[wp.vec4],
+    q: wp.array[wp.vec4],
+    scalars: wp.array2d[wp.float64],
+    guessed: int,
+    count: int,
+    threads: int,
+    lanes: int,
+    # In and out
+    x: wp.array[wp.vec4],
+    # Out
+    r: wp.array[wp.vec4],
+    parts: wp.array3d[wp.float64],
+):
+    """x = alpha x and r = b - alpha q with a guess, else x = 0 and r = b; parts of r . r, and of like . like, which it is
+    compared with."""
+    world, thread = wp.tid()
+    alpha = float(0.0)
+    if guessed != 0:
+        alpha = float(scalars[world, ALPHA])
+    square = wp.float64(0.0)
+    right = wp.float64(0.0)
+    k = thread
+    while k < count:
+        i = world * count + k
+        given = load_node(b, i)
+        rest = given
+        first = wp.vec3()
+        if alpha != 0.0:
+            first = alpha * load_node(x, i)
+            rest -= alpha * load_node(q, i)
+        store_node(x, i, first)
+        store_node(r, i, rest)
+        square += dot64(rest, rest)
+        compared = load_node(like, i)
+        right += dot64(compared, compared)
+        k += threads
+    square = sum_of_lanes(square)
+    right = sum_of_lanes(right)
+    if thread % lanes == 0:
+        parts[world, thread / lanes, SQUARE] = square
+        parts[world, thread / lanes, RIGHT] = right
+
+
+@wp.kernel(enable_backward=False)
 def take_first(
     # In
     parts: wp.array3d[wp.float64],
@@ -51,26 +133,47 @@ def take_first(
     status: wp.array[wp.int32],
     running: wp.array[wp.int32],
 ):
-    """Scalars before the first iteration; worlds without a right side, or with a tolerance of one, are done."""
+    """Scalars before the first iteration; worlds whose residual is small enough already are done."""
     world, lane = wp.tid()
     rr = add_up(parts, world, lane, lanes, SQUARE)
-    rz = add_up(parts, world, lane, lanes, PRODUCT)
+    bb = add_up(parts, world, lane, lanes, RIGHT)
     if lane == 0:
-        scalars[world, RZ] = rz
+        end = tolerance[world] * tolerance[world] * bb
+        scalars[world, RZ] = wp.float64(0.0)
         scalars[world, BETA] = wp.float64(0.0)
         scalars[world, ALPHA] = wp.float64(0.0)
         scalars[world, RR] = rr
-        scalars[world, FIRST] = rr
-        scalars[world, END] = tolerance[world] * tolerance[world] * rr
+        scalars[world, FIRST] = bb
+        scalars[world, END] = end
         iterations[world] = 0
-        status[world] = CONVERGED
-        if rr > wp.float64(0.0) or not is_number(rr):
+        if not (is_number(rr) and is_number(bb)):
             status[world] = BROKEN
-            if is_number(rr) and tolerance[world] >= wp.float64(1.0):
-                status[world] = CONVERGED
-            elif is_number(rr) and is_number(rz) and rz > wp.float64(0.0):
-                status[world] = RUNNING
-                wp.atomic_add(running, 0, 1)
+        elif rr <= end:
+            status[world] = CONVERGED
+        else:
+            status[world] = RUNNING
+            wp.atomic_add(running, 0, 1)
+
+
+@wp.kernel(enable_backward=False)
+def take_beta(
+    # In
+    parts: wp.array3d[wp.float64],
+    lanes: int,
+    # In and out
+    scalars: wp.array2d[wp.float64],
+    status: wp.array[wp.int32],
+    running: wp.array[wp.int32],
+):
+    """beta = r . z over that of the iteration before; zero in the first one."""
+    world, lane = wp.tid()
+    rz = add_up(parts, world, lane, lanes, PRODUCT)
+    if lane == 0 and status[world] == RUNNING:
+        before = scalars[world, RZ]
+        scalars[world, BETA] = wp.where(before > wp.float64(0.0), rz / before, wp.float64(0.0))
+        scalars[world, RZ] = rz
+        if not is_number(rz) or rz <= wp.float64(0.0):
+            stop(status, running, world, BROKEN)
 
 
 @wp.kernel(enable_backward=False)
@@ -137,33 +240,28 @@ def advance(
 
 
 @wp.kernel(enable_backward=False)
-def take_beta(
+def judge(
     # In
     parts: wp.array3d[wp.float64],
     lanes: int,
     most: int,
+    iterations: wp.array[wp.int32],
     # In and out
     scalars: wp.array2d[wp.float64],
-    iterations: wp.array[wp.int32],
     status: wp.array[wp.int32],
     running: wp.array[wp.int32],
 ):
-    """beta = r . z after the iteration over r . z before; a world stops where r . r is small enough."""
+    """A world stops where r . r is small enough."""
     world, lane = wp.tid()
     rr = add_up(parts, world, lane, lanes, SQUARE)
-    rz = add_up(parts, world, lane, lanes, PRODUCT)
     if lane == 0 and status[world] == RUNNING:
-        scalars[world, BETA] = rz / scalars[world, RZ]
-        scalars[world, RZ] = rz
         scalars[world, RR] = rr
-        if not (is_number(rr) and is_number(rz)):
+        if not is_number(rr):
             stop(status, running, world, BROKEN)
         elif rr <= scalars[world, END]:
             stop(status, running, world, CONVERGED)
         elif iterations[world] >= most:
             stop(status, running, world, LIMIT)
-        elif rz <= wp.float64(0.0):
-            stop(status, running, world, BROKEN)
 
 
 @wp.kernel(enable_backward=False)

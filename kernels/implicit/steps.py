@@ -85,16 +85,20 @@ def begin_step(
     h2: wp.array[wp.vec4],
     # In and out
     u: wp.array[wp.vec4],
+    before: wp.array[wp.vec4],
     # Out
     base: wp.array[wp.vec4],
     increment: wp.array[wp.vec4],
     pull: wp.array[wp.vec4],
+    guess: wp.array[wp.vec4],
     drift: wp.array[wp.vec4],
 ):
     """The base of the increments, their first values, and what inertia and damping pull with.
 
-    Held nodes move with the velocity they have. ``drift`` is the stage's velocity without its increment's share, one
-    entry where nobody asks for it; h1 and h2 are one entry where a scheme has none.
+    ``guess`` is what increments would be, beyond their first values, if the velocity went on to change as it has since
+    the step before, ``before``; zero at held nodes. Held nodes move with the velocity they have. ``drift`` is the
+    stage's velocity without its increment's share, one entry where nobody asks for it; h1 and h2 are one entry where a
+    scheme has none.
     """
     i = wp.tid()
     which = begins[0]
@@ -109,10 +113,18 @@ def begin_step(
     share = table[which, STAGE, 0]
     d = (share * dt) * velocity
     rate = combined(table, RATE, which, velocity, first, second)
+    rest = wp.vec3()
     if inverse_mass[i] > 0.0:
-        d = (share * table[which, STAGE, 1] * dt) * velocity
+        last = load_node(before, i)
+        rest = d
+        if is_finite(last):
+            rest += (share * dt) * (velocity - last)
+        store_node(before, i, velocity)
+        d = table[which, STAGE, 1] * d
+        rest -= d
         store_node(pull, i, -(combined(table, ACCELERATION, which, velocity, first, second) + damping * rate))
     store_node(base, i, place)
+    store_node(guess, i, rest)
     store_node(increment, i, d)
     store_node(u, i, place + d)
     if drift.shape[0] > 1:

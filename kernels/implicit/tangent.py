@@ -85,3 +85,23 @@ def apply_blocks(blocks: wp.array[wp.mat33], r: wp.array[wp.vec4], z: wp.array[w
     """z = B r, block by block."""
     i = wp.tid()
     store_node(z, i, blocks[i] * load_node(r, i))
+
+
+@wp.kernel(enable_backward=False)
+def find_rest(b: wp.array[wp.vec4], q: wp.array[wp.vec4], r: wp.array[wp.vec4]):
+    """r = b - q."""
+    i = wp.tid()
+    store_node(r, i, load_node(b, i) - load_node(q, i))
+
+
+@wp.kernel(enable_backward=False)
+def add_vectors(change: wp.array[wp.vec4], d: wp.array[wp.vec4]):
+    """d += change."""
+    i = wp.tid()
+    store_node(d, i, load_node(d, i) + load_node(change, i))
+
+
+@wp.kernel(enable_backward=False)
+def add_counts(more: wp.array[wp.int32], total: wp.array[wp.int32]):
+    i = wp.tid()
+    total[i] = total[i] + more[i]

@@ -12,6 +12,7 @@ from warp_corot.kernels.contact import motion, sums
 from warp_corot.kernels.contact.law import Law
 from warp_corot.solvers.system import System
 
+from .active_set import ActiveSet
 from .obstacles import Obstacles
 from .options import Contact
 from .pairs import Pairs, smallest_size
@@ -66,7 +67,7 @@ class Contacts:
         self.obstacles = Obstacles(obstacles, options.friction, system, dt)
         self.surface = ContactSurface(system.bodies)
         self.law = self._law(stable_dt)
-        self.search = Search(self.surface, self.obstacles, self._smallest)
+        self.search = Search(self.surface, self.obstacles, self.smallest)
         self.rigid: RigidForces | None = None
         if self.obstacles.count:
             self.rigid = RigidForces(self.surface, self.obstacles, self.search, self.law, system.pace.arrays)
@@ -128,7 +129,7 @@ class Contacts:
         if not self._is_looked_at:
             self._is_looked_at = True
             self._predict(0, 0.0)
-            warn_of_overlaps(self, OVERLAP * self._smallest)
+            warn_of_overlaps(self, OVERLAP * self.smallest)
 
     def look(self) -> None:
         """See whether elements are turned inside out, until some were; waits for the device.
@@ -151,10 +152,19 @@ class Contacts:
             inputs = [surface.parts[k].start, surface.arrays]
             self._launch(motion.add_contact_forces, self._count(k), inputs, outputs)
 
+    def launch_motion(self, offset: int) -> None:
+        """Launch where obstacles go in an implicit step."""
+        if self.obstacles.count:
+            self.obstacles.launch_motion(offset)
+
+    def active_set(self, k: int) -> ActiveSet:
+        """The contact of a body in implicit steps; there must be obstacles."""
+        return ActiveSet(self, k)
+
     def measure(self) -> None:
         thinnest = self.obstacles.thinnest
         if self.pairs is not None:
-            thinnest = min(thinnest, 0.5 * self._smallest)
+            thinnest = min(thinnest, 0.5 * self.smallest)
         if not np.isfinite(thinnest):
             return
         for k, body in enumerate(self.system.bodies):
@@ -211,7 +221,7 @@ class Contacts:
             self.pairs.follow()
 
     @property
-    def _smallest(self) -> float:
+    def smallest(self) -> float:
         """The size of the smallest element [m]."""
         return smallest_size([body.discretization.smallest_volume for body in self.system.bodies])
 
@@ -219,7 +229,7 @@ class Contacts:
         points = [np.abs(body.mesh.points).max() for body in self.system.bodies]
         law = Law()
         law.tolerance = ROUNDINGS * 2.0**-24 * max(*points, 1e-3)
-        law.recovery = RECOVERY * self._smallest / stable_dt if np.isfinite(stable_dt) else 0.1
+        law.recovery = RECOVERY * self.smallest / stable_dt if np.isfinite(stable_dt) else 0.1
         return law
 
     def _predict(self, offset: int, damping: float) -> None:

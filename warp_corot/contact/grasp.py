@@ -30,7 +30,7 @@ class Grasp:
 
     Raises:
         InputError: The tool is in no simulation or the body in another, no node of the surface is meant, a body that is
-            remeshed, or a stiffness that is not positive.
+            remeshed, implicit steps, or a stiffness that is not positive.
     """
 
     def __init__(self, body: SoftBody, patch: Nodes, *, tool: Tool, stiffness: float | None = None):
@@ -42,6 +42,8 @@ class Grasp:
         system = self._obstacles.system
         if body not in system.bodies:
             raise InputError("the body is in no simulation with this tool; both must be in one")
+        if system.is_implicit:
+            raise InputError("steps of the simulation are implicit; a grasp needs SymplecticEuler")
         if body.changing is not None:
             raise InputError("a body that is remeshed cannot be grasped; its nodes may change")
         if stiffness is not None and not 0.0 < checked_number(stiffness, "stiffness", "N/m") < math.inf:

@@ -27,6 +27,8 @@ class RigidForces:
         forces: Of each obstacle on each surface node itself in the last step [N], vec3 [O, S].
         totals: The same with the nodes' shares of the forces between them, when they were last published.
         touches: Obstacles at triangles.
+        kinds, drag: How each surface node is with each obstacle in implicit steps; see ``kernels.contact.active``,
+            [O, S].
         have_edges: Whether any of the obstacles can come between the nodes.
     """
 
@@ -46,6 +48,8 @@ class RigidForces:
         count, obstacles = self.surface.count, self.obstacles.count
         self.forces = wp.zeros((obstacles, count), dtype=wp.vec3, device=device)
         self.totals = wp.zeros_like(self.forces)
+        self.kinds = wp.zeros((obstacles, count), dtype=wp.int32, device=device)
+        self.drag = wp.zeros((obstacles, count), dtype=wp.float32, device=device)
         self.anchors = wp.zeros((obstacles, count), dtype=wp.vec4, device=device)
         self.touches = triangles.Touches()
         shape = (obstacles, self.surface.triangle_count if self.have_edges else 0)
@@ -58,6 +62,7 @@ class RigidForces:
     def forget(self) -> None:
         """Forget the last step."""
         self.anchors.zero_()
+        self.kinds.zero_()
         self.touches.force.zero_()
 
     @property

@@ -15,7 +15,7 @@ from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.elasticity import Model
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_things, shown
-from warp_corot.solvers import Integrator, Stepper
+from warp_corot.solvers import BackwardEuler, Integrator, Stepper
 from warp_corot.solvers.system import System
 
 
@@ -83,12 +83,12 @@ def checked_contact(
     return given, Contact() if contact is None else contact
 
 
-def check_implicit(integrator: Integrator, *, touches: bool, remeshes: bool, ordered: bool) -> None:
+def check_implicit(integrator: Integrator, *, touches: bool, soft_touches: bool, remeshes: bool, ordered: bool) -> None:
     """Check that an implicit integrator supports what the simulation needs.
 
     Args:
         integrator: Any integrator.
-        touches, remeshes: Whether bodies touch something, or are remeshed.
+        touches, soft_touches, remeshes: Whether bodies touch something, other bodies or themselves, or are remeshed.
         ordered: Whether sums must have a fixed order on CUDA, which products with the stiffness do not have.
 
     Raises:
@@ -98,11 +98,24 @@ def check_implicit(integrator: Integrator, *, touches: bool, remeshes: bool, ord
         return
     name = type(integrator).__name__
     if touches:
-        raise InputError(f"{name} knows no contact; with obstacles or contact the integrator must be SymplecticEuler")
+        _check_touching(integrator, soft_touches=soft_touches)
     if remeshes:
         raise InputError(f"{name} knows no remeshing; with remesh the integrator must be SymplecticEuler")
     if ordered:
         raise InputError(f"{name} is not reproducible on CUDA; with deterministic=True it must be SymplecticEuler")
+
+
+def _check_touching(integrator: Integrator, *, soft_touches: bool) -> None:
+    name = type(integrator).__name__
+    if not isinstance(integrator, BackwardEuler) or integrator.tolerance is not None:
+        raise InputError(
+            f"{name} knows no contact; the integrator must be SymplecticEuler, or BackwardEuler without a tolerance"
+        )
+    if soft_touches:
+        raise InputError(
+            f"{name} knows no contact of soft surfaces; with several bodies, or self_contact, the integrator must be "
+            "SymplecticEuler"
+        )
 
 
 def check_constraints(system: System, stepper: Stepper, integrator: Integrator) -> None:

@@ -109,7 +109,13 @@ class Simulation:
         self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
         touching = checked_contact(obstacles, contact)
         ordered = self.deterministic and self.device.is_cuda
-        check_implicit(self.integrator, touches=touching is not None, remeshes=remesh is not None, ordered=ordered)
+        check_implicit(
+            self.integrator,
+            touches=touching is not None,
+            soft_touches=touching is not None and (len(self.bodies) > 1 or touching[1].self_contact),
+            remeshes=remesh is not None,
+            ordered=ordered,
+        )
 
         self.remeshing = Remeshing(self.bodies, self.models, remesh, deterministic=self.deterministic)
         bound = zip(self.models, self.bodies, strict=True)
@@ -132,11 +138,9 @@ class Simulation:
         #: Chooses the step, if none was given.
         self.safe_step = SafeStep(self.system, self.models, stable) if given is None else None
         self.guard = Guard(self.system)
-        self.stepper = stepper = self.integrator.bind(self.system)
-        check_constraints(self.system, stepper, self.integrator)
-        self.recorded = RecordedSteps(self.system, stepper, self.guard, self.safe_step)
-        #: Everything that a checkpoint keeps besides the states of bodies and fields, so that a run continues the same.
-        self.kept = self.pace.state | ({} if self.safe_step is None else self.safe_step.state) | stepper.kept
+        self.stepper = self.integrator.bind(self.system)
+        check_constraints(self.system, self.stepper, self.integrator)
+        self.recorded = RecordedSteps(self.system, self.stepper, self.guard, self.safe_step)
         self._running = Running(self)
 
     # --- stepping --------------------------------------------------------------------------------------------------
@@ -166,6 +170,11 @@ class Simulation:
         """The cost of an implicit integrator's solves so far; None for others. Waits for the device."""
         totals = getattr(self.stepper, "totals", None)
         return None if totals is None else Solves(*(int(total) for total in totals.numpy()))
+
+    @property
+    def kept(self) -> dict[str, wp.array]:
+        """Everything that a checkpoint keeps, by name, besides the states of bodies and fields."""
+        return self.pace.state | ({} if self.safe_step is None else self.safe_step.state) | self.stepper.kept
 
     @property
     def steps(self) -> int:

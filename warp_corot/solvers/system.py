@@ -112,6 +112,7 @@ class System:
             values [J], float64 [2].
         offset: The number of the step being launched, since the clock was last advanced.
         lag: How far velocities are behind displacements, in half steps: 1 for symplectic Euler.
+        is_implicit: Whether steps are implicit.
         histories: Arrays that a step leaves for the next one besides the state of bodies and fields.
         bad_step: The first step after which something was not finite, int64 [1] on the device.
     """
@@ -121,7 +122,7 @@ class System:
         self.forces: list[Forces] = []
         self.constraints: list[Constraint] = []
         self.changes = self.offset = 0
-        self.lag = 1.0
+        self.lag, self.is_implicit = 1.0, False
         self.histories: list[wp.array] = []
         self._work = ForcesWork(self.bodies, pace, self.gravity)
         self.device, self.worlds = bodies[0].device, bodies[0].worlds
@@ -140,6 +141,10 @@ class System:
     def accounts(self) -> list[wp.array]:
         """The work of forces and of constraints on each body; see ``ForcesWork``."""
         return [*(self._work.accounts if self.counted else []), *self._work.of_constraints.values()]
+
+    def constraint_accounts(self, k: int) -> list[wp.array]:
+        """The work of constraints on a body, if it may be touched; see ``ForcesWork``."""
+        return [self._work.of_constraints[k]] if k in self._work.of_constraints else []
 
     @property
     def state(self) -> list[wp.array]:

@@ -335,9 +335,7 @@ def test_stiff_springs_are_in_the_tangent(integrator, preconditioner, device):
     assert (-1e5 * u[end]).sum(0) == pytest.approx(carried.sum(0), abs=0.02 * np.abs(carried).sum())
 
 
-def test_contact_and_remeshing_are_refused():
-    with pytest.raises(wc.InputError, match="BackwardEuler knows no contact"):
-        wc.Simulation(beam(), integrator=wc.BackwardEuler(), obstacles=wc.Ground())
+def test_remeshing_is_refused():
     with pytest.raises(wc.InputError, match="Newmark knows no remeshing"):
         wc.Simulation(beam(), integrator=wc.Newmark(), remesh=wc.OnlineRemesh())
 

@@ -34,7 +34,7 @@ from warp_corot.kernels.elements.forces import element_energies, element_von_mis
 from warp_corot.kernels.elements.general_cpu import scatter_law_elements
 from warp_corot.kernels.math.rotation import byers_xu
 
-from .tangents import ExactTangent, RotatedTangent
+from .tangents import ExactTangent, KeptTangent, RotatedTangent
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
@@ -189,6 +189,9 @@ class CorotatedField(ForceField):
         if exact and self.model.rotation_level is None:
             rotation = byers_xu if self.model.rotation == "warm" else self.model.own_rotation
             return ExactTangent(self, rotation)
+        own = self.model.level is None and self.model.tolerance is None and self.model.rotation != "warm"
+        if own and self.device.is_cpu and self.plan.counts is None:
+            return KeptTangent(self)
         return RotatedTangent(self)
 
     def write_rotations(self, u: wp.array, rotations: wp.array) -> None:

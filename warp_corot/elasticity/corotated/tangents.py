@@ -6,9 +6,22 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
+from warp_corot.elasticity.paths.lanes import as_general
 from warp_corot.elasticity.stiffness import ElementStiffness
+from warp_corot.elasticity.structs import Kept
 from warp_corot.elasticity.tangent import Tangent
+from warp_corot.kernels.corotated.kept_gradients import (
+    PLACES,
+    KeptGradients,
+    add_kept_product,
+    turn_gradients,
+    turn_listed,
+)
 from warp_corot.kernels.corotated.tangent import KeptStrains, keep_strains, kept_differential
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.elements import ForestElements
+from warp_corot.kernels.elements.general_cpu import rest_matrices
+from warp_corot.kernels.elements.lanes import LANES
 
 if TYPE_CHECKING:
     from .elements import CorotatedField
@@ -43,6 +56,53 @@ class RotatedTangent(Tangent):
     def add_diagonal(self, blocks: wp.array) -> None:
         stiffness, material = self.field.stiffness_with(self.rotations)
         stiffness.add_diagonal(self.field.elements, material, self.displacements, blocks)
+
+
+class KeptTangent(Tangent):
+    """The same on the CPU, of elements with rotations of their own: turned gradients are kept.
+
+    The diagonal is found with rotations one by one, as solvers with multigrid never ask for it.
+    """
+
+    field: CorotatedField
+
+    def __init__(self, field: CorotatedField):
+        super().__init__(field)
+        self._rotated = RotatedTangent(field)
+        self._take, self._product = turn_gradients(), add_kept_product()
+        elements = field.elements
+        is_forest = field.discretization.element_kind is ForestElements
+        self._general = as_general(elements, rest_matrices, [elements]) if is_forest else elements
+        self._count = field.element_count
+        self._blocks = -(-self._count // LANES)
+        self._gradients = wp.zeros(PLACES * self._blocks, dtype=wp.vec4, device=field.device)
+        self._listed = wp.zeros(self._count + 1, dtype=wp.int32, device=field.device)
+        self._none = wp.zeros(0, dtype=wp.int32, device=field.device)
+        self._material = Kept(_kept_gradients)
+
+    def prepare(self, u: wp.array) -> None:
+        super().prepare(u)
+        self._rotated.prepare(u)
+
+    def take(self, u: wp.array) -> None:
+        super().take(u)
+        inputs = [self._general, self._count, self.field.isotropic, u]
+        self.field.launch(self._take, self._blocks, inputs, [self._gradients, self._listed])
+        self.field.launch(turn_listed, 1, [self._general, u], [self._listed, self._gradients])
+
+    def add_product(self, p: wp.array, y: wp.array) -> None:
+        material = self._material(self.field.isotropic, self._gradients)
+        self.field.launch(self._product, self._blocks, [self._general, self._count, material, p], [y, self._none])
+
+    def add_diagonal(self, blocks: wp.array) -> None:
+        self._rotated.take(self.displacements)
+        self._rotated.add_diagonal(blocks)
+
+
+def _kept_gradients(isotropic: IsotropicMaterial, gradients: wp.array) -> KeptGradients:
+    material = KeptGradients()
+    material.isotropic, material.gradients = isotropic, gradients
+    return material
 
 
 class ExactTangent(Tangent):

@@ -61,40 +61,51 @@ class ConjugateGradients:
         self.iterations, self.status = (wp.zeros(self.worlds, dtype=wp.int32, device=self.device) for _ in range(2))
         self._running = wp.zeros(1, dtype=wp.int32, device=self.device)
 
-    def launch(self, preconditioner: Preconditioner, b: wp.array, x: wp.array) -> None:
+    def launch(
+        self,
+        preconditioner: Preconditioner,
+        b: wp.array,
+        x: wp.array,
+        *,
+        guessed: bool = False,
+        like: wp.array | None = None,
+    ) -> None:
         """Launch a solve, recorded or at once.
 
         Args:
             preconditioner: Up to date with the operator.
             b: Right side, zero at nodes that are not free, vec4 [worlds * nodes].
             x: The solution.
+            guessed: Whether x has a first guess, zero at nodes that are not free; the share of it is used that leaves
+                the least energy.
+            like: What the residual is compared with, vec4 [worlds * nodes]; None: b.
         """
-        r, z, sums = self._r, self._z, self._sums
-        self._launch(kernels.begin, [b, x, r])
-        preconditioner.apply(r, z)
-        sums.launch_products(r, r, int(kernels.SQUARE))
-        sums.launch_products(r, z, int(kernels.PRODUCT))
+        r, q, sums = self._r, self._q, self._sums
+        if guessed:
+            self.operator.apply(x, q)
+            wp.launch(kernels.measure_guess, sums.shape, [b, x, q, *sums.sizes], [sums.parts], device=self.device)
+            sums.launch_scalars(kernels.take_guess, [], [self._scalars])
+        inputs = [b, b if like is None else like, q, self._scalars, int(guessed), *sums.sizes, x]
+        wp.launch(kernels.begin, sums.shape, inputs, [r, sums.parts], device=self.device)
         self._running.zero_()
         outputs = [self._scalars, self.iterations, self.status, self._running]
         sums.launch_scalars(kernels.take_first, [self.tolerance], outputs)
-        self._take_direction()
         wp.capture_while(self._running, self._iterate, preconditioner=preconditioner, x=x)
 
     def _iterate(self, preconditioner: Preconditioner, x: wp.array) -> None:
         r, z, p, q, sums = self._r, self._z, self._p, self._q, self._sums
-        outputs = [self._scalars, self.iterations, self.status, self._running]
+        preconditioner.apply(r, z)
+        sums.launch_products(r, z, int(kernels.PRODUCT))
+        sums.launch_scalars(kernels.take_beta, [], [self._scalars, self.status, self._running])
+        self._launch(kernels.take_direction, [z, self._scalars, self._count, p])
         self.operator.apply(p, q)
         sums.launch_products(p, q, int(kernels.CURVATURE))
+        outputs = [self._scalars, self.iterations, self.status, self._running]
         sums.launch_scalars(kernels.take_alpha, [], outputs)
         inputs = [p, q, self._scalars, *sums.sizes, x, r]
         wp.launch(kernels.advance, sums.shape, inputs, [sums.parts], device=self.device)
-        preconditioner.apply(r, z)
-        sums.launch_products(r, z, int(kernels.PRODUCT))
-        sums.launch_scalars(kernels.take_beta, [self.most], outputs)
-        self._take_direction()
-
-    def _take_direction(self) -> None:
-        self._launch(kernels.take_direction, [self._z, self._scalars, self._count, self._p])
+        outputs = [self._scalars, self.status, self._running]
+        sums.launch_scalars(kernels.judge, [self.most, self.iterations], outputs)
 
     def _launch(self, kernel: wp.Kernel, arguments: list) -> None:
         wp.launch(kernel, self.worlds * self._count, arguments, device=self.device)

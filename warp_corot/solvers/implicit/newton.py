@@ -64,6 +64,7 @@ class Newton:
         others: Launches forces besides elasticity to ``body.state.forces``.
 
     Attributes:
+        residual: Forces that are out of balance [N], vec4.
         forces: Room for elastic forces, zero between launches [N], vec4.
         step: The last step [m], vec4.
         iterations, solved, status: Of each world, as ``NewtonReport`` has them, int32 [worlds].
@@ -94,7 +95,7 @@ class Newton:
             operator.worlds,
         )
         like = self.body.state.displacements
-        self.forces, self._residual, self._outer, self.step, self.base, self.increment, self.pull = (
+        self.forces, self.residual, self._outer, self.step, self.base, self.increment, self.pull = (
             wp.zeros_like(like) for _ in range(7)
         )
         self.solver = ConjugateGradients(operator, len(like), most=most_linear)
@@ -126,7 +127,7 @@ class Newton:
         outputs = [self._scalars, self.iterations, self.status, self.running, self.solver.tolerance]
         sums.launch_scalars(kernels.judge_residual, [wp.float64(self.tolerance), self.most], outputs)
         self.launch_solve()
-        inputs = [self.body.conditions.mass, self._residual, self._outer, self.step, u, *sums.sizes]
+        inputs = [self.body.conditions.mass, self.residual, self._outer, self.step, u, *sums.sizes]
         wp.launch(kernels.measure_step, sums.shape, inputs, [sums.parts], device=self.device)
         self._searching.zero_()
         self._accepted.zero_()
@@ -146,15 +147,15 @@ class Newton:
             self._others()
         inputs: list[Any] = [self.gravity, conditions.mass, conditions.inverse_mass, int(conditions.has_loads)]
         inputs += [conditions.loads, self.external_share, self.inertia, self.pull, self.increment, *sums.sizes]
-        outputs = [self.forces, body.state.forces, self._residual, self._outer, sums.parts]
+        outputs = [self.forces, body.state.forces, self.residual, self._outer, sums.parts]
         kernel = kernels.FIND_RESIDUAL[conditions.loads.dtype]
         wp.launch(kernel, sums.shape, inputs, outputs, device=self.device)
 
-    def launch_solve(self) -> None:
-        """Launch the linearisation, and the step that it gives."""
+    def launch_solve(self, *, guessed: bool = False) -> None:
+        """Launch the linearisation, and the step that it gives, from a guess of it in ``step`` if there is one."""
         self.operator.take(self.body.state.displacements)
         self.preconditioner.update(self.operator)
-        self.solver.launch(self.preconditioner, self._residual, self.step)
+        self.solver.launch(self.preconditioner, self.residual, self.step, guessed=guessed)
 
     def _launch_trial(self) -> None:
         self._try_step(commits=False)

@@ -20,21 +20,33 @@ from .tangent import TangentOperator
 MOST_LAMBDA = 9.0
 
 
-def _multigrid(operator: TangentOperator) -> Multigrid:
+#: Of a short cycle: the smoother's degree, by how much it rises, and the nodes of a level that is not made coarser.
+SHORT: dict[str, int] = {"degree": 2, "rise": 1, "few_nodes": 24}
+
+
+def _multigrid(operator: TangentOperator, short_cycles: bool) -> Multigrid:
     stiffening = 0.0 if operator.viscosity is None else operator.viscosity.seconds
-    most = MOST_LAMBDA if operator.field.shares_dilatation else np.inf
-    return Multigrid(operator.body, is_turned=not operator.field.is_linear, stiffening=stiffening, most_lambda=most)
+    shares = operator.field.shares_dilatation
+    # Where a product costs as much as a cycle, fewer iterations are worth longer ones; so are fewer launches on CUDA.
+    short = SHORT if short_cycles and operator.device.is_cpu and not shares else {}
+    most, is_turned = MOST_LAMBDA if shares else np.inf, not operator.field.is_linear
+    return Multigrid(operator.body, is_turned=is_turned, stiffening=stiffening, most_lambda=most, **short)
 
 
 #: By name.
-PRECONDITIONERS: dict[str, Callable[[TangentOperator], Preconditioner]] = {
+PRECONDITIONERS: dict[str, Callable[[TangentOperator, bool], Preconditioner]] = {
     "multigrid": _multigrid,
-    "diagonal": BlockDiagonal,
+    "diagonal": lambda operator, _: BlockDiagonal(operator),
 }
 
 
-def preconditioner_of(name: Any, operator: TangentOperator) -> Preconditioner:
+def preconditioner_of(name: Any, operator: TangentOperator, *, short_cycles: bool = False) -> Preconditioner:
     """A preconditioner by its name; for None multigrid where the mesh is a forest, else the block diagonal.
+
+    Args:
+        name: One of ``PRECONDITIONERS``, or None.
+        operator: The operator.
+        short_cycles: Whether solves begin near the answer and need few digits.
 
     Raises:
         InputError: There is none of this name, or it is multigrid and the mesh is no forest.
@@ -42,7 +54,7 @@ def preconditioner_of(name: Any, operator: TangentOperator) -> Preconditioner:
     check_preconditioner(name)
     if name is None:
         name = "multigrid" if operator.body.discretization.element_kind is ForestElements else "diagonal"
-    return PRECONDITIONERS[name](operator)
+    return PRECONDITIONERS[name](operator, short_cycles)
 
 
 def check_preconditioner(name: Any) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import warp as wp
@@ -15,9 +15,12 @@ from warp_corot.kernels.implicit import steps as kernels
 from warp_corot.kernels.stepping.integrate import follow_trajectory
 from warp_corot.solvers.integrator import Stepper
 
+from .lagged import Lagged
+from .multigrid import Multigrid
 from .newton import Newton
 from .preconditioners import preconditioner_of
 from .tangent import TangentOperator
+from .touching import Touching, TouchingSolve
 
 if TYPE_CHECKING:
     from warp_corot.solvers.system import System
@@ -35,21 +38,27 @@ class ImplicitStepper(Stepper):
     Attributes:
         totals: Steps, iterations of Newton's method and of linear solves, and steps that did not come within the
             tolerance, of all bodies, int64 [4].
+        touching: The constraints.
     """
 
     graph_steps = 8
+    resolves_constraints = True
 
     def __init__(self, system: System, integrator: ImplicitIntegrator):
         self.system, self.integrator = system, integrator
-        system.lag = 0.0
+        system.lag, system.is_implicit = 0.0, True
         self.totals = wp.zeros(4, dtype=wp.int64, device=system.device)
+        self.touching = cast("list[Touching]", list(system.constraints))
         self._bodies = [BodySteps(self, k) for k in range(len(system.bodies))]
         system.histories += [array for body in self._bodies for array in body.history]
 
     @property
     def kept(self) -> dict[str, wp.array]:
         arrays = enumerate(array for body in self._bodies for array in body.history)
-        return {f"history.{number}": array for number, array in arrays}
+        kept = {f"history.{number}": array for number, array in arrays}
+        kept |= {f"velocities.{k}": body.before for k, body in enumerate(self._bodies)}
+        lagged = [(k, body.lagged) for k, body in enumerate(self._bodies) if body.lagged is not None]
+        return kept | {f"setup.{k}.{name}": array for k, each in lagged for name, array in each.state.items()}
 
     def prepare(self) -> None:
         for body in self._bodies:
@@ -64,6 +73,8 @@ class ImplicitStepper(Stepper):
             self.system.offset = offset
             if forces_known and offset == 0:
                 self.forget_forces()
+            for each in self.touching:
+                each.launch_motion(offset)
             for body in self._bodies:
                 body.launch(offset)
 
@@ -94,6 +105,8 @@ class BodySteps:
 
     Attributes:
         history: What a step leaves for the next one, and the state in which it left the body, vec4 each.
+        before: Velocities before the last step, of which the guess of the next one is made, vec4; NaN before the first.
+        lagged: The preconditioner if it is kept over many steps, else None.
     """
 
     def __init__(self, stepper: ImplicitStepper, k: int):
@@ -104,21 +117,29 @@ class BodySteps:
         self.viscosity = Viscosity(self.body, self.field, options.viscosity) if options.viscosity else None
         exact = options.tolerance is not None
         self.operator = TangentOperator(self.body, self.field, viscosity=self.viscosity, exact=exact)
+        preconditioner = preconditioner_of(options.preconditioner, self.operator, short_cycles=not exact)
+        self.lagged: Lagged | None = None
+        if not exact and isinstance(preconditioner, Multigrid):
+            preconditioner = self.lagged = Lagged(preconditioner, self.operator)
         self.newton = Newton(
             self.operator,
-            preconditioner_of(options.preconditioner, self.operator),
+            preconditioner,
             system.gravity,
             tolerance=options.tolerance or options.linear_tolerance,
             most=options.iterations,
             most_linear=options.linear_iterations,
             others=self._add_others,
         )
+        self.touching: TouchingSolve | None = None
+        for each in stepper.touching:
+            self.touching = TouchingSolve(self.newton, each.active_set(k))
         like = self.body.state.displacements
         self._none = wp.zeros(1, dtype=wp.vec4, device=self.device)
         wanted = options.history
         self._h = [wp.zeros_like(like) if number < wanted else self._none for number in range(2)]
         self._left = [wp.full_like(like, np.nan) if wanted else self._none for _ in range(2)]
         self.history = [*self._h[:wanted], *(self._left if wanted else [])]
+        self.before = wp.full_like(like, np.nan)
         self._drift, self._rates = (self._none if self.viscosity is None else wp.zeros_like(like) for _ in range(2))
         self._begins = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._one = wp.ones(self.body.worlds, dtype=wp.int32, device=self.device)
@@ -128,6 +149,10 @@ class BodySteps:
     def prepare(self) -> None:
         """Have all that launches use, so that they can be recorded."""
         self.operator.prepare()
+        if self.lagged is not None:
+            self.lagged.prepare()
+        if self.touching is not None:
+            self.touching.held.prepare()
         self.operator.stiff_forces = tuple(each for each in self.system.forces if hasattr(each, "add_stiffness"))
         if self.stepper.integrator.tolerance is None:
             self.newton.solver.tolerance.fill_(self.stepper.integrator.linear_tolerance)
@@ -143,9 +168,16 @@ class BodySteps:
         self._begin()
         if self.stepper.integrator.tolerance is None:
             newton.launch_residual()
-            newton.launch_solve()
+            iterations = solver.iterations
+            if self.touching is None:
+                newton.launch_solve(guessed=True)
+            else:
+                self.touching.launch()
+                iterations = self.touching.iterations
+            if self.lagged is not None:
+                self.lagged.judge(iterations, solver.status)
             self._launch(kernels.take_step, [newton.step], [newton.increment, self.body.state.displacements])
-            counts, good = [self._one, solver.iterations, solver.status], conjugate_gradients.CONVERGED
+            counts, good = [self._one, iterations, solver.status], conjugate_gradients.CONVERGED
         else:
             newton.launch_begin()
             wp.capture_while(newton.running, newton.launch_iteration)
@@ -184,7 +216,8 @@ class BodySteps:
             wp.launch(set_elapsed, 1, inputs, [self.field.elapsed], device=self.device)
         inputs = [self._begins, self._table, options.dt, options.damping, conditions.inverse_mass]
         inputs += [state.velocities, *self._h]
-        outputs = [state.displacements, newton.base, newton.increment, newton.pull, self._drift]
+        outputs = [state.displacements, self.before, newton.base, newton.increment, newton.pull]
+        outputs += [newton.step, self._drift]
         self._launch(kernels.begin_step, inputs, outputs)
 
     def _add_others(self) -> None:
@@ -209,6 +242,9 @@ class BodySteps:
             self.stepper.add_counted_forces()
             account = system.accounts[self.k]
             self._launch(kernels.count_work, [conditions.inverse_mass, state.forces, newton.increment], [account])
+        for account in system.constraint_accounts(self.k):
+            inputs = [conditions.inverse_mass, state.contact_forces, newton.increment]
+            self._launch(kernels.count_work, inputs, [account])
         self.field.add_forces(state.displacements, newton.forces)
         self.stepper.add_other_forces()
         inputs = [system.gravity, conditions.mass, conditions.inverse_mass, int(conditions.has_loads)]

@@ -20,12 +20,8 @@ from .coarsest import DenseInverse
 from .level import Level
 from .pattern import Midpoints, Pattern, PatternFinder
 
-#: Levels of more nodes than this are made coarser, while there are coarser ones.
-FEW_NODES = 64
 #: The largest coarsest level that is inverted [nodes].
 MOST_DENSE = 64
-#: By how much the smoother's degree rises from a level to the next coarser one, which costs little.
-MORE = 2
 #: The smoother's degree on a coarsest level that is not inverted, as of a grid of many cubes.
 COARSEST_DEGREE = 24
 
@@ -51,6 +47,8 @@ class Multigrid:
         is_turned: Whether elements turn; False: linear elasticity.
         stride: Number of bisections from one level to the next, 1 to 3.
         degree: Of the smoother on the finest level, before and after.
+        rise: By how much the degree rises from a level to the next coarser one, which costs little.
+        few_nodes: Levels of more nodes than this are made coarser, while there are coarser ones.
         stiffening: Viscous over elastic stress at one strain [s], as in the operator's D.
         most_lambda: Up to how many times mu lambda counts.
 
@@ -69,6 +67,8 @@ class Multigrid:
         is_turned: bool = True,
         stride: int = 3,
         degree: int = 5,
+        rise: int = 2,
+        few_nodes: int = MOST_DENSE,
         stiffening: float = 0.0,
         most_lambda: float = np.inf,
     ):
@@ -78,7 +78,7 @@ class Multigrid:
             raise InputError(f"degree is {degree!r}; it must be 1 or more")
         self.discretization = discretization_of(body)
         self.is_turned, self.stride, self.degree, self.stiffening = is_turned, stride, degree, stiffening
-        self.most_lambda = most_lambda
+        self.most_lambda, self.rise, self.few_nodes = most_lambda, rise, few_nodes
         self.revision, self._version = -1, -1
         self.follow()
 
@@ -167,13 +167,13 @@ class Multigrid:
     def _level(self, found: Pattern, counts: list[int]) -> Level:
         """A level with its smoother; the coarsest one's is only used where it is not inverted."""
         k = counts.index(found.count)
-        degree = COARSEST_DEGREE if k == len(counts) - 1 else self.degree + MORE * k
+        degree = COARSEST_DEGREE if k == len(counts) - 1 else self.degree + self.rise * k
         return Level(found, self.discretization.worlds, self.count, self._free, degree)
 
     def _counts(self, levels: Levels) -> list[int]:
         """Numbers of nodes of the levels that the cycle has, finest first."""
         counts, level = [levels.node_count], levels.depth
-        while level > 0 and counts[-1] > FEW_NODES:
+        while level > 0 and counts[-1] > self.few_nodes:
             # Three bisections of the third shape also bisect an edge that the first of them makes.
             stride = 2 if level % 3 == 2 and self.stride == 3 else self.stride
             level = max(level - stride, 0)

@@ -1,0 +1,70 @@
+"""Products with the corotated R K R^T on the CPU, rotations found once; see ``elements.lanes``.
+
+With rotations held fixed, K is that of linear elasticity with the gradients of hat functions turned by R. These are
+kept, times the root of the volume, so that a product reads 36 bytes an element and nothing of the law.
+"""
+
+import functools
+
+import warp as wp
+
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.elements import GeneralElements, local_gradient
+from warp_corot.kernels.elements.lanes import ELEMENTS, ISOTROPIC_PART, native, scatter_lanes
+from warp_corot.kernels.elements.law_lanes import LAWS, ROTATION
+from warp_corot.kernels.math.matrices import identity3
+from warp_corot.kernels.math.rotation import quick_rotation
+
+wp.set_module_options({"enable_backward": False})
+
+#: Places of eight elements in the array of gradients, vec4.
+PLACES = 18
+
+
+@wp.struct
+class KeptGradients:
+    """Lamé's parameters, and the gradients that ``turn_gradients`` writes."""
+
+    isotropic: IsotropicMaterial
+    gradients: wp.array[wp.vec4]
+
+
+@functools.cache
+def turn_gradients() -> wp.Kernel:
+    """Write the gradients; a thread is eight elements. Those without a good rotation are listed."""
+    code = ROTATION + native(*ELEMENTS, "turned_gradients", "left_out_elements")
+    return scatter_lanes(code, GeneralElements, IsotropicMaterial, wp.int32)
+
+
+@functools.cache
+def add_kept_product() -> wp.Kernel:
+    """y += K p; a thread is eight elements."""
+    code = LAWS["linear"] + ISOTROPIC_PART
+    code += native("eights", "kept_elements", "elements", "isotropic_elements", "element_forces")
+    return scatter_lanes(code, GeneralElements, KeptGradients, wp.int32)
+
+
+@wp.kernel(enable_backward=False)
+def turn_listed(
+    # In
+    elements: GeneralElements,
+    u: wp.array[wp.vec4],
+    # In and out
+    listed: wp.array[wp.int32],
+    # Out
+    gradients: wp.array[wp.vec4],
+):
+    """The gradients of listed elements, by one thread, which empties the list: how many, then which."""
+    for i in range(listed[0]):
+        t = listed[i + 1]
+        turn = quick_rotation(identity3() + local_gradient(elements, t, u))
+        rows = elements.rest_inverse[t]
+        root = wp.sqrt(elements.volume[t])
+        for n in range(3):
+            h = root * (turn * wp.vec3(rows[n, 0], rows[n, 1], rows[n, 2]))
+            for axis in range(3):
+                place = 18 * (t / 8) + 2 * (3 * n + axis) + (t % 8) / 4
+                four = gradients[place]
+                four[t % 4] = h[axis]
+                gradients[place] = four
+    listed[0] = 0

@@ -1,0 +1,87 @@
+"""When a preconditioner that is kept over many steps is set up again: decisions on the device.
+
+A set-up costs as much as some iterations. It is made again when the iterations beyond those just after the last one add
+up to that, which is never more than about twice the least cost. Where a set-up has not helped, the next one waits
+longer.
+"""
+
+import warp as wp
+
+from .conjugate_gradients import CONVERGED, RUNNING
+
+wp.set_module_options({"enable_backward": False})
+
+#: Places in the counts: set-ups so far, iterations just after the last one, those beyond since then, how many of these
+#: are worth another, and iterations of the last solve before the set-up; the first is zero before the first set-up.
+SETUPS, FIRST, BEYOND, WORTH, BEFORE = (wp.constant(k) for k in range(5))
+COUNTS = 5
+#: What is due: nothing, a set-up for the present state, or the last one over again, after what it made has been lost.
+NOTHING, PRESENT, AGAIN = (wp.constant(k) for k in range(3))
+#: Iterations that a set-up is worth at first, and at most.
+LEAST_WORTH, MOST_WORTH = wp.constant(8), wp.constant(256)
+
+
+@wp.kernel(enable_backward=False)
+def find_held_changes(inverse_mass: wp.array[wp.float32], held: wp.array[wp.uint8], due: wp.array[wp.int32]):
+    """A set-up is due where nodes are held that were free, or the other way round."""
+    i = wp.tid()
+    now = wp.where(inverse_mass[i] > 0.0, wp.uint8(0), wp.uint8(1))
+    if now != held[i] and due[0] == NOTHING:
+        due[0] = PRESENT
+
+
+@wp.kernel(enable_backward=False)
+def keep_state(
+    # In
+    u: wp.array[wp.vec4],
+    inverse_mass: wp.array[wp.float32],
+    due: wp.array[wp.int32],
+    # In and out
+    counts: wp.array[wp.int32],
+    # Out
+    kept: wp.array[wp.vec4],
+    held: wp.array[wp.uint8],
+):
+    """Note the state of the set-up, unless it is made over again."""
+    i = wp.tid()
+    held[i] = wp.where(inverse_mass[i] > 0.0, wp.uint8(0), wp.uint8(1))
+    if due[0] != AGAIN or counts[SETUPS] == 0:
+        kept[i] = u[i]
+
+
+@wp.kernel(enable_backward=False)
+def note_setup(due: wp.array[wp.int32], counts: wp.array[wp.int32]):
+    if due[0] != AGAIN or counts[SETUPS] == 0:
+        counts[SETUPS] = counts[SETUPS] + 1
+        counts[FIRST] = -1
+        counts[BEYOND] = 0
+    due[0] = NOTHING
+
+
+@wp.kernel(enable_backward=False)
+def judge_solve(
+    # In
+    iterations: wp.array[wp.int32],
+    status: wp.array[wp.int32],
+    # In and out
+    counts: wp.array[wp.int32],
+    due: wp.array[wp.int32],
+):
+    """After a solve: whether the next one is worth a set-up, by the world that needed most."""
+    most = int(0)
+    is_good = bool(True)
+    for world in range(iterations.shape[0]):
+        most = wp.max(most, iterations[world])
+        if status[world] != CONVERGED and status[world] != RUNNING:
+            is_good = False
+    if counts[FIRST] < 0:
+        counts[FIRST] = most
+        worth = int(LEAST_WORTH)
+        if counts[SETUPS] > 1 and most >= counts[BEFORE]:
+            worth = wp.min(2 * counts[WORTH], MOST_WORTH)
+        counts[WORTH] = worth
+    else:
+        counts[BEYOND] = counts[BEYOND] + wp.max(most - counts[FIRST], 0)
+        if counts[BEYOND] >= counts[WORTH] or not is_good:
+            due[0] = PRESENT
+    counts[BEFORE] = most

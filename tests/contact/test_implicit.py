@@ -1,0 +1,133 @@
+"""Obstacles in implicit steps of 16 ms, which is a hundred times what explicit steps of the same bodies last."""
+
+import numpy as np
+import pytest
+
+import warp_corot as wc
+
+SOFT = wc.Isotropic(young=2e4, poisson=0.4, density=1000.0)
+EULER = wc.BackwardEuler(dt=0.016)
+DOWN = (0.0, 0.0, -9.81)
+
+
+def block(device, level=3, origin=(0.0, 0.0, 0.0), cells=(2, 2, 1), material=SOFT, **options):
+    mesh = wc.TetForest.box(cells=cells, cell_size=0.02, level=level, origin=origin)
+    return wc.SoftBody(mesh, material, device=device, **options)
+
+
+def weight(body):
+    return 9.81 * body.masses.sum() / body.worlds
+
+
+def force_on(obstacle, world=0):
+    return obstacle.wrench.numpy()[world].astype(float)[:3]
+
+
+def motion(body):
+    """Displacement and velocity of the centre of mass."""
+    m = body.masses / body.masses.sum()
+    return m @ body.displacements.numpy().astype(float), m @ body.velocities.numpy().astype(float)
+
+
+def test_a_block_that_falls_comes_to_rest_with_its_weight(device):
+    body, ground = block(device, origin=(0.0, 0.0, 0.01)), wc.Ground()
+    sim = wc.Simulation(body, obstacles=ground, gravity=DOWN, integrator=EULER)
+    for _ in range(12):
+        sim.advance_steps(2)
+        assert body.positions.numpy()[:, 2].min() > -1e-6
+    sim.advance_steps(6)
+    assert force_on(ground)[2] == pytest.approx(-weight(body), rel=1e-3)
+    assert body.contact_forces.numpy()[:, 2].sum() == pytest.approx(weight(body), rel=1e-3)
+    assert sum(point.force[2] for point in sim.contacts()) == pytest.approx(weight(body), rel=1e-3)
+    assert np.abs(body.velocities.numpy()).max() < 1e-4
+
+
+@pytest.mark.parametrize("share", [0.99, 1.01])
+def test_a_block_slips_at_the_angle_of_friction(device, share):
+    """At rest below arctan mu, and with the right acceleration above."""
+    mu = 0.3
+    angle = share * np.arctan(mu)
+    body = block(device, material=wc.Isotropic(young=1e5, poisson=0.3, density=1000.0))
+    gravity = 9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)])
+    contact = wc.Contact(friction=mu)
+    sim = wc.Simulation(body, obstacles=wc.Ground(), gravity=gravity, integrator=EULER, contact=contact)
+    sim.advance_steps(12)
+    start, before = motion(body)
+    sim.advance_steps(6)
+    end, after = motion(body)
+    if share < 1.0:
+        assert np.abs(after).max() < 1e-6
+        assert np.abs(end - start).max() < 1e-7
+    else:
+        acceleration = 9.81 * (np.sin(angle) - mu * np.cos(angle))
+        assert (after - before)[0] / (6 * EULER.dt) == pytest.approx(acceleration, rel=0.01)
+
+
+def test_nothing_passes_a_thin_plate(device):
+    """Falling 80 mm in a step, onto 4 mm."""
+    body, plate = block(device, origin=(0.0, 0.0, 0.02), cells=(1, 1, 1)), wc.Box((0.1, 0.1, 0.004))
+    body.velocities = np.tile([0.0, 0.0, -5.0], (body.node_count, 1))
+    sim = wc.Simulation(body, obstacles=plate, gravity=DOWN, integrator=EULER)
+    sim.advance_steps(1)
+    assert body.positions.numpy()[:, 2].min() > 0.002 - 1e-6
+    sim.advance_steps(20)
+    assert body.positions.numpy()[:, 2].min() > 0.002 - 1e-6
+    assert force_on(plate)[2] == pytest.approx(-weight(body), rel=1e-3)
+
+
+def test_forces_in_a_corner_balance(device):
+    """Nodes at the edge touch both walls."""
+    body, walls = block(device), [wc.Ground(), wc.Ground((1.0, 0.0, 0.0))]
+    gravity = np.array([-8.0, 0.0, -9.81])
+    sim = wc.Simulation(body, obstacles=walls, gravity=gravity, integrator=EULER, contact=wc.Contact(friction=0.1))
+    sim.advance_steps(25)
+    total = force_on(walls[0]) + force_on(walls[1])
+    assert total == pytest.approx(body.masses.sum() * gravity, abs=2e-3 * weight(body))
+    assert (body.positions.numpy()[:, [0, 2]] > -1e-6).all()
+
+
+def test_a_plate_presses_as_in_explicit_steps(device):
+    """Without friction, the force of which depends on how surfaces got where they are."""
+    options = {"gravity": (0.0, 0.0, 0.0), "contact": wc.Contact(friction=0.0)}
+
+    def pressed(integrator):
+        body, plate = block(device), wc.Tool(wc.Box((0.06, 0.06, 0.01)))
+        body.fix(body.mesh.points[:, 2] < 1e-9)
+        plate.follow([0.0, 0.1], [(0.02, 0.02, 0.025), (0.02, 0.02, 0.022)])
+        sim = wc.Simulation(body, obstacles=plate, **options, integrator=integrator)
+        sim.advance(0.4)
+        return force_on(plate)[2]
+
+    explicit = pressed(wc.SymplecticEuler(damping=60.0))
+    assert explicit > 1.0
+    assert pressed(wc.BackwardEuler(dt=0.016)) == pytest.approx(explicit, rel=0.01)
+
+
+def test_worlds_and_saved_runs(device, tmp_path):
+    """A world that is reset falls again, and the others do not notice; a run that is loaded goes on bit by bit."""
+    body = block(device, origin=(0.0, 0.0, 0.001), cells=(1, 1, 1), worlds=2)
+    sim = wc.Simulation(body, obstacles=wc.Ground(), gravity=DOWN, integrator=EULER)
+    sim.advance_steps(3)
+    sim.reset(1)
+    sim.advance_steps(2)
+    nodes = body.node_count // 2
+    lowest = body.positions.numpy().reshape(2, nodes, 3)[:, :, 2].min(axis=1)
+    assert np.abs(lowest).max() < 1e-6
+    sim.save(tmp_path / "state.npz")
+    sim.advance_steps(3)
+    later = wc.Simulation.load(tmp_path / "state.npz")
+    later.advance_steps(3)
+    error = np.abs(later.body.displacements.numpy() - body.displacements.numpy()).max()
+    assert error <= (0.0 if body.device.is_cpu else 1e-6)
+
+
+def test_what_implicit_steps_cannot_touch_is_refused(device):
+    first, second = block(device), block(device, origin=(0.0, 0.0, 0.1))
+    with pytest.raises(wc.InputError, match="BackwardEuler knows no contact of soft surfaces"):
+        wc.Simulation([first, second], obstacles=wc.Ground(), integrator=EULER)
+    with pytest.raises(wc.InputError, match="BDF2 knows no contact"):
+        wc.Simulation(first, obstacles=wc.Ground(), integrator=wc.BDF2(dt=0.01))
+    tool = wc.Tool(wc.Sphere(0.02))
+    wc.Simulation(first, obstacles=tool, integrator=EULER)
+    with pytest.raises(wc.InputError, match="a grasp needs SymplecticEuler"):
+        wc.Grasp(first, [0], tool=tool)

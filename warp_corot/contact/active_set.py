@@ -1,0 +1,122 @@
+"""The nodes of one body that obstacles hold in an implicit step; see ``kernels.contact.active``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from warp_corot.kernels.contact import active as kernels
+
+if TYPE_CHECKING:
+    from .contacts import Contacts
+
+#: Way in a step, as a share of the smallest element's size, below which friction gets smaller.
+LEAST_SLIP = 1e-4
+#: In the place of an infinite thickness [m].
+THICK = 1e6
+
+
+class ActiveSet:
+    """Contact of a body with obstacles in implicit steps.
+
+    Args:
+        contacts: Of the system.
+        k: Which body.
+    """
+
+    def __init__(self, contacts: Contacts, k: int):
+        assert contacts.rigid is not None
+        self._contacts, self._rigid, self._k = contacts, contacts.rigid, k
+        self.body, self.device = contacts.system.bodies[k], contacts.device
+        shapes = [tool.shape for tool in contacts.obstacles.tools]
+        thickness = np.array([min(shape.thickness, THICK) for shape in shapes], np.float32)
+        self._thickness = wp.array(thickness, dtype=wp.float32, device=self.device)
+        self._rounds = wp.zeros(1, dtype=wp.int32, device=self.device)
+        #: Whether another round is needed, int32 [1].
+        self.changed = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self.prepare()
+
+    def prepare(self) -> None:
+        """Take the present surface; not while launches are recorded."""
+        rigid, holding = self._rigid, kernels.Holding()
+        holding.kinds, holding.forces, holding.drag = rigid.kinds, rigid.forces, rigid.drag
+        shape, device = rigid.kinds.shape, self.device
+        holding.released, holding.caught = (wp.zeros(shape, dtype=wp.int32, device=device) for _ in range(2))
+        holding.normals = wp.zeros(shape, dtype=wp.vec3, device=device)
+        holding.least = wp.zeros(shape, dtype=wp.float32, device=device)
+        holding.touched = wp.zeros(shape[1], dtype=wp.int32, device=device)
+        holding.projectors = wp.zeros(shape[1], dtype=wp.mat33, device=device)
+        holding.given = wp.zeros(shape[1], dtype=wp.vec3, device=device)
+        self._holding = holding
+
+    # --- launches ----------------------------------------------------------------------------------------------------
+
+    def launch_begin(self, d: wp.array) -> None:
+        """Launch what a step begins with: nodes are held as the last one has left them. d is a guess [m], vec4."""
+        state, conditions = self.body.state, self.body.conditions
+        inputs = [conditions.inverse_mass, state.rest, state.displacements, self._surface, self._holding]
+        self._launch(kernels.begin_places, inputs)
+        self._rounds.zero_()
+        self.changed.fill_(1)
+        self._find_bounds(d, int(kernels.THOSE_TOUCHED), at_end=False)
+        self._hold()
+
+    def launch_free(self, v: wp.array) -> None:
+        """Launch v = S v, without the directions that are held."""
+        self._launch(kernels.leave_free, [self._surface, self._holding, v])
+
+    def launch_imposed(self, d: wp.array) -> None:
+        """Launch that d has the motion that is given in these directions."""
+        self._launch(kernels.impose, [self._surface, self._holding, d])
+
+    def launch_drag(self, x: wp.array, y: wp.array) -> None:
+        """Launch y = S (y + D x) with the drag D of friction, x in the range of S."""
+        self._launch(kernels.add_drag, [self._surface, self._holding, x, y])
+
+    def launch_friction(self, d: wp.array, r: wp.array) -> None:
+        """Launch r = S (r + friction) for the motion d."""
+        motions = self._contacts.obstacles.motions
+        self._launch(kernels.add_friction, [motions, self._surface, self._holding, d, r])
+
+    def launch_judgement(self, b: wp.array, q: wp.array, d: wp.array) -> None:
+        """Launch which nodes are held from now on, and ``changed``.
+
+        Args:
+            b: Forces at the beginning of the step without contact [N].
+            q: A d [N].
+            d: The motion [m].
+        """
+        contacts = self._contacts
+        self.changed.zero_()
+        self._find_bounds(d, int(kernels.THOSE_APART), at_end=True)
+        inputs = [contacts.obstacles.shapes, contacts.obstacles.motions, contacts.law, self._surface]
+        slip = LEAST_SLIP * contacts.smallest
+        self._launch(kernels.judge_places, [*inputs, b, q, d, slip, self._rounds, self._holding, self.changed])
+        wp.launch(kernels.count_round, 1, [self._rounds, self.changed], device=self.device)
+        self._find_bounds(d, int(kernels.THOSE_TOUCHED), at_end=True)
+        self._hold()
+
+    def launch_end(self, d: wp.array) -> None:
+        """Launch what users read of contact."""
+        self._launch(kernels.end_places, [d, self._holding, self._surface, self.body.state.contact_forces])
+
+    # --- pieces ------------------------------------------------------------------------------------------------------
+
+    @property
+    def _surface(self) -> object:
+        return self._contacts.surface.arrays
+
+    def _find_bounds(self, d: wp.array, which: int, *, at_end: bool) -> None:
+        contacts = self._contacts
+        obstacles, pace = contacts.obstacles, contacts.system.pace.arrays
+        inputs = [int(at_end), which, obstacles.shapes, self._thickness, obstacles.motions, contacts.law, pace]
+        self._launch(kernels.find_bounds, [*inputs, self._surface, d, self._holding])
+
+    def _hold(self) -> None:
+        self._launch(kernels.hold_places, [self._contacts.obstacles.motions, self._surface, self._holding])
+
+    def _launch(self, kernel: wp.Kernel, inputs: list) -> None:
+        part = self._contacts.surface.parts[self._k]
+        wp.launch(kernel, self._contacts.system.worlds * part.nodes, [part.start, *inputs], device=self.device)
