@@ -106,7 +106,7 @@ def find_curvatures(
 def find_strains(Elements: Any) -> wp.Kernel:
     """The largest entry of C - I = F^T F - I among elements, now and after ``steps`` more at the present rate.
 
-    One element of ``TURNS`` is looked at, others the next time: neighbours, which share nodes, are strained too.
+    One element of ``turns`` is looked at, others the next time: neighbours, which share nodes, are strained too.
     """
 
     @unique_kernel()
@@ -117,13 +117,14 @@ def find_strains(Elements: Any) -> wp.Kernel:
         v: wp.array[wp.vec4],
         pace: Pace,
         steps: int,
+        turns: int,
         count: int,
         # Out
         found: wp.array[wp.float32],
     ):
         measurement = int(pace.counts[DONE] / wp.int64(steps))
         i = wp.tid()
-        t = i * TURNS + measurement % TURNS
+        t = i * turns + measurement % turns
         if t >= count:
             return
         g = local_gradient(elements, t, u)

@@ -67,6 +67,16 @@ def add_support_work(elastic: wp.vec3, moved: wp.vec3, work: wp.array[wp.float64
         wp.atomic_add(work, 1, wp.abs(added))
 
 
+@wp.func
+def count_support_work(elastic: wp.vec3, moved: wp.vec3, i: int, work: wp.array[wp.float64]):
+    """``add_support_work`` in the places of node i if ``work`` has two for each node, the absolute values last."""
+    added = wp.float64(-wp.dot(elastic, moved))
+    if added != wp.float64(0.0):
+        count = work.shape[0] / 2
+        wp.atomic_add(work, i % count, added)
+        wp.atomic_add(work, count + i % count, wp.abs(added))
+
+
 @wp.kernel(enable_backward=False)
 def step_symplectic_euler(
     # In
@@ -92,7 +102,8 @@ def step_symplectic_euler(
     After a change of the step forces act for half of the old one and half of the new one.
 
     ``offset`` is this step's place in a run of recorded ones, whose steps ``pace`` does not count before its end.
-    ``support_work`` adds up what moving supports put in against the elastic forces, and its absolute value [J].
+    ``support_work`` adds up what moving supports put in against the elastic forces, and its absolute value [J], of all
+    nodes in two places or of each in two of its own.
     A node without inverse mass moves with the velocity it has (zero if fixed), and its support takes what is left of
     Newton's second law: the weight, the elastic force and the load.
     """
@@ -112,7 +123,7 @@ def step_symplectic_euler(
         store_node(v, i, velocity)
     else:
         store_node(reactions, i, -(force + mass[i] * gravity))
-        add_support_work(elastic, kick * velocity, support_work)
+        count_support_work(elastic, kick * velocity, i, support_work)
     displacement = load_node(u, i) + dt * velocity
     store_node(u, i, displacement)
     store_node(f, i, wp.vec3())
@@ -160,7 +171,7 @@ def follow_trajectory(
     if offset == 0:
         before = float(length_before(pace))
     velocity = (target - load_node(u, i)) / dt
-    add_support_work(load_node(f, i), 0.5 * before * (load_node(v, i) - velocity), support_work)
+    count_support_work(load_node(f, i), 0.5 * before * (load_node(v, i) - velocity), i, support_work)
     store_node(v, i, velocity)
 
 

@@ -17,6 +17,7 @@ from .options import add_parser
 from .prepared import Run, prepared
 from .previews import Previews, check_preview
 from .probing import Table, check_table_path
+from .ranks import fall_silent, leader
 from .run_file import bodies_of, check_run_path, write_run
 from .say import complain, interrupt_status, kept_so_far
 from .summary import summary, title_of
@@ -38,11 +39,14 @@ def run(args: argparse.Namespace) -> int:
     """
     from warp_corot.io.write.animate import Recording
 
+    if not leader():
+        return _serve(args)
     options = bodies_of(args)
     shared = options[0]
     _check_output(args, shared)
     ready = prepared(options)
     done = Recording(shared.output)
+    end = getattr(ready.sim, "end", lambda: None)
     table = Table(shared.csv, ready.sim, ready.probes, ready.touched.obstacles) if shared.csv else None
     previews = Previews(shared, ready.count) if shared.preview else None
     try:
@@ -61,7 +65,22 @@ def run(args: argparse.Namespace) -> int:
     except OSError as error:
         complain(str(error))
         return 1
+    finally:
+        end()
     print(summary(ready.bodies, ready.sim, done, ready.touched.rows, rested))
+    return 0
+
+
+def _serve(args: argparse.Namespace) -> int:
+    """``run`` on a rank that makes its part of the steps, and neither speaks nor writes; returns the exit status."""
+    fall_silent()
+    options = bodies_of(args)
+    _check_output(args, options[0])
+    ready = prepared(options)
+    try:
+        ready.sim.serve()  # type: ignore[attr-defined]
+    except UnstableError:
+        return 3
     return 0
 
 

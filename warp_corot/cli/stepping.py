@@ -14,6 +14,7 @@ from warp_corot.solvers import INTEGRATORS, Integrator, QuasiStatic, SymplecticE
 
 from .bodies import Body, gravity_of
 from .implicit import IMPLICIT_DT, check_implicit, integrator_name, is_static
+from .ranks import are_several, led_simulation
 from .remesh import as_remesh_options
 from .touching import Touched
 
@@ -38,8 +39,9 @@ def make_simulation(args: argparse.Namespace, bodies: Sequence[Body], touched: T
         steps = steps_per_frame(args.fps, args.dt or tried)  # refuses an excessive number
         integrator = SymplecticEuler(None if args.dt is None else 1.0 / (args.fps * steps), damping, viscosity)
     with as_remesh_options():
-        return Simulation(
-            [body.soft for body in bodies],
+        make = led_simulation if are_several() else Simulation
+        return make(
+            bodies=[body.soft for body in bodies],
             model=[body.model for body in bodies],
             integrator=integrator,
             gravity=gravity_of(args, first),

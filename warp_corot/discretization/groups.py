@@ -49,6 +49,8 @@ class Groups:
 
 def group_numbers(forest: TetForest, leaves: npt.NDArray[np.integer]) -> npt.NDArray[np.int32]:
     """The group of each given leaf of a forest, from 0; int32 [n]."""
+    if forest.leaf_groups is not None:
+        return np.unique(forest.leaf_groups[leaves], return_inverse=True)[1].astype(np.int32)
     group = np.full(len(leaves), -1, np.int32)
     above = forest.tree.leaves[leaves]
     level = np.array(forest.levels, dtype=np.int32)[leaves]

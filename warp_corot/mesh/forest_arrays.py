@@ -34,6 +34,8 @@ class ForestArrays:
     node_labels: np.ndarray | None = None
     label_names: tuple[str, ...] = ()
     detail: Detail | None = None
+    #: Groups of leaves that share something, int32 [T], if they are those of a larger forest; None: as they are found.
+    leaf_groups: np.ndarray | None = None
 
     @cached_property
     def points(self) -> np.ndarray:

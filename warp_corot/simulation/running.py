@@ -103,7 +103,8 @@ class Running:
 
     def _bar(self, total: float, unit: str) -> AbstractContextManager[Callable[[float], None]]:
         """A bar for long waits; none where hooks may print lines of their own."""
-        return nullcontext(lambda _: None) if self._sim.hook_intervals else bar_of(total, unit)
+        silent = self._sim.hook_intervals or not self._sim.ranks.speaks
+        return nullcontext(lambda _: None) if silent else bar_of(total, unit)
 
     def look(self) -> None:
         """Check that the state is finite and, every few hundred steps, that nodes are within reach.

@@ -27,6 +27,7 @@ from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.remesh.remeshing import Remeshing
 from warp_corot.solvers import Integrator, SymplecticEuler, largest_frequency
 from warp_corot.solvers.guarding.guard import Guard
+from warp_corot.solvers.ranks import ALONE, Ranks
 from warp_corot.solvers.recorded import RecordedSteps, Segment
 from warp_corot.solvers.steps.pace import Pace
 from warp_corot.solvers.steps.safe_step import ANY_STEP, SafeStep
@@ -77,6 +78,7 @@ class Simulation:
         stable_dt: Largest linearly stable step at rest [s], estimated; infinite where nothing can vibrate, and for
             implicit integrators.
         gravity: Tuple [m/s^2].
+        ranks: Who makes the same steps with other parts of the bodies.
 
     Raises:
         InputError: There is no body, one is given twice, bodies have different devices or numbers of worlds, the number
@@ -88,6 +90,8 @@ class Simulation:
         StabilityWarning: The given step is larger than ``stable_dt``.
         CapacityWarning: A mesh has no room left for refinement; once.
     """
+
+    ranks: Ranks = ALONE
 
     def __init__(
         self,
@@ -101,7 +105,7 @@ class Simulation:
         obstacles: Obstacle | Sequence[Obstacle] = (),
         contact: Contact | None = None,
     ):
-        self.bodies = checked_bodies(bodies)
+        self.bodies = checked_bodies(bodies, self.ranks)
         self.device, self.worlds = self.bodies[0].device, self.bodies[0].worlds
         self.deterministic = bool(deterministic)
         self.models = checked_models(Corotated() if model is None else model, len(self.bodies))
@@ -126,7 +130,7 @@ class Simulation:
         self._hooks: list[_Hook] = []
         given = self.integrator.dt
         self.pace = Pace(ANY_STEP if given is None else float(given), self.device)
-        self.system = System(self.bodies, self.fields, self.pace, self.gravity)
+        self.system = System(self.bodies, self.fields, self.pace, self.gravity, self.ranks)
         stable = self._find_stable_steps()
         #: Keeps bodies out of obstacles and out of one another; None without contact.
         self.contact: Contacts | None = None
@@ -387,7 +391,8 @@ class Simulation:
         if self.integrator.is_implicit:
             self.stable_dt = math.inf
             return [math.inf] * len(self.bodies)
-        frequencies = [largest_frequency(body, f.stiffest) for body, f in zip(self.bodies, self.fields, strict=True)]
+        bound = enumerate(zip(self.bodies, self.fields, strict=True))
+        frequencies = [largest_frequency(body, f.stiffest, self.ranks, k) for k, (body, f) in bound]
         added = sum(getattr(each, "curvature", 0.0) for each in self.system.forces)
         steps = [self.integrator.stable_step(math.sqrt(frequency**2 + added)) for frequency in frequencies]
         self.stable_dt = min(steps)

@@ -193,6 +193,10 @@ class RecordedSteps:
         self._rewritten = self._system.rewritten
 
     def _replay_recording(self, segment: Segment) -> None:
+        if not self._system.ranks.can_record:
+            self.launch(segment)
+            self._pace.forget()
+            return
         if segment not in self._graphs:
             if len(self._graphs) >= MOST_GRAPHS:
                 self._graphs.clear()

@@ -12,6 +12,7 @@ from warp_corot.elasticity import ForceField
 from warp_corot.solvers.steps.pace import Pace
 
 from .forces_work import ForcesWork
+from .ranks import ALONE, Ranks
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -100,6 +101,7 @@ class System:
         fields: The elastic force field of each.
         pace: The clock and the length of a step; steps recorded in one run add their offset.
         gravity: [m/s^2].
+        ranks: Who makes the same steps with other parts of the bodies.
 
     Attributes:
         forces: Forces besides elasticity.
@@ -117,7 +119,15 @@ class System:
         bad_step: The first step after which something was not finite, int64 [1] on the device.
     """
 
-    def __init__(self, bodies: Sequence[SoftBody], fields: Sequence[ForceField], pace: Pace, gravity: Sequence[float]):
+    def __init__(
+        self,
+        bodies: Sequence[SoftBody],
+        fields: Sequence[ForceField],
+        pace: Pace,
+        gravity: Sequence[float],
+        ranks: Ranks = ALONE,
+    ):
+        self.ranks = ranks
         self.bodies, self.fields, self.pace, self.gravity = tuple(bodies), tuple(fields), pace, wp.vec3(*gravity)
         self.forces: list[Forces] = []
         self.constraints: list[Constraint] = []
@@ -128,6 +138,10 @@ class System:
         self.device, self.worlds = bodies[0].device, bodies[0].worlds
         self.motion_rates = wp.zeros(2, dtype=wp.float32, device=self.device)
         self.support_work = pace.support_work
+        shapes = {} if ranks.is_alone else {body: (2, len(body.state.forces)) for body in bodies}
+        self._work_of_supports = {
+            body: wp.zeros(shape, dtype=wp.float64, device=self.device) for body, shape in shapes.items()
+        }
         self.bad_step = wp.array([NEVER], dtype=wp.int64, device=self.device)
 
     @property
@@ -139,8 +153,13 @@ class System:
 
     @property
     def accounts(self) -> list[wp.array]:
-        """The work of forces and of constraints on each body; see ``ForcesWork``."""
-        return [*(self._work.accounts if self.counted else []), *self._work.of_constraints.values()]
+        """The work of forces and of constraints on each body, and of its supports where each node has its own; see
+        ``ForcesWork``."""
+        return [
+            *self._work_of_supports.values(),
+            *(self._work.accounts if self.counted else []),
+            *self._work.of_constraints.values(),
+        ]
 
     def constraint_accounts(self, k: int) -> list[wp.array]:
         """The work of constraints on a body, if it may be touched; see ``ForcesWork``."""
@@ -176,7 +195,8 @@ class System:
                 forces.add_forces()
         # The work of supports includes the forces so far, but not those that are counted below.
         for k in moving:
-            self.bodies[k].conditions.follow_trajectories(self.pace, offset, self.support_work)
+            body = self.bodies[k]
+            body.conditions.follow_trajectories(self.pace, offset, self.support_work_of(body))
         counted = self.counted
         if counted:
             self._work.launch_begin()
@@ -188,6 +208,12 @@ class System:
         if counted:
             self._work.launch_count(offset, damping)
         self._work.launch_constraints(offset, damping)
+
+    def support_work_of(self, body: SoftBody) -> wp.array:
+        """Where steps add up the work of a body's supports: ``support_work``, or two places for each node, which add up
+        in an order that does not depend on the number of ranks."""
+        own = self._work_of_supports.get(body)
+        return self.support_work if own is None else own.flatten()
 
     def pushing(self, k: int) -> wp.array | None:
         """Forces on a body besides elasticity in the last step [N], vec4, for the balance of energy.

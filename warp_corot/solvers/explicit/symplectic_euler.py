@@ -88,7 +88,8 @@ class SymplecticEulerStepper(Stepper):
         """The launches that make many steps of a body, or None."""
         many = self._many[k]
         follows = isinstance(many, BlockSteps) and self.system.bodies[k].conditions.trajectories
-        return None if follows or self.system.forces or self.system.constraints else many
+        others = self.system.forces or self.system.constraints or not self.system.ranks.is_alone
+        return None if follows or others else many
 
     def prepare(self) -> None:
         for many in self._many:
@@ -119,6 +120,7 @@ class SymplecticEulerStepper(Stepper):
             for k in one_by_one:
                 body = self.system.bodies[k]
                 self._move(body, offset)
+                self.system.ranks.complete(k, body.state.displacements)
                 self.system.fields[k].complete_step(body.state.displacements, self.system.pace.arrays)
 
     def _move(self, body: SoftBody, offset: int) -> None:
@@ -140,7 +142,7 @@ class SymplecticEulerStepper(Stepper):
                 body.state.displacements,
                 body.state.velocities,
             ],
-            outputs=[body.state.reactions, system.support_work, system.bad_step],
+            outputs=[body.state.reactions, system.support_work_of(body), system.bad_step],
             device=body.device,
         )
 

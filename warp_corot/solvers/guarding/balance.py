@@ -87,7 +87,13 @@ class Balance:
         wanted = -(-max(body.sizes.launch_nodes for body in self.bodies) // (self.worlds * NODES * WARP))
         warps = 1 if self.device.is_cpu else max(min(wanted, WARPS // self.worlds), 1)
         self._threads = warps * self._lanes
+        self._ranks = system.ranks
+        if self._ranks.is_settled:
+            # Every node and every element is an addend: sums of theirs are the same in any order.
+            self._lanes, warps = 1, max(max(b.sizes.launch_nodes, b.sizes.launch_elements) for b in self.bodies)
+            warps = self._threads = max(warps // self.worlds, 1)
         self._sums = wp.zeros((self.worlds, warps, kernels.COLUMNS), dtype=wp.float64, device=self.device)
+        self._addends = wp.zeros_like(self._sums) if self._ranks.is_settled else None
         self._energies: list[wp.array] = [wp.empty(0, dtype=wp.float64, device=self.device) for _ in self.bodies]
         self._field_states: list[dict[str, wp.array]] = [{} for _ in self.bodies]
         self._mapped = Mapped(self.worlds * kernels.COLUMNS + kernels.NUMBERS, self.device)
@@ -145,6 +151,8 @@ class Balance:
         for account in system.accounts if accounts is None else accounts:
             inputs = [account, account.shape[1] // self.worlds, self._threads, self._lanes]
             wp.launch(kernels.sum_work, (self.worlds, self._threads), inputs, [self._sums], device=self.device)
+        if self._addends is not None:
+            wp.copy(self._addends, self._sums)
         inputs = [self._lanes, system.pace.orders, system.support_work, system.bad_step, copies.changed]
         inputs += [system.pace.control, system.pace.arrays, self._sums]
         dim = (self.worlds, kernels.COLUMNS, self._lanes)
@@ -156,6 +164,8 @@ class Balance:
         numbers = self._mapped.values[self.worlds * kernels.COLUMNS :]
         total = self._mapped.values[: self.worlds * kernels.COLUMNS].reshape(self.worlds, kernels.COLUMNS).copy()
         self.system.pace.saw(numbers)
+        ranks = self._ranks
+        total = ranks.totals(total, None if self._addends is None else self._addends.numpy())
         kinetic, ahead, elastic = (total[:, int(c)] for c in (kernels.KINETIC, kernels.AHEAD, kernels.ELASTIC))
         done = numbers[int(kernels.WORK)] + total[:, int(kernels.SUPPORTS)].sum() + total[:, int(kernels.WORKED)]
         energies = Energies(
@@ -169,17 +179,17 @@ class Balance:
             supports_absolute=numbers[int(kernels.WORK_ABSOLUTE)] + total[:, int(kernels.WORKED_ABSOLUTE)],
             reach=total[:, int(kernels.REACH)],
         )
-        bad_step = numbers[int(kernels.BAD_STEP)]
+        bad_step = ranks.least(min(int(numbers[int(kernels.BAD_STEP)]), NEVER))
         return Report(
             energies=energies,
             has_changed=bool(numbers[int(kernels.CHANGED)]),
-            bad_step=NEVER if bad_step >= float(NEVER) else int(bad_step),
+            bad_step=bad_step,
         )
 
     def rounding(self) -> Floats:
         """Energies that float32 cannot distinguish from zero, for each world [J]: those of strains of about 4e-4."""
         found = np.zeros(self.worlds)
-        for body in self.bodies:
+        for body in map(self._ranks.whole, self.bodies):
             stiffness = 2.0 * float(body.discretization.mu.numpy().mean()) + float(
                 body.discretization.lam.numpy().mean()
             )
@@ -193,6 +203,7 @@ class Balance:
         for name, array in field.state.items():
             wp.copy(kept[name], array)
         field.write_energies(u, energies)
+        self._ranks.leave_own(k, energies)
         field.add_forces(u, body.state.forces)
         for name, array in field.state.items():
             wp.copy(array, kept[name])

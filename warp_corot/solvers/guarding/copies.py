@@ -94,6 +94,7 @@ class Copies:
             kernel = kernels.TAKE_OVER[body.state.positions.dtype]
             wp.launch(kernel, body.sizes.launch_nodes, inputs, outputs, device=self.device)
         self._launch_words(beside=False)
+        self._system.ranks.agree_on_changes(self.changed, self._pace.arrays)
 
     def launch_keep(self) -> None:
         """Launch the copies of the fields' state at the end of a run; nodes are copied as their energies are summed."""

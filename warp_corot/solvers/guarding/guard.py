@@ -72,7 +72,9 @@ class Guard:
 
     def __init__(self, system: System):
         self.system, self.bodies, self.worlds = system, system.bodies, system.worlds
-        self._size = max(float(np.ptp(body.mesh.points, axis=0).max()) for body in system.bodies)
+        self._ranks = system.ranks
+        wholes = map(self._ranks.whole, system.bodies)
+        self._size = max(float(np.ptp(body.mesh.points, axis=0).max()) for body in wholes)
         self._copies = Copies(system)
         self._balance = Balance(system, self._copies)
         self._reference: Energies | None = None
@@ -205,7 +207,7 @@ class Guard:
 
     def not_finite(self) -> Fault | None:
         """Whether the state is not finite: the cheapest check."""
-        return self._not_finite(int(self.system.bad_step.numpy()[0]))
+        return self._not_finite(self._ranks.least(int(self.system.bad_step.numpy()[0])))
 
     def beyond_reach(self) -> Fault | None:
         """Whether nodes are beyond reach: the only check of a state that users may write to."""
@@ -303,7 +305,7 @@ class Guard:
         for body in self.bodies:
             sizes = np.abs(body.state.displacements.numpy().astype(np.float64)).sum(axis=1)
             bad |= ~(sizes.reshape(self.worlds, -1) <= 3e38).all(axis=1)
-        return np.flatnonzero(bad)
+        return np.flatnonzero(self._ranks.anywhere(bad))
 
     def _beyond_reach(self, found: Energies) -> Fault | None:
         bad = np.flatnonzero(~(found.reach <= REACH * self._size))

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.kernels.stepping import gauge as kernels
+from warp_corot.solvers.ranks import ALONE, Ranks
 
 from .pace import Pace
 from .stable_step import PROBE
@@ -28,14 +29,17 @@ class Gauge:
         body: The body.
         field: Its force field.
         found: The result, float32 [2], zero before: ``CURVATURE`` and ``STRAIN`` of ``kernels.stepping.pace``.
+        ranks, number: Who has the other parts of the body, and the number under which they know it.
     """
 
-    def __init__(self, body: SoftBody, field: ForceField, found: wp.array):
+    def __init__(self, body: SoftBody, field: ForceField, found: wp.array, ranks: Ranks = ALONE, number: int = 0):
+        self._ranks, self._number = ranks, number
         self.body = body
         self.field = field
         self.found = found
         places = body.state.displacements.shape
         self.directions = wp.zeros(places, dtype=wp.vec4, device=body.device)
+        ranks.number_directions(number, self.directions)
         self._probed, self._forces = (wp.zeros(places, dtype=wp.vec4, device=body.device) for _ in range(2))
         self._rest_directions = self.directions
         #: The size of the probing motion, float32 [1].
@@ -47,7 +51,7 @@ class Gauge:
     def rescale(self) -> None:
         """Scale the probing motion to the mesh: the lightest free node moves a share of the smallest element."""
         inverse = self.body.conditions.inverse_mass[: self.body.node_count].numpy()
-        lightest = float(inverse.max())
+        lightest = self._ranks.most(float(inverse.max(initial=0.0)))
         size = self.body.discretization.smallest_volume ** (1.0 / 3.0)
         self.scale.fill_(PROBE * size / np.sqrt(lightest) if lightest > 0 else 0.0)
 
@@ -64,15 +68,18 @@ class Gauge:
         """
         body = self.body
         self._find_curvature(body.state.displacements, body.state.forces)
+        # Parts of a body number their elements each in their own way: there, all are looked at.
+        turns = int(kernels.TURNS) if self._ranks.is_alone else 1
         wp.launch(
             kernels.find_strains(body.discretization.element_kind),
-            dim=-(-body.sizes.launch_elements // int(kernels.TURNS)),
+            dim=-(-body.sizes.launch_elements // turns),
             inputs=[
                 body.discretization.elements,
                 body.state.displacements,
-                body.state.velocities,
+                self._ranks.completed(self._number, body.state.velocities),
                 pace.arrays,
                 ahead,
+                turns,
                 body.sizes.launch_elements,
             ],
             outputs=[self.found],
@@ -87,6 +94,7 @@ class Gauge:
             for _ in range(REST_TURNS):
                 self.found.zero_()
                 self._find_curvature(u, f)
+            self._ranks.take_most(self.found)
         self._rest_directions = wp.clone(self.directions)
         value = float(self.found.numpy()[0])
         self.found.zero_()
@@ -96,6 +104,7 @@ class Gauge:
         inverse_mass = self.body.conditions.inverse_mass
         outputs = [self.directions, self._probed, self._forces]
         self._launch(kernels.probe_directions, [self.scale, inverse_mass, u], outputs)
+        self._ranks.complete(self._number, self._probed)
         self.field.add_forces(self._probed, self._forces)
         inputs = [inverse_mass, u, self._probed, f, self._forces]
         self._launch(kernels.find_curvatures, inputs, [self.directions, self.found])

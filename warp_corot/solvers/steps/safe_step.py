@@ -71,7 +71,8 @@ class SafeStep:
         self._at_rest = wp.zeros((count, 4), dtype=wp.float64, device=self.device)
         self._control, self._system = system.pace.control, system
         bound = zip(system.bodies, system.fields, strict=True)
-        self.gauges = [Gauge(body, field, self._found[k]) for k, (body, field) in enumerate(bound)]
+        ranks = system.ranks
+        self.gauges = [Gauge(body, field, self._found[k], ranks, k) for k, (body, field) in enumerate(bound)]
         self.find_rest(stable)
 
     @property
@@ -140,6 +141,7 @@ class SafeStep:
             gauge.launch(self.pace, ahead)
         for each in self._system.constraints:
             each.measure()
+        self._system.ranks.take_most(self._found)
         inputs = [self._at_rest, self._found, self._system.motion_rates, self._control, self.pace.arrays]
         wp.launch(kernels.take_safe_step, dim=1, inputs=inputs, device=self.device)
 

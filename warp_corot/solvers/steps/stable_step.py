@@ -10,6 +10,7 @@ import warp as wp
 
 from warp_corot.elasticity.model import SmallForces
 from warp_corot.kernels.stepping import lanczos
+from warp_corot.solvers.ranks import ALONE, Ranks
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -22,10 +23,14 @@ LAST_STEPS = 8
 PROBE = 1e-3
 
 
-def largest_frequency(body: SoftBody, field: SmallForces) -> float:
+def largest_frequency(body: SoftBody, field: SmallForces, ranks: Ranks = ALONE, number: int = 0) -> float:
     """Largest angular frequency [rad/s] of small motions about rest; explicit central differences need dt < 2 / it.
 
     Zero if no node is free to move.
+
+    Args:
+        body, field: The body and its forces.
+        ranks, number: Who has the other parts of the body, and the number under which they know it.
     """
     largest = largest_eigenvalue(
         field,
@@ -33,12 +38,20 @@ def largest_frequency(body: SoftBody, field: SmallForces) -> float:
         body.discretization.smallest_volume,
         body.sizes.nodes,
         body.sizes.launch_nodes,
+        ranks,
+        number,
     )
     return float(np.sqrt(largest))
 
 
 def largest_eigenvalue(
-    forces: SmallForces, inverse_mass: wp.array, smallest_volume: float, nodes: int, launch_nodes: int | None = None
+    forces: SmallForces,
+    inverse_mass: wp.array,
+    smallest_volume: float,
+    nodes: int,
+    launch_nodes: int | None = None,
+    ranks: Ranks = ALONE,
+    number: int = 0,
 ) -> float:
     """The largest eigenvalue of M^-1 K [1/s^2], where K gives the forces of small displacements from rest.
 
@@ -51,11 +64,13 @@ def largest_eigenvalue(
         smallest_volume: The volume of the smallest element [m^3], which sets the size of small displacements.
         nodes: How many nodes there are.
         launch_nodes: How many nodes launches go through; None: ``nodes``.
+        ranks, number: As for ``largest_frequency``.
     """
-    free = int((inverse_mass[:nodes].numpy() > 0).sum())
+    free = int(ranks.together(int((inverse_mass[:nodes].numpy() > 0).sum())))
     if not free:
         return 0.0
-    iteration = _Lanczos(forces, inverse_mass, PROBE * smallest_volume ** (1.0 / 3.0), launch_nodes or nodes)
+    probe = PROBE * smallest_volume ** (1.0 / 3.0)
+    iteration = _Lanczos(forces, inverse_mass, probe, launch_nodes or nodes, ranks, number)
     with forces.state_kept():
         iteration.find_rest_forces()
         for step in range(min(LANCZOS_STEPS, 3 * free)):
@@ -77,13 +92,16 @@ def _largest_value(diagonal: npt.NDArray[np.float64], off: npt.NDArray[np.float6
 class _Lanczos:
     """The iteration's vectors on the device, vec4, as long as launches: the present, the previous and the next one."""
 
-    def __init__(self, forces: SmallForces, inverse_mass: wp.array, probe: float, count: int):
+    def __init__(
+        self, forces: SmallForces, inverse_mass: wp.array, probe: float, count: int, ranks: Ranks, number: int
+    ):
+        self._ranks, self._number = ranks, number
         self.forces, self.inverse_mass, self.probe, self.count = forces, inverse_mass, probe, count
         self.device = inverse_mass.device
         self.q, self.before, self.next = (wp.empty(count, dtype=wp.vec4, device=self.device) for _ in range(3))
         places = len(inverse_mass)
         self.u, self.f, self._rest = (wp.zeros(places, dtype=wp.vec4, device=self.device) for _ in range(3))
-        parts = min(count, lanczos.PARTS)
+        parts = count if ranks.is_settled else min(count, lanczos.PARTS)
         self._parts, self._sums, self._largest, self._diagonal, self._off = (
             wp.empty(size, dtype=wp.float64, device=self.device)
             for size in (parts, lanczos.FOLDED, lanczos.FOLDED, LANCZOS_STEPS, LANCZOS_STEPS + 1)
@@ -91,6 +109,7 @@ class _Lanczos:
         self._scale = wp.empty(1, dtype=wp.float32, device=self.device)
         self._steps = 0
         self._launch(lanczos.random_motion, [0, inverse_mass, self.q])
+        ranks.number_motion(number, inverse_mass, self.q)
         self._normalise(self.q, 0)
 
     def find_rest_forces(self) -> None:
@@ -103,8 +122,10 @@ class _Lanczos:
         inverse_mass = self.inverse_mass
         self._launch(lanczos.largest_motions, [inverse_mass, self.q, self._parts], len(self._parts))
         self._launch(lanczos.fold, [self._parts, self._sums, self._largest], lanczos.FOLDED)
+        self._ranks.take_most(self._largest)
         self._launch(lanczos.take_scale, [self.probe, self._largest, self._scale], 1)
         self._launch(lanczos.probe_motion, [self._scale, inverse_mass, self.q, self.u])
+        self._ranks.complete(self._number, self.u)
         wp.copy(self.f, self._rest, count=self.count)
         self.forces.add_forces(self.u, self.f)
         arguments = [self._scale, self._off, step, inverse_mass, self.f, self.before, self.next]
@@ -133,6 +154,7 @@ class _Lanczos:
     def _sum(self, a: wp.array, b: wp.array, numbers: wp.array, place: int, *, root: bool = False) -> None:
         self._launch(lanczos.inner_products, [a, b, self._parts], len(self._parts))
         self._launch(lanczos.fold, [self._parts, self._sums, self._largest], lanczos.FOLDED)
+        self._ranks.add_up(self._parts, self._sums)
         self._launch(lanczos.take_sum, [self._sums, int(root), place, numbers], 1)
 
     def _launch(self, kernel: wp.Kernel, arguments: list, dim: int | None = None) -> None:

@@ -1,0 +1,177 @@
+#!/usr/bin/env python3
+"""Weak and strong scaling of one body over ranks, with a model of it that predicts other numbers of ranks.
+
+    python benchmarks/scaling.py [--device cuda] [--ranks 1,2] [--weak 18,21] [--strong 21] [--json FILE]
+
+The command starts ``mpirun`` by itself for each number of ranks, and needs nothing but this package, mpi4py and MPI; on
+cards nccl4py, too. Weak scaling has a root cube of the level on each rank; strong scaling has as many cubes as the
+largest number of ranks, divided among all. Levels are those of ``TetForest.box``: a cube has 1.6 million tetrahedra at
+level 18, 12.6 million at 21, 100 million at 24.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+#: Steps in one measurement, measurements, and exchanges that are timed by themselves.
+STEPS, ROUNDS, EXCHANGES = 64, 7, 200
+#: A step far below every stable one [s]: steps of this length cost what others do.
+SHORT_STEP = 1e-7
+
+
+def measured(cubes: int, level: int, device: str) -> dict[str, Any]:
+    """What one rank finds of a row of root cubes, bisected so often; all ranks call."""
+    import warp as wp
+
+    wp.config.quiet = True
+    import warp_corot as wc
+    import warp_corot.distributed as wd
+
+    mesh = wc.TetForest.box((1, 1, cubes), 0.1, level=level)
+    body = wc.SoftBody(mesh, wc.Isotropic(5e3, 0.4, 1000.0), device=device)
+    edge = 0.1 * 0.5 ** (level // 3)
+    body.displacements = np.random.default_rng(20130705).uniform(-0.05 * edge, 0.05 * edge, mesh.points.shape)
+    began = time.perf_counter()
+    sim = wd.Simulation(body, integrator=wc.SymplecticEuler(dt=SHORT_STEP), gravity=(0, 0, 0))
+    ready = time.perf_counter() - began
+    sim.advance_steps(2 * STEPS)
+    seconds = []
+    for _ in range(ROUNDS):
+        began = time.perf_counter()
+        sim.advance_steps(STEPS)
+        seconds.append((time.perf_counter() - began) / STEPS)
+    computed, copied = sim.elements_here
+    return {
+        "step_us": 1e6 * statistics.median(seconds),
+        "spread": (max(seconds) - min(seconds)) / statistics.median(seconds),
+        "exchange_us": 1e6 * sim.exchange_seconds(EXCHANGES),
+        "sent_bytes": sim.sent_bytes,
+        "elements": len(mesh.tets),
+        "computed": computed,
+        "copied": copied,
+        "ready_s": ready,
+        "device": sim.device.name,
+        "rank": sim.rank,
+        "ranks": sim.size,
+    }
+
+
+def on_ranks(ranks: int, cubes: int, level: int, device: str) -> dict[str, Any]:
+    """The slowest rank's numbers of a run on so many ranks.
+
+    Raises:
+        RuntimeError: The run failed.
+    """
+    beside = Path(sys.executable).with_name("mpirun")
+    mpirun = str(beside) if beside.exists() else shutil.which("mpirun")
+    if mpirun is None:
+        raise RuntimeError('there is no mpirun; pip install "warp-corot[distributed]"')
+    start = [mpirun, "--oversubscribe", "--allow-run-as-root", "--bind-to", "none", "-n", str(ranks), sys.executable]
+    asked = ["--worker", str(cubes), "--level", str(level), "--device", device]
+    done = subprocess.run([*start, __file__, *asked], capture_output=True, text=True, check=False)
+    rows = [json.loads(line[4:]) for line in done.stdout.splitlines() if line.startswith("ROW ")]
+    if done.returncode or len(rows) != ranks:
+        raise RuntimeError(f"{ranks} ranks, level {level}: {done.stderr.strip()[-2000:]}")
+    slowest = max(rows, key=lambda row: row["step_us"])
+    return slowest | {"level": level, "computed": max(row["computed"] for row in rows)}
+
+
+def fitted(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """A step's time [us] as start + per_element * computed, of the runs on one rank, and an exchange's time [us] as
+    latency + per_byte * sent, of the others; by least squares, none negative."""
+    from scipy.optimize import nnls
+
+    alone = [row for row in rows if row["ranks"] == 1]
+    several = [row for row in rows if row["ranks"] > 1]
+    found = {}
+    for names, key, value, chosen in (
+        (("start", "per_element"), "computed", "step_us", alone),
+        (("latency", "per_byte"), "sent_bytes", "exchange_us", several),
+    ):
+        if chosen:
+            system = np.array([[1.0, row[key]] for row in chosen])
+            weight = 1.0 / np.array([row[value] for row in chosen])
+            solution, _ = nnls(system * weight[:, None], np.ones(len(chosen)))
+            found |= dict(zip(names, solution.tolist(), strict=True))
+    return found
+
+
+def predicted(model: dict[str, float], ranks: int, level: int) -> dict[str, float]:
+    """Weak scaling that the model predicts: a cube of the level on each rank, copies and exchanges on two sides."""
+    elements = 6 * 2**level
+    # A cut through a cube of edge 2^(level/3) cells meets so many nodes; copies stand on it in layers.
+    nodes = (2.0 ** (level / 3) + 1.0) ** 2
+    sides = min(ranks - 1, 2)
+    computed = elements + sides * 12.0 * nodes
+    alone = model["start"] + model["per_element"] * elements
+    step = model["start"] + model["per_element"] * computed
+    if ranks > 1:
+        step += model["latency"] + model["per_byte"] * sides * 16.0 * nodes
+    return {"ranks": ranks, "level": level, "step_us": step, "efficiency": alone / step}
+
+
+def main() -> int:
+    of = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    of.add_argument("--device", default="cpu", help="cpu or cuda: on cuda each rank takes a card of its own")
+    of.add_argument("--ranks", default="1,2", help="numbers of ranks, ascending, with 1")
+    of.add_argument("--weak", default="12", help="levels of the cubes of weak scaling")
+    of.add_argument("--strong", default="12", help="levels of the cubes of strong scaling, as many as the most ranks")
+    of.add_argument("--json", type=Path, help="write all numbers to this file, too")
+    of.add_argument("--worker", type=int, help=argparse.SUPPRESS)
+    of.add_argument("--level", type=int, help=argparse.SUPPRESS)
+    options = of.parse_args()
+    if options.worker is not None:
+        row = measured(options.worker, options.level, options.device)
+        # One write a line, so that ranks' lines do not mix.
+        os.write(1, f"ROW {json.dumps(row)}\n".encode())
+        return 0
+    counts = [int(n) for n in options.ranks.split(",")]
+    rows: list[dict[str, Any]] = []
+    print(
+        "scaling  level  ranks    elements    computed  copied      step     spread  exchange  efficiency", flush=True
+    )
+    for kind, levels in (("weak", options.weak), ("strong", options.strong)):
+        for level in (int(n) for n in levels.split(",") if n):
+            alone = None
+            for ranks in counts:
+                row = on_ranks(ranks, ranks if kind == "weak" else max(counts), level, options.device)
+                alone = alone or row["step_us"] * (1 if kind == "weak" else row["ranks"])
+                share = alone / row["step_us"] / (1 if kind == "weak" else ranks)
+                rows.append(row | {"scaling": kind, "efficiency": share})
+                print(
+                    f"{kind:7} {level:6} {ranks:6} {row['elements']:11} {row['computed']:11} {row['copied']:7} "
+                    f"{row['step_us']:9.1f} us {row['spread']:6.1%} {row['exchange_us']:6.1f} us {share:10.1%}",
+                    flush=True,
+                )
+    model = fitted(rows)
+    print(
+        "model: " + ", ".join(f"{name} {value:.4g}" for name, value in model.items()) + " [us, us an element or byte]"
+    )
+    predictions = []
+    if {"start", "latency"} <= model.keys():
+        levels = sorted({int(n) for n in options.weak.split(",") if n})
+        predictions = [predicted(model, ranks, level) for level in levels for ranks in (*counts, 8, 64)]
+        for each in predictions:
+            print(
+                f"predicted: level {each['level']}, {each['ranks']} ranks: {each['step_us']:.1f} us a step, "
+                f"{each['efficiency']:.1%}"
+            )
+    if options.json is not None:
+        found = {"benchmark": "scaling", "device": options.device, "rows": rows, "model": model}
+        options.json.write_text(json.dumps(found | {"predictions": predictions}, indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""What a process launches to exchange values with others."""

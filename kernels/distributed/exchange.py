@@ -1,0 +1,57 @@
+"""Values of nodes to and from other arrays: of a whole body and its part, and of a part and what travels."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel(enable_backward=False)
+def gather_vectors(places: wp.array[wp.int32], source: wp.array[wp.vec4], found: wp.array[wp.vec4]):
+    """found[i] = source[places[i]]."""
+    i = wp.tid()
+    found[i] = source[places[i]]
+
+
+@wp.kernel(enable_backward=False)
+def scatter_vectors(places: wp.array[wp.int32], source: wp.array[wp.vec4], found: wp.array[wp.vec4]):
+    """found[places[i]] = source[i]."""
+    i = wp.tid()
+    found[places[i]] = source[i]
+
+
+@wp.kernel(enable_backward=False)
+def move_vectors(
+    sources: wp.array[wp.int32], targets: wp.array[wp.int32], source: wp.array[wp.vec4], found: wp.array[wp.vec4]
+):
+    """found[targets[i]] = source[sources[i]]."""
+    i = wp.tid()
+    found[targets[i]] = source[sources[i]]
+
+
+@wp.kernel(enable_backward=False)
+def move_marks(
+    sources: wp.array[wp.int32], targets: wp.array[wp.int32], source: wp.array[wp.uint8], found: wp.array[wp.uint8]
+):
+    """The same for uint8."""
+    i = wp.tid()
+    found[targets[i]] = source[sources[i]]
+
+
+@wp.kernel(enable_backward=False)
+def move_numbers(sources: wp.array[wp.int32], source: wp.array[wp.float32], found: wp.array[wp.float32]):
+    """found[i] = source[sources[i]]."""
+    i = wp.tid()
+    found[i] = source[sources[i]]
+
+
+@wp.kernel(enable_backward=False)
+def clear_energies(places: wp.array[wp.int32], energies: wp.array[wp.float64]):
+    """Zero at some places."""
+    energies[places[wp.tid()]] = wp.float64(0.0)
+
+
+@wp.kernel(enable_backward=False)
+def forget_length(changed: wp.array[wp.int32], before: wp.array[wp.float64]):
+    """Velocities that somebody wrote belong to steps of any length."""
+    if changed[0] != 0:
+        before[0] = wp.float64(0.0)

@@ -1,0 +1,69 @@
+"""Small runs on several ranks, for ``tests/distributed``: ``mpirun -n 3 python ranked.py results.npz``."""
+
+import sys
+
+import numpy as np
+import warp as wp
+
+wp.config.quiet = True
+wp.config.enable_backward = False
+
+import warp_corot as wc  # noqa: E402
+
+
+def graded() -> wc.TetForest:
+    """A beam whose leaves are of three levels."""
+    mesh = wc.TetForest.box((1, 1, 3), 0.064, level=4)
+    for end in (0.05, 0.02):
+        mesh = mesh.refine(np.flatnonzero(mesh.points[mesh.tets].mean(axis=1)[:, 2] < end))
+    return mesh
+
+
+def jittered() -> wc.TetMesh:
+    """The same region in tetrahedra of any shape."""
+    forest = wc.TetForest.box((1, 1, 3), 0.064, level=5)
+    noise = np.random.default_rng(20130705).normal(scale=8e-4, size=forest.points.shape)
+    return wc.TetMesh(forest.points + noise, forest.tets)
+
+
+def body_of(mesh: wc.TetForest | wc.TetMesh, poisson: float, worlds: int = 1) -> wc.SoftBody:
+    """A soft body held at one end, stiffer towards the other, loaded in the middle and moved at the far end."""
+    z = mesh.points[mesh.tets].mean(axis=1)[:, 2]
+    young = 800.0 * (1.0 + 5.0 * z) * np.linspace(1.0, 1.5, worlds)[:, None]
+    body = wc.SoftBody(mesh, wc.Isotropic(young, poisson, 1000.0), worlds=worlds, device="cpu")
+    body.fix(mesh.points[:, 2] < 0.003)
+    body.prescribe("z > zmax - 0.003", times=[0.0, 0.05, 0.1], displacements=[[0, 0, 0], [0.02, 0, 0], [0.02, 0, 0.01]])
+    body.load("z > 0.09 and z < 0.1", [0.0, 2e-3, 0.0])
+    return body
+
+
+CASES = {
+    "forest": lambda: body_of(graded(), 0.49),
+    "tets": lambda: body_of(jittered(), 0.49),
+    "worlds": lambda: body_of(wc.TetForest.box((1, 1, 3), 0.064, level=4), 0.3, worlds=2),
+}
+
+
+def main() -> None:
+    import warp_corot.distributed as wd
+
+    found = {}
+    for name, make in CASES.items():
+        for deterministic in (True, False) if name == "forest" else (True,):
+            body = make()
+            sim = wd.Simulation(body, deterministic=deterministic)
+            sim.advance(0.04)
+            body.load("z > 0.09 and z < 0.1", [0.0, 0.0, 0.0])
+            sim.advance(0.01)
+            kind = f"{name}.{deterministic}"
+            found |= {f"{kind}.x": wd.gather(body.positions), f"{kind}.v": wd.gather(body.velocities)}
+            found |= {f"{kind}.numbers": np.array([sim.steps, sim.dt, sim.time, *sim.dt_range])}
+            found |= {f"{kind}.energy": np.array(sim.energy())}
+    if sim.rank == 0:
+        np.savez(sys.argv[1], **found)
+    else:
+        assert all(value is None for key, value in found.items() if key.endswith((".x", ".v")))
+
+
+if __name__ == "__main__":
+    main()

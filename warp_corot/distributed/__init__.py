@@ -1,0 +1,13 @@
+"""One body over many processes: MPI starts and controls them, MPI and NCCL carry what they exchange.
+
+``mpirun -n 4 python script.py`` runs the script on four ranks. ``Simulation`` has the names of
+``warp_corot.Simulation`` and is called on every rank.
+"""
+
+from . import mpi
+from .gathering import gather
+from .simulation import Simulation
+
+__all__ = ["Simulation", "gather"]
+
+mpi.choose_device()

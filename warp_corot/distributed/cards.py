@@ -1,0 +1,87 @@
+"""The exchange between cards through NCCL, launched on Warp's stream and recorded with the launches around it.
+
+NCCL is imported here only.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_corot.errors import InputError
+from warp_corot.kernels.distributed import exchange as kernels
+
+from .halo import Halo
+
+
+@functools.cache
+def nccl_of(comm: Any, alias: str) -> Any:
+    """NCCL's communicator of the ranks, whose card this is.
+
+    Raises:
+        InputError: ``nccl4py`` is not there.
+    """
+    try:
+        import nccl.core as nccl
+    except ImportError as error:
+        raise InputError(
+            f'runs on several cards need nccl4py ({error}); pip install "warp-corot[distributed]" "nccl4py[cu13]"'
+        ) from None
+    with wp.ScopedDevice(alias):
+        name = comm.bcast(nccl.get_unique_id() if comm.rank == 0 else None, root=0)
+        comm.Barrier()
+        return nccl.Communicator.init(nranks=comm.size, rank=comm.rank, unique_id=name)
+
+
+class CardExchange:
+    """The exchange of a part's nodal vectors between cards.
+
+    Args:
+        halo: Who gets what.
+        comm: The ranks.
+        device: The card.
+    """
+
+    def __init__(self, halo: Halo, comm: Any, device: wp.Device):
+        self._nccl, self._device = nccl_of(comm, device.alias), device
+        self._sent, self._received = (_joined(lists, device) for lists in (halo.sent, halo.received))
+        self._out, self._in = (
+            wp.zeros(len(nodes), dtype=wp.vec4, device=device) for nodes in (self._sent[0], self._received[0])
+        )
+
+    def launch(self, vectors: wp.array) -> None:
+        """Launch that ghosts get their values, in a nodal array vec4; may be recorded."""
+        import nccl.core as nccl
+
+        stream = wp.get_stream(self._device)
+        (sent, to), (received, by) = self._sent, self._received
+        wp.launch(kernels.gather_vectors, len(sent), [sent, vectors], [self._out], device=self._device)
+        with nccl.group():
+            for rank, start, end in to:
+                self._nccl.send(_floats(self._out, start, end), rank, stream=stream)
+            for rank, start, end in by:
+                self._nccl.recv(_floats(self._in, start, end), rank, stream=stream)
+        wp.launch(kernels.scatter_vectors, len(received), [received, self._in], [vectors], device=self._device)
+
+
+def take_most(comm: Any, values: wp.array) -> None:
+    """Launch that an array on a card holds the largest values of all ranks, in place; may be recorded."""
+    import nccl.core as nccl
+
+    own, stream = nccl_of(comm, values.device.alias), wp.get_stream(values.device)
+    own.allreduce(values, values, nccl.MAX, stream=stream)
+
+
+def _joined(lists: dict[int, Any], device: wp.Device) -> tuple[wp.array, list[tuple[int, int, int]]]:
+    """All lists in one array, and where each rank's begins and ends."""
+    ends = np.cumsum([len(nodes) for nodes in lists.values()])
+    nodes = np.concatenate([*lists.values(), np.zeros(0, np.int32)]).astype(np.int32)
+    places = [(rank, int(end) - len(lists[rank]), int(end)) for rank, end in zip(lists, ends, strict=True)]
+    return wp.array(nodes, dtype=wp.int32, device=device), places
+
+
+def _floats(vectors: wp.array, start: int, end: int) -> wp.array:
+    return vectors[start:end].view(wp.float32).flatten()

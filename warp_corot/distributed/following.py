@@ -1,0 +1,146 @@
+"""A whole body, as users hold it on every rank, and the part of it that the rank computes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.body.trajectory import NodeKeyframes, Trajectory
+from warp_corot.errors import InputError
+from warp_corot.kernels.distributed import exchange as kernels
+
+from .parts import Part
+
+
+class Following:
+    """Takes what users write to a whole body over to its part, and gives them what became of the part.
+
+    On each rank the whole body has the present state of the nodes that this rank moves; of other nodes it is out of
+    date. What users do to the body they must do on every rank.
+
+    Args:
+        whole, part: The body and this rank's part of it.
+        comm: The ranks.
+    """
+
+    def __init__(self, whole: SoftBody, part: Part, comm: Any):
+        self.whole, self.part, self._comm = whole, part, comm
+        n, count, worlds = len(part.numbers.nodes), whole.world_node_count, whole.worlds
+        shift = np.arange(worlds, dtype=np.int32)[:, None]
+        everywhere = (part.numbers.nodes + count * shift).ravel()
+        own = np.tile(part.numbers.owner == comm.rank, worlds)
+        #: This rank's nodes among those of all worlds of the whole body, int32, and of its part.
+        self.own_nodes = everywhere[own]
+        device = part.device
+        self._all = [wp.array(a, dtype=wp.int32, device=device) for a in (everywhere, np.arange(worlds * n))]
+        self._own = [wp.array(a, dtype=wp.int32, device=device) for a in (self.own_nodes, np.flatnonzero(own))]
+        elements = (part.numbers.elements + whole.world_element_count * shift).ravel()
+        self._elements = wp.array(elements, dtype=wp.int32, device=device)
+        #: The number in the part of each node that this rank moves, -1 for others.
+        self._number = np.full(worlds * count, -1, np.int32)
+        self._number[self.own_nodes] = np.flatnonzero(own)
+        self._trajectories: list[Trajectory] = []
+
+    def take_over(self) -> None:
+        """Take what users have written: the state, supports, loads and keyframes."""
+        whole, part = self.whole, self.part
+        whole.state.adopt_positions()
+        (sources, targets), (own_sources, own_targets) = self._all, self._own
+        self._move(kernels.move_vectors, sources, targets, whole.state.displacements, part.state.displacements)
+        self._move(kernels.move_vectors, own_sources, own_targets, whole.state.velocities, part.state.velocities)
+        self._move(kernels.move_marks, own_sources, own_targets, whole.conditions.held, part.conditions.held)
+        part.conditions.find_inverse_masses()
+        part.state.publish_positions()
+        self._take_loads()
+        self._take_keyframes()
+        self._take_activation()
+        wp.copy(part.conditions.world_starts, whole.conditions.world_starts)
+
+    def publish(self) -> None:
+        """Give the whole body the state of the nodes that this rank moves."""
+        whole, part, (targets, sources) = self.whole, self.part, self._own
+        for name in ("displacements", "velocities", "reactions"):
+            self._move(kernels.move_vectors, sources, targets, getattr(part.state, name), getattr(whole.state, name))
+        whole.state.publish_positions()
+        wp.copy(whole.conditions.world_starts, part.conditions.world_starts)
+
+    def take_initial(self) -> None:
+        """Take over what a reset restores."""
+        given = self.whole.state.initial
+        if given is None:
+            self.part.state.initial = None
+            return
+        sources, targets = self._own
+        found = []
+        for array in given:
+            found.append(wp.zeros_like(self.part.state.displacements))
+            self._move(kernels.move_vectors, sources, targets, array, found[-1])
+        self.part.state.initial = (found[0], found[1])
+
+    def gather(self, array: wp.array) -> npt.NDArray[Any] | None:
+        """A nodal array of the whole body with every node from the rank that moves it, on rank 0; None elsewhere."""
+        values = array.numpy()
+        given = self._comm.gather((self.own_nodes, values[self.own_nodes]), root=0)
+        if given is None:
+            return None
+        found = values.copy()
+        for nodes, own in given:
+            found[nodes] = own
+        return found
+
+    def owns(self, array: wp.array) -> bool:
+        """Whether an array is one of the whole body's nodal ones."""
+        state, conditions = self.whole.state, self.whole.conditions
+        arrays = (state.positions, state.displacements, state.velocities, state.reactions, state.rest)
+        return array.ptr in {each.ptr for each in (*arrays, conditions.loads, conditions.mass)}
+
+    # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _move(self, kernel: wp.Kernel, sources: wp.array, targets: wp.array, source: wp.array, found: wp.array) -> None:
+        wp.launch(kernel, len(sources), [sources, targets, source], [found], device=self.part.device)
+
+    def _take_loads(self) -> None:
+        whole, part = self.whole.conditions, self.part.conditions
+        if whole.loads.dtype != wp.vec4 or self.whole.state.positions.dtype != wp.vec4:
+            raise InputError("use_loads and use_positions do not work on several ranks; use_…(None) ends them")
+        if whole.has_loads:
+            part.make_loads()
+            sources, targets = self._own
+            self._move(kernels.move_vectors, sources, targets, whole.loads, part.loads)
+        elif part.has_loads:
+            part.use_loads(part.loads, False)
+
+    def _take_keyframes(self) -> None:
+        given = self.whole.conditions.trajectories
+        if len(given) == len(self._trajectories) and all(map(_same, given, self._trajectories)):
+            return
+        self._trajectories = list(given)
+        found = []
+        for each in given:
+            numbers = self._number[each.host_nodes]
+            own = numbers >= 0
+            displacements = each.displacements.numpy()
+            if displacements.shape[1] > 1:
+                displacements = displacements[:, own]
+            if own.any():
+                keys = NodeKeyframes(numbers[own], each.times.numpy(), displacements)
+                found.append(keys.on(self.part.device))
+        self.part.conditions.set_trajectories(found)
+
+    def _take_activation(self) -> None:
+        whole, part = self.whole, self.part
+        if whole.conditions.activations:
+            raise InputError("active stress along keyframes does not work on several ranks yet; set it between steps")
+        if whole.discretization.has_activation:
+            part.conditions.make_activation()
+            inputs = [self._elements, whole.discretization.activation]
+            device, found = part.device, part.discretization.activation
+            wp.launch(kernels.move_numbers, len(self._elements), inputs, [found], device=device)
+
+
+def _same(a: Trajectory, b: Trajectory) -> bool:
+    return a is b

@@ -1,0 +1,90 @@
+"""Whose values travel to whom: lists of nodes, and the exchange through the host's memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from .parts import Numbers
+
+Ints = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class Halo:
+    """What a part sends and receives, neighbour by neighbour in ascending order of ranks.
+
+    Attributes:
+        sent: Neighbours, and the nodes whose values each gets, numbers within the part, int32.
+        received: Neighbours, and the ghosts whose values each has.
+    """
+
+    sent: dict[int, Ints]
+    received: dict[int, Ints]
+
+    @classmethod
+    def of(cls, numbers: Numbers, worlds: int, comm: Any) -> Halo:
+        """Find out what neighbours want; all ranks must call.
+
+        Args:
+            numbers: The part's.
+            worlds: Copies of the body.
+            comm: The ranks.
+        """
+        wanted: list[Ints] = []
+        received = {}
+        for rank in range(comm.size):
+            ghosts = np.flatnonzero(numbers.owner == rank).astype(np.int32)
+            # Both sides have them in the order of the whole mesh's numbers.
+            ghosts = ghosts[np.argsort(numbers.nodes[ghosts])] if rank != comm.rank else ghosts[:0]
+            wanted.append(numbers.nodes[ghosts])
+            if len(ghosts):
+                received[rank] = _in_worlds(ghosts, worlds, len(numbers.nodes))
+        place = np.argsort(numbers.nodes)
+        sent = {}
+        for rank, nodes in enumerate(comm.alltoall(wanted)):
+            if len(nodes):
+                own = place[np.searchsorted(numbers.nodes[place], nodes)].astype(np.int32)
+                sent[rank] = _in_worlds(own, worlds, len(numbers.nodes))
+        return cls(sent, received)
+
+    @property
+    def sent_bytes(self) -> int:
+        """What one exchange of nodal vectors sends."""
+        return 16 * sum(map(len, self.sent.values()))
+
+
+class HostExchange:
+    """The exchange of a part's nodal vectors through MPI, on the CPU.
+
+    Args:
+        halo: Who gets what.
+        comm: The ranks.
+        tag: Of its messages.
+    """
+
+    def __init__(self, halo: Halo, comm: Any, tag: int):
+        self._halo, self._comm, self._tag = halo, comm, tag
+        self._out = {rank: np.zeros((len(nodes), 4), np.float32) for rank, nodes in halo.sent.items()}
+        self._in = {rank: np.zeros((len(nodes), 4), np.float32) for rank, nodes in halo.received.items()}
+
+    def launch(self, vectors: wp.array) -> None:
+        """Give ghosts their values, in a nodal array vec4."""
+        comm, halo = self._comm, self._halo
+        values = vectors.numpy()
+        asked = [comm.Irecv(buffer, rank, self._tag) for rank, buffer in self._in.items()]
+        for rank, nodes in halo.sent.items():
+            np.take(values, nodes, axis=0, out=self._out[rank])
+            asked.append(comm.Isend(self._out[rank], rank, self._tag))
+        for request in asked:
+            request.Wait()
+        for rank, nodes in halo.received.items():
+            values[nodes] = self._in[rank]
+
+
+def _in_worlds(nodes: Ints, worlds: int, count: int) -> Ints:
+    return (nodes + count * np.arange(worlds, dtype=np.int32)[:, None]).ravel()

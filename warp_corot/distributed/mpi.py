@@ -1,0 +1,76 @@
+"""MPI: who the ranks are. It is imported here only."""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+import traceback
+from types import TracebackType
+from typing import Any
+
+import warp as wp
+
+from warp_corot.errors import InputError
+
+#: What ``mpirun`` and SLURM tell each process of how many there are.
+SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS")
+
+
+def started_size() -> int:
+    """How many processes ``mpirun``, or what stands for it, says that it started; 1 without it."""
+    for name in SIZES:
+        if os.environ.get(name, "").isdigit():
+            return int(os.environ[name])
+    return 1
+
+
+@functools.cache
+def library() -> Any:
+    """The module ``mpi4py.MPI``, which starts MPI when it is first imported.
+
+    Raises:
+        InputError: It is not there.
+    """
+    try:
+        from mpi4py import MPI
+    except (ImportError, RuntimeError) as error:
+        raise InputError(
+            f'runs on several processes need mpi4py and an MPI library ({error}); pip install "warp-corot[distributed]"'
+        ) from None
+    return MPI
+
+
+@functools.cache
+def world() -> Any:
+    """A communicator of all ranks of our own.
+
+    An error that nobody catches on one rank ends all of them with one line; the others would wait for ever.
+
+    Raises:
+        InputError: MPI is not there.
+    """
+    comm = library().COMM_WORLD.Dup()
+    if comm.size > 1:
+        sys.excepthook = functools.partial(_end_all, comm)
+    return comm
+
+
+def choose_device() -> None:
+    """Give each process of one machine a card of its own, if there are cards: Warp's default device."""
+    if started_size() == 1:
+        return
+    local = library().COMM_WORLD.Split_type(library().COMM_TYPE_SHARED)
+    count = wp.get_cuda_device_count()
+    if count:
+        wp.set_device(f"cuda:{local.rank % count}")
+    local.Free()
+
+
+def _end_all(comm: Any, kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """End all ranks; they cannot go on without this one."""
+    if not isinstance(error, InputError | KeyboardInterrupt):
+        traceback.print_exception(kind, error, trace)
+    sys.stderr.write(f"warp-corot: rank {comm.rank} of {comm.size} ends all others: {kind.__name__}: {error}\n")
+    sys.stderr.flush()
+    comm.Abort(130 if isinstance(error, KeyboardInterrupt) else 1)

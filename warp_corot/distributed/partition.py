@@ -1,0 +1,160 @@
+"""Which rank computes which elements, which rank moves which nodes, and what a rank needs of others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.discretization.elements import Mesh
+from warp_corot.discretization.groups import group_numbers
+from warp_corot.errors import InputError
+from warp_corot.mesh import TetForest, TetMesh
+from warp_corot.mesh.tree import UniformTree
+
+Ints = npt.NDArray[np.int32]
+
+#: Bits of each coordinate of a place on the curve along which general elements are dealt out.
+CURVE_BITS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Partition:
+    """How a mesh is dealt out.
+
+    Attributes:
+        groups: Elements that stay together, since they are computed together: the group of each, int32 [T].
+        rank_of_element: Who counts the element's energy, int32 [T].
+        rank_of_node: Who moves the node, int32 [N]; -1 for nodes of no element.
+    """
+
+    groups: Ints
+    rank_of_element: Ints
+    rank_of_node: Ints
+
+    @classmethod
+    def of(cls, mesh: Mesh, ranks: int, costs: npt.ArrayLike | None = None) -> Partition:
+        """Deal a mesh out.
+
+        Leaves of a forest are dealt out along the tree's order, which is a space-filling curve, in whole groups;
+        general meshes by METIS if ``pymetis`` is there, else along a curve. A node goes with the lowest rank around it.
+
+        Args:
+            mesh: The whole mesh.
+            ranks: Number of ranks.
+            costs: What an element costs on each rank, in any unit, [ranks]; None: the same everywhere.
+
+        Raises:
+            InputError: Fewer groups than ranks, or costs that are not positive.
+        """
+        shares = _shares(ranks, costs)
+        groups = _groups(mesh)
+        order, sizes = _ordered(groups)
+        if len(sizes) < ranks:
+            raise InputError(f"the body has {len(sizes)} groups of elements for {ranks} ranks; take fewer ranks")
+        if isinstance(mesh, TetMesh):
+            of_group = _dealt_general(mesh, ranks, shares)
+            rank = of_group
+        else:
+            ends = np.cumsum(sizes) - 0.5 * sizes
+            rank_of_group = np.searchsorted(np.cumsum(shares)[:-1] * len(groups), ends, side="right")
+            rank_of_group = _nobody_empty(rank_of_group, ranks)
+            rank = np.empty(len(groups), np.int32)
+            rank[order] = np.repeat(rank_of_group, sizes)
+        owner = np.full(len(mesh.points), ranks, np.int32)
+        np.minimum.at(owner, mesh.tets.ravel(), np.repeat(rank, 4))
+        owner[owner == ranks] = -1
+        return cls(groups, rank.astype(np.int32), owner)
+
+    def needed(self, mesh: Mesh, rank: int, layers: int) -> npt.NDArray[np.bool_]:
+        """The elements that a rank computes, its own and copies of others', bool [T]: all that say what becomes of its
+        nodes.
+
+        Args:
+            layers: 1, or 2 where forces on a node depend on elements around the elements around it.
+        """
+        nodes, own = self.rank_of_node == rank, self.rank_of_element == rank
+        found = own
+        for layer in range(layers):
+            if layer > 0:
+                # The energies of its own elements, too.
+                nodes[mesh.tets[own]] = True
+            found = nodes[mesh.tets].any(axis=1)
+            in_groups = np.zeros(int(self.groups.max()) + 1, bool)
+            in_groups[self.groups[found]] = True
+            found = in_groups[self.groups]
+            nodes = np.zeros_like(nodes)
+            nodes[mesh.tets[found]] = True
+        return found | own
+
+
+def _shares(ranks: int, costs: npt.ArrayLike | None) -> npt.NDArray[np.float64]:
+    given = np.ones(ranks) if costs is None else np.asarray(costs, float)
+    if given.shape != (ranks,) or not (np.isfinite(given) & (given > 0.0)).all():
+        raise InputError(f"costs is {costs!r}; it must be {ranks} positive numbers, one for each rank")
+    return (1.0 / given) / np.sum(1.0 / given)
+
+
+def _groups(mesh: Mesh) -> Ints:
+    count = len(mesh.tets)
+    if not isinstance(mesh, TetForest):
+        return np.arange(count, dtype=np.int32)
+    if isinstance(mesh.tree, UniformTree) and mesh.tree.depth >= 3:
+        return (np.arange(count, dtype=np.int32) >> 3).astype(np.int32)
+    return group_numbers(mesh, np.arange(count))
+
+
+def _ordered(groups: Ints) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Elements group after group, groups in the order of their first elements; and the size of each group."""
+    _, first, inverse, sizes = np.unique(groups, return_index=True, return_inverse=True, return_counts=True)
+    turn = np.argsort(first, kind="stable")
+    place = np.empty_like(turn)
+    place[turn] = np.arange(len(turn))
+    return np.argsort(place[inverse], kind="stable"), sizes[turn]
+
+
+def _nobody_empty(rank_of_group: npt.NDArray[np.intp], ranks: int) -> npt.NDArray[np.intp]:
+    """The same ranks in ascending order, but with at least one group each."""
+    count = len(rank_of_group)
+    starts = np.searchsorted(rank_of_group, np.arange(ranks))
+    starts = np.maximum.accumulate(np.maximum(starts - np.arange(ranks), 0)) + np.arange(ranks)
+    starts = np.minimum(starts, count - ranks + np.arange(ranks))
+    starts[0] = 0
+    return np.searchsorted(starts, np.arange(count), side="right") - 1
+
+
+def _dealt_general(mesh: TetMesh, ranks: int, shares: npt.NDArray[np.float64]) -> Ints:
+    """The rank of each element of a general mesh."""
+    if ranks == 1:
+        return np.zeros(len(mesh.tets), np.int32)
+    try:
+        import pymetis
+    except ImportError:
+        return _along_curve(mesh, ranks, shares)
+    from warp_corot.mesh.growing.cut import face_pairs
+
+    pairs = face_pairs(mesh.tets)
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    both = both[np.argsort(both[:, 0], kind="stable")]
+    starts = np.searchsorted(both[:, 0], np.arange(len(mesh.tets) + 1))
+    _, rank = pymetis.part_graph(ranks, xadj=starts, adjncy=both[:, 1], tpwgts=list(shares))
+    found = np.asarray(rank, np.int32)
+    complete = len(np.unique(found)) == ranks
+    return found if complete else _along_curve(mesh, ranks, shares)
+
+
+def _along_curve(mesh: TetMesh, ranks: int, shares: npt.NDArray[np.float64]) -> Ints:
+    """Elements along the curve that interleaves the bits of their centroids' coordinates."""
+    centre = mesh.points[mesh.tets].mean(axis=1)
+    low, extent = centre.min(axis=0), max(float(np.ptp(centre, axis=0).max()), 1e-300)
+    place = np.minimum(((centre - low) / extent * 2**CURVE_BITS).astype(np.int64), 2**CURVE_BITS - 1)
+    key = np.zeros(len(centre), np.int64)
+    for bit in range(CURVE_BITS):
+        for axis in range(3):
+            key |= (place[:, axis] >> bit & 1) << (3 * bit + axis)
+    order = np.argsort(key, kind="stable")
+    turn = np.searchsorted(np.cumsum(shares)[:-1] * len(order), np.arange(len(order)) + 0.5, side="right")
+    rank = np.empty(len(order), np.int32)
+    rank[order] = _nobody_empty(turn, ranks)
+    return rank

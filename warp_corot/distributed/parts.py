@@ -1,0 +1,99 @@
+"""A rank's part of a body: its elements, copies of its neighbours', and their nodes."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.discretization.elements import Mesh
+from warp_corot.materials.isotropic import Material
+from warp_corot.mesh import TetForest, TetMesh
+from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, renumbered, with_virtual
+
+from .partition import Partition
+
+Ints = npt.NDArray[np.int32]
+M = TypeVar("M", bound=Material)
+
+
+@dataclass(frozen=True, eq=False)
+class Numbers:
+    """The numbers that a part's nodes and elements have in the whole mesh.
+
+    Attributes:
+        nodes, elements: int32 [n] and [t] of one world; elements ascend.
+        owner: The rank that moves each of the nodes, int32 [n].
+        counted: Whether this rank counts the element's energy, bool [t].
+    """
+
+    nodes: Ints
+    elements: Ints
+    owner: Ints
+    counted: npt.NDArray[np.bool_]
+
+
+class Part(SoftBody):
+    """A rank's part of a body. Ghosts have no mass, so that they never move by themselves.
+
+    Args:
+        whole: The body.
+        partition: How its mesh is dealt out.
+        rank: Whose part.
+        layers: See ``Partition.needed``.
+    """
+
+    def __init__(self, whole: SoftBody, partition: Partition, rank: int, layers: int):
+        kept = partition.needed(whole.mesh, rank, layers)
+        mesh, nodes = part_of_mesh(whole.mesh, kept, partition)
+        elements = np.flatnonzero(kept).astype(np.int32)
+        self.numbers = Numbers(
+            nodes, elements, partition.rank_of_node[nodes], partition.rank_of_element[elements] == rank
+        )
+        self._is_own = np.tile(self.numbers.owner == rank, whole.worlds)
+        material = part_of_material(whole.material, elements, len(whole.mesh.tets))
+        super().__init__(mesh, material, worlds=whole.worlds, device=whole.device)
+        self.discretization.smallest_volume = whole.discretization.smallest_volume
+
+    @property
+    def masses(self) -> npt.NDArray[np.float64]:
+        """Lumped masses of the nodes that this rank moves [kg], float64 [worlds * n]; zero for ghosts."""
+        return np.where(self._is_own, super().masses, 0.0)
+
+
+def part_of_mesh(mesh: Mesh, kept: npt.NDArray[np.bool_], partition: Partition) -> tuple[Mesh, Ints]:
+    """The mesh of some elements, bool [T], in the order that they have; and its nodes' numbers in the whole mesh."""
+    if isinstance(mesh, TetForest):
+        return _part_of_forest(mesh, kept, partition.groups[kept])
+    nodes = np.unique(mesh.tets[kept]).astype(np.int32)
+    number = np.full(len(mesh.points), -1, np.int32)
+    number[nodes] = np.arange(len(nodes), dtype=np.int32)
+    return TetMesh(mesh.points[nodes], number[mesh.tets[kept]], up_axis=mesh.up_axis), nodes
+
+
+def _part_of_forest(forest: TetForest, kept: npt.NDArray[np.bool_], groups: Ints) -> tuple[TetForest, Ints]:
+    live = np.zeros(len(forest.tree.level), bool)
+    live[forest.tree.leaves[kept]] = True
+    tree = live_or_void(forest.tree, live)
+    real = in_order_of_leaves(tree)
+    order = with_virtual(real, tree, forest.lattice)
+    ends, tree = renumbered(order, forest.node_ends, tree)
+    fill = None if forest.fill is None else forest.fill[kept]
+    place = (forest.cells, forest.cell_size, forest.origin)
+    made = TetForest(*place, forest.lattice[order], ends, tree, forest.up_axis, fill=fill, leaf_groups=groups)
+    return made, real.astype(np.int32)
+
+
+def part_of_material(material: M, elements: Ints, count: int) -> M:
+    """The material of some of ``count`` elements."""
+    found: dict[str, Any] = {}
+    for field in dataclasses.fields(material):  # type: ignore[arg-type]
+        values, tail = getattr(material, field.name), material.components.get(field.name, ())
+        axis = np.ndim(values) - len(tail) - 1
+        if axis >= 0 and np.shape(values)[axis] == count > 1:
+            found[field.name] = np.take(values, elements, axis=axis)
+    return dataclasses.replace(material, **found) if found else material  # type: ignore[type-var]

@@ -1,0 +1,151 @@
+"""The ranks of a run on several processes, as steps and checks know them (``solvers.ranks.Ranks``)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.kernels.distributed import exchange as kernels
+from warp_corot.kernels.stepping import balance
+from warp_corot.kernels.stepping import pace as clock
+from warp_corot.kernels.stepping.pace import Pace
+from warp_corot.solvers.ranks import Floats, Ranks
+
+from .cards import CardExchange, take_most
+from .directions import normal_numbers
+from .halo import Halo, HostExchange
+from .parts import Part
+from .settled import settled_sums
+
+
+class MpiRanks(Ranks):
+    """All processes of an MPI communicator, each with its part of every body.
+
+    Args:
+        comm: The communicator.
+        wholes: The bodies.
+        parts: This rank's part of each.
+        settled: Whether sums are the same bit by bit for any number of ranks.
+    """
+
+    is_alone = False
+
+    def __init__(self, comm: Any, wholes: Sequence[SoftBody], parts: Sequence[Part], *, settled: bool):
+        self.comm, self.is_settled = comm, settled
+        self.speaks = comm.rank == 0
+        self.device = parts[0].device
+        self.can_record = self.device.is_cuda
+        self._wholes = dict(zip(parts, wholes, strict=True))
+        self._parts = parts
+        self.halos = halos = [Halo.of(part.numbers, part.worlds, comm) for part in parts]
+        self._exchanges: list[HostExchange | CardExchange] = [
+            CardExchange(halo, comm, self.device) if self.device.is_cuda else HostExchange(halo, comm, k)
+            for k, halo in enumerate(halos)
+        ]
+        self._copies = [wp.zeros_like(part.state.displacements) for part in parts]
+        self._copied_energies = [self._places_of_copies(part) for part in parts]
+
+    def _places_of_copies(self, part: Part) -> wp.array:
+        """Elements that other ranks count, in all worlds, int32."""
+        own = np.tile(part.numbers.counted, part.worlds)
+        return wp.array(np.flatnonzero(~own).astype(np.int32), dtype=wp.int32, device=self.device)
+
+    # --- launches --------------------------------------------------------------------------------------------------
+
+    def complete(self, k: int, vectors: wp.array) -> None:
+        self._exchanges[k].launch(vectors)
+
+    def completed(self, k: int, vectors: wp.array) -> wp.array:
+        wp.copy(self._copies[k], vectors)
+        self.complete(k, self._copies[k])
+        return self._copies[k]
+
+    def take_most(self, values: wp.array) -> None:
+        if self.device.is_cuda:
+            take_most(self.comm, values)
+        else:
+            own = values.numpy()
+            own[...] = np.max(self.comm.allgather(own), axis=0)
+
+    def agree_on_changes(self, changed: wp.array, clock_now: Pace) -> None:
+        self.take_most(changed)
+        place = int(clock.BEFORE)
+        before = clock_now.seconds[place : place + 1]
+        wp.launch(kernels.forget_length, 1, [changed], [before], device=self.device)
+
+    def leave_own(self, k: int, energies: wp.array) -> None:
+        places = self._copied_energies[k]
+        wp.launch(kernels.clear_energies, len(places), [places], [energies], device=self.device)
+
+    def number_directions(self, k: int, directions: wp.array) -> None:
+        found = np.zeros((len(directions), 4), np.float32)
+        count = self._parts[k].node_count
+        numbers = normal_numbers(self._numbers(k), 20130705)
+        found[:count, :3] = numbers / np.linalg.norm(numbers, axis=1, keepdims=True)
+        directions.assign(found)
+
+    def number_motion(self, k: int, inverse_mass: wp.array, motion: wp.array) -> None:
+        found = np.zeros((len(motion), 4), np.float32)
+        count = self._parts[k].node_count
+        found[:count, :3] = normal_numbers(self._numbers(k), 0)
+        found[inverse_mass.numpy()[: len(motion)] == 0.0] = 0.0
+        motion.assign(found)
+
+    def add_up(self, parts: wp.array, sums: wp.array) -> None:
+        if self.is_settled:
+            total = settled_sums(parts.numpy().reshape(-1, 1), self.comm)[0]
+        else:
+            total = float(np.sum(self.comm.allgather(float(sums.numpy().sum()))))
+        found = np.zeros(len(sums))
+        found[0] = total
+        sums.assign(found)
+
+    # --- numbers ---------------------------------------------------------------------------------------------------
+
+    def most(self, value: float) -> float:
+        return max(self.comm.allgather(value))
+
+    def least(self, value: int) -> int:
+        return min(self.comm.allgather(value))
+
+    def anywhere(self, mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        return np.any(self.comm.allgather(mask), axis=0)
+
+    def together(self, value: float) -> float:
+        return sum(self.comm.allgather(value))
+
+    def totals(self, totals: Floats, addends: Floats | None) -> Floats:
+        everybody = np.array(self.comm.allgather(totals))
+        found = everybody.sum(axis=0)
+        reach = int(balance.REACH)
+        if addends is not None:
+            worlds, _, columns = addends.shape
+            by_world = np.moveaxis(addends, 0, 1).reshape(-1, worlds * columns)
+            found = settled_sums(by_world, self.comm).reshape(worlds, columns)
+        found[:, reach] = everybody[..., reach].max(axis=0)
+        return found
+
+    def exchange_seconds(self, vectors: Sequence[wp.array], count: int) -> float:
+        """The mean time of so many exchanges in a row, of a nodal array of each body [s]."""
+        self.comm.Barrier()
+        began = time.perf_counter()
+        for _ in range(count):
+            for k, each in enumerate(vectors):
+                self.complete(k, each)
+        wp.synchronize_device(self.device)
+        return (time.perf_counter() - began) / count
+
+    def whole(self, body: SoftBody) -> SoftBody:
+        return self._wholes[body]  # type: ignore[index]
+
+    def _numbers(self, k: int) -> npt.NDArray[np.int64]:
+        """The numbers of a part's nodes among those of all worlds of the whole body, int64 [worlds * n]."""
+        part = self._parts[k]
+        count = self._wholes[part].world_node_count
+        return (part.numbers.nodes + count * np.arange(part.worlds, dtype=np.int64)[:, None]).ravel()

@@ -1,0 +1,52 @@
+"""What does not work on several ranks yet, each in one line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.elasticity import Corotated, Linear, Model, NeoHookean, StVenantKirchhoff
+from warp_corot.errors import InputError
+from warp_corot.solvers import Integrator
+
+#: Models whose forces need nothing but the elements around a node.
+MODELS = (Corotated, Linear, NeoHookean, StVenantKirchhoff)
+
+
+def check_supported(
+    bodies: Sequence[SoftBody], models: Sequence[Model], integrator: Integrator, others: dict[str, Any]
+) -> None:
+    """See that a simulation can be made on several ranks.
+
+    Args:
+        bodies, models, integrator: As for ``Simulation``.
+        others: Its other arguments, by name.
+
+    Raises:
+        InputError: It cannot.
+    """
+    refused = {
+        "remesh": "remeshing",
+        "obstacles": "contact with obstacles",
+        "contact": "contact",
+    }
+    for name, what in refused.items():
+        if others.get(name):
+            raise InputError(f"{what} does not work on several ranks yet; leave {name} out, or run on one process")
+    if integrator.is_implicit:
+        raise InputError(
+            f"{type(integrator).__name__} does not work on several ranks yet; the integrator must be SymplecticEuler"
+        )
+    if getattr(integrator, "viscosity", 0.0):
+        raise InputError("viscosity does not work on several ranks yet; it must be 0")
+    for model in models:
+        if not isinstance(model, MODELS):
+            raise InputError(f"{type(model).__name__} does not work on several ranks yet; take a law of elements")
+        if getattr(model, "rotation_level", None) is not None:
+            raise InputError("shared rotations do not work on several ranks yet; rotation_level must be None")
+        if getattr(model, "rotation", None) == "warm":
+            raise InputError("rotation 'warm' does not work on several ranks yet; it must be 'byers-xu' or 'svd'")
+    for body in bodies:
+        if body.changing is not None:
+            raise InputError("a body that is remeshed does not work on several ranks yet")

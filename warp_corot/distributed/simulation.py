@@ -1,0 +1,271 @@
+"""Bodies in motion on several processes, each of which computes its part of every body."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.elasticity import Corotated, Model
+from warp_corot.elasticity.dilatation.options import ELEMENT, SHARED, shares_dilatation
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_count
+from warp_corot.mesh import TetForest
+from warp_corot.simulation import simulation as on_one
+from warp_corot.simulation.energy import Energy, WorldEnergies
+from warp_corot.simulation.parts import checked_bodies, checked_gravity, checked_integrator, checked_models
+from warp_corot.solvers import Integrator, SymplecticEuler
+
+from . import mpi
+from .following import Following
+from .gathering import register
+from .partition import Partition
+from .parts import Part
+from .ranks import MpiRanks
+from .refusals import check_supported
+
+
+class Simulation:
+    """One or several soft bodies, stepped together by all ranks of an MPI run.
+
+    Every rank makes the same bodies and calls the same methods in the same order. A rank computes its part of every
+    body. Of the whole bodies, which users hold, each rank keeps the nodes up to date that it moves; ``gather`` brings
+    all of them together on rank 0, and ``collect`` brings them into the bodies of all ranks.
+
+    Args:
+        bodies, model, integrator, gravity: As for ``warp_corot.Simulation``.
+        deterministic: Whether the run must come out the same bit by bit for any number of ranks.
+        costs: What an element costs on each rank, in any unit, [ranks]; None: the same everywhere.
+        others: Other arguments of ``warp_corot.Simulation``, which do not work on several ranks yet.
+
+    Attributes:
+        bodies: Tuple of the whole bodies.
+        rank, size: This rank's number, and how many there are.
+        worlds, device, stable_dt, gravity: As for ``warp_corot.Simulation``.
+
+    Raises:
+        InputError: MPI is not there, something that does not work on several ranks, a body of fewer groups of elements
+            than ranks, or as for ``warp_corot.Simulation``.
+    """
+
+    def __init__(
+        self,
+        bodies: SoftBody | Sequence[SoftBody],
+        *,
+        model: Model | Sequence[Model] | None = None,
+        integrator: Integrator | None = None,
+        gravity: npt.ArrayLike | None = None,
+        deterministic: bool = False,
+        costs: npt.ArrayLike | None = None,
+        **others: Any,
+    ):
+        self._comm = comm = mpi.world()
+        self.rank, self.size = comm.rank, comm.size
+        self.bodies = checked_bodies(bodies)
+        models = checked_models(Corotated() if model is None else model, len(self.bodies))
+        integrator = checked_integrator(SymplecticEuler() if integrator is None else integrator)
+        check_supported(self.bodies, models, integrator, others)
+        models = tuple(_settled_model(m, body) for m, body in zip(models, self.bodies, strict=True))
+        self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
+        parts = [_part_of(body, m, comm, costs) for body, m in zip(self.bodies, models, strict=True)]
+        self._following = [Following(body, part, comm) for body, part in zip(self.bodies, parts, strict=True)]
+        for each in self._following:
+            each.take_over()
+        ranks = MpiRanks(comm, self.bodies, parts, settled=bool(deterministic))
+        self._parts: _OfParts = _OfParts(
+            ranks,
+            parts,
+            model=models,
+            integrator=integrator,
+            gravity=self.gravity,
+            deterministic=deterministic,
+            **others,
+        )
+        register(self._following)
+
+    # --- stepping --------------------------------------------------------------------------------------------------
+
+    def step(self) -> None:
+        """Advance by one time step; as ``warp_corot.Simulation.step``."""
+        self._take_over()
+        self._parts.step()
+        self._publish()
+
+    def advance(self, seconds: float) -> None:
+        """Advance by ``seconds``; as ``warp_corot.Simulation.advance``. All ranks must call."""
+        self._take_over()
+        self._parts.advance(seconds)
+        self._publish()
+
+    def advance_until(self, total_time: float) -> None:
+        """Advance until ``total_time`` [s], nowhere if that is past; as ``advance``."""
+        self._take_over()
+        self._parts.advance_until(total_time)
+        self._publish()
+
+    def advance_steps(self, count: int) -> None:
+        """Advance by ``count`` time steps; as ``advance``."""
+        self._take_over()
+        self._parts.advance_steps(count)
+        self._publish()
+
+    def on_step(self, callback: Callable[[Simulation], None], every: int = 1) -> None:
+        """Call ``callback(sim)`` on every rank after every ``every``-th step, counted from the beginning.
+
+        Raises:
+            InputError: ``every`` is not a positive whole number, or the callback cannot be called.
+        """
+        if not callable(callback):
+            raise InputError(f"callback is {callback!r}; it must be a function of the simulation")
+
+        def called(_: object) -> None:
+            self._publish()
+            callback(self)
+            self._take_over()
+
+        self._parts.on_step(called, checked_count(every, "every", least=1))
+
+    def reset(self, worlds: npt.ArrayLike | wp.array | None = None) -> None:
+        """Put worlds back to their initial state; as ``warp_corot.Simulation.reset``."""
+        self._take_over()
+        for each in self._following:
+            each.take_initial()
+        self._parts.reset(worlds)
+        self._publish()
+
+    # --- looking ---------------------------------------------------------------------------------------------------
+
+    @property
+    def body(self) -> SoftBody:
+        """The first body."""
+        return self.bodies[0]
+
+    @property
+    def worlds(self) -> int:
+        """Copies of the bodies."""
+        return self._parts.worlds
+
+    @property
+    def device(self) -> wp.Device:
+        """Where this rank computes."""
+        return self._parts.device
+
+    @property
+    def stable_dt(self) -> float:
+        """Largest linearly stable step at rest [s], estimated."""
+        return self._parts.stable_dt
+
+    @property
+    def dt(self) -> float:
+        """The time step [s]; if none was given, the one that the present state allows."""
+        return self._parts.dt
+
+    @property
+    def dt_range(self) -> tuple[float, float]:
+        """The shortest and the longest time step so far [s]."""
+        return self._parts.dt_range
+
+    @property
+    def steps(self) -> int:
+        """Time steps done, since the last ``reset()`` if there was one."""
+        return self._parts.steps
+
+    @property
+    def total_steps(self) -> int:
+        """Time steps done, whatever has been reset since."""
+        return self._parts.total_steps
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s], since the last ``reset()`` if there was one."""
+        return self._parts.time
+
+    @property
+    def total_time(self) -> float:
+        """Simulated time [s], whatever has been reset since."""
+        return self._parts.total_time
+
+    @property
+    def elements_here(self) -> tuple[int, int]:
+        """Elements that this rank computes in one world, over all bodies, and how many of these are copies of other
+        ranks' elements."""
+        counted = [each.part.numbers.counted for each in self._following]
+        return sum(map(len, counted)), sum(int((~each).sum()) for each in counted)
+
+    @property
+    def sent_bytes(self) -> int:
+        """What this rank sends in one exchange [bytes]."""
+        return sum(each.sent_bytes for each in self._parts.ranks.halos)
+
+    def exchange_seconds(self, count: int) -> float:
+        """How long one exchange takes by itself, the mean of so many in a row [s]; all ranks must call."""
+        probes = [wp.zeros_like(each.part.state.displacements) for each in self._following]
+        return self._parts.ranks.exchange_seconds(probes, checked_count(count, "count", least=1))
+
+    def energy(self) -> Energy:
+        """Kinetic, elastic and gravitational energy of all bodies on all ranks in the present state [J]."""
+        return self.world_energies().together
+
+    def world_energies(self) -> WorldEnergies:
+        """The same of each world [J], float64 [worlds]."""
+        self._take_over()
+        own = self._parts.world_energies()
+        return WorldEnergies(*np.sum(self._comm.allgather(np.array(own)), axis=0))
+
+    def collect(self) -> None:
+        """Bring the state of all nodes into the bodies of all ranks; all ranks must call."""
+        for each in self._following:
+            state = each.whole.state
+            for array in (state.displacements, state.velocities, state.reactions):
+                array.assign(self._comm.bcast(each.gather(array), root=0))
+            state.publish_positions()
+
+    # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _take_over(self) -> None:
+        for k, each in enumerate(self._following):
+            each.take_over()
+            self._parts.ranks.complete(k, each.part.state.displacements)
+            each.part.state.publish_positions()
+
+    def _publish(self) -> None:
+        for each in self._following:
+            each.publish()
+
+
+class _OfParts(on_one.Simulation):
+    """A rank's own simulation, of parts, which asks other ranks where it must."""
+
+    def __init__(self, ranks: MpiRanks, parts: Sequence[Part], **options: Any):
+        self.ranks: MpiRanks = ranks
+        super().__init__(parts, **options)
+
+    def world_energies(self) -> WorldEnergies:
+        """This rank's share."""
+        found = super().world_energies()
+        elastic = np.zeros(self.worlds)
+        for k, (part, field) in enumerate(zip(self.bodies, self.fields, strict=True)):
+            energies = wp.zeros(field.energy_count, dtype=wp.float64, device=self.device)
+            with field.state_kept():
+                field.write_energies(part.state.displacements, energies)
+            self.ranks.leave_own(k, energies)
+            elastic += energies.numpy().reshape(self.worlds, -1).sum(axis=1)
+        return found._replace(elastic=elastic)
+
+
+def _part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None) -> Part:
+    at_nodes = not isinstance(body.mesh, TetForest) and getattr(model, "dilatation", ELEMENT) == SHARED
+    return Part(body, Partition.of(body.mesh, comm.size, costs), comm.rank, layers=2 if at_nodes else 1)
+
+
+def _settled_model(model: Model, body: SoftBody) -> Model:
+    """The model with what "auto" means for the whole body, since a part may hold other materials."""
+    if not hasattr(model, "dilatation"):
+        return model
+    shares = shares_dilatation(model.dilatation, body.discretization)
+    return dataclasses.replace(model, dilatation=SHARED if shares else ELEMENT)  # type: ignore[type-var]

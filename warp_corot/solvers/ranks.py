@@ -1,0 +1,103 @@
+"""The other processes, each with a part of the same bodies, that make the same steps; alone there are none."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.kernels.stepping.pace import Pace
+
+
+Floats = npt.NDArray[np.float64]
+
+
+class Ranks:
+    """What steps and checks ask of the processes ("ranks") that hold the other parts of the bodies.
+
+    This is the answer of a process that holds everything: nothing is launched, and every number is what it was.
+    ``warp_corot.distributed`` has another one, whose methods all ranks must call in the same order.
+
+    Every node is moved by one rank. Where other ranks need its displacement they hold a *ghost* of it, a node without
+    mass that never moves by itself.
+    """
+
+    is_alone = True
+    #: Whether exchanges can be recorded with the launches around them.
+    can_record = True
+    #: Whether sums must be the same bit by bit for any number of ranks.
+    is_settled = False
+    #: Whether this is the rank that prints and writes.
+    speaks = True
+
+    # --- launches --------------------------------------------------------------------------------------------------
+
+    def complete(self, k: int, vectors: wp.array) -> None:
+        """Launch that ghosts of the k-th body get their values, in a nodal array vec4."""
+
+    def completed(self, k: int, vectors: wp.array) -> wp.array:
+        """The same in another array, if there are ghosts; the array itself stays as it is."""
+        return vectors
+
+    def take_most(self, values: wp.array) -> None:
+        """Launch that an array holds the largest values of all ranks, in place."""
+
+    def agree_on_changes(self, changed: wp.array, clock: Pace) -> None:
+        """Launch that all ranks know whether the state has changed on any; after ``Copies.launch_take_over``."""
+
+    def leave_own(self, k: int, energies: wp.array) -> None:
+        """Launch that energies of elements that other ranks count are zero."""
+
+    def number_directions(self, k: int, directions: wp.array) -> None:
+        """Give every node of the k-th body, in a nodal array vec4, a direction that does not depend on how many ranks
+        there are."""
+
+    def number_motion(self, k: int, inverse_mass: wp.array, motion: wp.array) -> None:
+        """The same with normally distributed numbers at free nodes, zero at others."""
+
+    def add_up(self, parts: wp.array, sums: wp.array) -> None:
+        """Let an array, whose sum is that of this rank's parts, have the sum over all ranks; both float64.
+
+        Args:
+            parts: Addends of this rank; if sums are settled, one for each node.
+            sums: Their sums.
+        """
+
+    # --- numbers ---------------------------------------------------------------------------------------------------
+
+    def most(self, value: float) -> float:
+        """The largest value of all ranks."""
+        return value
+
+    def least(self, value: int) -> int:
+        """The smallest value of all ranks."""
+        return value
+
+    def anywhere(self, mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        """Where any rank has true."""
+        return mask
+
+    def together(self, value: float) -> float:
+        """The sum over all ranks."""
+        return value
+
+    def totals(self, totals: Floats, addends: Floats | None) -> Floats:
+        """Sums of the columns of ``kernels.stepping.balance`` over all ranks, float64 [worlds, COLUMNS].
+
+        Args:
+            totals: Those of this rank.
+            addends: What they are sums of [worlds, n, COLUMNS]; only if sums are settled.
+        """
+        return totals
+
+    def whole(self, body: SoftBody) -> SoftBody:
+        """The body of which another is this rank's part."""
+        return body
+
+
+#: A process that holds everything.
+ALONE = Ranks()
