@@ -100,6 +100,8 @@ def missing_extras(code: str) -> list[str]:
             imported |= {name.name.partition(".")[0] for name in node.names}
         elif isinstance(node, ast.ImportFrom):
             imported.add((node.module or "").partition(".")[0])
+    if "warp_corot.distributed" in code:
+        imported.add("mpi4py")
     optional = {re.split(r"[\[>=<]", need)[0] for needs in EXTRAS.values() for need in needs}
     return [name for name in sorted(imported & optional) if find_spec(name) is None]
 

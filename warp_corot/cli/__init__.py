@@ -18,6 +18,7 @@ from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.likely import meant
 
 from .parsing import StrictParser
+from .ranks import fall_silent, speaks
 from .say import EXIT_CODES, as_option, complain, interrupt_status, open_streams, silence
 from .signals import leaving_at_once, terminable
 
@@ -76,6 +77,8 @@ def make_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     open_streams()
+    if not speaks():
+        fall_silent()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")

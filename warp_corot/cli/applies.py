@@ -43,6 +43,7 @@ RULES = (
         lambda args, opened: opened.kind == "surface" or (opened.kind == "scan" and args.skin == "marched"),
         "surfaces",
     ),
+    Rule(("level",), lambda _, opened: opened.kind == "box", "the box"),
     Rule(("unit", "up"), _is_file, "files"),
     Rule(("rotation_level",), lambda _, opened: opened.kind != "tets", "box, surfaces and scans"),
     Rule(

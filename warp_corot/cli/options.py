@@ -30,7 +30,7 @@ from .quantities import (
 from .remesh import add_remesh_options
 from .say import EXIT_CODES
 from .several import TETS
-from .subject import STIFFNESS_PER_WEIGHT
+from .subject import BOX_LEVEL, STIFFNESS_PER_WEIGHT
 from .touching import add_touch_options
 
 FPS = 24.0
@@ -154,6 +154,12 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="make everything in the file one body, and merge coincident nodes of tetrahedra "
         "(default: closed surfaces, and prims, blocks and instances of tetrahedra, are separate bodies)",
+    )
+    body.add_argument(
+        "--level",
+        type=whole_number,
+        metavar="L",
+        help=f"number of bisections of the cubes of the box; three halve the edge (default: {BOX_LEVEL})",
     )
     body.add_argument("--scale", type=number, metavar="S", help="multiply the coordinates by this, after --unit")
     body.add_argument(

@@ -6,18 +6,21 @@ import os
 import sys
 from typing import Any
 
-#: What ``mpirun`` and SLURM tell each process of how many there are; the same as in ``distributed.mpi``, which starts
-#: MPI when it is imported.
-SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS")
+from warp_corot.inputs.processes import process_count, process_number
 
 
 def are_several() -> bool:
     """Whether ``mpirun`` has started several processes."""
-    return any(os.environ.get(name, "1").isdigit() and int(os.environ.get(name, "1")) > 1 for name in SIZES)
+    return process_count() > 1
 
 
-def leader() -> bool:
-    """Whether this process is the one that speaks and writes; where there are several, MPI is started.
+def speaks() -> bool:
+    """Whether this process prints: the only one, or the first of several."""
+    return process_number() == 0
+
+
+def leads() -> bool:
+    """Whether this process writes; where there are several, MPI is started.
 
     Raises:
         InputError: MPI is not there.

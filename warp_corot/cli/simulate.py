@@ -17,7 +17,7 @@ from .options import add_parser
 from .prepared import Run, prepared
 from .previews import Previews, check_preview
 from .probing import Table, check_table_path
-from .ranks import fall_silent, leader
+from .ranks import leads
 from .run_file import bodies_of, check_run_path, write_run
 from .say import complain, interrupt_status, kept_so_far
 from .summary import summary, title_of
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from warp_corot.io.write.animate import Recording
 
-    if not leader():
+    if not leads():
         return _serve(args)
     options = bodies_of(args)
     shared = options[0]
@@ -73,7 +73,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _serve(args: argparse.Namespace) -> int:
     """``run`` on a rank that makes its part of the steps, and neither speaks nor writes; returns the exit status."""
-    fall_silent()
     options = bodies_of(args)
     _check_output(args, options[0])
     ready = prepared(options)

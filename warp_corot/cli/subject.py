@@ -122,7 +122,8 @@ def find_subject(opened: Opened, args: argparse.Namespace) -> Subject:
     if args.scale is not None and not (np.isfinite(args.scale) and args.scale > 0):
         raise InputError(f"scale is {args.scale:g}; it must be a positive number")
     if opened.kind == "box":
-        return _box(1.0 if args.scale is None else args.scale, offset_of(args))
+        level = BOX_LEVEL if args.level is None else args.level
+        return _box(1.0 if args.scale is None else args.scale, level, offset_of(args))
     loaded = placed_tets(opened, args)
     points, tets = loaded.points, loaded.tets
     sets = {name: np.isin(np.arange(len(points)), nodes) for name, nodes in loaded.node_sets.items()}
@@ -171,9 +172,9 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
 
 
-def _box(scale: float, offset: np.ndarray) -> Subject:
+def _box(scale: float, level: int, offset: np.ndarray) -> Subject:
     x, y, z = offset.tolist()
-    mesh = TetForest.box(paper.CELLS, paper.CELL_SIZE * scale, BOX_LEVEL, origin=(x, y, z))
+    mesh = TetForest.box(paper.CELLS, paper.CELL_SIZE * scale, level, origin=(x, y, z))
     return Subject(
         mesh,
         "box",

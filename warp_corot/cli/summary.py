@@ -11,6 +11,7 @@ from warp_corot.elasticity import MODELS
 from warp_corot.elasticity.dilatation import ELEMENT
 from warp_corot.elasticity.dilatation.options import shares_dilatation
 from warp_corot.holding.choice import NAMED
+from warp_corot.inputs.processes import process_count
 from warp_corot.mesh import TetForest
 from warp_corot.solvers import INTEGRATORS
 
@@ -57,7 +58,7 @@ def summary(
     height = max(body.subject.height for body in bodies)
     at_end = f"{length(done.final_displacement)} at the end ({done.final_displacement / height:.1%} of the height)"
     at_last = " (at the end)" if sim.remeshing.every else ""
-    lines = []
+    lines, ranks = [], process_count()
     for body in bodies:
         lines += [f"{body.subject.name}, {body.held.words}", *_aligned(_of_body(body))]
     rows = [
@@ -69,7 +70,7 @@ def summary(
         ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"),
         ("wall time", f"{done.stepping:.2f} s stepping, {done.writing:.2f} s writing"),
         ("displacement", f"{length(done.largest_displacement)} largest, {at_end}"),
-        ("device", f"{sim.device} ({sim.device.name})"),
+        ("device", f"{sim.device} ({sim.device.name})" + (f", {ranks} ranks" if ranks > 1 else "")),
         ("written", f"{done.path}, {done.frames} frames, {done.simulated:.4g} s"),
     ]
     rows += [("also written", str(path)) for path in shared.also or ()]

@@ -28,7 +28,7 @@ class LedSimulation(OnOne):
 
     def __init__(self, bodies: SoftBody | Sequence[SoftBody], **options: Any):
         self._comm = mpi.world()
-        options = {name: value for name, value in options.items() if value is not None and value != []}
+        options = {name: value for name, value in options.items() if value is not None}
         self._on_all = Simulation(bodies, **options)
         super().__init__(bodies, **options)
         self._served = False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
 import sys
 import traceback
 from types import TracebackType
@@ -12,17 +11,7 @@ from typing import Any
 import warp as wp
 
 from warp_corot.errors import InputError
-
-#: What ``mpirun`` and SLURM tell each process of how many there are.
-SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS")
-
-
-def started_size() -> int:
-    """How many processes ``mpirun``, or what stands for it, says that it started; 1 without it."""
-    for name in SIZES:
-        if os.environ.get(name, "").isdigit():
-            return int(os.environ[name])
-    return 1
+from warp_corot.inputs.processes import process_count
 
 
 @functools.cache
@@ -58,7 +47,7 @@ def world() -> Any:
 
 def choose_device() -> None:
     """Give each process of one machine a card of its own, if there are cards: Warp's default device."""
-    if started_size() == 1:
+    if process_count() == 1:
         return
     local = library().COMM_WORLD.Split_type(library().COMM_TYPE_SHARED)
     count = wp.get_cuda_device_count()
@@ -71,6 +60,7 @@ def _end_all(comm: Any, kind: type[BaseException], error: BaseException, trace: 
     """End all ranks; they cannot go on without this one."""
     if not isinstance(error, InputError | KeyboardInterrupt):
         traceback.print_exception(kind, error, trace)
-    sys.stderr.write(f"warp-corot: rank {comm.rank} of {comm.size} ends all others: {kind.__name__}: {error}\n")
-    sys.stderr.flush()
+    stream = sys.__stderr__ or sys.stderr
+    stream.write(f"warp-corot: rank {comm.rank} of {comm.size} ends all others: {kind.__name__}: {error}\n")
+    stream.flush()
     comm.Abort(130 if isinstance(error, KeyboardInterrupt) else 1)

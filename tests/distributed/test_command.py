@@ -1,0 +1,51 @@
+"""``mpirun -n 2 warp-corot simulate``, and ranks that end early."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import simulate
+from mpirun import needs_mpi, on_ranks
+
+pytestmark = needs_mpi
+
+FAULTY = Path(__file__).parents[1] / "support" / "faulty.py"
+BEAM = ("box", "--level", "3", "--duration", "0.1", "--probe", "z == zmax", "--device", "cpu")
+
+
+def last_row(path):
+    with open(path, newline="") as file:
+        return np.array(list(csv.reader(file))[-1], float)
+
+
+def test_two_ranks_write_one_stage(folder):
+    from pxr import Usd
+
+    on_two = on_ranks(2, "-m", "warp_corot", "simulate", *BEAM, "--csv", "two.csv", "-o", "two.usda")
+    assert on_two.returncode == 0, on_two.stderr
+    assert "2 ranks" in on_two.stdout
+    assert on_two.stdout.count("time step") == 1
+    assert simulate(*BEAM, "--csv", "one.csv", "-o", "one.usda") == 0
+    stages = [Usd.Stage.Open(name) for name in ("one.usda", "two.usda")]
+    assert stages[0].GetEndTimeCode() == stages[1].GetEndTimeCode()
+    one, two = map(last_row, ("one.csv", "two.csv"))
+    # Places, times and lengths of steps; the body falls by centimetres.
+    np.testing.assert_allclose(two, one, rtol=0.02, atol=1e-4)
+
+
+def test_what_does_not_work_is_refused_in_one_line(folder):
+    done = on_ranks(2, "-m", "warp_corot", "simulate", "box", "--level", "3", "--ground", "-o", "out.usda")
+    assert done.returncode != 0
+    said = [line for line in done.stderr.splitlines() if line.startswith("warp-corot:")]
+    assert len(said) == 1
+    assert "does not work on several ranks yet" in said[0]
+
+
+@pytest.mark.parametrize("how", ["killed", "failed"])
+def test_a_rank_that_ends_takes_the_others_along(how):
+    done = on_ranks(2, str(FAULTY), how, timeout=120.0)
+    assert done.returncode != 0
+    if how == "failed":
+        said = [line for line in done.stderr.splitlines() if line.startswith("warp-corot:")]
+        assert said == ["warp-corot: rank 1 of 2 ends all others: ValueError: rank 1 has had enough"]

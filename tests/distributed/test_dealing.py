@@ -1,0 +1,91 @@
+"""Who computes what: dealing out, sums in any order, numbers of nodes. One process is enough."""
+
+import math
+
+import numpy as np
+import pytest
+from ranked import graded, jittered
+
+import warp_corot as wc
+from warp_corot.distributed.directions import normal_numbers
+from warp_corot.distributed.partition import Partition
+from warp_corot.distributed.parts import Part
+from warp_corot.distributed.refusals import check_supported
+from warp_corot.distributed.settled import settled_sums
+
+
+class Others:
+    """Ranks that have nothing to add, in place of a communicator."""
+
+    def allgather(self, value):
+        return [value, np.zeros_like(value)]
+
+
+@pytest.mark.parametrize("make", [graded, jittered, lambda: wc.TetForest.box(level=6)])
+@pytest.mark.parametrize("ranks", [1, 2, 3, 7])
+def test_every_element_is_counted_once_and_every_node_moved_once(make, ranks):
+    mesh = make()
+    dealt = Partition.of(mesh, ranks)
+    sizes = np.bincount(dealt.rank_of_element, minlength=ranks)
+    assert sizes.min() > 0
+    for rank in range(ranks):
+        needed = dealt.needed(mesh, rank, 1)
+        own = np.isin(mesh.tets, np.flatnonzero(dealt.rank_of_node == rank)).any(axis=1)
+        assert needed[own].all()
+        # Groups come whole.
+        assert np.isin(dealt.groups[needed], dealt.groups[~needed]).sum() == 0
+
+
+def test_slow_ranks_get_less():
+    mesh = wc.TetForest.box(level=12)
+    sizes = np.bincount(Partition.of(mesh, 2, [1.0, 3.0]).rank_of_element)
+    np.testing.assert_allclose(sizes / sizes.sum(), [0.75, 0.25], atol=0.01)
+
+
+def test_more_ranks_than_groups_are_refused():
+    with pytest.raises(wc.InputError, match=r"6 groups of elements for 7 ranks"):
+        Partition.of(wc.TetForest.box(level=3), 7)
+
+
+@pytest.mark.parametrize("make", [graded, jittered])
+def test_masses_of_parts_are_those_of_the_body(make):
+    body = wc.SoftBody(make(), wc.Isotropic(1e3, 0.3, 1000.0), device="cpu")
+    dealt, found = Partition.of(body.mesh, 3), np.zeros(body.node_count)
+    for rank in range(3):
+        part = Part(body, dealt, rank, 1)
+        np.add.at(found, part.numbers.nodes, part.masses)
+        np.testing.assert_array_equal(body.mesh.points[part.numbers.nodes], part.mesh.points)
+    np.testing.assert_array_equal(found, body.masses)
+
+
+def test_sums_are_the_same_in_any_order(rng):
+    addends = rng.normal(size=(5000, 2)) * 10.0 ** rng.uniform(-12, 12, (5000, 2))
+    first = settled_sums(addends, Others())
+    for _ in range(3):
+        np.testing.assert_array_equal(settled_sums(rng.permutation(addends), Others()), first)
+    np.testing.assert_allclose(first, [math.fsum(column) for column in addends.T], rtol=1e-15)
+    assert np.isnan(settled_sums(np.array([[1.0], [np.inf]]), Others())).all()
+    np.testing.assert_array_equal(settled_sums(np.zeros((3, 1)), Others()), [0.0])
+
+
+def test_directions_depend_on_a_nodes_number_alone():
+    every = normal_numbers(np.arange(10000), 3)
+    np.testing.assert_array_equal(normal_numbers(np.array([17, 4]), 3), every[[17, 4]])
+    assert abs(every.mean()) < 0.02
+    np.testing.assert_allclose(every.std(), 1.0, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("models", "integrator", "others", "said"),
+    [
+        ([wc.Corotated()], wc.BackwardEuler(0.01), {}, "BackwardEuler does not work"),
+        ([wc.Corotated(rotation_level=2)], wc.SymplecticEuler(), {}, "shared rotations do not work"),
+        ([wc.MassSpring()], wc.SymplecticEuler(), {}, "MassSpring does not work"),
+        ([wc.Corotated()], wc.SymplecticEuler(viscosity=1e-3), {}, "viscosity does not work"),
+        ([wc.Corotated()], wc.SymplecticEuler(), {"remesh": wc.OnlineRemesh()}, "remeshing does not work"),
+        ([wc.Corotated()], wc.SymplecticEuler(), {"contact": wc.Contact()}, "contact does not work"),
+    ],
+)
+def test_what_does_not_work_is_refused(models, integrator, others, said):
+    with pytest.raises(wc.InputError, match=said):
+        check_supported([], models, integrator, others)
