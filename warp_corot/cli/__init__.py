@@ -18,7 +18,7 @@ from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.likely import meant
 
 from .parsing import StrictParser
-from .ranks import fall_silent, speaks
+from .ranks import fall_silent, let_others_speak, speaks
 from .say import EXIT_CODES, as_option, complain, interrupt_status, open_streams, silence
 from .signals import leaving_at_once, terminable
 
@@ -77,8 +77,19 @@ def make_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     open_streams()
-    if not speaks():
-        fall_silent()
+    if speaks():
+        return _main(argv)
+    fall_silent()
+    status = 2  # unknown options end the parser
+    try:
+        status = _main(argv)
+        return status
+    finally:
+        if status in (1, 2, 3):
+            let_others_speak()
+
+
+def _main(argv: Sequence[str] | None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")

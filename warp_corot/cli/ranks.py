@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from typing import Any
 
 from warp_corot.inputs.processes import process_count, process_number
+
+#: Time for rank 0 to come as far as another one that failed, and to say so [s].
+WAIT = 5.0
 
 
 def are_several() -> bool:
@@ -36,6 +40,11 @@ def fall_silent() -> None:
     """Print nothing from here on: what all ranks have to say, rank 0 says."""
     null = open(os.devnull, "w")  # noqa: SIM115 (open as long as the process lives)
     sys.stdout = sys.stderr = null
+
+
+def let_others_speak() -> None:
+    """Wait before the end of a rank that failed, at which ``mpirun`` ends all others: rank 0 says what is wrong."""
+    time.sleep(WAIT)
 
 
 def led_simulation(**options: Any) -> Any:

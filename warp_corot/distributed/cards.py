@@ -27,9 +27,7 @@ def nccl_of(comm: Any, alias: str) -> Any:
     try:
         import nccl.core as nccl
     except ImportError as error:
-        raise InputError(
-            f'runs on several cards need nccl4py ({error}); pip install "warp-corot[cards]"'
-        ) from None
+        raise InputError(f'runs on several cards need nccl4py ({error}); pip install "warp-corot[cards]"') from None
     with wp.ScopedDevice(alias):
         name = comm.bcast(nccl.get_unique_id() if comm.rank == 0 else None, root=0)
         comm.Barrier()
