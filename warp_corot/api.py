@@ -31,6 +31,7 @@ from .elasticity import (
     MassSpring,
     NeoHookean,
     Ogden,
+    Prestressed,
     Prony,
     StVenantKirchhoff,
 )
@@ -67,6 +68,7 @@ __all__ = [
     "Ogden",
     "OnlineRemesh",
     "Orthotropic",
+    "Prestressed",
     "Prony",
     "QuasiStatic",
     "RunGradient",

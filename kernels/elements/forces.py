@@ -143,6 +143,25 @@ def element_energies(Elements: type, Material: type, density: wp.Function) -> wp
 
 
 @functools.cache
+def add_energies(Elements: type, Material: type, density: wp.Function) -> wp.Kernel:
+    """Add the energy of each element [J] to one that is known."""
+
+    @unique_kernel()
+    def add_energies(
+        # In
+        elements: Elements,
+        material: Material,
+        u: wp.array[wp.vec4],
+        # In and out
+        energies: wp.array[wp.float64],
+    ):
+        t = wp.tid()
+        energies[t] += wp.float64(density(elements, t, material, u)) * wp.float64(rest_volume(elements, t))
+
+    return add_energies
+
+
+@functools.cache
 def element_von_mises(Elements: type, Material: type, cauchy: wp.Function) -> wp.Kernel:
     """Von Mises stress of each element [Pa]."""
 

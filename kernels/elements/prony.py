@@ -19,7 +19,7 @@ from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.stepping.pace import DT, Pace
 
 from .constitutive import IsotropicMaterial, green_strain, symmetric
-from .elements import frame, local_gradient, rest_volume
+from .elements import frame, local_gradient
 
 wp.set_module_options({"enable_backward": False})
 
@@ -128,25 +128,6 @@ def prony_density(elements: Any, t: int, material: PronyMaterial, u: wp.array[wp
         own = mean * wp.ddot(change, change) + left * (2.0 * wp.ddot(s, change) + wp.ddot(s, s))
         density += material.g[i] * own
     return density * material.isotropic.mu[t * material.isotropic.stride]
-
-
-@functools.cache
-def add_prony_energies(Elements: type) -> wp.Kernel:
-    """Add the energy of the Maxwell elements of each element [J]."""
-
-    @unique_kernel()
-    def add_prony_energies(
-        # In
-        elements: Elements,
-        material: PronyMaterial,
-        u: wp.array[wp.vec4],
-        # In and out
-        energies: wp.array[wp.float64],
-    ):
-        t = wp.tid()
-        energies[t] += wp.float64(prony_density(elements, t, material, u)) * wp.float64(rest_volume(elements, t))
-
-    return add_prony_energies
 
 
 @functools.cache

@@ -36,7 +36,7 @@ from .touching import add_touch_options
 FPS = 24.0
 
 #: Models that the command line has options for.
-CHOICES = [name for name in MODELS if name not in ("holzapfel-gasser-ogden", "prony")]
+CHOICES = [name for name in MODELS if name not in ("holzapfel-gasser-ogden", "prestressed", "prony")]
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:

@@ -9,6 +9,7 @@ from .mass_spring import MassSpring
 from .model import ForceField, Model
 from .neo_hookean import NeoHookean
 from .ogden import Ogden
+from .prestress import Prestressed
 from .prony import Prony
 from .stvk import StVenantKirchhoff
 
@@ -20,6 +21,7 @@ MODELS: dict[str, type[Model]] = {
     "ogden": Ogden,
     "holzapfel-gasser-ogden": HolzapfelGasserOgden,
     "prony": Prony,
+    "prestressed": Prestressed,
     "edge-stvk": EdgeStVK,
     "mass-spring": MassSpring,
 }
@@ -35,6 +37,7 @@ __all__ = [
     "Model",
     "NeoHookean",
     "Ogden",
+    "Prestressed",
     "Prony",
     "StVenantKirchhoff",
 ]

@@ -193,8 +193,10 @@ class ForceField(ABC):
         """Arrays that must be kept for the steps to go on as they would have."""
         return {}
 
-    #: Seconds since the state that is kept was known, float32 [1], where forces depend on that; a stepper sets them.
-    elapsed: wp.array | None = None
+    @property
+    def elapsed(self) -> wp.array | None:
+        """Seconds since the state that is kept was known, float32 [1], where forces depend on it; set by steppers."""
+        return None
 
     def complete_step(self, u: wp.array, pace: Pace) -> None:  # noqa: B027 (most keep nothing)
         """Launch that a step of the clock's length has ended at displacements u; may be recorded."""

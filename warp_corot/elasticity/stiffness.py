@@ -12,6 +12,7 @@ from warp_corot.kernels.corotated.anisotropic import FibreMaterial
 from warp_corot.kernels.corotated.tangent import KeptStrains
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.fibres import ReinforcedMaterial
+from warp_corot.kernels.elements.prestress import Prestress
 from warp_corot.kernels.elements.prony import PronyMaterial
 from warp_corot.kernels.elements.stiffness_products import add_stiffness_diagonal, add_stiffness_product
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 #: Structs of materials.
 ElementMaterial: TypeAlias = (
-    "IsotropicMaterial | RotatedMaterial | KeptStrains | FibreMaterial | ReinforcedMaterial | PronyMaterial"
+    "IsotropicMaterial | RotatedMaterial | KeptStrains | FibreMaterial | ReinforcedMaterial | PronyMaterial | Prestress"
 )
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warp_corot.elasticity import MODELS, Corotated, EdgeStVK, MassSpring, Model, Prony
+from warp_corot.elasticity import MODELS, Corotated, EdgeStVK, MassSpring, Model, Prestressed, Prony
 from warp_corot.elasticity.dilatation import AUTO
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest
@@ -37,7 +37,9 @@ class Tissue:
         with gui.add_folder("tissue", expand_by_default=False):
             law = next(name for name, kind in MODELS.items() if type(sim.models[0]) is kind)
             self._law = gui.add_dropdown(
-                "law", [name for name in MODELS if name == law or name != "prony"], initial_value=law
+                "law",
+                [name for name in MODELS if name == law or name not in ("prestressed", "prony")],
+                initial_value=law,
             )
             self._rotations = gui.add_dropdown(
                 "rotations", _levels(meshes, sim.models[0]), initial_value=_level_of(sim.models[0]), hint="corotated"
@@ -81,7 +83,7 @@ def model_of(law: str, rotations: str, former: Model | None = None) -> Model:
         former: The one before, whose dilatation goes on.
     """
     kind = MODELS[law]
-    if kind is Prony and former is not None:
+    if kind in (Prestressed, Prony) and former is not None:
         return former
     options: dict[str, Any] = {}
     springs = (EdgeStVK, MassSpring)
