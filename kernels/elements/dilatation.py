@@ -5,8 +5,8 @@ J - 1. Linear tetrahedra have more of these than a nearly incompressible body ha
 elements share it. A group of elements, such as the eight leaves of a subtree, has the mean of theirs, weighted by
 lambda and volume, and the energy
     W = sum over e of lambda_e V_e w(theta),  theta = sum of lambda_e V_e theta_e / sum of lambda_e V_e.
-Where there is no tree to tell groups there is one theta at each node, the mean of the elements around it, and each
-element has the mean of w at its four nodes.
+In a forest without subtrees there is one theta at each node, the mean of the elements around it, and each element has
+the mean of w at its four nodes.
 
 Nothing of this keeps an element of a group from turning over while others grow, which elements of crushed tissue do. So
 where theta_e is J - 1, W has lambda_e V_e h(theta_e) of each element besides. h is zero up to |theta| = ``FREE``; from

@@ -13,7 +13,7 @@ from warp_corot.kernels.modules import unique_kernel
 
 from .constitutive import CONTINUED_BELOW, IsotropicMaterial
 from .dilatation import FREE, MOST, RAMP, Dilatation
-from .elements import ForestElements, GeneralElements, frame, rest_volume
+from .elements import GeneralElements, frame, rest_volume
 from .general_cpu import rest_inverse_of
 from .lanes import COMPILER_FLAGS, ELEMENTS, ISOTROPIC, ISOTROPIC_PART, constants, native, on_cpu, scatter_lanes
 from .law_lanes import LAWS
@@ -126,29 +126,34 @@ def scatter_grouped_elements(law: str, of: Dilatation) -> wp.Kernel:
     return scatter_lanes(code, GeneralElements, GroupedMaterial, wp.int32)
 
 
-@wp.kernel(enable_backward=False)
-def order_elements(
-    # In
-    elements: ForestElements,
-    material: IsotropicMaterial,
-    lam: wp.array[wp.float32],
-    members: wp.array[wp.int32],
-    live: wp.array[wp.int32],
-    # In and out
-    general: GeneralElements,
-    grouped: GroupedMaterial,
-):
-    """Elements in the order of their groups."""
-    k = wp.tid()
-    last = members.shape[0]
-    if live.shape[0] > 0:
-        last = grouped.starts[live[0]]
-    if k >= last:
-        return
-    t = members[k]
-    general.nodes[k] = elements.nodes[t]
-    general.rest_inverse[k] = rest_inverse_of(elements, t, wp.transpose(frame(elements, t)))
-    general.volume[k] = rest_volume(elements, t)
-    if material.stride > 0:
-        grouped.isotropic.mu[k] = material.mu[t]
-        grouped.lam[k] = lam[t]
+@functools.cache
+def order_elements(Elements: type) -> wp.Kernel:
+    """Puts elements in the order of their groups."""
+
+    @unique_kernel()
+    def order_elements(
+        # In
+        elements: Elements,
+        material: IsotropicMaterial,
+        lam: wp.array[wp.float32],
+        members: wp.array[wp.int32],
+        live: wp.array[wp.int32],
+        # In and out
+        general: GeneralElements,
+        grouped: GroupedMaterial,
+    ):
+        k = wp.tid()
+        last = members.shape[0]
+        if live.shape[0] > 0:
+            last = grouped.starts[live[0]]
+        if k >= last:
+            return
+        t = members[k]
+        general.nodes[k] = elements.nodes[t]
+        general.rest_inverse[k] = rest_inverse_of(elements, t, wp.transpose(frame(elements, t)))
+        general.volume[k] = rest_volume(elements, t)
+        if material.stride > 0:
+            grouped.isotropic.mu[k] = material.mu[t]
+            grouped.lam[k] = lam[t]
+
+    return order_elements

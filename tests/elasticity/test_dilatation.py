@@ -25,7 +25,7 @@ MESHES = {
     "level 4": (lambda: wc.TetForest.box((1, 1, 1), CUBE, 4), reference.of_eights),
     "level 8": (lambda: wc.TetForest.box((1, 1, 1), CUBE, 8), reference.of_eights),
     "mixed levels": (mixed_forest, reference.of_forest),
-    "general": (jittered, reference.of_nodes),
+    "general": (jittered, reference.of_neighbours),
 }
 
 

@@ -194,14 +194,14 @@ def work_by_differences(law, mesh, groups, u, motion):
     ],
 )
 def test_work_of_a_shared_dilatation(law, mesh, device):
-    """With a shear modulus of almost nothing; of groups in a forest, of nodes in a general mesh."""
+    """With a shear modulus of almost nothing; of groups in a forest and in a general mesh."""
     rng = np.random.default_rng(5)
     if mesh == "forest":
         mesh = wc.TetForest.box((1, 1, 3), CUBE, 3).refine(np.arange(144) % 17 == 0)
         groups = shared_dilatation.of_forest(mesh)
     else:
         mesh = jittered()
-        groups = shared_dilatation.of_nodes(mesh)
+        groups = shared_dilatation.of_neighbours(mesh)
     young = 1000.0 * rng.uniform(0.5, 2.0, len(mesh.tets))
     body = wc.SoftBody(mesh, wc.Isotropic(young, 0.4999995, 10.0), device=device)
     lam = body.discretization.lam.numpy().astype(float)

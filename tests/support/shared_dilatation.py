@@ -5,6 +5,8 @@ import oracle
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 
+from warp_corot.discretization.matching import neighbour_groups
+
 
 def of_eights(mesh):
     """Which elements share one dilatation: a matrix of ones [groups, T], each eight elements in a row."""
@@ -17,6 +19,12 @@ def of_nodes(mesh):
     count = len(mesh.tets)
     places = (np.asarray(mesh.tets).ravel(), np.repeat(np.arange(count), 4))
     return coo_matrix((np.full(4 * count, 0.25), places), (len(mesh.points), count)).tocsr()
+
+
+def of_neighbours(mesh):
+    """Neighbours in a general mesh, [groups, T]; what such groups are is tested by themselves."""
+    group, count = neighbour_groups(mesh.points, mesh.tets), len(mesh.tets)
+    return coo_matrix((np.ones(count), (group, np.arange(count)))).tocsr()
 
 
 def of_forest(forest):

@@ -13,7 +13,9 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.mesh import TetForest
+from warp_corot.mesh import TetForest, TetMesh
+
+from .matching import neighbour_groups
 
 #: How many leaves make a group below an element of the tree, and among the remaining leaves of a root.
 LEAST, LEAST_OF_ROOT = 8, 4
@@ -39,10 +41,27 @@ class Groups:
     @classmethod
     def of_leaves(cls, forest: TetForest, leaves: npt.NDArray[np.integer], device: wp.Device, worlds: int) -> Groups:
         """The groups of some leaves of a forest, int [n], in each world."""
-        group = group_numbers(forest, leaves)
+        return cls._of(group_numbers(forest, leaves), np.asarray(leaves), len(forest.tets), device, worlds)
+
+    @classmethod
+    def of_elements(cls, mesh: TetMesh, device: wp.Device, worlds: int) -> Groups:
+        """The groups of all elements of a general mesh, in each world."""
+        group = neighbour_groups(mesh.points, mesh.tets)
+        return cls._of(group, np.arange(len(mesh.tets)), len(mesh.tets), device, worlds)
+
+    @classmethod
+    def _of(
+        cls,
+        group: npt.NDArray[np.integer],
+        elements: npt.NDArray[np.integer],
+        in_world: int,
+        device: wp.Device,
+        worlds: int,
+    ) -> Groups:
+        """The groups of elements, int [n] both, of which there are so many in a world."""
         order = np.argsort(group, kind="stable")
         sizes = np.tile(np.bincount(group), worlds)
-        members = np.asarray(leaves)[order] + len(forest.tets) * np.arange(worlds)[:, None]
+        members = elements[order] + in_world * np.arange(worlds)[:, None]
         starts = np.concatenate([[0], np.cumsum(sizes)])
         return cls(*(wp.array(values.ravel(), dtype=wp.int32, device=device) for values in (starts, members)))
 

@@ -11,6 +11,7 @@ from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.elements import Elements
 from warp_corot.discretization.plan import Plan, Units
 from warp_corot.elasticity.model import ForceField
+from warp_corot.elasticity.paths.dilating import Dilating
 from warp_corot.elasticity.paths.lanes import Lanes
 from warp_corot.elasticity.stiffness import ElementStiffness
 from warp_corot.elasticity.stress_law import StressLaw
@@ -279,6 +280,19 @@ class LanesField(CorotatedField):
     def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
         super().__init__(discretization, model, deterministic)
         self._lanes = general_lanes(self.elements)
+        self._dilating: Dilating | None = None
+
+    def share_dilatation(self, dilating: Dilating) -> bool:
+        self._dilating = dilating
+        self.derive()
+        return True
+
+    def derive(self) -> None:
+        if self._dilating is not None:
+            self._dilating.derive(self.isotropic)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        self._lanes.scatter_forces(self.isotropic, u, f)
+        if self._dilating is None or self._dilating.groups is None:
+            self._lanes.scatter_forces(self.isotropic, u, f)
+        else:
+            self._dilating.groups.scatter_forces("corotated", u, f, repair_elements())

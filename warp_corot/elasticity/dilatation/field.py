@@ -27,7 +27,7 @@ class DilatationField(ForceField):
     """A law's force field without lambda's part, and that part with a dilatation that elements share.
 
     In a forest the eight leaves of each complete subtree share one, and so do groups of the other leaves. In a
-    general mesh there is one at each node. The von Mises stress is each element's own.
+    general mesh groups of neighbours do. The von Mises stress is each element's own.
 
     Args:
         discretization: The mesh and the material.

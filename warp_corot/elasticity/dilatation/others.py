@@ -25,8 +25,8 @@ from warp_corot.mesh import TetForest
 class Others:
     """The elements of a plan that are in no complete subtree.
 
-    In a forest they are in groups, which are found anew where it changes. In a general mesh, and in a forest of a plan
-    without subtrees, they have their dilatation at nodes.
+    They are in groups, which are found anew where a forest changes. Only in a forest of a plan without subtrees do they
+    have their dilatation at nodes.
 
     Call ``follow`` before anything is launched, once it is known whether they are joined.
 
@@ -56,12 +56,14 @@ class Others:
             leaves = plan.flat.leaves.numpy()
             leaves = leaves[: len(leaves) // discretization.worlds]
             self._groups = Groups.of_leaves(mesh, leaves, self._device, discretization.worlds)
+        elif not isinstance(mesh, TetForest):
+            self._groups = Groups.of_elements(mesh, self._device, discretization.worlds)
         self.grouped: GroupedLanes | None = None
         self.count, self.are_joined = 0, False
         groups = self._groups
         if groups is not None and not self._device.is_cuda:
             live = groups.live if isinstance(groups, ChangingGroups) else self._none
-            self.grouped = GroupedLanes(plan, of, groups.starts, groups.members, live)
+            self.grouped = GroupedLanes(plan, self._kind, of, groups.starts, groups.members, live)
         self.derive()
 
     def derive(self) -> None:

@@ -1,4 +1,4 @@
-"""Leaves of a forest that share their dilatation in groups, on the CPU: group after group in the lanes."""
+"""Elements in no subtree that share their dilatation in groups, on the CPU: group after group in the lanes."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from warp_corot.kernels.elements.elements import GeneralElements
 
 
 class GroupedLanes:
-    """Launches that add the forces of leaves in groups under a law, with the dilatation that groups share.
+    """Launches that add the forces of elements in groups under a law, with the dilatation that groups share.
 
     Args:
-        plan: Of whose leaves groups are.
+        plan: Of whose elements groups are.
+        kind: Of these elements.
         of: What is shared.
         starts, members, live: The groups, as ``kernels.elements.shared_dilatation.share_in_groups`` takes them.
 
@@ -29,9 +30,9 @@ class GroupedLanes:
         count: How many groups launches go through.
     """
 
-    def __init__(self, plan: Plan, of: Dilatation, starts: wp.array, members: wp.array, live: wp.array):
+    def __init__(self, plan: Plan, kind: type, of: Dilatation, starts: wp.array, members: wp.array, live: wp.array):
         self.count = 0
-        self._plan, self._of = plan, of
+        self._plan, self._of, self._order = plan, of, order_elements(kind)
         self._members, self._live, most = members, live, len(members)
         general = self._general = GeneralElements()
         general.nodes = general.targets = wp.zeros(most, dtype=wp.vec4i, device="cpu")
@@ -43,10 +44,10 @@ class GroupedLanes:
         self._left_out = wp.zeros(most + 1, dtype=wp.int32, device="cpu")
 
     def derive(self, material: IsotropicMaterial, lam: wp.array) -> None:
-        """Launch what puts leaves in order; may be recorded.
+        """Launch what puts elements in order; may be recorded.
 
         Args:
-            material: Of all leaves, without lambda.
+            material: Of all elements, without lambda.
             lam: Lambda [Pa], as ``material`` has mu.
         """
         grouped, most = self._material, len(self._members)
@@ -59,7 +60,7 @@ class GroupedLanes:
             grouped.isotropic = isotropic_material([mu, none, material.stride])
             grouped.lam = lam_here
         inputs = [self._plan.elements, material, lam, self._members, self._live]
-        wp.launch(order_elements, most, inputs, [self._general, grouped], device="cpu")
+        wp.launch(self._order, most, inputs, [self._general, grouped], device="cpu")
 
     def kernel(self, law: str) -> wp.Kernel:
         """What adds the forces under a law."""
@@ -70,7 +71,7 @@ class GroupedLanes:
 
         Args:
             law: A key of ``kernels.elements.law_lanes.LAWS``.
-            repair: Does the leaves that the law leaves out, if it does.
+            repair: Does the elements that the law leaves out, if it does.
         """
         if not self.count:
             return

@@ -36,10 +36,7 @@ class LawLanesField(LawField):
         self._lanes: Lanes | None = None
         self._dilating: Dilating | None = None
         self._lanes_material = self.isotropic
-        if not isinstance(discretization.mesh, TetForest):
-            self._lanes = Lanes(self.elements, self.elements, scatter=scatter_law_elements(law))
-        else:
-            self.follow()
+        self.follow()
 
     def plan_of(self, discretization: Discretization) -> Plan:
         return discretization.plan()
@@ -56,7 +53,7 @@ class LawLanesField(LawField):
         return scatter_law_subtrees(shape, self._law, None if self._dilating is None else self._dilating.of)
 
     def share_dilatation(self, dilating: Dilating) -> bool:
-        if not isinstance(self.discretization.mesh, TetForest):
+        if dilating.groups is None and not isinstance(self.discretization.mesh, TetForest):
             return False
         self._dilating = dilating
         self.derive()
@@ -84,7 +81,9 @@ class LawLanesField(LawField):
         self._lanes = None
         if self._dilating is not None and self._dilating.groups is not None:
             return
-        if len(flat):
+        if not isinstance(self.discretization.mesh, TetForest):
+            self._lanes = Lanes(self.elements, self.elements, scatter=scatter_law_elements(self._law))
+        elif len(flat):
             self._lanes_material = self.isotropic_of(flat)
             general = flat.general or as_general(flat.elements, rest_matrices, [flat.elements])
             self._lanes = Lanes(general, general, scatter=scatter_law_elements(self._law))
