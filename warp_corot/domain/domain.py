@@ -249,6 +249,9 @@ class _Made(Domain):
     def exits(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         return self._kind.exits(starts, ends)
 
+    def corners(self) -> np.ndarray:
+        return self._kind.corners()
+
     def point_in(self, name: str) -> np.ndarray | None:
         return self._kind.point_in(name)
 

@@ -21,6 +21,8 @@ MESSY = 2.0e-3
 FOLDED = 0.05
 #: Winding numbers are computed for this number of patches; more are not worth the time.
 MOST_PATCHES = 20_000
+#: Normals of two triangles that differ by more than this make a sharp edge [°].
+SHARP = 30.0
 #: Points near the surface at which what was found is tried.
 TRIED = 4096
 
@@ -176,3 +178,25 @@ def _near(corners: np.ndarray, area: np.ndarray) -> np.ndarray:
     size = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
     apart = size * 10.0 ** rng.uniform(-4.0, -1.0, (TRIED, 1)) * rng.standard_normal((TRIED, 3))
     return np.einsum("nc,ncx->nx", rng.dirichlet([1.0, 1.0, 1.0], TRIED), corners[chosen]) + apart
+
+
+def corner_points(points: np.ndarray, triangles: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Numbers of the points where three or more sharp edges meet.
+
+    Args:
+        points: float64 [N, 3].
+        triangles: Closed, int64 [T, 3].
+        bounds: Which have the body on one side and the outside on the other, bool [T]; points of others do not count.
+    """
+    corners = points[triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    ends = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    keys = ends[:, 0] * len(points) + ends[:, 1]
+    order = np.argsort(keys, kind="stable")
+    pair = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
+    one, other = order[pair] // 3, order[pair + 1] // 3
+    sharp = np.einsum("nc,nc->n", normal[one], normal[other]) < np.cos(np.radians(SHARP))
+    found = np.bincount(ends[order[pair[sharp]]].ravel(), minlength=len(points)) >= 3
+    found[triangles[~bounds].ravel()] = False
+    return np.flatnonzero(found)

@@ -116,6 +116,10 @@ class SignedFunction:
         """
         return None
 
+    def corners(self) -> np.ndarray:
+        """Points where three or more sharp edges of the body meet, as far as they are known, float64 [n, 3] [m]."""
+        return np.empty((0, 3))
+
     def part(self, name: str) -> SignedFunction:
         """The domain of one label alone.
 

@@ -17,7 +17,7 @@ from warp_corot.kernels.meshing import domain as kernels
 from warp_corot.kernels.meshing import windings
 from warp_corot.mesh.side_by_side import in_parts
 
-from .sides import sides_of
+from .sides import corner_points, sides_of
 from .signed import SignedFunction
 from .units import length, metres_per_unit, unlikely_size, volume
 
@@ -89,6 +89,10 @@ class SurfaceDomain(SignedFunction):
         in_parts(self.device, given.size, find)
         found = shares.numpy().astype(np.float64)
         return np.where(found < 0.0, np.nan, found), normals.numpy().astype(np.float64)
+
+    def corners(self) -> np.ndarray:
+        points, triangles = self.closed.points, self.closed.triangles.astype(np.int64)
+        return points[corner_points(points, triangles, self.sides.known == kernels.BOUNDARY)]
 
     @property
     def has_pieces(self) -> bool:

@@ -1,0 +1,165 @@
+"""Marched surfaces that meet the body's own corners.
+
+A corner of three creases lies in one element, whose polygon may see two of its planes alone. Where the corner is known,
+the triangle below it is replaced by three that meet there, and edges around them are turned where that brings the
+surface nearer to the body's.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+if TYPE_CHECKING:
+    from warp_corot.domain import Domain
+
+Array = np.ndarray
+
+#: Vertices near a corner whose triangles are tried; of more corners none is met, as they would be noise.
+TRIED, MOST = 4, 300
+#: A corner that is nearer to a vertex than this share of the shortest edge there is met already.
+MET = 0.02
+#: A triangle that is nearer to the body's surface than this share of that edge cuts nothing off.
+FAR = 1.0e-3
+#: Around a corner so many edges are looked at, and so many triangles that may cut it off are tried.
+LOOKS, CUTTING = 24, 4
+#: Where the space between a triangle and the body's surface is sampled: its middle and those of its sides.
+_WITHIN = np.array([[2, 2, 2], [3, 3, 0], [3, 0, 3], [0, 3, 3]]) / 6.0
+
+
+def with_corners(x: Array, triangles: Array, domain: Domain) -> tuple[Array, Array]:
+    """A surface that meets the body's corners: its points [V, 3] and triangles [F, 3].
+
+    Args:
+        x: Vertices [m], float64 [V, 3].
+        triangles: int32 [F, 3].
+        domain: The body.
+    """
+    corners = domain.corners()
+    if not 0 < len(corners) <= MOST or not len(triangles):
+        return x, triangles
+    _, near = cKDTree(x).query(corners, k=min(TRIED, len(x)))
+    surface = _Surface(x, triangles, domain, near)
+    for point, vertices in zip(corners, near, strict=True):
+        surface.meet(point, vertices)
+    return surface.arrays()
+
+
+class _Surface:
+    """Triangles that are replaced one by one.
+
+    Args:
+        x, triangles, domain: See `with_corners`.
+        near: Vertices around which triangles may be replaced.
+    """
+
+    def __init__(self, x: Array, triangles: Array, domain: Domain, near: Array):
+        self.x, self.domain, self.given = list(x), domain, triangles
+        marked = np.zeros(len(x), bool)
+        marked[near] = True
+        # And around their neighbours.
+        marked[triangles[marked[triangles].any(axis=1)]] = True
+        self.local = {int(t): tuple(map(int, triangles[t])) for t in np.flatnonzero(marked[triangles].any(axis=1))}
+        self.around: dict[int, set[int]] = {}
+        for number, corners in self.local.items():
+            for corner in corners:
+                self.around.setdefault(corner, set()).add(number)
+        self.count = self.count_before = len(triangles)
+        #: What the last fan has added and removed: number, corners and whether it was added.
+        self.replaced: list[tuple[int, tuple[int, ...], bool]] = []
+
+    def arrays(self) -> tuple[Array, Array]:
+        kept = [t for t in range(self.count) if t in self.local or t < len(self.given)]
+        triangles = [self.local.get(t) or tuple(self.given[t]) for t in kept]
+        return np.array(self.x), np.array(triangles, np.int32)
+
+    def meet(self, point: Array, vertices: Array) -> None:
+        """Have a vertex at a point, if that brings the surface nearer to the body's."""
+        ring = sorted({t for v in vertices.tolist() for t in self.around[v]})
+        sides = np.array([[self.x[v] for v in self.local[t]] for t in ring])
+        shortest = np.linalg.norm(sides - np.roll(sides, 1, axis=1), axis=2).min()
+        if np.linalg.norm(self.x[vertices[0]] - point) < MET * shortest:
+            return
+        off = self._off(sides)
+        far = off > FAR * shortest * np.linalg.norm(_normals(sides), axis=1)
+        # The triangle that cuts the corner off is far from the body's surface.
+        for place in [place for place in np.argsort(-off)[:CUTTING] if far[place]]:
+            if off[place] + self._fan(ring[place], point) > 0.0:
+                return
+            self._undo()
+
+    def _undo(self) -> None:
+        """Take back all that the last fan has replaced."""
+        for number, corners, added in reversed(self.replaced.copy()):
+            if added:
+                self._remove(number)
+            else:
+                self._add(corners, number)
+        self.x.pop()
+        self.count = self.count_before
+
+    def _fan(self, triangle: int, point: Array) -> float:
+        """Put a vertex above a triangle and turn edges around it; the space between new triangles and the body's
+        surface, less what turning saves, below zero."""
+        apex, self.count_before = len(self.x), self.count
+        self.x.append(point)
+        self.around[apex] = set()
+        a, b, c = self.local[triangle]
+        self.replaced.clear()
+        self._remove(triangle)
+        waiting = [self._add((apex, *ends), place) for ends, place in (((a, b), triangle), ((b, c), -1), ((c, a), -1))]
+        gain = -float(self._off(np.array([[self.x[v] for v in self.local[t]] for t in waiting])).sum())
+        for _ in range(LOOKS):
+            if not waiting:
+                break
+            gain += self._turned(waiting.pop(0), apex, waiting)
+        return gain
+
+    def _turned(self, triangle: int, apex: int, waiting: list[int]) -> float:
+        """Turn the edge across from the apex, if that helps: by how much."""
+        start = self.local[triangle].index(apex)
+        _, a, b = (self.local[triangle][(start + k) % 3] for k in range(3))
+        others = (self.around[a] & self.around[b]) - {triangle}
+        if len(others) != 1:
+            return 0.0
+        (other,) = others
+        (far,) = set(self.local[other]) - {a, b}
+        if self.around[apex] & self.around[far]:
+            return 0.0
+        corners = np.array([self.x[k] for k in (apex, a, b, far)])
+        old, new = corners[[[0, 1, 2], [3, 2, 1]]], corners[[[0, 1, 3], [0, 3, 2]]]
+        gain = float(np.array([1.0, 1.0, -1.0, -1.0]) @ self._off(np.concatenate([old, new])))
+        facing = (_normals(new)[:, None] * _normals(old)[None]).sum(axis=2).max(axis=1)
+        if gain <= 0.0 or facing.min() <= 0.0:
+            return 0.0
+        self._remove(triangle)
+        self._remove(other)
+        waiting += [self._add((apex, a, far), triangle), self._add((apex, far, b), other)]
+        return gain
+
+    def _add(self, corners: tuple[int, ...], number: int) -> int:
+        if number < 0:
+            number, self.count = self.count, self.count + 1
+        self.local[number] = corners
+        self.replaced.append((number, corners, True))
+        for corner in corners:
+            self.around[corner].add(number)
+        return number
+
+    def _remove(self, number: int) -> None:
+        corners = self.local.pop(number)
+        self.replaced.append((number, corners, False))
+        for corner in corners:
+            self.around[corner].discard(number)
+
+    def _off(self, triangles: Array) -> Array:
+        """About the space between triangles [n, 3, 3] and the body's surface [m^3]."""
+        off = np.abs(np.asarray(self.domain.phi((_WITHIN @ triangles).reshape(-1, 3)), np.float64))
+        return np.linalg.norm(_normals(triangles), axis=1) * off.reshape(-1, len(_WITHIN)).mean(axis=1)
+
+
+def _normals(triangles: Array) -> Array:
+    """Vectors across triangles, as long as they are large."""
+    return 0.5 * np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
