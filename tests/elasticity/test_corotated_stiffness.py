@@ -7,6 +7,7 @@ import numpy as np
 import oracle
 import pytest
 from cases import CUBE, MATERIAL, MESHES, edge_scale, jittered, mixed_forest, oracle_mesh, random_displacement
+from shortened import crossed
 from tangents import (
     assert_diagonal,
     assert_equal,
@@ -53,8 +54,11 @@ def with_own_rotations(mesh, u, p):
     return rotated_product(reference, own_rotations(reference, places(mesh, u)), MU, LAM, p)
 
 
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("options", OWN)
+def is_short(options, case):
+    return case != "general" or options == "byers-xu"
+
+
+@pytest.mark.parametrize(("options", "case"), crossed(OWN, CASES, is_short))
 def test_own_rotations(options, case, device, rng):
     mesh = MESHES[case]()
     if case == "general" and options == "sparse":
@@ -66,8 +70,10 @@ def test_own_rotations(options, case, device, rng):
     assert_keeps_translations(field, u, rng)
 
 
-@pytest.mark.parametrize("options", ["byers-xu", "warm"])
-@pytest.mark.parametrize("make", [mixed_forest, jittered])
+@pytest.mark.parametrize(
+    ("options", "make"),
+    crossed(["byers-xu", "warm"], [mixed_forest, jittered], lambda o, m: m is mixed_forest or o == "byers-xu"),
+)
 def test_diagonal_blocks_are_those_of_the_product(make, options, device, rng):
     mesh = make()
     u = turned(mesh, rng, 0.1)
@@ -138,7 +144,7 @@ def test_rotations_of_ancestors(make, rotation_level, is_fast, device, rng):
         product(field, u, p, exact=True)
 
 
-@pytest.mark.parametrize("level", [6, 7, 8])
+@pytest.mark.parametrize("level", [6, *(pytest.param(level, marks=pytest.mark.slow) for level in (7, 8))])
 def test_rotations_within_a_tolerance(level, device, rng):
     """Elements have the rotations of the forces: their root's if it is close."""
     tolerance = 0.1

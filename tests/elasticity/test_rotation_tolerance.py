@@ -5,6 +5,7 @@ import oracle
 import pytest
 import warp as wp
 from cases import edge_scale, oracle_mesh
+from shortened import crossed
 
 import warp_corot as wc
 from warp_corot.discretization.planning.fixed import ForcePlan
@@ -21,12 +22,12 @@ ROUNDING = 1e-5  # of the largest force
 #: Both force paths: eight subtrees in the lanes of a CPU, and CUDA's kernel without groups.
 LANES, SUBTREES = "lanes", "subtrees"
 WAYS = [LANES, SUBTREES]
-#: For the second path, each tolerance compiles its own kernels.
-TOLERANCES = [
-    *((LANES, tolerance) for tolerance in (0.01, AUTO_TOLERANCE, 0.3)),
-    (SUBTREES, AUTO_TOLERANCE),
-    *(pytest.param(SUBTREES, tolerance, marks=pytest.mark.slow) for tolerance in (0.01, 0.3)),
-]
+#: For the second path, each tolerance and each type of subtrees compiles its own kernels.
+TOLERANCES = crossed(
+    [6, 7, 8],
+    [(way, tolerance) for way in WAYS for tolerance in (0.01, AUTO_TOLERANCE, 0.3)],
+    lambda level, way: way[0] == LANES or (level == 6 and way[1] == AUTO_TOLERANCE),
+)
 
 
 def forces(forest, u, tolerance, way, device):
@@ -88,11 +89,11 @@ def bound(reference, F, tolerance, mu=MU, lam=LAM):
     return found
 
 
-@pytest.mark.parametrize(("way", "tolerance"), TOLERANCES)
+@pytest.mark.parametrize(("level", "way_and_tolerance"), TOLERANCES)
 @pytest.mark.parametrize("radius", [10.0, 1.0, 0.3])
-@pytest.mark.parametrize("level", [6, 7, 8])
-def test_error_of_the_force_is_bounded(level, radius, tolerance, way, device):
+def test_error_of_the_force_is_bounded(level, radius, way_and_tolerance, device):
     """At every node by the sum of V |grad N| (2 mu + 3 lambda) (3 w |U - I| + w^2 |U|) with w = 2 tolerance."""
+    way, tolerance = way_and_tolerance
     forest = wc.TetForest.box((1, 1, 3), 0.1, level)
     u = bent(forest.points, radius)
     found, _ = forces(forest, u, tolerance, way, device)

@@ -9,6 +9,7 @@ import runpy
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import oracle
@@ -22,9 +23,29 @@ BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 STAGES = {"rotation", "stiffness product", "scatter", "whole force", "integration", "whole step"}
 
 
-def run(script, *arguments, path=None):
-    """Run a script as users do, small and fast; ``path`` comes before installed packages."""
-    paths = filter(None, [path and str(path), os.environ.get("PYTHONPATH")])
+@pytest.fixture
+def benchmarks(monkeypatch):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+
+
+@pytest.fixture
+def run(benchmarks, monkeypatch, capsys):
+    """Runs a script, small and fast, in this process, which has started Warp and compiled most kernels already."""
+
+    def run(script, *arguments):
+        monkeypatch.setattr(sys, "argv", [script, *map(str, arguments)])
+        monkeypatch.setattr(wp.config, "log_level", wp.config.log_level)  # which scripts change
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(BENCHMARKS / script), run_name="__main__")
+        said = capsys.readouterr()
+        return SimpleNamespace(returncode=ended.value.code or 0, stdout=said.out, stderr=said.err)
+
+    return run
+
+
+def run_apart(script, *arguments, path):
+    """Run a script as users do, in a process where the folder ``path`` comes before installed packages."""
+    paths = filter(None, [str(path), os.environ.get("PYTHONPATH")])
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
     command = [sys.executable, str(BENCHMARKS / script), *map(str, arguments)]
     here = Path(__file__).parent
@@ -45,12 +66,7 @@ def report(done, path):
     return found
 
 
-@pytest.fixture
-def benchmarks(monkeypatch):
-    monkeypatch.syspath_prepend(BENCHMARKS)
-
-
-def test_kernels(device, tmp_path):
+def test_kernels(run, device, tmp_path):
     path = tmp_path / "kernels.json"
     done = run("kernels.py", "--device", device, "--level", 3, "--rounds", 1, "--json", path)
     found = report(done, path)
@@ -80,7 +96,7 @@ def test_peers_that_are_not_there_are_left_out(device, tmp_path):
         (tmp_path / f"{name}.py").write_text(f"raise ImportError('no {name} here')\n")
     path = tmp_path / "peers.json"
     arguments = ["--device", device, "--level", 3, "--step-level", 3, "--rounds", 1, "--json", path]
-    done = run("peers.py", *arguments, path=tmp_path)
+    done = run_apart("peers.py", *arguments, path=tmp_path)
     found = report(done, path)
     assert "newton: left out (no newton here)" in done.stdout
     assert "mujoco: left out (no mujoco here)" in done.stdout
@@ -104,7 +120,7 @@ def test_peers_that_are_not_there_are_left_out(device, tmp_path):
         ("mujoco", ("flex",)),
     ],
 )
-def test_peers(package, rows, device, tmp_path):
+def test_peers(run, package, rows, device, tmp_path):
     if importlib.util.find_spec(package) is None:
         pytest.skip(f"{package} is not installed")
     path = tmp_path / "peers.json"
@@ -127,14 +143,10 @@ def test_peers(package, rows, device, tmp_path):
         ("--json", "nowhere/at/all.json", "nowhere/at"),
     ],
 )
-@pytest.mark.usefixtures("benchmarks")
-def test_bad_options_are_said_in_one_line(script, option, value, said, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", [script, option, value])
-    monkeypatch.setattr(wp.config, "log_level", wp.config.log_level)  # which the script changes
-    with pytest.raises(SystemExit) as ended:
-        runpy.run_path(str(BENCHMARKS / script), run_name="__main__")
-    assert ended.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
+def test_bad_options_are_said_in_one_line(run, script, option, value, said):
+    ended = run(script, option, value)
+    assert ended.returncode == 2
+    (line,) = ended.stderr.splitlines()
     assert line.startswith(f"{script}: error: ")
     assert said in line
 
@@ -201,7 +213,7 @@ def test_the_largest_stable_step_is_found(limit):
     assert found >= min(limit, LONGEST) / PRECISION
 
 
-def test_remesh(device, tmp_path):
+def test_remesh(run, device, tmp_path):
     path = tmp_path / "remesh.json"
     done = run("remesh.py", "--device", device, "--level", 6, "--rounds", 1, "--json", path)
     rows = report(done, path)["rows"]
@@ -217,7 +229,7 @@ def test_remesh(device, tmp_path):
         assert row["bisected"] >= {"doubled": 384}.get(row["stage"], 0)
 
 
-def test_states(device, tmp_path):
+def test_states(run, device, tmp_path):
     path = tmp_path / "states.json"
     done = run("states.py", "--device", device, "--quick", "--laws", "corotated", "neo-Hookean", "--json", path)
     found = report(done, path)
@@ -239,7 +251,7 @@ def test_states(device, tmp_path):
             assert row["flagged"] == 0.0
 
 
-def test_bodies(tmp_path):
+def test_bodies(run, tmp_path):
     """A body that is meshed, one that is refused, and an earlier run for comparison."""
     pytest.importorskip("trimesh")
     table, numbers = tmp_path / "bodies.md", tmp_path / "bodies.json"
@@ -258,14 +270,14 @@ def test_bodies(tmp_path):
     assert {"cube", "windpipe", "rough-ball-1-7-million"} <= set(listed)
 
 
-def test_dragging_changes_patches_and_no_recording():
+def test_dragging_changes_patches_and_no_recording(run):
     done = run("dragging.py", "--device", "cpu", "--level", "6")
     assert done.returncode == 0, done.stderr
     assert len(done.stdout.splitlines()) == 2 + 6
     assert "follow keyframes" in done.stdout
 
 
-def test_the_haptic_loop_is_timed(tmp_path):
+def test_the_haptic_loop_is_timed(run, tmp_path):
     done = run("haptics.py", "--device", "cpu", "--level", "3", "--seconds", "1", "--json", tmp_path / "a.json")
     assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "a.json").read_text(encoding="utf-8"))
@@ -275,7 +287,7 @@ def test_the_haptic_loop_is_timed(tmp_path):
     assert all(word in done.stdout for word in ("median", "99 %", "longest", "delay"))
 
 
-def test_preconditioners_are_compared(tmp_path):
+def test_preconditioners_are_compared(run, tmp_path):
     path = tmp_path / "solvers.json"
     done = run("solvers.py", "--device", "cpu", "--levels", 5, "--poisson", 0.3, "--json", path)
     assert done.returncode == 0, done.stderr

@@ -42,6 +42,7 @@ PATHS = {
     "muscle": (MUSCLE, wc.Corotated()),
     "muscle, leaf by leaf": (MUSCLE, wc.Corotated(subtrees=False)),
 }
+ON_GENERAL = ("neo-Hookean", "edge springs", "mass-spring", "corotated", "corotated, warm", "muscle")
 FOREST_ONLY = {name for name in PATHS if "shared" in name or "explicit" in name}
 
 
@@ -91,7 +92,13 @@ def energy_changes(mesh, material, model, speed, steps, device, parts=4):
     return np.array(changes)
 
 
-@pytest.mark.parametrize(("mesh", "path"), [case for case in CASES if case.values[0] != "forest"])
+#: Each path on the adaptive forest, and one of each kind on the general mesh.
+SHORT = [
+    case for case in CASES if case.values[0] == "adaptive" or case.values in {("general", path) for path in ON_GENERAL}
+]
+
+
+@pytest.mark.parametrize(("mesh", "path"), SHORT)
 def test_energy_is_kept(mesh, path, device):
     """Over 2,000 steps; if digits were lost, the slowest motion would have hundreds of times its energy by then."""
     changes = energy_changes(mesh, *PATHS[path], 1e-6, 2000, device)

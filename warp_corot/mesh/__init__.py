@@ -1,4 +1,4 @@
-"""Meshes: the forest of bisected tetrahedra, tetrahedra of any shape, and surfaces that go along with them."""
+"""Meshes: the forest of bisected tetrahedra, tetrahedra of any shape, and surfaces that follow them."""
 
 from warp_corot.mesh.surfaces.bound import BoundPoints, SurfaceMesh
 

@@ -1,9 +1,9 @@
-"""Bisection of tetrahedra in Maubach order, by the one rule everything else follows from.
+"""Bisection of tetrahedra in Maubach order: the rule from which everything else follows.
 
 A tetrahedron (x0, x1, x2, x3) of type t = level mod 3 is bisected at the midpoint z of its refinement edge x0-xk,
 k = 3 - t, into (x0 .. x(k-1), z, x(k+1) .. x3) and (x1 .. xk, z, x(k+1) .. x3) (Maubach 1995).
 
-A whole subtree of one type looks the same wherever it hangs: which leaf stands on which node is a table, and only its
+All subtrees below elements of one type look the same: a table says which node of which leaf is which, and only the
 nodes are data. ``Patch`` is that table.
 """
 
@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 IntArray = npt.NDArray[np.int32]
 
-#: Patches worked on at a time, so that what is read again is still in the cache.
+#: Patches that are computed at a time, so that what is read again is still in the cache.
 CHUNK = 4096
 
 
@@ -39,7 +39,7 @@ def children(tets: np.ndarray, middle: np.ndarray, kind: int) -> np.ndarray:
 
 
 def corner_leaves(level: int, depth: int) -> list[tuple[int, int]]:
-    """Where an element's four corners stand in the 2**(depth - level) leaves below it: for each a leaf and a place."""
+    """For each of an element's corners, a leaf among the 2**(depth - level) below it and the corner's place there."""
     found = []
     for place in range(4):
         leaf = 0
@@ -53,9 +53,9 @@ def corner_leaves(level: int, depth: int) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """The subtree below an element of one type, uniformly bisected: which of its nodes stand where.
+    """The uniformly bisected subtree below an element of one type, as a table of its nodes.
 
-    The nodes have numbers of their own, in the order in which the leaves first name them.
+    Nodes are numbered within the patch, in the order in which the leaves first name them.
 
     Attributes:
         corners: The element's own four nodes.
@@ -74,14 +74,14 @@ class Patch:
     def lattice_points(self, tets: IntArray) -> IntArray:
         """The patches' nodes below elements [n, 4], where a node's number is an affine function of its coordinates.
 
-        Then a midpoint is the mean of its ends, and nothing needs to be looked up.
+        A midpoint is then the mean of its ends, without a search.
         """
         points = np.empty((len(tets), self.node_count), np.int32)
         for start in range(0, len(tets), CHUNK):
             part = points[start : start + CHUNK]
             part[:, self.corners] = tets[start : start + CHUNK]
             for middle, a, b in self.middles:
-                # Half the difference, as the sum of two numbers may not fit.
+                # Half the difference, because the sum of two numbers may overflow.
                 part[:, middle] = part[:, a] + (part[:, b] - part[:, a]) // 2
         return points
 
@@ -107,12 +107,12 @@ def patch(kind: int, depth: int) -> Patch:
 
 
 def path_tetrahedra(cells: tuple[int, int, int], points: tuple[int, int, int]) -> IntArray:
-    """Six path (Kuhn) tetrahedra in each cube of a box, one for each order in which the axes are walked, int32 [n, 4].
+    """Six path (Kuhn) tetrahedra in each cube of a box, one for each order of the axes, int32 [n, 4].
 
     Args:
         cells: Number of cubes along x, y, z.
-        points: Number of grid points along x, y, z, which nodes are numbered by with z running fastest; a multiple of
-            cells, plus one.
+        points: Number of grid points along x, y, z; a multiple of ``cells``, plus one. Nodes are numbered by grid
+            points, z fastest.
     """
     walks = np.zeros((6, 4, 3), np.int64)
     for walk, order in zip(walks, itertools.permutations(range(3)), strict=True):

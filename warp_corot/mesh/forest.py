@@ -1,7 +1,7 @@
-"""The forest of bisected tetrahedra: a grid of cubes, six path tetrahedra each, every one the root of a binary tree.
+"""The forest of bisected tetrahedra: a grid of cubes with six path tetrahedra each, each the root of a binary tree.
 
 Tetrahedra are bisected by Maubach's rule (``bisection``; Maubach 1995; Tagawa et al. 2013). Vertices lie on an integer
-lattice. The tree knows every ancestor; the leaves are the mesh. All is built with array operations.
+lattice. The tree has every ancestor; the leaves are the mesh. Everything is built with array operations.
 """
 
 from __future__ import annotations
@@ -44,20 +44,20 @@ class TetForest(ForestArrays):
     Attributes:
         cells: Number of root cubes along x, y, z.
         cell_size: Edge length of a root cube [m].
-        origin: Position of the lattice's point (0, 0, 0) [m].
-        lattice: Lattice coordinates of the nodes, 2**16 intervals a cube edge, int32 [N, 3]. Where parts of the forest
+        origin: Position of the lattice point (0, 0, 0) [m].
+        lattice: Lattice coordinates of the nodes, 2**16 intervals per cube edge, int32 [N, 3]. If parts of the forest
             are void, corners of void or coarser tetrahedra that no leaf names follow the N nodes.
         node_ends: The two ends of the edge whose midpoint a node is, the lower number first; -1, -1 for corners of
             cubes; int32, as many as there are lattice points.
         tree: All tetrahedra of all levels.
         up_axis: "X", "Y" or "Z".
         phi: The body's signed function at all lattice points [m], negative inside, float32; None for a box.
-        fill: Share of each leaf's volume that the body takes, float64 [T]; None: all of it. Above one where a leaf has
-            taken over what a neighbour held too little of.
+        fill: Share of each leaf's volume that is inside the body, float64 [T]; None: all of it. It is above one if a
+            leaf took over the share of a neighbour that was left out.
         labels: Each leaf's label, its place in ``label_names`` plus one, 0 for none, int32 [T]; None: no labels.
-        node_labels: As ``labels``, at all lattice points, at points outside that of the nearest part of the body.
+        node_labels: The same at all lattice points; points outside have the label of the nearest part of the body.
         label_names: Names of the labels.
-        detail: The body's surface where it was looked at more closely than the mesh follows it; None: nowhere.
+        detail: The body's surface where it was resolved more finely than the mesh; None: nowhere.
     """
 
     @classmethod
@@ -77,10 +77,10 @@ class TetForest(ForestArrays):
             cell_size: Edge length of a root cube [m].
             level: How often every root is bisected, 0 to 48; three levels halve the edge length.
             origin: Lower corner of the box [m].
-            up_axis: Which axis points up where results are drawn.
+            up_axis: The axis that points up in drawings.
 
         Raises:
-            InputError: An argument is out of its range, or there would be 2**31 tetrahedra or more.
+            InputError: An argument is out of its range, or the mesh would have 2**31 tetrahedra or more.
         """
         cells, cell_size, level = checked_cells(cells), checked_cell_size(cell_size), checked_level(level, "level")
         if up_axis not in ("X", "Y", "Z"):
@@ -114,36 +114,40 @@ class TetForest(ForestArrays):
         sliver: float = 0.02,
         device: str | wp.Device | None = None,
     ) -> TetForest:
-        """A forest that follows a domain: fine where its surface is curved, without what lies outside.
+        """A forest that follows a domain: fine where its surface is curved, empty outside.
 
-        A tetrahedron is bisected while the surface inside it deviates from the linear interpolant by more than
-        ``surface_error``, judged at its edges' midpoints and one point more, where the domain's Lipschitz constant
-        does not rule a surface out; where labels vary in it; and where the user's functions ask for it. These and
-        labels are looked at in corners and centroids: details smaller than that need a ``min_level``.
+        A tetrahedron is bisected in three cases. First, while the surface inside it deviates from the linear
+        interpolant by more than ``surface_error``. That is measured at its edges' midpoints and at one more point,
+        unless the domain's Lipschitz constant excludes a surface. Second, where labels vary in it. Third, where the
+        user's functions ask for it. Labels and functions are evaluated at corners and centroids: smaller details need a
+        ``min_level``.
 
         Args:
-            domain: What to mesh.
-            cell_size: Edge length of a root cube [m]; None, with ``target_elements``: as suits these.
-            max_level: How often a root is bisected at most, up to 48; three levels halve the edge length. None: 12, or
-                as suits ``target_elements``.
-            surface_error: How far the surface may be from the domain's [m]; None: all of it at ``max_level``.
-            min_level: How often everything is bisected at least.
-            refine_where: Points [n, 3] [m] -> bool [n]: tetrahedra at such points are bisected to ``max_level``.
+            domain: The body.
+            cell_size: Edge length of a root cube [m]; None: chosen for ``target_elements``.
+            max_level: The most bisections of a root, up to 48; three levels halve the edge length. None: 12, or chosen
+                for ``target_elements``.
+            surface_error: The largest distance between the mesh's surface and the domain's [m]; None: the whole surface
+                is at ``max_level``.
+            min_level: The fewest bisections of every root.
+            refine_where: Points [n, 3] [m] -> bool [n]: tetrahedra at these points are bisected to ``max_level``.
             field: Points [n, 3] [m] -> numbers [n]: tetrahedra in which it varies by more than ``field_tolerance`` are
                 bisected.
             field_tolerance: In the field's unit.
-            target_elements: At most so many tetrahedra, and nearly as many: the body is looked at in a finer forest,
-                and the mesh is what follows it best with that number. Tetrahedra hold what they hold of the body there,
-                so parts thinner than one are not lost.
-            min_layers: With ``target_elements``: so many elements through the body's thickness, where there are enough.
-            detail: Without: to how many levels below ``max_level`` the body is looked at, where its surface is not
-                what the tetrahedra there say. 0: what lies between the mesh's nodes is not seen.
-            sliver: Tetrahedra of which the body takes less than this share are left out, and what they hold is counted
-                to a neighbour, so that no node is left with next to no stiffness.
-            device: Where to work; None: where the domain is.
+            target_elements: The most tetrahedra; the mesh has nearly that number. The body is sampled in a finer
+                forest, and the mesh is the one with this number that follows it best. Its tetrahedra know their volume
+                inside the body from that forest, so parts thinner than a tetrahedron are not lost.
+            min_layers: With ``target_elements``: the fewest elements through the body's thickness, if the number
+                allows.
+            detail: Without ``target_elements``: how many levels below ``max_level`` the body is sampled where the
+                surface differs from the tetrahedra's. 0: details between the mesh's nodes are lost.
+            sliver: Tetrahedra with less than this share inside the body are left out, and their volume is added to a
+                neighbour's, so that no node has almost no stiffness.
+            device: The device that does the work; None: the domain's.
 
         Raises:
-            InputError: An argument is out of its range, the body comes out empty, or there is no mesh so coarse.
+            InputError: An argument is out of its range, no tetrahedron holds any of the body, or even the coarsest mesh
+                has more elements.
         """
         from warp_corot.domain import Domain
         from warp_corot.mesh.growing.from_domain import mesh_domain
@@ -168,18 +172,17 @@ class TetForest(ForestArrays):
         )
 
     def refine(self, leaves: npt.ArrayLike) -> TetForest:
-        """A forest in which the chosen leaves are bisected, and as many others as conformity asks for.
+        """A forest in which the chosen leaves are bisected, and as many others as conformity needs.
 
-        A leaf with an active midpoint on any edge must be bisected itself, until none has (the closure of the set of
-        midpoints). Nodes keep their numbers; new ones are appended. What was void stays void, the surface stays where
-        it is, and both halves of a leaf have its share of the body and its label; for more detail, mesh
-        the domain again.
+        A leaf with an active midpoint on any edge is bisected, too, until no leaf has one (the closure of the set of
+        midpoints). Nodes keep their numbers; new ones are appended. Void tetrahedra stay void, the surface does not
+        change, and both halves of a leaf have its filled share and its label; for more detail, mesh the domain again.
 
         Args:
             leaves: Mask bool [T] or indices into the leaves.
 
         Raises:
-            InputError: Not a mask or indices of leaves, or a leaf already at the deepest level.
+            InputError: The argument is no mask or list of leaves, or a leaf is already at the deepest level.
         """
         chosen = checked_indices(leaves, len(self.tets), "leaf")
         return refined(self, chosen)
@@ -191,33 +194,33 @@ class TetForest(ForestArrays):
             points: [n, 3] [m].
 
         Returns:
-            Leaves int32 [n], and barycentric weights of their nodes float64 [n, 4], some negative where the point lies
+            Leaves int32 [n], and barycentric weights of their nodes float64 [n, 4]; some are negative if the point is
             outside the leaf.
 
         Raises:
-            InputError: Not [n, 3], or not finite.
+            InputError: The points are not [n, 3], or not finite.
         """
         return embed(self, np.asarray(points))
 
     def bind(self, points: npt.ArrayLike, triangles: npt.ArrayLike | None = None) -> BoundPoints:
-        """Points, or with triangles [F, 3] a surface, of the user's own that go along with the mesh.
+        """Bind your own points, or with triangles [F, 3] a surface, to the mesh, so that they follow it.
 
         Raises:
-            InputError: As `embed`, or triangles of points that are not there.
+            InputError: As for `embed`, or triangles name points that do not exist.
         """
         elements, weights = self.embed(points)
         return bound(np.asarray(points), self.tets[elements], weights, triangles)
 
     def surface(self) -> SurfaceMesh:
-        """The marched surface of a mesh made from a domain, closed; of any other its boundary.
+        """The closed marched surface of a mesh made from a domain; the boundary of any other mesh.
 
-        Points sit on edges between nodes inside and outside. Where the outer end went with an element that holds too
-        little, the point is bound to the nodes of the nearest element.
+        Points are on edges between nodes inside and outside. If the outer end belonged to an element that was left out,
+        the point is bound to the nodes of the nearest element.
         """
         return surface(self)
 
     def separating_surface(self) -> SurfaceMesh:
-        """The surfaces between labels and around them, with ``sides``; `SurfaceMesh.of_label` gives each alone.
+        """The surfaces between labels and around them, with ``sides``; `SurfaceMesh.of_label` gives a single label's.
 
         Raises:
             InputError: The mesh has no labels.
@@ -225,13 +228,13 @@ class TetForest(ForestArrays):
         return separating_surface(self)
 
     def pieces(self) -> np.ndarray:
-        """Which piece each leaf is in, int32 [T]: leaves that hang together by faces; the largest piece is 0."""
+        """The piece of each leaf, int32 [T]: leaves connected by faces are one piece; the largest is 0."""
         return pieces_of(self.tets)
 
     def largest_piece(self) -> TetForest:
-        """The mesh without what hangs together with its largest piece by no face, surface and all."""
+        """The mesh, with its surface, without leaves that no faces connect to the largest piece."""
         return largest_piece(self)
 
     def summary(self) -> list[str]:
-        """What a user should know of the mesh, line by line: counts by level and type, volume, labels, pieces."""
+        """A summary of the mesh, line by line: counts by level and type, volume, labels, pieces."""
         return summary(self)

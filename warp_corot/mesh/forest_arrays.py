@@ -1,4 +1,4 @@
-"""The arrays that a forest of bisected tetrahedra is made of, and what follows from them without a search."""
+"""The arrays of a forest of bisected tetrahedra, and what follows from them without a search."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class ForestArrays:
-    """What refining, embedding and drawing a forest work on; ``TetForest``, which users hold, says what each is."""
+    """The arrays that refinement, embedding and drawing use; ``TetForest``, which users hold, documents them."""
 
     cells: tuple[int, int, int]
     cell_size: float
@@ -49,7 +49,7 @@ class ForestArrays:
 
     @cached_property
     def node_count(self) -> int:
-        """Number of nodes N, those that leaves name."""
+        """Number of nodes N that leaves name."""
         return len(self.lattice) if isinstance(self.tree, UniformTree) else int(self.tets.max()) + 1
 
     @cached_property
@@ -59,19 +59,19 @@ class ForestArrays:
 
     @cached_property
     def levels(self) -> np.ndarray:
-        """Level of each leaf, int32 [T]; of uniform leaves one number seen T times, which takes no memory."""
+        """Level of each leaf, int32 [T]; for uniform leaves, a broadcast number that takes no memory."""
         return self.tree.leaf_levels
 
     @cached_property
     def volumes(self) -> np.ndarray:
-        """Rest volume of each leaf [m^3], float64 [T], of uniform leaves as ``levels``."""
+        """Rest volume of each leaf [m^3], float64 [T]; for uniform leaves broadcast, as ``levels``."""
         if isinstance(self.tree, UniformTree):
             return np.broadcast_to(volume_shares(self.tree.depth) * self.cell_size**3, self.levels.shape)
         return volume_shares(self.levels) * self.cell_size**3
 
     def ancestors(self, level: int) -> np.ndarray:
-        """For each leaf the highest tetrahedron above it, or the leaf itself, that is not above ``level`` and whose
-        corners are nodes; indices into the tree, int32 [T]. But for the rim of a body it is the one at ``level``."""
+        """For each leaf, the highest ancestor (or the leaf itself) that is not above ``level`` and whose corners are
+        nodes; indices into the tree, int32 [T]. Except at the border of a body, it is the ancestor at ``level``."""
         if self.node_count == len(self.lattice):
             return self.tree.ancestors(self.tree.leaves, level)
         tree, found = self.tree, self.tree.leaves.copy()
@@ -87,7 +87,7 @@ class ForestArrays:
         return found
 
     def elements_of(self, label: str) -> np.ndarray:
-        """Leaves whose label this is, bool [T].
+        """Leaves with this label, bool [T].
 
         Raises:
             InputError: The mesh has no label of this name.
@@ -97,7 +97,7 @@ class ForestArrays:
         return np.equal(self.labels, self.label_names.index(label) + 1)
 
     def nodes_of(self, label: str) -> np.ndarray:
-        """Nodes of the leaves whose label this is, bool [N]; nodes on a border belong to both sides.
+        """Nodes of the leaves with this label, bool [N]; nodes on a border belong to both sides.
 
         Raises:
             InputError: The mesh has no label of this name.

@@ -1,4 +1,4 @@
-"""The integer lattice that vertices of a forest lie on, and the cubes and levels that it has room for."""
+"""The integer lattice of a forest's vertices, and the cubes and levels for which it has room."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number
 from warp_corot.kernels.tables.shapes import VOLUME
 
-#: A root cube has 2**LATTICE_BITS lattice intervals a side, so levels may go to 3 * LATTICE_BITS.
+#: A root cube has 2**LATTICE_BITS lattice intervals a side, so levels go up to 3 * LATTICE_BITS.
 LATTICE_BITS = 16
 MAX_LEVEL = 3 * LATTICE_BITS
 
@@ -17,16 +17,16 @@ MAX_CELLS = 2 ** (31 - LATTICE_BITS) - 1
 
 
 def volume_shares(level: np.ndarray | int) -> np.ndarray:
-    """Volume of tetrahedra of these levels over that of a root cube."""
+    """Volume of tetrahedra of these levels over the volume of a root cube."""
     all_levels = np.arange(MAX_LEVEL + 1)
     return (0.125 ** (all_levels // 3) * np.array(VOLUME)[all_levels % 3])[level]
 
 
 def checked_level(level: Any, name: str) -> int:
-    """A level that the lattice has room for.
+    """A level for which the lattice has room.
 
     Raises:
-        InputError: It is none.
+        InputError: It is no such level.
     """
     try:
         found = int(level)
@@ -38,10 +38,10 @@ def checked_level(level: Any, name: str) -> int:
 
 
 def check_levels(min_level: Any, max_level: Any) -> None:
-    """See that two levels, or None where one is left open, are in order.
+    """Check that two levels are in order; None leaves one open.
 
     Raises:
-        InputError: One of them is no level, or the first is above the second.
+        InputError: One is no level, or the first is larger than the second.
     """
     levels = {"min_level": min_level, "max_level": max_level}
     found = [checked_level(level, name) for name, level in levels.items() if level is not None]
@@ -53,7 +53,7 @@ def checked_cells(cells: Any) -> tuple[int, int, int]:
     """Numbers of root cubes along x, y, z.
 
     Raises:
-        InputError: They are not three that the lattice has room for.
+        InputError: They are not three numbers for which the lattice has room.
     """
     counts = np.asarray(cells)
     whole = counts.shape == (3,) and np.issubdtype(counts.dtype, np.integer)

@@ -8,7 +8,7 @@ from .tree import LIVE, VOID, Tree
 
 
 def in_order_of_leaves(tree: Tree) -> np.ndarray:
-    """Nodes that live leaves name, in the order in which they first do: neighbours stay neighbours."""
+    """Nodes that live leaves name, in the order in which they first name them: neighbours stay neighbours."""
     touched = tree.leaf_tets.ravel()
     turn = np.arange(len(touched), dtype=np.int64)
     first = np.empty(int(touched.max()) + 1, np.int64)
@@ -18,7 +18,7 @@ def in_order_of_leaves(tree: Tree) -> np.ndarray:
 
 
 def with_virtual(real: np.ndarray, tree: Tree, lattice: np.ndarray) -> np.ndarray:
-    """The given nodes, and behind them all others that the tree names, in the order of their lattice points."""
+    """The given nodes, followed by all others that the tree names, in the order of their lattice points."""
     named = np.zeros(len(lattice), bool)
     named[tree.tets] = True
     named[real] = False
@@ -27,7 +27,7 @@ def with_virtual(real: np.ndarray, tree: Tree, lattice: np.ndarray) -> np.ndarra
 
 
 def renumbered(order: np.ndarray, ends: np.ndarray, tree: Tree) -> tuple[np.ndarray, Tree]:
-    """Ends and tree when the node that was ``order[i]`` is node i, and nodes that are not in it are gone."""
+    """Ends and tree after node ``order[i]`` becomes node i; nodes that are not in ``order`` disappear."""
     number = np.full(len(ends), -1, np.int32)
     number[order] = np.arange(len(order), dtype=np.int32)
     moved = ends[order]
@@ -37,14 +37,14 @@ def renumbered(order: np.ndarray, ends: np.ndarray, tree: Tree) -> tuple[np.ndar
 
 
 def pruned(tree: Tree, empty: np.ndarray) -> tuple[Tree, np.ndarray]:
-    """The tree without what lies below tetrahedra that hold nothing.
+    """The tree without the descendants of tetrahedra that hold nothing.
 
     Args:
         tree: Its leaves are live or void.
         empty: Which void leaves hold nothing at all, bool [M]; two of one parent become one.
 
     Returns:
-        The tree, and which of the old tetrahedra are in it, ascending.
+        The tree, and the old tetrahedra that are in it, ascending.
     """
     first_child, empty = tree.first_child.copy(), empty.copy()
     inner = np.flatnonzero(first_child >= 0)

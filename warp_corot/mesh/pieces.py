@@ -1,4 +1,4 @@
-"""The pieces of a mesh, wherever they are counted, held or kept."""
+"""The pieces of a mesh."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from warp_corot.mesh.growing.cut import face_pairs
 
 
 def pieces_of(tets: npt.NDArray[np.integer]) -> npt.NDArray[np.int32]:
-    """Which piece each element is in, int32 [T]; the one with most elements is number 0.
+    """The piece of each element, int32 [T]; the piece with most elements has the number 0.
 
-    Elements that share a face are of one piece. Parts that meet in a node or an edge alone are pieces of their own, as
-    one would turn about it.
+    Elements that share a face belong to one piece. Parts that meet only in a node or an edge are different pieces,
+    because one can rotate about it.
 
     Args:
         tets: Nodes of each element [T, 4].

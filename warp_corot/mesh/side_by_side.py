@@ -1,4 +1,4 @@
-"""Launches on all cores of a CPU: Warp's kernels run on one, but parts of a launch may run side by side."""
+"""Launches on all cores of a CPU: Warp runs a kernel on one core, but parts of a launch can run in parallel."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from concurrent.futures import ThreadPoolExecutor
 
 import warp as wp
 
-#: Fewer threads of a kernel than these are not worth a second core.
+#: A kernel with fewer threads is not worth a second core.
 LEAST = 8192
-#: Parts for each core, as some take longer than others.
+#: Parts for each core, because some take longer than others.
 PARTS = 4
 
 
 def in_parts(device: wp.Device, count: int, work: Callable[[int, int], None]) -> None:
-    """Have work done on numbers from 0 to ``count``: on a CPU in parts, on all its cores; otherwise at once.
+    """Do work on the numbers from 0 to ``count``: on a CPU in parts on all its cores, elsewhere at once.
 
     Args:
-        device: Where the work launches kernels. While one runs on the CPU, Python is free for other threads.
-        count: Of threads of a kernel.
-        work: Called with where a part starts and where it ends; parts must not depend on one another.
+        device: The device of the launches. While a kernel runs on the CPU, Python is free for other threads.
+        count: The number of threads of the kernel.
+        work: Called with the start and the end of a part; parts must not depend on one another.
     """
     if not count:
         return

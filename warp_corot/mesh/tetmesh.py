@@ -1,4 +1,4 @@
-"""General tetrahedral meshes: any shapes, a rest matrix each."""
+"""General tetrahedral meshes: tetrahedra of any shape, each with a rest matrix."""
 
 from __future__ import annotations
 
@@ -19,37 +19,37 @@ from .surfaces.bound import BoundPoints, bound
 from .surfaces.boundary import signed_volumes
 from .surfaces.locating import embed_in_tets
 
-#: A tetrahedron of less volume than this times its longest edge cubed cannot be told from a flat one in float32.
+#: In float32, a tetrahedron with less volume than this times its longest edge cubed looks flat.
 FLAT = 1e-7
 
 
 class TetMesh:
     """Tetrahedra of any shape.
 
-    Wrongly wound tetrahedra (negative volume) are turned round by exchanging their last two nodes; ``repaired`` says
-    how many. Nodes that no tetrahedron names are kept, in their place, and stay at rest.
+    Mirrored tetrahedra (negative volume) are repaired by exchanging their last two nodes; ``repaired`` says how many.
+    Nodes that no tetrahedron names are kept and stay at rest.
 
     Args:
         points: Rest positions [m], [N, 3].
         tets: Node indices, [T, 4].
-        up_axis: "X", "Y" or "Z": which axis points up where results are drawn.
+        up_axis: "X", "Y" or "Z": the axis that points up in drawings.
         scale: Factor by which the points are multiplied.
         labels: Each tetrahedron's region, its place in ``label_names`` plus one, 0 for none, [T]; None: no regions.
         label_names: Names of the regions.
-        node_sets: Nodes with a name, masks bool [N] or indices; ``SoftBody.fix`` and the like take the names.
+        node_sets: Named sets of nodes, masks bool [N] or indices; ``SoftBody.fix`` and other methods take the names.
 
     Attributes:
         points: float64 [N, 3] [m].
         tets: int32 [T, 4], positively oriented.
-        repaired: Number of tetrahedra that were turned round.
+        repaired: Number of mirrored tetrahedra that were repaired.
         up_axis: As given.
         labels: int32 [T] or None, as given.
         label_names: As given.
         node_sets: Masks bool [N] by name.
 
     Raises:
-        InputError: Wrong shapes, non-finite coordinates, indices out of range, or a degenerate tetrahedron; the message
-            names the first one.
+        InputError: An array has the wrong shape, a coordinate is not finite, an index is out of range, or a tetrahedron
+            is degenerate; the message names the first one.
     """
 
     def __init__(
@@ -113,23 +113,24 @@ class TetMesh:
         up_axis: str | None = None,
         regions: str | None = None,
     ) -> TetMesh:
-        """Read the cells with volume of a file: USD (TetMesh, or Mesh with ``tetraIndices``), VTK, Gmsh, Abaqus, Medit,
-        TetGen, NetGen and whatever else meshio reads; or of ``warp:bear``.
+        """Read the volume cells of a file: USD (TetMesh, or Mesh with ``tetraIndices``), VTK, Gmsh, Abaqus, Medit,
+        TetGen, NetGen and other formats of meshio; or of ``warp:bear``.
 
-        Hexahedra, wedges and pyramids become tetrahedra that fit one another; cells of higher order are taken by their
-        corners. Physical groups, sets and cell data become ``labels``; sets of nodes, groups of points, curves and
-        surfaces, and point data of few whole numbers ``node_sets``.
+        Hexahedra, wedges and pyramids become conforming tetrahedra; cells of higher order become tetrahedra of their
+        corners. Physical groups, sets and cell data become ``labels``. Sets of nodes, groups of points, curves and
+        surfaces, and point data with few different whole numbers become ``node_sets``.
 
         Args:
             path: File, or the name of an asset.
-            scale: Factor by which the points are multiplied, after the unit has been turned into metres.
-            unit: Of the coordinates, any length such as "mm" or "3.2cm", or metres as a number. None: what the file
-                says, metres if it says nothing.
-            up_axis: "X", "Y" or "Z". None: what the file says, Z if it says nothing.
+            scale: Factor by which the points are multiplied, after conversion to metres.
+            unit: The unit of the coordinates, any length such as "mm" or "3.2cm", or metres as a number. None: the
+                file's unit, or metres.
+            up_axis: "X", "Y" or "Z". None: the file's axis, or Z.
             regions: Name of the file's array that numbers regions; None: the likeliest.
 
         Raises:
-            InputError: No such file, unknown format, no such cells in it, or a mesh that cannot be simulated.
+            InputError: The file does not exist, its format is unknown, it has no volume cells, or its mesh cannot be
+                simulated.
         """
         from warp_corot.io.read.tetrahedra import load_tets
 
@@ -170,25 +171,25 @@ class TetMesh:
         return found
 
     def embed(self, points: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """The tetrahedron that holds each point, or the one behind the nearest face, and the point's place in it.
+        """The tetrahedron that holds each point, or the one behind the nearest face, and the point's weights in it.
 
         Args:
             points: [n, 3] [m].
 
         Returns:
-            Tetrahedra int32 [n], and barycentric weights of their nodes float64 [n, 4], some negative where the point
-            lies outside.
+            Tetrahedra int32 [n], and barycentric weights of their nodes float64 [n, 4]; some are negative if the point
+            is outside.
 
         Raises:
-            InputError: Not [n, 3], or not finite.
+            InputError: The points are not [n, 3], or not finite.
         """
         return embed_in_tets(self.points, self.tets, np.asarray(points))
 
     def bind(self, points: npt.ArrayLike, triangles: npt.ArrayLike | None = None) -> BoundPoints:
-        """Points, or with triangles [F, 3] a surface, of the user's own that go along with the mesh.
+        """Bind your own points, or with triangles [F, 3] a surface, to the mesh, so that they follow it.
 
         Raises:
-            InputError: As `embed`, or triangles of points that are not there.
+            InputError: As for `embed`, or triangles name points that do not exist.
         """
         elements, weights = self.embed(points)
         return bound(np.asarray(points), self.tets[elements], weights, triangles)

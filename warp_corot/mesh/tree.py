@@ -1,4 +1,4 @@
-"""The trees of a forest: every tetrahedron of every level, stored or, where all leaves are alike, computed."""
+"""The trees of a forest: every tetrahedron of every level, stored or, if all leaves have one level, computed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from .bisection import corner_leaves
 
-#: What stands in place of a first child where there is none: a leaf of the mesh, or a leaf outside the body.
+#: In place of a first child: a leaf of the mesh, or a leaf outside the body.
 LIVE = -1
 VOID = -2
 
@@ -37,7 +37,7 @@ class Tree:
         inner = np.flatnonzero(self.first_child >= 0)
         inner = inner[np.argsort(self.level[inner], kind="stable")]
         by_level = np.split(inner, np.cumsum(np.bincount(self.level[inner])))
-        # How many leaves there are below each element, from the bottom up; then where the first of them stands.
+        # The number of leaves below each element, from the bottom up; then the place of the first of them.
         count = (self.first_child == LIVE).astype(np.int32)
         for elements in reversed(by_level):
             first = self.first_child[elements]
@@ -65,18 +65,18 @@ class Tree:
         return self.level[self.leaves]
 
     def rows(self, elements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes, int32 [n, 4], and level, int32 [n], of the elements of these indices."""
+        """Nodes, int32 [n, 4], and levels, int32 [n], of the elements with these indices."""
         return self.tets[elements], self.level[elements]
 
     def above(self, elements: np.ndarray, steps: int) -> np.ndarray:
-        """The ancestor so many levels above each element, -1 where it would be above a root; int32."""
+        """The ancestor a number of levels above each element, -1 if it would be above a root; int32."""
         found = np.array(elements, dtype=np.int32)
         for _ in range(steps):
             found = np.where(found >= 0, self.parent[found], np.int32(-1))
         return found
 
     def ancestors(self, elements: np.ndarray, level: int) -> np.ndarray:
-        """The ancestor at ``level`` of each element, or the element itself where it lies above that level; int32."""
+        """The ancestor at ``level`` of each element, or the element itself if it is above that level; int32."""
         found = np.array(elements, dtype=np.int32)
         below = np.flatnonzero(self.level[found] > level)
         while len(below):
@@ -86,11 +86,10 @@ class Tree:
 
 
 class UniformTree(Tree):
-    """A tree whose leaves are all of one level: levels stand one after the other, each in tree order.
+    """A tree whose leaves all have one level: its elements are ordered by level, and each level is in tree order.
 
-    So parents, children and levels are arithmetic, and an ancestor's corners are corners of its leaves. Only the leaves
-    are stored; the attributes of ``Tree`` are made when they are first asked for. Indices are int64 where there are
-    2**31 tetrahedra and more.
+    So parents, children and levels are computed, and an ancestor's corners are corners of its leaves. Only the leaves
+    are stored; the attributes of ``Tree`` are made on first use. Indices are int64 from 2**31 tetrahedra on.
 
     Args:
         leaf_tets: The leaves' nodes in Maubach order, in tree order, int32 [T, 4].
@@ -165,7 +164,7 @@ class UniformTree(Tree):
         return self.above(elements, max(own - level, 0))
 
     def _common_level(self, elements: np.ndarray) -> int | None:
-        """The level that all elements are of, if they are."""
+        """The common level of all elements, if there is one."""
         if not len(elements):
             return 0
         first, last = np.searchsorted(self.starts, [elements.min(), elements.max()], side="right") - 1

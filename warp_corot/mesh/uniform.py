@@ -1,8 +1,8 @@
 """A box of root cubes bisected uniformly, without a search.
 
 All vertices lie on a grid, and a vertex's place on it is an affine function of its coordinates: a midpoint's place is
-the mean of its ends' places. So the leaves come out of the roots by tables of whole patches of six levels, and only
-the last patches' nodes, about one in seven of what the leaves name, are numbered.
+the mean of its ends' places. So tables of whole patches of six levels give the leaves from the roots, and only the last
+patches' nodes, about one in seven of the leaves' entries, are numbered.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy as np
 
 from .bisection import CHUNK, IntArray, Patch, patch, path_tetrahedra
 
-#: Levels a patch spans: 64 leaves on 35 or 37 nodes.
+#: Levels of a patch: 64 leaves on 35 or 37 nodes.
 PATCH_DEPTH = 6
 
 
 def halvings(level: int) -> int:
-    """How often a cube's edge is halved until all vertices of a level are on the grid."""
+    """How often a cube's edge must be halved for all vertices of a level to be on the grid."""
     return -(-level // 3)
 
 
@@ -36,7 +36,7 @@ def uniform_leaves(cells: tuple[int, int, int], level: int) -> tuple[IntArray, I
     patches: list[tuple[Patch, IntArray]] = []
     at = 0
     while at < level or not patches:
-        # The odd levels first, so that the last patches, which are nearly all, are whole ones.
+        # The remaining levels come first, so that the last patches, which are nearly all, are whole.
         depth = (level - at) % PATCH_DEPTH or min(level, PATCH_DEPTH)
         if patches:
             tets = patches[-1][0].leaves_of(patches[-1][1])
@@ -61,7 +61,7 @@ def _numbered(touched: IntArray, place_count: int) -> tuple[IntArray, IntArray]:
     """Places numbered in the order in which they are first named.
 
     Returns:
-        The number of each place, int32 [place_count] (anything where none names it), and the place of each number.
+        The number of each place, int32 [place_count] (undefined if nothing names it), and the place of each number.
     """
     number = np.empty(place_count, np.int32)
     turn = np.arange(len(touched), dtype=np.int32)

@@ -1,4 +1,4 @@
-"""What a forest made from a domain is as a body: its surfaces, and its pieces."""
+"""The surfaces and pieces of a forest made from a domain."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def surface(forest: ForestArrays) -> SurfaceMesh:
         found = _embedded(forest, forest.detail.surface())
     else:
         found = _on_nodes(forest, marched(forest.lattice_points, _all_cut(forest), forest.phi))
-    # What is thinner than all elements and between their nodes is not met by any.
+    # Parts that are thinner than all elements and lie between their nodes meet no edge.
     return found if len(found.triangles) else boundary_surface(forest)
 
 
@@ -94,7 +94,7 @@ def summary(forest: ForestArrays) -> list[str]:
 
 
 def _all_cut(forest: ForestArrays) -> np.ndarray:
-    """Nodes of all leaves that hold something, also of those given up for holding too little, int32 [n, 4]."""
+    """Nodes of all leaves that hold something, also of those that were left out, int32 [n, 4]."""
     assert forest.phi is not None
     tets = forest.tree.tets[forest.tree.first_child < 0]
     return tets[(forest.phi[tets] < 0).any(axis=1)]
@@ -107,13 +107,13 @@ def _embedded(forest: ForestArrays, found: SurfaceMesh) -> SurfaceMesh:
 
 
 def _within(forest: ForestArrays, detail: Detail, kept: np.ndarray) -> Detail:
-    """What of a detail is in elements, or nearest to them, that are in a mask bool [T]."""
+    """The part of a detail that is in, or nearest to, the elements in a mask bool [T]."""
     elements, _ = embed(forest, detail.points[detail.tets].mean(axis=1))
     return Detail.of(detail.points, detail.tets[kept[elements]], detail.phi, detail.labels)
 
 
 def _on_nodes(forest: ForestArrays, found: SurfaceMesh) -> SurfaceMesh:
-    """The surface with points that are bound to no nodes of the mesh bound to the nearest element's."""
+    """The surface, in which points without nodes of the mesh are bound to those of the nearest element."""
     lost = np.flatnonzero(((found.nodes >= forest.node_count) & (found.weights != 0)).any(axis=1))
     unused = found.nodes >= forest.node_count
     nodes = np.where(unused, found.nodes.min(axis=1, keepdims=True), found.nodes)
@@ -125,7 +125,7 @@ def _on_nodes(forest: ForestArrays, found: SurfaceMesh) -> SurfaceMesh:
 
 
 def boundary_surface(mesh: Any, of: npt.NDArray[np.bool_] | None = None) -> SurfaceMesh:
-    """The boundary of any tetrahedral mesh, or of some of its elements, its points bound to the nodes that they are."""
+    """The boundary of any tetrahedral mesh, or of some of its elements; each point is bound to its own node."""
     faces, _ = boundary_faces(mesh.tets if of is None else mesh.tets[of], mesh.points)
     used, triangles = np.unique(faces, return_inverse=True)
     weights = np.tile([1.0, 0.0, 0.0, 0.0], (len(used), 1))

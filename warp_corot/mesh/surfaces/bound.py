@@ -1,4 +1,4 @@
-"""Points and surfaces that go along with a mesh: each bound to up to four of its nodes."""
+"""Points and surfaces that follow a mesh: each point is bound to up to four of its nodes."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class BoundPoints:
 
     Attributes:
         points: Rest positions [m], float64 [V, 3].
-        nodes: The mesh's nodes that each point is bound to, int32 [V, 4].
-        weights: How much each counts, float64 [V, 4]; they sum to one.
+        nodes: The nodes to which each point is bound, int32 [V, 4].
+        weights: Weights of these nodes, float64 [V, 4]; they sum to one.
     """
 
     points: np.ndarray
@@ -30,12 +30,12 @@ class BoundPoints:
     weights: np.ndarray
 
     def moved(self, displacements: npt.ArrayLike) -> np.ndarray:
-        """Positions [m], float64 [V, 3], when the mesh's nodes are displaced by [N, 3] [m]."""
+        """Positions [m], float64 [V, 3], after displacements [N, 3] of the mesh's nodes [m]."""
         u = np.asarray(displacements, dtype=np.float64)
         return self.points + np.einsum("vn,vnc->vc", self.weights, u[self.nodes])
 
     def on_device(self, device: str | wp.Device | None = None) -> DeviceBinding:
-        """What moves the points on a device."""
+        """The binding that moves the points on a device."""
         return DeviceBinding(self, wp.get_device(device))
 
 
@@ -45,7 +45,7 @@ class SurfaceMesh(BoundPoints):
 
     Attributes:
         triangles: int32 [F, 3], wound counter-clockwise seen from outside.
-        sides: Labels behind and in front of each triangle, int32 [F, 2], 0 outside; None where there is one body only.
+        sides: Labels behind and in front of each triangle, int32 [F, 2], 0 outside; None for a single body.
     """
 
     triangles: np.ndarray
@@ -53,14 +53,14 @@ class SurfaceMesh(BoundPoints):
 
     @property
     def ends(self) -> np.ndarray:
-        """The two nodes of the edge that a point of a marched surface sits on, int32 [V, 2], twice the same where it is
-        a node; its place is ``weights[:, 1]`` of the way. Points on an edge that is no part of the mesh (of an element
-        that held too little) are bound to four nodes of the nearest element instead."""
+        """The two nodes of the edge on which a point of a marched surface lies, int32 [V, 2]; the same node twice if the
+        point is a node. The point is at the share ``weights[:, 1]`` of the edge. Points on edges of elements that were
+        left out are bound to four nodes of the nearest element instead."""
         return self.nodes[:, :2]
 
     @cached_property
     def normals(self) -> np.ndarray:
-        """Unit normals of the points at rest, outward, weighted by the triangles' areas, float64 [V, 3]."""
+        """Outward unit normals of the points at rest, weighted by the triangles' areas, float64 [V, 3]."""
         return vertex_normals(self.points, self.triangles)
 
     @property
@@ -70,26 +70,26 @@ class SurfaceMesh(BoundPoints):
 
     @property
     def volume(self) -> float:
-        """What the surface encloses [m^3]."""
-        # About its own middle, so that a body far from the origin loses no digits.
+        """The enclosed volume [m^3]."""
+        # About its own centre, so that a body far from the origin loses no digits.
         x = self.points - self.points.mean(axis=0)
         return float(np.einsum("fc,fc->", x[self.triangles[:, 0]], self._doubled_areas) / 6.0)
 
     @property
     def euler_characteristic(self) -> int:
-        """Vertices less edges plus triangles: 2 for a ball, 0 for a torus."""
+        """Vertices minus edges plus triangles: 2 for a ball, 0 for a torus."""
         edges = np.sort(np.concatenate([self.triangles[:, [i, j]] for i, j in ((0, 1), (1, 2), (2, 0))]), axis=1)
         used = len(np.unique(self.triangles))
         return used - len(np.unique(edges, axis=0)) + len(self.triangles)
 
     def of_label(self, label: int) -> SurfaceMesh:
-        """The closed surface around one label alone, out of a surface with ``sides``.
+        """The closed surface around one label, from a surface with ``sides``.
 
         Args:
             label: Its number, its place in ``label_names`` plus one.
 
         Raises:
-            InputError: The surface has no sides, or none of that label.
+            InputError: The surface has no sides, or none with that label.
         """
         if self.sides is None:
             raise InputError("this surface is around one body; surfaces between labels come from separating_surface()")
@@ -109,7 +109,7 @@ class SurfaceMesh(BoundPoints):
 
 
 class DeviceBinding:
-    """Bound points on a device: their positions and, of a surface, their normals, brought up to date by kernels.
+    """Bound points on a device: kernels update their positions and, for a surface, their normals.
 
     Attributes:
         positions: [m], vec3 [V].
@@ -129,7 +129,7 @@ class DeviceBinding:
             self.normals = wp.array(bound.normals, dtype=wp.vec3, device=device)
 
     def update(self, displacements: wp.array) -> None:
-        """Move the points, and turn the normals, with displacements of the nodes [m], vec3 [N] on the same device."""
+        """Move the points and normals with displacements of the nodes [m], vec3 [N] on the same device."""
         inputs = [self.rest, self.nodes, self.weights, displacements]
         wp.launch(kernels.move_points, len(self.rest), inputs, [self.positions], device=self.device)
         if self.triangles is not None:
@@ -151,14 +151,14 @@ def vertex_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def bound(points: np.ndarray, nodes: np.ndarray, weights: np.ndarray, triangles: npt.ArrayLike | None) -> BoundPoints:
-    """Points, or with triangles [F, 3] a surface, of a user's own.
+    """A user's points, or with triangles [F, 3] a surface.
 
     Args:
         points: Rest positions [m], [V, 3].
         nodes, weights: See ``BoundPoints``.
 
     Raises:
-        InputError: Triangles of another shape, or of points that are not there.
+        InputError: The triangles have another shape, or name points that do not exist.
     """
     rest = np.array(points, dtype=np.float64)
     if triangles is None:

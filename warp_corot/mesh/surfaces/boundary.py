@@ -32,14 +32,14 @@ def boundary_faces(tets: ArrayLike, points: ArrayLike | None = None) -> tuple[ND
 
     Args:
         tets: Vertex indices [T, 4].
-        points: Vertex positions [N, 3], needed when some tetrahedra are mirrored (as half of a bisection forest's are):
-            their faces are turned round. Without points all tetrahedra are taken as positively oriented,
+        points: Vertex positions [N, 3], needed if some tetrahedra are mirrored (as half of a bisection forest's are):
+            their faces are reversed. Without points, all tetrahedra must be positively oriented,
             det(x1−x0, x2−x0, x3−x0) > 0.
 
     Returns:
         ``faces`` int32 [F, 3], in the order of the tetrahedra they come from, and ``parents`` int32 [F], the
         tetrahedron of each. A face shared by three or more tetrahedra (they overlap) is no boundary; a warning counts
-        such faces.
+        these faces.
     """
     t = np.ascontiguousarray(tets, dtype=np.int32).reshape(-1, 4)
     if len(t) == 0:
@@ -73,7 +73,7 @@ def neighbours(tets: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def _sort_faces(corners: NDArray[np.int32]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """An order that puts equal faces (as sets of nodes) side by side, and where in it a new face begins."""
+    """An order in which equal faces (as sets of nodes) are neighbours, and where in it a new face begins."""
     low = corners.min(axis=1).astype(np.uint64)
     high = corners.max(axis=1).astype(np.uint64)
     middle = corners.astype(np.int64).sum(axis=1).astype(np.uint64) - low - high

@@ -1,4 +1,4 @@
-"""Points in a forest: which element holds each, found by walking down the tree."""
+"""Points in a forest: a walk down the tree finds the element that holds each."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from warp_corot.mesh.tree import VOID
 from .boundary import boundary_faces
 from .locating import FARTHEST, checked_points, nearest_faces
 
-#: The walk from one corner of a cube to the opposite one, by the axes in descending order of a point's coordinates.
+#: The path from one corner of a cube to the opposite one, by the axes in descending order of a point's coordinates.
 _WALKS = np.array([[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]])
 
 
@@ -28,7 +28,7 @@ def embed(forest: ForestArrays, points: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def barycentric(forest: ForestArrays, elements: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Barycentric coordinates of points in leaves, float64 [n, 4]; outside of them some are negative."""
+    """Barycentric coordinates of points in leaves, float64 [n, 4]; some are negative for points outside."""
     x = forest.points[forest.tets[elements]]
     edges = np.swapaxes(x[:, 1:] - x[:, :1], 1, 2)
     later = np.linalg.solve(edges, (points - x[:, 0])[..., None])[..., 0]
@@ -69,7 +69,7 @@ def _descended(forest: ForestArrays, points: np.ndarray) -> np.ndarray:
 def _nearest(forest: ForestArrays, points: np.ndarray) -> np.ndarray:
     """The element behind the boundary face that is closest to each point, int32 [n]."""
     faces, parents = _boundary_faces(forest)
-    # About the middle of the mesh, as float32 keeps few digits far from zero.
+    # About the centre of the mesh, because float32 keeps few digits far from zero.
     middle = forest.points.mean(axis=0)
     moved = points - middle
     limit = FARTHEST * np.ptp(forest.points, axis=0).max()
@@ -78,18 +78,18 @@ def _nearest(forest: ForestArrays, points: np.ndarray) -> np.ndarray:
 
 
 def _boundary_faces(forest: ForestArrays) -> tuple[np.ndarray, np.ndarray]:
-    """Boundary faces and the leaves they belong to, sought where all nodes are on void or on the grid's end."""
+    """Boundary faces and their leaves, sought where all nodes are on void tetrahedra or on the border of the grid."""
     tree = forest.tree
     lattice = forest.lattice[: forest.node_count]
     on_rim = ((lattice == 0) | (lattice == np.array(forest.cells) << LATTICE_BITS)).any(axis=1)
     if forest.phi is not None:
-        # Void that is wholly outside need not be conforming, but then no node on its faces is inside.
+        # Void tetrahedra far outside may be non-conforming, but then no node on their faces is inside.
         on_rim |= forest.phi[: forest.node_count] >= 0
         of_void = tree.tets[tree.first_child == VOID]
         of_void = of_void[(forest.phi[of_void] < 0).any(axis=1)]
         on_rim[of_void[of_void < forest.node_count]] = True
     near = np.flatnonzero(on_rim[forest.tets].sum(axis=1) >= 3)
     faces, parents = boundary_faces(forest.tets[near], forest.points)
-    # Between near ones and others there are faces that only look like it.
+    # Faces between near leaves and others only look like boundary faces.
     real = on_rim[faces].all(axis=1)
     return faces[real], near[parents[real]].astype(np.int32)

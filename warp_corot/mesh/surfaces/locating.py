@@ -1,4 +1,4 @@
-"""Points in tetrahedra of any shape: which one holds each, found in a tree of their boxes."""
+"""Points in tetrahedra of any shape: a tree of bounding boxes finds the one that holds each."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from warp_corot.kernels.meshing import embedding as kernels
 
 from .boundary import boundary_faces
 
-#: Points farther away than so many lengths of the mesh count as that far: beyond, float32 tells no distances apart.
+#: Points farther away than this many lengths of the mesh are moved to that distance; float32 cannot resolve more.
 FARTHEST = 1.0e3
 
 
@@ -18,7 +18,7 @@ def checked_points(points: np.ndarray) -> np.ndarray:
     """Points float64 [n, 3].
 
     Raises:
-        InputError: Another shape, or not finite.
+        InputError: They have another shape, or are not finite.
     """
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -30,7 +30,7 @@ def checked_points(points: np.ndarray) -> np.ndarray:
 
 
 def embed_in_tets(nodes: np.ndarray, tets: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The tetrahedron that holds each point, or the one behind the nearest face, and the point's place in it.
+    """The tetrahedron that holds each point, or the one behind the nearest face, and the point's coordinates in it.
 
     Args:
         nodes: float64 [N, 3].
@@ -38,14 +38,14 @@ def embed_in_tets(nodes: np.ndarray, tets: np.ndarray, points: np.ndarray) -> tu
         points: [n, 3].
 
     Returns:
-        Tetrahedra int32 [n], and barycentric coordinates float64 [n, 4], some negative where a point lies outside.
+        Tetrahedra int32 [n], and barycentric coordinates float64 [n, 4]; some are negative for points outside.
 
     Raises:
-        InputError: Not [n, 3], or not finite.
+        InputError: The points are not [n, 3], or not finite.
     """
     points = checked_points(points)
     device = wp.get_device("cpu")
-    # About the middle of the mesh, as float32 keeps few digits far from zero.
+    # About the centre of the mesh, because float32 keeps few digits far from zero.
     middle = nodes[tets].reshape(-1, 3).mean(axis=0)
     placed, moved = nodes - middle, points - middle
     size = float(np.ptp(placed, axis=0).max())

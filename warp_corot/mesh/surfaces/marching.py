@@ -1,7 +1,7 @@
 """Marching tetrahedra: the zero surface of the linear interpolant.
 
-A vertex sits on each edge between a node inside and one outside, so triangles share vertices by sharing edges. A node
-at exactly zero counts as a tiny bit outside: all vertices around it become one, and triangles that lose a side vanish.
+Each edge between a node inside and one outside has a vertex, so triangles share vertices by sharing edges. A node at
+exactly zero counts as outside: all vertices around it become one, and triangles that lose a side vanish.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Array = np.ndarray
 
 
 def _triangles_by_code() -> list[list[list[tuple[int, int]]]]:
-    """For each set of inside nodes the triangles, of (inside node, outside node) corners, in a right-handed element."""
+    """For each set of inside nodes, the triangles in a right-handed element; corners are (inner node, outer node)."""
     tables: list[list[list[tuple[int, int]]]] = []
     for code in range(16):
         inside = [n for n in range(4) if code >> n & 1]
@@ -50,8 +50,8 @@ def marched(points: Array, tets: Array, values: Array) -> SurfaceMesh:
         values: Signed function at the nodes, negative inside [n].
 
     Returns:
-        The surface, wound so that it is seen counter-clockwise from outside. Its points are bound to the two ends of
-        their edges, the inner one first.
+        The surface, counter-clockwise seen from outside. Its points are bound to the two ends of their edges, the inner
+        one first.
     """
     inside = values[tets] < 0
     code = codes(inside)
@@ -89,7 +89,7 @@ def _merged_surface(points: Array, corners: Array, values: Array) -> SurfaceMesh
 
 
 def _without_flat(triangles: Array, at_node: Array) -> Array:
-    """Without triangles that lost a side, and without pairs that lie on one another back to back."""
+    """Remove triangles that lost a side, and pairs that lie back to back on one another."""
     a, b, c = triangles.T
     triangles = triangles[(a != b) & (b != c) & (c != a)]
     whole = np.flatnonzero(at_node[triangles].all(axis=1))
@@ -106,8 +106,8 @@ def crossing_polygons(points: Array, tets: Array, values: Array) -> tuple[Array,
         points, tets, values: As for `marched`.
 
     Returns:
-        The two ends of the edge that each vertex is on, the inner one first, or the same node twice [V, 2]; vertices of
-        the polygons in order, of triangles the last one twice [P, 4]; the element of each polygon [P].
+        The two ends of each vertex's edge, the inner one first, or the same node twice [V, 2]; vertices of the polygons
+        in order, the last one twice for triangles [P, 4]; the element of each polygon [P].
     """
     code = codes(values[tets] < 0)
     cut = np.flatnonzero((code > 0) & (code < 15))
@@ -116,7 +116,7 @@ def crossing_polygons(points: Array, tets: Array, values: Array) -> tuple[Array,
     for kind in range(1, 15):
         chosen = np.flatnonzero(code == kind)
         faces = TRIANGLES[kind]
-        # The second triangle of a quadrangle adds its last vertex; of one that is turned round, its first.
+        # The second triangle of a quadrangle adds its last vertex; of a reversed one, its first.
         order = [*faces[0], faces[0][2]] if len(faces) == 1 else _quadrangle(faces)
         ends = tets[cut[chosen]][:, np.array(order)]
         turned = mirrored[chosen]

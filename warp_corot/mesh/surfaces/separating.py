@@ -1,7 +1,7 @@
 """Surfaces between labels (Nielson and Franke 1997, *Computing the separating surface for segmented data*).
 
-A vertex sits on each edge between two labels, one in each face where three meet, and one in each element with four. So
-the surfaces of all labels fit together without gaps, and each label's is closed.
+There is a vertex on each edge between two labels, in each face with three, and in each element with four. So the
+surfaces of all labels fit together without gaps, and each label's surface is closed.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _odd(order: tuple[int, ...]) -> bool:
 
 
 class _Pieces:
-    """Triangles whose corners are known by the nodes between which they lie: two, three or four."""
+    """Triangles whose corners are given by the nodes between which they lie: two, three or four."""
 
     def __init__(self, values: Array):
         self.values = values.astype(np.float64)
@@ -96,7 +96,7 @@ class _Pieces:
         self.sides: list[Array] = []
 
     def add(self, tets: Array, face: Sequence[tuple[int, ...]], behind: Array, front: Array, turned: Array) -> None:
-        """A polygon in each element, which looks from the label behind to the one in front unless it is turned."""
+        """Add a polygon in each element; it faces from the label behind to the one in front unless it is reversed."""
         turned = turned ^ (behind < front)
         sides = np.stack([np.maximum(behind, front), np.minimum(behind, front)], axis=1)
         for n in range(1, len(face) - 1):
@@ -124,7 +124,7 @@ class _Pieces:
         return SurfaceMesh(x, nodes.astype(np.int32), weights, triangles, sides.astype(np.int32))
 
     def _move_to_nodes(self, corners: Array) -> None:
-        """Points on edges that end at a node at exactly zero are that node."""
+        """Move points on edges that end at a node at exactly zero to that node."""
         on_edge = np.flatnonzero(corners[:, 2] < 0)
         for end in range(2):
             node, other = corners[on_edge, end], corners[on_edge, 1 - end]
@@ -134,7 +134,7 @@ class _Pieces:
             on_edge = on_edge[~at]
 
     def _weights(self, keys: Array) -> Array:
-        """Each point is the mean of the points on the edges between its nodes."""
+        """Weights: each point is the mean of the points on the edges between its nodes."""
         weights = np.zeros(keys.shape)
         pairs = np.zeros(len(keys))
         for i, j in EDGES:
