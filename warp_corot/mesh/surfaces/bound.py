@@ -53,7 +53,7 @@ class SurfaceMesh(BoundPoints):
 
     @property
     def ends(self) -> np.ndarray:
-        """The two nodes of the edge on which a point of a marched surface lies, int32 [V, 2]; the same node twice if the
+        """The ends of the edge on which a point of a marched surface lies, int32 [V, 2]; the same node twice if the
         point is a node. The point is at the share ``weights[:, 1]`` of the edge. Points on edges of elements that were
         left out are bound to four nodes of the nearest element instead."""
         return self.nodes[:, :2]
