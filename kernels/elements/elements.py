@@ -201,11 +201,16 @@ def nodal_forces(elements: GeneralElements, t: int, p: wp.mat33):
 
 
 @wp.func
+def add_nodal_forces(elements: Any, t: int, p: wp.mat33, places: wp.vec4i, f: wp.array[wp.vec4]):
+    """Add the nodal forces of a local-frame first Piola-Kirchhoff stress [Pa] at four places."""
+    f0, f1, f2, f3 = nodal_forces(elements, t, p)
+    add_force(f, places[0], f0)
+    add_force(f, places[1], f1)
+    add_force(f, places[2], f2)
+    add_force(f, places[3], f3)
+
+
+@wp.func
 def scatter_stress(elements: Any, t: int, p: wp.mat33, f: wp.array[wp.vec4]):
     """Add the nodal forces of a local-frame first Piola-Kirchhoff stress [Pa]."""
-    f0, f1, f2, f3 = nodal_forces(elements, t, p)
-    targets = elements.targets[t]
-    add_force(f, targets[0], f0)
-    add_force(f, targets[1], f1)
-    add_force(f, targets[2], f2)
-    add_force(f, targets[3], f3)
+    add_nodal_forces(elements, t, p, elements.targets[t], f)

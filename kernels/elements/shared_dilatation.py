@@ -17,7 +17,7 @@ from warp_corot.kernels.modules import unique_kernel
 
 from .constitutive import IsotropicMaterial
 from .dilatation import Dilatation, mean_of
-from .elements import add_force, nodal_forces, rest_volume
+from .elements import add_force, add_nodal_forces, rest_volume
 from .forces import in_local_frame, own_gradient
 
 wp.set_module_options({"enable_backward": False})
@@ -220,11 +220,7 @@ def share_at_nodes(Elements: type) -> wp.Kernel:
 
 @wp.func
 def scatter(elements: Any, targets: wp.vec4i, t: int, stress: wp.mat33, f: wp.array[wp.vec4]):
-    f0, f1, f2, f3 = nodal_forces(elements, t, in_local_frame(elements, t, stress))
-    add_force(f, targets[0], f0)
-    add_force(f, targets[1], f1)
-    add_force(f, targets[2], f2)
-    add_force(f, targets[3], f3)
+    add_nodal_forces(elements, t, in_local_frame(elements, t, stress), targets, f)
 
 
 @functools.cache

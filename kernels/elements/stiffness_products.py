@@ -14,7 +14,7 @@ import warp as wp
 from warp_corot.kernels.modules import unique_kernel
 
 from .constitutive import IsotropicMaterial
-from .elements import add_force, frame, gradient_of, local_gradient, nodal_forces, rest_volume
+from .elements import add_nodal_forces, frame, gradient_of, local_gradient, rest_volume
 
 wp.set_module_options({"enable_backward": False})
 
@@ -49,12 +49,7 @@ def add_stiffness_product(Elements: type, Material: type, differential: wp.Funct
     ):
         t = wp.tid()
         stress = differential(elements, t, material, u, local_gradient(elements, t, p))
-        f0, f1, f2, f3 = nodal_forces(elements, t, -stress)
-        nodes = elements.nodes[t]
-        add_force(y, nodes[0], f0)
-        add_force(y, nodes[1], f1)
-        add_force(y, nodes[2], f2)
-        add_force(y, nodes[3], f3)
+        add_nodal_forces(elements, t, -stress, elements.nodes[t], y)
 
     return add_stiffness_product
 
