@@ -8,6 +8,8 @@ contacts are found late, start with deep penetration, and can launch the body.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import warp as wp
 
@@ -28,6 +30,26 @@ KINEMATIC = int(newton.BodyFlags.KINEMATIC)
 
 #: Number of iterations that find which contacts still hold after bodies have yielded.
 ROUNDS = 4
+
+
+class Touch(NamedTuple):
+    """What launches of contact read in a substep.
+
+    Attributes:
+        state: The state of the particles.
+        of_bodies: The state of the bodies.
+        contacts: Contacts between particles and shapes; None if there can be none.
+        records: Their records; empty without contacts.
+        law: The law of contact.
+        dt: The length of the substep [s].
+    """
+
+    state: newton.State
+    of_bodies: newton.State
+    contacts: newton.Contacts | None
+    records: list[wp.array]
+    law: ContactLaw
+    dt: float
 
 
 class Contacts:
@@ -141,16 +163,15 @@ class Contacts:
         attached = model.attachment_particle_body_count
         law = self._law()
         pairs = None if self.pairs is None or contacts is None else self.pairs.lists_of(contacts)
-        records: list[wp.array] = []
         if touching is not None or pairs is not None:
             wp.copy(self._before, f)
-        if touching is not None:
-            records = records_of(touching)
-        self._count_loads(state, of_bodies, touching, records, pairs)
-        bodies = self._find_bodies(state, of_bodies, touching, records, dt, law)
+        records = [] if touching is None else records_of(touching)
+        touch = Touch(state, of_bodies, touching, records, law, dt)
+        self._count_loads(touch, pairs)
+        bodies = self._find_bodies(touch)
         if touching is not None:
             rows = self._no_wrenches if reported is None else reported
-            inputs = [law, dt, *self._found(touching, records), touching.soft_contact_body_vel]
+            inputs = [law, dt, *self._found(touch), touching.soft_contact_body_vel]
             inputs += [touching.soft_contact_normal, *self._shapes(), model.shape_material_kd]
             inputs += [model.shape_material_kf, model.shape_material_mu, model.particle_flags, model.particle_world]
             inputs += [model.particle_radius, model.particle_inv_mass, state.particle_q, state.particle_qd]
@@ -164,38 +185,24 @@ class Contacts:
             inputs += [state.particle_q, state.particle_qd, *bodies]
             self._launch(scatter_attachments, attached, inputs, [f, self.reactions])
 
-    def _count_loads(
-        self,
-        state: newton.State,
-        of_bodies: newton.State,
-        touching: newton.Contacts | None,
-        records: list[wp.array],
-        pairs: PairLists | None,
-    ) -> None:
+    def _count_loads(self, touch: Touch, pairs: PairLists | None) -> None:
         """Find how many contacts share each particle, if several may."""
+        touching, q = touch.contacts, touch.state.particle_q
         self._loads.begin((touching is not None and self.crowded) or pairs is not None)
         if touching is not None and len(self._loads.array):
-            poses = of_bodies.body_q if self.model.body_count else self._no_poses
+            poses = touch.of_bodies.body_q if self.model.body_count else self._no_poses
             shapes = [self.model.shape_body, self._margins(), self.model.particle_adhesion]
-            self._loads.count(touching, records, shapes, state.particle_q, poses)
+            self._loads.count(touching, touch.records, shapes, q, poses)
         if pairs is not None and self.pairs is not None:
-            self.pairs.count_loads(pairs, state.particle_q, self._loads.array)
+            self.pairs.count_loads(pairs, q, self._loads.array)
 
-    def _find_bodies(
-        self,
-        state: newton.State,
-        of_bodies: newton.State,
-        touching: newton.Contacts | None,
-        records: list[wp.array],
-        dt: float,
-        law: ContactLaw,
-    ) -> list:
-        """Everything that forces need of bodies."""
-        model = self.model
+    def _find_bodies(self, touch: Touch) -> list:
+        """The arguments of forces that describe bodies."""
+        model, of_bodies = self.model, touch.of_bodies
         if model.body_count:
             self.reactions.zero_()
-            if touching is not None or model.attachment_particle_body_count:
-                self._find_yielding(state, of_bodies, touching, records, dt, law)
+            if touch.contacts is not None or model.attachment_particle_body_count:
+                self._find_yielding(touch)
             masses = [model.body_flags, model.body_inv_mass, model.body_inv_inertia, self._places]
             bodies = [of_bodies.body_q, of_bodies.body_qd, model.body_com, self._yielding]
         else:
@@ -203,34 +210,29 @@ class Contacts:
             bodies = [self._no_poses, self._no_twists, self._no_points, self._no_twists]
         return [KINEMATIC, *masses, *bodies]
 
-    def _find_yielding(
-        self,
-        state: newton.State,
-        of_bodies: newton.State,
-        touching: newton.Contacts | None,
-        records: list[wp.array],
-        dt: float,
-        law: ContactLaw,
-    ) -> None:
+    def _find_yielding(self, touch: Touch) -> None:
         """Find how far bodies yield to springs, and at how many places they are touched."""
-        model, q = self.model, state.particle_q
+        model, touching, of_bodies, q = self.model, touch.contacts, touch.of_bodies, touch.state.particle_q
         self._places.zero_()
         outputs = [self._places, self._curvature, self._slope]
         bodies = [of_bodies.body_q, model.body_com]
         for number in range(ROUNDS if touching is not None else 1):
             if touching is not None:
-                inputs = [law, *self._found(touching, records), touching.soft_contact_normal, *self._shapes()]
+                inputs = [touch.law, *self._found(touch), touching.soft_contact_normal, *self._shapes()]
                 inputs += [model.particle_flags, model.particle_radius, q, KINEMATIC, model.body_flags, *bodies]
                 inputs += [self._yielding, number]
                 self._launch(gather_soft_contacts, touching.soft_contact_max, inputs, outputs)
             if model.attachment_particle_body_count:
                 inputs = [*self._attachments(), model.attachment_particle_body_enabled, q, *bodies, number]
                 self._launch(gather_attachments, model.attachment_particle_body_count, inputs, outputs)
-            inputs = [dt, KINEMATIC, model.body_flags, model.body_inv_mass, model.body_inv_inertia, of_bodies.body_q]
+            inputs = [touch.dt, KINEMATIC, model.body_flags, model.body_inv_mass, model.body_inv_inertia]
+            inputs += [of_bodies.body_q]
             self._launch(solve_yielding, model.body_count, inputs, [self._curvature, self._slope, self._yielding])
 
-    def _found(self, touching: newton.Contacts, records: list[wp.array]) -> list[wp.array]:
-        return [*records, self._loads.array, touching.soft_contact_shape, touching.soft_contact_body_pos]
+    def _found(self, touch: Touch) -> list[wp.array]:
+        touching = touch.contacts
+        assert touching is not None
+        return [*touch.records, self._loads.array, touching.soft_contact_shape, touching.soft_contact_body_pos]
 
     def _shapes(self) -> list[wp.array]:
         return [self.model.shape_body, self._margins(), self.model.shape_material_ke]
