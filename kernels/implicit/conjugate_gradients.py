@@ -91,8 +91,8 @@ def begin(
     r: wp.array[wp.vec4],
     parts: wp.array3d[wp.float64],
 ):
-    """x = alpha x and r = b - alpha q with a guess, else x = 0 and r = b; parts of r . r, and of like . like, which it is
-    compared with."""
+    """x = alpha x and r = b - alpha q with a guess, else x = 0 and r = b; parts of r . r, and of like . like for
+    comparison."""
     world, thread = wp.tid()
     alpha = float(0.0)
     if guessed != 0:

@@ -124,7 +124,13 @@ class HapticLoop:
         self._thread.start()
 
     def connect(self) -> None:
-        """Let the simulation publish the tool's state, and the tool follow the device; ``start`` does so."""
+        """Let the simulation publish the tool's state, and the tool follow the device; ``start`` does so.
+
+        Raises:
+            InputError: Steps of the simulation are implicit.
+        """
+        if self._sim.system.is_implicit:
+            raise InputError("steps of the simulation are implicit; a haptic loop needs SymplecticEuler")
         if self._exchange not in self._sim.system.constraints:
             self._exchange.send(self._tool.pose[:3], self._tool.pose[3:], 0.0)
             self._sim.system.constraints.append(self._exchange)

@@ -15,7 +15,7 @@ from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.elasticity import Model
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_things, shown
-from warp_corot.solvers import BackwardEuler, Integrator, Stepper
+from warp_corot.solvers import BackwardEuler, Integrator, QuasiStatic, Stepper
 from warp_corot.solvers.ranks import ALONE, Ranks
 from warp_corot.solvers.system import System
 
@@ -100,8 +100,8 @@ def check_implicit(integrator: Integrator, *, touches: bool, soft_touches: bool,
     name = type(integrator).__name__
     if touches:
         _check_touching(integrator, soft_touches=soft_touches)
-    if remeshes:
-        raise InputError(f"{name} knows no remeshing; with remesh the integrator must be SymplecticEuler")
+    if remeshes and isinstance(integrator, QuasiStatic):
+        raise InputError(f"{name} knows no remeshing; with remesh the integrator must be another one")
     if ordered:
         raise InputError(f"{name} is not reproducible on CUDA; with deterministic=True it must be SymplecticEuler")
 

@@ -149,6 +149,9 @@ class System:
         """Changes whenever the launches of a step change, so that steps must be recorded again."""
         others = sum(each.launch_revision for each in self.constraints) + self.changes + len(self.forces)
         others += sum(getattr(each, "revision", 0) for each in self.forces)
+        if self.is_implicit:
+            # Solvers follow the mesh, also where launches have the same sizes.
+            others += sum(body.version for body in self.bodies)
         return sum(body.launch_revision for body in self.bodies) + others
 
     @property

@@ -335,11 +335,6 @@ def test_stiff_springs_are_in_the_tangent(integrator, preconditioner, device):
     assert (-1e5 * u[end]).sum(0) == pytest.approx(carried.sum(0), abs=0.02 * np.abs(carried).sum())
 
 
-def test_remeshing_is_refused():
-    with pytest.raises(wc.InputError, match="Newmark knows no remeshing"):
-        wc.Simulation(beam(), integrator=wc.Newmark(), remesh=wc.OnlineRemesh())
-
-
 def test_a_page_with_hands_is_refused():
     pytest.importorskip("viser")
     with pytest.raises(wc.InputError, match="hands on the page need explicit steps; the integrator is BackwardEuler"):

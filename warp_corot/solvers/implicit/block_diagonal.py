@@ -17,8 +17,9 @@ class BlockDiagonal:
     """
 
     def __init__(self, operator: LinearOperator):
-        self._count, self.device = operator.worlds * operator.node_count, operator.device
-        self._inverses = wp.zeros(self._count, dtype=wp.mat33, device=self.device)
+        self._operator, self.device = operator, operator.device
+        # The arrays of a mesh that changes keep their length.
+        self._inverses = wp.zeros(len(operator.inverse_mass), dtype=wp.mat33, device=self.device)
 
     def update(self, operator: LinearOperator) -> None:
         self._launch(invert_blocks, [operator.diagonal_blocks()], [self._inverses])
@@ -27,4 +28,5 @@ class BlockDiagonal:
         self._launch(apply_blocks, [self._inverses, r], [z])
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, self._count, inputs, outputs, device=self.device)
+        count = self._operator.worlds * self._operator.node_count
+        wp.launch(kernel, count, inputs, outputs, device=self.device)

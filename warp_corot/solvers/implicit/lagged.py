@@ -55,14 +55,12 @@ class Lagged:
         self.preconditioner, self._operator, self.device = preconditioner, operator, operator.device
         self._counts = wp.zeros(kernels.COUNTS, dtype=wp.int32, device=self.device)
         self._due = wp.zeros(1, dtype=wp.int32, device=self.device)
-        self._is_set_up = False
-        self._make_room()
-
-    def _make_room(self) -> None:
-        length = self._operator.worlds * self._operator.node_count
+        self._is_prepared = False
+        # Arrays of a mesh that changes keep their length.
+        length = len(operator.inverse_mass)
         self._kept = wp.zeros(length, dtype=wp.vec4, device=self.device)
         self._held = wp.zeros(length, dtype=wp.uint8, device=self.device)
-        self._then = At(self._operator, self._kept)
+        self._then = At(operator, self._kept)
 
     @property
     def state(self) -> dict[str, wp.array]:
@@ -70,14 +68,12 @@ class Lagged:
 
     def prepare(self) -> None:
         """Follow the mesh; not while launches are recorded. Launches are to be recorded again after this."""
-        if self.preconditioner.follow() or len(self._kept) != self._operator.worlds * self._operator.node_count:
-            self._make_room()
-            self._is_set_up = True
-        if self._is_set_up:
+        self.preconditioner.follow()
+        if self._is_prepared:
             self._due.fill_(int(kernels.PRESENT))
         elif not self._due.numpy()[0]:
             self._due.fill_(int(kernels.AGAIN))
-        self._is_set_up = True
+        self._is_prepared = True
 
     def update(self, operator: LinearOperator) -> None:
         """Launch a set-up if one is due."""

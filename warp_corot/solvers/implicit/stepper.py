@@ -117,22 +117,12 @@ class BodySteps:
         self.viscosity = Viscosity(self.body, self.field, options.viscosity) if options.viscosity else None
         exact = options.tolerance is not None
         self.operator = TangentOperator(self.body, self.field, viscosity=self.viscosity, exact=exact)
-        preconditioner = preconditioner_of(options.preconditioner, self.operator, short_cycles=not exact)
+        self._preconditioner = preconditioner_of(options.preconditioner, self.operator, short_cycles=not exact)
         self.lagged: Lagged | None = None
-        if not exact and isinstance(preconditioner, Multigrid):
-            preconditioner = self.lagged = Lagged(preconditioner, self.operator)
-        self.newton = Newton(
-            self.operator,
-            preconditioner,
-            system.gravity,
-            tolerance=options.tolerance or options.linear_tolerance,
-            most=options.iterations,
-            most_linear=options.linear_iterations,
-            others=self._add_others,
-        )
-        self.touching: TouchingSolve | None = None
-        for each in stepper.touching:
-            self.touching = TouchingSolve(self.newton, each.active_set(k))
+        if not exact and isinstance(self._preconditioner, Multigrid):
+            self._preconditioner = self.lagged = Lagged(self._preconditioner, self.operator)
+        self._held = [each.active_set(k) for each in stepper.touching]
+        self._make_solvers()
         like = self.body.state.displacements
         self._none = wp.zeros(1, dtype=wp.vec4, device=self.device)
         wanted = options.history
@@ -142,17 +132,42 @@ class BodySteps:
         self.before = wp.full_like(like, np.nan)
         self._drift, self._rates = (self._none if self.viscosity is None else wp.zeros_like(like) for _ in range(2))
         self._begins = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self._is_prepared = False
         self._one = wp.ones(self.body.worlds, dtype=wp.int32, device=self.device)
         tables = np.stack([options.scheme(options.dt), options.start(options.dt)])
         self._table = wp.array(tables, dtype=wp.float32, device=self.device)
+
+    def _make_solvers(self) -> None:
+        """Make what depends on the mesh."""
+        options = self.stepper.integrator
+        self._version = self.body.version
+        self.newton = Newton(
+            self.operator,
+            self._preconditioner,
+            self.system.gravity,
+            tolerance=options.tolerance or options.linear_tolerance,
+            most=options.iterations,
+            most_linear=options.linear_iterations,
+            others=self._add_others,
+        )
+        self.touching: TouchingSolve | None = None
+        for held in self._held:
+            self.touching = TouchingSolve(self.newton, held)
 
     def prepare(self) -> None:
         """Have all that launches use, so that they can be recorded."""
         self.operator.prepare()
         if self.lagged is not None:
             self.lagged.prepare()
-        if self.touching is not None:
-            self.touching.held.prepare()
+        elif isinstance(self._preconditioner, Multigrid):
+            self._preconditioner.follow()
+        for held in self._held:
+            held.prepare()
+        if self._version != self.body.version:
+            if self._is_prepared:
+                self.before.fill_(np.nan)
+            self._make_solvers()
+        self._is_prepared = True
         self.operator.stiff_forces = tuple(each for each in self.system.forces if hasattr(each, "add_stiffness"))
         if self.stepper.integrator.tolerance is None:
             self.newton.solver.tolerance.fill_(self.stepper.integrator.linear_tolerance)
