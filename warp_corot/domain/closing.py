@@ -1,4 +1,4 @@
-"""Triangle surfaces made fit to enclose a body: welded, wound, closed; and what that took."""
+"""Repair of triangle surfaces so that they enclose a body: welding, orientation, closing; and a record of it."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from warp_corot.errors import InputError
 
 from .winding import edge_parts, linked, net_edges, part_volumes, wind_alike, wind_outwards
 
-#: Points closer than this share of the surface's size are welded where it is open.
+#: Where the surface is open, points closer than this share of its size are welded.
 WELD = 1.0e-6
-#: Holes may take this share of the surface's area to close.
+#: The caps that close holes may have at most this share of the surface's area.
 LARGEST_HOLES = 1.0 / 3.0
-#: A body thinner than this share of its size is no body.
+#: A body must be thicker than this share of its size.
 THINNEST = 1.0e-5
 
 
@@ -27,15 +27,15 @@ class ClosedSurface:
     Attributes:
         points: float64 [N, 3].
         triangles: int32 [T, 3]; the last ones close the holes.
-        caps: How many close holes.
-        open_edges: Edges of holes.
-        holes: Connected groups of them.
+        caps: Number of triangles that close holes.
+        open_edges: Number of edges of holes.
+        holes: Number of connected groups of these edges.
         cap_share: Area of the caps over that of the surface.
-        turned: Triangles that were wound against their neighbours.
-        inside_out: Closed parts that were turned round as a whole.
-        dropped: Triangles left out: without area, there twice, or facing each other.
+        turned: Triangles that were wound against their neighbours and were reversed.
+        inside_out: Closed parts that were inside out and were reversed.
+        dropped: Triangles left out: without area, repeated, or facing each other.
         pieces: Parts that enclose something.
-        cavities: Parts wound inwards, within another.
+        cavities: Parts inside another that are wound inwards.
         volume: Enclosed volume.
     """
 
@@ -101,7 +101,7 @@ def close_surface(points: np.ndarray, triangles: np.ndarray) -> ClosedSurface:
 
 
 def weld(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Make points that lie in one place one; where the surface is still open then, nearly in one place.
+    """Merge points in the same place, and then, where the surface is still open, points in nearly the same place.
 
     Points that no triangle names are left out.
     """
@@ -124,10 +124,10 @@ def weld(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def drop_useless(triangles: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Without triangles that name a point twice, repeat another, or lie on one facing the other way.
+    """Remove triangles that name a point twice, repeat another, or coincide with one that faces the other way.
 
-    Where at least half the triangles lie on one facing the other way, they are two sides of one sheet: one of each
-    stays, and the second value is True.
+    If at least half of the triangles coincide with one that faces the other way, they are two sides of one sheet: one
+    of each pair stays, and the second value is True.
     """
     a, b, c = triangles.T
     triangles = triangles[(a != b) & (b != c) & (c != a)]
@@ -148,8 +148,8 @@ def cones(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int, int]:
     """Close every hole by a cone from its rim to the rim's centre.
 
-    The boundary of a surface is a sum of cycles, also where more than two triangles meet; a cone over it has the same
-    boundary, so with it the surface has none.
+    The boundary of a surface is a sum of cycles, even where more than two triangles meet. A cone over it has the same
+    boundary, so together they have none.
 
     Returns:
         Points with the centres appended, caps [C, 3], the part of each, number of open edges, number of holes.

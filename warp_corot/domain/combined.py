@@ -12,7 +12,7 @@ from .signed import SignedFunction
 
 
 class Pair(SignedFunction):
-    """Two domains and how they are put together."""
+    """Two domains and the way they are combined."""
 
     outer: float
     inner: float
@@ -38,7 +38,7 @@ class Pair(SignedFunction):
 
 
 class Union(Pair):
-    """What either holds. The label is that of the first that holds the point and has one there."""
+    """The points in either domain. The label is that of the first domain that holds the point and has one there."""
 
     outer, inner, word = -1.0, -1.0, "and also"
 
@@ -69,7 +69,7 @@ class Union(Pair):
 
 
 class Intersection(Pair):
-    """What both hold. Labels are the first's, or the second's if the first has none."""
+    """The points in both domains. Labels are the first's, or the second's if the first has none."""
 
     outer, inner, word = 1.0, 1.0, "cut to"
 
@@ -95,7 +95,7 @@ class Intersection(Pair):
 
 
 class Difference(Pair):
-    """What the first holds and the second does not; the first's labels."""
+    """The points in the first domain but not in the second; the first's labels."""
 
     outer, inner, word = 1.0, -1.0, "without"
 

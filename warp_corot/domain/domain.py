@@ -31,11 +31,11 @@ class Domain(SignedFunction):
             |phi| > lipschitz * r no surface is nearer than r.
         up_axis: "X", "Y" or "Z".
         label_names: Names of the labels, () without any.
-        device: Where points that are given as NumPy arrays are evaluated.
+        device: The device that evaluates points given as NumPy arrays.
     """
 
     def part(self, name: str) -> Domain:
-        """The domain of one label alone.
+        """The domain of a single label.
 
         Raises:
             InputError: The domain has no label of this name; the message lists its labels.
@@ -43,7 +43,7 @@ class Domain(SignedFunction):
         return _Made(super().part(name))
 
     def named(self, name: str) -> Domain:
-        """The same body, all of it one label of that name.
+        """The same body, with one label of that name everywhere.
 
         In a union, the label of the first domain that holds a point counts: ``tumour.named("tumour") | liver``.
         """
@@ -69,29 +69,29 @@ class Domain(SignedFunction):
         up_axis: str | None = None,
         device: str | wp.Device | None = None,
     ) -> Domain:
-        """What a closed triangle surface encloses.
+        """The body that a closed triangle surface encloses.
 
-        The distance to the surface is exact; a point is inside where the winding number is above one half (Jacobson,
-        Kavan and Sorkine-Hornung 2013, by Warp's meshes). Before that, triangles wound against their neighbours are
-        turned round, parts that are inside out too, and holes are closed by cones over their rims. How open the surface
-        was is reported. Parts that overlap count as one body, a part inside another and wound inwards as a cavity.
+        The distance to the surface is exact; a point is inside if the winding number is above one half (Jacobson,
+        Kavan and Sorkine-Hornung 2013, by Warp's meshes). Before that, triangles wound against their neighbours and
+        parts that are inside out are reversed, and holes are closed by cones over their rims. The report says how open
+        the surface was. Parts that overlap count as one body; a part inside another that is wound inwards is a cavity.
 
         Args:
             surface: A file (.obj .stl .ply .off .glb .gltf through trimesh, USD, or one of the formats of
-                `warp_corot.io.read` with triangles alone), ``warp:bunny``, what `load_surface` gives, or points [N, 3]
-                and triangles [T, 3].
-            unit: Of the coordinates, any length such as "mm", "inch" or "3.2cm". None: what the file says, metres if
-                it says nothing.
-            up_axis: "X", "Y" or "Z". None: what the file says; if it says nothing Y, for .stl, .ply and .off Z.
-            device: Where it is evaluated; None: Warp's default.
+                `warp_corot.io.read` with triangles only), ``warp:bunny``, the result of `load_surface`, or points
+                [N, 3] and triangles [T, 3].
+            unit: The unit of the coordinates, any length such as "mm", "inch" or "3.2cm". None: the file's unit, or
+                metres.
+            up_axis: "X", "Y" or "Z". None: the file's axis; without one Z for .stl, .ply and .off, and Y for others.
+            device: The device that evaluates it; None: Warp's default.
 
         Raises:
-            InputError: Not a surface, or none that encloses a body: open for more than a third of its area, of zero
-                thickness, or crossing itself so that part of the body is inside out.
+            InputError: The argument is no surface, or encloses no body: more than a third of its area is open, it has
+                zero thickness, or it crosses itself so that part of the body is inside out.
 
         Warns:
-            UserWarning: A body longer than 100 m or shorter than 1 mm, or a surface whose holes are more than one per
-                cent of its area.
+            UserWarning: The body is longer than 100 m or shorter than 1 mm, or holes are more than one per cent of the
+                surface's area.
         """
         from .surface import surface_domain
 
@@ -111,34 +111,34 @@ class Domain(SignedFunction):
         up_axis: str = "Z",
         device: str | wp.Device | None = None,
     ) -> Domain:
-        """The voxels of a segmented volume that bear certain labels.
+        """The voxels of a segmented volume with certain labels.
 
-        phi is, at voxel centres, the Euclidean distance to the nearest centre on the other side less half a step, and
-        trilinear between them: the surface lies halfway between neighbours inside and outside. Beyond the volume is
-        outside; more than two voxels outside the body's box, phi is a lower bound of the distance.
+        At voxel centres, phi is the Euclidean distance to the nearest centre on the other side minus half a step, and
+        trilinear in between: the surface lies halfway between neighbours inside and outside. Points beyond the volume
+        are outside; more than two voxels outside the body's box, phi is a lower bound of the distance.
 
         Args:
-            volume: Whole numbers [nx, ny, nz], what `load_volume` gives, or a file: .nii, .nii.gz, .mgz (nibabel),
+            volume: Whole numbers [nx, ny, nz], the result of `load_volume`, or a file: .nii, .nii.gz, .mgz (nibabel),
                 .mha, .mhd, .nrrd (SimpleITK), .vti (VTK), or a folder with a DICOM series. Positions are the file's
-                own, in the directions right-anterior-superior where the format names directions.
+                own, with axes right-anterior-superior if the format names directions.
             spacing: Distance of voxel centres along the three axes, in ``unit``; needed for an array.
             origin: Position of the centre of voxel (0, 0, 0), in ``unit``; None: the origin.
-            affine: Instead of spacing and origin: the matrix [4, 4] from voxel indices to positions in ``unit``. It
-                may turn, mirror and shear.
-            labels: The numbers of each named label. None: all numbers but 0, each named by itself.
-            unit: Any length such as "mm" or "3.2cm". None: what a file says (an error where it says nothing); metres
-                for an array.
-            smoothing: Standard deviation [m] of a Gaussian by which phi is smoothed: takes the steps of the voxels
-                off, and details of this size with them. What it does to the volume is reported.
+            affine: In place of spacing and origin: the matrix [4, 4] from voxel indices to positions in ``unit``. It
+                may rotate, mirror and shear.
+            labels: The numbers of each named label. None: all numbers but 0, each named by its number.
+            unit: Any length such as "mm" or "3.2cm". None: the file's unit (an error if it has none); metres for an
+                array.
+            smoothing: Standard deviation [m] of a Gaussian that smooths phi. It removes the steps of the voxels, and
+                details of this size. The report says how it changes the volume.
             up_axis: "X", "Y" or "Z".
-            device: Where it is evaluated; None: Warp's default.
+            device: The device that evaluates it; None: Warp's default.
 
         Raises:
-            InputError: Not a label volume, empty, not whole or not finite numbers, no spacing, no unit, or a label
-                that it does not have; the message lists those it has.
+            InputError: The argument is no label volume, is empty, has values that are not whole or finite, has no
+                spacing or no unit, or does not have a label; the message lists the labels that exist.
 
         Warns:
-            UserWarning: A body longer than 100 m or shorter than 1 mm.
+            UserWarning: The body is longer than 100 m or shorter than 1 mm.
         """
         from .labels import label_domain
 
@@ -158,15 +158,16 @@ class Domain(SignedFunction):
         up_axis: str = "Z",
         device: str | wp.Device | None = None,
     ) -> Domain:
-        """The body that probability maps make: each voxel takes the likeliest label, see `labels_from_probabilities`.
+        """A body from probability maps: each voxel has the likeliest label; see `labels_from_probabilities`.
 
         Args:
-            maps: Volumes or files, all of one shape and place, by label name.
-            certain: The value that means probability one: 255 for maps in bytes.
+            maps: Volumes or files by label name, all with the same shape and place.
+            certain: The value that means probability one: 255 for maps of bytes.
             spacing, origin, affine, unit, smoothing, up_axis, device: As for `from_labels`.
 
         Raises:
-            InputError: Maps of different shapes or places, values outside 0 to ``certain``, or as for `from_labels`.
+            InputError: The maps have different shapes or places, a value is outside 0 to ``certain``, or as for
+                `from_labels`.
         """
         from .labels import probability_domain
 
@@ -182,19 +183,19 @@ class Domain(SignedFunction):
         up_axis: str = "Y",
         device: str | wp.Device | None = None,
     ) -> Domain:
-        """Where a function is negative, within a box.
+        """The points of a box at which a function is negative.
 
         Args:
             function: A NumPy function float64 [n, 3] -> [n], or a Warp function (``wp.func``) vec3 -> float, which is
                 evaluated on the device.
-            bounds: Lowest and highest corner of a box [2, 3] [m]; the body is cut off there.
-            lipschitz: How much the function changes per metre, at most.
+            bounds: Lowest and highest corner of a box [2, 3] [m], which cuts off the body.
+            lipschitz: The most that the function changes per metre.
             up_axis: "X", "Y" or "Z".
-            device: Where it is evaluated; None: Warp's default.
+            device: The device that evaluates it; None: Warp's default.
 
         Raises:
-            InputError: An empty box, a function of another form or not finite in the box, or one that was seen to
-                change faster than ``lipschitz`` says.
+            InputError: The box is empty, the function has another form, is not finite in the box, or changes faster
+                than ``lipschitz`` says.
         """
         return _Made(FunctionDomain(function, bounds, lipschitz, up_axis=up_axis, device=device))
 
@@ -222,7 +223,7 @@ class Domain(SignedFunction):
 
 
 class _Made(Domain):
-    """A signed function of any kind, as users hold it."""
+    """A signed function of any kind, as a user holds it."""
 
     def __init__(self, kind: SignedFunction):
         options: dict[str, Any] = {"up_axis": kind.up_axis, "label_names": kind.label_names, "device": kind.device}
@@ -230,7 +231,7 @@ class _Made(Domain):
         self._kind = kind
 
     def __getattr__(self, name: str) -> Any:
-        """What its kind alone has, as ``numbers`` and ``affine`` of voxels and ``closed`` of a surface."""
+        """Attributes of one kind only, such as ``numbers`` and ``affine`` of voxels and ``closed`` of a surface."""
         if name.startswith("_"):
             raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
         return getattr(self._kind, name)

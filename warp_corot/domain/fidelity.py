@@ -1,4 +1,4 @@
-"""How true a mesh is to the body that it was made from: volume, distances, pieces, labels, shapes of elements."""
+"""The fidelity of a mesh to its body: volume, distances, pieces, labels, shapes of elements."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from .winding import net_edges
 if TYPE_CHECKING:
     from warp_corot.mesh import SurfaceMesh, TetForest, TetMesh
 
-#: Points spread over each of the two surfaces.
+#: Sample points on each of the two surfaces.
 SAMPLES = 20_000
-#: Volume may be off by this share before it draws a warning.
+#: A relative error of the volume above this draws a warning.
 LARGEST_VOLUME_ERROR = 0.03
 
 
@@ -31,16 +31,16 @@ class Fidelity:
     """A mesh compared with the body that it was made from. Lengths [m], volumes [m^3], angles [°].
 
     Attributes:
-        volume: What the elements hold of the body.
-        input_volume: Of the body as given.
+        volume: Volume of the body inside the elements.
+        input_volume: Volume of the given body.
         distance_mean: Mean distance of the mesh's surface from the given one, and of the given one from the mesh's.
-        distance_95: The distances below which 95 % are, likewise.
-        pieces: Of the mesh; elements that share a face are of one piece.
-        input_pieces: Of the body as given; parts of a surface that touch, cross or hold one another are one, and so are
-            voxels that touch, be it in a corner.
+        distance_95: The 95th percentiles of the same distances.
+        pieces: Number of pieces of the mesh; elements that share a face belong to one piece.
+        input_pieces: Number of pieces of the given body. Parts of a surface that touch, cross or contain one another
+            are one piece, and so are voxels that touch, even in a corner.
         lost_pieces: Pieces of the body that are in no element.
         lost_labels: Names of labels that no element has.
-        watertight: Whether every edge of the mesh's surface is walked once each way.
+        watertight: Whether every edge of the mesh's surface is used once in each direction.
         smallest_dihedral: The sharpest angle between two faces of an element.
         elements: How many there are.
     """
@@ -59,11 +59,11 @@ class Fidelity:
 
     @property
     def volume_error(self) -> float:
-        """What the mesh holds too much, as a share of the body."""
+        """The excess volume of the mesh, as a share of the body's."""
         return self.volume / self.input_volume - 1.0
 
     def report(self) -> list[str]:
-        """What was measured, line by line."""
+        """The measurements, line by line."""
         (there, back), (far, far_back) = self.distance_mean, self.distance_95
         return [
             f"volume {volume(self.volume)} of {volume(self.input_volume)} ({self.volume_error:+.2%})",
@@ -74,7 +74,7 @@ class Fidelity:
         ]
 
     def doubts(self) -> list[str]:
-        """What has gone wrong and what would help, a line each; nothing where the mesh is as it should be."""
+        """What went wrong and what would help, a line each; empty if the mesh is good."""
         found = []
         if abs(self.volume_error) > LARGEST_VOLUME_ERROR:
             found.append(f"the tetrahedra hold {self.volume_error:+.1%} of the body's volume; more of them would help")
@@ -108,16 +108,16 @@ def fidelity(
     surface: SurfaceMesh | None = None,
     samples: int = SAMPLES,
 ) -> Fidelity:
-    """Measure how true a mesh is to what it was made from.
+    """Measure the fidelity of a mesh to the body that it was made from.
 
     Args:
         mesh: A forest or a mesh of any tetrahedra.
-        surface_or_domain: A domain, or what `Domain.from_surface` takes: a file or (points [N, 3] [m], triangles).
-        surface: The mesh's surface; None: its marched one, or its boundary if it has none.
-        samples: Points spread over each of the two surfaces.
+        surface_or_domain: A domain, or an argument of `Domain.from_surface`: a file or (points [N, 3] [m], triangles).
+        surface: The mesh's surface; None: its marched surface, or its boundary if it has none.
+        samples: Sample points on each of the two surfaces.
 
     Raises:
-        InputError: A surface that encloses nothing.
+        InputError: The surface encloses nothing.
     """
     domain = surface_or_domain if isinstance(surface_or_domain, Domain) else Domain.from_surface(surface_or_domain)
     from warp_corot.mesh.pieces import pieces_of
@@ -143,7 +143,7 @@ def fidelity(
 
 
 def held_volume(mesh: TetForest | TetMesh) -> float:
-    """Volume of a mesh's elements [m^3], of those that a surface cuts what is inside."""
+    """Volume of a mesh's elements [m^3]; elements that a surface cuts count with the part inside."""
     from warp_corot.mesh.surfaces.boundary import signed_volumes
 
     volumes = getattr(mesh, "volumes", None)
@@ -196,7 +196,7 @@ def _spread(surface: SurfaceMesh, count: int) -> np.ndarray:
 
 def _distances(surface: SurfaceMesh, points: np.ndarray, device: wp.Device) -> np.ndarray:
     """How far points are from a surface [m], float64 [n]."""
-    # About the middle of the surface, as float32 keeps few digits far from zero.
+    # About the centre of the surface, because float32 keeps few digits far from zero.
     middle = surface.points.mean(axis=0)
     mesh = wp.Mesh(
         wp.array(surface.points - middle, dtype=wp.vec3, device=device),

@@ -15,12 +15,12 @@ from warp_corot.kernels.meshing import domain as kernels
 from .signed import SignedFunction
 from .units import length
 
-#: What users write, or a Warp function, which type checkers do not know.
+#: A user's function, or a Warp function, whose type type checkers do not know.
 Function = Callable[[np.ndarray], npt.ArrayLike]
 
-#: Pairs of points at which the slope is looked at.
+#: Pairs of points at which the slope is measured.
 PAIRS = 4096
-#: What float32 may add to a slope.
+#: Rounding of float32 may add this to a slope.
 SLACK = 1.0e-2
 
 
@@ -65,11 +65,11 @@ class FunctionDomain(SignedFunction):
         return values.astype(np.float32)
 
     def _check(self) -> bool:
-        """See that the function is finite and no steeper than was said; whether it is negative at the bounds."""
+        """Check that the function is finite and not too steep; returns whether it is negative at the bounds."""
         rng = np.random.default_rng(0)
         size = np.ptp(self.bounds, axis=0)
         points = self.bounds[0] + rng.random((PAIRS, 3)) * size
-        # At once far and near: steps from the box's whole size down to a thousandth of it.
+        # Steps of all sizes, from the box's size down to a thousandth of it.
         steps = rng.standard_normal((PAIRS, 3)) * size * 10.0 ** rng.uniform(-3.0, 0.0, (PAIRS, 1))
         others = np.clip(points + steps, *self.bounds)
         a, b = (self._values(self._on_device(x)).numpy().astype(np.float64) for x in (points, others))

@@ -1,4 +1,4 @@
-"""Voxels as users give them: placed in metres, their labels numbered, probabilities turned to labels."""
+"""Voxels as users give them: placed in metres, with numbered labels; probabilities become labels."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MOST_LABELS = 2**15 - 1
 
 @dataclass
 class Grid:
-    """Voxels in space: values, their affine in metres, and what to say of them."""
+    """Voxels in space: values, their affine in metres, and notes for the report."""
 
     values: np.ndarray
     affine: np.ndarray
@@ -71,7 +71,7 @@ def placed_grid(scan: Volume, spacing: Any, origin: Any, affine: Any, unit: str 
 
 
 def _replaced(affine: np.ndarray, spacing: Any, origin: Any) -> np.ndarray:
-    """A file's affine with the spacing and the origin that were asked for instead; its directions stay."""
+    """A file's affine with another spacing and origin; its directions stay."""
     affine = affine.copy()
     if spacing is not None:
         wanted = affine_of(spacing, origin)[:3, :3]
@@ -105,7 +105,7 @@ def numbered_labels(
     """Place of each voxel's label plus one, int16, and the labels' names.
 
     Raises:
-        InputError: Not whole numbers, or labels that are not there.
+        InputError: The values are not whole numbers, or a label does not occur.
     """
     values = _whole(values)
     there = np.unique(values)
@@ -166,8 +166,8 @@ def _whole(values: np.ndarray) -> np.ndarray:
 def labels_from_probabilities(maps: Mapping[str, npt.ArrayLike], *, certain: float = 1.0) -> np.ndarray:
     """The likeliest label of each voxel.
 
-    What the maps leave to ``certain`` is the probability of the background. A voxel is background where that is the
-    largest or none is; among equals the first map counts.
+    The rest up to ``certain`` is the probability of the background. A voxel is background if that is the largest, or if
+    all are zero; among equals the first map counts.
 
     Args:
         maps: Probabilities, arrays of one shape, by label name.
@@ -177,7 +177,7 @@ def labels_from_probabilities(maps: Mapping[str, npt.ArrayLike], *, certain: flo
         int32, of the maps' shape: 0 for background, k for the k-th map.
 
     Raises:
-        InputError: No maps, different shapes, or values that are not finite or outside 0 to ``certain``.
+        InputError: There are no maps, their shapes differ, or a value is not finite or outside 0 to ``certain``.
     """
     if not maps:
         raise InputError("maps is empty; it must give at least one volume by label name")

@@ -20,7 +20,7 @@ from .voxels import gaussian, pieces, signed_distance, steepest_slope
 
 #: Voxels of background around the body: the interpolant is positive beyond.
 MARGIN = 2
-#: Smoothing beyond this share of the body's length takes more than the steps of voxels off.
+#: Smoothing beyond this share of the body's length removes more than the steps of voxels.
 LARGEST_SMOOTHING = 0.1
 
 
@@ -75,7 +75,7 @@ class LabelDomain(SignedFunction):
             change = np.count_nonzero(phi < 0.0) / np.count_nonzero(inside) - 1.0
             self.notes.append(f"smoothed by {length(smoothing)}, which changes the volume by {change:+.2%}")
         self.values = phi
-        # Distances are of voxel axes at right angles; other affines stretch them.
+        # Distances assume voxel axes at right angles; other affines stretch them.
         inverse = np.linalg.inv(self.affine[:3, :3])
         stretch = np.linalg.norm(self.spacing[:, None] * inverse, 2)
         slope = max(1.0, steepest_slope(phi, self.spacing)) * float(stretch)
@@ -107,7 +107,7 @@ class LabelDomain(SignedFunction):
         return labels
 
     def point_in(self, name: str) -> np.ndarray | None:
-        """See `Domain.point_in`: the voxel of it that is nearest to their middle."""
+        """See `Domain.point_in`: the voxel of the label that is nearest to their centre."""
         if name not in self.label_names:
             return None
         voxels = np.argwhere(self.numbers == self.label_names.index(name) + 1)

@@ -1,4 +1,4 @@
-"""Which triangles of a closed surface have the body behind them and the outside in front, all over."""
+"""The triangles of a closed surface that have the body behind them and the outside in front everywhere."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from warp_corot.kernels.meshing.windings import Lines
 
 from .winding import linked
 
-#: How far off a triangle winding numbers are looked at, over its own size and, at least, over the surface's.
+#: Winding numbers are evaluated this far off a triangle, over its own size and, at least, over the surface's.
 ASIDE, LEAST_ASIDE = 1.0e-3, 2.0e-6
-#: Where more than this share of the edges goes through triangles of their own part, nothing is sure.
+#: If more than this share of the edges crosses triangles of their own part, no triangle is sure.
 MESSY = 2.0e-3
-#: Two triangles whose unit normals add up to less lie on one another, nearly.
+#: Two triangles whose unit normals add up to less nearly coincide.
 FOLDED = 0.05
-#: Winding numbers are computed for this number of patches; more are not worth the time.
+#: Winding numbers are computed for at most this many patches; more are not worth the time.
 MOST_PATCHES = 20_000
 #: Normals of two triangles that differ by more than this make a sharp edge [°].
 SHARP = 30.0
-#: Points near the surface at which what was found is tried.
+#: Points near the surface at which the result is tested.
 TRIED = 4096
 
 
 @dataclass(frozen=True)
 class Sides:
-    """What tells inside from outside at the triangle that is closest to a point.
+    """Data that tell inside from outside at the triangle that is closest to a point.
 
     Attributes:
         known: BOUNDARY, BURIED or UNSURE, uint8 [T].
@@ -52,12 +52,12 @@ class Sides:
 
 
 def sides_of(points: np.ndarray, triangles: np.ndarray, mesh: wp.Mesh, lines: Lines) -> Sides:
-    """What is on the two sides of each triangle.
+    """Find what is on the two sides of each triangle.
 
-    Where no triangle crosses or touches another but along common edges, all of a patch is alike, and two winding
-    numbers tell of it. Triangles that cross others are unsure, and so are those around edges that are not shared by
-    two. In the end signs are compared at random points near the surface; if any is wrong, or if the surface crosses
-    itself in many places, no triangle is sure.
+    If the triangles of a patch meet others only along common edges, all of them have the same sides, and two winding
+    numbers decide. Triangles that cross others are unsure, and so are those around edges that are not shared by two.
+    Finally, signs are compared at random points near the surface; if any is wrong, or if the surface crosses itself in
+    many places, no triangle is sure.
 
     Args:
         points: float64 [N, 3].
@@ -101,7 +101,7 @@ def sides_of(points: np.ndarray, triangles: np.ndarray, mesh: wp.Mesh, lines: Li
     folded = np.linalg.norm(normal[a] + normal[b], axis=1) < FOLDED
     doubtful[a[folded]] = doubtful[b[folded]] = True
     doubtful |= np.isin(triangles, _pinched(triangles, one, other)).any(axis=1)
-    # And their neighbours, as what crosses does not end at a triangle's edge for float32.
+    # And their neighbours, because in float32 a crossing does not end at a triangle's edge.
     doubtful |= np.isin(triangles, triangles[doubtful]).any(axis=1)
     linking = ~(doubtful[a] | doubtful[b])
     patches, patch = linked(a[linking], b[linking], count)

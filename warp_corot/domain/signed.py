@@ -1,4 +1,4 @@
-"""Bodies as signed functions, sampled on the device: what all kinds of domains have in common."""
+"""Bodies as signed functions, sampled on the device: the base class of all kinds of domains."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SPHERES = 25
 
 
 class SignedFunction:
-    """What all kinds of bodies are; ``Domain``, which users hold, says what the attributes mean."""
+    """The base class of all kinds of bodies; ``Domain``, which users hold, documents the attributes."""
 
     def __init__(
         self,
@@ -51,14 +51,14 @@ class SignedFunction:
             float32 [n]: NumPy's for NumPy's, Warp's on the same device for Warp's.
 
         Raises:
-            InputError: NumPy points of another shape, or not finite.
+            InputError: NumPy points have another shape, or are not finite.
         """
         if isinstance(points, wp.array):
             return self._phi(points)
         return self._phi(self._on_device(points)).numpy()
 
     def labels_at(self, points: Any, *, nearest: bool = False) -> Any:
-        """Which label holds each point.
+        """The label at each point.
 
         Args:
             points: As for `phi`.
@@ -78,24 +78,24 @@ class SignedFunction:
 
     @property
     def kind(self) -> SignedFunction:
-        """The function itself, whose class says of what kind it is; of a ``Domain`` what it was made as."""
+        """The function itself, whose class is its kind; for a ``Domain``, the function in it."""
         return self
 
     @property
     def has_pieces(self) -> bool:
-        """Whether the body has, or may have, several pieces, which are not to grow together."""
+        """Whether the body has, or may have, several pieces, which must not be joined by the mesh."""
         return False
 
     def thickness(
         self, points: npt.ArrayLike, inward: npt.ArrayLike, reach: float, *, outside: bool = False
     ) -> np.ndarray:
-        """How thick the body is at points of its surface: how far it is to where one leaves it again.
+        """The thickness of the body at points of its surface: the distance inwards until one leaves it again.
 
         Args:
-            points: On the surface, or nearly [n, 3] [m].
+            points: Points on or near the surface [n, 3] [m].
             inward: Unit vectors [n, 3].
-            reach: What is thicker counts as this thick [m].
-            outside: The same of what is around the body, outwards: how wide gaps are.
+            reach: The largest thickness that is measured [m].
+            outside: Measure outwards instead: the widths of gaps.
 
         Returns:
             float64 [n] [m].
@@ -105,14 +105,14 @@ class SignedFunction:
         return self._thickness(given, directions, float(reach), side).astype(np.float64)
 
     def exits(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Where segments from inside to outside leave the body, by its triangles; None: it has none.
+        """Where segments from inside to outside leave the body, by its triangles; None if it has none.
 
         Args:
             starts, ends: float64 [n, 3] [m].
 
         Returns:
-            The way from the starts as a share of the segments, NaN where triangles do not tell, float64 [n]; and unit
-            normals there [n, 3].
+            The distances from the starts as shares of the segments, NaN if triangles cannot tell, float64 [n]; and the
+            unit normals there [n, 3].
         """
         return None
 
@@ -121,7 +121,7 @@ class SignedFunction:
         return np.empty((0, 3))
 
     def part(self, name: str) -> SignedFunction:
-        """The domain of one label alone.
+        """The domain of a single label.
 
         Raises:
             InputError: The domain has no label of this name; the message lists its labels.
@@ -130,7 +130,7 @@ class SignedFunction:
         raise InputError(f"there is no label {name!r} in this domain; its labels: {there}")
 
     def report(self) -> list[str]:
-        """What a user should know of it, line by line: size, unit, how closed, pieces, labels."""
+        """A summary, line by line: size, unit, openness, pieces, labels."""
         low, high = self.bounds
         size = " x ".join(length(side) for side in high - low)
         lines = [f"bounds {size}, {self.up_axis} up", *self._details()]
@@ -139,7 +139,7 @@ class SignedFunction:
         return lines
 
     def point_in(self, name: str) -> np.ndarray | None:
-        """A point where a label is [m], float64 [3]; None where none is known without looking for it."""
+        """A point with a label [m], float64 [3]; None if none is known without a search."""
         return None
 
     # What a kind of body defines.
@@ -155,7 +155,7 @@ class SignedFunction:
     def _thickness(self, points: wp.array, along: wp.array, reach: float, side: float) -> np.ndarray:
         """float32 [n]; of the body for a ``side`` of 1, of what is around it for -1.
 
-        Here by spheres: as far on as no surface can be, again and again.
+        By sphere tracing: each step is the distance within which there can be no surface.
         """
         start, along = points.numpy(), along.numpy()
         gone = np.full(len(start), SPHERE_STEP * reach, np.float32)

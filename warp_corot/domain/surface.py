@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 #: A file, what ``load_surface`` gives, or points and triangles.
 Surface = str | PathLike[str] | LoadedSurface | tuple[npt.ArrayLike, npt.ArrayLike]
 
-#: Points along each side of the box at which winding numbers are looked at.
+#: Points along each side of the box at which winding numbers are evaluated.
 SAMPLES = 16
-#: Space enclosed inside out, as a share of all that is enclosed, at which the surface is refused.
+#: A surface is refused if more than this share of the space that it encloses is inside out.
 LARGEST_REVERSED = 0.05
-#: Rays into the body start so far inside, over how far they go.
+#: Rays into the body start this far inside, over their length.
 START = 0.01
-#: Holes of this share of the area draw a warning.
+#: Holes above this share of the area draw a warning.
 LARGE_HOLES = 0.01
 
 
@@ -47,7 +47,7 @@ class SurfaceDomain(SignedFunction):
 
     def __init__(self, closed: ClosedSurface, notes: Sequence[str] = (), **options: Any):
         used = closed.points[np.unique(closed.triangles)]
-        # Triangles are kept in float32, and may stand out by its rounding.
+        # Triangles are kept in float32; its rounding may move them outwards.
         rounding = 2.0**-23 * np.abs(used).max()
         bounds = np.stack([used.min(axis=0) - rounding, used.max(axis=0) + rounding])
         super().__init__(bounds, 1.0, **options)
@@ -100,7 +100,7 @@ class SurfaceDomain(SignedFunction):
 
     def _thickness(self, points: wp.array, along: wp.array, reach: float, side: float) -> np.ndarray:
         found = wp.empty(points.size, wp.float32, device=points.device)
-        # A little inside, so that the surface that a ray starts at is not the one that it meets.
+        # A little inside, so that a ray does not hit the surface on which it starts.
         start = wp.array(points.numpy() + START * reach * along.numpy(), dtype=wp.vec3, device=points.device)
         mesh = self._mesh(points.device)
 
@@ -216,7 +216,7 @@ def checked_triangles(
 
 
 def surface_mesh(points: np.ndarray, triangles: np.ndarray, device: wp.Device, *, is_open: bool = False) -> wp.Mesh:
-    """A Warp mesh, of an open surface one that can tell winding numbers."""
+    """A Warp mesh; for an open surface, one that supports winding numbers."""
     return wp.Mesh(
         wp.array(np.ascontiguousarray(points, dtype=np.float32), dtype=wp.vec3, device=device),
         wp.array(np.ascontiguousarray(triangles, dtype=np.int32).ravel(), dtype=wp.int32, device=device),
@@ -225,7 +225,7 @@ def surface_mesh(points: np.ndarray, triangles: np.ndarray, device: wp.Device, *
 
 
 def lines_through(bounds: np.ndarray) -> windings.Lines:
-    """The lines along which winding numbers of a surface are found: along its shortest side, where it is met least."""
+    """The lines along which winding numbers are found: along the surface's shortest side, where lines meet it least."""
     lines = windings.Lines()
     lines.axis = int(np.argmin(np.ptp(bounds, axis=0)))
     margin = 1e-3 * float(np.ptp(bounds, axis=0).max())

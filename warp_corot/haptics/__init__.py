@@ -1,4 +1,4 @@
-"""Forces for the hand: a loop on a clock of its own between a haptic device and a tool of a simulation."""
+"""Forces for the hand: a loop with its own clock between a haptic device and a tool of a simulation."""
 
 from .devices import Device, MouseDevice, ScriptedDevice
 from .loop import HapticLoop

@@ -1,4 +1,4 @@
-"""What a driver of a haptic device is, and two devices without hardware."""
+"""The interface of a haptic device's driver, and two devices without hardware."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Floats = npt.NDArray[np.float64]
 class Device(Protocol):
     """A haptic device, in the coordinates of the simulation.
 
-    A loop calls both methods from its own thread, at its rate. Whatever they raise ends the loop.
+    A loop calls both methods from its own thread, at its rate. Any exception in them ends the loop.
     """
 
     def read(self) -> tuple[Vector, Vector]:
@@ -37,16 +37,16 @@ class Device(Protocol):
 
 
 class ScriptedDevice:
-    """A device that a script moves along keyframes, in straight lines, and that keeps what it is made to feel.
+    """A device that a script moves along keyframes, in straight lines, and that records what it feels.
 
     Args:
         times: Increasing, at least two, from the first reading on [s], [K].
         positions: [m], [K, 3].
-        quaternions: (x, y, z, w), [K, 4]; None: not turned.
-        clock: Seconds of a clock.
+        quaternions: (x, y, z, w), [K, 4]; None: no rotation.
+        clock: A function that gives the seconds of a clock.
 
     Attributes:
-        felt: What was written: time [s], position [m], force [N] and torque [N m], ten numbers each.
+        felt: The record: time [s], position [m], force [N] and torque [N m], ten numbers each.
 
     Raises:
         InputError: As ``Tool.follow``.
@@ -92,14 +92,14 @@ class MouseDevice:
     """A device that takes its position from a caller in any thread, such as a page or a window, and shows the force.
 
     Args:
-        position: Where it is first [m].
-        quaternion: How it is turned first, (x, y, z, w).
+        position: Its first position [m].
+        quaternion: Its first orientation, (x, y, z, w).
 
     Attributes:
-        force, torque: What was written last [N], [N m].
+        force, torque: The last force and torque [N], [N m].
 
     Raises:
-        InputError: Not finite numbers.
+        InputError: A number is not finite.
     """
 
     def __init__(self, position: Vector = (0.0, 0.0, 0.0), quaternion: Vector = NO_TURN):
@@ -107,10 +107,10 @@ class MouseDevice:
         self._pose = (checked_vector(position, "position"), checked_quaternion(quaternion))
 
     def move(self, position: Vector, quaternion: Vector | None = None) -> None:
-        """Be somewhere else from the next reading on.
+        """Move the device; the next reading gives the new place.
 
         Raises:
-            InputError: Not finite numbers; the device stays where it is.
+            InputError: A number is not finite; the device stays where it is.
         """
         turn = self._pose[1] if quaternion is None else checked_quaternion(quaternion)
         self._pose = (checked_vector(position, "position"), turn)

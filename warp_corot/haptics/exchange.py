@@ -1,4 +1,4 @@
-"""Numbers that the simulation and the haptic loop exchange, without either waiting for the other."""
+"""Numbers that the simulation and the haptic loop exchange without waiting for each other."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ TRIES = 8
 
 @dataclass(frozen=True, eq=False)
 class ToolState:
-    """What was published of a tool.
+    """The published state of a tool.
 
     Attributes:
         count: How many states were published up to this one.
         time: Simulated time [s].
-        stamp: When the position that it moves to was read from the device, on the loop's clock [s]; zero: none was.
+        stamp: When the position to which it moves was read from the device, on the loop's clock [s]; zero: never.
         position: [m], [3].
         quaternion: (x, y, z, w), [4].
         force, torque: On the tool in the last step [N], and about its origin [N m], [3] each.
@@ -44,13 +44,13 @@ class ToolState:
 class Exchange(Constraint):
     """Publishes a tool's state after each run of steps, and lets the tool follow the device.
 
-    It is among the constraints of a system only to be launched with it: it exerts no force. On CUDA kernels write to
-    and read from pinned memory of the host; on the CPU both sides use the same arrays.
+    It is one of the system's constraints only so that it is launched with them; it exerts no force. On CUDA, kernels
+    write to and read from pinned host memory; on the CPU both sides use the same arrays.
 
     Args:
-        system: The simulation's.
+        system: The simulation's system.
         obstacles: Its obstacles.
-        number: Which of them is the tool.
+        number: The number of the tool among them.
     """
 
     launch_revision = 1
@@ -67,24 +67,24 @@ class Exchange(Constraint):
         pinned = wp.zeros(7, dtype=wp.float32, device="cpu", pinned=device.is_cuda)
         self._pose_memory, self._pose = pinned, pinned.numpy()
         self._pose[6] = 1.0
-        #: Where the tool is to go, a ``wp.transform`` for ``Tool.use_poses``.
+        #: The target of the tool, a ``wp.transform`` for ``Tool.use_poses``.
         self.target = wp.array(ptr=pinned.ptr, shape=1, dtype=wp.transform, device=device)
 
     # --- the loop's side -------------------------------------------------------------------------------------------
 
     def send(self, position: Floats, quaternion: Floats, stamp: float) -> None:
-        """Let the tool go to a place [m] that was read from the device at a time on the loop's clock [s]."""
+        """Send the tool to a place [m] that was read from the device at a time on the loop's clock [s]."""
         self._pose[:3] = position
         self._pose[3:] = quaternion
         self._stamp.values[0] = stamp
 
     @property
     def place(self) -> Floats:
-        """Where the tool was sent last: position and quaternion, [7]."""
+        """The place to which the tool was sent last: position and quaternion, [7]."""
         return self._pose.astype(np.float64)
 
     def newest(self, last: ToolState | None) -> ToolState | None:
-        """The newest state, or the last one if nothing was published since; never one that is half written."""
+        """The newest state, or the last one if nothing was published since; never a half-written one."""
         values = self._shared.values
         for _ in range(TRIES):
             count = int(values[0])

@@ -1,8 +1,8 @@
 """The force between two states of the simulation: a plane at the tool, and the tissue's stiffness across it.
 
-The loop runs faster than the simulation, and the tool of the simulation follows the hand with a delay. Where the hand
-has gone on since, the force of the last state is continued along the direction in which the tissue pushes, with the
-stiffness that the last states have shown: the contact's compliance seen from the tool.
+The loop runs faster than the simulation, and the simulation's tool follows the hand with a delay. If the hand has moved
+since, the force of the last state is extrapolated along the direction in which the tissue pushes, with the stiffness in
+the last states: the contact's compliance as the tool sees it.
 
 After Courtecuisse, Jung, Allard, Duriez, Lee and Cotin, GPU-based real-time soft tissue deformation with cutting and
 haptic feedback (2010), where the compliance comes from the solver's matrix; explicit steps have none, so that it is
@@ -18,11 +18,11 @@ from .exchange import ToolState
 
 Floats = npt.NDArray[np.float64]
 
-#: Share of the older states in means over states.
+#: Weight of the older states in means over states.
 MEMORY = 0.9
-#: Depths that vary by less [m] tell little of a stiffness.
+#: Depths that vary by less [m] say little about a stiffness.
 SPREAD = 3e-5
-#: Forces below this [N] are none.
+#: Forces below this [N] count as zero.
 NO_FORCE = 1e-9
 
 
@@ -30,8 +30,8 @@ class LocalModel:
     """The contact plane and the stiffness at a tool.
 
     Args:
-        stiffness: What is expected before anything is measured [N/m].
-        most: What is used at most [N/m].
+        stiffness: The expected stiffness, before anything is measured [N/m].
+        most: The largest stiffness that is used [N/m].
 
     Attributes:
         stiffness: The present estimate [N/m].
@@ -77,7 +77,7 @@ class LocalModel:
         return self._force + self.stiffness * deeper * self.normal, self._torque * min(continued / push, 1.0)
 
     def _measure(self, depth: float, push: float, *, first: bool) -> None:
-        """The slope of force over depth in the last states, where they tell one."""
+        """Measure the slope of force over depth in the last states, if the depths vary enough."""
         if first:
             self._depth, self._push = depth, push
             return

@@ -43,10 +43,9 @@ EVERY = 0.002
 class HapticLoop:
     """Connects a haptic device to a tool of a simulation, in its own thread.
 
-    The loop reads the device, lets the tool follow it, takes the newest state of the tool that the simulation has
-    published, without waiting, and writes the force of a local model (`local_model`), bounded in energy
-    (`passivity`). Meanwhile the caller steps the simulation, by ``run`` or by calls of ``sim.advance``. When the
-    simulation stops, the force fades.
+    The loop reads the device, lets the tool follow it, and takes the newest published state of the tool without
+    waiting. It writes the force of a local model (`local_model`), bounded in energy (`passivity`). Meanwhile the caller
+    steps the simulation, by ``run`` or by calls of ``sim.advance``. When the simulation stops, the force fades.
 
     Args:
         sim: The simulation, of one world, with the tool among its obstacles.
@@ -56,15 +55,15 @@ class HapticLoop:
         stiffness: Expected stiffness of the tissue at the tool [N/m]; None: of a half-space of the first body's
             material under a flat punch as thick as the tool.
         most_force: Largest force [N]; larger ones are scaled down together with the torque.
-        energy_bound: What may be put out beyond what was put in [J], and in each second after [W]; see
+        energy_bound: How much more energy may go out than came in [J], and in each second after [W]; see
             ``PassivityControl``.
 
     Attributes:
         error: The line on why the loop stopped, if the device failed; else None.
 
     Raises:
-        InputError: Something that is none of these, a tool of another simulation, several worlds, or a number out of
-            range.
+        InputError: An argument has another type, the tool belongs to another simulation, there are several worlds, or a
+            number is out of its range.
     """
 
     def __init__(
@@ -166,8 +165,8 @@ class HapticLoop:
             Simulated time over time on the wall.
 
         Raises:
-            InputError: A time that is not positive.
-            DeviceError: The device failed; the simulation can go on without it.
+            InputError: A time is not positive.
+            DeviceError: The device failed; the simulation can continue without it.
             UnstableError: As ``Simulation.advance``.
         """
         _positive(seconds, "seconds", "s")
@@ -185,7 +184,7 @@ class HapticLoop:
 
     @property
     def report(self) -> Report:
-        """How well it has kept its time so far."""
+        """The loop's times and energy so far."""
         periods, delays, control = self._periods, self._delays, self._control
         return Report(
             readings=self._busy.count,

@@ -2,7 +2,7 @@
 
 A force that is held from one reading to the next does work on the hand that is known exactly at the next reading: the
 observer adds it up. The controller then gives the next force. It damps a force that would put out energy if the hand
-went on as it does, and scales down a force that could put out more than there is wherever the hand goes.
+continued its motion, and scales down a force that could put out more than there is in any motion of the hand.
 
 After Hannaford and Ryu, Time-domain passivity control of haptic interfaces (2002), for observer and damping; the bound
 for any motion is that of Kim and Ryu, Robustly stable haptic interaction control using an energy-bounding algorithm
@@ -18,7 +18,7 @@ Floats = npt.NDArray[np.float64]
 
 
 class PassivityControl:
-    """Bounds the energy that goes out through the device.
+    """Bounds the energy that leaves through the device.
 
     At any time ``t`` [s] since the beginning, the energy put out is at most the energy put in plus
     ``bound * (1 + t)``, as long as the hand moves no farther than ``reach`` and turns no farther than ``turn`` from one
@@ -30,9 +30,9 @@ class PassivityControl:
         turn: [rad].
 
     Attributes:
-        balance: Energy put in, less energy put out, that the controller counts with [J]; never below ``-bound``.
-        put_out: Energy put out, less energy put in, since the beginning [J].
-        most_put_out: The highest that it was [J].
+        balance: Energy put in minus energy put out, as the controller counts it [J]; never below ``-bound``.
+        put_out: Energy put out minus energy put in since the beginning [J].
+        most_put_out: The largest value of ``put_out`` [J].
         beyond: Readings between which the hand moved farther than ``reach`` or ``turn``.
         damped: Readings at which a force was changed.
     """
@@ -44,7 +44,7 @@ class PassivityControl:
         self._force, self._torque = np.zeros(3), np.zeros(3)
 
     def observe(self, moved: Floats, turned: Floats, seconds: float) -> None:
-        """Count the work of the last force along the way that the hand has gone [m] and turned [rad] in some time."""
+        """Count the work of the last force along the hand's motion [m] and rotation [rad] in some time."""
         work = float(self._force @ moved + self._torque @ turned)
         self.put_out += work
         self.most_put_out = max(self.most_put_out, self.put_out)
@@ -54,11 +54,11 @@ class PassivityControl:
         self.beyond += int(moved @ moved > self._reach**2 or turned @ turned > self._turn**2)
 
     def control(self, force: Floats, torque: Floats, moved: Floats, turned: Floats) -> tuple[Floats, Floats]:
-        """The force [N] and torque [N m] to be held until the next reading, for those that the model gives.
+        """The force [N] and torque [N m] to be held until the next reading, from those of the model.
 
         Args:
-            force, torque: Of the model.
-            moved, turned: The way of the hand since the last reading [m], [rad], which it is expected to go again.
+            force, torque: The model's force and torque.
+            moved, turned: The hand's motion since the last reading [m], [rad], which it is expected to repeat.
         """
         given = force, torque
         if not force.any() and not torque.any():

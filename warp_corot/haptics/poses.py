@@ -1,4 +1,4 @@
-"""What a device read: checked, and the way from one reading to the next."""
+"""Readings of a device: checks, and the motion from one reading to the next."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def checked_pose(position: object, quaternion: object) -> Pose:
     """A position [m], [3], and a unit quaternion (x, y, z, w), [4].
 
     Raises:
-        DeviceError: Something else.
+        DeviceError: The reading is something else.
     """
     try:
         place, turn = np.array(position, dtype=np.float64), np.array(quaternion, dtype=np.float64)

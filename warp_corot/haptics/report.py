@@ -1,4 +1,4 @@
-"""How well a haptic loop kept its time."""
+"""A report on a haptic loop's times."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Report:
         delay, delay_99, delay_most: Time from reading a position to the first force that comes from a step with the
             tool there: median, 99 % and longest [s]; NaN if the simulation published nothing.
         updates: States of the simulation that were read.
-        put_out: The most energy put out through the device, less what was put in, at any time [J].
+        put_out: The most energy put out through the device minus what was put in, at any time [J].
         damped: Readings at which passivity control changed the force.
-        beyond: Readings between which the device moved farther than the bound on energy counts with.
+        beyond: Readings between which the device moved farther than the bound on energy assumes.
         stiffness: The last estimate of the tissue's stiffness at the tool [N/m].
     """
 
@@ -60,11 +60,11 @@ class Report:
 
 
 class Times:
-    """The last values of something that is measured often, in a ring.
+    """The last values of a quantity that is measured often, in a ring.
 
     Attributes:
         count: How many values there were.
-        largest: Of all.
+        largest: The largest of all values.
     """
 
     def __init__(self) -> None:

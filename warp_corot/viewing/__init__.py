@@ -1,4 +1,4 @@
 """The page: a simulation in a browser, and a person's hands on it.
 
-``session`` steps and knows nothing of browsers; ``page`` shows a session with viser; ``gate`` says who may come in.
+``session`` steps and does not depend on browsers; ``page`` shows a session with viser; ``gate`` decides who may enter.
 """

@@ -1,4 +1,4 @@
-"""What the colours of a surface say: sources of values by name, and their colours."""
+"""The colours of a surface: sources of values by name, and their colours."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class Source:
     """Values that colours can show.
 
     Attributes:
-        unit: Of the values.
-        values: At the points of a shown surface, [V], for a simulation and one of its bodies.
+        unit: The unit of the values.
+        values: The values at the points of a shown surface, [V], for a simulation and one of its bodies.
         applies: Whether a body has such values.
     """
 
@@ -43,7 +43,7 @@ class Source:
 
 
 def displacement(sim: Simulation, shown: Shown) -> Values:
-    """How far the points are from where they were at rest [m]."""
+    """The distances of the points from their rest positions [m]."""
     return np.linalg.norm(shown.positions - shown.rest, axis=1)
 
 
@@ -51,7 +51,7 @@ class ElementValues:
     """Values of elements, averaged to nodes by volume and carried to the points of a surface, on the device.
 
     Args:
-        values: Of the elements of the first world, float32 [T] or more, on the body's device.
+        values: The values of the first world's elements, float32 [T] or more, on the body's device.
     """
 
     def __init__(self, values: Callable[[Simulation, SoftBody], wp.array]):
@@ -105,7 +105,7 @@ def _level(sim: Simulation, body: SoftBody) -> wp.array:
 
 
 def contact_pressure(sim: Simulation, shown: Shown) -> Values:
-    """Pressure of contact in the last step [Pa]: of triangles, averaged to nodes by area."""
+    """Contact pressure in the last step [Pa]: triangles' values, averaged to nodes by area."""
     body = shown.body
     corners, pressure = body.surface_triangles, body.contact_pressure.numpy()
     a, b, c = np.moveaxis(body.mesh.points[corners], 1, 0)
@@ -117,7 +117,7 @@ def contact_pressure(sim: Simulation, shown: Shown) -> Values:
 
 
 def sources() -> dict[str, Source]:
-    """What can be shown, by name; those that keep something of a body belong to one session."""
+    """The sources by name. Sources that keep data of a body belong to one session."""
     return {
         "stress": Source("Pa", ElementValues(_stress)),
         "displacement": Source("m", displacement),
@@ -127,7 +127,7 @@ def sources() -> dict[str, Source]:
 
 
 class Range:
-    """From where to where colours go: from zero to a round number that follows the largest value."""
+    """The range of the colours: from zero to a round number that follows the largest value."""
 
     def __init__(self) -> None:
         self.highest = 0.0
@@ -140,7 +140,7 @@ class Range:
 
 
 def colored(values: Values | None, highest: float, count: int) -> npt.NDArray[np.uint8]:
-    """Colours of values from zero to ``highest``, uint8 [V, 3]; of tissue where there are none.
+    """Colours of values from zero to ``highest``, uint8 [V, 3]; without values, the colour of tissue.
 
     Args:
         values: [V].

@@ -1,4 +1,4 @@
-"""Cuts through a body along a plane of its rest shape: what is left of its surface, and the section, bound to nodes."""
+"""Cuts through a body along a plane of its rest shape: the rest of its surface, and the section, bound to nodes."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ _AROUND = {
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane of the rest shape; what is beyond it is taken away.
+    """A plane of the rest shape; the part beyond it is removed.
 
     Attributes:
-        axis: 0, 1 or 2: the axis at right angles to it.
-        share: Where it is, as a share of the body's extent along the axis.
-        flipped: Whether the other side is taken away.
+        axis: 0, 1 or 2: the axis at right angles to the plane.
+        share: Its position, as a share of the body's extent along the axis.
+        flipped: Whether the other side is removed.
     """
 
     axis: int
@@ -73,7 +73,7 @@ def cut(surface: SurfaceMesh, mesh: Any, plane: Plane) -> SurfaceMesh:
 
 
 def _kept(surface: SurfaceMesh, beyond: npt.NDArray[np.float64]) -> SurfaceMesh:
-    """Triangles on the near side; those that the plane crosses end at it, their far corners drawn in along edges."""
+    """Triangles on the near side. Those that the plane crosses end there: their far corners move along edges to it."""
     outside = beyond > 0.0
     corners = surface.triangles
     count = outside[corners].sum(axis=1)
@@ -102,7 +102,7 @@ def _between(
     t = (beyond[a] / (beyond[a] - beyond[b]))[:, None]
     nodes = np.concatenate([surface.nodes[a], surface.nodes[b]], axis=1)
     weights = np.concatenate([(1.0 - t) * surface.weights[a], t * surface.weights[b]], axis=1)
-    # The four that count most: all there are of marched surfaces and of boundaries.
+    # The four nodes with the largest weights; marched surfaces and boundaries have no more.
     most = np.argsort(-np.abs(weights), axis=1, kind="stable")[:, :4]
     nodes, weights = (np.take_along_axis(each, most, axis=1) for each in (nodes, weights))
     weights /= weights.sum(axis=1, keepdims=True)
@@ -110,7 +110,7 @@ def _between(
 
 
 def _section(mesh: Any, beyond: npt.NDArray[np.float64]) -> SurfaceMesh:
-    """The polygons in which the plane cuts tetrahedra, facing what was taken away."""
+    """The polygons in which the plane cuts tetrahedra, facing the removed part."""
     tets, outside = mesh.tets, beyond[mesh.tets] > 0.0
     sides = outside @ np.array([1, 2, 4, 8])
     sides = np.where(np.isin(sides, list(_AROUND)), sides, 15 - sides)

@@ -1,4 +1,4 @@
-"""What goes to and fro between a page and its session: controls one way, frames the other."""
+"""The data between a page and its session: controls in one direction, frames in the other."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ Vector: TypeAlias = npt.NDArray[np.float64]
 
 @dataclass
 class Controls:
-    """What the page's controls say.
+    """The values of the page's controls.
 
     Attributes:
-        running: Whether time goes on.
-        speed: Simulated seconds that a second on the wall is to have.
-        fps: Frames a second at most.
+        running: Whether the simulation runs.
+        speed: Wanted simulated seconds for each second of wall time.
+        fps: The most frames per second.
         hand: A name in ``HANDS``.
-        radius: Of a hand's patch over the body's size.
-        strength: Of a hand's spring, 0 to 1.
+        radius: Radius of a hand's patch over the body's size.
+        strength: Strength of a hand's spring, 0 to 1.
         colors: A name in ``Session.sources``; "" for none.
         surface: The name of the surface that is shown; bodies without it show their first.
         plane: Where bodies are cut, if they are.
@@ -43,20 +43,20 @@ class Controls:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What is seen at one time.
+    """The picture at one time.
 
     Attributes:
-        number: Of the surfaces' topology; other triangles have another number.
-        positions: Of the shown points of each body [m], float32 [V, 3].
-        triangles: int32 [F, 3] each.
-        colors: uint8 [V, 3] each.
-        highest: What the last colour stands for.
-        poses: Of each obstacle, position [m] and quaternion (x, y, z, w), float64 [7].
-        time: Simulated [s].
-        ratio: Simulated time over time on the wall, lately.
-        slow: Whether that is less than was asked for.
-        forces: Of each hand that holds something, by its owner [N], float64 [3].
-        ends: From where to where each of these pulls [m].
+        number: A number of the surfaces' topology, which changes with the triangles.
+        positions: The shown points of each body [m], float32 [V, 3].
+        triangles: int32 [F, 3] for each body.
+        colors: uint8 [V, 3] for each body.
+        highest: The value of the last colour.
+        poses: Position [m] and quaternion (x, y, z, w) of each obstacle, float64 [7].
+        time: Simulated time [s].
+        ratio: Simulated over wall time, lately.
+        slow: Whether that is less than was requested.
+        forces: The force of each hand that holds something, by its owner [N], float64 [3].
+        ends: The two ends of each of these hands' springs [m].
     """
 
     number: int

@@ -1,8 +1,8 @@
-"""Who may come in: a check of every request that viser's server gets, before anything is answered.
+"""Access control: a check of every request to viser's server before anything is answered.
 
-A browser sends requests for every page that it shows. Without a token only those count that name this computer, so that
-no name on the network can be made to mean it, and websockets must come from the page itself. With a token every request
-must bring it, at first in the address, later in a cookie.
+Any page in a browser can send requests. Without a token, a request must name this computer itself, so that no other
+name on the network can be made to mean it, and websockets must come from the page itself. With a token, every request
+must contain it, at first in the address, later in a cookie.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from urllib.parse import parse_qs, quote, urlsplit
 
 from warp_corot.errors import InputError
 
-#: What a browser may call the computer that it runs on.
+#: Names by which a browser may address its own computer.
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
-#: How long the server may take to answer when it is tried [s].
+#: How long the server may take to answer when it is tested [s].
 PATIENCE = 5.0
-#: Servers are started one at a time: a name of the module ``websockets`` is another one meanwhile.
+#: Servers are started one at a time, because a name of the module ``websockets`` is replaced meanwhile.
 _starting = threading.Lock()
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address can be reached from this computer alone."""
+    """Whether an address can be reached only from this computer."""
     try:
         return ip_address(host.strip("[]")).is_loopback
     except ValueError:
@@ -47,11 +47,11 @@ class Gate:
     """Lets requests pass or refuses them.
 
     Args:
-        host: The address that is listened to.
-        token: What requests must bring; None: they must come from this computer.
+        host: The address on which the server listens.
+        token: The token that requests must contain; None: they must come from this computer.
 
     Raises:
-        InputError: No token where others can reach the address, or one that is empty.
+        InputError: There is no token although others can reach the address, or it is empty.
     """
 
     def __init__(self, host: str, token: str | None = None):
@@ -63,17 +63,17 @@ class Gate:
         self._cookie = "warp-corot-" + secrets.token_hex(4)
 
     def address(self, port: int) -> str:
-        """What to open in a browser."""
+        """The address to open in a browser."""
         host = "localhost" if self.host in ("0.0.0.0", "::", "") else self.host
         shown = f"http://{f'[{host}]' if ':' in host else host}:{port}/"
         return shown if self.token is None else f"{shown}?token={quote(self.token, safe='')}"
 
     def refusal(self, path: str, headers: Any) -> tuple[http.HTTPStatus, dict[str, str]] | None:
-        """The status and the headers of the answer to a request, None if it may pass.
+        """The status and the headers of the refusal of a request; None if it may pass.
 
         Args:
-            path: With its query.
-            headers: A mapping of names, whatever their case.
+            path: The path with its query.
+            headers: A mapping of names; case does not matter.
         """
         forbidden: tuple[http.HTTPStatus, dict[str, str]] = (http.HTTPStatus.FORBIDDEN, {})
         try:
@@ -92,7 +92,7 @@ class Gate:
             return forbidden
         if (headers.get("Upgrade") or "").lower() == "websocket":
             return None
-        # The address in the browser's line, its history and what it tells others is without the token from now on.
+        # From now on the address bar, the history and the referrer do not contain the token.
         cookie = f"{self._cookie}={quote(given[0], safe='')}; HttpOnly; SameSite=Strict; Path=/"
         return http.HTTPStatus.SEE_OTHER, {"Location": urlsplit(path).path or "/", "Set-Cookie": cookie}
 
@@ -111,7 +111,7 @@ class Gate:
 
 @contextmanager
 def guarded(gate: Gate) -> Iterator[None]:
-    """Servers that begin inside ask the gate about each request, of the page's files and of websockets alike."""
+    """Servers that start inside ask the gate about each request, for the page's files and for websockets."""
     import websockets.asyncio.server as servers
     from websockets.datastructures import Headers
     from websockets.http11 import Response
@@ -139,7 +139,7 @@ def guarded(gate: Gate) -> Iterator[None]:
 
 
 def is_closed(gate: Gate, port: int) -> bool:
-    """Whether the server refuses what the gate does: requests from elsewhere, or without the token."""
+    """Whether the server refuses the requests that the gate refuses: from elsewhere, or without the token."""
     host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(gate.host, gate.host)
     upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
     upgrade["Sec-WebSocket-Key"] = "dGhlIHNhbXBsZSBub25jZQ=="
@@ -157,10 +157,10 @@ def is_closed(gate: Gate, port: int) -> bool:
 
 
 def check_port(host: str, port: int) -> None:
-    """See that a port is free; 0 stands for any that is.
+    """Check that a port is free; 0 stands for any free port.
 
     Raises:
-        InputError: It is not, or there is no such address here.
+        InputError: It is not, or this computer does not have the address.
     """
     if not 0 <= port <= 65535:
         raise InputError(f"port is {port}; it must be 0 to 65535")

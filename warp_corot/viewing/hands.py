@@ -1,7 +1,7 @@
-"""What a person does to a body: one small class for each way, listed in ``HANDS``.
+"""Hands: the ways in which a person acts on a body, a small class each, listed in ``HANDS``.
 
-A hand takes hold of a picked place, is moved, and says the force that it exerts. Those here are springs; a hand that
-moves a rigid tool needs the same few members.
+A hand takes hold of a picked place, is moved, and reports the force that it exerts. The hands here are springs; a hand
+that moves a rigid tool needs the same few members.
 """
 
 from __future__ import annotations
@@ -18,31 +18,31 @@ Vector = npt.NDArray[np.float64]
 
 
 class Hand(Protocol):
-    """Something that a person holds a body with.
+    """A way to hold a body.
 
     Class attributes:
-        stays: Whether it holds on when the mouse lets go.
+        stays: Whether it holds on after the mouse is released.
     """
 
     stays: ClassVar[bool]
     pick: Pick
 
     def move(self, motion: Vector) -> None:
-        """The mouse is so far from where it was pressed [m], [3]."""
+        """Move to the mouse's present distance from where it was pressed [m], [3]."""
         ...
 
     def release(self) -> None:
-        """Let go; once more does no harm."""
+        """Let go; a second call does nothing."""
         ...
 
     @property
     def force(self) -> Vector:
-        """On the body, in the last step [N], float64 [3]."""
+        """The force on the body in the last step [N], float64 [3]."""
         ...
 
     @property
     def ends(self) -> tuple[Vector, Vector]:
-        """From where to where it pulls [m], float64 [3] each."""
+        """The two ends of the spring [m], float64 [3] each."""
         ...
 
 
@@ -50,11 +50,11 @@ class SpringHand:
     """A spring between the mouse and a patch around the picked place.
 
     Args:
-        springs: Of the simulation.
-        shown: The surface that the place is on.
+        springs: The simulation's springs.
+        shown: The surface with the place.
         pick: The place.
-        radius: Of the patch, at rest [m].
-        strength: Stiffness over the largest that the time step carries, 0 to 1.
+        radius: Radius of the patch at rest [m].
+        strength: Stiffness over the largest stable one at the time step, 0 to 1.
     """
 
     rigid: ClassVar[bool] = False
@@ -67,7 +67,7 @@ class SpringHand:
         self._before: Vector = np.zeros(3)
 
     def begin(self) -> None:
-        """The mouse takes hold once more: motion counts from here."""
+        """Take hold again: motion counts from here."""
         self._before = self._spring.motion
 
     def move(self, motion: Vector) -> None:
@@ -86,11 +86,11 @@ class SpringHand:
 
 
 class Drag(SpringHand):
-    """Draws the tissue after the mouse; the patch may turn and stretch."""
+    """Pulls the tissue after the mouse; the patch may rotate and stretch."""
 
 
 class Press(SpringHand):
-    """Pushes the patch as it is into the body, as deep as the mouse goes away, like a stamp of the patch's shape."""
+    """Pushes the rigid patch into the body, as deep as the mouse moves, like a stamp of the patch's shape."""
 
     rigid = True
 
@@ -99,7 +99,7 @@ class Press(SpringHand):
 
 
 class Grasp(SpringHand):
-    """Holds the patch as it is, and stays where the mouse leaves it, until it is released."""
+    """Holds the patch rigidly, and stays where the mouse leaves it, until it is released."""
 
     rigid = True
     stays = True
@@ -109,13 +109,13 @@ HANDS: dict[str, type[SpringHand]] = {"drag": Drag, "press": Press, "grasp": Gra
 
 
 def patch_around(shown: Shown, pick: Pick, radius: float) -> Patch:
-    """The points of the shown surface within a radius at rest [m] of a place, more where they are nearer; the corners
-    of its triangle at the least."""
+    """The points of the shown surface within a rest radius of a place [m], with larger weights nearer to it; at least
+    the corners of its triangle."""
     corners = shown.triangles[pick.triangle]
     distance = np.linalg.norm(shown.rest - shown.at(pick, shown.rest), axis=1)
     near = np.flatnonzero(distance < radius)
     near = near[np.argsort(distance[near], kind="stable")]
-    # Evenly thinned: the nearest ones alone would be a smaller patch.
+    # Evenly thinned: the nearest points would be a smaller patch.
     near = near[:: -(-len(near) // (MOST_POINTS - 3))] if len(near) > MOST_POINTS - 3 else near
     points, place = np.unique(np.concatenate([corners, near]), return_inverse=True)
     shares = np.concatenate([pick.place, (1.0 - (distance[near] / max(radius, 1e-300)) ** 2) ** 2])

@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
-#: The least share of a frame's time that steps have, however long the rest takes.
+#: The least share of a frame's time for steps, however long the rest takes.
 STEPPING = 0.4
-#: A frame is not to be longer than this many times its period, whatever was late.
+#: A frame takes at most this many times its period, even after a delay.
 MOST_LATE = 2.0
 #: Time counts as slow below this share of the requested speed.
 SLOW = 0.9
@@ -18,9 +18,9 @@ class Pace:
     """The speed of simulated time.
 
     Attributes:
-        rate: Simulated seconds a second of stepping, lately.
+        rate: Simulated seconds per second of stepping, lately.
         ratio: Simulated over wall time, lately.
-        rest: Wall time of a frame that is not stepping, lately [s].
+        rest: Wall time of a frame without its steps, lately [s].
     """
 
     rate: float = 0.0
@@ -29,11 +29,11 @@ class Pace:
     _then: float = 0.0
 
     def wanted(self, speed: float, period: float) -> float:
-        """Simulated seconds that the next frame is to have: as asked for, if a frame's time is enough.
+        """Simulated seconds of the next frame: as requested, if a frame's time is enough.
 
         Args:
-            speed: Simulated seconds that a second on the wall is to have.
-            period: Of frames [s].
+            speed: Wanted simulated seconds for each second of wall time.
+            period: Period of frames [s].
         """
         since = time.perf_counter() - self._then if self._then else period
         asked = speed * min(since, MOST_LATE * period)
@@ -45,7 +45,7 @@ class Pace:
         return 0.0 < self.ratio < SLOW * speed
 
     def took(self, simulated: float, stepping: float, rest: float) -> None:
-        """A frame was made: of so much simulated time, so much stepping, and the rest [s]."""
+        """Note a frame: its simulated time, its time for steps, and the rest [s]."""
         now = time.perf_counter()
         if simulated > 0.0:
             self.rate = _mean(self.rate, simulated / max(stepping, 1e-9), 0.3)
@@ -55,7 +55,7 @@ class Pace:
         self._then = now
 
     def interrupted(self) -> None:
-        """What follows has nothing to do with the time before."""
+        """Forget the time before an interruption."""
         self._then = 0.0
 
 

@@ -1,4 +1,4 @@
-"""The controls of a page, and what it tells in words, numbers and a plot."""
+"""The controls of a page, and its words, numbers and plot."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from .session import Session
 
-#: How often numbers and the plot are renewed [1/s]; frames come more often.
+#: How often numbers and the plot are updated [1/s]; frames come more often.
 TOLD = 8.0
 #: Seconds that the plot shows, at most so many points.
 WINDOW, POINTS = 10.0, 400
@@ -28,11 +28,11 @@ NOTHING = "none"
 
 
 class Panel:
-    """The controls of a page. Callbacks hand commands to the session, and touch nothing else.
+    """The controls of a page. Callbacks only hand commands to the session.
 
     Args:
-        server: viser's.
-        session: What is controlled.
+        server: viser's server.
+        session: The session that they control.
     """
 
     def __init__(self, server: ViserServer, session: Session):
@@ -48,10 +48,10 @@ class Panel:
     # --- what is told ----------------------------------------------------------------------------------------------
 
     def tell(self, frame: Frame, now: float) -> None:
-        """Bring words, numbers and the plot up to date.
+        """Update words, numbers and the plot.
 
         Args:
-            now: Time on the wall [s].
+            now: Wall time [s].
         """
         force = float(np.linalg.norm(sum(frame.forces.values(), np.zeros(3)))) if frame.forces else 0.0
         if self._samples and frame.time < self._samples[-1][0]:

@@ -1,6 +1,6 @@
-"""What a visitor saves: pictures, films, animations, run files and checkpoints, sent to the browser that asked.
+"""Saving by a visitor: pictures, films, animations, run files and checkpoints, sent to the browser that asked.
 
-Nothing is written on the page's computer but files in a folder that is gone afterwards.
+On the page's computer, only files in a temporary folder are written.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ FPS, SECONDS = 24.0, 4.0
 
 
 class Cancelled(Exception):
-    """The visitor has cancelled."""
+    """The visitor cancelled."""
 
 
 class Saving:
     """The folder of controls that save.
 
     Args:
-        server: viser's.
-        session: What is saved.
+        server: viser's server.
+        session: The session that is saved.
         show: Sends the present frame to all visitors; called on the session's thread.
-        run_file: The run file of what is simulated; None: there is none.
+        run_file: The run file of the simulation, or None.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Saving:
     # --- pictures --------------------------------------------------------------------------------------------------
 
     def _picture(self, event: Any) -> None:
-        """Called on viser's threads, which draw nothing but what the browser shows."""
+        """Save what the browser shows; called on viser's threads."""
         try:
             found = io.BytesIO()
             _drawn(event.client).save(found, format="PNG")
@@ -106,7 +106,7 @@ class Saving:
             self._session.ask(lambda: setattr(self._session, "note", note))
 
     def _film(self, client: Any) -> None:
-        """Frames at even distances of simulated time, however long each takes."""
+        """Save frames at even intervals of simulated time, however long each takes."""
         name = "film.mp4" if find_spec("imageio_ffmpeg") else "film.gif"
         count = frame_count(float(self._seconds.value), FPS)
         with tempfile.TemporaryDirectory() as folder:
@@ -117,7 +117,7 @@ class Saving:
                 if number:
                     self._session.sim.advance(1.0 / FPS)
                 self._between(number, count)
-                # Once more, since colours are seen a frame later.
+                # Once more, because browsers show colours a frame later.
                 self._show()
                 frames.append(Path(folder) / f"{number}.png")
                 _drawn(client).save(frames[-1])
@@ -159,7 +159,7 @@ class Saving:
             _send(client, path.name, path.read_bytes())
 
     def _between(self, number: int, count: int) -> None:
-        """What goes on while something long is made: hands move, and the frame is shown."""
+        """Continue during a long save: hands move, and the frame is shown."""
         self._session.take_commands()
         self._session.note = f"frame {number} of {count}"
         self._show()

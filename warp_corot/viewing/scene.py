@@ -30,8 +30,8 @@ _ARROW = (20, 90, 200)
 class _Body:
     """The nodes of one body's surface in the scene.
 
-    A plain mesh follows the mouse. Where there are colours it is seen through, and two coloured meshes take turns: the
-    one that is hidden takes the new frame while the other is seen, since browsers take a moment to read it.
+    A plain mesh follows the mouse. With colours it is transparent, and two coloured meshes take turns: the hidden one
+    receives the new frame while the other is shown, because browsers take a moment to read it.
     """
 
     def __init__(self, server: ViserServer, name: str, on_drag: Callable[[Any], Any]):
@@ -49,7 +49,7 @@ class _Body:
     ) -> None:
         if number != self._number or self._plain is None:
             self._number = number
-            # Without shadows, which take browsers longer than all the rest, and fall on what is in the same place.
+            # Without shadows, which cost browsers more than all the rest, and fall on meshes in the same place.
             self._plain = self._server.scene.add_mesh_simple(
                 self._name,
                 points,
@@ -97,8 +97,8 @@ class Scene:
     """The scene of a page.
 
     Args:
-        server: viser's.
-        session: What is shown; only its commands are called, on the session's own thread.
+        server: viser's server.
+        session: The session that is shown; only its commands are called, on the session's own thread.
     """
 
     def __init__(self, server: ViserServer, session: Session):

@@ -1,4 +1,4 @@
-"""viser's server, behind the gate and without what it does unasked."""
+"""viser's server, behind the gate and without its tunnel."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ def open_server(gate: Gate, port: int, title: str) -> ViserServer:
     """Start the server.
 
     Args:
-        gate: Says who may come in.
-        port: Where to listen, 0 for any free port.
-        title: Of the page.
+        gate: Decides who may enter.
+        port: The port, 0 for any free one.
+        title: The title of the page.
 
     Raises:
-        InputError: viser is not there, the port is taken, or the gate would not be asked.
+        InputError: viser is not installed, the port is taken, or this version of viser would not ask the gate.
     """
     viser = library()
     check_port(gate.host, port)
@@ -62,7 +62,7 @@ def stop(server: ViserServer) -> None:
 
 
 def _without_tunnel(server: ViserServer) -> None:
-    """No visitor may have the page published through a tunnel."""
+    """Prevent visitors from publishing the page through a tunnel."""
     from viser import _messages
 
     server._connection.unregister_handler(_messages.ShareUrlRequest)

@@ -1,6 +1,6 @@
-"""A simulation under a person's hands: commands taken between advances, time shared with a clock on the wall, frames.
+"""A simulation under a person's hands: commands between advances, time that follows a wall clock, frames.
 
-Nothing here knows a browser. One thread calls ``tick``; others hand it commands by ``ask`` and touch nothing else.
+Nothing here depends on a browser. One thread calls ``tick``; others only hand it commands by ``ask``.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ from .springs import Springs
 
 
 class Session:
-    """A simulation, what is shown of it, and the hands that hold it.
+    """A simulation, its shown surfaces, and the hands that hold it.
 
     Args:
         sim: The simulation.
-        own: Of each body the user's own surface, or None.
-        made: Called with every simulation that takes the place of another.
+        own: The user's own surface of each body, or None.
+        made: Called with every simulation that replaces another.
 
     Attributes:
-        sim: The present simulation: another one after its law, material or remeshing was switched.
-        controls: As the page has them; only commands change them.
-        shown: What is shown of each body.
-        hands: Those that hold something, by who moves them.
-        note: What the person should know, if anything.
-        sending: How long it took to send the last frame [s], as who sends it says.
-        busy: Whether something is being saved, for which the simulation must stay the same one.
+        sim: The present simulation; a switch of law, material or remeshing replaces it.
+        controls: The page's controls; only commands change them.
+        shown: The shown surfaces of each body.
+        hands: The hands that hold something, by who moves them.
+        note: A note for the person, or "".
+        sending: How long the last frame took to send [s]; the sender sets it.
+        busy: Whether something is being saved, so that the simulation must not be replaced.
     """
 
     def __init__(
@@ -67,11 +67,11 @@ class Session:
     # --- commands --------------------------------------------------------------------------------------------------
 
     def ask(self, command: Callable[[], None]) -> None:
-        """Have a command called between two advances; from any thread."""
+        """Queue a command to be called between two advances; may be called from any thread."""
         self._commands.put(command)
 
     def take_commands(self) -> None:
-        """Call all commands that wait. One that is refused leaves a note."""
+        """Call all waiting commands. A refused command leaves a note."""
         while True:
             try:
                 command = self._commands.get_nowait()
@@ -83,18 +83,18 @@ class Session:
                 self.note = str(error)
 
     def change(self, **values: Any) -> None:
-        """Change controls; what is shown follows."""
+        """Change controls, and the picture with them."""
         shown = self.controls.surface, self.controls.plane
         self.controls = replace(self.controls, **values)
         if (self.controls.surface, self.controls.plane) != shown:
             self._show()
 
     def step(self, count: int = 1) -> None:
-        """Make so many steps although time stands still."""
+        """Make a number of steps while the simulation is paused."""
         self._steps_asked += count
 
     def reset(self) -> None:
-        """Let everything go and go back to the beginning.
+        """Release everything and return to the beginning.
 
         Raises:
             InputError: Something is being saved.
@@ -105,7 +105,7 @@ class Session:
         self.note = ""
 
     def switch(self, **what: Any) -> None:
-        """Go on with other laws, materials or remeshing: ``remade``'s arguments. Hands let go.
+        """Continue with other laws, materials or remeshing: the arguments of ``remade``. All hands let go.
 
         Raises:
             InputError: Something is being saved, or as ``remade``; then nothing has changed.
@@ -120,15 +120,15 @@ class Session:
         self._open()
 
     def close(self) -> None:
-        """Let everything go and leave the simulation as it is."""
+        """Release everything and leave the simulation as it is."""
         self._close()
 
     # --- hands -----------------------------------------------------------------------------------------------------
 
     def press(self, owner: Any, body: int, position: npt.ArrayLike) -> None:
-        """A mouse takes hold of the place of a body's shown surface that is nearest to a position [m].
+        """Take hold, with a mouse, of the place of a body's shown surface that is nearest to a position [m].
 
-        A hand that stays and holds that place is moved on.
+        If a hand that stays holds that place already, the mouse moves it.
         """
         pick = self.shown[body].pick(body, position)
         for held, hand in list(self.hands.items()):
@@ -142,12 +142,12 @@ class Session:
         self.hands[owner] = kind(self.springs, self.shown[body], pick, radius, self.controls.strength)
 
     def move(self, owner: Any, motion: npt.ArrayLike) -> None:
-        """The mouse is so far from where it was pressed [m], [3]."""
+        """Move a hand to the mouse's present distance from where it was pressed [m], [3]."""
         if owner in self.hands and np.isfinite(motion).all():
             self.hands[owner].move(np.asarray(motion, dtype=np.float64))
 
     def let_go(self, owner: Any) -> None:
-        """The mouse was released; hands that stay do."""
+        """Release the mouse; hands that stay hold on."""
         hand = self.hands.get(owner)
         if hand is None:
             return
@@ -157,7 +157,7 @@ class Session:
             self.hands.pop(owner).release()
 
     def release_all(self) -> None:
-        """All hands let go."""
+        """Release all hands."""
         for hand in self.hands.values():
             hand.release()
         self.hands.clear()
@@ -165,7 +165,7 @@ class Session:
     # --- time ------------------------------------------------------------------------------------------------------
 
     def tick(self) -> Frame:
-        """Take commands, advance by as much as a frame's time allows, and read the frame."""
+        """Take commands, advance as far as a frame's time allows, and return the frame."""
         started = time.perf_counter()
         self.take_commands()
         before = self.sim.total_time
@@ -187,7 +187,7 @@ class Session:
         return frame
 
     def frame(self) -> Frame:
-        """What is seen now."""
+        """The present frame."""
         versions = [body.version for body in self.sim.bodies]
         if versions != self._versions:
             self._versions = versions
