@@ -1,4 +1,4 @@
-"""Elastic models, one file each, all from the same Young's modulus and Poisson's ratio. A new one is listed here."""
+"""Elastic models, one file each, all from the same Young's modulus and Poisson's ratio. List new ones here."""
 
 from warp_corot.elasticity.corotated.model import Corotated
 

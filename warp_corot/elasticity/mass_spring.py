@@ -26,12 +26,12 @@ from .structs import isotropic_material
 class MassSpring(Model):
     """W = sum over edges of k/2 (l - L)^2, with k = sum of E V / L^2 over the tetrahedra around an edge.
 
-    The stiffness is Van Gelder's (1998) carried to three dimensions: averaged over all directions of edges it gives
-    Young's modulus E with Poisson's ratio 1/4. Springs between pairs of points cannot have any other ratio, so the
-    material's own is ignored. Von Mises stress is that of Hooke's law with E and 1/4 on the Green strain.
+    The stiffness is Van Gelder's (1998), extended to three dimensions: averaged over all directions of edges, it gives
+    Young's modulus E and Poisson's ratio 1/4. Springs between pairs of points cannot have another ratio, so the
+    material's ratio is ignored. The von Mises stress is that of Hooke's law with E and 1/4 for the Green strain.
 
     Attributes:
-        dilatation: "element": the only choice, of springs.
+        dilatation: "element", the only value for springs.
     """
 
     dilatation: str = ELEMENT

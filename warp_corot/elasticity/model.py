@@ -1,4 +1,4 @@
-"""What every elastic model is: a small description, and the force field that it becomes on a discretization."""
+"""Elastic models: a small description each, and the force field that it becomes on a discretization."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 
 
 class SmallForces(Protocol):
-    """Forces of small displacements, whatever they come from."""
+    """Forces of small displacements, from any source."""
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
-        """Add the forces [N] of displacements u to f; both vec4, a place for each node."""
+        """Add the forces [N] of displacements u to f; both vec4, one entry for each node."""
         ...
 
     def state_kept(self) -> AbstractContextManager[None]:
@@ -52,15 +52,15 @@ class SmallForces(Protocol):
 class ForceField(ABC):
     """An elastic model on one body: launches that read displacements and add forces.
 
-    Launches only; nothing here waits for the device or comes back to the host but ``elastic_energies``.
+    Methods only launch; they do not wait for the device, except those that return energies or stresses on the host.
 
     Args:
         body: A body, or its discretization.
-        deterministic: Whether forces must come out the same bit by bit every time, also on CUDA, where threads run in
-            any order; ``slots`` are then where kernels add them first.
+        deterministic: Whether forces must be the same bit by bit every time, even on CUDA, where threads run in any
+            order; kernels then first add them to ``slots``.
 
     Attributes:
-        plan: What launches go through.
+        plan: The units of work of launches.
         elements: All of its elements.
         is_linear: Whether forces are linear in displacements.
         shares_dilatation: Whether elements share their dilatation.
@@ -81,7 +81,7 @@ class ForceField(ABC):
             raise InputError(f"the material is {name}; only the model {only} supports this material")
         self.discretization = discretization
         self.device = discretization.device
-        #: On the CPU there is one thread, and nothing to settle.
+        #: On the CPU there is one thread, and the order is always the same.
         self.deterministic = deterministic and discretization.device.is_cuda
         self._isotropic = Kept(lambda *values: isotropic_material(list(values)))
         self.plan = self.plan_of(discretization)
@@ -104,14 +104,14 @@ class ForceField(ABC):
     def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None:
         """Add K(u) p to y [N], K minus the derivative of the elastic forces at displacements u; all vec4 [worlds * N].
 
-        K is symmetric, and need not be positive semidefinite. A field whose K is not the exact derivative says so. All
-        laws on all meshes go element by element, and sums are atomic: on CUDA rounding differs from call to call, also
-        where forces are deterministic.
+        K is symmetric, and may be indefinite. A field whose K is not the exact derivative says so. All laws on all
+        meshes go element by element, and sums are atomic: on CUDA rounding differs from call to call, even if forces
+        are deterministic.
 
         Args:
             u: Displacements [m].
-            p: Displacements that K is multiplied by [m].
-            y: What the product is added to.
+            p: Displacements by which K is multiplied [m].
+            y: The array to which the product is added.
         """
 
     @abstractmethod
@@ -122,47 +122,48 @@ class ForceField(ABC):
         """The same K for many products at the same displacements.
 
         Args:
-            exact: Whether K must be the exact derivative where the field has two; see ``CorotatedField``.
+            exact: Whether K must be the exact derivative, if the field has two stiffnesses; see ``CorotatedField``.
         """
         return Tangent(self)
 
     def plan_of(self, discretization: Discretization) -> Plan:
-        """The plan that the field goes through; by default the elements one by one."""
+        """The plan of the field; by default the elements one by one."""
         return discretization.plan(subtrees=False, deterministic=self.deterministic)
 
     def load_kernels(self) -> None:  # noqa: B027 (most have none)
-        """Load every kernel that a later plan may need, so that none is compiled once steps are made.
+        """Load every kernel that a later plan may need, so that none is compiled during steps.
 
-        Called where plans change, before the first step.
+        Called before the first step if plans change.
         """
 
     def derive(self) -> None:  # noqa: B027 (most need nothing)
-        """Launch what brings up to date what is kept of the elements, if the plan has changed; may be recorded.
+        """Launch the update of what the field keeps of the elements, if the plan has changed; may be recorded.
 
-        Called where plans change, after each time that one is derived.
+        Called if plans change, each time after one is derived.
         """
 
     def follow(self) -> None:  # noqa: B027 (most need nothing)
-        """Make launches of the sizes that the plan has now.
+        """Adapt launches to the present sizes of the plan.
 
-        Called where plans change, before steps are recorded, whenever a size is another one.
+        Called if plans change, before steps are recorded, whenever a size has changed.
         """
 
     def share_dilatation(self, dilating: Dilating) -> bool:
-        """Add from now on the forces of a dilatation that subtrees and groups share, if the field can; whether it can.
+        """From now on add the forces of a dilatation that subtrees and groups share, if the field can; returns whether
+        it can.
 
-        Called again where groups are other ones.
+        Called again when groups change.
         """
         return False
 
     @property
     def stiffest(self) -> SmallForces:
-        """Forces near rest that bound the step: these, or stiffer ones if the field becomes so where it is strained."""
+        """Forces near rest that bound the step: these, or stiffer ones if the field becomes stiffer under strain."""
         return self
 
     @abstractmethod
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
-        """Write the strain energies [J] that make up the whole, world after world; float64."""
+        """Write strain energies whose sum is the body's [J], world after world; float64."""
 
     def write_potentials(self, u: wp.array, energies: wp.array) -> None:
         """Write the energies [J] whose derivative forces are, as ``write_energies``: these, and of active stress that
@@ -180,7 +181,7 @@ class ForceField(ABC):
 
     @property
     def element_count(self) -> int:
-        """How many elements launches go through; those beyond the body's do nothing."""
+        """How many elements launches go through; elements beyond the body's do nothing."""
         return self.discretization.sizes.launch_elements
 
     @property
@@ -190,7 +191,7 @@ class ForceField(ABC):
 
     @property
     def state(self) -> dict[str, wp.array]:
-        """Arrays that must be kept for the steps to go on as they would have."""
+        """Arrays that must be kept so that steps continue the same."""
         return {}
 
     @property
@@ -215,7 +216,7 @@ class ForceField(ABC):
                 wp.copy(array, kept[name])
 
     def reset(self, chosen: wp.array) -> None:  # noqa: B027 (most have no state)
-        """Forget the state of chosen worlds; int32 [worlds], not zero for these."""
+        """Forget the state of chosen worlds, nonzero in int32 [worlds]."""
 
     def elastic_forces(self, u: wp.array) -> wp.array:
         """Elastic nodal forces [N] of displacements u, a new vec4 [worlds * N]."""
@@ -260,11 +261,11 @@ class ForceField(ABC):
 
     @property
     def isotropic_shown(self) -> IsotropicMaterial:
-        """Lamé's parameters for stresses: the material's own."""
+        """Lamé's parameters for stresses: those of the material."""
         return isotropic_material(list(self.discretization.lame))
 
     def isotropic_of(self, flat: FlatLeaves) -> IsotropicMaterial:
-        """Lamé's parameters for the forces of leaves that are in no subtree."""
+        """Lamé's parameters for the forces of leaves in no subtree."""
         kept = self.discretization.lame_of_flat(flat)
         if kept is not None:
             return isotropic_material([*kept, 1])
@@ -278,8 +279,8 @@ class Model(ABC):
     """The description of an elastic model: a frozen dataclass of plain values.
 
     Class attributes:
-        step_safety: Share of the stable step that is taken by default while strains are small.
-        strained_safety: The same for large strains, where stiffness can change before it is measured again.
+        step_safety: Share of the stable step that is taken by default at small strains.
+        strained_safety: The same for large strains, where stiffness can change before the next measurement.
     """
 
     step_safety: ClassVar[float] = 0.9
@@ -290,23 +291,23 @@ class Model(ABC):
         """The model's force field on a discretization.
 
         Args:
-            deterministic: Whether forces must come out the same bit by bit every time also on CUDA.
+            deterministic: Whether forces must be the same bit by bit every time, even on CUDA.
 
         Raises:
-            InputError: The model cannot be used with this body's mesh.
+            InputError: The model does not support this body's mesh or material.
         """
 
     @property
     def kept_of_elements(self) -> str | None:
-        """What a force field keeps of the elements that it is bound to, for a message; None: it can go on with others.
+        """What a force field keeps of its elements, for a message; None if it supports a change of elements.
 
-        A body whose elements change cannot have a model that keeps something of them.
+        A body whose elements change cannot have a model that keeps data of them.
         """
         return None
 
 
 class ElementField(ForceField):
-    """Force field of kernels that need nothing but each element's nodal displacements.
+    """Force field of kernels that need only each element's nodal displacements.
 
     Args:
         body, deterministic: As for every field.

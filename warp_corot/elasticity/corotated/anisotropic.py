@@ -32,20 +32,20 @@ if TYPE_CHECKING:
 class AnisotropicField(ForceField):
     """W = V/2 e : C : e with e = sym(R^T F) - I, R the element's own rotation, C fixed in rest space.
 
-    The force is the gradient of W, with the turning of R that isotropic materials need not account for, and conserves
-    linear and angular momentum. Where F comes near having no definite rotation (inverted, or flattened to a sixth in
-    two directions, as fibres are that stretch 3.4 times; see ``kernels.corotated.anisotropic``), C goes over to that of
-    the nearest isotropic material, and the force is the gradient of that energy.
+    The force is the gradient of W, with the derivative of R, which isotropic materials do not need, and conserves
+    linear and angular momentum. Where F has hardly a definite rotation (inverted, or flattened to a sixth in two
+    directions, as fibres are that stretch 3.4 times; see ``kernels.corotated.anisotropic``), C blends into that of the
+    nearest isotropic material, and the force is the gradient of that energy.
 
-    To it comes the active stress of ``SoftBody.activation``, P = s (F d) d^T along the fibres' direction d. It keeps
-    both momenta; it puts work in, so that there is no energy of it.
+    The active stress of ``SoftBody.activation`` is added: P = s (F d) d^T along the fibres' direction d. It conserves
+    both momenta. It does work, and has no energy.
 
-    The stiffness is exact, with the turning of R, at the present active stress; it is bounded where F has hardly a
+    The stiffness is exact, with the derivative of R, at the present active stress; it is bounded where F has hardly a
     definite rotation (``kernels.corotated.tangent``).
 
     Args:
-        discretization: Of an ``Anisotropic`` material.
-        rotation: Device function that finds rotations.
+        discretization: A discretization with an ``Anisotropic`` material.
+        rotation: The device function that finds rotations.
         deterministic: As for every field.
     """
 
@@ -110,7 +110,7 @@ class AnisotropicLanesField(AnisotropicField):
 
     def __init__(self, discretization: Discretization, rotation: wp.Function, deterministic: bool):
         super().__init__(discretization, rotation, deterministic)
-        # The elements as general ones, their rest matrices turned into the material's axes.
+        # The elements as general ones, with rest matrices in the material's axes.
         inputs = [self.elements, self.material]
         self._general = as_general(self.elements, turn_elements(discretization.element_kind), inputs)
         self.follow()

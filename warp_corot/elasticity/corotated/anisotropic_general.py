@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 
 class GeneralAnisotropicField(AnisotropicField):
-    """Single elements whose forces need no settled order.
+    """Single elements whose sums of forces may have any order.
 
     Args:
-        discretization: Of an ``Anisotropic`` material, on a general mesh or a forest with few groups of subtrees.
+        discretization: A general mesh, or a forest with few groups of subtrees, with an ``Anisotropic`` material.
     """
 
     def __init__(self, discretization: Discretization):
@@ -50,7 +50,7 @@ class GeneralAnisotropicField(AnisotropicField):
 def active_material(
     passive: OrthotropicMaterial, axes: wp.array, is_active: int, activation: wp.array
 ) -> ActiveMaterial:
-    """``kernels.clusters.laws.ActiveMaterial`` of its parts."""
+    """``kernels.clusters.laws.ActiveMaterial`` from its parts."""
     material = ActiveMaterial()
     material.passive, material.axes = passive, axes
     material.is_active, material.activation = is_active, activation

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 
 class AnisotropicSubtreeField(AnisotropicField):
-    """Complete subtrees in batches; what is left over leaf by leaf, or where the mesh stays as it is in clusters.
+    """Complete subtrees in batches; other leaves one by one or, if the mesh never changes, in clusters.
 
     Args:
-        discretization: A forest's, of an ``Anisotropic`` material, on CUDA.
+        discretization: A forest with an ``Anisotropic`` material, on CUDA.
     """
 
     def __init__(self, discretization: Discretization):
@@ -76,5 +76,5 @@ class AnisotropicSubtreeField(AnisotropicField):
 
 
 def as_bytes(flags: wp.array) -> wp.array:
-    """The same memory, uint8 [8 n] of uint64 [n]."""
+    """The memory of uint64 [n] as uint8 [8 n]."""
     return wp.array(ptr=flags.ptr, dtype=wp.uint8, shape=8 * len(flags), device=flags.device)

@@ -1,4 +1,4 @@
-"""Force fields of the corotated model that go element by element."""
+"""Force fields of the corotated model, element by element."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 class CorotatedOptions(Protocol):
-    """What fields read of the model; see ``corotated.Corotated``."""
+    """The part of the model that fields read; see ``corotated.Corotated``."""
 
     @property
     def rotation_level(self) -> int | float | str | None: ...
@@ -88,14 +88,14 @@ def general_lanes(elements: Elements) -> Lanes:
 
 
 def repair_elements() -> wp.Kernel:
-    """The kernel that does the general elements that those launches leave out."""
+    """The kernel for the general elements that those launches leave out."""
     return repair_forces(GeneralElements, IsotropicMaterial, own_stress(byers_xu))
 
 
 class CorotatedField(ForceField):
-    """Rotations and forces as one kernel where each element uses its own, as two stages otherwise."""
+    """Forces by one kernel if each element uses its own rotation; otherwise by two, rotations first."""
 
-    #: Whether complete subtrees go as one.
+    #: Whether complete subtrees are units of work.
     takes_subtrees: ClassVar[bool] = False
 
     def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
@@ -131,7 +131,7 @@ class CorotatedField(ForceField):
 
     @property
     def rotation_level(self) -> int | None:
-        """Level of the tree at which rotations are shared, if they are."""
+        """Level of the tree at which rotations are shared, or None."""
         return self.model.level
 
     def plan_of(self, discretization: Discretization) -> Plan:
@@ -142,7 +142,7 @@ class CorotatedField(ForceField):
 
     @property
     def unit_count(self) -> int:
-        """How many rotations are found."""
+        """The number of rotations."""
         return self._sharing().units.count
 
     def extract_rotations(self, u: wp.array) -> wp.array:
@@ -153,7 +153,7 @@ class CorotatedField(ForceField):
         return shared.rotations
 
     def add_rotated_forces(self, u: wp.array, f: wp.array) -> None:
-        """Forces with the rotations that were extracted last."""
+        """Add forces with the rotations that were extracted last."""
         self._launch_with_rotations(self._forces, self.isotropic, u, f)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
@@ -166,12 +166,12 @@ class CorotatedField(ForceField):
     def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array, *, exact: bool = False) -> None:
         """Add K(u) p to y [N], with the paper's K = R K R^T: the rotations that forces at u use, held fixed.
 
-        It is symmetric and positive semidefinite. The exact derivative of the forces has the turning of the rotations
-        besides, which vanishes where the body is not strained.
+        It is symmetric and positive semidefinite. The exact derivative of the forces also has the derivative of the
+        rotations, which vanishes if the body is not strained.
 
         Args:
             u, p, y: As for every field.
-            exact: Whether K is the exact derivative, which can be indefinite; for own rotations alone. It is bounded
+            exact: Whether K is the exact derivative, which can be indefinite; only for own rotations. It is bounded
                 where F has hardly a definite rotation (``kernels.corotated.tangent``).
 
         Raises:
@@ -186,7 +186,7 @@ class CorotatedField(ForceField):
         stiffness.add_diagonal(self.elements, material, u, blocks)
 
     def tangent(self, *, exact: bool = False) -> Tangent:
-        """As for every field; the rotations are found once. With shared rotations K is never the exact derivative."""
+        """As for every field; rotations are found once. With shared rotations, K is never the exact derivative."""
         if exact and self.model.rotation_level is None:
             rotation = byers_xu if self.model.rotation == "warm" else self.model.own_rotation
             return ExactTangent(self, rotation)
@@ -196,19 +196,19 @@ class CorotatedField(ForceField):
         return RotatedTangent(self)
 
     def write_rotations(self, u: wp.array, rotations: wp.array) -> None:
-        """Write the rotation of every unit, mat33 [units]; leaves no trace in the state."""
+        """Write the rotation of every unit, mat33 [units]; the state stays unchanged."""
         is_warm, kind = self.model.rotation == "warm", self.discretization.element_kind
         units = self._sharing().units
         kernel = extract_rotations(kind, byers_xu) if is_warm else self._extract
         self.launch(kernel, units.count, [units.elements, u], [rotations])
 
     def stiffness_with(self, rotations: wp.array) -> tuple[ElementStiffness, RotatedMaterial]:
-        """The stiffness with these rotations of the units, held fixed, and the material that it reads."""
+        """The stiffness with fixed rotations of the units, and the material that it reads."""
         material = rotated_material(self.isotropic, rotations, self._sharing().units.unit)
         return ElementStiffness(self.discretization, given_differential, RotatedMaterial), material
 
     def used_rotations(self, u: wp.array) -> wp.array:
-        """The rotation of every unit, as forces use it; leaves no trace in the state."""
+        """The rotation of every unit, as forces use it; the state stays unchanged."""
         with self.state_kept():
             return self.extract_rotations(u)
 
@@ -242,7 +242,7 @@ class CorotatedField(ForceField):
         self._launch_with_rotations(self._von_mises, self.isotropic_shown, u, stress)
 
     def _sharing(self) -> Rotations:
-        """Who uses whose rotation; made on first use, since own rotations need none of it for their forces."""
+        """The units whose rotations elements use; made on first use, since forces with own rotations do not need it."""
         if self._shared is None:
             self._shared = Rotations.of(self._units())
         return self._shared

@@ -20,7 +20,7 @@ from warp_corot.kernels.subtrees.repair import (
     repair_listed_shared,
 )
 
-#: Thread blocks a multiprocessor: as many as it has room for at once, so that a launch over an empty list soon ends.
+#: Thread blocks for each multiprocessor: as many as fit at once, so that a launch over an empty list ends soon.
 BLOCKS = 6
 
 
@@ -28,11 +28,11 @@ class LeftOutLeaves:
     """Lists of all leaves with own rotations, and of each batch that shares its roots' rotations.
 
     Args:
-        own: How many subtrees, and single leaves, each launch has that finds own rotations.
+        own: The numbers of subtrees and single leaves of each launch that finds own rotations.
         shared: The batches that share their roots' rotations.
     """
 
-    #: What a kernel gets that makes no list.
+    #: The argument of kernels that make no list.
     NONE: ClassVar[LeftOut] = LeftOut()
 
     def __init__(self, own: list[int], shared: list[Batch], device: wp.Device):
@@ -49,7 +49,7 @@ class LeftOutLeaves:
 
     @staticmethod
     def load(device: wp.Device) -> None:
-        """Compile now what launches will need."""
+        """Compile now the kernels that launches will need."""
         wp.load_module(repair_listed_own.module, device, block_dim=LIST_BLOCK)
 
     def list_of(self, batch: Batch) -> LeftOut:

@@ -1,4 +1,4 @@
-"""Corotated linear elasticity, the paper's model: linear in a frame that turns with the element or its ancestor."""
+"""Corotated linear elasticity, the paper's model: linear in a frame that rotates with the element or its ancestor."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization, Discretized
 
 STIFFNESSES = ("factored", "sparse", "dense")
-#: The tolerance that "auto" stands for [rad]: it moves the end of the paper's beam by 0.24 mm where it sinks by 87, a
-#: tolerance of 0.05 by 0.04, of 0.02 by 0.005, and level 3 by 0.47.
+#: The tolerance of "auto" [rad]. It moves the end of the paper's beam by 0.24 mm, where it sinks by 87 mm; a tolerance
+#: of 0.05 moves it by 0.04 mm, one of 0.02 by 0.005 mm, and level 3 by 0.47 mm.
 AUTO_TOLERANCE = 0.1
 
 
@@ -38,33 +38,34 @@ AUTO_TOLERANCE = 0.1
 class Corotated(Model):
     """W = V (mu e:e + lambda/2 tr(e)^2) with e = sym(R^T F) - I and R the rotation of F.
 
-    With every element's own rotation the force is the gradient of W and conserves linear and angular momentum. Shared
-    rotations are cheaper; they conserve linear momentum only.
+    If every element has its own rotation, the force is the gradient of W and conserves linear and angular momentum.
+    Shared rotations are cheaper; they conserve only linear momentum.
 
-    Anisotropic materials keep both momenta too (see ``AnisotropicField``), always with own rotations.
+    Anisotropic materials always have own rotations and conserve both momenta, too (see ``AnisotropicField``).
 
-    With the defaults, forests take the fast path: complete three-level subtrees as units of work. Any other rotation,
-    iterations or stiffness goes leaf by leaf.
+    With the defaults, forests use the fast path: complete three-level subtrees as units of work. With any other
+    rotation, iterations or stiffness, forces are computed leaf by leaf.
 
     Attributes:
         rotation_level: None: every element has its own rotation. An int: the rotation of the ancestor at that level of
-            the tree, or an element's own where it lies above (forests only). On the fast path three levels above the
-            leaves or more; one or two levels above go leaf by leaf and are slower than own rotations. A float: the
-            tolerance [rad] up to which the rotation of the ancestor three levels up may stand for the own rotations of
-            its leaves, decided for each subtree at every evaluation from its displacements alone; "auto": 0.1. Where
-            it does, an element's rotation is off by w <= 2 tolerance and its stress by at most
-            (2 mu + 3 lambda) (3 w |U - I| + w^2 |U|); energies use own rotations.
+            the tree, or an element's own if it is above that level (forests only). Levels three or more above the
+            leaves use the fast path; one or two levels above are computed leaf by leaf and are slower than own
+            rotations. A float: the tolerance [rad] within which the rotation of the ancestor three levels up replaces
+            the own rotations of its leaves. Each evaluation decides this for each subtree from its displacements.
+            "auto": 0.1. Then the error w of an element's rotation is at most 2 tolerance, and that of its stress at
+            most (2 mu + 3 lambda) (3 w |U - I| + w^2 |U|); energies use own rotations.
         rotation: "byers-xu" (the paper's), "svd" (McAdams et al. 2011) or "warm" (a quaternion kept from step to step).
-        iterations: For "byers-xu": None iterates to the paper's tolerance 3.85e-5, an int 2 to 12 that often.
+        iterations: For "byers-xu": None iterates to the paper's tolerance 3.85e-5; an int from 2 to 12 is the number.
         stiffness: "factored" (sums and differences), "sparse" (the paper's explicit K_T by type, zeros skipped) or
             "dense" (the same with all 144 products); the last two for forests only. All agree to rounding.
-        subtrees: False: leaf by leaf also where the fast path could be taken, as the paper has it; for comparison.
-        dilatation: "element": each element has its own, tr(R^T F) - 3, as the paper has it, and nearly incompressible
-            tissue is too stiff. "shared": elements share theirs, J - 1 of each, see ``elasticity.dilatation``; slower.
-            "auto": they do where Poisson's ratio is 0.45 or more in any element, and the material is isotropic.
+        subtrees: False: leaf by leaf even where the fast path is possible, as in the paper; for comparison.
+        dilatation: "element": each element has its own dilatation, tr(R^T F) - 3, as in the paper, and nearly
+            incompressible tissue is too stiff. "shared": elements share their dilatations, J - 1 of each, see
+            ``elasticity.dilatation``; slower. "auto": "shared" if the material is isotropic and Poisson's ratio is 0.45
+            or more in any element.
 
     Raises:
-        InputError: An option is none of these.
+        InputError: An option has another value.
     """
 
     rotation_level: int | float | str | None = None
@@ -92,7 +93,7 @@ class Corotated(Model):
 
     @property
     def tolerance(self) -> float | None:
-        """How far an ancestor's rotation may be from those of its leaves [rad], if rotations are shared by that."""
+        """How far an ancestor's rotation may be from those of its leaves [rad], or None."""
         level = self.rotation_level
         if level is None or isinstance(level, Integral):
             return None
@@ -150,10 +151,10 @@ class Corotated(Model):
 
 
 def _check_level(level: int | float | str | None) -> None:
-    """See that a rotation level is one.
+    """Check a rotation level.
 
     Raises:
-        InputError: It is none.
+        InputError: It is no rotation level.
     """
     if level is None or level == "auto":
         return

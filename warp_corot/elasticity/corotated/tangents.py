@@ -31,7 +31,7 @@ class RotatedTangent(Tangent):
     """The paper's R K R^T with rotations that are found once.
 
     Attributes:
-        rotations: Of the units, mat33 [units].
+        rotations: The rotations of the units, mat33 [units].
     """
 
     field: CorotatedField
