@@ -26,7 +26,7 @@ def test_a_free_bar_contracts_by_stress_over_modulus(device):
 
 @pytest.mark.parametrize("make", [lambda forest: forest, lambda forest: wc.TetMesh(forest.points, forest.tets)])
 def test_a_string_sounds_at_the_root_of_stress_over_density(make, device):
-    """w = pi / L sqrt(S / rho), and of cells of length h with mass at the ends 2 / h sqrt(S / rho) sin(pi h / 2 L), 0.4 %
+    """w = pi / L sqrt(S / rho). Cells of length h with mass at the ends have 2 / h sqrt(S / rho) sin(pi h / 2 L), 0.4 %
     less. Young's modulus is so small that clamped ends hardly matter."""
     mesh = make(wc.TetForest.box((1, 1, 10), 0.1, 0))
     body = wc.SoftBody(mesh, wc.Isotropic(1.0, 0.0, 1000.0), device=device)
