@@ -25,9 +25,9 @@ from .signals import leaving_at_once, terminable
 
 def commands() -> dict[str, ModuleType]:
     """The subcommands by name; they import the whole package, which takes a while."""
-    from . import paper, scene, simulate, view
+    from . import paper, scene, simulate, sweep, view
 
-    return {"simulate": simulate, "view": view, "scene": scene, "paper": paper}
+    return {"simulate": simulate, "sweep": sweep, "view": view, "scene": scene, "paper": paper}
 
 
 class Parser(StrictParser):

@@ -6,7 +6,7 @@ import argparse
 import json
 import os
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -115,6 +115,28 @@ def check_run_path(path: Path, source: str) -> None:
         raise InputError(f"{path}: is the input; it must be another file")
     if not os.access(path if path.exists() else path.parent, os.W_OK):
         raise InputError(f"{path}: cannot be written to")
+
+
+def option_of(name: str) -> Callable[[str], Any]:
+    """What reads the value of an option of one value.
+
+    Raises:
+        InputError: There is no such option, or it does not have one value; raised by the function, too, for a text that
+            the option does not take.
+    """
+    _, actions = _parser(Path("--vary"))
+    action = actions.get(name)
+    if action is None or action.nargs is not None or not action.option_strings:
+        raise InputError(f"--vary: {name!r} is not an option with one value; see warp-corot simulate --help")
+    kind = action.type if callable(action.type) else str
+
+    def read(text: str) -> Any:
+        try:
+            return kind(text.strip())
+        except (argparse.ArgumentTypeError, ValueError) as error:
+            raise InputError(f"--vary: {name}: {error}") from None
+
+    return read
 
 
 def _parser(path: Path) -> tuple[_Parser, dict[str, argparse.Action]]:

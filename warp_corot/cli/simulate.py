@@ -71,6 +71,25 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def simulated(args: argparse.Namespace) -> Recording:
+    """``run`` without a word at its end, for runs among many.
+
+    Raises:
+        InputError, UnstableError, OSError: What would end the command.
+    """
+    from warp_corot.io.write.animate import Recording
+
+    options = bodies_of(args)
+    shared = options[0]
+    _check_output(args, shared)
+    ready = prepared(options)
+    done = Recording(shared.output)
+    table = Table(shared.csv, ready.sim, ready.probes, ready.touched.obstacles) if shared.csv else None
+    rest(shared, ready.sim)
+    _record(args, shared, ready, done, table, None)
+    return done
+
+
 def _serve(args: argparse.Namespace) -> int:
     """``run`` on a rank that makes its part of the steps, and neither speaks nor writes; returns the exit status."""
     options = bodies_of(args)

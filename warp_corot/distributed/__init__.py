@@ -7,7 +7,8 @@
 from . import mpi
 from .gathering import gather
 from .simulation import Simulation
+from .sweeping import sweep
 
-__all__ = ["Simulation", "gather"]
+__all__ = ["Simulation", "gather", "sweep"]
 
 mpi.choose_device()

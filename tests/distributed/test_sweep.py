@@ -1,0 +1,97 @@
+"""Sweeps over parameters: every combination once, whatever ends in between."""
+
+import csv
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import swept
+from command_line import run
+
+import warp_corot as wc
+import warp_corot.distributed as wd
+from warp_corot.cli.sweep import values_of
+
+
+def calls(folder):
+    return sorted((folder / "calls.txt").read_text().splitlines())
+
+
+def test_every_combination_is_made_once_and_has_a_row(folder):
+    grid = {"a": [1, 2, 3], "b": np.array([1.0, 2.0]), "folder": [str(folder)]}
+    with ThreadPoolExecutor(2) as engine:
+        rows = wd.sweep(swept.product, grid, folder="results", executor=engine)
+    assert [(row["a"], row["b"], row["product"]) for row in rows] == [(a, b, a * b) for a in (1, 2, 3) for b in (1, 2)]
+    assert len(calls(folder)) == 6
+    with open("results/table.csv", newline="") as file:
+        table = list(csv.DictReader(file))
+    assert [float(row["sum"]) for row in table] == [row["sum"] for row in rows]
+    assert list(table[0]) == ["a", "b", "folder", "product", "sum", "seconds", "error"]
+    # More of the same: what is done is not done again.
+    with ThreadPoolExecutor(2) as engine:
+        wd.sweep(swept.product, grid | {"a": [1, 2, 3, 4]}, folder="results", executor=engine)
+    assert len(calls(folder)) == 8
+
+
+def test_a_journal_that_ends_within_a_line_goes_on(folder):
+    grid = {"a": [1, 2, 3], "b": [1], "folder": [str(folder)]}
+    with ThreadPoolExecutor(1) as engine:
+        wd.sweep(swept.product, grid, folder="results", executor=engine)
+        journal = folder / "results" / "runs.jsonl"
+        journal.write_bytes(journal.read_bytes()[:-7])
+        rows = wd.sweep(swept.product, grid, folder="results", executor=engine)
+    assert [row["product"] for row in rows] == [1, 2, 3]
+    assert len(calls(folder)) == 4
+
+
+def test_a_worker_that_is_killed_loses_nothing(folder):
+    grid = {"a": [1, 2], "b": [1, 2], "folder": [str(folder)]}
+    rows = wd.sweep(swept.deadly, grid, folder="results", workers=1)
+    assert (folder / "killed").exists()
+    assert [row["error"] for row in rows] == [""] * 4
+    assert calls(folder) == ["1 1", "1 2", "2 1", "2 2"]
+
+
+def test_what_failed_is_said_and_tried_again(folder):
+    grid = {"a": [1, 2], "folder": [str(folder)]}
+    with ThreadPoolExecutor(1) as engine:
+        rows = wd.sweep(swept.failing, grid, folder="results", executor=engine, retries=1)
+        assert [row["error"] for row in rows] == ["", "ValueError: a is two"]
+        (folder / "right").touch()
+        rows = wd.sweep(swept.failing, grid, folder="results", executor=engine)
+    assert [row["result"] for row in rows] == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [({}, "no parameters"), ({"a": 1}, "a is 1"), ({"a": [1, 1]}, "the same parameters"), ({"a": [np.inf]}, "inf")],
+)
+def test_bad_parameters_are_refused(given, said):
+    with pytest.raises(wc.InputError, match=said):
+        wd.sweep(swept.failing, given)
+
+
+def test_values_of_options():
+    assert values_of("young=1kPa,5kPa") == ("young", [1e3, 5e3])
+    assert values_of("poisson=0.3:0.45:4") == ("poisson", pytest.approx([0.3, 0.35, 0.4, 0.45]))
+    assert values_of("young=1kPa:100kPa:3:log") == ("young", pytest.approx([1e3, 1e4, 1e5]))
+    assert values_of("model=linear,corotated") == ("model", ["linear", "corotated"])
+    for text, said in (
+        ("young", "OPTION=VALUES"),
+        ("yung=1", "'yung' is not an option"),
+        ("young=1kg", "young"),
+        ("output=a,b", "sets output itself"),
+    ):
+        with pytest.raises(wc.InputError, match=said):
+            values_of(text)
+
+
+def test_the_command_sweeps(folder, capsys):
+    words = ("sweep", "box", "--vary", "young=500,1kPa", "--duration", "0.1", "--probe", "z == zmax", "--device", "cpu")
+    assert run(*words, "-o", "results", "--workers", "1") == 0
+    assert "2 of 2 runs" in capsys.readouterr().out
+    with open("results/table.csv", newline="") as file:
+        soft, stiff = csv.DictReader(file)
+    assert float(soft["largest displacement [m]"]) > float(stiff["largest displacement [m]"]) > 0.0
+    assert len(list((folder / "results" / "runs").glob("*.usd"))) == 2
+    assert run(*words, "-o", "results") == 0

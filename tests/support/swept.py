@@ -1,0 +1,28 @@
+"""Functions for sweeps, which other processes find here."""
+
+import os
+import signal
+from pathlib import Path
+
+
+def product(a: float, b: float, folder: str) -> dict[str, float]:
+    """Note the call, and multiply."""
+    with open(Path(folder) / "calls.txt", "a") as calls:
+        calls.write(f"{a} {b}\n")
+    return {"product": a * b, "sum": a + b}
+
+
+def deadly(a: float, b: float, folder: str) -> dict[str, float]:
+    """The first call with a = 2 and b = 1 kills its process."""
+    mark = Path(folder) / "killed"
+    if (a, b) == (2, 1) and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return product(a, b, folder)
+
+
+def failing(a: float, folder: str) -> float:
+    """Fails for a = 2 until somebody has put things right."""
+    if a == 2 and not (Path(folder) / "right").exists():
+        raise ValueError("a is two")
+    return a

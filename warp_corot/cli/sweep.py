@@ -1,0 +1,173 @@
+"""``warp-corot sweep``: the same run with other parameters, side by side, and a table of what came of them."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import hashlib
+import json
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warp_corot.errors import InputError
+
+from .say import complain, interrupt_status
+
+if TYPE_CHECKING:
+    from warp_corot.distributed.journal import Row
+
+__all__ = ["add_parser", "run"]
+
+#: Options that a sweep sets itself.
+OWN = ("input", "output", "csv", "preview", "also", "write_run")
+#: Where runs write, below the sweep's folder.
+RUNS = "runs"
+
+
+def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
+    """Add the command to ``warp-corot``."""
+    parser = subparsers.add_parser(
+        "sweep",
+        help="make a run with many combinations of parameters, and a table of the results",
+        description="Makes the run of INPUT with every combination of the values of --vary, in several processes. A "
+        "sweep that was ended goes on where it was when the same command is given again.",
+        epilog="""examples:
+  warp-corot sweep box --vary young=500,1kPa,2kPa -o results
+  warp-corot sweep run.toml --vary young=1kPa:100kPa:64:log --vary poisson=0.3,0.45,0.49 -o results
+
+the folder gets table.csv, table.parquet (with pyarrow), results.png, runs.jsonl with what is done, and in runs/ a
+stage and a table for each run. Results are the last row of each run's table, and the largest displacement.""",
+    )
+    parser.add_argument("input", metavar="INPUT", help="as for simulate: a run file, a mesh, a surface, a scan or box")
+    parser.add_argument(
+        "--vary",
+        action="append",
+        required=True,
+        metavar="OPTION=VALUES",
+        help="an option of simulate and its values: A,B,C, FIRST:LAST:COUNT or FIRST:LAST:COUNT:log; may be repeated",
+    )
+    parser.add_argument("--probe", action="append", metavar="WHERE", help="as for simulate: its motion is a result")
+    parser.add_argument("--duration", metavar="T", help="as for simulate")
+    parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="where the results go")
+    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one a card, or one a core)")
+    parser.add_argument("--retries", type=int, default=2, metavar="N", help="how often a failed run is made again (2)")
+    parser.add_argument("--device", help="as for simulate")
+    return parser
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command; returns the exit status.
+
+    Raises:
+        InputError: Bad options; nothing was simulated.
+    """
+    from warp_corot.distributed.sweeping import combinations, sweep
+
+    if args.output is None:
+        raise InputError("-o is missing; it must name the folder of the results, for example -o results")
+    varied = dict(values_of(text) for text in args.vary)
+    if len(varied) < len(args.vary):
+        raise InputError("--vary names an option twice")
+    given = [word for name in ("duration", "device") if (word := getattr(args, name))]
+    names = [f"--{name}" for name in ("duration", "device") if getattr(args, name)]
+    others = [word for pair in zip(names, given, strict=True) for word in pair]
+    others += [word for probe in args.probe or () for word in ("--probe", probe)]
+    for each in combinations(varied):
+        options_of(args.input, others, each, args.output)
+    try:
+        (args.output / RUNS).mkdir(parents=True, exist_ok=True)
+        function = partial(simulated, _input=args.input, _others=others, _folder=str(args.output))
+        rows = sweep(function, varied, folder=args.output, workers=args.workers, retries=args.retries)
+    except KeyboardInterrupt as signalled:
+        complain(f"interrupted; what is done is kept in {args.output}, and the same command goes on", kind="")
+        return interrupt_status(signalled)
+    except OSError as error:
+        complain(f"{args.output}: {error.strerror or error}")
+        return 1
+    failed = [row for row in rows if row["error"]]
+    print(f"{len(rows) - len(failed)} of {len(rows)} runs, written to {args.output / 'table.csv'}")
+    if failed:
+        complain(f"{len(failed)} runs failed, the first with {failed[0]['error']}")
+    return 3 if failed else 0
+
+
+def values_of(text: str) -> tuple[str, list[Any]]:
+    """The name of an option, and its values: numbers in SI units, or texts.
+
+    Raises:
+        InputError: Not of this form, no such option, or a value that it does not take.
+    """
+    from .run_file import option_of
+
+    name, equals, given = text.partition("=")
+    name = name.strip().lstrip("-").replace("-", "_")
+    if not equals or not given:
+        raise InputError(f"--vary {text!r}: it must be OPTION=VALUES, for example young=1kPa,5kPa")
+    if name in OWN:
+        raise InputError(f"--vary {text!r}: the sweep sets {name} itself")
+    parse = option_of(name)
+    pieces = given.split(":")
+    if len(pieces) in (3, 4) and pieces[2].isdigit() and "," not in given:
+        first, last = (parse(piece) for piece in pieces[:2])
+        count, spacing = int(pieces[2]), pieces[3] if len(pieces) == 4 else "linear"
+        if spacing not in ("log", "linear") or count < 2 or not isinstance(first, float | int):
+            raise InputError(f"--vary {text!r}: it must be FIRST:LAST:COUNT or FIRST:LAST:COUNT:log with two or more")
+        if spacing == "log" and not (first > 0 and last > 0):
+            raise InputError(f"--vary {text!r}: both ends must be positive for :log")
+        make = np.geomspace if spacing == "log" else np.linspace
+        return name, make(first, last, count).tolist()
+    return name, [parse(piece) for piece in given.split(",")]
+
+
+def options_of(source: str, others: list[str], values: dict[str, Any], folder: Path) -> argparse.Namespace:
+    """The options of one run, checked.
+
+    Raises:
+        InputError: A value is out of its range, or the input's run file is wrong.
+    """
+    from . import Parser, simulate
+    from .run_file import bodies_of
+
+    name = folder / RUNS / name_of(values)
+    words = ["simulate", source, *others, "-o", f"{name}.usd", "--csv", f"{name}.csv"]
+    for option, value in values.items():
+        words += [f"--{option.replace('_', '-')}", f"{value!r}" if isinstance(value, float) else str(value)]
+    parser = Parser(prog="warp-corot")
+    simulate.add_parser(parser.add_subparsers(dest="command", parser_class=Parser))
+    args = parser.parse_args(words)
+    args.command_line = "warp-corot " + " ".join(words)
+    bodies_of(args)
+    return args
+
+
+def name_of(values: dict[str, Any]) -> str:
+    """The name of a run's files: the same for the same parameters."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def simulated(*, _input: str, _others: list[str], _folder: str, **values: Any) -> Row:
+    """What came of one run: the last row of its table, and the largest displacement.
+
+    Raises:
+        InputError, UnstableError, OSError: As from simulate.
+    """
+    import csv
+
+    import warp as wp
+
+    from .simulate import simulated as made
+
+    wp.config.log_level = wp.LOG_ERROR
+    wp.config.enable_backward = False
+    folder = Path(_folder)
+    args = options_of(_input, _others, values, folder)
+    log = (folder / RUNS / f"{name_of(values)}.log").open("w", encoding="utf-8")
+    with log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
+        done = made(args)
+    with open(folder / RUNS / f"{name_of(values)}.csv", newline="", encoding="utf-8") as file:
+        heads, *rows = csv.reader(file)
+    found: Row = {name: float(value) for name, value in zip(heads, rows[-1], strict=True)}
+    return found | {"largest displacement [m]": done.largest_displacement, "steps": done.steps}

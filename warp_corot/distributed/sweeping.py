@@ -1,0 +1,158 @@
+"""Many runs with other parameters, side by side: which there are, which are done, and what came of them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from contextlib import contextmanager
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_count
+
+from .journal import Journal, Row, key_of
+from .tables import write_tables
+from .workers import local_executor, timed, worker_count
+
+Parameters = Mapping[str, Sequence[Any]] | Sequence[Mapping[str, Any]]
+
+
+def sweep(
+    function: Callable[..., Any],
+    parameters: Parameters,
+    *,
+    folder: str | PathLike[str] | None = None,
+    workers: int | None = None,
+    retries: int = 2,
+    executor: Executor | None = None,
+    progress: bool | None = None,
+) -> list[Row]:
+    """Call a function with every combination of parameters, in several processes.
+
+    With a folder, each result is noted there as soon as it is known. Called again with the same folder, the sweep makes
+    what is missing: what is done is not done twice, and what has failed is tried again.
+
+    Args:
+        function: Called as ``function(young=1e3, poisson=0.45)``; gives a number, or a dictionary of numbers and texts.
+            A function at the top of a module, since other processes must find it.
+        parameters: Values of each parameter, of which all combinations are made; or a list with the parameters of each
+            run.
+        folder: Where results are noted, and tables (CSV and, with pyarrow, Parquet) and a picture are written.
+        workers: Processes; None: one for each card, or for each core where there is none.
+        retries: How often a run that failed, or whose process died, is made again.
+        executor: Another engine in place of processes of this machine: any ``concurrent.futures.Executor``, such as
+            ``mpi4py.futures.MPIPoolExecutor()`` or ``dask.distributed.Client(…).get_executor()``.
+        progress: Whether to show a bar; None: on a terminal.
+
+    Returns:
+        For each run, in order, a dictionary of its parameters, results, ``seconds`` and ``error`` (empty if all is
+        well).
+
+    Raises:
+        InputError: No parameters, values that are no numbers or texts, a folder that cannot be written to, or numbers
+            out of range.
+    """
+    runs = combinations(parameters)
+    checked_count(retries, "retries", least=0)
+    if not callable(function):
+        raise InputError(f"function is {function!r}; it must be a function of the parameters")
+    window = worker_count(workers, len(runs), executor)
+    journal = Journal(None if folder is None else Path(folder))
+    left = [run for run in runs if not journal.is_done(run)]
+    with _bar(len(runs), progress) as show:
+        show(len(runs) - len(left))
+        for done in _made(function, left, executor, window, retries):
+            journal.note({name: done[name] for name in runs[0]}, done)
+            show(1)
+    rows = [journal.row(run) for run in runs]
+    if folder is not None:
+        write_tables(rows, list(runs[0]), Path(folder))
+    return rows
+
+
+def combinations(parameters: Parameters) -> list[dict[str, Any]]:
+    """The parameters of each run.
+
+    Raises:
+        InputError: There are none, or they are of another form.
+    """
+    if isinstance(parameters, Mapping):
+        for name, values in parameters.items():
+            if isinstance(values, str) or not hasattr(values, "__iter__"):
+                raise InputError(f"{name} is {values!r}; it must be a list of values")
+        values = [[_plain(value) for value in each] for each in parameters.values()]
+        runs = [dict(zip(parameters, each, strict=True)) for each in itertools.product(*values)]
+    else:
+        runs = [{name: _plain(value) for name, value in run.items()} for run in parameters]
+    if not runs or not runs[0]:
+        raise InputError("there are no parameters to vary")
+    if any(run.keys() != runs[0].keys() for run in runs):
+        raise InputError("runs have parameters of different names; each must have all of them")
+    if len({key_of(run) for run in runs}) < len(runs):
+        raise InputError("two runs have the same parameters; each can be made once only")
+    return runs
+
+
+def _plain(value: Any) -> Any:
+    """A number or text of Python's own."""
+    value = value.item() if hasattr(value, "item") else value
+    if not isinstance(value, str | int | float | bool) or (isinstance(value, float) and not math.isfinite(value)):
+        raise InputError(f"a parameter is {value!r}; it must be a finite number or a text")
+    return value
+
+
+def _made(
+    function: Callable[..., Any], runs: Sequence[dict[str, Any]], executor: Executor | None, workers: int, retries: int
+) -> Iterator[Row]:
+    """Rows of runs as they come to an end. An engine of our own whose worker has died is made anew."""
+    waiting = deque((run, 0) for run in runs)
+    while waiting:
+        engine = local_executor(workers) if executor is None else executor
+        try:
+            yield from _until_broken(function, engine, waiting, workers, retries)
+        finally:
+            if executor is None:
+                engine.shutdown(wait=False, cancel_futures=True)
+        if waiting and executor is not None:
+            raise InputError("the engine of the sweep has broken; start it again, and the sweep with the same folder")
+
+
+def _until_broken(
+    function: Callable[..., Any], engine: Executor, waiting: deque[tuple[Row, int]], window: int, retries: int
+) -> Iterator[Row]:
+    """Rows of runs as they come to an end, until none waits or a worker has died."""
+    under_way: dict[Future[Row], tuple[Row, int]] = {}
+    broken = False
+    while under_way or (waiting and not broken):
+        # No more at a time than workers: those under way when one dies are those that may have killed it.
+        while waiting and not broken and len(under_way) < window:
+            run, tries = waiting.popleft()
+            try:
+                under_way[engine.submit(timed, function, run)] = (run, tries)
+            except BrokenExecutor:
+                waiting.appendleft((run, tries))
+                broken = True
+        for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+            run, tries = under_way.pop(future)
+            error = future.exception()
+            broken = broken or isinstance(error, BrokenExecutor)
+            if error is None:
+                yield {**run, **future.result(), "error": ""}
+            elif tries < retries:
+                waiting.append((run, tries + 1))
+            else:
+                what = "its process died" if isinstance(error, BrokenExecutor) else " ".join(str(error).split())
+                yield {**run, "error": f"{type(error).__name__}: {what}"}
+
+
+@contextmanager
+def _bar(count: int, wanted: bool | None) -> Iterator[Callable[[int], Any]]:
+    from tqdm import tqdm
+
+    with tqdm(desc="sweep", total=count, unit="run", disable=None if wanted is None else not wanted) as bar:
+        yield bar.update
