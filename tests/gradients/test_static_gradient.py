@@ -34,7 +34,8 @@ class Case:
             "young": 500.0 * self.rng.uniform(0.5, 2.0, count),
             "poisson": 0.4,
             "density": 10.0,
-            "loads": 1e-4 * self.rng.standard_normal((nodes, 3)),
+            # In float32, as the body has them.
+            "loads": (1e-4 * self.rng.standard_normal((nodes, 3))).astype(np.float32).astype(float),
             "boundary": np.zeros((nodes, 3)),
             "rest": np.asarray(mesh.points),
             "gravity": GRAVITY,
@@ -58,7 +59,8 @@ class Case:
         loads = given["loads"] + mesh.masses(given["density"])[:, None] * given["gravity"]
         lame = oracle.lame(given["young"], given["poisson"])
         start = given["rest"] + given["boundary"]
-        x = oracle.equilibrium(self.law, mesh, *lame, self.fixed, loads, increments=1, tolerance=1e-12, start=start)
+        options = {"increments": 1, "tolerance": 1e-12, "start": start}
+        x = oracle.equilibrium(self.law, mesh, *lame, self.fixed, loads, **options)
         return float((self.weights * x).sum())
 
     def direction(self, name):
@@ -79,13 +81,13 @@ class Case:
         return (8.0 * near - far) / (12.0 * step)
 
 
-def check(case, found, names, step=1e-3):
+def check(case, found, names, step=1e-3, tolerance=TOLERANCE):
     for name in names:
         way = case.direction(name)
         along, right = float(np.sum(found[name] * way)), case.difference(name, way, step)
         error = abs(along - right) / max(abs(right), np.linalg.norm(found[name] * way))
         print(f"{name}: {along:.8g} against {right:.8g}, off by {error:.1e}")
-        assert error < TOLERANCE
+        assert error < tolerance
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -106,6 +108,16 @@ def test_derivatives_of_a_general_mesh(law, device):
     case = Case(jittered(cells=(1, 1, 2), level=3), law, device, seed=3)
     names = ("young", "loads", "rest", "boundary")
     check(case, case.gradient(wrt=names), names)
+
+
+@pytest.mark.parametrize("law", ["corotated", "neo_hookean", "stvk", "linear"])
+def test_derivatives_in_float64(law, device):
+    """To 1e-8 of central differences."""
+    make = jittered if law == "stvk" else wc.TetForest.box
+    case = Case(make(cells=(1, 1, 2), level=3, **({} if law == "stvk" else {"cell_size": CUBE})), law, device)
+    found = case.gradient(wrt=NAMES, precision="float64")
+    assert found.value == pytest.approx(case.value(), rel=1e-12)
+    check(case, found, NAMES, tolerance=1e-8)
 
 
 @wp.kernel(enable_backward=True)
@@ -289,6 +301,9 @@ def test_refusals(device):
         ({"wrt": "activation"}, "the material has no fibres"),
         ({"model": wc.Corotated(rotation_level=0)}, "the model shares rotations"),
         ({"model": wc.EdgeStVK(springs="quadratic")}, "have no derivative with respect to moduli"),
+        ({"precision": "float16"}, "precision is 'float16'; it must be 'float32' or 'float64'"),
+        ({"model": wc.MassSpring(), "wrt": "loads", "precision": "float64"}, "precision is 'float64'; it needs an iso"),
+        ({"model": wc.Corotated(dilatation="shared"), "precision": "float64"}, "elements share their dilatation; it"),
         ({"adjoint_tolerance": 2.0}, "adjoint_tolerance is 2.0; it must be between 0 and 1"),
     ):
         with pytest.raises(wc.InputError, match=message):

@@ -9,7 +9,7 @@ import numpy as np
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.errors import InputError
 
-from .operation import StaticOperation, positions_of
+from .operation import StaticOperation
 
 if TYPE_CHECKING:
     from jax import Array
@@ -44,7 +44,7 @@ def static(body: SoftBody, *, options: dict[str, Any] | None = None, **values: A
     of_positions = jax.ShapeDtypeStruct((body.node_count, 3), dtype)
 
     def found(given: Any) -> Any:
-        return positions_of(operation.solve(_on_host(given))).astype(dtype)
+        return operation.solve(_on_host(given)).positions.astype(dtype)
 
     def derivatives(given: Any, x: Any, derivative: Any) -> Any:
         host = _on_host(given)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.errors import InputError
 from warp_corot.gradients.given import REPLACED, with_values
-from warp_corot.gradients.rest_state import RestState
+from warp_corot.gradients.precise import solved_state
 from warp_corot.inputs.checks import shown
 
 Array = npt.NDArray[np.floating]
@@ -42,15 +42,15 @@ class StaticOperation:
         if "gravity" in names and self._options.pop("gravity", None) is not None:
             raise InputError("gravity is given twice")
 
-    def solve(self, values: Mapping[str, Array], start: Array | None = None) -> RestState:
+    def solve(self, values: Mapping[str, Array], start: Array | None = None) -> Any:
         """The body at rest with these values of the arguments; the search begins at ``start`` [m], [worlds * N, 3]."""
         body = with_values(self.body, {name: value for name, value in values.items() if name != "gravity"})
         if start is not None:
             body.displacements = start - body.rest_positions
         options = {"model": None, "gravity": values.get("gravity"), **self._options}
-        return RestState(body, names=self.names, **options)
+        return solved_state(body, names=self.names, **options)
 
-    def pull_back(self, solved: RestState, derivative: Array, values: Mapping[str, Array]) -> dict[str, Array]:
+    def pull_back(self, solved: Any, derivative: Array, values: Mapping[str, Array]) -> dict[str, Array]:
         """Derivatives with respect to these arguments, each of its argument's shape.
 
         Args:
@@ -66,12 +66,6 @@ class StaticOperation:
         if "rest" in values:
             found["rest"] = found["rest"].reshape(self.body.worlds, -1, 3).sum(axis=0)
         return {name: reduced(np.asarray(found[name], np.float64), np.shape(value)) for name, value in values.items()}
-
-
-def positions_of(solved: RestState) -> npt.NDArray[np.float64]:
-    """Positions [m], float64 [worlds * N, 3]."""
-    body = solved.body
-    return body.rest_positions + body.state.displacements.numpy()[: body.sizes.nodes, :3]
 
 
 def reduced(values: Array, shape: tuple[int, ...]) -> Array:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.errors import InputError
 
-from .operation import StaticOperation, positions_of
+from .operation import StaticOperation
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -21,7 +21,7 @@ def static(body: SoftBody, *, options: dict[str, Any] | None = None, **values: T
 
     Args:
         body: The body; it is left as it is. What is not given is the body's.
-        options: ``model``, ``gravity`` and others of ``static_gradient``.
+        options: ``model``, ``gravity``, ``precision`` and others of ``static_gradient``.
         values: Tensors, of any device, by name: ``young``, ``poisson`` and ``density`` in a shape that a material
             takes; ``loads`` [N], [worlds * N, 3]; ``boundary``, positions of which those of held nodes are read
             [m], [worlds * N, 3]; ``rest``, rest positions [m], [N, 3]; ``activation`` [Pa], [worlds, T];
@@ -54,7 +54,7 @@ def _function() -> Any:
             ctx.values = {name: torch.as_tensor(tensor).detach().cpu().numpy() for name, tensor in given}
             ctx.operation, ctx.solved = operation, operation.solve(ctx.values)
             dtype = first.dtype if first.is_floating_point() else torch.float32
-            return torch.as_tensor(positions_of(ctx.solved), dtype=dtype, device=first.device)
+            return torch.as_tensor(ctx.solved.positions, dtype=dtype, device=first.device)
 
         @staticmethod
         @torch.autograd.function.once_differentiable

@@ -78,6 +78,18 @@ class ElementWork:
         """The derivative with respect to rest positions, float64 [worlds * N, 3]."""
         return np.asarray(self._of_rest.numpy()[: self.field.discretization.sizes.nodes, :3], np.float64)
 
+    def of_weights(self, densities: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """The derivative with respect to rest positions of the work of weights, float64 [worlds * N, 3].
+
+        Args:
+            densities: Of that work in elements [J/m^3], [worlds * T].
+        """
+        discretization = self.field.discretization
+        rest = wp.zeros(discretization.sizes.launch_nodes, dtype=wp.vec4, device=self.device)
+        on_device = wp.array(densities, dtype=wp.float32, device=self.device)
+        self._launch(kernels.add_rest_weight(self._kind), [on_device], rest)
+        return np.asarray(rest.numpy()[: discretization.sizes.nodes, :3], np.float64)
+
     def _add_lame(self, u: wp.array, adjoint: wp.array, scale: float) -> None:
         kernel = kernels.add_stress_work(self._kind, IsotropicMaterial, self._law.stress)
         self._launch(kernel, [self._unit_mu, u, adjoint, scale], self._of_mu)
@@ -113,15 +125,6 @@ class ElementWork:
     def _launch(self, kernel: wp.Kernel, inputs: list, output: wp.array) -> None:
         elements: Elements = self.field.discretization.elements
         wp.launch(kernel, self.field.element_count, [elements, *inputs], [output], device=self.device)
-
-
-def add_weight_to_rest(field: ForceField, densities: npt.NDArray[np.float64], rest: wp.array) -> None:
-    """Add the derivative with respect to rest positions of the work of weights, whose density in elements is given
-    [J/m^3], [worlds * T], to vec4 [worlds * N]."""
-    on_device = wp.array(densities, dtype=wp.float32, device=field.device)
-    kernel = kernels.add_rest_weight(field.discretization.element_kind)
-    inputs = [field.discretization.elements, on_device]
-    wp.launch(kernel, field.element_count, inputs, [rest], device=field.device)
 
 
 def _listed(names: set[str]) -> str:

@@ -36,6 +36,8 @@ class RestState:
 
     Attributes:
         report: Of the solve.
+        law: The model.
+        gravity: [m/s^2], float64 [3].
         adjoint_iterations, adjoint_residual: Of the last adjoint solve.
 
     Raises:
@@ -59,15 +61,20 @@ class RestState:
         if not 0.0 < checked_number(adjoint_tolerance, "adjoint_tolerance") < 1.0:
             raise InputError(f"adjoint_tolerance is {adjoint_tolerance}; it must be between 0 and 1")
         (law,) = checked_models(Corotated() if model is None else model, 1)
-        self.body, self._gravity = body, np.array(checked_gravity(gravity, body.mesh.up_axis))
+        self.body, self.gravity = body, np.array(checked_gravity(gravity, body.mesh.up_axis))
         self._field, needs = bound(body, law, names)
         ElementWork(self._field, needs)
         self.report = solve_static(body, model=law, gravity=gravity, preconditioner=preconditioner, **options)
         if not self.report.converged:
             raise ConvergenceError(f"there is no gradient: {self.report.message}")
-        self._preconditioner, self._tolerance = preconditioner, adjoint_tolerance
+        self.law, self._preconditioner, self._tolerance = law, preconditioner, adjoint_tolerance
         self._adjoint: Adjoint | None = None
         self.adjoint_iterations, self.adjoint_residual = 0, 0.0
+
+    @property
+    def positions(self) -> Array:
+        """[m], float64 [worlds * N, 3]."""
+        return self.body.rest_positions + self.body.state.displacements.numpy()[: self.body.sizes.nodes, :3]
 
     def pull_back(self, derivative: Array, names: Sequence[str]) -> dict[str, Any]:
         """Derivatives of J with respect to what these names stand for, as ``StaticGradient`` has them.
@@ -91,11 +98,11 @@ class RestState:
 
     def _derivatives(self, names: Sequence[str], motion: wp.array, boundary: Array) -> dict[str, Any]:
         """The derivatives from an adjoint motion, vec4, and the derivative with respect to the boundary."""
-        body, gravity = self.body, self._gravity
+        body, gravity = self.body, self.gravity
         moved = motion.numpy()[: body.sizes.nodes, :3].astype(np.float64)
         work = ElementWork(self._field, parameters.needed(names))
         work.add(body.state.displacements, motion)
-        found = derivatives(body, self._field, work, names, moved, moved @ gravity)
+        found = derivatives(body, work, names, moved, moved @ gravity)
         if "rest" in names:
             # Held nodes keep their displacements, so that their places follow the rest shape.
             found["rest"] = found["rest"] + boundary

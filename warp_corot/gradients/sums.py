@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,7 @@ from warp_corot.elasticity import ForceField
 from warp_corot.kernels.gradients import steps as kernels
 
 from . import parameters
-from .element_work import ElementWork, add_weight_to_rest
+from .element_work import ElementWork
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -62,16 +62,26 @@ class StepSums:
         """The derivatives with respect to all but the initial state, whose part "rest" lacks."""
         count = self.body.sizes.nodes
         moved = self.of_loads.numpy()[:count, :3].astype(np.float64)
-        return derivatives(self.body, self.field, self.work, self.names, moved, self._of_mass.numpy()[:count])
+        return derivatives(self.body, self.work, self.names, moved, self._of_mass.numpy()[:count])
 
 
-def derivatives(
-    body: SoftBody, field: ForceField, work: ElementWork, names: Sequence[str], moved: Array, of_mass: Array
-) -> dict[str, Any]:
+class Work(Protocol):
+    """Sums of elements; see ``ElementWork``."""
+
+    def of_lame(self) -> tuple[Array, Array]: ...
+
+    def of_activation(self) -> Array: ...
+
+    def of_rest(self) -> Array: ...
+
+    def of_weights(self, densities: Array) -> Array: ...
+
+
+def derivatives(body: SoftBody, work: Work, names: Sequence[str], moved: Array, of_mass: Array) -> dict[str, Any]:
     """Derivatives of these names that are made of sums.
 
     Args:
-        body, field: The body and its elastic forces.
+        body: The body.
         work: The sums of elements.
         names: Others than "boundary" and those of an initial state; "rest" is the derivative where positions stay.
         moved: The sum of adjoint motions, [worlds * N, 3].
@@ -92,9 +102,7 @@ def derivatives(
         elif name == "activation":
             found[name] = work.of_activation().reshape(body.worlds, -1)
         elif name == "rest":
-            weights = wp.zeros_like(body.state.displacements)
-            add_weight_to_rest(field, parameters.weight_densities(body, of_mass), weights)
-            found[name] = work.of_rest() + weights.numpy()[: body.sizes.nodes, :3]
+            found[name] = work.of_rest() + work.of_weights(parameters.weight_densities(body, of_mass))
     return found
 
 
