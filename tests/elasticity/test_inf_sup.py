@@ -1,5 +1,6 @@
 """Whether shared dilatation has pressures that no motion feels, and how well motions feel the others: inf-sup
 constants.
+
 The constant is the least of sup_u (p, div u) / (|grad u| |p|) over pressures p with a value for each group; a clamped
 beam, float64, from points and tetrahedra alone.
 """
