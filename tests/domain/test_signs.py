@@ -7,6 +7,7 @@ import warp as wp
 import warp_corot as wc
 from warp_corot.domain.surface import lines_through, surface_mesh, windings_of
 from warp_corot.domain.winding import winding_number
+from warp_corot.kernels.meshing import domain as kernels
 
 
 def box(low, high) -> trimesh.Trimesh:
@@ -66,6 +67,21 @@ def test_lines_through_points_in_which_many_triangles_meet_count_right(device):
             scale[axis] = share
             off = points[np.abs(points[:, axis]) > 0.1]
             assert (windings_of(mesh, lines, wp.array(off * scale, dtype=wp.vec3, device=device)) == expected).all()
+
+
+def test_a_part_that_crosses_itself_is_known_away_from_where_it_does(device):
+    """A ring that is thicker than its hole: what is in the middle is enclosed once each way, which is not at all."""
+    ring = trimesh.creation.torus(0.15, 0.3, major_sections=48, minor_sections=40)
+    ring.apply_transform(trimesh.transformations.euler_matrix(0.3, 0.2, 0.1))
+    domain = wc.Domain.from_surface((ring.vertices, ring.faces), device=device)
+    sides = np.bincount(domain.sides.known, minlength=3)
+    assert sides[kernels.UNSURE] > 0
+    assert sides[kernels.BOUNDARY] > 0.5 * len(ring.faces)
+    rng = np.random.default_rng(0)
+    points = ring.triangles_center[rng.integers(len(ring.faces), size=1500)]
+    points = points + rng.standard_normal((1500, 3)) * 10.0 ** rng.uniform(-3.0, -1.0, (1500, 1))
+    exact = np.array([winding_number(ring.triangles, point) for point in points]) > 0.5
+    assert np.array_equal(domain.phi(points) < 0.0, exact)
 
 
 def test_segments_leave_the_body_where_it_ends(device):
