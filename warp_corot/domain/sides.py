@@ -15,8 +15,8 @@ from .winding import linked
 
 #: Winding numbers are evaluated this far off a triangle, over its own size and, at least, over the surface's.
 ASIDE, LEAST_ASIDE = 1.0e-3, 2.0e-6
-#: If more than this share of the edges crosses triangles of their own part, no triangle is sure. For five tubes and lumps
-#: that cross themselves in up to this share, no sign was wrong at 100,000 points near each.
+#: If more than this share of the edges crosses triangles of their own part, no triangle is sure. For five tubes and
+#: lumps that cross themselves in up to this share, no sign was wrong at 100,000 points near each.
 MESSY = 0.1
 #: Two triangles whose unit normals add up to less nearly coincide.
 FOLDED = 0.05
