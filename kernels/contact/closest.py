@@ -104,38 +104,66 @@ def crossing(p: wp.vec3, q: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
 
 
 @wp.func
-def segment_to_triangle(p: wp.vec3, q: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """The share of q and those of the corners in the closest points of a segment and a triangle."""
-    t, best = crossing(p, q, a, b, c)
+def candidate(k: int, p: wp.vec3, q: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """The corners' shares in the point of a triangle closest to the k-th of: p, q, and the segment pq for each edge;
+    and how far it is from pq."""
+    if k == 0:
+        w = on_triangle(p, a, b, c)
+        return w, wp.length(point_of(w, a, b, c) - p)
+    if k == 1:
+        w = on_triangle(q, a, b, c)
+        return w, wp.length(point_of(w, a, b, c) - q)
+    first = a
+    second = b
+    if k == 3:
+        first = b
+        second = c
+    if k == 4:
+        first = c
+        second = a
+    s, r = on_segments(p, q, first, second)
+    far = wp.length(p + s * (q - p) - first - r * (second - first))
+    w = wp.vec3(1.0 - r, r, 0.0)
+    if k == 3:
+        w = wp.vec3(0.0, 1.0 - r, r)
+    if k == 4:
+        w = wp.vec3(r, 0.0, 1.0 - r)
+    return w, far
+
+
+@wp.func
+def segment_to_triangle(p: wp.vec3, q: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3, blur: float):
+    """The share of q and those of the corners in the closest points of a segment and a triangle.
+
+    Where places differ by less than about ``blur`` in their distance [m], as along a segment that is parallel to the
+    triangle, it is between them: the closest one would be another at every step.
+    """
+    t, w = crossing(p, q, a, b, c)
     if t >= 0.0:
-        return t, best
-    best = on_triangle(p, a, b, c)
-    share = float(0.0)
-    least = wp.length_sq(point_of(best, a, b, c) - p)
-    w = on_triangle(q, a, b, c)
-    far = wp.length_sq(point_of(w, a, b, c) - q)
-    if far < least:
-        least, best, share = far, w, float(1.0)
-    for edge in range(3):
-        first = a
-        second = b
-        if edge == 1:
-            first = b
-            second = c
-        elif edge == 2:
-            first = c
-            second = a
-        s, r = on_segments(p, q, first, second)
-        far = wp.length_sq(p + s * (q - p) - first - r * (second - first))
+        return t, w
+    least = float(3.0e38)
+    w = wp.vec3()
+    total = float(0.0)
+    k = int(0)
+    # A loop that stays one; what was found before shrinks when something closer is found.
+    while k < 5:
+        place, far = candidate(k, p, q, a, b, c)
         if far < least:
+            shrunk = wp.exp(-(least - far) / blur)
+            w = shrunk * w
+            total = shrunk * total
             least = far
-            share = s
-            best = wp.vec3(1.0 - r, r, 0.0)
-            if edge == 1:
-                best = wp.vec3(0.0, 1.0 - r, r)
-            elif edge == 2:
-                best = wp.vec3(r, 0.0, 1.0 - r)
-    return share, best
+        weight = wp.exp(-(far - least) / blur)
+        w += weight * place
+        total += weight
+        k += 1
+    w = w / total
+    way = q - p
+    square = wp.length_sq(way)
+    along = float(0.0)
+    if square > 0.0:
+        along = wp.clamp(wp.dot(point_of(w, a, b, c) - p, way) / square, 0.0, 1.0)
+    return along, w
 
 
 @wp.func

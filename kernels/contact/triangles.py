@@ -20,8 +20,11 @@ wp.set_module_options({"enable_backward": False})
 
 #: A point with so large a share of one corner is that corner, which is looked after.
 CORNER = wp.constant(0.999)
-#: Share of the last step's force from which rounds begin: with more, contacts that share nodes chatter; with less,
-#: they give way a little.
+#: Places along a capsule whose gaps differ by so small a share of its radius are touched between them.
+BLUR = wp.constant(1.0e-3)
+
+#: Share of the last step's push from which rounds begin: with more, nodes around an obstacle are held off by what lies
+#: between them, and bodies seem stiffer. Friction begins with all of it: what slips to bring it back would add up.
 WARMTH = wp.constant(0.5)
 
 
@@ -48,7 +51,7 @@ def nearest(shapes: Shapes, o: int, pose: wp.transform, most: float, a: wp.vec3,
         w = wp.vec3()
         if kind == CAPSULE:
             half = wp.quat_rotate(wp.transform_get_rotation(pose), wp.vec3(0.0, 0.0, size[1]))
-            along, w = segment_to_triangle(centre - half, centre + half, a, b, c)
+            along, w = segment_to_triangle(centre - half, centre + half, a, b, c, BLUR * size[0])
             centre = centre + (2.0 * along - 1.0) * half
         else:
             w = on_triangle(centre, a, b, c)
@@ -105,11 +108,11 @@ def find_touch(
     touches.normal[o, t] = n
     touches.gap[o, t] = gap
     touches.moved[o, t] = carried(pose, later, point_of(w, a, b, c))
-    # Few rounds begin where the last step has ended: what lasts is found over some steps.
-    push = WARMTH * wp.max(wp.dot(was, n), 0.0)
+    was_push = wp.max(wp.dot(was, n), 0.0)
+    push = WARMTH * was_push
     if push > 0.0:
         touches.acts[o, t] = 1
-        force = push * n + held_back(across(was, n), push, shapes.friction[o])
+        force = push * n + held_back(across(was, n), was_push, shapes.friction[o])
         touches.force[o, t] = force
         touches.more[o, t] = force
 

@@ -225,6 +225,35 @@ def test_a_needle_does_not_pass(device, speed):
     assert felt > 0.0
 
 
+@pytest.mark.parametrize("rod", [wc.Capsule, wc.Box])
+def test_a_block_on_two_rods_does_not_creep(device, rod):
+    """At 0.7 of the angle of friction, on what touches it only between its nodes."""
+    mesh = wc.TetForest.box(cells=(4, 1, 1), cell_size=0.01, level=2, origin=(-0.02, -0.005, 0.003))
+    body = wc.SoftBody(mesh, wc.Isotropic(young=5e4, poisson=0.3, density=1000.0), device=device)
+    along_y = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
+    rods = []
+    for x in (-0.0113, 0.0121):
+        size = (0.003, 0.05) if rod is wc.Capsule else ((0.006, 0.006, 0.05),)
+        rods.append(rod(*size, position=(x, 0.0, 0.0), quaternion=along_y))
+    angle = 0.7 * np.arctan(0.4)
+    sim = wc.Simulation(
+        body,
+        obstacles=rods,
+        contact=wc.Contact(friction=0.4),
+        gravity=(9.81 * np.sin(angle), 0.0, -9.81 * np.cos(angle)),
+        integrator=wc.SymplecticEuler(viscosity=1e-3, damping=2.0),
+    )
+    sim.advance(0.5)
+    before = body.positions.numpy().astype(float)
+    sim.advance(0.5)
+    moved = body.positions.numpy() - before
+    assert np.abs(moved.mean(axis=0)).max() < 1e-7
+    assert np.abs(moved).max() < 1e-6
+    carried = sum(force_on(each) for each in rods)
+    expected = 9.81 * body.masses.sum() * np.array([np.sin(angle), 0.0, -np.cos(angle)])
+    np.testing.assert_allclose(carried, expected, atol=2e-3 * np.linalg.norm(expected))
+
+
 # --- tools ---------------------------------------------------------------------------------------------------------
 
 
