@@ -78,7 +78,7 @@ def _joined(
 ) -> tuple[Integers, Numbers, Numbers, Integers]:
     """Groups of elements, their centres and sizes and pairs of neighbours, after some have joined others."""
     kept, number = np.unique(joined, return_inverse=True)
-    sizes: Numbers = np.bincount(number, size)
+    sizes = np.bincount(number, size).astype(np.float64)
     centres: Numbers = np.stack([np.bincount(number, size * x) for x in centre.T], axis=1) / sizes[:, None]
     low, high = np.sort(number[pairs], axis=1).T
     keys = np.unique((low * len(kept) + high)[low != high])

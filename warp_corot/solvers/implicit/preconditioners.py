@@ -17,9 +17,9 @@ from .operator import Preconditioner
 from .tangent import TangentOperator
 
 #: Plain elements lock where those that share their dilatation do not: these are preconditioned by compressible ones.
-MOST_LAMBDA = 9.0
-
-
+MOST_LAMBDA = 4.0
+#: As the two differ, better smoothing saves no iterations there: its degree, and by how much it rises.
+SHARED: dict[str, int] = {"degree": 2, "rise": 0}
 #: Of a short cycle: the smoother's degree, by how much it rises, and the nodes of a level that is not made coarser.
 SHORT: dict[str, int] = {"degree": 2, "rise": 1, "few_nodes": 24}
 
@@ -28,9 +28,10 @@ def _multigrid(operator: TangentOperator, short_cycles: bool) -> Multigrid:
     stiffening = 0.0 if operator.viscosity is None else operator.viscosity.seconds
     shares = operator.field.shares_dilatation
     # Where a product costs as much as a cycle, fewer iterations are worth longer ones; so are fewer launches on CUDA.
-    short = SHORT if short_cycles and operator.device.is_cpu and not shares else {}
+    short = SHORT if short_cycles and operator.device.is_cpu else {}
+    options = SHARED if shares else short
     most, is_turned = MOST_LAMBDA if shares else np.inf, not operator.field.is_linear
-    return Multigrid(operator.body, is_turned=is_turned, stiffening=stiffening, most_lambda=most, **short)
+    return Multigrid(operator.body, is_turned=is_turned, stiffening=stiffening, most_lambda=most, **options)
 
 
 #: By name.
