@@ -104,19 +104,21 @@ def _corotated_differential(f: Tensors, df: Tensors, mu: Any, lam: Any) -> Tenso
     return 2.0 * mu * (df - turning) + lam * _product(r, df) * r + lam * (_product(r, f) - 3.0) * turning
 
 
-def _cofactor(f: Tensors) -> Tensors:
+def cofactor(f: Tensors) -> Tensors:
+    """The derivative of det F."""
     c0, c1, c2 = (f[..., :, k] for k in range(3))
     return np.stack([np.cross(c1, c2), np.cross(c2, c0), np.cross(c0, c1)], axis=-1)
 
 
-def _cofactor_differential(f: Tensors, df: Tensors) -> Tensors:
+def cofactor_differential(f: Tensors, df: Tensors) -> Tensors:
+    """Its differential in the direction dF."""
     (c0, c1, c2), (d0, d1, d2) = ([a[..., :, k] for k in range(3)] for a in (f, df))
     pairs = ((c1, c2, d1, d2), (c2, c0, d2, d0), (c0, c1, d0, d1))
     return np.stack([np.cross(da, b) + np.cross(a, db) for a, b, da, db in pairs], axis=-1)
 
 
-def _volumetric(f: Tensors, mu: Any, lam: Any) -> tuple[Tensors, Tensors]:
-    """U'(J) and U''(J) of U = -mu ln J + lambda/2 (ln J)^2, which is a parabola below ``CONTINUED_BELOW``."""
+def volumetric(f: Tensors, mu: Any, lam: Any) -> tuple[Tensors, Tensors]:
+    """U'(J) and U''(J) of U = -mu ln J + lambda/2 (ln J)^2, J = det F; U is a parabola below ``CONTINUED_BELOW``."""
     det = np.linalg.det(f)[..., None, None]
     j = np.maximum(det, CONTINUED_BELOW)
     slope, curvature = (lam * np.log(j) - mu) / j, (mu + lam * (1.0 - np.log(j))) / j**2
@@ -124,13 +126,13 @@ def _volumetric(f: Tensors, mu: Any, lam: Any) -> tuple[Tensors, Tensors]:
 
 
 def _neo_hookean_stress(f: Tensors, mu: Any, lam: Any) -> Tensors:
-    return mu * f + _volumetric(f, mu, lam)[0] * _cofactor(f)
+    return mu * f + volumetric(f, mu, lam)[0] * cofactor(f)
 
 
 def _neo_hookean_differential(f: Tensors, df: Tensors, mu: Any, lam: Any) -> Tensors:
-    slope, curvature = _volumetric(f, mu, lam)
-    cofactor = _cofactor(f)
-    return mu * df + slope * _cofactor_differential(f, df) + curvature * _product(cofactor, df) * cofactor
+    slope, curvature = volumetric(f, mu, lam)
+    cof = cofactor(f)
+    return mu * df + slope * cofactor_differential(f, df) + curvature * _product(cof, df) * cof
 
 
 LAWS: dict[type[Model], HostLaw] = {

@@ -7,17 +7,18 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import SuperLU, splu
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.elasticity import Corotated, Model
-from warp_corot.elasticity.dilatation.options import ELEMENT, shares_dilatation
+from warp_corot.elasticity.dilatation.field import DilatationField
+from warp_corot.elasticity.dilatation.on_host import HostDilatation
 from warp_corot.elasticity.host_laws import HostLaw, host_law
 from warp_corot.errors import ConvergenceError, InputError
 from warp_corot.inputs.checks import shown
 from warp_corot.materials.isotropic import Isotropic
 
+from .precise_elements import PreciseElements
 from .rest_state import RestState
 from .sums import derivatives
 
@@ -48,68 +49,6 @@ def solved_state(body: SoftBody, *, precision: str = FLOAT32, model: Model | Non
     return solved if precision == FLOAT32 else PreciseState(solved)
 
 
-class PreciseElements:
-    """The elements of one world.
-
-    Args:
-        body: The body.
-        law: Its law.
-        world: Which world.
-    """
-
-    def __init__(self, body: SoftBody, law: HostLaw, world: int):
-        mesh = body.mesh
-        self.tets, self.nodes, self._law = np.asarray(mesh.tets), len(mesh.points), law
-        corners = np.asarray(mesh.points)[self.tets]
-        inverse = np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2))
-        self.hats = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
-        self.volumes = np.asarray(mesh.volumes, np.float64)
-        fill = 1.0 if body.discretization.fill is None else body.discretization.fill
-        lame = (np.atleast_2d(value) for value in (body.material.mu, body.material.lam))
-        self._lame = [
-            (np.broadcast_to(value, (body.worlds, len(self.tets)))[world] * fill)[:, None, None] for value in lame
-        ]
-        dofs = (3 * self.tets[:, :, None] + np.arange(3)).reshape(-1, 12)
-        self._rows, self._columns = np.repeat(dofs, 12, axis=1).ravel(), np.tile(dofs, (1, 12)).ravel()
-
-    def gradients(self, u: Array) -> Array:
-        """du/dX of nodal vectors [N, 3], [T, 3, 3]."""
-        return np.asarray(np.einsum("tai,taj->tij", u[self.tets], self.hats))
-
-    def scatter(self, stress: Array) -> Array:
-        """-V P grad N summed at nodes [N], [N, 3]."""
-        forces = np.zeros((self.nodes, 3))
-        np.add.at(forces, self.tets, -np.einsum("t,tij,taj->tai", self.volumes, stress, self.hats))
-        return forces
-
-    def forces(self, u: Array) -> Array:
-        return self.scatter(self._law.stress(np.eye(3) + self.gradients(u), *self._lame))
-
-    def stiffness(self, u: Array) -> Any:
-        """K, sparse [3 N, 3 N]."""
-        f, blocks = np.eye(3) + self.gradients(u), np.empty((len(self.tets), 4, 3, 4, 3))
-        for k in range(3):
-            for b in range(4):
-                way = np.zeros_like(f)
-                way[:, k] = self.hats[:, b]
-                stress = self._law.differential(f, way, *self._lame)
-                blocks[:, :, :, b, k] = np.einsum("t,tij,taj->tai", self.volumes, stress, self.hats)
-        size = 3 * self.nodes
-        return coo_matrix((blocks.ravel(), (self._rows, self._columns)), shape=(size, size)).tocsc()
-
-    def work(self, u: Array, motion: Array) -> tuple[Array, Array, Array]:
-        """Derivatives of the work of forces in a motion with respect to mu and lambda, [T], and to rest positions,
-        [N, 3]; see ``kernels.gradients.elements``."""
-        f, grad = np.eye(3) + self.gradients(u), self.gradients(motion)
-        of_mu, of_lam = (
-            -self.volumes * np.sum(self._law.stress(f, *pair) * grad, axis=(1, 2)) for pair in ((1.0, 0.0), (0.0, 1.0))
-        )
-        stress = self._law.stress(f, *self._lame)
-        turned = np.swapaxes(f, 1, 2) @ self._law.differential(f, grad, *self._lame)
-        e = np.sum(stress * grad, axis=(1, 2))[:, None, None] * np.eye(3) - turned - np.swapaxes(grad, 1, 2) @ stress
-        return of_mu, of_lam, self.scatter(e)
-
-
 class PreciseState:
     """A body at rest in float64, and gradients there; as ``RestState``.
 
@@ -128,9 +67,10 @@ class PreciseState:
     def __init__(self, solved: RestState):
         body, gravity = solved.body, solved.gravity
         self.body, self.report, self._gravity = body, solved.report, gravity
-        found = checked_host_law(body, solved.law)
+        law = checked_host_law(body, solved.law)
+        shared = HostDilatation(solved.field) if isinstance(solved.field, DilatationField) else None
         worlds, count = body.worlds, body.sizes.nodes
-        self._elements = [PreciseElements(body, found, world) for world in range(worlds)]
+        self._elements = [PreciseElements(body, law, shared, world) for world in range(worlds)]
         loads = body.masses[:, None] * gravity
         if body.conditions.has_loads:
             loads = loads + body.conditions.loads.numpy()[:count, :3]
@@ -227,10 +167,5 @@ def checked_host_law(body: SoftBody, law: Model) -> HostLaw:
         raise InputError(
             "precision is 'float64'; it needs an isotropic material and Linear, Corotated, StVenantKirchhoff, "
             "NeoHookean or EdgeStVK with biquadratic springs"
-        )
-    dilatation = getattr(law, "dilatation", ELEMENT)
-    if shares_dilatation(dilatation, body.discretization):
-        raise InputError(
-            f"precision is 'float64', and elements share their dilatation; it needs a model with dilatation={ELEMENT!r}"
         )
     return found

@@ -36,7 +36,7 @@ class RestState:
 
     Attributes:
         report: Of the solve.
-        law: The model.
+        law, field: The model, and its elastic forces.
         gravity: [m/s^2], float64 [3].
         adjoint_iterations, adjoint_residual: Of the last adjoint solve.
 
@@ -62,8 +62,8 @@ class RestState:
             raise InputError(f"adjoint_tolerance is {adjoint_tolerance}; it must be between 0 and 1")
         (law,) = checked_models(Corotated() if model is None else model, 1)
         self.body, self.gravity = body, np.array(checked_gravity(gravity, body.mesh.up_axis))
-        self._field, needs = bound(body, law, names)
-        ElementWork(self._field, needs)
+        self.field, needs = bound(body, law, names)
+        ElementWork(self.field, needs)
         self.report = solve_static(body, model=law, gravity=gravity, preconditioner=preconditioner, **options)
         if not self.report.converged:
             raise ConvergenceError(f"there is no gradient: {self.report.message}")
@@ -84,7 +84,7 @@ class RestState:
             names: Of the names that the state was made with.
         """
         if self._adjoint is None:
-            self._adjoint = Adjoint(self.body, self._field, self._preconditioner, self._tolerance)
+            self._adjoint = Adjoint(self.body, self.field, self._preconditioner, self._tolerance)
             self._adjoint.take(self.body.state.displacements)
         adjoint, count = self._adjoint, self.body.sizes.nodes
         given = np.asarray(derivative, np.float64)
@@ -100,7 +100,7 @@ class RestState:
         """The derivatives from an adjoint motion, vec4, and the derivative with respect to the boundary."""
         body, gravity = self.body, self.gravity
         moved = motion.numpy()[: body.sizes.nodes, :3].astype(np.float64)
-        work = ElementWork(self._field, parameters.needed(names))
+        work = ElementWork(self.field, parameters.needed(names))
         work.add(body.state.displacements, motion)
         found = derivatives(body, work, names, moved, moved @ gravity)
         if "rest" in names:

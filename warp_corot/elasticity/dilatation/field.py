@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
@@ -224,6 +226,18 @@ class DilatationField(ForceField):
     def _make_room(self) -> None:
         """Make room for what passes leave to one another of all elements."""
         self._shared = wp.zeros(self.element_count, dtype=wp.vec4, device=self.device)
+
+    def groups(self) -> list[npt.NDArray[np.int32]]:
+        """The elements of each group that shares a dilatation, of all worlds; none where they do at nodes."""
+        found = []
+        for starts, members, _live, count in self._groups():
+            begins, of_groups = starts.numpy(), members.numpy()
+            for g in range(count):
+                if len(of_groups):
+                    found.append(of_groups[begins[g] : begins[g + 1]])
+                else:
+                    found.append(np.arange(begins[g], begins[g] + 8, dtype=np.int32))
+        return found
 
     def _groups(self) -> list[tuple[wp.array, wp.array, wp.array, int]]:
         """Subtrees and other groups, as ``kernels.share_in_groups`` takes them, and how many."""

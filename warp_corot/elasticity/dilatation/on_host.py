@@ -1,0 +1,94 @@
+"""A shared dilatation on the host, in float64; as ``kernels.elements.dilatation`` has it."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_matrix, csr_matrix
+
+from warp_corot.elasticity.host_laws import cofactor, cofactor_differential, volumetric
+from warp_corot.kernels.elements import dilatation as kernels
+
+from .field import DilatationField
+
+Array = npt.NDArray[np.float64]
+
+
+class Measured(NamedTuple):
+    """Dilatations of elements.
+
+    Attributes:
+        theta: [T].
+        slope: d theta / dF, [T, 3, 3].
+        held, stiffness: h' and h'' of theta, [T].
+    """
+
+    theta: Array
+    slope: Array
+    held: Array
+    stiffness: Array
+
+
+class HostDilatation:
+    """The shared dilatation of a field, of the elements of one world.
+
+    Args:
+        field: The field.
+
+    Attributes:
+        sharing: Who shares: shares of elements, [groups, T].
+    """
+
+    def __init__(self, field: DilatationField):
+        self._of, self.sharing = field.of, sharing_of(field)
+
+    def measure(self, f: Array) -> Measured:
+        """Of deformation gradients [T, 3, 3]."""
+        of = self._of
+        if of is kernels.SMALL:
+            theta, slope = np.trace(f, axis1=1, axis2=2) - 3.0, np.broadcast_to(np.eye(3), f.shape)
+        elif of is kernels.GREEN:
+            theta, slope = 0.5 * (np.sum(f * f, axis=(1, 2)) - 3.0), f
+        else:
+            theta, slope = np.linalg.det(f) - 1.0, cofactor(f)
+        if of in (kernels.SMALL, kernels.GREEN):
+            return Measured(theta, slope, np.zeros_like(theta), np.zeros_like(theta))
+        free, ramp = float(kernels.FREE), float(kernels.RAMP)
+        beyond = np.maximum(np.abs(theta) - free, 0.0)
+        near = np.minimum(beyond, ramp)
+        return Measured(theta, slope, np.sign(theta) * (0.5 * near**2 / ramp + beyond - near), near / ramp)
+
+    def turning(self, f: Array, df: Array) -> Array:
+        """The differential of d theta / dF."""
+        if self._of is kernels.SMALL:
+            return np.zeros_like(f)
+        return df if self._of is kernels.GREEN else cofactor_differential(f, df)
+
+    def law(self, theta: Array) -> tuple[Array, Array]:
+        """w' and w'' of shared dilatations."""
+        if self._of is not kernels.LOG_VOLUME:
+            return theta, np.ones_like(theta)
+        slope, curvature = volumetric((1.0 + theta)[:, None, None], 0.0, 1.0)
+        return slope[:, 0, 0], curvature[:, 0, 0]
+
+    def means(self, weights: Array, values: Array) -> Array:
+        """Means of elements' values over those who share, [groups]; zero where nothing has weight."""
+        total = self.sharing @ weights
+        return np.asarray((self.sharing @ (weights * values)) / np.where(total != 0.0, total, 1.0))
+
+
+def sharing_of(field: DilatationField) -> Any:
+    """Which elements of one world share a dilatation, sparse [groups, T]: one for each element of a group, or a quarter
+    for each of an element's nodes."""
+    mesh = field.discretization.mesh
+    count = len(mesh.tets)
+    groups = [group for group in field.groups() if group[0] < count]
+    if not groups:
+        tets = np.asarray(mesh.tets)
+        places = (tets.ravel(), np.repeat(np.arange(count), 4))
+        return csr_matrix(coo_matrix((np.full(4 * count, 0.25), places), (len(mesh.points), count)))
+    rows = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+    columns = np.concatenate(groups)
+    return csr_matrix(coo_matrix((np.ones(len(columns)), (rows, columns)), (len(groups), count)))
