@@ -72,6 +72,34 @@ def test_a_released_patch_falls_back(device):
     assert np.abs(body.displacements.numpy()).max() < 1e-4
 
 
+def test_a_grasped_patch_is_remeshed(device):
+    """New nodes between those that are held are held; where elements are joined, what is left is."""
+    body = wc.SoftBody(wc.TetForest.box((2, 2, 1), 0.02, 1), SOFT, device=device)
+    body.fix("z == zmin")
+    tool = wc.Tool(wc.Sphere(0.002, position=(0.02, 0.02, 0.03)), speed=0.1)
+    remesh = wc.OnlineRemesh(every=32, max_level=5, refine_above=1.04, simplify_below=1.01)
+    sim = wc.Simulation(body, obstacles=[tool], gravity=(0.0, 0.0, 0.0), integrator=CALM, remesh=remesh)
+    grasp = wc.Grasp(body, "z == zmax", tool=tool)
+    counts = [len(grasp.nodes)]
+    for height, turn in ((0.032, 0.1), (0.03, 0.0)):
+        tool.move((0.02, 0.02, height), (0.0, 0.0, np.sin(turn), np.cos(turn)))
+        sim.advance(0.2)
+        x = body.mesh.points
+        top = x[:, 2] > 0.0199
+        np.testing.assert_array_equal(grasp.nodes, np.flatnonzero(top))
+        c, s = np.cos(2 * turn), np.sin(2 * turn)
+        expected = (x[top] - (0.02, 0.02, 0.03)) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + (0.02, 0.02, height)
+        np.testing.assert_allclose(body.positions.numpy()[top], expected, atol=5e-6)
+        felt, held = grasp.wrench.numpy()[0].astype(float), body.reactions.numpy().astype(float).sum(axis=0)
+        np.testing.assert_allclose(felt[:3], held, atol=0.01)
+        counts.append(len(grasp.nodes))
+    assert counts[1] > counts[0]
+    assert counts[2] < counts[1]
+    grasp.release()
+    sim.advance(0.01)
+    assert not grasp.wrench.numpy().any()
+
+
 def test_bad_grasps_are_refused(device):
     body, tool, _sim, _grasp = held_block(device)
     with pytest.raises(wc.InputError, match="simulation"):

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.places import Nodes, chosen_nodes, nodes_at
 from warp_corot.body.soft_body import SoftBody
-from warp_corot.errors import InputError
+from warp_corot.errors import InputError, StabilityWarning, depth_of_user
 from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.kernels.contact import grasp as kernels
+from warp_corot.mesh import TetForest
 
 from .tool import Tool
 
@@ -30,7 +33,7 @@ class Grasp:
 
     Raises:
         InputError: The tool is in no simulation or the body in another, no node of the surface is meant, a body that is
-            remeshed, implicit steps, or a stiffness that is not positive.
+            remeshed in several worlds, implicit steps, or a stiffness that is not positive.
     """
 
     def __init__(self, body: SoftBody, patch: Nodes, *, tool: Tool, stiffness: float | None = None):
@@ -44,8 +47,10 @@ class Grasp:
             raise InputError("the body is in no simulation with this tool; both must be in one")
         if system.is_implicit:
             raise InputError("steps of the simulation are implicit; a grasp needs SymplecticEuler")
-        if body.changing is not None:
-            raise InputError("a body that is remeshed cannot be grasped; its nodes may change")
+        if body.changing is not None and body.worlds > 1:
+            raise InputError(
+                f"the body is remeshed in {body.worlds} worlds; a grasp of one that is must be in one world"
+            )
         if stiffness is not None and not 0.0 < checked_number(stiffness, "stiffness", "N/m") < math.inf:
             raise InputError(f"stiffness is {stiffness}; it must be a positive number [N/m], or None")
         chosen = chosen_nodes(nodes_at(patch, lambda: body.mesh), body.world_node_count, 1).indices
@@ -53,19 +58,14 @@ class Grasp:
         if not len(nodes):
             raise InputError("the patch has no node of the body's surface; it must have one at least")
         self.body, self.tool, self.device, self._system = body, tool, body.device, system
-        self._per_world = len(nodes)
-        everywhere = (nodes + body.world_node_count * np.arange(body.worlds)[:, None]).ravel()
-        self.nodes = nodes
         self.stiffness = None if stiffness is None else float(stiffness)
-        self._stiffness = 0.0 if stiffness is None else float(stiffness) / len(nodes)
-        count = len(everywhere)
-        self._nodes = wp.array(everywhere, dtype=wp.int32, device=self.device)
-        self._places, self._forces = (wp.zeros(count, dtype=wp.vec3, device=self.device) for _ in range(2))
+        self.launch_revision = 0
+        self._take(nodes)
         self._wrenches: wp.array = wp.zeros(body.worlds, dtype=wp.spatial_vectorf, device=self.device)
         body.state.adopt_positions()
         state = body.state
         inputs = [self._nodes, self._per_world, self._number, self._obstacles.motions, state.rest, state.displacements]
-        wp.launch(kernels.take_hold, count, inputs, [self._places], device=self.device)
+        wp.launch(kernels.take_hold, len(self._nodes), inputs, [self._places], device=self.device)
         system.constraints.append(self)
         system.changes += 1
 
@@ -84,13 +84,13 @@ class Grasp:
         """Let the patch go; again is not wrong."""
         if self.is_holding:
             self._system.constraints.remove(self)
-            self._system.changes += 1
+            # Their sum must not come back to what it was.
+            self._system.changes += 1 + self.launch_revision
             self._forces.zero_()
             self._wrenches.zero_()
 
     # --- as a constraint -------------------------------------------------------------------------------------------
 
-    launch_revision = 0
     is_full = False
 
     @property
@@ -103,9 +103,31 @@ class Grasp:
         return {"places": self._places, "forces": self._forces, "wrenches": self._wrenches}
 
     def prepare(self) -> None:
-        """Nothing changes."""
+        """Hold the same patch of another mesh: the nodes that are left of it, and new ones between two of them.
+
+        Warns:
+            StabilityWarning: None is left, and it holds nothing.
+        """
+        if self.body.version == self._version:
+            return
+        places = dict(zip(self._lattice, self._places.numpy(), strict=True))
+        mesh = self.body.mesh
+        assert isinstance(mesh, TetForest)
+        held = patch_of(mesh, np.unique(self.body.surface_triangles), places)
+        if not held:
+            warnings.warn(
+                "remeshing has left no node of a grasped patch, which is held no more; it must have corners of coarse "
+                "elements, or remeshing a min_level that keeps it",
+                StabilityWarning,
+                stacklevel=depth_of_user(),
+            )
+        nodes = np.array(sorted(held), np.int32)
+        self._take(nodes)
+        self._places.assign(np.array([held[node] for node in nodes.tolist()], np.float32).reshape(-1, 3))
 
     def launch(self, offset: int, damping: float) -> None:
+        if not len(self._nodes):
+            return
         system, state, conditions = self._system, self.body.state, self.body.conditions
         inputs = [self._nodes, self._per_world, self._number, self._obstacles.motions, self._places, self._stiffness]
         inputs += [damping, system.gravity, conditions.inverse_mass, int(conditions.has_loads), conditions.loads]
@@ -129,3 +151,48 @@ class Grasp:
 
     def reset(self, chosen: wp.array) -> None:
         """It goes on holding."""
+
+    # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _take(self, nodes: npt.NDArray[np.integer]) -> None:
+        """Hold these nodes of each world, at places to be told."""
+        body, device = self.body, self.device
+        self.nodes, self._per_world, self._version = nodes, len(nodes), body.version
+        mesh = body.mesh
+        self._lattice: list[tuple[int, ...]] = []
+        if body.changing is not None and isinstance(mesh, TetForest):
+            self._lattice = list(map(tuple, mesh.lattice[nodes].tolist()))
+        self._stiffness = 0.0 if self.stiffness is None else self.stiffness / max(len(nodes), 1)
+        everywhere = (nodes + body.world_node_count * np.arange(body.worlds)[:, None]).ravel()
+        self._nodes = wp.array(everywhere, dtype=wp.int32, device=device)
+        self._places, self._forces = (wp.zeros(len(everywhere), dtype=wp.vec3, device=device) for _ in range(2))
+        self.launch_revision += 1
+
+
+Place = npt.NDArray[np.float32]
+
+
+def patch_of(
+    mesh: TetForest, surface: npt.NDArray[np.integer], places: dict[tuple[int, ...], Place]
+) -> dict[int, Place]:
+    """Which nodes of a forest's surface belong to a patch, and their places in the tool's frame.
+
+    Args:
+        mesh: The present mesh.
+        surface: The nodes on its surface.
+        places: Of the patch's nodes on the mesh before, by their lattice points.
+
+    Returns:
+        By node: those that were there, and new ones halfway between two of the patch.
+    """
+    points = list(map(tuple, mesh.lattice.tolist()))
+    held = {node: places[points[node]] for node in surface.tolist() if points[node] in places}
+    left = [node for node in surface.tolist() if node not in held]
+    grows = True
+    while grows:
+        ends = {node: mesh.node_ends[node].tolist() for node in left}
+        new = {node: 0.5 * (held[a] + held[b]) for node, (a, b) in ends.items() if a in held and b in held}
+        held |= new
+        left = [node for node in left if node not in new]
+        grows = bool(new)
+    return held
