@@ -16,6 +16,7 @@ import warp as wp
 
 from warp_corot.kernels.math.matrices import identity3
 from warp_corot.kernels.modules import unique_kernel
+from warp_corot.kernels.plan.plan import Plan, extent, leaf_row
 from warp_corot.kernels.stepping.pace import DT, Pace
 
 from .constitutive import IsotropicMaterial, green_strain, symmetric
@@ -169,6 +170,23 @@ def set_elapsed(
 ):
     """The time of the stage of an implicit step after its beginning [s]; see ``implicit.steps``."""
     elapsed[0] = shares[begins[0], row, 0] * dt
+
+
+@wp.kernel(enable_backward=False)
+def adopt_values(
+    # In
+    threads: int,
+    plan: Plan,
+    first: int,
+    blocks: int,
+    count: int,
+    # Out
+    known: wp.array[wp.float32],
+):
+    """What the leaves of a changed mesh carry from row ``first`` on, if the plan was just derived; zero in padding."""
+    for i in range(wp.tid(), extent(leaf_row(plan), plan), threads):
+        for k in range(blocks):
+            known[k * count + i] = plan.values[first + k, i]
 
 
 @wp.kernel(enable_backward=False)

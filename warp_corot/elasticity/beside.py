@@ -152,6 +152,9 @@ class BesideField(ForceField):
     def load_kernels(self) -> None:
         self.law.load_kernels()
 
+    def note(self) -> None:
+        self.law.note()
+
     def derive(self) -> None:
         self.law.derive()
 

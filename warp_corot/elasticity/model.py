@@ -136,6 +136,9 @@ class ForceField(ABC):
         Called before the first step if plans change.
         """
 
+    def note(self) -> None:  # noqa: B027 (most keep nothing)
+        """Launch that elements carry what is kept of them; called before a pass changes the mesh."""
+
     def derive(self) -> None:  # noqa: B027 (most need nothing)
         """Launch the update of what the field keeps of the elements, if the plan has changed; may be recorded.
 
@@ -296,6 +299,11 @@ class Model(ABC):
         Raises:
             InputError: The model does not support this body's mesh or material.
         """
+
+    @property
+    def carried(self) -> tuple[str, ...]:
+        """Names of numbers that a force field keeps of each element, and that elements carry where the mesh changes."""
+        return ()
 
     @property
     def kept_of_elements(self) -> str | None:

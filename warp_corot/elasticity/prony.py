@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import warp as wp
@@ -15,12 +15,14 @@ from warp_corot.discretization.discretization import Discretization, discretizat
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.kernels.elements import prony as kernels
+from warp_corot.kernels.remesh.anisotropic import WRITE_LEAVES
 
 from .beside import BesideField
 from .corotated.model import Corotated
 from .model import ForceField, Model
 
 if TYPE_CHECKING:
+    from warp_corot.discretization.changing.plan import DevicePlan
     from warp_corot.discretization.discretization import Discretized
     from warp_corot.kernels.stepping.pace import Pace
 
@@ -76,8 +78,12 @@ class Prony(Model):
         return getattr(self.model, "dilatation", "element")
 
     @property
+    def carried(self) -> tuple[str, ...]:
+        return tuple(f"history{number}" for number in range(6 * (len(self.terms[0]) + 1)))
+
+    @property
     def kept_of_elements(self) -> str | None:
-        return "Prony keeps the history of each element"
+        return self.model.kept_of_elements
 
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
         discretization = discretization_of(body)
@@ -97,10 +103,12 @@ class PronyField(BesideField):
         functions = (kernels.prony_stress, kernels.prony_differential, kernels.prony_density)
         super().__init__(discretization, law, kernels.PronyMaterial, *functions)
         g, tau = (np.array(values, np.float32) for values in model.terms)
-        self._count = discretization.sizes.launch_elements
+        self._carried, counts = model.carried, self.plan.counts
+        #: There may be more elements later where the mesh changes.
+        self._count = discretization.sizes.launch_elements if counts is None else counts.most
         self._g, self._tau = (wp.array(v, dtype=wp.float32, device=self.device) for v in (g, tau))
         self._elapsed = wp.zeros(1, dtype=wp.float32, device=self.device)
-        self._known = wp.zeros(6 * (len(g) + 1) * self._count, dtype=wp.float32, device=self.device)
+        self._known = wp.zeros(len(self._carried) * self._count, dtype=wp.float32, device=self.device)
         self._relax = kernels.relax(discretization.element_kind)
 
     @property
@@ -120,6 +128,22 @@ class PronyField(BesideField):
 
     def relax_fully(self) -> None:
         self._elapsed.fill_(math.inf)
+
+    def note(self) -> None:
+        super().note()
+        forest, present = cast("DevicePlan", self.plan).forest, self.discretization.sizes.elements
+        columns, names = forest.carriage.arrays.values, forest.carriage.names
+        for block, name in enumerate(self._carried):
+            begin = block * self._count
+            inputs = [forest.pools.leaves, self._known[begin : begin + present], names.index(name)]
+            self.launch(WRITE_LEAVES[wp.float32], present, inputs, [columns])
+
+    def derive(self) -> None:
+        super().derive()
+        plan = cast("DevicePlan", self.plan)
+        threads, first = plan.forest.threads, plan.values_row(self._carried[0])
+        inputs = [threads, plan.arrays, first, len(self._carried), self._count]
+        self.launch(kernels.adopt_values, threads, inputs, [self._known])
 
     @contextmanager
     def at_rest(self) -> Iterator[None]:

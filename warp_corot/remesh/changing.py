@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,9 +14,11 @@ from warp_corot.discretization.changing.plan import DevicePlan
 from warp_corot.discretization.changing.pools import DeviceForest, PassCounts
 from warp_corot.discretization.changing.sizes import launch_size
 from warp_corot.discretization.changing.survey import Survey
+from warp_corot.discretization.changing.transfer import Column
 from warp_corot.discretization.clock import Clock
 from warp_corot.errors import InputError
 from warp_corot.kernels.remesh.mark import elongation, marking_kernel
+from warp_corot.kernels.remesh.state import MEAN_OF_CONTENTS
 from warp_corot.kernels.stepping.integrate import set_start
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.lattice import volume_shares
@@ -38,6 +41,11 @@ class Changing:
 
     It is made before the body's force field, whose launches then run over the pools.
 
+    Args:
+        body: The body.
+        options: The user's options.
+        carried: Numbers of elements that the force field will keep; see ``Model.carried``.
+
     Attributes:
         body: The body.
         options: The user's options with all defaults filled in.
@@ -53,7 +61,7 @@ class Changing:
         InputError: A general mesh, more than one world, or options that do not fit the mesh.
     """
 
-    def __init__(self, body: SoftBody, options: OnlineRemesh):
+    def __init__(self, body: SoftBody, options: OnlineRemesh, carried: Sequence[str] = ()):
         self.options = fitted(options, body)
         mesh = body.mesh
         assert isinstance(mesh, TetForest)
@@ -61,6 +69,7 @@ class Changing:
         self.device = body.device
         self.is_full = False
         self.carried_material = carried_material(body.discretization)
+        self.carried_material.values |= {name: Column(0.0, int(MEAN_OF_CONTENTS)) for name in carried}
         assert self.options.capacity is not None
         assert self.options.min_level is not None
         assert self.options.max_level is not None
@@ -121,6 +130,7 @@ class Changing:
         """Make one pass over the mesh, and update what depends on the mesh if it has changed."""
         self.body.state.adopt_positions()
         self.conditions.note()
+        self.field.note()
         if self._graph is None:
             self._launch()
         else:

@@ -62,7 +62,8 @@ class Remeshing:
                 fitted(each, body)
 
         self.changing = tuple(
-            None if each is None else Changing(body, each) for body, each in zip(bodies, options, strict=True)
+            None if each is None else Changing(body, each, model.carried)
+            for each, body, model in zip(options, bodies, models, strict=True)
         )
         self._said_full: set[int] = set()
 
