@@ -173,6 +173,23 @@ def set_elapsed(
 
 
 @wp.kernel(enable_backward=False)
+def carry_values(
+    # In
+    leaves: wp.array[wp.int32],
+    known: wp.array[wp.float32],
+    first: int,
+    blocks: int,
+    count: int,
+    # Out
+    columns: wp.array2d[wp.float32],
+):
+    """Let the elements of a mesh that changes carry what is known of them, from column ``first`` on."""
+    i = wp.tid()
+    for k in range(blocks):
+        columns[leaves[i], first + k] = known[k * count + i]
+
+
+@wp.kernel(enable_backward=False)
 def adopt_values(
     # In
     threads: int,

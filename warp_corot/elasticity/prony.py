@@ -15,7 +15,6 @@ from warp_corot.discretization.discretization import Discretization, discretizat
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.kernels.elements import prony as kernels
-from warp_corot.kernels.remesh.anisotropic import WRITE_LEAVES
 
 from .beside import BesideField
 from .corotated.model import Corotated
@@ -132,11 +131,9 @@ class PronyField(BesideField):
     def note(self) -> None:
         super().note()
         forest, present = cast("DevicePlan", self.plan).forest, self.discretization.sizes.elements
-        columns, names = forest.carriage.arrays.values, forest.carriage.names
-        for block, name in enumerate(self._carried):
-            begin = block * self._count
-            inputs = [forest.pools.leaves, self._known[begin : begin + present], names.index(name)]
-            self.launch(WRITE_LEAVES[wp.float32], present, inputs, [columns])
+        first = forest.carriage.names.index(self._carried[0])
+        inputs = [forest.pools.leaves, self._known, first, len(self._carried), self._count]
+        self.launch(kernels.carry_values, present, inputs, [forest.carriage.arrays.values])
 
     def derive(self) -> None:
         super().derive()
