@@ -93,8 +93,9 @@ def static_gradient(
         model, gravity, tolerance, iterations, load_steps, preconditioner: As for ``solve_static``.
         adjoint_tolerance: Of the adjoint solve, the residual over the right side.
         precision: "float32": all on the body's device. "float64": the answer is refined on the host, by Newton's method
-            with a sparse direct solver, and the adjoint is solved there; positions are vec3d. For ``Corotated``, ``Linear``,
-            ``StVenantKirchhoff`` and ``NeoHookean``, isotropic materials, and bodies of some 10,000 nodes.
+            with a sparse direct solver, and the adjoint is solved there; positions are vec3d. For the models
+            ``Corotated``, ``Linear``, ``StVenantKirchhoff`` and ``NeoHookean`` with isotropic materials, and bodies of
+            some 10,000 nodes.
 
     Raises:
         InputError: As ``solve_static``, a name is none of these, the model or the material has no such derivative, a
