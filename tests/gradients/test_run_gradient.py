@@ -186,6 +186,7 @@ def test_refusals(device):
         (wc.SymplecticEuler(1e-3, viscosity=1e-3), {}, "viscosity is 0.001"),
         (wc.BackwardEuler(0.01), {}, "tolerance of the integrator is None"),
         (wc.QuasiStatic(0.01), {}, "it must be SymplecticEuler or an implicit one with inertia"),
+        (wc.SymplecticEuler(1e-3), {"model": wc.Prony(), "wrt": "loads"}, "forces of Prony depend on what happened"),
         (wc.SymplecticEuler(1e-3), {"wrt": "boundary"}, "wrt has 'boundary'"),
         (wc.SymplecticEuler(1e-3), {"every": 40}, "every is 40; the run has 30 steps"),
     ):

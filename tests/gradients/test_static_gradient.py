@@ -168,6 +168,20 @@ def test_worlds_are_each_their_own(device):
         assert rest == pytest.approx(alone.rest, abs=1e-4 * np.abs(alone.rest).max())
 
 
+def test_relaxed_tissue_is_that_of_slow_motion(device):
+    """With Maxwell elements beside the law the gradient at rest is the law's own."""
+    body = wc.SoftBody(wc.TetForest.box((1, 1, 1), CUBE, 3), wc.Isotropic(500.0, 0.4, 10.0), device=device)
+    body.fix(body.mesh.points[:, 2] < 1e-9)
+    options = {"wrt": ("loads", "density"), "gravity": 50.0 * GRAVITY}
+    law = MODELS["corotated"]()
+    slow, plain = (
+        wc.static_gradient(body, lambda x: (0.0, x.numpy()), model=model, **options)
+        for model in (wc.Prony(0.5, 0.1, law), law)
+    )
+    assert slow.loads == pytest.approx(plain.loads, abs=1e-4 * np.abs(plain.loads).max())
+    assert slow.density == pytest.approx(plain.density, rel=1e-4)
+
+
 # --- a dilatation that elements share ---------------------------------------------------------------------------------
 
 
@@ -359,6 +373,7 @@ def test_refusals(device):
         ({"wrt": ()}, "wrt is empty"),
         ({"wrt": "activation"}, "the material has no fibres"),
         ({"model": wc.Corotated(rotation_level=0)}, "the model shares rotations"),
+        ({"model": wc.Prony(model=wc.Corotated(rotation_level=0)), "wrt": "loads"}, "the model shares rotations"),
         ({"model": wc.EdgeStVK(springs="quadratic")}, "have no derivative with respect to moduli"),
         ({"precision": "float16"}, "precision is 'float16'; it must be 'float32' or 'float64'"),
         ({"model": wc.MassSpring(), "wrt": "loads", "precision": "float64"}, "precision is 'float64'; it needs an iso"),

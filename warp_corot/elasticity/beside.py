@@ -111,6 +111,10 @@ class BesideField(ForceField):
         self.law.write_energies(u, energies)
         self.launch(self._energies, self.element_count, [self.elements, self.material, u], [energies])
 
+    def write_potentials(self, u: wp.array, energies: wp.array) -> None:
+        self.law.write_potentials(u, energies)
+        self.launch(self._energies, self.element_count, [self.elements, self.material, u], [energies])
+
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
         self.law.write_von_mises(u, stress)
 

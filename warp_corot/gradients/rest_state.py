@@ -63,6 +63,7 @@ class RestState:
         (law,) = checked_models(Corotated() if model is None else model, 1)
         self.body, self.gravity = body, np.array(checked_gravity(gravity, body.mesh.up_axis))
         self.field, needs = bound(body, law, names)
+        self.field.relax_fully()
         ElementWork(self.field, needs)
         self.report = solve_static(body, model=law, gravity=gravity, preconditioner=preconditioner, **options)
         if not self.report.converged:
@@ -117,7 +118,10 @@ def bound(body: SoftBody, law: Model, names: Sequence[str]) -> tuple[ForceField,
     Raises:
         InputError: The model shares rotations.
     """
-    if getattr(law, "rotation_level", None) is not None:
+    inner = law
+    while isinstance(getattr(inner, "model", None), Model):
+        inner = inner.model  # type: ignore[attr-defined]
+    if getattr(inner, "rotation_level", None) is not None:
         raise InputError(
             "the model shares rotations, and has no exact stiffness; for gradients each element needs its own"
         )

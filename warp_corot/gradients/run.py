@@ -107,6 +107,10 @@ def run_gradient(
     names = _checked(body, integrator, steps, wrt)
     (law,) = checked_models(Corotated() if model is None else model, 1)
     field, _needs = bound(body, law, [name for name in names if name in parameters.NEEDS])
+    if field.elapsed is not None:
+        raise InputError(
+            f"forces of {type(law).__name__} depend on what happened before; runs with gradients have none"
+        )
     down = checked_gravity(gravity, body.mesh.up_axis)
     body.state.adopt_positions()
     sums = StepSums(body, field, names)
