@@ -37,8 +37,8 @@ FINER_SURFACE, FINER_FOREST = 0.3, 0.2
 #: surface. Of more elements the surface needs fewer, so that the share goes up, between two numbers of elements.
 UNBISECTED, UNBISECTED_OF_MANY = 1.0 / 6.0, 0.5
 FEWER, MORE = 50_000, 1_000_000
-#: Where nothing in the forest is left to bisect, smaller cubes are to give so many times the elements asked for; there
-#: are hardly four times as many at half the size.
+#: Where nothing in the forest is left to bisect of many elements, smaller cubes are to give so many times the elements
+#: asked for; there are hardly four times as many at half the size.
 AMPLE, SLOW = 1.3, 2.0
 #: How often cubes are bisected for the surface's sake. Where it is most curved elements are a fifth of a cube long;
 #: finer ones would bring the rest of the surface little, and make the time step smaller. From so many elements on
@@ -128,7 +128,8 @@ def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Devi
         if budget.surface_error and count <= budget.target:
             break
         ratio = count / (NEAR * budget.target)
-        factor = ratio ** (1.0 / 2.5) if meshes.has_more else (ratio / AMPLE) ** (1.0 / SLOW)
+        exhausted = budget.target > MANY and not meshes.has_more
+        factor = (ratio / AMPLE) ** (1.0 / SLOW) if exhausted else ratio ** (1.0 / 2.5)
         # Cubes larger than the body would be the whole of it.
         size = min(size * float(np.clip(factor, 0.5, 2.0)), largest)
     if best is None and given_up:
