@@ -151,7 +151,10 @@ def test_a_beam_swings_while_it_is_remeshed(device, tmp_path):
     again = wc.Simulation.load(tmp_path / "beam.npz")
     for each in (sim, again):
         each.advance(0.01)
-    np.testing.assert_array_equal(again.bodies[0].displacements.numpy(), body.displacements.numpy())
+    # On CUDA sums come in any order.
+    moved = body.displacements.numpy()
+    off = 0.0 if body.device.is_cpu else 1e-4 * np.abs(moved).max()
+    np.testing.assert_allclose(again.bodies[0].displacements.numpy(), moved, rtol=0, atol=off)
 
 
 def test_worlds_share_their_dilatation(device):
