@@ -61,13 +61,22 @@ def test_an_implicit_run(tmp_path, capsys):
     assert np.array_equal(first[-1], frames_of(tmp_path / "again.usd")[-1])
 
 
+def test_a_body_falls_in_implicit_steps(tmp_path, capsys):
+    path = tmp_path / "falls.usd"
+    options = ["--integrator", "backward-euler", "--fix", "none", "--drop", "1cm", "--duration", "0.1", "--dt", "16ms"]
+    assert simulate(*BOX, *options, "-o", path) == 0
+    assert "linear ones a step" in capsys.readouterr().out
+    lowest = frames_of(path)[-1][:, 1].min()
+    assert -0.01 - 1e-5 < lowest < -0.009
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
         (["--static", "--dt", "1ms"], "--static has no steps in time; leave out --dt"),
         (["--static", "--integrator", "newmark"], "leave out --integrator"),
         (["--static", "--drop", "1cm"], "--static knows no contact"),
-        (["--integrator", "bdf2", "--remesh"], "--integrator bdf2 knows no remeshing"),
+        (["--integrator", "bdf2", "--drop", "1cm"], "BDF2 knows no contact"),
         (["--integrator", "generalized-alpha", "--dt", "-1ms"], "--dt is -0.001"),
         (["--integrator", "euler"], "argument --integrator: invalid choice: 'euler'"),
     ],

@@ -287,6 +287,17 @@ def test_the_haptic_loop_is_timed(run, tmp_path):
     assert all(word in done.stdout for word in ("median", "99 %", "longest", "delay"))
 
 
+def test_implicit_steps_are_timed(run, tmp_path):
+    path = tmp_path / "steps.json"
+    options = ["--levels", 3, "--tolerances", "1e-2", "--repeats", 1, "--json", path]
+    done = run("implicit_steps.py", "--device", "cpu", *options)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads(path.read_text(encoding="utf-8"))["rows"]
+    assert row["seconds"] > 0.0
+    assert 1 <= row["setups"] < 43
+    assert row["error"] < 0.02
+
+
 def test_preconditioners_are_compared(run, tmp_path):
     path = tmp_path / "solvers.json"
     done = run("solvers.py", "--device", "cpu", "--levels", 5, "--poisson", 0.3, "--json", path)

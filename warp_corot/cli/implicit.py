@@ -16,7 +16,7 @@ IMPLICIT_DT = 0.01
 
 
 def check_implicit(args: argparse.Namespace, *, touches: bool, remeshes: bool) -> None:
-    """Check the options for static answers and implicit steps.
+    """Check the options for static answers.
 
     Args:
         args: The options.
@@ -25,19 +25,16 @@ def check_implicit(args: argparse.Namespace, *, touches: bool, remeshes: bool) -
     Raises:
         InputError: They do not go with others.
     """
-    if is_static(args):
-        asked = "--static"
-        for name in ("integrator", "dt", "damping", "viscosity"):
-            if getattr(args, name) is not None:
-                raise InputError(f"--static has no steps in time; leave out --{name}")
-    elif INTEGRATORS[integrator_name(args)].is_implicit:
-        asked = f"--integrator {integrator_name(args)}"
-    else:
+    if not is_static(args):
+        # The simulation says what an integrator cannot do.
         return
+    for name in ("integrator", "dt", "damping", "viscosity"):
+        if getattr(args, name) is not None:
+            raise InputError(f"--static has no steps in time; leave out --{name}")
     if touches:
-        raise InputError(f"{asked} knows no contact; leave out --ground, --drop, --tool, --touch and --self-contact")
+        raise InputError("--static knows no contact; leave out --ground, --drop, --tool, --touch and --self-contact")
     if remeshes:
-        raise InputError(f"{asked} knows no remeshing; leave out --remesh")
+        raise InputError("--static knows no remeshing; leave out --remesh")
 
 
 def rest(args: argparse.Namespace, sim: Simulation) -> list[str]:
