@@ -146,7 +146,10 @@ def test_compiling_is_said_when_kernels_are_compiled_and_only_then(tmp_path):
 
 
 def test_module_and_version(tmp_path):
-    process = started(tmp_path, "--version")
-    out, _ = process.communicate(timeout=60)
+    """Large libraries are imported when they are needed, so that the command starts quickly."""
+    process = started(tmp_path, "--version", env=os.environ | {"PYTHONPROFILEIMPORTTIME": "1"})
+    out, imported = process.communicate(timeout=60)
     assert process.returncode == 0
     assert out.startswith(f"warp-corot {wc.__version__}")
+    assert "warp_corot.cli.simulate" in imported
+    assert not re.search(r"\| +(scipy|pxr|newton|meshio|vtk|viser|matplotlib)\n", imported)

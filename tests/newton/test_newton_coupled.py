@@ -91,6 +91,7 @@ def test_in_a_proxy_coupling(device, mode):
     rests(model, run(solver, model, 2000, 5e-4, pipeline=pipeline))
 
 
+@pytest.mark.slow
 def test_in_an_admm_coupling(device):
     """Newton's SolverCoupledADMM: the ball hangs on the soft block by an attachment, each stepped by its solver."""
     made = builder()

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from warp_corot.domain.units import in_units
 from warp_corot.errors import InputError
@@ -183,6 +182,8 @@ def _turned(
     length = np.linalg.norm(axis)
     if not (np.isfinite(axis).all() and length > 0.0):
         raise InputError(f"{load}: has no axis; it must be three numbers, not all zero")
+    from scipy.spatial.transform import Rotation
+
     fine = [times[:1]]
     for start, end, span in zip(times, times[1:], np.abs(np.diff(shares)) * abs(load.values[0]), strict=False):
         fine.append(np.linspace(start, end, 1 + max(1, math.ceil(span / KEY_ANGLE)))[1:])

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +16,10 @@ from warp_corot.mesh.pieces import pieces_of
 from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 from .regions import Patch, Shape, broad_sides, flat_region, lowest_part
-from .sag import CoarseBody
-from .sag_mesh import MOST_TETS, MeshBody
+
+if TYPE_CHECKING:
+    from .sag import CoarseBody
+    from .sag_mesh import MeshBody
 
 #: A patch supports a body whose sag is at most this fraction of its height.
 LARGEST_SAG = 0.3
@@ -129,6 +131,9 @@ class _Piece:
 
     @cached_property
     def body(self) -> CoarseBody | MeshBody:
+        from .sag import CoarseBody
+        from .sag_mesh import MOST_TETS, MeshBody
+
         kind = MeshBody if len(self.tets) <= MOST_TETS else CoarseBody
         return kind(self.shape.points, self.tets, self.volumes, self.young, self.density)
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
@@ -40,6 +39,8 @@ def with_corners(x: Array, triangles: Array, domain: Domain) -> tuple[Array, Arr
     corners = domain.corners()
     if not 0 < len(corners) <= MOST or not len(triangles):
         return x, triangles
+    from scipy.spatial import cKDTree
+
     _, near = cKDTree(x).query(corners, k=min(TRIED, len(x)))
     surface = _Surface(x, triangles, domain, near)
     for point, vertices in zip(corners, near, strict=True):
