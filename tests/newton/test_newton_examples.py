@@ -50,7 +50,11 @@ def test_example(harness, path):
     harness(script(path), "--viewer", "null", "--num-frames", "180")
 
 
-@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    # Newton's collisions of the gripper's boxes take a quarter of a minute to compile.
+    [pytest.param(path, marks=pytest.mark.slow if path.stem == "gripper" else (), id=path.stem) for path in SCRIPTS],
+)
 def test_example_draws(harness, path, monkeypatch):
     """Newton's USD viewer writes frames in which things move; a short form of the test above."""
     made = runpy.run_path(str(path), run_name="example")["Example"]
