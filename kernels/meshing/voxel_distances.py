@@ -6,6 +6,8 @@ A thread has one line of voxels; ``first`` is the number of the first thread's l
 
 import warp as wp
 
+wp.set_module_options({"enable_backward": False})
+
 #: A squared distance to nothing.
 NOTHING = wp.constant(1.0e30)
 

@@ -1,6 +1,7 @@
 """Rules for imports."""
 
 import ast
+from pathlib import Path
 
 import pytest
 from imports import Import, against_the_floors, circles, floor_of, imports, modules
@@ -83,3 +84,13 @@ def test_imports_of_every_kind_are_seen(kind, tmp_path):
         ("c.__init__", "a", "load"),
     }
     assert circles(edges) == [["a", "b", "c.__init__"]]
+
+
+def test_modules_of_kernels_have_no_adjoint():
+    """Else the names of compiled kernels depend on ``wp.config.enable_backward``; see ``kernels.modules``."""
+    kernels = Path(__file__).parents[2] / "kernels"
+    for path in kernels.rglob("*.py"):
+        code = path.read_text(encoding="utf-8")
+        if path.name != "modules.py":
+            assert 'module="unique"' not in code, path
+            assert "@wp.kernel" not in code or 'wp.set_module_options({"enable_backward": False' in code, path
