@@ -140,7 +140,7 @@ def test_explicit_steps_are_those_of_a_simulation(device):
 @pytest.mark.parametrize(
     "make",
     [
-        wc.BackwardEuler,
+        pytest.param(wc.BackwardEuler, marks=pytest.mark.slow),
         pytest.param(wc.Newmark, marks=pytest.mark.slow),
         wc.GeneralizedAlpha,
         pytest.param(wc.BDF2, marks=pytest.mark.slow),
