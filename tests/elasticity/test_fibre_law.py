@@ -39,7 +39,7 @@ def of_mesh(mesh, x, material):
     return oracle.continuum(lambda F, _mu, _lam: plain(F, material), reference, x, MU, LAM)
 
 
-@pytest.mark.parametrize("make", [mixed_forest, jittered])
+@pytest.mark.parametrize("make", [mixed_forest, pytest.param(jittered, marks=pytest.mark.slow)])
 def test_forces_and_stiffness_equal_the_float64_formula(make, device, rng):
     """Directions, k1, dispersion and angle of each element; some families are slack."""
     mesh = make()
@@ -114,7 +114,7 @@ def test_closed_forms(device):
 
 
 def test_force_is_the_gradient_where_elements_are_turned_over(device, rng):
-    mesh = jittered()
+    mesh = mixed_forest()
     body = wc.SoftBody(mesh, tissue(np.eye(3)), device=device)
     sim = wc.Simulation(body, model=MODEL, gravity=(0, 0, 0))
     u, du = random_displacement(mesh, rng, 0.9), random_displacement(mesh, rng, 2e-3)

@@ -24,7 +24,13 @@ def test_a_free_bar_contracts_by_stress_over_modulus(device):
     assert np.abs(u - expected).max() < 5e-3 * np.abs(expected).max()
 
 
-@pytest.mark.parametrize("make", [lambda forest: forest, lambda forest: wc.TetMesh(forest.points, forest.tets)])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda forest: forest,
+        pytest.param(lambda forest: wc.TetMesh(forest.points, forest.tets), marks=pytest.mark.slow),
+    ],
+)
 def test_a_string_sounds_at_the_root_of_stress_over_density(make, device):
     """w = pi / L sqrt(S / rho). Cells of length h with mass at the ends have 2 / h sqrt(S / rho) sin(pi h / 2 L), 0.4 %
     less. Young's modulus is so small that clamped ends hardly matter."""
@@ -51,7 +57,7 @@ def test_a_string_sounds_at_the_root_of_stress_over_density(make, device):
     assert found == pytest.approx(20.0 * np.sqrt(1e4 / 1000.0) * np.sin(np.pi / 20), rel=0.002)
 
 
-@pytest.mark.parametrize("make", [mixed_forest, jittered])
+@pytest.mark.parametrize("make", [mixed_forest, pytest.param(jittered, marks=pytest.mark.slow)])
 def test_force_and_stiffness_are_derivatives(make, device, rng):
     """With a stress of each element, beside a law that relaxes, in a body that has turned."""
     mesh = make()
