@@ -29,8 +29,8 @@ BELOW = -3
 
 #: Pieces of less than this share of the body are none, and more of them are crumbs of what is not resolved.
 LEAST_PIECE, MOST_PIECES = 1.0e-4, 16
-#: About so many points in all for labels, and for what elements hold.
-MOST_POINTS, MOST_POINTS_HELD = 250_000, 100_000
+#: About so many points in all.
+MOST_POINTS = 250_000
 #: A leaf with a corner inside the body counts as filled to at least this share.
 LEAST = 1.0e-6
 
@@ -257,7 +257,7 @@ def _sampled_shares(
     elements; a little at least where a corner is."""
     rng = np.random.default_rng(0)
     found = np.zeros(len(elements))
-    some = int(np.clip(MOST_POINTS_HELD // max(len(elements), 1), 1, 8))
+    some = int(np.clip(MOST_POINTS // max(len(elements), 1), 1, 8))
     for part in np.array_split(np.arange(len(elements)), len(elements) // 100_000 + 1):
         within = points_within(grown, elements[part], cell_size, some, rng)
         inside = np.asarray(domain.phi(within.reshape(-1, 3))) < 0.0
