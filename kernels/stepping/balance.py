@@ -196,13 +196,17 @@ def sum_nodes(
             store_node(kept_u[1 - slot], i, x)
             store_node(kept_v[1 - slot], i, velocity)
         k += threads
-    kinetic = sum_of_lanes(kinetic)
-    ahead = sum_of_lanes(ahead)
-    gravitational = sum_of_lanes(gravitational)
-    work = sum_of_lanes(work)
-    supports = sum_of_lanes(supports)
-    untimely = sum_of_lanes(wp.float64(0.125) * dt * dt * untimely)
-    reach = most_of_lanes(wp.sqrt(reach))
+    untimely = wp.float64(0.125) * dt * dt * untimely
+    reach = wp.sqrt(reach)
+    # Otherwise each thread has its own place.
+    if lanes > 1:
+        kinetic = sum_of_lanes(kinetic)
+        ahead = sum_of_lanes(ahead)
+        gravitational = sum_of_lanes(gravitational)
+        work = sum_of_lanes(work)
+        supports = sum_of_lanes(supports)
+        untimely = sum_of_lanes(untimely)
+        reach = most_of_lanes(reach)
     if thread % lanes == 0:
         part = thread / lanes
         sums[world, part, KINETIC] = sums[world, part, KINETIC] + kinetic
@@ -223,7 +227,8 @@ def sum_elements(energies: wp.array[wp.float64], count: int, threads: int, lanes
     while k < count:
         total += energies[world * count + k]
         k += threads
-    total = sum_of_lanes(total)
+    if lanes > 1:
+        total = sum_of_lanes(total)
     if thread % lanes == 0:
         part = thread / lanes
         sums[world, part, ELASTIC] = sums[world, part, ELASTIC] + total
@@ -240,8 +245,9 @@ def sum_work(account: wp.array2d[wp.float64], count: int, threads: int, lanes: i
         work += account[0, world * count + k]
         absolute += account[1, world * count + k]
         k += threads
-    work = sum_of_lanes(work)
-    absolute = sum_of_lanes(absolute)
+    if lanes > 1:
+        work = sum_of_lanes(work)
+        absolute = sum_of_lanes(absolute)
     if thread % lanes == 0:
         part = thread / lanes
         sums[world, part, WORKED] = sums[world, part, WORKED] + work
@@ -289,9 +295,11 @@ def report(
         else:
             value += part
         k += lanes
-    together = sum_of_lanes(value)
-    if column == REACH:
-        together = most_of_lanes(value)
+    together = value
+    if lanes > 1:
+        together = sum_of_lanes(value)
+        if column == REACH:
+            together = most_of_lanes(value)
     if lane == 0:
         totals[world, column] = together
         if world == 0 and column == 0:

@@ -10,6 +10,9 @@ from mpirun import needs_mpi, on_ranks
 import warp_corot as wc
 
 SIZES = (1, 2, 3, 7)
+#: Seven processes have two cores: there, one case in the short form.
+ALL = ",".join(ranked.CASES)
+SHORT = {7: "forest"}
 
 pytestmark = needs_mpi
 
@@ -18,24 +21,40 @@ pytestmark = needs_mpi
 def runs(tmp_path_factory):
     """What each number of ranks has found."""
     folder, found = tmp_path_factory.mktemp("ranks"), {}
+    before: list[str] = []
     for size in SIZES:
-        done = on_ranks(size, str(Path(ranked.__file__)), str(folder / f"{size}.npz"))
+        done = on_ranks(size, str(Path(ranked.__file__)), str(folder / f"{size}.npz"), SHORT.get(size, ALL), *before)
+        before = [str(folder / f"{size}.checkpoint.npz")]
         assert done.returncode == 0, done.stderr
         with np.load(folder / f"{size}.npz") as archive:
             found[size] = dict(archive)
     return found
 
 
+def sizes_of(case):
+    """Numbers of ranks above one that have made a case."""
+    return [size for size in SIZES[1:] if case in SHORT.get(size, ALL)]
+
+
 @pytest.mark.parametrize("case", ranked.CASES)
 def test_a_deterministic_run_is_the_same_bit_by_bit(runs, case):
-    for size in SIZES[1:]:
+    for size in sizes_of(case):
         for what in ("x", "v", "numbers"):
             np.testing.assert_array_equal(runs[size][f"{case}.True.{what}"], runs[1][f"{case}.True.{what}"])
 
 
+@pytest.mark.slow
+def test_all_cases_are_the_same_on_seven_ranks(runs, tmp_path):
+    done = on_ranks(7, str(Path(ranked.__file__)), str(tmp_path / "7.npz"), ALL, timeout=1200.0)
+    assert done.returncode == 0, done.stderr
+    with np.load(tmp_path / "7.npz") as found:
+        for case in ranked.CASES:
+            np.testing.assert_array_equal(found[f"{case}.True.x"], runs[1][f"{case}.True.x"])
+
+
 def test_any_run_is_the_same_to_rounding(runs):
     """Rounding alone tells runs apart, and the steps that it changes: the beams have moved by some centimetres."""
-    for size in SIZES:
+    for size in (1, 2, 3):
         np.testing.assert_allclose(runs[size]["forest.False.x"], runs[1]["forest.True.x"], atol=1e-5)
         energies = [runs[n][f"forest.{kind}.energy"] for n, kind in ((size, "False"), (1, "True"))]
         np.testing.assert_allclose(*energies, rtol=1e-3, atol=1e-6)
@@ -43,7 +62,7 @@ def test_any_run_is_the_same_to_rounding(runs):
 
 @pytest.mark.parametrize("case", ranked.CASES)
 def test_energies_are_those_of_all_ranks(runs, case):
-    for size in SIZES[1:]:
+    for size in sizes_of(case):
         np.testing.assert_allclose(runs[size][f"{case}.True.energy"], runs[1][f"{case}.True.energy"], rtol=1e-12)
 
 
@@ -51,9 +70,18 @@ def test_energies_are_those_of_all_ranks(runs, case):
 def test_ranks_do_what_one_process_does(runs, case):
     body = ranked.CASES[case]()
     sim = wc.Simulation(body)
-    sim.advance(0.04)
+    sim.advance(0.03)
     body.load("z > 0.09 and z < 0.1", [0.0, 0.0, 0.0])
     sim.advance(0.01)
     moved = np.abs(body.displacements.numpy()).max()
     assert moved > 0.01
-    np.testing.assert_allclose(runs[7][f"{case}.True.x"], body.positions.numpy(), atol=2e-3 * moved)
+    np.testing.assert_allclose(runs[3][f"{case}.True.x"], body.positions.numpy(), atol=2e-3 * moved)
+
+
+def test_a_checkpoint_goes_on_with_any_number_of_ranks(runs):
+    for size in SIZES:
+        found = runs[size]
+        np.testing.assert_array_equal(found["loaded.x"], found["saved.x"])
+        if size > 1:
+            np.testing.assert_array_equal(found["others.x"], runs[1]["saved.x"])
+            np.testing.assert_array_equal(found["others.numbers"], runs[1]["loaded.numbers"])

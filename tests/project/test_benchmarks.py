@@ -15,6 +15,7 @@ import numpy as np
 import oracle
 import pytest
 import warp as wp
+from mpirun import needs_mpi
 
 import warp_corot as wc
 
@@ -307,3 +308,17 @@ def test_preconditioners_are_compared(run, tmp_path):
         counts = [found[body, name]["iterations"] for name in ("none", "diagonal", "multigrid")]
         assert counts[0] > counts[1] > 2 * counts[2] > 0
         assert all(found[body, name]["error"] < 1e-3 for name in ("none", "diagonal", "multigrid"))
+
+
+@needs_mpi
+def test_scaling(run, tmp_path):
+    path = tmp_path / "scaling.json"
+    done = run("scaling.py", "--ranks", "1,2", "--weak", "6", "--strong", "6", "--json", path)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(path.read_text(encoding="utf-8"))
+    rows = {(row["scaling"], row["ranks"]): row for row in found["rows"]}
+    assert rows["weak", 2]["elements"] == 2 * rows["weak", 1]["elements"] == rows["strong", 1]["elements"]
+    for (_, ranks), row in rows.items():
+        assert row["step_us"] > 0
+        assert (row["sent_bytes"] > 0) == (ranks == 2)
+    assert {each["ranks"] for each in found["predictions"]} == {1, 2, 8, 64}

@@ -17,12 +17,22 @@ needs_mpi = pytest.mark.skipif(
 )
 
 
-def on_ranks(count: int, *command: str, timeout: float = 240.0, **options) -> subprocess.CompletedProcess:
-    """Run Python with these arguments on so many ranks, more than there are cores if need be."""
+def on_ranks(count: int, *command: str, timeout: float = 900.0) -> subprocess.CompletedProcess:
+    """Run Python with these arguments on so many ranks, more than there are cores if need be.
+
+    Raises:
+        TimeoutError: The run hangs; all its processes are ended.
+    """
     assert MPIRUN is not None
-    start = [MPIRUN, "--oversubscribe", "--allow-run-as-root", "-n", str(count), sys.executable]
+    start = [MPIRUN, "--oversubscribe", "--allow-run-as-root", "-n", str(count), sys.executable, *command]
     environment = {**os.environ, "OMPI_MCA_mpi_yield_when_idle": "1", "OMP_NUM_THREADS": "1"}
     environment["OPENBLAS_NUM_THREADS"] = "1"
-    return subprocess.run(
-        [*start, *command], env=environment, capture_output=True, text=True, check=False, timeout=timeout, **options
-    )
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(start, env=environment, **pipes) as process:
+        try:
+            out, said = process.communicate(timeout=timeout)
+        except subprocess.TimeoutExpired:
+            process.terminate()  # mpirun ends its ranks
+            process.communicate()
+            raise TimeoutError(f"{' '.join(command)} on {count} ranks: no end after {timeout} s") from None
+    return subprocess.CompletedProcess(start, process.returncode, out, said)

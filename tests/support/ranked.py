@@ -1,6 +1,7 @@
-"""Small runs on several ranks, for ``tests/distributed``: ``mpirun -n 3 python ranked.py results.npz``."""
+"""Small runs on several ranks, for ``tests/distributed``: ``mpirun -n 3 python ranked.py results.npz forest,tets``."""
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -44,23 +45,43 @@ CASES = {
 }
 
 
+def saved_and_loaded(results: Path, before: list[str]) -> dict[str, np.ndarray]:
+    """A run that goes on from a checkpoint, and one that was never stopped; and one from others' checkpoint."""
+    import warp_corot.distributed as wd
+
+    sim = wd.Simulation(CASES["forest"](), deterministic=True)
+    sim.advance(0.02)
+    mine = results.with_suffix(".checkpoint.npz")
+    sim.save(mine)
+    sim.advance(0.02)
+    found = {"saved.x": wd.gather(sim.body.positions)}
+    for name, path in (("loaded", mine), *(("others", other) for other in before)):
+        again = wd.Simulation.load(path)
+        again.advance(0.02)
+        found |= {f"{name}.x": wd.gather(again.body.positions), f"{name}.numbers": np.array([again.steps, again.time])}
+    return found
+
+
 def main() -> None:
     import warp_corot.distributed as wd
 
+    results, names, *before = sys.argv[1:]
     found = {}
-    for name, make in CASES.items():
-        for deterministic in (True, False) if name == "forest" else (True,):
+    for name in names.split(","):
+        make = CASES[name]
+        for deterministic in (True, False) if name == "forest" and names != "forest" else (True,):
             body = make()
             sim = wd.Simulation(body, deterministic=deterministic)
-            sim.advance(0.04)
+            sim.advance(0.03)
             body.load("z > 0.09 and z < 0.1", [0.0, 0.0, 0.0])
             sim.advance(0.01)
             kind = f"{name}.{deterministic}"
             found |= {f"{kind}.x": wd.gather(body.positions), f"{kind}.v": wd.gather(body.velocities)}
             found |= {f"{kind}.numbers": np.array([sim.steps, sim.dt, sim.time, *sim.dt_range])}
             found |= {f"{kind}.energy": np.array(sim.energy())}
+    found |= saved_and_loaded(Path(results), before)
     if sim.rank == 0:
-        np.savez(sys.argv[1], **found)
+        np.savez(results, **found)
     else:
         assert all(value is None for key, value in found.items() if key.endswith((".x", ".v")))
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from warp_corot.inputs.processes import process_count, process_number
@@ -45,6 +47,24 @@ def fall_silent() -> None:
 def let_others_speak() -> None:
     """Wait before the end of a rank that failed, at which ``mpirun`` ends all others: rank 0 says what is wrong."""
     time.sleep(WAIT)
+
+
+@contextmanager
+def one_first() -> Iterator[None]:
+    """Rank 0 first, then all others at once: what it compiles they find."""
+    if not are_several():
+        yield
+        return
+    from warp_corot.distributed import mpi
+
+    comm = mpi.world()
+    if comm.rank > 0:
+        comm.Barrier()
+    try:
+        yield
+    finally:
+        if comm.rank == 0:
+            comm.Barrier()
 
 
 def led_simulation(**options: Any) -> Any:

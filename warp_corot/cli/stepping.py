@@ -14,7 +14,7 @@ from warp_corot.solvers import INTEGRATORS, Integrator, QuasiStatic, SymplecticE
 
 from .bodies import Body, gravity_of
 from .implicit import IMPLICIT_DT, check_implicit, integrator_name, is_static
-from .ranks import are_several, led_simulation
+from .ranks import are_several, led_simulation, one_first
 from .remesh import as_remesh_options
 from .touching import Touched
 
@@ -35,7 +35,8 @@ def make_simulation(args: argparse.Namespace, bodies: Sequence[Body], touched: T
         steps = steps_per_frame(args.fps, args.dt or IMPLICIT_DT)
         integrator = INTEGRATORS[integrator_name(args)](1.0 / (args.fps * steps), damping, viscosity)  # type: ignore[call-arg]
     else:
-        tried = min(_tried_step(body, damping, viscosity) for body in bodies)
+        with one_first():
+            tried = min(_tried_step(body, damping, viscosity) for body in bodies)
         steps = steps_per_frame(args.fps, args.dt or tried)  # refuses an excessive number
         integrator = SymplecticEuler(None if args.dt is None else 1.0 / (args.fps * steps), damping, viscosity)
     with as_remesh_options():

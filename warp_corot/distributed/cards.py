@@ -14,12 +14,13 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.kernels.distributed import exchange as kernels
 
+from . import mpi
 from .halo import Halo
 
 
 @functools.cache
-def nccl_of(comm: Any, alias: str) -> Any:
-    """NCCL's communicator of the ranks, whose card this is.
+def nccl_of(alias: str) -> Any:
+    """NCCL's communicator of all ranks, of which this one has the card of this name.
 
     Raises:
         InputError: ``nccl4py`` is not there.
@@ -28,6 +29,7 @@ def nccl_of(comm: Any, alias: str) -> Any:
         import nccl.core as nccl
     except ImportError as error:
         raise InputError(f'runs on several cards need nccl4py ({error}); pip install "warp-corot[cards]"') from None
+    comm = mpi.world()
     with wp.ScopedDevice(alias):
         name = comm.bcast(nccl.get_unique_id() if comm.rank == 0 else None, root=0)
         comm.Barrier()
@@ -39,12 +41,11 @@ class CardExchange:
 
     Args:
         halo: Who gets what.
-        comm: The ranks.
         device: The card.
     """
 
-    def __init__(self, halo: Halo, comm: Any, device: wp.Device):
-        self._nccl, self._device = nccl_of(comm, device.alias), device
+    def __init__(self, halo: Halo, device: wp.Device):
+        self._nccl, self._device = nccl_of(device.alias), device
         self._sent, self._received = (_joined(lists, device) for lists in (halo.sent, halo.received))
         self._out, self._in = (
             wp.zeros(len(nodes), dtype=wp.vec4, device=device) for nodes in (self._sent[0], self._received[0])
@@ -65,11 +66,11 @@ class CardExchange:
         wp.launch(kernels.scatter_vectors, len(received), [received, self._in], [vectors], device=self._device)
 
 
-def take_most(comm: Any, values: wp.array) -> None:
+def take_most(values: wp.array) -> None:
     """Launch that an array on a card holds the largest values of all ranks, in place; may be recorded."""
     import nccl.core as nccl
 
-    own, stream = nccl_of(comm, values.device.alias), wp.get_stream(values.device)
+    own, stream = nccl_of(values.device.alias), wp.get_stream(values.device)
     own.allreduce(values, values, nccl.MAX, stream=stream)
 
 

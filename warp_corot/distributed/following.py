@@ -92,6 +92,20 @@ class Following:
             found[nodes] = own
         return found
 
+    def whole_values(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Values of the part's nodes, [n, …], as those of all nodes of the whole body on all ranks; zero at nodes of no
+        element."""
+        found = np.zeros((self.whole.node_count, *values.shape[1:]), values.dtype)
+        for nodes, own in self._comm.allgather((self.own_nodes, values[self._number[self.own_nodes]])):
+            found[nodes] = own
+        return found
+
+    def part_values(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Values of all nodes of the whole body as those of the part's nodes; zero at ghosts."""
+        found = np.zeros((self.part.node_count, *values.shape[1:]), values.dtype)
+        found[self._number[self.own_nodes]] = values[self.own_nodes]
+        return found
+
     def owns(self, array: wp.array) -> bool:
         """Whether an array is one of the whole body's nodal ones."""
         state, conditions = self.whole.state, self.whole.conditions

@@ -45,7 +45,7 @@ class MpiRanks(Ranks):
         self._parts = parts
         self.halos = halos = [Halo.of(part.numbers, part.worlds, comm) for part in parts]
         self._exchanges: list[HostExchange | CardExchange] = [
-            CardExchange(halo, comm, self.device) if self.device.is_cuda else HostExchange(halo, comm, k)
+            CardExchange(halo, self.device) if self.device.is_cuda else HostExchange(halo, comm, k)
             for k, halo in enumerate(halos)
         ]
         self._copies = [wp.zeros_like(part.state.displacements) for part in parts]
@@ -68,7 +68,7 @@ class MpiRanks(Ranks):
 
     def take_most(self, values: wp.array) -> None:
         if self.device.is_cuda:
-            take_most(self.comm, values)
+            take_most(values)
         else:
             own = values.numpy()
             own[...] = np.max(self.comm.allgather(own), axis=0)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -13,7 +16,7 @@ import warp as wp
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.elasticity import Corotated, Model
 from warp_corot.elasticity.dilatation.options import ELEMENT, SHARED, shares_dilatation
-from warp_corot.errors import InputError
+from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.checks import checked_count
 from warp_corot.mesh import TetForest
 from warp_corot.simulation import simulation as on_one
@@ -21,13 +24,17 @@ from warp_corot.simulation.energy import Energy, WorldEnergies
 from warp_corot.simulation.parts import checked_bodies, checked_gravity, checked_integrator, checked_models
 from warp_corot.solvers import Integrator, SymplecticEuler
 
-from . import mpi
+from . import checkpoint, mpi
 from .following import Following
 from .gathering import register
 from .partition import Partition
 from .parts import Part
 from .ranks import MpiRanks
 from .refusals import check_supported
+
+#: Parts of so many elements are tried by one rank first; larger ones take longer than several ranks' compiling.
+FEW_ELEMENTS = 200_000
+TRIED_STEPS = 10
 
 
 class Simulation:
@@ -76,6 +83,9 @@ class Simulation:
         self._following = [Following(body, part, comm) for body, part in zip(self.bodies, parts, strict=True)]
         for each in self._following:
             each.take_over()
+        _compile_once(comm, parts, model=models, integrator=integrator, gravity=self.gravity)
+        for each in self._following:
+            each.take_over()
         ranks = MpiRanks(comm, self.bodies, parts, settled=bool(deterministic))
         self._parts: _OfParts = _OfParts(
             ranks,
@@ -87,6 +97,11 @@ class Simulation:
             **others,
         )
         register(self._following)
+
+    def __getattr__(self, name: str) -> Any:
+        if not name.startswith("_") and hasattr(on_one.Simulation, name):
+            raise AttributeError(f"{name} does not work on several ranks yet; it is there on one process")
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     # --- stepping --------------------------------------------------------------------------------------------------
 
@@ -225,6 +240,46 @@ class Simulation:
                 array.assign(self._comm.bcast(each.gather(array), root=0))
             state.publish_positions()
 
+    # --- keeping ---------------------------------------------------------------------------------------------------
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write a checkpoint on rank 0, as ``warp_corot.Simulation.save`` does; all ranks must call.
+
+        One process, or any number of ranks, goes on from it. The bodies of all ranks are up to date at all nodes then.
+
+        Raises:
+            InputError: On all ranks, if rank 0 cannot write to the folder.
+        """
+        self._take_over()
+        self.collect()
+        checkpoint.save(path, self.bodies, self._parts, self._following, self._comm)
+
+    @classmethod
+    def load(cls, path: str | PathLike[str], *, device: str | wp.Device | None = None) -> Simulation:
+        """Go on from a checkpoint that ``save`` wrote, on any number of ranks, or one process; all ranks must call.
+
+        A deterministic run goes on bit by bit as if it had never stopped.
+
+        Args:
+            path: The file, which every rank reads.
+            device: Where to go on; None: where it was saved, or on the rank's own card.
+
+        Raises:
+            InputError: As for ``warp_corot.Simulation.load``, or a run that does not work on several ranks.
+        """
+        loaded = on_one.Simulation.load(path, device=device)
+        others = {"remesh": any(loaded.remesh), "contact": loaded.contact}
+        check_supported(loaded.bodies, loaded.models, loaded.integrator, others)
+        made = cls(
+            loaded.bodies,
+            model=loaded.models,
+            integrator=loaded.integrator,
+            gravity=loaded.gravity,
+            deterministic=loaded.deterministic,
+        )
+        checkpoint.resume(path, loaded, made._parts, made._following)
+        return made
+
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _take_over(self) -> None:
@@ -261,6 +316,24 @@ class _OfParts(on_one.Simulation):
 def _part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None) -> Part:
     at_nodes = not isinstance(body.mesh, TetForest) and getattr(model, "dilatation", ELEMENT) == SHARED
     return Part(body, Partition.of(body.mesh, comm.size, costs), comm.rank, layers=2 if at_nodes else 1)
+
+
+def _compile_once(comm: Any, parts: Sequence[Part], **options: Any) -> None:
+    """Let one rank of each machine compile the kernels, by some steps of its parts; the others wait and find them."""
+    if comm.size == 1 or comm.allreduce(max(part.element_count for part in parts), op=max) > FEW_ELEMENTS:
+        return
+    here = comm.Split_type(mpi.library().COMM_TYPE_SHARED)
+    free = all((part.conditions.inverse_mass.numpy() > 0.0).any() for part in parts)
+    if here.rank == 0 and free:
+        with warnings.catch_warnings(), suppress(UnstableError):
+            warnings.simplefilter("ignore")
+            tried = on_one.Simulation(parts, **options)
+            tried.advance_steps(TRIED_STEPS)
+            tried.energy()
+        for part in parts:
+            part.state.reactions.zero_()
+    here.Barrier()
+    here.Free()
 
 
 def _settled_model(model: Model, body: SoftBody) -> Model:

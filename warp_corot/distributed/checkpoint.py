@@ -1,0 +1,97 @@
+"""Checkpoints of a run on several ranks: files as one process writes them, from which any number of ranks goes on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from os import PathLike
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.errors import InputError
+from warp_corot.io.checkpoint.archive import save_checkpoint
+
+from .following import Following
+
+if TYPE_CHECKING:
+    from warp_corot.simulation.simulation import Simulation
+
+#: The arrays besides nodal ones of what is kept that are the same on all ranks begin otherwise.
+NODAL = "directions"
+GUARD = ("scale", "drift", "lately", "counted")
+
+
+@dataclass(frozen=True, eq=False)
+class _Values:
+    """Numbers in place of an array on a device."""
+
+    values: np.ndarray
+
+    def numpy(self) -> np.ndarray:
+        return self.values
+
+
+def save(
+    path: str | PathLike[str], bodies: tuple[SoftBody, ...], parts: Simulation, following: list[Following], comm: Any
+) -> None:
+    """Write a checkpoint on rank 0; all ranks must call, with bodies in which all nodes are up to date.
+
+    Args:
+        path: The file.
+        bodies: The whole bodies.
+        parts: This rank's simulation of parts.
+        following: Of each body.
+        comm: The ranks.
+
+    Raises:
+        InputError: On all ranks, if rank 0 cannot write.
+    """
+    kept = {}
+    for name, array in parts.kept.items():
+        values = array.numpy()
+        if name.startswith(NODAL):
+            values = following[int(name.removeprefix(NODAL))].whole_values(values)
+        kept[name] = _Values(values)
+    guard, failed = parts.guard.state, None
+    if comm.rank == 0:
+        told = SimpleNamespace(
+            **{name: getattr(parts, name) for name in ("stable_dt", "steps_before_reset", "time_before_reset")},
+            **{name: getattr(parts, name) for name in ("device", "gravity", "integrator", "deterministic", "worlds")},
+            **{name: getattr(parts, name) for name in ("models", "fields", "remeshing")},
+            bodies=bodies,
+            kept=kept,
+            guard=SimpleNamespace(state=guard),
+            contact=None,
+            grasps=(),
+        )
+        try:
+            save_checkpoint(told, path)  # type: ignore[arg-type]
+        except InputError as error:
+            failed = str(error)
+    failed = comm.bcast(failed, root=0)
+    if failed is not None:
+        raise InputError(failed)
+
+
+def resume(path: str | PathLike[str], loaded: Simulation, parts: Simulation, following: list[Following]) -> None:
+    """Let a simulation of parts go on where a saved one was.
+
+    Args:
+        path: The checkpoint.
+        loaded: What one process makes of it.
+        parts: This rank's simulation of parts of the same bodies.
+        following: Of each body.
+    """
+    for name, array in parts.kept.items():
+        values = loaded.kept[name].numpy()
+        if name.startswith(NODAL):
+            values = following[int(name.removeprefix(NODAL))].part_values(values)
+        array.assign(values)
+    parts.steps_before_reset, parts.time_before_reset = loaded.steps_before_reset, loaded.time_before_reset
+    parts.stable_dt = loaded.stable_dt
+    with np.load(path, allow_pickle=False) as archive:
+        parts.guard.resume(**{name: archive[f"guard.{name}"] for name in GUARD})
+    wp.synchronize_device(parts.device)
