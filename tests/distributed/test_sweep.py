@@ -102,3 +102,6 @@ def test_the_command_sweeps(folder, capsys):
     assert float(soft["largest displacement [m]"]) > float(stiff["largest displacement [m]"]) > 0.0
     assert len(list((folder / "results" / "runs").glob("*.usd"))) == 2
     assert run(*words, "-o", "results") == 0
+    # Other options would give other results.
+    assert run(*words, "--duration", "0.2", "-o", "results") == 2
+    assert "another folder" in capsys.readouterr().err

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warp_corot.errors import InputError
+from warp_corot.io.files.whole import written_whole
 
 from .say import complain, interrupt_status
 
@@ -79,6 +80,7 @@ def run(args: argparse.Namespace) -> int:
         options_of(args.input, others, each, args.output)
     try:
         (args.output / RUNS).mkdir(parents=True, exist_ok=True)
+        _check_same(args.output, args.input, others)
         function = partial(simulated, _input=args.input, _others=others, _folder=str(args.output))
         rows = sweep(function, varied, folder=args.output, workers=args.workers, retries=args.retries)
     except KeyboardInterrupt as signalled:
@@ -92,6 +94,27 @@ def run(args: argparse.Namespace) -> int:
     if failed:
         complain(f"{len(failed)} runs failed, the first with {failed[0]['error']}")
     return 3 if failed else 0
+
+
+def _check_same(folder: Path, source: str, others: list[str]) -> None:
+    """See that what is done in a folder was done with the same input and the same options.
+
+    Raises:
+        InputError: It was done with others.
+    """
+    text = Path(source).read_text(encoding="utf-8") if source.lower().endswith(".toml") else ""
+    told = {"input": source, "options": others, "run_file": text}
+    path = folder / "sweep.json"
+    if path.exists():
+        try:
+            same = json.loads(path.read_text(encoding="utf-8")) == told
+        except ValueError:
+            same = False
+        if not same:
+            raise InputError(f"{folder} has results of another input or of other options; name another folder")
+    else:
+        with written_whole(path) as part:
+            part.write_text(json.dumps(told), encoding="utf-8")
 
 
 def values_of(text: str) -> tuple[str, list[Any]]:

@@ -46,7 +46,8 @@ class Groups:
     @classmethod
     def of_elements(cls, mesh: TetMesh, device: wp.Device, worlds: int) -> Groups:
         """The groups of all elements of a general mesh, in each world."""
-        group = neighbour_groups(mesh.points, mesh.tets)
+        given = mesh.element_groups
+        group = neighbour_groups(mesh.points, mesh.tets) if given is None else np.unique(given, return_inverse=True)[1]
         return cls._of(group, np.arange(len(mesh.tets)), len(mesh.tets), device, worlds)
 
     @classmethod

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from warp_corot.discretization.elements import Mesh
 from warp_corot.discretization.groups import group_numbers
+from warp_corot.discretization.matching import neighbour_groups
 from warp_corot.errors import InputError
 from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.tree import UniformTree
@@ -34,7 +35,7 @@ class Partition:
     rank_of_node: Ints
 
     @classmethod
-    def of(cls, mesh: Mesh, ranks: int, costs: npt.ArrayLike | None = None) -> Partition:
+    def of(cls, mesh: Mesh, ranks: int, costs: npt.ArrayLike | None = None, *, grouped: bool = False) -> Partition:
         """Deal a mesh out.
 
         Leaves of a forest are dealt out along the tree's order, which is a space-filling curve, in whole groups;
@@ -44,18 +45,21 @@ class Partition:
             mesh: The whole mesh.
             ranks: Number of ranks.
             costs: What an element costs on each rank, in any unit, [ranks]; None: the same everywhere.
+            grouped: Whether elements of a general mesh share something in groups, as leaves may always do.
 
         Raises:
             InputError: Fewer groups than ranks, or costs that are not positive.
         """
         shares = _shares(ranks, costs)
-        groups = _groups(mesh)
+        groups = _groups(mesh, grouped)
         order, sizes = _ordered(groups)
         if len(sizes) < ranks:
             raise InputError(f"the body has {len(sizes)} groups of elements for {ranks} ranks; take fewer ranks")
         if isinstance(mesh, TetMesh):
-            of_group = _dealt_general(mesh, ranks, shares)
-            rank = of_group
+            rank = _dealt_general(mesh, ranks, shares)
+            # Each group goes where its first element goes.
+            _, first, place = np.unique(groups, return_index=True, return_inverse=True)
+            rank = rank[first][place]
         else:
             ends = np.cumsum(sizes) - 0.5 * sizes
             rank_of_group = np.searchsorted(np.cumsum(shares)[:-1] * len(groups), ends, side="right")
@@ -96,10 +100,10 @@ def _shares(ranks: int, costs: npt.ArrayLike | None) -> npt.NDArray[np.float64]:
     return (1.0 / given) / np.sum(1.0 / given)
 
 
-def _groups(mesh: Mesh) -> Ints:
+def _groups(mesh: Mesh, grouped: bool) -> Ints:
     count = len(mesh.tets)
     if not isinstance(mesh, TetForest):
-        return np.arange(count, dtype=np.int32)
+        return neighbour_groups(mesh.points, mesh.tets) if grouped else np.arange(count, dtype=np.int32)
     if isinstance(mesh.tree, UniformTree) and mesh.tree.depth >= 3:
         return (np.arange(count, dtype=np.int32) >> 3).astype(np.int32)
     return group_numbers(mesh, np.arange(count))

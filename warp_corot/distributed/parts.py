@@ -72,7 +72,9 @@ def part_of_mesh(mesh: Mesh, kept: npt.NDArray[np.bool_], partition: Partition) 
     nodes = np.unique(mesh.tets[kept]).astype(np.int32)
     number = np.full(len(mesh.points), -1, np.int32)
     number[nodes] = np.arange(len(nodes), dtype=np.int32)
-    return TetMesh(mesh.points[nodes], number[mesh.tets[kept]], up_axis=mesh.up_axis), nodes
+    part = TetMesh(mesh.points[nodes], number[mesh.tets[kept]], up_axis=mesh.up_axis)
+    part.element_groups = partition.groups[kept]
+    return part, nodes
 
 
 def _part_of_forest(forest: TetForest, kept: npt.NDArray[np.bool_], groups: Ints) -> tuple[TetForest, Ints]:

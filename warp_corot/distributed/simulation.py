@@ -18,7 +18,6 @@ from warp_corot.elasticity import Corotated, Model
 from warp_corot.elasticity.dilatation.options import ELEMENT, SHARED, shares_dilatation
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.checks import checked_count
-from warp_corot.mesh import TetForest
 from warp_corot.simulation import simulation as on_one
 from warp_corot.simulation.energy import Energy, WorldEnergies
 from warp_corot.simulation.parts import checked_bodies, checked_gravity, checked_integrator, checked_models
@@ -314,8 +313,8 @@ class _OfParts(on_one.Simulation):
 
 
 def _part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None) -> Part:
-    at_nodes = not isinstance(body.mesh, TetForest) and getattr(model, "dilatation", ELEMENT) == SHARED
-    return Part(body, Partition.of(body.mesh, comm.size, costs), comm.rank, layers=2 if at_nodes else 1)
+    grouped = getattr(model, "dilatation", ELEMENT) == SHARED
+    return Part(body, Partition.of(body.mesh, comm.size, costs, grouped=grouped), comm.rank, layers=1)
 
 
 def _compile_once(comm: Any, parts: Sequence[Part], **options: Any) -> None:
