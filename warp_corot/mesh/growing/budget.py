@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 #: What share of the number asked for is aimed at and is enough; after how many sizes of cubes any is.
 NEAR, NEAR_ENOUGH = 0.985, 0.92
 MOST_CUBES = 4
+#: Along flat sides nothing is bisected; more sizes are tried then, which takes little time.
+MOST_CUBES_OF_BOXES = 7
 #: With between so many elements a size of cubes is given up early that comes to between these shares of them.
 SEEN, MISSED = (5_000, 300_000), (0.6, 0.85)
 #: What an element counts as being off by between such pieces, as a share of its edge.
@@ -117,8 +119,8 @@ def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Devi
     largest = 1.001 * float(np.ptp(domain.bounds, axis=0).max())
     suits = min(predicted_cell_size(domain, budget.target), largest)
     size, given_up = budget.cell_size or suits, False
-    for trial in range(MOST_CUBES):
-        last = trial == MOST_CUBES - 1
+    for trial in range(MOST_CUBES_OF_BOXES):
+        last = trial >= MOST_CUBES - 1
         meshes = _of_cubes(domain, budget, size, suits, sliver, device, first=trial == 0, spread=last)
         count, given_up = meshes.count, given_up or not meshes.looked_closely
         if count <= budget.target and meshes.looked_closely and (best is None or count > best.count):
@@ -126,6 +128,8 @@ def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Devi
         if budget.cell_size or NEAR_ENOUGH * budget.target <= count <= budget.target:
             break
         if budget.surface_error and count <= budget.target:
+            break
+        if last and meshes.has_more and count <= budget.target:
             break
         ratio = count / (NEAR * budget.target)
         exhausted = budget.target > MANY and not meshes.has_more
