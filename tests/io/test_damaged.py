@@ -12,6 +12,7 @@ from warp_corot.domain import Domain
 from warp_corot.domain.closing import close_surface
 from warp_corot.errors import InputError
 from warp_corot.io.files import usd as usd_files
+from warp_corot.io.read import vtk_files
 from warp_corot.io.read.filemesh import FileMesh, Unreadable
 from warp_corot.io.read.volumes import load_volume
 
@@ -103,3 +104,14 @@ def test_a_nastran_file_that_ends_before_its_first_card(tmp_path):
     path.write_text("$ a comment\nBEGIN BULK\n$ nothing\n\n")
     with pytest.raises(InputError, match="it ends before its first card"):
         wc.TetMesh.load(path)
+
+
+def test_a_vtk_array_whose_name_is_not_text(tmp_path):
+    pytest.importorskip("vtkmodules")
+    path = SEEDS["vtk-4"](tmp_path)
+    data = path.read_bytes()
+    assert data.count(b"tissue") == 1
+    path.write_bytes(data.replace(b"tissue", b"tiss\xffe"))
+    mesh = vtk_files.read(path)
+    assert {name for block in mesh.blocks for name in block.data} == {"tiss\N{REPLACEMENT CHARACTER}e"}
+    assert len(wc.TetMesh.load(path).tets)

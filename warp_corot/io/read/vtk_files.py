@@ -247,6 +247,8 @@ def _whole_arrays(arrays: Any, count: int) -> dict[str, NDArray[np.int64]]:
     found = {}
     for k in range(arrays.GetNumberOfArrays()):
         array, name = arrays.GetArray(k), arrays.GetArrayName(k)
+        if isinstance(name, bytes):  # VTK's answer where a name is not UTF-8
+            name = name.decode(errors="replace")
         if array is None or not name or name in INTERNAL:
             continue
         values = whole_numbers(vtk_to_numpy(array))
