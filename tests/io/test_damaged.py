@@ -12,7 +12,6 @@ from warp_corot.domain import Domain
 from warp_corot.domain.closing import close_surface
 from warp_corot.errors import InputError
 from warp_corot.io.files import usd as usd_files
-from warp_corot.io.read import vtk_files
 from warp_corot.io.read.filemesh import FileMesh, Unreadable
 from warp_corot.io.read.volumes import load_volume
 
@@ -108,6 +107,8 @@ def test_a_nastran_file_that_ends_before_its_first_card(tmp_path):
 
 def test_a_vtk_array_whose_name_is_not_text(tmp_path):
     pytest.importorskip("vtkmodules")
+    from warp_corot.io.read import vtk_files
+
     path = SEEDS["vtk-4"](tmp_path)
     data = path.read_bytes()
     assert data.count(b"tissue") == 1
