@@ -100,7 +100,7 @@ def test_bear(folder, capsys):
     "options",
     [
         # Near critical damping, so that it soon comes to rest.
-        ["--damping", 20, "--duration", 1],
+        ["--damping", 20, "--duration", 1.2],
         pytest.param([], marks=pytest.mark.slow),
     ],
     ids=["damped", "as it comes"],

@@ -20,13 +20,24 @@ from mpirun import needs_mpi
 import warp_corot as wc
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+SUPPORT = Path(__file__).parents[1] / "support"
 
 STAGES = {"rotation", "stiffness product", "scatter", "whole force", "integration", "whole step"}
 
 
+#: Modules of the benchmarks whose names modules of tests have, too.
+TWICE = {path.stem for path in BENCHMARKS.glob("*.py")} & {path.stem for path in SUPPORT.glob("*.py")}
+
+
 @pytest.fixture
 def benchmarks(monkeypatch):
+    """The folder of the benchmarks comes first, and none of their modules stays in the place of one of the tests'."""
+    of_tests = {name: sys.modules.pop(name) for name in TWICE & sys.modules.keys()}
     monkeypatch.syspath_prepend(BENCHMARKS)
+    yield
+    for name in TWICE & sys.modules.keys():
+        del sys.modules[name]
+    sys.modules.update(of_tests)
 
 
 @pytest.fixture

@@ -119,7 +119,8 @@ def test_a_file_format_is_added_as_the_recipe_says(tmp_path):
 
 def test_the_reference_has_every_public_name():
     text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
-    assert {name for name in wc.__all__ if f"::: warp_corot.{name}\n" not in text} == set()
+    # Of modules their members.
+    assert {name for name in wc.__all__ if not re.search(rf"::: warp_corot\.{name}(\.\w+)?\n", text)} == set()
     newton = pytest.importorskip("warp_corot.newton")
     text = (ROOT / "docs" / "api_newton.md").read_text(encoding="utf-8")
     assert {name for name in newton.__all__ if f"::: warp_corot.newton.{name}\n" not in text} == set()
