@@ -184,3 +184,18 @@ def test_refuses_what_it_does_not_know(device):
         wc.FibreReinforced(**MATRIX, k1=1.0, k2=1.0, direction=(1, 0, 0), angle=0.5)
     with pytest.raises(wc.InputError, match="right angles"):
         tissue(np.array([[1, 0, 0], [1, 1, 0], [0, 0, 1.0]]))
+
+
+@pytest.mark.parametrize("poisson", [0.4, 0.49], ids=["own dilatation", "shared"])
+def test_active_fibres_shorten_a_beam_at_rest(poisson, device):
+    """Forces balance there: the energy of Newton's line search counts what active stress does."""
+    mesh = wc.TetForest.box((1, 1, 2), 0.064, 2)
+    fibres = wc.FibreReinforced(3e3, poisson, 200.0, 1.0, [0.0, 0.0, 1.0], 1000.0)
+    body = wc.SoftBody(mesh, fibres, device=device)
+    body.fix("z == zmin")
+    body.activate(300.0)
+    report = wc.solve_static(body, model=wc.HolzapfelGasserOgden(), gravity=(0, 0, 0))
+    assert report.converged, report.message
+    end = mesh.points[:, 2] > mesh.points[:, 2].max() - 1e-9
+    assert body.displacements.numpy()[end, 2].max() < -0.001
+    assert np.abs(body.displacements.numpy()[end, 2]).max() < 0.03

@@ -11,7 +11,7 @@ from warp_corot.discretization.discretization import Discretization, discretizat
 from warp_corot.elasticity.stiffness import ElementStiffness
 from warp_corot.elasticity.structs import Kept
 from warp_corot.errors import InputError
-from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial
+from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial, add_active_energies
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import LOG_VOLUME
 from warp_corot.kernels.elements.fibres import (
@@ -24,6 +24,7 @@ from warp_corot.kernels.elements.fibres import (
 from warp_corot.kernels.elements.forces import element_energies, element_von_mises, scatter_forces
 from warp_corot.materials.reinforced import FibreReinforced
 
+from .corotated.anisotropic import fibre_material
 from .dilatation import AUTO, bind_law, check_dilatation
 from .model import ForceField, Model
 
@@ -72,7 +73,7 @@ class ReinforcedField(ForceField):
         self._von_mises = element_von_mises(kind, ReinforcedMaterial, reinforced_cauchy)
         self._stiffness = ElementStiffness(discretization, reinforced_differential, ReinforcedMaterial)
         self._fibres = discretization.anisotropic_material()
-        self._made = Kept(_material)
+        self._made, self._active = Kept(_material), Kept(fibre_material)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         self.launch(self._forces, self.element_count, [self.elements, self.material, u], [f])
@@ -85,6 +86,13 @@ class ReinforcedField(ForceField):
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         self.launch(self._energies, self.element_count, [self.elements, self.material, u], [energies])
+
+    def write_potentials(self, u: wp.array, energies: wp.array) -> None:
+        self.write_energies(u, energies)
+        if self.discretization.has_activation:
+            kernel = add_active_energies(self.discretization.element_kind)
+            active = self._active(self._fibres, *self._activation)
+            self.launch(kernel, self.element_count, [self.elements, active, u], [energies])
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
         shown = _material(self.isotropic_shown, self._fibres, *self._activation)

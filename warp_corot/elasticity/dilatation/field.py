@@ -203,6 +203,13 @@ class DilatationField(ForceField):
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         self.shear.write_energies(u, energies)
+        self._add_shared_energies(u, energies)
+
+    def write_potentials(self, u: wp.array, energies: wp.array) -> None:
+        self.shear.write_potentials(u, energies)
+        self._add_shared_energies(u, energies)
+
+    def _add_shared_energies(self, u: wp.array, energies: wp.array) -> None:
         inputs = [self.elements, self.isotropic, u, self._share(u, self._still)]
         self.launch(kernels.add_energies(self._kind, self.of), self.element_count, inputs, [energies])
 
