@@ -29,7 +29,7 @@ def test_every_element_is_counted_once_and_every_node_moved_once(make, ranks):
     sizes = np.bincount(dealt.rank_of_element, minlength=ranks)
     assert sizes.min() > 0
     for rank in range(ranks):
-        needed = dealt.needed(mesh, rank, 1)
+        needed = dealt.needed(mesh, rank)
         own = np.isin(mesh.tets, np.flatnonzero(dealt.rank_of_node == rank)).any(axis=1)
         assert needed[own].all()
         # Groups come whole.
@@ -52,7 +52,7 @@ def test_masses_of_parts_are_those_of_the_body(make):
     body = wc.SoftBody(make(), wc.Isotropic(1e3, 0.3, 1000.0), device="cpu")
     dealt, found = Partition.of(body.mesh, 3), np.zeros(body.node_count)
     for rank in range(3):
-        part = Part(body, dealt, rank, 1)
+        part = Part(body, dealt, rank)
         np.add.at(found, part.numbers.nodes, part.masses)
         np.testing.assert_array_equal(body.mesh.points[part.numbers.nodes], part.mesh.points)
     np.testing.assert_array_equal(found, body.masses)

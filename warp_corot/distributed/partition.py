@@ -71,26 +71,13 @@ class Partition:
         owner[owner == ranks] = -1
         return cls(groups, rank.astype(np.int32), owner)
 
-    def needed(self, mesh: Mesh, rank: int, layers: int) -> npt.NDArray[np.bool_]:
-        """The elements that a rank computes, its own and copies of others', bool [T]: all that say what becomes of its
-        nodes.
-
-        Args:
-            layers: 1, or 2 where forces on a node depend on elements around the elements around it.
-        """
-        nodes, own = self.rank_of_node == rank, self.rank_of_element == rank
-        found = own
-        for layer in range(layers):
-            if layer > 0:
-                # The energies of its own elements, too.
-                nodes[mesh.tets[own]] = True
-            found = nodes[mesh.tets].any(axis=1)
-            in_groups = np.zeros(int(self.groups.max()) + 1, bool)
-            in_groups[self.groups[found]] = True
-            found = in_groups[self.groups]
-            nodes = np.zeros_like(nodes)
-            nodes[mesh.tets[found]] = True
-        return found | own
+    def needed(self, mesh: Mesh, rank: int) -> npt.NDArray[np.bool_]:
+        """The elements that a rank computes, its own and copies of others', bool [T]: the groups of all elements around
+        its nodes."""
+        around = (self.rank_of_node == rank)[mesh.tets].any(axis=1)
+        in_groups = np.zeros(int(self.groups.max()) + 1, bool)
+        in_groups[self.groups[around]] = True
+        return in_groups[self.groups] | (self.rank_of_element == rank)
 
 
 def _shares(ranks: int, costs: npt.ArrayLike | None) -> npt.NDArray[np.float64]:

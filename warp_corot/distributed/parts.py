@@ -44,11 +44,10 @@ class Part(SoftBody):
         whole: The body.
         partition: How its mesh is dealt out.
         rank: Whose part.
-        layers: See ``Partition.needed``.
     """
 
-    def __init__(self, whole: SoftBody, partition: Partition, rank: int, layers: int):
-        kept = partition.needed(whole.mesh, rank, layers)
+    def __init__(self, whole: SoftBody, partition: Partition, rank: int):
+        kept = partition.needed(whole.mesh, rank)
         mesh, nodes = part_of_mesh(whole.mesh, kept, partition)
         elements = np.flatnonzero(kept).astype(np.int32)
         self.numbers = Numbers(

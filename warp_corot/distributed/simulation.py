@@ -314,7 +314,7 @@ class _OfParts(on_one.Simulation):
 
 def _part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None) -> Part:
     grouped = getattr(model, "dilatation", ELEMENT) == SHARED
-    return Part(body, Partition.of(body.mesh, comm.size, costs, grouped=grouped), comm.rank, layers=1)
+    return Part(body, Partition.of(body.mesh, comm.size, costs, grouped=grouped), comm.rank)
 
 
 def _compile_once(comm: Any, parts: Sequence[Part], **options: Any) -> None:
