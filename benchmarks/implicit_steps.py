@@ -27,7 +27,7 @@ import warp_corot as wc
 from warp_corot.experiments import paper
 from warp_corot.inputs.device import checked_device
 
-#: Parts of the time [s], of which the first ones are not timed: they record the steps.
+#: The time is divided into parts [s]. The first ones record the steps and are not timed.
 PART, WARM_UP, PARTS = 0.14, 2, 5
 TIGHT = 1e-6
 HEADER = ("elements", "tolerance", "iterations a step", "set-ups", "ms/step", "ns/element", "error")
@@ -100,7 +100,7 @@ def main() -> int:
     of.add_argument("--dt", type=float, default=0.01, help="step [s] (default: 0.01)")
     of.add_argument("--tolerances", type=float, nargs="+", default=[1e-2, 1e-4], help="of linear solves")
     of.add_argument("--dilatation", default="element", choices=["element", "shared"], help="of the law")
-    of.add_argument("--repeats", type=int, default=3, help="runs, of which the fastest counts (default: 3)")
+    of.add_argument("--repeats", type=int, default=3, help="how often to run; the fastest run counts (default: 3)")
     of.add_argument("--json", type=Path, metavar="FILE", help="write everything to this file, too")
     options = of.parse_args()
     if not all(3 <= level <= 21 for level in options.levels):
