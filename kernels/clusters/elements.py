@@ -1,11 +1,11 @@
-"""Elements of a forest that changes, as clusters take them: one by one, on their axes.
+"""Elements of a forest that changes, in the form in which clusters read them: one by one, each on its own axes.
 
 On suitable axes, which are those of the lattice in some order and direction, an element of a forest has the
 displacement gradient W = (D0, D1, D2) / h with
     D0 = u1 - u0,  D1 = (u2 - u1) + [type 2] (u2 - u0),  D2 = (1 + [type 2]) (u3 - u2) + [type 1] (u3 - u0),
 nodes in Maubach order: the columns of ``tables.shapes.GRADIENT``, but for type 2 half their sum and difference, which
-turns its two diagonals into an edge and the height on it. One integer says which axes these are; isotropic laws do not
-mind whether they are right- or left-handed.
+turns its two diagonals into an edge and the height on it. One integer says which axes these are. Isotropic laws give
+the same result in right- and left-handed axes.
 """
 
 import warp as wp
@@ -28,7 +28,7 @@ HALVINGS_SHIFT = wp.constant(8)
 
 @wp.struct
 class AlignedElements:
-    """Elements of a forest, as their clusters order them."""
+    """Elements of a forest, in the order of their clusters."""
 
     shape: wp.array[wp.int32]  # [T] see above
     cell: float  # edge length of a root cube [m]
@@ -47,7 +47,9 @@ def power_of_two(n: int) -> float: ...
 
 @wp.func_native("return numbers.data[i];")
 def number_of(numbers: wp.array[wp.int32], i: int) -> int:
-    """Of a contiguous array, which Warp does not know: that saves some instructions."""
+    """Read a number of a contiguous array. Warp does not know that arrays are contiguous; this saves some
+    instructions.
+    """
     ...
 
 
@@ -80,7 +82,7 @@ def one_if(shape: int, bit: int):
 
 @wp.func
 def directions(shape: int, length: float):
-    """The same length along each axis, negative where that points backwards."""
+    """The same length along each axis, negative where the axis points backwards."""
     return wp.vec3(
         wp.where((shape & BACKWARDS_X) != 0, -length, length),
         wp.where((shape & BACKWARDS_Y) != 0, -length, length),
@@ -101,7 +103,7 @@ def shape_word(elements: AlignedElements, t: int):
 
 @wp.func
 def element_gradient(elements: AlignedElements, t: int, shape: int, u0: wp.vec3, u1: wp.vec3, u2: wp.vec3, u3: wp.vec3):
-    """The displacement gradient of element t in its axes, of its nodes' displacements."""
+    """The displacement gradient of element t in its axes, from its nodes' displacements."""
     type1, type2 = one_if(shape, IS_TYPE1), one_if(shape, IS_TYPE2)
     d0 = u1 - u0
     d1 = (u2 - u1) + type2 * (u2 - u0)
@@ -112,7 +114,7 @@ def element_gradient(elements: AlignedElements, t: int, shape: int, u0: wp.vec3,
 
 @wp.func
 def material_scale(elements: AlignedElements, t: int, shape: int):
-    """What stresses are multiplied by before ``element_forces``: V / h."""
+    """The factor that stresses need before ``element_forces``: V / h."""
     h = elements.cell * power_of_two(-(shape >> HALVINGS_SHIFT))
     volume = wp.where((shape & IS_TYPE1) != 0, wp.static(VOLUME[1]), wp.static(VOLUME[0]))
     return wp.where((shape & IS_TYPE2) != 0, wp.static(VOLUME[2]), volume) * (h * h)
@@ -142,7 +144,7 @@ def align_elements(
     # Out
     shape: wp.array[wp.int32],
 ):
-    """The integers of elements from their shape codes, if ``goes`` says so.
+    """Find the integers of elements from their shape codes, if ``goes`` is not zero.
 
     ``words`` has those of all frames, mirrored or not, and types; see ``single.axis_words``.
     """

@@ -1,4 +1,4 @@
-"""The laws of elements in clusters: stress from displacement gradient, with what each needs to know of the material."""
+"""The laws of elements in clusters: stress from displacement gradient, with the material data that each law needs."""
 
 import functools
 
@@ -23,7 +23,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class ActiveMaterial:
-    """An orthotropic material, its axes once more as quaternions, and the active stress of each element."""
+    """An orthotropic material, its axes also as quaternions, and the active stress of each element."""
 
     passive: OrthotropicMaterial
     axes: wp.array[wp.quat]
@@ -47,9 +47,9 @@ def isotropic_law(stress: wp.Function) -> wp.Function:
 
 @wp.func(inline=False)
 def robust_stress(g: wp.mat33, m: wp.mat33, c: vec9, mu: float, lam: float):
-    """P of an F = I + g that the unscaled iteration does not turn, or whose rotation is hardly definite.
+    """P of an F = I + g for which the unscaled iteration finds no rotation, or whose rotation is hardly definite.
 
-    Given the axes, the stiffness in these, and the nearest isotropic material.
+    The arguments are the axes, the stiffness in these, and the nearest isotropic material.
     """
     turned_gradient = g * m
     r = byers_xu(m + turned_gradient)
@@ -59,7 +59,7 @@ def robust_stress(g: wp.mat33, m: wp.mat33, c: vec9, mu: float, lam: float):
 
 @functools.cache
 def anisotropic_law(transverse: bool) -> wp.Function:
-    """The anisotropic corotated law, for elements whose axes are those of rest space."""
+    """The anisotropic corotated law, for elements whose axes are the axes of rest space."""
     law = definite_law(transverse)
 
     @wp.func

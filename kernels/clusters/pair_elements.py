@@ -1,8 +1,9 @@
-"""Elements in pairs, as clusters take them: two that share a face have five nodes in place of eight.
+"""Elements in pairs, in the form in which clusters read them: two elements that share a face have five nodes, not
+eight.
 
 The nodes of a pair are a, b and c of the face, then d of the first element and e of the second. An element's
 displacement gradient is W = (ub - ua, uc - ua, ud - ua) B with the hat functions' gradients at b, c and d as rows of B.
-What a pair is stands in one record, which is read 16 bytes at once: the five nodes, and B twice. In a forest the
+One record describes a pair and is read 16 bytes at a time: the five nodes, and B twice. In a forest the
 entries of B are whole numbers over the edge of a root cube, each of a power of two or zero, for which 16 bits are
 enough. Where a second element is missing its B is zero, and so are its forces.
 """
@@ -116,7 +117,7 @@ def lower_half(word: wp.uint32):
 
 @wp.func
 def scaled_difference(pairs: LatticePairs, difference: wp.vec3):
-    """A difference of displacements in what B is the inverse of: scaled before, it would lose digits."""
+    """A difference of displacements in the units of B's inverse. Scaled earlier, it would lose digits."""
     return pairs.inverse_cell * difference
 
 
@@ -165,7 +166,7 @@ def second_matrix(record: general_record):
 
 @wp.func
 def first_scale(pairs: LatticePairs, record: lattice_record):
-    """What the first element's stress times the transpose of B is to be multiplied by for forces: its volume."""
+    """The factor that turns the first element's stress times the transpose of B into forces: its volume."""
     return pairs.scale * as_float(((record[2] >> wp.uint32(16)) & wp.uint32(0xFF)) << wp.uint32(23))
 
 
@@ -186,7 +187,7 @@ def second_scale(pairs: GeneralPairs, record: general_record):
 
 @functools.cache
 def pair_forces(law: wp.Function) -> wp.Function:
-    """Forces on the five nodes of the i-th pair, of their displacements, by a law of ``laws``."""
+    """Forces on the five nodes of the i-th pair from their displacements, by a law of ``laws``."""
 
     @wp.func
     def pair_forces(

@@ -6,7 +6,7 @@ from warp_corot.kernels.tables.cluster_layout import BANK_GROUPS
 
 from .pairs import PAIR_TASK_SLOTS, SLOT_BITS, WORD_SLOTS
 
-# Loops stay loops: written out, these take a compiler most of a minute.
+# Loops are not unrolled: unrolled, they take a compiler most of a minute.
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 
@@ -27,9 +27,9 @@ def pack_slots(
 ):
     """Pack the slots of eight tasks, in an order in which threads seldom want the same banks at once.
 
-    Eight threads read 16 bytes each at once, from eight groups of banks. When a task reads which of its slots is free,
-    and so is which of eight slots that are zero, from ``zero`` on, stands in for one that it has not. A word that is
-    not needed has the first of these alone.
+    Eight threads read 16 bytes each at once, from eight groups of banks. A task may read its slots in any order. It may
+    also choose which of the eight slots that are zero, from ``zero`` on, stands in for a slot that it does not have. A
+    word that is not needed holds the first of these only.
 
     Args:
         count: How many slots each task has, [tasks].
@@ -103,7 +103,7 @@ def cut_clusters(
                 node = of_pairs[i, k]
                 if cluster_of[node] != cluster or degree[node] % PAIR_TASK_SLOTS == 0:
                     more += 1
-            # Where there is no second element the fifth is the first again, and may be one too many for its task.
+            # Without a second element, the fifth node repeats the first and may be one too many for its task.
             if of_pairs[i, 4] == of_pairs[i, 0]:
                 more += 1
         if cluster < 0 or i - begin >= threads or tasks + more > threads:

@@ -1,8 +1,8 @@
 """Forces of pairs of elements in clusters, on CUDA: a cluster's nodes meet in shared memory; see ``single``.
 
-What bounds such a kernel is not arithmetic but how long a block waits, so nothing is looked up on the way: each thread
-has a pair, and a task, which is a node to read and to add up to twelve slots of; both are read at once, and at the
-begin. A cluster has no more pairs or tasks than threads. Nodes of more slots have several tasks.
+The time of such a kernel is not arithmetic but waiting, so no thread looks anything up on the way. Each thread has a
+pair and a task: a node that it reads, and up to twelve slots of that node that it adds up. It reads both at once, at
+the beginning. A cluster has no more pairs or tasks than threads. Nodes of more slots have several tasks.
 """
 
 import functools
@@ -37,7 +37,7 @@ SLOT_MASK = (1 << SLOT_BITS) - 1
 
 @wp.struct
 class PairClusters:
-    """Pairs by clusters, one thread's after another's."""
+    """Pairs by clusters, in the order of the threads."""
 
     elements: wp.array[wp.int32]  # [2 * threads] which of a mesh's elements a pair is of
     nodes: wp.array[wp.int32]  # [threads] the task's node, -1: there is none; a node's first task is its place
@@ -51,7 +51,7 @@ def slot_of(word: wp.uint32, k: int):
 
 
 def slot_sum(slot: wp.Function, zero: int) -> wp.Function:
-    """The sum of a task's slots; words that are all ``zero`` are left out but for the first."""
+    """The sum of a task's slots. Words of zero slots only are skipped, except the first word."""
     nothing = sum(zero << SLOT_BITS * k for k in range(WORD_SLOTS))
 
     @wp.func
@@ -72,7 +72,7 @@ def slot_sum(slot: wp.Function, zero: int) -> wp.Function:
 #endif
 """)
 def fetch_quad(quads: wp.array[vec4u], i: int):
-    """Bring an entry nearer that another block will soon read."""
+    """Fetch into the second-level cache an entry that another block will soon read."""
     ...
 
 
@@ -98,7 +98,7 @@ def scatter_pairs(Pairs: type, Material: type, law: wp.Function, layout: PairLay
     slot = shared_quads(zero + BANK_GROUPS, "forces")
     forces, sum_of = pair_forces(law), slot_sum(slot, zero)
 
-    # What is out of line is rarely run, and shall not take registers from all.
+    # Code out of line runs rarely and must not take registers from the rest.
     @unique_kernel(grid_stride=False, launch_bounds=(threads, layout.resident))
     def scatter_pairs(
         # In

@@ -1,12 +1,13 @@
-"""Forces of elements in clusters, on CUDA: a cluster's nodes meet in shared memory, and each is read and added to once.
+"""Forces of elements in clusters, on CUDA: a cluster's nodes are in shared memory, and each is read once and added to
+once.
 
 A thread block takes a stretch of elements that follow one another in the order of the tree and so share most of their
 nodes: half a node an element is left of four. Threads write their elements' four forces to slots; then each sums up to
 eight slots of a node, and adds the sum to memory. Displacements and forces are read and written 16
 bytes at once.
 
-Here are the leaves of forests that change, whose clusters are found on the device (``tables``); meshes that
-stay as they are go by pairs (``pairs``).
+These kernels compute the leaves of forests that change, whose clusters are found on the device (``tables``). Meshes
+that do not change use pairs (``pairs``).
 """
 
 import functools
@@ -41,7 +42,7 @@ class Clusters:
     slots: wp.array[vec2ul]  # [tasks] eight slots each, the zero one past the last, in bytes
 
 
-# Arrays here are contiguous, which Warp does not know: that saves some hundred instructions of addresses.
+# Arrays here are contiguous. Warp does not know that, so these functions save some hundred instructions for addresses.
 
 
 @wp.func_native("""
@@ -127,7 +128,7 @@ def scatter_clusters(law: wp.Function, layout: ClusterLayout = DEFAULT_LAYOUT) -
     displacement, slot = shared_quads(corners, "displacements"), shared_quads(corners + 1, "forces")
     sum_of = slot_sum(slot, corners)
 
-    # What is out of line is rarely run, and shall not take registers from all.
+    # Code out of line runs rarely and must not take registers from the rest.
     @unique_kernel(grid_stride=False, launch_bounds=(threads, layout.resident))
     def scatter_clusters(
         # In

@@ -1,8 +1,8 @@
 """The tables of clusters found on the device, for meshes that change; see ``single.Clusters``.
 
-A thread block for each cluster finds its nodes by a hash table, then gives each a place: first those of more than four
-corners, then the others, so that the threads of a warp have about as much to add up; a node's further slots come after
-all of these. On a CPU one thread does all that.
+A thread block for each cluster finds its nodes by a hash table, then gives each a place: first the nodes of more than
+four corners, then the others, so that the threads of a warp have similar sums. Further slots of a node come after all
+of these. On a CPU one thread does all that.
 """
 
 import functools

@@ -16,7 +16,7 @@ from warp_corot.kernels.math.quaternion import robust_rotation
 
 wp.set_module_options({"enable_backward": False})
 
-# J up to which an element counts as flat or turned over, and the trace of E up to which F counts as of order one.
+# Up to this J an element counts as flat or turned over; up to this trace of E, F counts as of order one.
 FLAT = wp.constant(0.03)
 FAR = wp.constant(50.0)
 # |E|^2 below which the series for t is the start.
@@ -124,7 +124,7 @@ def stretch_stress(w: wp.mat33, mu: float, lam: float):
 
 @wp.func
 def turned_stress(f: wp.mat33, mu: float, lam: float):
-    """As ``stretch_stress``, of F, for every F; where E is small it has not its digits."""
+    """As ``stretch_stress``, but from F and for every F. Where E is small the result loses digits."""
     r = robust_rotation(f)
     return (2.0 * mu) * f + (lam * (wp.ddot(r, f) - 3.0) - 2.0 * mu) * r
 

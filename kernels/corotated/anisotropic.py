@@ -1,9 +1,9 @@
 """Corotated forces of orthotropic materials, and active stress along their first axis.
 
-All is worked out in the material's axes: with M their rotation into rest space, F M and its rotation R M take the
-place of the local frame's F Q and R Q, and the stiffness is nine numbers. With S = R^T F and s = C : (S - I), the
-energy density (S - I) : s / 2 has the derivative R (s + [a]x), where (tr(S) I - S) a is the axial vector of S s - s S.
-That a comes of R turning as F changes; an isotropic material has none, others are free of torque by it.
+The law works in the material's axes: with M their rotation into rest space, F M and its rotation R M take the place of
+the local frame's F Q and R Q, and the stiffness is nine numbers. With S = R^T F and s = C : (S - I), the energy density
+(S - I) : s / 2 has the derivative R (s + [a]x), where (tr(S) I - S) a is the axial vector of S s - s S. The vector a
+appears because R turns as F changes. It is zero for isotropic materials, and it keeps other materials free of torque.
 
 tr(S) I - S is singular where F has no definite rotation: flat in two directions, or inverted by as much in one as is
 left in another. Near there the law goes over smoothly to the nearest isotropic one, which needs no a: the energy is
@@ -80,7 +80,7 @@ def orthotropic_stress(strain: wp.mat33, c: vec9):
 
 @wp.func
 def definiteness(strain: wp.mat33):
-    """How definite the rotation is, of S scaled to order one, so that nothing is out of range.
+    """How definite the rotation is, from S scaled to order one, so that no power of it is out of range.
 
     Returns:
         b, its derivative with respect to the scaled S, the scale, and adjugate and determinant of tr(S) I - S.
@@ -106,7 +106,7 @@ def definiteness(strain: wp.mat33):
 
 @wp.func
 def turned_stress(strain: wp.mat33, material: OrthotropicMaterial, t: int):
-    """R^T P: its symmetric part and the axial vector of the other one."""
+    """R^T P: its symmetric part, and the axial vector of its skew part."""
     i = t * material.stride
     stress, a = turned_stress_of(strain, material.stiffness[i], material.mu[i], material.lam[i])
     return stress, a
@@ -114,7 +114,7 @@ def turned_stress(strain: wp.mat33, material: OrthotropicMaterial, t: int):
 
 @wp.func
 def turned_stress_of(strain: wp.mat33, c: vec9, mu: float, lam: float):
-    """The same of a stiffness and the nearest isotropic material."""
+    """The same, from a stiffness and the nearest isotropic material."""
     stress = orthotropic_stress(strain, c)
     share, slope, scale, adjugate, det = definiteness(strain)
     e = strain * scale
@@ -232,7 +232,7 @@ def fibre_cauchy(rotation: wp.Function) -> wp.Function:
 
 @functools.cache
 def add_active_energies(Elements: type) -> wp.Kernel:
-    """Add what each element's active stress s would have for an energy if s stayed: V s (|F d|^2 - 1) / 2."""
+    """Add the energy that each element's active stress s would have if s stayed constant: V s (|F d|^2 - 1) / 2."""
 
     @unique_kernel()
     def add_active_energies(

@@ -2,7 +2,7 @@
 
 Both kinds of elements come as general ones, with M multiplied into their rest matrix: F M = M + (d1 d2 d3) B. An
 element of which no rotation is found adds nothing and is put on a list, which ``forces.repair_forces`` goes through.
-Left out are also all that are near having no definite rotation (see ``anisotropic``): det(tr(S) I - S) = q / 2 below
+Elements whose rotation is nearly indefinite are left out, too (see ``anisotropic``): det(tr(S) I - S) = q / 2 below
 ``NEARLY_INDEFINITE`` |S|^3.
 """
 
@@ -24,8 +24,7 @@ wp.set_module_options({"enable_backward": False})
 #: Of det(tr(S) I - S) over |S|^3, where leaves of no definite rotation begin.
 NEARLY_INDEFINITE = 0.41
 
-#: Corotated forces of orthotropic elements, which have Dm^-1 M for the inverse of their rest matrix, and of their
-#: active stress.
+#: Corotated forces of orthotropic elements, whose inverse rest matrix is Dm^-1 M, and forces of their active stress.
 scatter_anisotropic_lanes = scatter_lanes(
     constants(NEARLY_INDEFINITE=(2 * NEARLY_INDEFINITE) ** 2)
     + ROTATION
@@ -79,7 +78,7 @@ def turn_changed(
     rest_inverse: wp.array[wp.mat33],
     volume: wp.array[wp.float32],
 ):
-    """The same of leaves that have changed, and of what padding there is in their place; nothing if ``goes`` is 0."""
+    """The same for leaves that have changed, and for the padding in their places; nothing if ``goes`` is 0."""
     count = wp.max(now[0], before[0])
     if goes[0] == 0:
         count = 0

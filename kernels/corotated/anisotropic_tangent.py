@@ -3,7 +3,7 @@
 In the material's axes P = R (s + [a]x), where s is the derivative of the energy density with respect to S, H a =
 axial(S s), and H = tr(S) I - S (see ``anisotropic``). With b = R^T dF, H w = axial(b) and dS = sym(b - [w]x S),
     dP = R ([w]x (s + [a]x) + ds + [da]x),  H da = axial(dS s + S ds) - dH a.
-What is isotropic in s adds nothing to axial(S s). The rotation's turning is bounded as in ``tangent``.
+The isotropic part of s adds nothing to axial(S s). The change of the rotation is bounded as in ``tangent``.
 
 Active stress s (F d) d^T is linear in F; its s is held fixed.
 """

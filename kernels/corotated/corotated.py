@@ -78,7 +78,7 @@ def given_density(elements: Any, t: int, material: RotatedMaterial, u: wp.array[
 
 @wp.func
 def given_cauchy(elements: Any, t: int, material: RotatedMaterial, u: wp.array[wp.vec4]):
-    """Stress to be shown, with a given rotation."""
+    """Cauchy stress for display, with a given rotation."""
     i = t * material.isotropic.stride
     return hooke(given_strain(elements, t, material, u), material.isotropic.mu[i], material.isotropic.lam[i])
 
@@ -107,7 +107,7 @@ def extract_rotations(Elements: type, rotation: wp.Function) -> wp.Kernel:
 
 @functools.cache
 def extract_warm_rotations(Elements: type) -> wp.Kernel:
-    """As ``extract_rotations``, from and into the unit's quaternion of the step before."""
+    """As ``extract_rotations``, starting from the unit's quaternion of the step before, which is then replaced."""
 
     @unique_kernel()
     def extract_warm_rotations(

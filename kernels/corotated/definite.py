@@ -1,7 +1,7 @@
-"""The anisotropic corotated law where an element's rotation is definite, with as little arithmetic as it takes.
+"""The anisotropic corotated law where an element's rotation is definite, with as little arithmetic as possible.
 
-What kernels for CUDA share: the law of ``anisotropic``, in any frame that the columns of F come in, for elements that
-the unscaled iteration turns and that are far from where the law goes over to the isotropic one (``is_definite``).
+Kernels for CUDA share this code. It has the law of ``anisotropic``, in any frame of the columns of F, for elements
+whose rotation the unscaled iteration finds and that are far from the transition to the isotropic law (``is_definite``).
 """
 
 import warp as wp
@@ -90,7 +90,8 @@ def turned(e: wp.mat33, stress: wp.mat33, axial: wp.vec3):
 
 @wp.func
 def transverse_stress(e: wp.mat33, n: wp.mat33, c: vec9, scale: float):
-    """R^T P times ``scale``, for a stiffness that is the same all round the first axis d, by its invariants.
+    """R^T P times ``scale``, for a stiffness that is the same in all directions around the first axis d, by its
+    invariants.
 
     sigma = 2 mu e + (lambda tr e + alpha d.v) I + d w^T + w d^T, with v = e d.
     """
@@ -148,7 +149,9 @@ def orthotropic_turned_stress(e: wp.mat33, n: wp.mat33, c: vec9, scale: float):
 
 
 def definite_law(transverse: bool) -> wp.Function:
-    """R^T P of (strain, axes, stiffness, scale); ``transverse``: the stiffness is the same all round the first axis."""
+    """R^T P of (strain, axes, stiffness, scale); ``transverse``: the stiffness is the same in all directions around the
+    first axis.
+    """
     return transverse_stress if transverse else orthotropic_turned_stress
 
 

@@ -1,7 +1,8 @@
 """Products with the corotated R K R^T on the CPU, rotations found once; see ``elements.lanes``.
 
-With rotations held fixed, K is that of linear elasticity with the gradients of hat functions turned by R. These are
-kept, times the root of the volume, so that a product reads 36 bytes an element and nothing of the law.
+With rotations held fixed, K is the stiffness of linear elasticity with the gradients of hat functions turned by R.
+These gradients are kept, times the root of the volume, so that a product reads 36 bytes an element and does not
+evaluate the law.
 """
 
 import functools

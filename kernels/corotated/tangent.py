@@ -1,7 +1,7 @@
 """Differentials of the isotropic corotated law P = R sigma(e), e = sym(R^T F) - I, for ``elements.stiffness_products``.
 
 With the rotation held fixed dP = R sigma(sym(R^T dF)): the paper's R K R^T, which is positive semidefinite. The exact
-differential has the turning of R too, dR = R [w]x with (tr(S) I - S) w = axial(R^T dF), which needs the rotation to be
+differential includes the change of R, dR = R [w]x with (tr(S) I - S) w = axial(R^T dF), which needs the rotation to be
 the element's own: dP = R ([w]x sigma(e) + sigma(dS)), dS = sym(R^T dF - [w]x e).
 """
 
@@ -73,7 +73,7 @@ def given_differential(elements: Any, t: int, material: RotatedMaterial, u: wp.a
 
 @functools.cache
 def exact_differential(rotation: wp.Function) -> wp.Function:
-    """With the element's own rotation and its turning."""
+    """With the element's own rotation and its change."""
 
     @wp.func
     def exact_differential(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4], dg: wp.mat33):
@@ -93,7 +93,9 @@ def exact_differential(rotation: wp.Function) -> wp.Function:
 
 @wp.struct
 class KeptStrains:
-    """Lamé's parameters, and what ``exact_differential`` finds of each element, kept for many products."""
+    """Lamé's parameters, and the rotation and strain of each element, which ``exact_differential`` would find again for
+    every product.
+    """
 
     isotropic: IsotropicMaterial
     rotations: wp.array[wp.mat33]
@@ -125,7 +127,7 @@ def keep_strains(Elements: type, rotation: wp.Function) -> wp.Kernel:
 
 @wp.func
 def kept_differential(elements: Any, t: int, material: KeptStrains, u: wp.array[wp.vec4], dg: wp.mat33):
-    """As ``exact_differential``, with what was kept."""
+    """As ``exact_differential``, with the kept rotations and strains."""
     i = t * material.isotropic.stride
     mu = material.isotropic.mu[i]
     lam = material.isotropic.lam[i]

@@ -1,1 +1,1 @@
-"""What a process launches to exchange values with others."""
+"""Kernels that a process launches to exchange values with others."""

@@ -1,4 +1,4 @@
-"""Values of nodes to and from other arrays: of a whole body and its part, and of a part and what travels."""
+"""Copies of nodal values: between a whole body and its part, and between a part and the buffers that are sent."""
 
 import warp as wp
 
@@ -52,6 +52,6 @@ def clear_energies(places: wp.array[wp.int32], energies: wp.array[wp.float64]):
 
 @wp.kernel(enable_backward=False)
 def forget_length(changed: wp.array[wp.int32], before: wp.array[wp.float64]):
-    """Velocities that somebody wrote belong to steps of any length."""
+    """Note that velocities were written by a user and so belong to steps of any length."""
     if changed[0] != 0:
         before[0] = wp.float64(0.0)

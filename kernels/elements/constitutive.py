@@ -1,8 +1,8 @@
-"""Constitutive laws, one set of functions each: first Piola-Kirchhoff stress and its differential, energy density, a
-stress to be shown.
+"""Constitutive laws, one set of functions each: first Piola-Kirchhoff stress and its differential, energy density, and
+a stress for display.
 
 A law takes the displacement gradient A of an element in an orthonormal frame of its own, so that F = I + A there, and
-returns P in the same frame: materials are isotropic, so any frame will do, a left-handed one too. ``elements`` gives
+returns P in the same frame. Materials are isotropic, so any frame is right, also a left-handed one. ``elements`` gives
 G = (du/dX) Q, and A = Q^T G. ``cauchy`` functions return a tensor with the invariants of the Cauchy stress, for von
 Mises stress and the like. ``differential`` functions return dP, the exact directional derivative of P at A in the
 direction dA, which has the digits of dA. Stresses in Pa, energy densities in J/m^3.
@@ -145,8 +145,8 @@ def rotated_stress(g: wp.mat33, q: wp.mat33, r: wp.mat33, mu: float, lam: float)
 def stretch_strain(rough: wp.mat33, a: wp.mat33):
     """e = S - I of F = I + A to all its digits, from a ``rough`` one; S is the stretch in F = R S.
 
-    The rough one is a difference of numbers near one. But S^2 = F^T F, so that e = E - e^2 / 2 with Green's strain E,
-    and where e is small, what is wrong with the rough one hardly counts there.
+    The rough one is a difference of numbers near one. But S^2 = F^T F, so e = E - e^2 / 2 with Green's strain E, and
+    where e is small, the error of the rough one hardly changes this.
     """
     strain = rough
     if wp.ddot(rough, rough) < 0.25:

@@ -8,10 +8,10 @@ lambda and volume, and the energy
 In a forest without subtrees there is one theta at each node, the mean of the elements around it, and each element has
 the mean of w at its four nodes.
 
-Nothing of this keeps an element of a group from turning over while others grow, which elements of crushed tissue do. So
-where theta_e is J - 1, W has lambda_e V_e h(theta_e) of each element besides. h is zero up to |theta| = ``FREE``; from
-there on h'' grows from 0 to 1 over ``RAMP``.
-Forces are exact derivatives: P_e = lambda_e (w'(theta) + h'(theta_e)) d theta_e / dF.
+This alone would let an element of a group turn over while others grow, as elements of crushed tissue do. So where
+theta_e is J - 1, W also has lambda_e V_e h(theta_e) for each element. h is zero up to |theta| = ``FREE``; from there on
+h'' grows from 0 to 1 over ``RAMP``. Forces are exact derivatives: P_e = lambda_e (w'(theta) + h'(theta_e)) d theta_e /
+dF.
 
 Functions here take the displacement gradient A as ``constitutive`` has it. The kernels are in ``shared_dilatation``,
 those of subtrees' forces in ``subtrees.dilatation``.
@@ -37,14 +37,14 @@ wp.set_module_options({"enable_backward": False})
 
 #: |J - 1| of an element up to which it is free to differ from its group's.
 FREE = wp.constant(0.25)
-#: Past that, over which its stiffness grows to lambda.
+#: Beyond that, the range of |J - 1| over which its stiffness grows to lambda.
 RAMP = wp.constant(0.5)
-#: Elements in a group at most: what is left of the six roots of a cube, three of each.
+#: Maximum number of elements in a group: three left of each of the six roots of a cube.
 MOST = 18
 
 
 class Dilatation(NamedTuple):
-    """What a law has in the place of lambda times half the square of a trace; functions of device code.
+    """The functions (device code) that stand for lambda times half the square of a trace in a law.
 
     Attributes:
         lanes: The native code for lanes, files of ``native``.

@@ -1,7 +1,7 @@
 """Shared dilatations on the CPU, eight elements to the lanes of vector registers.
 
-Where it is shared at nodes, the passes of ``shared_dilatation`` that go through elements. Where groups share it,
-elements stand group after group, and one launch does all that a law and the shared dilatation ask: a thread is a few
+Where nodes share it, this file has the passes of ``shared_dilatation`` that loop over elements. Where groups share it,
+elements stand group after group, and one launch computes the law and the shared dilatation: a thread takes a few
 groups.
 """
 
@@ -22,7 +22,9 @@ wp.set_module_options({"enable_backward": False})
 
 
 def law_of(of: Dilatation, has_log: bool = False) -> str:
-    """The native code of a law's dilatation; ``has_log``: after neo-Hookean's, which has the logarithm already."""
+    """The native code of a law's dilatation; ``has_log``: it follows the code of neo-Hookean, which has the logarithm
+    already.
+    """
     free = constants(FREE=float(FREE), RAMP=float(RAMP))
     if has_log:
         return free + native(*(name for name in of.lanes if name != "log"))

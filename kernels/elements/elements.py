@@ -1,9 +1,9 @@
 """Elements on the device: deformation gradients in, nodal forces out.
 
-Two kinds share one set of functions, chosen by the type of the struct: tetrahedra of the forest, whose shape is a few
-bits, and general tetrahedra with a rest matrix each. Both work in a local frame Q (a proper rotation; the identity for
-general elements): ``local_gradient`` gives G = (du/dX) Q, so that Q + G is the local-frame deformation gradient F Q.
-Working from displacements keeps small strains free of the cancellation that positions would bring.
+Two kinds of elements share one set of functions, chosen by the type of the struct: tetrahedra of the forest, whose
+shape is a few bits, and general tetrahedra with a rest matrix each. Both work in a local frame Q (a proper rotation;
+the identity for general elements): ``local_gradient`` gives G = (du/dX) Q, so that Q + G is the local-frame deformation
+gradient F Q. Working from displacements keeps small strains free of the cancellation that positions would bring.
 """
 
 from typing import Any
@@ -66,7 +66,9 @@ class GeneralElements:
 #endif
 """)
 def load_node(nodes: wp.array[wp.vec4], i: int) -> wp.vec3:
-    """The vector of node i by one 16-byte load, which Warp, not knowing that vec4 arrays are aligned, does not make."""
+    """The vector of node i by one 16-byte load. Warp does not know that vec4 arrays are aligned and would make four
+    loads.
+    """
     ...
 
 
@@ -202,7 +204,7 @@ def nodal_forces(elements: GeneralElements, t: int, p: wp.mat33):
 
 @wp.func
 def add_nodal_forces(elements: Any, t: int, p: wp.mat33, places: wp.vec4i, f: wp.array[wp.vec4]):
-    """Add the nodal forces of a local-frame first Piola-Kirchhoff stress [Pa] at four places."""
+    """Add the nodal forces of a local-frame first Piola-Kirchhoff stress [Pa] at four given places."""
     f0, f1, f2, f3 = nodal_forces(elements, t, p)
     add_force(f, places[0], f0)
     add_force(f, places[1], f1)

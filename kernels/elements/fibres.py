@@ -154,7 +154,7 @@ def reinforced_differential(elements: Any, t: int, material: ReinforcedMaterial,
 
 @wp.func
 def reinforced_density(elements: Any, t: int, material: ReinforcedMaterial, u: wp.array[wp.vec4]):
-    """Active stress has none."""
+    """Active stress has no energy density."""
     m = axes_of(material.fibres, t)
     g, _turn = material_gradient(elements, t, m, u)
     a = wp.transpose(m) * g
@@ -165,7 +165,7 @@ def reinforced_density(elements: Any, t: int, material: ReinforcedMaterial, u: w
 
 @wp.func
 def reinforced_cauchy(elements: Any, t: int, material: ReinforcedMaterial, u: wp.array[wp.vec4]):
-    """Elastic and active stress together, of the tissue itself, where an element is filled in part, too."""
+    """Elastic and active stress together, in the tissue itself, also where an element is only partly filled."""
     m = axes_of(material.fibres, t)
     g, _turn = material_gradient(elements, t, m, u)
     a = wp.transpose(m) * g

@@ -51,7 +51,7 @@ def in_local_frame(elements: GeneralElements, t: int, p: wp.mat33):
     return p
 
 
-# --- laws of ``constitutive``, of materials that are the same in all directions ---------------------------------------
+# --- laws of ``constitutive``, for isotropic materials -------------------------------------------------------------
 
 
 @functools.cache
@@ -102,7 +102,7 @@ def scatter_forces(Elements: type, Material: type, stress: wp.Function) -> wp.Ke
 
 @functools.cache
 def repair_forces(Elements: type, Material: type, stress: wp.Function) -> wp.Kernel:
-    """The same of the elements on a list, by one thread, which empties the list: how many, then which."""
+    """The same for the elements on a list (their number, then their indices), by one thread, which empties the list."""
 
     @unique_kernel()
     def repair_forces(
@@ -144,7 +144,7 @@ def element_energies(Elements: type, Material: type, density: wp.Function) -> wp
 
 @functools.cache
 def add_energies(Elements: type, Material: type, density: wp.Function) -> wp.Kernel:
-    """Add the energy of each element [J] to one that is known."""
+    """Add the energy of each element [J] to a known one."""
 
     @unique_kernel()
     def add_energies(

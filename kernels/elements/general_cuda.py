@@ -1,8 +1,8 @@
-"""What forces of general tetrahedra are made of on CUDA, one thread an element, as the solver for Newton has them.
+"""Forces of general tetrahedra on CUDA, one thread an element; the solver for Newton uses them.
 
-Two things make that fast: rest matrices are read component by component, so that the threads of a warp read what is
-side by side, and neighbouring elements' forces are added up before they go to memory. Blocks of 64 threads were the
-fastest.
+Two things make them fast. Rest matrices are stored component by component, so that the threads of a warp read
+neighbouring numbers, and neighbouring elements' forces are added up before they go to memory. Blocks of 64 threads were
+the fastest.
 """
 
 import functools
@@ -24,7 +24,7 @@ BLOCK = 64
 
 @wp.struct
 class PosedElements:
-    """As ``GeneralElements``, so that the threads of a warp read what is side by side."""
+    """As ``GeneralElements``, stored so that the threads of a warp read neighbouring numbers."""
 
     nodes: wp.array[wp.vec4i]  # [T]
     rest_inverse: wp.array2d[wp.float32]  # [9, T], row by row
@@ -64,7 +64,7 @@ def add_stress(rounds: int) -> wp.Function:
 
     @wp.func
     def add_stress(elements: PosedElements, t: int, nodes: wp.vec4i, p: wp.mat33, f: wp.array[wp.vec4]):
-        # The rest matrix is read again, so as to keep no registers meanwhile.
+        # The rest matrix is read again here, so that it takes no registers in between.
         h = (-elements.volume[t]) * p * wp.transpose(rest_inverse_of(elements, t))
         f1, f2, f3 = column(h, 0), column(h, 1), column(h, 2)
         add_forces(f, nodes, -(f1 + f2 + f3), f1, f2, f3)
@@ -76,7 +76,7 @@ def add_stress(rounds: int) -> wp.Function:
 def corotated_law(rotation: wp.Function) -> wp.Function:
     """The corotated stress of each element's own rotation, as a law of its displacement gradient.
 
-    That of ``quick_rotation`` needs none.
+    For ``quick_rotation`` it is found without the rotation.
     """
     if rotation is quick_rotation:
         return corotated_stress

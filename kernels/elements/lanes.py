@@ -1,14 +1,14 @@
 """Eight of a thing side by side in the lanes of a CPU's vector registers: native code that the fast CPU kernels share.
 
-What a CPU core lacks is vectorisation. The lanes here are the compiler's own vector type: code on them compiles in
-about a second, depends on no optimiser to find the vectors, and so is right and fast whatever its flags. The same in
-Warp's 8-lane vectors took ten times as long to compile and was as fast only where the optimiser saw through it.
+A CPU core is slow without vectorisation. The lanes here are the compiler's own vector type: code on them compiles in
+about a second, needs no optimiser to find the vectors, and so is right and fast with any flags. The same in Warp's
+8-lane vectors took ten times as long to compile and was as fast only where the optimiser saw through it.
 
 Memory is read and written four floats of a lane at a time and transposed in registers: written float by float, lanes
 would be read before the stores have arrived.
 
-What a lane comes to never depends on its neighbours, and forces are added lane after lane, so that worlds that share
-registers do what each would do alone.
+The result of a lane never depends on its neighbours, and forces are added lane after lane, so worlds that share
+registers move exactly as each would alone.
 """
 
 import functools
@@ -18,13 +18,13 @@ import warp as wp
 
 from warp_corot.kernels.modules import unique_kernel
 
-#: The vectors are as wide as the machine at hand has them.
+#: The vectors are as wide as this machine's registers.
 COMPILER_FLAGS = "-march=native -ffp-contract=fast"
 
 LANES = 8
 
-#: Native code in files of its own, each of which says what it takes and what it leaves. They are parts of one function
-#: and stand one after another in it.
+#: Native code in files of its own. Each file states its inputs and outputs. The files are parts of one function and
+#: follow one another in it.
 NATIVE = Path(__file__).parents[1] / "native"
 
 
@@ -50,7 +50,7 @@ ISOTROPIC_PART = "const auto& isotropic = material.isotropic;\n"
 
 
 def on_cpu(*code: str) -> str:
-    """A native snippet on lanes, which is nothing where Warp compiles it for a GPU."""
+    """A native snippet on lanes; it is empty where Warp compiles it for a GPU."""
     return f"#if !defined(__CUDA_ARCH__)\n{native('lanes')}{''.join(code)}#endif\n"
 
 
@@ -61,7 +61,7 @@ def scatter_lanes(code: str, Units: type, Material: type, missed_type: type) -> 
     Args:
         code: What it does with them. In: units, the number ``block`` of the eight, the ``count`` of all, material, u.
             Out: f, and ``missed``, what is left out.
-        Units, Material: Structs of what forces are found of, and of what these are made of.
+        Units, Material: Structs of the units and of their material.
         missed_type: uint8: flags of a subtree's leaves; int32: a list of elements, how many and then which.
     """
 

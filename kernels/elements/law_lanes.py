@@ -1,9 +1,9 @@
 """Stresses of the constitutive laws for eight elements in the lanes of vector registers; see ``lanes``.
 
 Each is a native function ``stress`` of the columns f of F, of E = C - I in the frame of these columns, of the frame's
-handedness and of mu and lambda, which come times the weight that P shall have. It writes the columns p of P and says
-in which lanes these may be trusted. ``find_strain`` and ``find_strain_there`` before it find E and f. E has its digits
-however small it is, and all is worked out from E: so P keeps them.
+handedness and of mu and lambda, which are already multiplied by the weight of P. It writes the columns p of P and says
+in which lanes these may be trusted. ``find_strain`` and ``find_strain_there`` before it find E and f. E keeps its
+digits however small it is, and everything is computed from E, so P keeps them, too.
 
 The corotated law needs no rotation for that. With t = tr S - 3, j = J - 1 and the invariants a, b, c of E, t is the
 largest root of the quartic (Cayley-Hamilton for S; x = t + 3 is the largest eigenvalue of Horn's 4x4 matrix)

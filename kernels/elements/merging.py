@@ -13,10 +13,10 @@ wp.set_module_options({"enable_backward": False})
 def add_four_forces(rounds: int) -> wp.Function:
     """Add an element's forces to its nodes', where neighbouring threads have neighbouring elements.
 
-    On CUDA a sum in memory costs more than all else, and elements that follow one another mostly share nodes. So a
-    thread gives its forces on nodes that it shares with the next one to that, two by two, then four by four, as many
-    ``rounds``. In the order of a forest's leaves 2.5 sums an element are left after one, 2.0 after two; in that of
-    ``add_soft_grid`` 2.95 and 2.46; of 4.
+    On CUDA a sum in memory costs more than everything else, and consecutive elements mostly share nodes. So a thread
+    passes its forces on shared nodes to the next thread, two by two, then four by four, for a number of ``rounds``. Of
+    four sums an element, 2.5 are left after one round and 2.0 after two in the order of a forest's leaves; 2.95 and
+    2.46 in the order of ``add_soft_grid``.
     """
     snippet = f"""
     int at[4];

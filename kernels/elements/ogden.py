@@ -30,9 +30,10 @@ from .constitutive import (
 
 wp.set_module_options({"enable_backward": False})
 
-#: A term goes on as a parabola where it would be this many times as stiff as at rest.
+#: A term continues as a parabola where it would be this many times as stiff as at rest.
 STIFFENING = 1000.0
-#: Nearer eigenvalues, relative to themselves, have the derivative at their mean for a quotient of differences.
+#: For eigenvalues nearer to each other than this, relative to their size, the derivative at their mean replaces the
+#: quotient of differences.
 NEAR = wp.constant(3.0e-3)
 
 

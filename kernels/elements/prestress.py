@@ -1,4 +1,4 @@
-"""Stress that a body has where it is not deformed: a second Piola-Kirchhoff stress S of each element, which stays.
+"""Stress that a body has at rest: a constant second Piola-Kirchhoff stress S of each element.
 
 P = F S is the derivative of the energy density S : E with Green's strain E; it turns with the body.
 """

@@ -1,8 +1,8 @@
 """Viscoelastic stresses of a Prony series: Maxwell elements beside the elastic law, in rest space.
 
 Element i has the shear modulus g_i mu and the relaxation time tau_i. Its overstrain s_i, symmetric and without trace,
-follows ds_i/dt = dE/dt - s_i / tau_i with E the deviator of Green's strain, and its second Piola-Kirchhoff stress is
-2 g_i mu s_i: nothing of that knows how the body has turned. If E grows evenly over a time t, then exactly
+follows ds_i/dt = dE/dt - s_i / tau_i with E the deviator of Green's strain, and its second Piola-Kirchhoff stress is 2
+g_i mu s_i. None of this depends on how the body has turned. If E grows evenly over a time t, then exactly
     s_i(t) = exp(-t / tau_i) s_i(0) + phi (E(t) - E(0)),  phi = (1 - exp(-t / tau_i)) tau_i / t.
 So forces t after a known state are those of an elastic law with the energy density
     sum_i g_i mu (phi |E - E(0)|^2 + 2 exp(-t / tau_i) s_i(0) : (E - E(0)) + exp(-t / tau_i) |s_i(0)|^2),
@@ -27,7 +27,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class PronyMaterial:
-    """The elastic material, the series, and what is known of each element.
+    """The elastic material, the series, and the known state of each element.
 
     ``known`` has blocks of six numbers a tensor, each of ``count`` elements: E(0), and the overstrains in their order.
     """
@@ -72,7 +72,7 @@ def write_tensor(material: PronyMaterial, block: int, t: int, a: wp.mat33):
 
 @wp.func
 def fading(time: float, tau: float):
-    """exp(-t / tau) and phi, to all their digits; also of an infinite time."""
+    """exp(-t / tau) and phi, to all their digits, also for an infinite time."""
     x = time / tau
     left = wp.exp(-x)
     mean = 1.0 - 0.5 * x * (1.0 - x / 3.0 * (1.0 - 0.25 * x))
@@ -133,7 +133,7 @@ def prony_density(elements: Any, t: int, material: PronyMaterial, u: wp.array[wp
 
 @functools.cache
 def relax(Elements: type) -> wp.Kernel:
-    """A step of the clock's length has ended at displacements u: that state is known now."""
+    """Make the state at displacements u, after a step of the clock's length, the known one."""
 
     @unique_kernel()
     def relax(
@@ -183,7 +183,7 @@ def carry_values(
     # Out
     columns: wp.array2d[wp.float32],
 ):
-    """Let the elements of a mesh that changes carry what is known of them, from column ``first`` on."""
+    """Let the elements of a mesh that changes carry their known state, from column ``first`` on."""
     i = wp.tid()
     for k in range(blocks):
         columns[leaves[i], first + k] = known[k * count + i]
@@ -200,7 +200,9 @@ def adopt_values(
     # Out
     known: wp.array[wp.float32],
 ):
-    """What the leaves of a changed mesh carry from row ``first`` on, if the plan was just derived; zero in padding."""
+    """Take the known state that the leaves of a changed mesh carry from row ``first`` on, if the plan was just derived;
+    padding gets zeros.
+    """
     for i in range(wp.tid(), extent(leaf_row(plan), plan), threads):
         for k in range(blocks):
             known[k * count + i] = plan.values[first + k, i]
@@ -215,7 +217,7 @@ def forget(
     # Out
     known: wp.array[wp.float32],
 ):
-    """Let the chosen worlds be relaxed at rest."""
+    """Forget the past of the chosen worlds: they are relaxed and at rest."""
     i = wp.tid()
     if chosen[(i % count) // world_count] != 0:
         known[i] = 0.0

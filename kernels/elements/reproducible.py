@@ -1,8 +1,8 @@
-"""Sums of forces in one order, whatever order threads run in.
+"""Sums of forces in one order, in whatever order threads run.
 
-Atomic sums come out a little different every time. Here each unit of work (an element, a subtree, a group of subtrees)
-has a slot of its own for each of its nodes, and a node adds up its slots. Slots stand in the order of the units: spread
-writes cost five times what spread reads do.
+Atomic sums differ a little from run to run. Here each unit of work (an element, a subtree, a group of subtrees) has a
+slot of its own for each of its nodes, and a node adds up its slots. Slots stand in the order of the units, because
+scattered writes cost five times as much as scattered reads.
 """
 
 import warp as wp

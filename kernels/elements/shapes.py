@@ -1,4 +1,6 @@
-"""What tells the three shapes apart, generated from ``tables.shapes``: sums and differences, and nodes at rest."""
+"""The code that differs between the three shapes, generated from ``tables.shapes``: sums and differences, and nodes at
+rest.
+"""
 
 import functools
 

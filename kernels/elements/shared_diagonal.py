@@ -36,7 +36,7 @@ def row_of(elements: Any, t: int, slope: wp.mat33, hat: wp.vec3):
 
 @functools.cache
 def turning_block(Elements: type, of: Dilatation) -> wp.Function:
-    """The part of a diagonal block that the turning of d theta / dF gives, over lambda V w'."""
+    """The part of a diagonal block that comes from the change of d theta / dF, over lambda V w'."""
     turning_of = of.turning
 
     @wp.func
@@ -55,7 +55,7 @@ def turning_block(Elements: type, of: Dilatation) -> wp.Function:
 
 @functools.cache
 def add_diagonal(Elements: type, of: Dilatation) -> wp.Kernel:
-    """Add diagonal blocks of which those of K are no more: each element's as if its dilatation were its own."""
+    """Add upper bounds of K's diagonal blocks: each element's block as if it did not share its dilatation."""
     measure, turning_of, holding = of.measure, turning_block(Elements, of), of.holding
 
     @unique_kernel()

@@ -1,11 +1,11 @@
 """Kernels of a dilatation that elements share; see ``dilatation``.
 
-They go in three passes. The first measures elements: theta, and its change along a direction where there is one. The
-second replaces these by what the law makes of the shared ones, of groups or at nodes. The third, a thread an element
-again, adds forces, products or energies. Between them stands one vec4 an element: (theta, change, 0, 0) and then
-(w, w', w'' change, w''), at the elements' places in the mesh.
+There are three passes. The first measures elements: theta, and its change along a direction if there is one. The second
+replaces these by the law's values for the shared ones, of groups or at nodes. The third, a thread an element again,
+adds forces, products or energies. Between them stands one vec4 an element: (theta, change, 0, 0) and then (w, w', w''
+change, w''), at the elements' places in the mesh.
 
-Launches may go through more than there is: ``live`` says how many there are, and nothing of it that all are.
+Launches may be larger than the mesh: ``live`` has the current number of elements; without it, all count.
 """
 
 import functools
@@ -25,7 +25,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def place_of(places: wp.array[wp.int32], t: int):
-    """Where in the mesh element t is; no places: there."""
+    """The place of element t in the mesh; without ``places`` it is t."""
     place = t
     if places.shape[0] > 0:
         place = places[t]
@@ -41,7 +41,7 @@ def is_live(live: wp.array[wp.int32], t: int):
 
 @functools.cache
 def law_at(of: Dilatation) -> wp.Function:
-    """What the third pass needs of a shared dilatation and its change."""
+    """The numbers of the third pass for a shared dilatation and its change."""
     energy_of, slope_of, curvature_of = of.energy, of.slope, of.curvature
 
     @wp.func
@@ -177,7 +177,7 @@ def add_to_nodes(Elements: type) -> wp.Kernel:
 
 @functools.cache
 def law_at_nodes(law: wp.Function) -> wp.Kernel:
-    """What the law makes of the sums at nodes, in their place; a thread a node."""
+    """Replace the sums at nodes by the law's values; a thread a node."""
 
     @unique_kernel()
     def law_at_nodes(
@@ -193,7 +193,7 @@ def law_at_nodes(law: wp.Function) -> wp.Kernel:
 
 @functools.cache
 def share_at_nodes(Elements: type) -> wp.Kernel:
-    """The mean of what the law makes of an element's four nodes."""
+    """The mean of the law's values at an element's four nodes."""
 
     @unique_kernel()
     def share_at_nodes(
@@ -306,7 +306,7 @@ def add_energies(Elements: type, of: Dilatation) -> wp.Kernel:
 
 @functools.cache
 def unshare(Elements: type, of: Dilatation) -> wp.Kernel:
-    """Put what w' of an element's own dilatation is beyond that of the shared one in the latter's place."""
+    """Replace w' of the shared dilatation by the difference of an element's own w' and that."""
     measure, slope_of = of.measure, of.slope
 
     @unique_kernel()

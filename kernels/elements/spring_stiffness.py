@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False})
 
 @functools.cache
 def edge_stvk_differential(biquadratic: bool) -> wp.Function:
-    """The differential, for ``stiffness_products``, of the stress that the six coupled springs of an element add up to.
+    """The differential, for ``stiffness_products``, of the total stress of an element's six coupled springs.
 
     A spring that pulls its ends together with the force v along the rest edge X adds v X^T / V to the stress.
     """
@@ -60,7 +60,7 @@ def spring_stiffness(edges: wp.array[wp.vec2i], rest: wp.array[wp.vec3], e: int,
     stretch = load_node(u, edges[e][1]) - load_node(u, edges[e][0])
     edge = rest[e] + stretch
     rest_length = wp.length(rest[e])
-    # An edge of no length has no direction to push in.
+    # An edge without length has no direction.
     length = wp.max(wp.length(edge), 1.0e-12 * rest_length)
     elongation = (2.0 * wp.dot(rest[e], stretch) + wp.dot(stretch, stretch)) / (length + rest_length)
     return elongation / length, (wp.sqrt(rest_length / length) / length) * edge

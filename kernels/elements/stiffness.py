@@ -3,8 +3,8 @@
 In its local frame an element of type T, edge length h and isotropic material has
     K_T = h (lambda STIFFNESS_LAMBDA[T] + mu STIFFNESS_MU[T]),
 rows and columns ordered node by node, x, y, z within a node. Its entries take only a few values, so the code computes
-each value once and then adds and subtracts; whether an entry exists at all is settled while the code is generated.
-Products for the unmirrored Maubach frame; for a mirrored element hand in the left-handed frame.
+each value once and then adds and subtracts; entries that are zero are left out when the code is generated. Products are
+for the unmirrored Maubach frame; for a mirrored element, pass the left-handed frame.
 """
 
 import functools

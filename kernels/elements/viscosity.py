@@ -1,10 +1,10 @@
-"""Viscous forces: a stress proportional to the rate at which an element's stretch changes, whatever it turns.
+"""Viscous forces: a stress proportional to the rate at which an element's stretch changes, however it turns.
 
 With F = R U, Fdot = (du/dt) grad N and A = R^T Fdot, A = W U + Udot, where W = R^T Rdot is skew and Udot symmetric. The
-skew part of A says W: (tr(U) I - U) w is the axial vector of A - A^T. Udot vanishes where a body turns as a whole,
-however it is strained. The stress s = eta (2 mu Udot + lambda tr(Udot) I) works against Udot; the force that does the
-same work at the nodes is that of P = R (s + [a]x), with (tr(U) I - U) a the axial vector of U s - s U: it takes out
-s : Udot >= 0 of power and has no torque.
+skew part of A says W: (tr(U) I - U) w is the axial vector of A - A^T. Udot vanishes where a body turns as a whole, at
+any strain. The stress s = eta (2 mu Udot + lambda tr(Udot) I) works against Udot; the force that does the same work at
+the nodes is that of P = R (s + [a]x), with (tr(U) I - U) a the axial vector of U s - s U: it takes out s : Udot >= 0 of
+power and has no torque.
 """
 
 import functools

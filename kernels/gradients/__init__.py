@@ -1,1 +1,1 @@
-"""What an adjoint solution says of each element's material, active stress and rest shape."""
+"""Derivatives with respect to each element's material, active stress and rest shape, from an adjoint solution."""

@@ -2,7 +2,7 @@
 
 A quantity J of displacements u at which forces f(u, q) balance changes by dJ = a . (df/dq) dq with the adjoint motion
 a, K a = dJ/du. Elastic forces of an element do the work -V P : L in it, with the first Piola-Kirchhoff stress P and
-L = grad a. Kernels here add up its derivatives with respect to what P and V are made of.
+L = grad a. Kernels here add up its derivatives with respect to the quantities that P and V depend on.
 
 Where nodes of the rest shape move by X' and deformed positions stay, F changes by -F grad X', V by V tr(grad X') and L
 by -L grad X'. So the work changes by -V E : grad X', with
@@ -74,8 +74,9 @@ def add_rest_work(Elements: type, Material: type, stress: wp.Function, different
 
 @functools.cache
 def add_rest_weight(Elements: type) -> wp.Kernel:
-    """Add the derivative with respect to rest positions of the work of weights [N]: of each element's density of work
-    times its volume."""
+    """Add the derivative, with respect to rest positions, of the work of weights [N]: each element's density of work
+    times its volume.
+    """
 
     @unique_kernel()
     def add_rest_weight(

@@ -1,7 +1,7 @@
 """Explicit steps that can be run backwards, and adjoints of steps.
 
 A step of symplectic Euler is v' = c (v + dt (f(u) / m + g)), u' = u + dt v' at free nodes, c = 1 / (1 + dt damping).
-Held nodes keep their velocity. Of the adjoints u_, v_ of the state after a step the state before has
+Held nodes keep their velocity. From the adjoints u_, v_ of the state after a step, the state before gets
     q = v_ + dt u_,  p = c dt q / m,  v_ <- c q,  u_ <- u_ - K(u) p,
 at held nodes p = 0 and v_ <- q. Changes of forces in the step change J by p times them.
 """
@@ -79,7 +79,7 @@ def add_of_mass(
     # In and out
     of_mass: wp.array[wp.float64],
 ):
-    """Mass takes part in a step as what forces are divided by."""
+    """Add the derivative with respect to mass, by which a step divides forces."""
     i = wp.tid()
     force = load_node(f, i) + load_node(loads, i)
     of_mass[i] = of_mass[i] - wp.float64(inverse_mass[i] * wp.dot(force, load_node(p, i)))

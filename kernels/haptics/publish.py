@@ -1,7 +1,7 @@
-"""What a tool feels, for a thread of the host that reads it without waiting.
+"""The force on a tool, for a thread of the host that reads it without waiting.
 
-There are two slots and a count. A kernel writes the slot that is not the newest, and a second one, after it on the
-stream, counts: whoever reads the same count before and after the newest slot has read one state.
+There are two slots and a count. One kernel writes the older slot, and a second kernel, after it on the stream, raises
+the count. A reader that finds the same count before and after reading the newest slot has read one state.
 """
 
 import warp as wp

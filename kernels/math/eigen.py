@@ -32,7 +32,7 @@ def plane_rotation(app: float, aqq: float, apq: float, arp: float, arq: float, p
 
 @wp.func
 def symmetric_eigen(a: wp.mat33):
-    """Eigenvalues, in no order, and eigenvectors as the columns of a rotation; errors are of the digits of |a|.
+    """Eigenvalues, in no order, and eigenvectors as the columns of a rotation, to float32's digits of |a|.
 
     ``wp.eig3`` errs by up to 1e-3 |a| in float32.
     """

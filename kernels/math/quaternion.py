@@ -16,8 +16,8 @@ wp.set_module_options({"enable_backward": False})
 MAX_TURNS = wp.constant(40)
 
 # The largest eigenvalue of K for |F| = 1: number of steps of Laguerre's method, and the smallest denominator of a step.
-# The value used in place of the eigenvalue is so far above it that the characteristic polynomial has the minimum slope
-# there, and at most this far.
+# The value that replaces the eigenvalue lies above it where the characteristic polynomial has the minimum slope, but at
+# most this far above.
 ROOT_STEPS = wp.constant(3)
 LEAST_DENOMINATOR = wp.constant(0.01)
 LEAST_SLOPE = wp.constant(3.0e-3)
@@ -75,8 +75,8 @@ def turn(f: wp.mat33, q: wp.quat):
     scale = wp.max(largest_entry(b), 1.0e-30)
     w, sound = newton_turn(axial, h, scale)
     if not sound:
-        # Beyond the reach of Newton's step: where the slope is small it would creep along a saddle, so leave about the
-        # axis of upward curvature.
+        # Beyond the reach of Newton's step. Where the slope is small the iteration would creep along a saddle, so it
+        # leaves about the axis of upward curvature.
         trace = wp.trace(b)
         w = axial / (wp.abs(trace) + scale)
         axis = leading_eigenvector(trace * identity3() - h, scale)
@@ -194,7 +194,7 @@ def dominant_quaternion(f: wp.mat33):
     b22 = a02 * a02 + a12 * a12 + a22 * a22 + a23 * a23
     b23 = a02 * a03 + a12 * a13 + a22 * a23 + a23 * a33
     b33 = a03 * a03 + a13 * a13 + a23 * a23 + a33 * a33
-    # By selections: a variable index would put the matrix into memory.
+    # Selections, because a variable index would put the matrix into memory.
     q = wp.where(b11 > b00, wp.vec4(b01, b11, b12, b13), wp.vec4(b00, b01, b02, b03))
     other = wp.where(b33 > b22, wp.vec4(b03, b13, b23, b33), wp.vec4(b02, b12, b22, b23))
     q = wp.where(wp.max(b22, b33) > wp.max(b00, b11), other, q)

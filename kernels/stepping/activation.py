@@ -21,7 +21,9 @@ def follow_activation(
     # Out
     activation: wp.array[wp.float32],
 ):
-    """Active stress by its keyframes at the beginning of a step, ``offset`` steps after the last that is counted."""
+    """Take the active stress of the keyframes at the beginning of a step, ``offset`` steps after the last counted
+    one.
+    """
     k = wp.tid()
     t = elements[k]
     start = world_starts[t // world_element_count]

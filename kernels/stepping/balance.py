@@ -1,9 +1,8 @@
-"""What a check needs of a state, in one look: energies world by world in float64 and in a settled order, the clock, and
-whether somebody has written to the state; and the two copies of it, of which one is the last good one.
+"""The data of a check, found together: energies of each world in float64 and in a fixed order, the clock, and whether a
+user has written to the state; and two copies of the state, one of which is the last good one.
 
 A run begins with ``take_over``, which compares the state with the last good copy, and ends with ``sum_nodes``, which
-writes the present state to the other copy in passing, and ``report``, which writes all that the host wants to know to
-one place.
+also writes the present state to the other copy, and ``report``, which writes all results for the host to one place.
 """
 
 from typing import Any
@@ -23,15 +22,15 @@ KINETIC, AHEAD, GRAVITATIONAL, LOADS, SUPPORTS, REACH, ELASTIC, UNTIMELY, WORKED
 )
 COLUMNS = 10
 
-#: Places in what is reported besides sums: the clock's numbers, what moving supports have put in and the sum of its
-#: absolute values [J], the first step that was not finite, whether somebody has written to the state, and from CONTROL
-#: on the control of the step.
+#: Places in the report besides sums: the clock's numbers, the work of moving supports and the sum of its absolute
+#: values [J], the first step that was not finite, whether a user has written to the state, and from CONTROL on the
+#: control of the step.
 STEPS, STEPS_THEN, LENGTH, TIME_THEN, LENGTH_BEFORE, WORK, WORK_ABSOLUTE, BAD_STEP, CHANGED, CONTROL = (
     wp.constant(k) for k in range(10)
 )
 NUMBERS = 9 + CONTROLS
 
-#: A run has ended in time if it came so near, in steps: what rounding leaves of the last one.
+#: A run has ended in time if it came this near, in steps: the rounding of the last one.
 NEAR = wp.constant(wp.float64(1e-4))
 
 
@@ -140,18 +139,18 @@ def sum_nodes(
     kept_v: wp.array2d[wp.vec4],
     sums: wp.array3d[wp.float64],
 ):
-    """Add what free nodes have: kinetic and gravitational energy, the work of loads since the last good state, the
-    farthest; and if ``keeps``, keep the present state beside the last good one.
+    """Add up over free nodes: kinetic and gravitational energy, the work of loads since the last good state, the
+    largest displacement. If ``keeps``, keep the present state beside the last good one.
 
     Velocities are half of the last step behind displacements. With the elastic forces f of these displacements they are
     known at any time about it. Half of the next step behind times half of it ahead, v_behind . M v_ahead / 2, kinetic
     energy and ``AHEAD``, is what symplectic Euler keeps exactly with the elastic energy where forces are linear: also
-    beyond the stable step, where it need not be positive.
-    The work of supports that ``add_support_work`` has added up counts half of f's share too early; that half is
-    ``SUPPORTS``. Velocities at the time of the displacements, halfway, have ``UNTIMELY`` more than that product.
-    With a ``lag`` of zero velocities are at the time of the displacements, and there is nothing of this.
-    The forces besides elasticity in the last step are part of what accelerates nodes; their work is counted elsewhere.
-    That of constraints takes a change of the step into account, so that ``AHEAD`` does not where they act.
+    beyond the stable step, where it need not be positive. The work of supports from ``add_support_work`` counts half of
+    f's share too early; that half is ``SUPPORTS``. With velocities at the time of the displacements, halfway, kinetic
+    energy is larger than that product by ``UNTIMELY``. With a ``lag`` of zero, velocities are at the time of the
+    displacements, and these terms vanish. The forces besides elasticity in the last step are part of what accelerates
+    nodes; their work is counted elsewhere. That of constraints takes a change of the step into account, so that
+    ``AHEAD`` does not where they act.
     """
     world, thread = wp.tid()
     slot = int(orders[SLOT])
@@ -236,7 +235,7 @@ def sum_elements(energies: wp.array[wp.float64], count: int, threads: int, lanes
 
 @wp.kernel(enable_backward=False)
 def sum_work(account: wp.array2d[wp.float64], count: int, threads: int, lanes: int, sums: wp.array3d[wp.float64]):
-    """Add the work of constraints and its absolute value, of ``count`` places in each world."""
+    """Add the work of constraints and its absolute value, from ``count`` places in each world."""
     world, thread = wp.tid()
     work = wp.float64(0.0)
     absolute = wp.float64(0.0)
@@ -280,9 +279,9 @@ def report(
     totals: wp.array2d[wp.float64],
     numbers: wp.array[wp.float64],
 ):
-    """Add the parts up, which are zero then, and write all that the host wants to know where it looks.
+    """Add the parts up, reset them, and write all results for the host.
 
-    The time is exactly ``END`` where the run has come there.
+    The time is exactly ``END`` if the run has reached it.
     """
     world, column, lane = wp.tid()
     value = wp.float64(0.0)

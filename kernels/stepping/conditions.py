@@ -1,6 +1,8 @@
-"""What users do to nodes between steps: hold them, let them go, load them. A launch is as large as the patch is.
+"""Changes that users make to nodes between steps: hold them, release them, load them. A launch is as large as the
+patch.
 
-Values are repeated where there are fewer of them than nodes: one for all, or those of one world for each.
+If there are fewer values than nodes, they are repeated: one value for all nodes, or the values of one world for each
+world.
 """
 
 from typing import Any
@@ -30,7 +32,7 @@ def free_nodes(
     # Out
     inverse_mass: wp.array[wp.float32],
 ):
-    """Give every node that is not held its inverse mass, and none to the others."""
+    """Give every free node its inverse mass, and held nodes zero."""
     i = wp.tid()
     inverse = float(0.0)
     if held[i] == wp.uint8(0):
@@ -66,7 +68,7 @@ def release_nodes(
     inverse_mass: wp.array[wp.float32],
     reactions: wp.array[wp.vec4],
 ):
-    """Let nodes go with the velocity they have."""
+    """Release nodes with their present velocities."""
     i = nodes[wp.tid()]
     held[i] = wp.uint8(0)
     inverse_mass[i] = inverse_of(mass[i])

@@ -1,11 +1,11 @@
-"""How stiff a body is now: one force evaluation looks at all places at once, and the elements' strains tell how soon
+"""How stiff a body is now: one force evaluation measures all places at once, and the elements' strains tell how soon
 that may change.
 
 Small motions about the present displacements u obey q'' = -A q with A = M^-1/2 K M^-1/2 and q = M^1/2 d. Every free
-node has a direction, |q_i| = 1, so that none is missed wherever the stiffest place will be. A q comes from a difference
-of forces. s_i = q_i . (A q)_i never exceeds the sum of the norms of the blocks of row i, which bounds the eigenvalues
-of A (Gershgorin's circles, for blocks). The directions then turn to A q, each made a unit again: a power iteration
-without the loss of what is small elsewhere. At places that fold (s_i < 0) nothing vibrates.
+node has a direction, |q_i| = 1, so that the stiffest place is not missed wherever it is. A q comes from a difference of
+forces. s_i = q_i . (A q)_i never exceeds the sum of the norms of the blocks of row i, which bounds the eigenvalues of A
+(Gershgorin's circles, for blocks). The directions then turn to A q, each normalised again: a power iteration that keeps
+the directions at softer places. Places that fold (s_i < 0) do not vibrate.
 """
 
 import functools
@@ -20,7 +20,7 @@ from .pace import CURVATURE, DONE, DT, STRAIN, Pace
 
 wp.set_module_options({"enable_backward": False})
 
-#: Measurements in which every element's strain is looked at once.
+#: Number of measurements in which every element's strain is measured once.
 TURNS = wp.constant(4)
 
 
@@ -71,7 +71,7 @@ _KEEP_LARGEST = """
 
 @wp.func_native(_KEEP_LARGEST)
 def keep_largest(value: float, place: int, largest: wp.array[wp.float32]):
-    """Let a place hold the largest value, at least zero, that any thread has for it; NaN is left out."""
+    """Let a place hold the largest value of all threads, at least zero; NaN is ignored."""
     ...
 
 
@@ -92,7 +92,7 @@ def find_curvatures(
     w = inverse_mass[i]
     if w == 0.0:
         return
-    # As it was after rounding: far from home it is still the motion that made the forces.
+    # The displacement after rounding: far from rest, it is still the motion that made the forces.
     d = load_node(probed, i) - load_node(u, i)
     force = load_node(f, i) - load_node(f_probed, i)
     square = wp.dot(d, d)
@@ -106,7 +106,7 @@ def find_curvatures(
 def find_strains(Elements: Any) -> wp.Kernel:
     """The largest entry of C - I = F^T F - I among elements, now and after ``steps`` more at the present rate.
 
-    One element of ``turns`` is looked at, others the next time: neighbours, which share nodes, are strained too.
+    One element in ``turns`` is measured, others the next time: neighbours, which share nodes, are strained alike.
     """
 
     @unique_kernel()

@@ -1,10 +1,10 @@
 """Time stepping on the nodes: symplectic Euler, prescribed motion, and the two ways positions and displacements meet.
 
 The state is the displacement from rest: float32 positions would lose what small strains need. Positions are published
-for users after each run of steps, and adopted before the next where somebody changed them.
+for users after each run of steps, and adopted before the next if a user has changed them.
 
-Loads and positions may be arrays of other programs. Kernels that meet them are there twice: for vec4 arrays, which the
-solver's own are, and for vec3 arrays with any stride.
+Loads and positions may be arrays of other programs. Kernels that read them exist twice: for vec4 arrays, such as the
+solver's own, and for vec3 arrays with any stride.
 """
 
 from typing import Any
@@ -40,7 +40,7 @@ def write_vector(vectors: wp.array[wp.vec3], i: int, value: wp.vec3):
 
 
 def by_vectors(kernel: wp.Kernel, argument: str) -> dict[type, wp.Kernel]:
-    """A generic kernel for either type of vectors in one of its arrays, chosen here and not anew at every launch."""
+    """A generic kernel for either type of vectors in one of its arrays, chosen once and not at every launch."""
     return {dtype: wp.overload(kernel, {argument: wp.array(dtype=dtype)}) for dtype in (wp.vec3, wp.vec4)}
 
 
@@ -60,7 +60,7 @@ def symplectic_euler_velocity(
 
 @wp.func
 def add_support_work(elastic: wp.vec3, moved: wp.vec3, work: wp.array[wp.float64]):
-    """What a support puts in that moves a node against its elastic force; only where supports move at all."""
+    """The work of a support that moves a node against its elastic force; only where supports move at all."""
     added = wp.float64(-wp.dot(elastic, moved))
     if added != wp.float64(0.0):
         wp.atomic_add(work, 0, added)
@@ -99,13 +99,12 @@ def step_symplectic_euler(
 ):
     """v <- (v + dt (f/m + g)) / (1 + dt damping); u <- u + dt v; f <- 0 for the next step to add to.
 
-    After a change of the step forces act for half of the old one and half of the new one.
+    After a change of the step, forces act for half of the old one and half of the new one.
 
     ``offset`` is this step's place in a run of recorded ones, whose steps ``pace`` does not count before its end.
-    ``support_work`` adds up what moving supports put in against the elastic forces, and its absolute value [J], of all
-    nodes in two places or of each in two of its own.
-    A node without inverse mass moves with the velocity it has (zero if fixed), and its support takes what is left of
-    Newton's second law: the weight, the elastic force and the load.
+    ``support_work`` adds up the work of moving supports against the elastic forces, and its absolute value [J]: in two
+    places for all nodes, or in two places for each. A node without inverse mass moves with its present velocity (zero
+    if fixed), and its support bears the weight, the elastic force and the load.
     """
     i = wp.tid()
     dt = float(pace.seconds[DT])
@@ -133,7 +132,7 @@ def step_symplectic_euler(
 
 @wp.kernel(enable_backward=False)
 def set_start(pace: Pace, world_starts: wp.array[wp.float64]):
-    """Let the time of the one world there is begin now."""
+    """Let the time of the only world begin now."""
     world_starts[0] = time_after(pace, 0)
 
 
@@ -153,7 +152,7 @@ def follow_trajectory(
     v: wp.array[wp.vec4],
     support_work: wp.array[wp.float64],
 ):
-    """Give prescribed nodes the velocity that takes them to their keyframed displacement at the end of the step.
+    """Give prescribed nodes the velocity that moves them to their keyframed displacement at the end of the step.
 
     The work of a step is that of the mean of the forces f at its two ends, by the trapezoidal rule: each force counts
     with half the motion before it and half the motion after. The step itself takes the velocity after for both.
@@ -195,7 +194,7 @@ def adopt_positions(
     # In and out
     u: wp.array[wp.vec4],
 ):
-    """Take over the positions that somebody wrote since they were published; untouched ones keep their digits."""
+    """Adopt positions that a user wrote since they were published; untouched ones keep their digits."""
     i = wp.tid()
     x = load_node(rest, i)
     p = vector_at(positions, i)
@@ -222,9 +221,9 @@ def reset_nodes(
     reactions: wp.array[wp.vec4],
     world_starts: wp.array[wp.float64],
 ):
-    """Put the nodes of chosen worlds back to their initial state, or to rest where there is none.
+    """Put the nodes of chosen worlds back to their initial state, or to rest if there is none.
 
-    Held nodes keep the velocity they were given.
+    Held nodes keep their velocity.
     """
     i = wp.tid()
     world = i // world_node_count

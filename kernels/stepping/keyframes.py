@@ -7,7 +7,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def key_before(times: wp.array[wp.float64], t: wp.float64):
-    """The key before t, of which there are two at least, and how far t is from it to the next, 0 to 1.
+    """The key before t among two or more, and where t is between it and the next one, 0 to 1.
 
     Before all keys it is the first, after them the last but one.
     """

@@ -1,7 +1,7 @@
-"""Vectors of Lanczos' iteration on M^-1/2 K M^-1/2, one vec4 a node: what it does between two evaluations of forces.
+"""Vectors of Lanczos' iteration on M^-1/2 K M^-1/2, one vec4 a node: its work between two evaluations of forces.
 
-Nothing comes back to the host before the last step. Sums are float64, and always in the same order: of parts, then of
-sums of parts.
+The host reads nothing before the last step. Sums are float64 and always have the same order: first sums of parts, then
+sums of those.
 """
 
 import warp as wp
@@ -49,7 +49,7 @@ def inner_products(a: wp.array[wp.vec4], b: wp.array[wp.vec4], sums: wp.array[wp
         x = load_node(a, i)
         y = load_node(b, i)
         for axis in range(3):
-            # What fits into float32 need not do so once multiplied.
+            # Products of two float32 numbers may be out of float32's range.
             total += wp.float64(x[axis]) * wp.float64(y[axis])
         i += sums.shape[0]
     sums[part] = total
@@ -70,7 +70,7 @@ def fold(parts: wp.array[wp.float64], sums: wp.array[wp.float64], largest: wp.ar
 
 @wp.kernel(enable_backward=False)
 def take_scale(probe: float, largest: wp.array[wp.float64], scale: wp.array[wp.float32]):
-    """By what motions are multiplied so that the largest of them is ``probe``."""
+    """The factor with which the largest motion becomes ``probe``."""
     most = wp.float64(0.0)
     for k in range(FOLDED):
         most = wp.max(most, largest[k])
@@ -81,7 +81,7 @@ def take_scale(probe: float, largest: wp.array[wp.float64], scale: wp.array[wp.f
 
 @wp.kernel(enable_backward=False)
 def take_sum(sums: wp.array[wp.float64], root: int, place: int, numbers: wp.array[wp.float64]):
-    """A sum, or its root, into its place."""
+    """Write a sum, or its root, to its place."""
     total = wp.float64(0.0)
     for k in range(FOLDED):
         total += sums[k]

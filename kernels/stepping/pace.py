@@ -1,7 +1,7 @@
 """The time of a simulation on the device: steps done, the length of a step, and the time now.
 
-Kernels read the step from here, so that recorded launches stay valid when it changes. The time is not added up: it is
-the time at the last change of the step, and a whole number of steps since then.
+Kernels read the step from here, so that recorded launches stay valid when it changes. The time is not a sum of steps:
+it is the time at the last change of the step plus a whole number of steps since then.
 """
 
 import warp as wp
@@ -11,30 +11,31 @@ wp.set_module_options({"enable_backward": False})
 #: Places in ``Pace.counts`` and ``Pace.seconds``.
 DONE, DONE_THEN = wp.constant(0), wp.constant(1)
 DT, THEN, BEFORE = wp.constant(0), wp.constant(1), wp.constant(2)
-#: Places in ``control``: the step that the state allows, the share of it that is taken, the longest step at rest, the
-#: shortest and longest that were taken, how many checks in a row found the bodies calm, how many intervals there are
-#: from one check on energies to the next, the steps done at the last one, and the step that the state allowed then.
+#: Places in ``control``: the step that the state allows, the fraction of it that is used, the longest step at rest, the
+#: shortest and longest steps used, how many checks in a row found the bodies calm, the number of intervals from one
+#: check of energies to the next, the steps done at the last one, and the step that the state allowed then.
 ALLOWED, SHARE, AT_REST, SHORTEST, LONGEST, CALM, CLOSENESS, FOLLOWED, CHECKED = (wp.constant(k) for k in range(9))
 CONTROLS = 9
-#: Places in ``orders``, what the host asks of a run: when it ends [s], which is NEVER without an end; the steps done by
-#: then; and which of the two copies of the state is the last good one.
+#: Places in ``orders``, the host's orders for a run: when it ends [s], NEVER if it has no end; the steps done by then;
+#: and which of the two copies of the state is the last good one.
 END, STOP, SLOT = (wp.constant(k) for k in range(3))
 ORDERS = 3
 #: Later than all ends [s].
 NEVER = 1e300
-#: What a gauge finds of a body: the largest curvature [1/s^2], and the largest strain until the next measurement.
+#: Results of a gauge for a body: the largest curvature [1/s^2], and the largest strain until the next measurement.
 CURVATURE, STRAIN = wp.constant(0), wp.constant(1)
-#: What is known of a body at rest: the largest stable step [s], the curvature that was found there, and the shares of a
+#: Known numbers of a body at rest: the largest stable step [s], the curvature measured there, and the fractions of a
 #: stable step that are safe for small strains and for large ones.
 STABLE, REST_CURVATURE, SAFE, SAFE_STRAINED = (wp.constant(k) for k in range(4))
 
-#: Strains |F^T F - I| up to which the first share is safe, and from which on the second is.
+#: Strains |F^T F - I| up to which the first fraction is safe, and from which on the second one is.
 SMALL, LARGE = wp.constant(wp.float64(0.1)), wp.constant(wp.float64(0.4))
-#: Growth of the step from one measurement to the next at most: what was stiff a moment ago may soon be so again.
+#: Largest growth of the step from one measurement to the next: a place that was stiff a moment ago may soon be stiff
+#: again.
 GROWTH = wp.constant(wp.float64(1.05))
-#: Share of the thinnest thing in the way that may be passed in a step.
+#: The fraction of the thinnest obstacle that a node may pass in a step.
 PASSED = wp.constant(wp.float64(0.2))
-#: No step is shorter than this share of that at rest.
+#: No step is shorter than this fraction of the step at rest.
 LEAST = wp.constant(wp.float64(0.002))
 
 
@@ -59,8 +60,8 @@ def time_after(pace: Pace, steps: int):
 def length_before(pace: Pace):
     """The length of the last step [s], float64: velocities are half of it behind displacements.
 
-    Where the next one is longer or shorter, forces act for half of each. Without this, steps that get shorter as a body
-    stiffens and longer as it springs back give it energy at every bounce, and so do steps fitted to the end of a run.
+    If the next one is longer or shorter, forces act for half of each. Otherwise steps that shorten as a body stiffens
+    and lengthen as it springs back would add energy at every bounce, and so would steps fitted to the end of a run.
     """
     before = pace.seconds[BEFORE]
     return wp.where(before > wp.float64(0.0), before, pace.seconds[DT])
@@ -124,7 +125,7 @@ def take_safe_step(
 ):
     """Take the smallest of the bodies' safe steps: at once where it is shorter than before, slowly where longer.
 
-    No step is so long that things pass one another within it; ``System.motion_rates`` says how fast they are.
+    No step is so long that a node could pass through an obstacle within it; ``System.motion_rates`` has their speeds.
     """
     longest = control[AT_REST]
     safe = longest
@@ -142,13 +143,13 @@ def take_safe_step(
 
 @wp.kernel(enable_backward=False)
 def resume_step(control: wp.array[wp.float64], pace: Pace):
-    """Take the step that the state allows again, after others that ended at a given time."""
+    """Return to the step that the state allows, after steps that ended at a given time."""
     take_allowed_step(control, pace)
 
 
 @wp.kernel(enable_backward=False)
 def take_orders(given: wp.array[wp.float64], orders: wp.array[wp.float64], changed: wp.array[wp.int32]):
-    """Begin a run: what the host asks of it lies in the host's own memory, which few threads should read."""
+    """Begin a run: copy the orders from the host's memory, which few threads should read."""
     for k in range(ORDERS):
         orders[k] = given[k]
     changed[0] = 0
@@ -158,8 +159,8 @@ def take_orders(given: wp.array[wp.float64], orders: wp.array[wp.float64], chang
 def fit_step(orders: wp.array[wp.float64], control: wp.array[wp.float64], pace: Pace):
     """Let the steps that are left end in time.
 
-    They are as long as one another, and no longer than what the state allows: where that is less than the host knew,
-    they end before, and the host asks for more.
+    They have equal lengths, no longer than the state allows. If that is shorter than the host knew, they end earlier,
+    and the host orders more.
     """
     dt = allowed_step(control)
     left = orders[END] - time_after(pace, 0)
@@ -177,7 +178,7 @@ def set_schedule(
     checked: wp.float64,
     control: wp.array[wp.float64],
 ):
-    """Note what the last check has found and when the next one is due; see ``CALM``."""
+    """Note the result of the last check and when the next one is due; see ``CALM``."""
     control[CALM] = calm
     control[CLOSENESS] = closeness
     control[FOLLOWED] = followed

@@ -1,9 +1,9 @@
 """An organ's steps in thread blocks that stay: each block keeps its patch of nodes, and many steps are one launch.
 
-A block computes every element that touches a node of its own, those between patches too, so that no forces travel and
-no block waits for all others. What travels are displacements: a block publishes those of its nodes, and waits for the
-other corners of its elements, its halo. Each goes as one word of 16 bytes with the number of its step in the last four;
-who polls it has the value as soon as it sees the number, without fences or counters. Two buffers take turns: a block
+A block computes every element that touches one of its nodes, also those between patches, so that blocks exchange no
+forces and no block waits for all others. They exchange displacements: a block publishes those of its nodes, and waits
+for those of its halo, the other corners of its elements. Each is one word of 16 bytes with the number of its step in
+the last four; a reader that sees the number has the value, without fences or counters. Two buffers take turns: a block
 publishes step n + 1 only when it has seen step n of all its neighbours, who then have read its step n - 1.
 
 All blocks of a launch must be on the card at once, one to a multiprocessor. Sums have one order, so runs are
@@ -28,11 +28,11 @@ from .pace import DONE, DT, Pace, length_before, time_after
 wp.set_module_options({"enable_backward": False})
 
 WARP = 32
-#: How often a block looks for a displacement that does not come, some seconds, before it gives up.
+#: How often a block polls for a displacement before it gives up: some seconds.
 MOST_LOOKS = 1 << 22
-#: What a row of ``PatchBody.rest`` is: the inverse of the rest edges, row by row, then the volume.
+#: The layout of a row of ``PatchBody.rest``: the inverse of the rest edges, row by row, then the volume.
 VOLUME_ROW = 9
-#: What a thread keeps of an element: the same, with the volume times mu and times lambda.
+#: The data that a thread keeps for an element: the same, with the volume times mu and times lambda.
 CONSTANTS = 11
 
 row = wp.types.vector(length=CONSTANTS, dtype=wp.float32)
@@ -60,7 +60,7 @@ class Layout:
 
     @property
     def floats(self) -> int:
-        """What all of that takes of shared memory, in numbers of four bytes."""
+        """The shared memory for all of that, in numbers of four bytes."""
         return 3 * (self.nodes + self.slots + 1)
 
 
@@ -92,7 +92,7 @@ class PatchBody:
 
 @wp.struct
 class Exchange:
-    """What blocks tell one another."""
+    """The data that blocks exchange."""
 
     published: wp.array[wp.vec4]  # [2 N] displacements of even and of odd steps, the step's number in the last bits
     begun: wp.array[wp.uint32]  # [patches] the number of the next launch's first state
@@ -384,7 +384,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
             step += 1
 
         if gave_up != 0:
-            # What could not be computed must not be taken for a state.
+            # A failed step must not look like a state.
             x = wp.vec3(wp.nan, wp.nan, wp.nan)
             wp.atomic_min(bad_step, 0, pace.counts[DONE] + wp.int64(step + 1))
         if moves:

@@ -1,8 +1,8 @@
-"""Subnormal numbers taken for zero on the CPU: the thread's floating-point mode, set and put back by two launches.
+"""Subnormal numbers count as zero on the CPU: two launches set and restore the thread's floating-point mode.
 
-A core takes a hundred times as long over a subnormal number, and where a wave has not arrived yet, forces and
-velocities are such numbers. The mode is the thread's own, so the kernels of a run stand between one launch that keeps
-and changes it and one that restores exactly what was there: recorded in graphs as any other launch.
+A core takes a hundred times as long for a subnormal number, and where a wave has not arrived yet, forces and velocities
+are subnormal. The mode is the thread's own, so the kernels of a run stand between one launch that keeps and changes it
+and one that restores exactly what was there: recorded in graphs as any other launch.
 """
 
 import warp as wp
@@ -49,5 +49,5 @@ def flush_subnormals(mode: wp.array[wp.uint32]):
 
 @wp.kernel(enable_backward=False)
 def restore_subnormals(mode: wp.array[wp.uint32]):
-    """Put back the mode that was kept."""
+    """Restore the kept mode."""
     put_back_mode(mode)

@@ -1,7 +1,7 @@
-"""The work of forces besides elasticity, so that the balance of energy knows what they put in or take out.
+"""The work of forces besides elasticity, for the balance of energy.
 
-A support pays for all that acts on its nodes, as ``integrate.add_support_work`` counts it. What is not elastic is given
-back here, since the balance has no energy for it.
+``integrate.add_support_work`` counts the work of a support against all forces on its nodes. The part against forces
+that are not elastic is subtracted here, because the balance has no energy for them.
 """
 
 from typing import Any
@@ -24,7 +24,7 @@ def add_work(account: wp.array2d[wp.float64], i: int, work: float):
 
 @wp.kernel(enable_backward=False)
 def separate_forces(elastic: wp.array[wp.vec4], f: wp.array[wp.vec4], others: wp.array[wp.vec4]):
-    """What has been added since the elastic forces."""
+    """Find the forces that were added after the elastic ones."""
     i = wp.tid()
     store_node(others, i, load_node(f, i) - load_node(elastic, i))
 
@@ -47,7 +47,8 @@ def count_work(
     account: wp.array2d[wp.float64],
 ):
     """Each force works along half of the motion before and half of the motion after it, as symplectic Euler keeps
-    energy. What is left in ``others`` is all that acted besides elasticity, constraints among it."""
+    energy. Afterwards ``others`` has all forces besides elasticity, constraints included.
+    """
     i = wp.tid()
     force = load_node(others, i)
     total = load_node(f, i)
@@ -88,8 +89,8 @@ def count_constraints(
 
     A step gives a node the kinetic energy of all forces times their common time, half of the step before and half of
     this one, times the mean of the velocities v and w before and after it. Elastic forces F, gravity and loads count
-    elsewhere, along half of the motion before and half of the motion after. Constraints say where a node goes, so the
-    rest is theirs: (b + d) / 2 C . (v + w) / 2 + (b - d) / 4 F . (w - v) for steps b and d.
+    elsewhere, along half of the motion before and half of the motion after. Constraints decide where a node goes, so
+    the rest is their work: (b + d) / 2 C . (v + w) / 2 + (b - d) / 4 F . (w - v) for steps b and d.
     """
     i = wp.tid()
     force = load_node(constrained, i)

@@ -1,9 +1,9 @@
 """Corotated forces of orthotropic materials by complete subtrees on CUDA; one thread a subtree, as in ``laws``.
 
-The law is that of ``corotated.anisotropic``; here each leaf is worked out in its own frame, whose columns are
-differences of displacements, and rotations are found by four unscaled iterations. A leaf that these do not turn adds
-nothing and is flagged, a bit each; ``repair_leaves`` does those. Among them are all that are near having no definite
-rotation: see ``corotated.anisotropic_cpu``.
+The law is the one of ``corotated.anisotropic``; here each leaf is computed in its own frame, whose columns are
+differences of displacements, and rotations are found by four unscaled iterations. A leaf for which these find no
+rotation adds nothing and is flagged with a bit; ``repair_leaves`` computes it. So are all leaves whose rotation is
+nearly indefinite: see ``corotated.anisotropic_cpu``.
 """
 
 import functools
@@ -166,7 +166,7 @@ def repair_leaves(
 ):
     """Add the forces of flagged leaves, in a way that is right for every F.
 
-    A bit a leaf, read 64 at a time: nearly always all are zero. Eight threads share them.
+    A thread reads 64 bits, one for each leaf: nearly always all are zero. Eight threads share them.
     """
     i = wp.tid()
     flags = flagged[i // 8] >> wp.uint64(i % 8)

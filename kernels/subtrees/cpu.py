@@ -1,10 +1,10 @@
 """Forces of complete subtrees on the CPU: eight subtrees side by side in the lanes of vector registers.
 
-What a CPU core lacks is vectorisation. So the ten nodes of eight subtrees of one type are gathered into arrays of
-lanes, one loop goes over the eight leaves, and forces are scattered once at the end. The laws are those of
-``elements.law_lanes``; leaves, or subtrees, that the corotated law leaves out are flagged by a bit each.
+A CPU core needs vectorisation to be fast. So the ten nodes of eight subtrees of one type are gathered into arrays of
+lanes, a loop computes the eight leaves, and forces are scattered once at the end. The laws are those of
+``elements.law_lanes``; each leaf or subtree that the corotated law leaves out is flagged by a bit.
 
-Native code: see ``elements.lanes`` for why, and ``lanes`` for what is generated of it.
+``elements.lanes`` says why this is native code, and ``lanes`` generates a part of it.
 """
 
 import functools
@@ -42,7 +42,7 @@ class DilatingMaterial:
 
 
 def joining(law: str, shared: Dilatation | None) -> str:
-    """Native code for what joins leaves of a law: the dilatation that they share, if they do."""
+    """Native code for the dilatation that the leaves of a law share, if they do."""
     if shared is None:
         return native("own_leaves")
     return (
@@ -54,7 +54,7 @@ def joining(law: str, shared: Dilatation | None) -> str:
 
 @functools.cache
 def scatter_law_subtrees(shape: int, law: str = "corotated", shared: Dilatation | None = None) -> wp.Kernel:
-    """Forces of subtrees under a law of ``elements.law_lanes``, every leaf by itself; a thread is eight subtrees.
+    """Forces of subtrees under a law of ``elements.law_lanes``, each leaf on its own; a thread is eight subtrees.
 
     With a shared dilatation the material is a ``DilatingMaterial``.
     """

@@ -1,14 +1,14 @@
 """Corotated forces of complete subtrees on CUDA: one thread a subtree, eight leaves in registers.
 
 Three things make it fast. Forces are summed over the eight leaves in registers, and over a group of eight subtrees in
-shared memory, by a table that tells each lane which slots to add up, so that nothing is added atomically twice. What
-leaves for global memory are 16-byte vector reductions where the card has them. And the stress comes of a root of one
-polynomial (``corotated.algebraic``), the same way for small strains and large ones.
+shared memory, by a table that tells each lane which slots to add up, so that nothing is added atomically twice. Sums go
+to global memory as 16-byte vector reductions where the card has them. And the stress comes from a root of one
+polynomial (``corotated.algebraic``), in the same way for small strains and large ones.
 
 A leaf that is flat, turned over or far from order one adds nothing. Its bit is set in its subtree's byte, and the
-subtree is put on a list; ``repair`` does those leaves. A warp most of whose leaves were left out before takes all of
-them one by one instead, and sets their bits anew. Bodies of one type of subtree alone have a kernel of their own; all
-others are one launch, in which each thread block looks up what it is to do.
+subtree is put on a list; ``repair`` computes those leaves. If most leaves of a warp were left out before, the warp
+takes all of them one by one instead, and sets their bits again. Bodies with subtrees of one type only have a kernel of
+their own; all others are one launch, in which each thread block looks up its work.
 """
 
 import functools
@@ -42,13 +42,13 @@ wp.set_module_options({"enable_backward": False})
 BLOCK = 128
 #: Blocks that a multiprocessor's registers must have room for, by type.
 RESIDENT = (5, 5, 5)
-#: What ``Stretch.shape`` is for leaves in no subtree.
+#: ``Stretch.shape`` of leaves in no subtree.
 FLAT = 3
 
 
 @wp.struct
 class Stretch:
-    """Subtrees of one type, or leaves in none, that neighbouring thread blocks go through."""
+    """Subtrees of one type, or leaves in none, that neighbouring thread blocks compute."""
 
     begin: int  # the first of these blocks
     count: int
@@ -136,7 +136,7 @@ def _merge_snippet(shapes: tuple[int, ...]) -> str:
 
 @functools.cache
 def _group_memory(shapes: tuple[int, ...]) -> tuple[wp.Function, wp.Function]:
-    """How displacements of subtrees in groups come in and their forces go out; ``row`` says which of the shapes."""
+    """How subtrees in groups read displacements and write forces; ``row`` is the shape's place."""
 
     @wp.func_native(_load_snippet(shapes))
     def load_group(nodes: wp.array2d[wp.int32], group: int, row: int, u: wp.array[wp.vec4]) -> mat10: ...
@@ -163,7 +163,7 @@ def add_single(subtrees: Subtrees, s: int, g: mat10, f: wp.array[wp.vec4]):
 
 @functools.cache
 def memory_of(shape: int, grouped: bool) -> tuple[wp.Function, wp.Function]:
-    """How a subtree's displacements come in and its forces go out."""
+    """How a subtree reads displacements and writes forces."""
     if not grouped:
         return load_single, add_single
     load_group, merge_group = _group_memory((shape,))
@@ -185,8 +185,8 @@ def scatter_subtrees_own(
 ) -> wp.Kernel:
     """Corotated forces of subtrees of one type, every leaf with its own rotation. Launch with block_dim BLOCK.
 
-    ``listed`` says whether subtrees with leaves that are left out are put on a list, and whether what ``flagged`` has
-    from before may tell how to go about it. With a ``tolerance`` the root's rotation is taken where it is near enough
+    If ``listed``, subtrees with leaves that are left out are put on a list, and the former bits in ``flagged`` may
+    choose the way. With a ``tolerance``, leaves use the root's rotation where it is near enough
     (``forces.shared_forces``).
     """
     load, add = memory_of(shape, grouped)
@@ -217,7 +217,7 @@ def scatter_subtrees_own(
         mirror = mirror_sign(code)
         q = subtrees.frames[code >> FRAME_SHIFT]
         x = load(subtrees, s, u)
-        # Asked only now: the bits and the displacements are on their way at once.
+        # Tested only here, so that the bits and the displacements are loaded at the same time.
         if wp.static(listed):  # noqa: SIM102 (what is static decides what is generated)
             if is_mostly_left_out(before):
                 mask = scatter_one_by_one(elements, subtrees.first[s], s % WARP, material, u, f)
@@ -286,7 +286,7 @@ def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: boo
 
 @functools.cache
 def _scatter_subtree(shape: int, uniform: bool, tolerance: float | None) -> wp.Function:
-    """One subtree of a stretch; all shapes share the memory that groups meet in."""
+    """One subtree of a stretch; all shapes use the same shared memory for groups."""
     load_group, merge_group = _group_memory((0, 1, 2))
     forces = near_forces(shape, uniform, tolerance)
 

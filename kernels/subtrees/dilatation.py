@@ -1,7 +1,8 @@
 """Dilatation that the eight leaves of a complete subtree share; see ``elements.dilatation``.
 
-Forces have two fast ways: a thread a subtree on CUDA, ten displacements in and ten forces out, and eight subtrees in
-the lanes of vector registers on the CPU. What else there is goes leaf by leaf, see ``elements.shared_dilatation``.
+Forces have two fast kernels: a thread a subtree on CUDA, with ten displacements in and ten forces out, and eight
+subtrees in the lanes of vector registers on the CPU. Everything else is computed leaf by leaf, see
+``elements.shared_dilatation``.
 """
 
 import functools
@@ -37,7 +38,7 @@ def scatter_in_lanes(shape: int, of: Dilatation) -> wp.Kernel:
 
 @functools.cache
 def dilatation_forces_of(shape: int, uniform: bool, of: Dilatation) -> wp.Function:
-    """Forces of the shared dilatation from ten displacements, in the frame that ``laws.turn_in`` turns them to."""
+    """Forces of the shared dilatation from ten displacements, both in the frame of ``laws.turn_in``."""
     measure, slope_of, holding = of.measure, of.slope, of.holding
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
     leaves, volume = LEAVES[shape], VOLUME[shape]

@@ -1,9 +1,8 @@
 """Corotated forces of one complete subtree in registers: ten displacements in, ten nodal forces out.
 
-What kernels share that read and write their nodes each in its own way (``cuda``, ``stepping.block``). Stresses are
-worked out from displacement gradients, so that small strains keep their digits
-(``corotated.algebraic.stretch_stress``); a leaf that is flat, turned over or far from order one is left out and
-reported: bit k stands for leaf k in tree order.
+Kernels that read and write their nodes in different ways share this code (``cuda``, ``stepping.block``). Stresses are
+computed from displacement gradients, so that small strains keep their digits (``corotated.algebraic.stretch_stress``);
+a leaf that is flat, turned over or far from order one is left out and reported: bit k stands for leaf k in tree order.
 """
 
 import functools
@@ -25,14 +24,14 @@ mat10 = wp.types.matrix(shape=(10, 3), dtype=wp.float32)
 
 @functools.cache
 def turns_of(shape: int) -> tuple[wp.Function, wp.Function]:
-    """B^T C and B C for the frame B of a leaf and a matrix C; the leaf's number is one that the compiler knows."""
+    """B^T C and B C for the frame B of a leaf and a matrix C; the compiler must know the leaf's number."""
     columns = FRAMES[shape]
     rows = [list(zip(*frame, strict=True)) for frame in columns]
     return _products(columns), _products(rows)
 
 
 def _products(matrices: Sequence[Sequence[Sequence[float]]]) -> wp.Function:
-    """What multiplies by one of these matrices, zeros left out."""
+    """Code that multiplies by one of these matrices, without its zeros."""
     cases = ""
     for number, matrix in enumerate(matrices):
         entries = []
@@ -56,11 +55,11 @@ def leaf_stress(g: wp.mat33, q: wp.mat33, mu: float, lam: float):
 
 @functools.cache
 def turned_forces_of(shape: int, uniform: bool, chosen: range, stress: wp.Function = stretch_stress) -> wp.Function:
-    """Forces of the chosen leaves, each by itself, and which are left out: in the subtree's Maubach frame, or in one
-    that is turned along with the subtree.
+    """Forces of the chosen leaves, each on its own, and which are left out: in the subtree's Maubach frame, or in one
+    that turns with the subtree.
 
     ``y`` are ten displacements there, in edge lengths h of a leaf; leaves' frames B are tables. ``stress`` is a law of
-    the displacement gradient and Lamé's parameters, and says whether it may be trusted.
+    the displacement gradient and Lamé's parameters, and returns whether its result may be trusted.
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
     leaves, frames = LEAVES[shape], FRAMES[shape]
@@ -87,7 +86,7 @@ def turned_forces_of(shape: int, uniform: bool, chosen: range, stress: wp.Functi
                 y[wp.static(leaves[leaf][2])],
                 y[wp.static(leaves[leaf][3])],
             )
-            # Of the displacement gradient in the leaf's frame.
+            # From the displacement gradient in the leaf's frame.
             sigma, trusted = stress(into_leaf(leaf, wp.matrix_from_cols(b0, b1, b2)), m, k)
             if trusted:
                 p = out_of_leaf(leaf, sigma)
@@ -141,8 +140,8 @@ def own_forces(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Functi
 def turned_back_of(shape: int) -> wp.Function:
     """Displacements R^T x - x0 in the subtree's Maubach frame q, in edge lengths of a leaf; r = R q.
 
-    They are R^T u + (R^T - I) x0. With D = R - I, which is small where the rotation is, sym(R^T - I) = -D^T D / 2 for a
-    rotation: so R^T - I keeps the digits of D, and the strain those of the displacements.
+    They are R^T u + (R^T - I) x0. With D = R - I, which is small for small rotations, sym(R^T - I) = -D^T D / 2 holds
+    for a rotation: so R^T - I keeps the digits of D, and the strain keeps the digits of the displacements.
     """
     at = [[2.0 * c for c in point] for point in POSITIONS[shape]]
 
@@ -183,12 +182,12 @@ def shared_forces(
     """Forces of the chosen leaves from ten displacements, all with one rotation, and which are left out: none or all.
 
     The rotation is the subtree root's or a given one; ``turn`` is the given one times the subtree's frame ``q``. Ten
-    displacements are turned back once; in the subtree's own frame the leaves are linear elements.
+    displacements are turned back once; then the leaves are linear elements in the subtree's own frame.
 
-    With a ``tolerance`` [rad] the chosen leaves share the root's rotation only where that is near their own ones: where
-    the displacement gradients E that are left have |skew E| <= tolerance and |sym E| <= 1/2. Then F = I + E = exp(w) U
-    with |w| <= 2 tolerance, and the stress is wrong by at most (2 mu + 3 lambda) (3 |w| |U - I| + |w|^2 |U|). Elsewhere
-    each has its own rotation.
+    With a ``tolerance`` [rad] the chosen leaves share the root's rotation only where it is near their own ones: where
+    the remaining displacement gradients E have |skew E| <= tolerance and |sym E| <= 1/2. Then F = I + E = exp(w) U with
+    |w| <= 2 tolerance, and the stress is wrong by at most (2 mu + 3 lambda) (3 |w| |U - I| + |w|^2 |U|). Elsewhere each
+    has its own rotation.
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
     leaves, frames, at = LEAVES[shape], FRAMES[shape], POSITIONS[shape]
@@ -303,7 +302,7 @@ def shared_forces(
 
 @functools.cache
 def near_forces(shape: int, uniform: bool, tolerance: float | None, chosen: range = range(8)) -> wp.Function:
-    """As ``own_forces``, which it is without a tolerance; with one, see ``shared_forces``."""
+    """The same as ``own_forces`` without a tolerance; with one, see ``shared_forces``."""
     if tolerance is None:
         return own_forces(shape, uniform, chosen)
     forces = shared_forces(shape, uniform, False, chosen, tolerance)

@@ -1,6 +1,6 @@
 """Native code on lanes of subtrees of a type, generated from the tables of ``tables.subtree``.
 
-Text, as the code in ``native`` that stands around it; nothing of Warp is in here.
+It is text, like the code in ``native`` around it; this file does not use Warp.
 """
 
 import functools
@@ -14,7 +14,7 @@ from warp_corot.kernels.tables.subtree import FRAMES, HANDEDNESS, LEAVES, POSITI
 
 @functools.cache
 def begin(shape: int) -> str:
-    """Eight subtrees of a type, and what is to be known of it.
+    """Code that begins with eight subtrees of a type, and the tables of this type.
 
     Defines what ``native/subtrees.h`` does; tables of the leaves' nodes, ``nodes_of``, and in the subtree's Maubach
     frame of the nodes' places ``at``, of the leaves' frames ``frame_of`` and handedness ``hand``; ``leaf_axes``, of

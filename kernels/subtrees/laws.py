@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def turn_in(x: mat10, q0: wp.vec3, q1: wp.vec3, q2: wp.vec3, inv_h: float):
-    """Displacements relative to the first node's in the frame of columns q, in edge lengths of a leaf."""
+    """Displacements relative to the first node's, in the frame with columns q and in edge lengths of a leaf."""
     origin = x[0]
     y = mat10()
     for n in range(1, 10):
@@ -32,7 +32,7 @@ def turn_in(x: mat10, q0: wp.vec3, q1: wp.vec3, q2: wp.vec3, inv_h: float):
 
 @wp.func
 def turn_out(g: mat10, q0: wp.vec3, q1: wp.vec3, q2: wp.vec3):
-    """Vectors in the frame of columns q turned into world space."""
+    """Turn vectors from the frame with columns q into world space."""
     x = mat10()
     for n in range(10):
         x[n] = g[n, 0] * q0 + g[n, 1] * q1 + g[n, 2] * q2

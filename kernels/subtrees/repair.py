@@ -1,9 +1,9 @@
 """Forces of the leaves that the subtree kernels left out: flat or inverted ones, with the rotation that is right for
 every F.
 
-Which those are is a byte a subtree, a bit a leaf. On CUDA the subtrees that have any stand in a list (``LeftOut``), and
-one launch of a fixed size goes through it. On the CPU, and where the order of the sums must be settled, a thread reads
-the bytes of eight subtrees at a time, nearly always all zero, and goes through their leaves in order.
+A byte for each subtree, with a bit for each leaf, says which these are. On CUDA the subtrees that have any are in a
+list (``LeftOut``), which one launch of a fixed size processes. On the CPU, and where sums must have a fixed order, a
+thread reads the bytes of eight subtrees at a time, nearly always all zero, and processes their leaves in order.
 """
 
 import warp as wp
@@ -17,10 +17,10 @@ from warp_corot.kernels.math.quaternion import robust_rotation
 
 wp.set_module_options({"enable_backward": False})
 
-#: Subtrees that one thread looks after; ``flagged`` has a multiple of these.
+#: Number of subtrees of one thread; ``flagged`` has a multiple of these.
 SUBTREES = 8
 LEAVES = 8
-#: Threads of a block that goes through a list, and of a warp.
+#: Number of threads in a block that processes a list, and in a warp.
 LIST_BLOCK = 128
 WARP = 32
 #: Lists that a body's thread blocks take in turn.
@@ -36,7 +36,7 @@ add_pairs = add_four_forces(1)
 class LeftOut:
     """Subtrees with leaves that were left out, in lists which thread blocks take in turn.
 
-    One list would not do: additions to one number, each of which returns what was there, take 5 ns each.
+    There are several because atomic additions to one number that return its former value take 5 ns each.
     """
 
     # Entries of each list, a cache line apart, then blocks that are done; all zero between evaluations.
@@ -58,9 +58,9 @@ class LeftOut:
 #endif
 """)
 def reserve(lists: LeftOut, list: int, is_left_out: bool, to_come: int) -> int:
-    """Make room on a list for those of a warp's threads who have leaves left out.
+    """Make room on a list for those threads of a warp that have left leaves out.
 
-    ``to_come`` is how many threads there are from this one on. All of a warp must come, and to ``append`` as well.
+    ``to_come`` is the number of threads from this one on. All threads of a warp must call this, and ``append`` as well.
     """
     ...
 
@@ -101,7 +101,7 @@ def list_of(block: int):
 #endif
 """)
 def any_left_out(lists: LeftOut) -> bool:
-    """Whether there is any entry; asked by all threads of a block at once."""
+    """Whether there is any entry; all threads of a block must call this together."""
     ...
 
 
@@ -186,7 +186,7 @@ def root_rotation(roots: ForestElements, s: int, u: wp.array[wp.vec4]):
 #endif
 """)
 def is_mostly_left_out(mask: int) -> bool:
-    """Whether most leaves of a warp were left out before, by their masks: then it takes its leaves one by one."""
+    """Whether most leaves of a warp were left out before, by their masks: then the warp takes its leaves one by one."""
     ...
 
 
@@ -288,9 +288,10 @@ def scatter_one_by_one(
 #endif
 """)
 def leaves_of_entries(lists: LeftOut, begin: int, entries: int, k: int) -> int:
-    """Write down the leaves of up to 32 entries for the threads of a warp, and how many there are; or the k-th of them.
+    """Write the leaves of up to 32 entries into a list for the threads of a warp and return how many there are; or
+    return the k-th of them.
 
-    Where few leaves of each entry were left out, every thread has one to do all the same.
+    So every thread has a leaf even where few leaves of each entry were left out.
     """
     ...
 
@@ -317,7 +318,7 @@ def repair_listed_own(
     lanes = wp.min(threads, WARP)
     warps = threads // lanes
     warp = wp.tid() // lanes
-    # A warp goes through one of so many lists at a time, with others.
+    # A warp processes one of the lists at a time, together with others.
     at_a_time = wp.min(warps, LISTS)
     list = warp % at_a_time
     each_list = (warps - list + at_a_time - 1) // at_a_time

@@ -1,6 +1,6 @@
-"""How a small body is dealt out to the threads of one block: numbers that ``stepping.block`` is generated from.
+"""How a small body is divided among the threads of one block: numbers that ``stepping.block`` is generated from.
 
-Plain Python, as ``subtree``. ``SHARED_BYTES`` is what a block may have without asking.
+Plain Python, as ``subtree``. ``SHARED_BYTES`` is the shared memory that a block has by default.
 """
 
 from dataclasses import dataclass
@@ -13,23 +13,24 @@ WARP = 32
 MAX_THREADS = 1024
 MOST_AT_A_TIME = 64
 
-#: Slots that one thread adds up, their places in bytes four to a word; more of the same node are its neighbours'.
+#: Slots that one thread adds up, with their places in bytes, four to a word; its neighbours add up further slots of the
+#: same node.
 TASK_SLOTS = 8
 NUMBERS = 4
 #: Words of the ten nodes of a subtree.
 NODE_WORDS = 3
-#: Neighbouring threads that may add up one node, and so how many slots a node can have.
+#: Number of neighbouring threads that may add up one node, which limits the slots of a node.
 NEIGHBOURS = 8
 MOST_SLOTS = NEIGHBOURS * TASK_SLOTS
-#: What a task is in one integer: the node, how many neighbours follow for the same node, and whether it is the
-#: first of them, who moves the node.
+#: A task as one integer: the node, how many neighbours follow for the same node, and whether it is the first of them,
+#: which moves the node.
 FOLLOWING_SHIFT, FIRST_SHIFT = 16, 24
 NO_NODE = 0xFFFF
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How a body is dealt out to the threads of a block.
+    """How a body is divided among the threads of a block.
 
     Attributes:
         shape: Type of its subtrees.
@@ -55,8 +56,8 @@ class Layout:
     def threads(self) -> int:
         """Threads a block: warp after warp of subtrees, the parts of a subtree in neighbouring warps.
 
-        A multiprocessor's four schedulers take warps in turn, so each goes through the code of one part only. Where a
-        world is to be done soon there are as many threads as tasks.
+        A multiprocessor's four schedulers take warps in turn, so each runs the code of one part only. If a world is to
+        be finished soon, there are as many threads as tasks.
         """
         return max(self.parts * self.subtrees, self.tasks if self.parts > 1 else 0)
 
@@ -84,7 +85,7 @@ class Layout:
 
     @property
     def places(self) -> list[list[int]]:
-        """For each part and each of a subtree's ten nodes, which of a subtree's slots it is, -1 if the part has none.
+        """For each part and each of a subtree's ten nodes, its place among a subtree's slots, -1 if the part has none.
 
         The slot's number is the subtree's plus this many times ``subtrees``.
         """
@@ -99,7 +100,8 @@ class Layout:
         return places
 
     def needs(self, part: int) -> list[bool]:
-        """Which of a subtree's ten nodes a part reads: the first, from which all is measured, and the root's for a
-        shared rotation."""
+        """Which of a subtree's ten nodes a part reads: among them the first, to which all are relative, and for a
+        shared rotation the root's.
+        """
         needs_root = self.shared or self.tolerance is not None
         return [place >= 0 or node == 0 or (needs_root and node < 4) for node, place in enumerate(self.places[part])]

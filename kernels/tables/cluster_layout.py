@@ -1,4 +1,4 @@
-"""How elements are dealt out to the thread blocks of ``clusters``: numbers from which its kernels are generated."""
+"""How elements are divided among the thread blocks of ``clusters``: numbers that its kernels are generated from."""
 
 from dataclasses import dataclass
 
@@ -10,13 +10,13 @@ BANK_GROUPS = 8
 
 @dataclass(frozen=True)
 class ClusterLayout:
-    """What a kernel is generated for.
+    """The numbers that a kernel is generated from.
 
     Attributes:
         threads: Threads a block.
         each: Elements a thread.
         resident: Blocks that a multiprocessor's registers must have room for.
-        early: Whether a thread reads what it will add up before it needs that.
+        early: Whether a thread reads the numbers of its sum before it needs them.
     """
 
     threads: int = 128
@@ -58,10 +58,10 @@ class PairLayout:
         return 5 * self.threads
 
 
-#: Of a forest's elements, of general ones, and of the anisotropic law: the more blocks are resident the less they wait,
-#: so long as few registers go to memory.
+#: For a forest's elements, for general ones, and for the anisotropic law: the more blocks are resident, the less they
+#: wait, if few registers spill to memory.
 LATTICE, GENERAL, ANISOTROPIC = PairLayout(resident=8), PairLayout(resident=7), PairLayout(resident=4)
 
-#: Tables of so many bytes and more do not stay in the second-level cache beside the nodes, and are fetched so many
-#: blocks ahead: about as many as an H200 has at once.
+#: Larger tables than this [bytes] do not stay in the second-level cache beside the nodes and are fetched this many
+#: blocks ahead: about as many as an H200 runs at once.
 LARGE, AHEAD = 24 << 20, 1024

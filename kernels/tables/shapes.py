@@ -16,7 +16,7 @@ import warp as wp
 SQRT2 = math.sqrt(2.0)
 
 #: Columns of the local displacement gradient times h, by type: a weight, and the differences of nodal values that it
-#: multiplies, each as (node, node taken off). All else about gradients and forces comes from this table.
+#: multiplies, each as (node, node taken off). Everything else about gradients and forces comes from this table.
 DIFFERENCES: tuple[tuple[tuple[float, tuple[tuple[int, int], ...]], ...], ...] = (
     ((1.0, ((1, 0),)), (1.0, ((2, 1),)), (1.0, ((3, 2),))),
     ((1.0, ((1, 0),)), (1.0, ((2, 1),)), (1.0, ((3, 2), (3, 0)))),

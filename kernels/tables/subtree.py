@@ -1,10 +1,10 @@
 """Complete three-level subtrees of the forest, the unit of work of the fast force path.
 
-Three bisections halve all six edges of a tetrahedron: its eight leaves stand on ten nodes, the four corners and the six
-midpoints, and are of its own type again. Which leaf uses which of the ten depends on the type alone: a table that
-kernels are generated from. Only the ten node numbers are data: forces are summed in registers and each subtree adds
-to 10 nodes in place of 32. Eight subtrees under one ancestor six levels up share nodes once more: 35 (37 under type 2)
-in place of 80.
+Three bisections halve all six edges of a tetrahedron. Its eight leaves have ten nodes, the four corners and the six
+midpoints, and are of its own type again. The type alone decides which leaf uses which of the ten: a table that kernels
+are generated from. Only the ten node numbers are data: forces are summed in registers and each subtree adds to 10 nodes
+in place of 32. Eight subtrees under one ancestor six levels up share nodes once more: 35 (37 under type 2) in place of
+80.
 
 Plain Python tables, as ``shapes``.
 """
@@ -74,7 +74,8 @@ HANDEDNESS = tuple([_handedness(frame) for frame in FRAMES[shape]] for shape in 
 
 def stiffness(shape: int) -> tuple[list[list[float]], list[list[float]]]:
     """The 30x30 stiffness of a whole subtree of a uniform isotropic material, in its Maubach frame and over its edge
-    length: what lambda multiplies and what mu multiplies. About 40 nonzeros a leaf, for the paper's 74 to 100."""
+    length: the parts that lambda and mu multiply. It has about 40 nonzeros a leaf; the paper has 74 to 100.
+    """
     parts = []
     for table in (STIFFNESS_LAMBDA[shape], STIFFNESS_MU[shape]):
         total = [[0.0] * 30 for _ in range(30)]
@@ -92,7 +93,7 @@ def stiffness(shape: int) -> tuple[list[list[float]], list[list[float]]]:
 
 #: Node numbers kept for a group of eight subtrees, -1 past its 35 or 37.
 GROUP_NODES = 40
-#: Subtree slots are spaced by this in shared memory, so that the eight lanes of a group meet in no bank.
+#: Subtree slots have this spacing in shared memory, so that the eight lanes of a group use different banks.
 SLOT_STRIDE = 11
 
 

@@ -1,7 +1,7 @@
 """Hands: springs between places that a person moves and points of a shown surface, which is bound to a body's nodes.
 
-One thread a hand goes through its patch, so that the cost is the patch's, sums come out in one order, and force, place
-and work are known in the same launch. Patches are small, and there are few hands.
+One thread a hand loops over its patch. So the cost depends on the patch only, sums have one order, and force, place and
+work are known in the same launch. Patches are small, and there are few hands.
 """
 
 import warp as wp
@@ -21,7 +21,7 @@ class Spring:
         stiffness: Of the whole patch [N/m].
         damping: The same [N s/m].
         limit: The largest force [N].
-        rigid: Whether every point is held where it was, seen from the hand; else only their mean is.
+        rigid: Whether the hand holds every point at its place relative to the hand; otherwise it holds only their mean.
         count: Points of the patch; 0 while the hand holds nothing.
     """
 
@@ -68,7 +68,7 @@ def squared_force(
     inverse_mass: wp.array[wp.float32],
     gravity: wp.vec3,
 ):
-    """Squares of the forces on nodes over their masses [N^2/kg], a part of each node's; loads are left out."""
+    """Squares of the forces on nodes over their masses [N^2/kg], weighted by each node's part; loads are left out."""
     total = float(0.0)
     for n in range(4):
         w = inverse_mass[nodes[n]]
@@ -130,9 +130,9 @@ def pull(
     of each point in the step before: its work is that of the trapezoidal rule, half with the motion before it and
     half, found a step later, with the motion after it. ``offset`` is this step's place in a run of recorded ones.
 
-    Where the length of steps changes, so does what counts as kinetic energy, by the forces on the nodes. That is work,
-    too, less what was ``counted`` when energies were last looked at, without this hand's force. ``parts`` are one over
-    how often the patch has each node.
+    Where the length of steps changes, the forces on the nodes change the kinetic energy by definition. That is work,
+    too, less the amount ``counted`` at the last check of energies, without this hand's force. ``parts`` are one over
+    the number of times that the patch names each node.
     """
     hand = wp.tid()
     spring = springs[hand]
@@ -196,7 +196,7 @@ def complete_work(
     counted: wp.array[wp.float32],
     work: wp.array[wp.float64],
 ):
-    """Count the half of the last forces' work that is done with the motion after them."""
+    """Count the second half of the last forces' work, which goes with the motion after them."""
     hand = wp.tid()
     done = wp.float64(0.0)
     after = 0.5 * float(length_before(pace))
