@@ -20,13 +20,13 @@ def check_implicit(args: argparse.Namespace, *, touches: bool, remeshes: bool) -
 
     Args:
         args: The options.
-        touches, remeshes: Whether others ask for contact, or for meshes that change.
+        touches, remeshes: Whether other options ask for contact, or for remeshing.
 
     Raises:
-        InputError: They do not go with others.
+        InputError: Options that exclude each other.
     """
     if not is_static(args):
-        # The simulation says what an integrator cannot do.
+        # The simulation reports what an integrator cannot do.
         return
     for name in ("integrator", "dt", "damping", "viscosity"):
         if getattr(args, name) is not None:
@@ -38,10 +38,10 @@ def check_implicit(args: argparse.Namespace, *, touches: bool, remeshes: bool) -
 
 
 def rest(args: argparse.Namespace, sim: Simulation) -> list[str]:
-    """With --static, find where bodies are at rest before anything moves them; a line on each.
+    """With --static, find where bodies are at rest before anything moves them; returns a line for each.
 
     Raises:
-        UnstableError: One of them is not.
+        UnstableError: No state at rest was found for a body.
     """
     if not is_static(args):
         return []
@@ -58,7 +58,7 @@ def rest(args: argparse.Namespace, sim: Simulation) -> list[str]:
 
 
 def solved(sim: Simulation) -> str | None:
-    """What implicit steps took, in words; None for explicit ones."""
+    """The cost of implicit steps, in words; None for explicit ones."""
     solves = sim.solves
     if solves is None or not solves.steps:
         return None

@@ -113,7 +113,7 @@ class Table:
         path: The file; a former one stays until the first row.
         sim: The simulation.
         probes: Probes of its bodies.
-        obstacles: What they touch, by name; the forces on it have columns, and the places of tools.
+        obstacles: Obstacles by name; the forces on them and the places of tools have columns.
 
     Raises:
         InputError: Another extension, a folder with this name, or no folder to write to.

@@ -1,4 +1,4 @@
-"""The command on several ranks: every rank runs it, rank 0 speaks and writes."""
+"""The command on several ranks: every rank runs it, and rank 0 prints and writes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 from warp_corot.inputs.processes import process_count, process_number
 
-#: Time for rank 0 to come as far as another one that failed, and to say so [s].
+#: Time for rank 0 to reach the place where another rank failed, and to report it [s].
 WAIT = 5.0
 
 
@@ -26,10 +26,10 @@ def speaks() -> bool:
 
 
 def leads() -> bool:
-    """Whether this process writes; where there are several, MPI is started.
+    """Whether this process writes files; starts MPI if there are several processes.
 
     Raises:
-        InputError: MPI is not there.
+        InputError: MPI is not installed.
     """
     if not are_several():
         return True
@@ -39,19 +39,19 @@ def leads() -> bool:
 
 
 def fall_silent() -> None:
-    """Print nothing from here on: what all ranks have to say, rank 0 says."""
+    """Print nothing from here on: rank 0 prints for all ranks."""
     null = open(os.devnull, "w")  # noqa: SIM115 (open as long as the process lives)
     sys.stdout = sys.stderr = null
 
 
 def let_others_speak() -> None:
-    """Wait before the end of a rank that failed, at which ``mpirun`` ends all others: rank 0 says what is wrong."""
+    """Wait before a failed rank ends, because ``mpirun`` then ends all others: rank 0 first reports the error."""
     time.sleep(WAIT)
 
 
 @contextmanager
 def one_first() -> Iterator[None]:
-    """Rank 0 first, then all others at once: what it compiles they find."""
+    """Rank 0 first, then all others at once: they find the kernels that it has compiled."""
     if not are_several():
         yield
         return

@@ -118,11 +118,11 @@ def check_run_path(path: Path, source: str) -> None:
 
 
 def option_of(name: str) -> Callable[[str], Any]:
-    """What reads the value of an option of one value.
+    """The function that reads the value of an option with one value.
 
     Raises:
-        InputError: There is no such option, or it does not have one value; raised by the function, too, for a text that
-            the option does not take.
+        InputError: There is no such option, or it does not have one value. The function raises it for a text that the
+        option does not accept.
     """
     _, actions = _parser(Path("--vary"))
     action = actions.get(name)

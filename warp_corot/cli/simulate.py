@@ -72,10 +72,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def simulated(args: argparse.Namespace) -> Recording:
-    """``run`` without a word at its end, for runs among many.
+    """``run`` without a summary, for one run of many.
 
     Raises:
-        InputError, UnstableError, OSError: What would end the command.
+        InputError, UnstableError, OSError: The errors that would end the command.
     """
     from warp_corot.io.write.animate import Recording
 
@@ -91,7 +91,7 @@ def simulated(args: argparse.Namespace) -> Recording:
 
 
 def _serve(args: argparse.Namespace) -> int:
-    """``run`` on a rank that makes its part of the steps, and neither speaks nor writes; returns the exit status."""
+    """``run`` on a rank that computes its part of the steps, and neither prints nor writes; returns the exit status."""
     options = bodies_of(args)
     _check_output(args, options[0])
     ready = prepared(options)

@@ -1,4 +1,4 @@
-"""The simulation of a run's bodies, with a time step that was tried."""
+"""The simulation of a run's bodies, with a tested time step."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def make_simulation(args: argparse.Namespace, bodies: Sequence[Body], touched: T
 
 
 def _tried_step(one: Body, damping: float, viscosity: float) -> float:
-    """The length of a step [s] that was made at rest and without weight: it loads every kernel and moves nothing."""
+    """The length of a trial step [s], made at rest and without weight: it loads every kernel and moves nothing."""
     tried = body = one.soft
     model, remesh = one.model, one.remesh
     if remesh:

@@ -155,7 +155,7 @@ def _values(young: float, poisson: float, density: float) -> str:
 
 
 def _time_step(sim: Simulation, at_last: str) -> list[tuple[str, str]]:
-    """The length of steps, and what limits them or what they took to solve."""
+    """The length of steps, and their limit or the iterations that they needed."""
     if not sim.integrator.is_implicit:
         return [
             ("time step", f"{_steps(sim)}; largest stable one at rest about {milliseconds(sim.stable_dt)}{at_last}")

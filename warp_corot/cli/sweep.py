@@ -1,4 +1,4 @@
-"""``warp-corot sweep``: the same run with other parameters, side by side, and a table of what came of them."""
+"""``warp-corot sweep``: the same run with many parameters, several at a time, and a table of the results."""
 
 from __future__ import annotations
 
@@ -97,10 +97,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_same(folder: Path, source: str, others: list[str]) -> None:
-    """See that what is done in a folder was done with the same input and the same options.
+    """Check that the finished runs in a folder had the same input and the same options.
 
     Raises:
-        InputError: It was done with others.
+        InputError: They had others.
     """
     text = Path(source).read_text(encoding="utf-8") if source.lower().endswith(".toml") else ""
     told = {"input": source, "options": others, "run_file": text}
@@ -172,7 +172,7 @@ def name_of(values: dict[str, Any]) -> str:
 
 
 def simulated(*, _input: str, _others: list[str], _folder: str, **values: Any) -> Row:
-    """What came of one run: the last row of its table, and the largest displacement.
+    """The result of one run: the last row of its table, and the largest displacement.
 
     Raises:
         InputError, UnstableError, OSError: As from simulate.

@@ -89,7 +89,7 @@ def _pair(word: str) -> tuple[str, str]:
 
 
 def make_tool(shape: ToolShape, path: Path) -> Tool:
-    """A tool that moves along the path in a file; one that has a single place stays there.
+    """A tool that moves along the path in a file; with a single row it stays there.
 
     Raises:
         InputError: The file cannot be read, or its rows are not a path.
@@ -109,8 +109,8 @@ def make_tool(shape: ToolShape, path: Path) -> Tool:
 def read_tool_path(path: Path) -> tuple[Floats, Floats, Floats | None]:
     """Times [s], [K], positions [m], [K, 3], and quaternions (x, y, z, w), [K, 4], or None without.
 
-    The columns are named in the first row, with units if they like ("x [mm]"); without names there are four or eight in
-    the order of `COLUMNS`. A value may have a unit of its own, too.
+    The first row names the columns, with optional units ("x [mm]"); without names there are four or eight columns in
+    the order of `COLUMNS`. A value may also have its own unit.
 
     Raises:
         InputError: No such file, other columns, a value that is not a finite number, or times that do not increase.

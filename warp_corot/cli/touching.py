@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from .bodies import Body
 
 AUTO = "auto"
-#: Overlaps below this share of a body's height are rounding, and nothing is printed about them.
+#: Overlaps below this fraction of a body's height are rounding and are not reported.
 SMALL = 1e-5
 
 Floats = np.ndarray
@@ -92,8 +92,8 @@ class Touched:
     """What the bodies of a run touch.
 
     Attributes:
-        contact: How things touch; None: nothing does.
-        obstacles: By their names in tables.
+        contact: The options of contact; None: there is no contact.
+        obstacles: The obstacles by their names in tables.
     """
 
     contact: Contact | None
@@ -116,13 +116,13 @@ def stands_free(args: argparse.Namespace) -> bool:
 
 
 def touched_by(options: Sequence[argparse.Namespace]) -> Touched:
-    """What the options ask for, without the ground, for which bodies must be there.
+    """The contact that the options request, except the ground, which needs the bodies first.
 
     Args:
         options: The options of each input.
 
     Raises:
-        InputError: Options that do not go together, or a path that is none.
+        InputError: Options that exclude each other, or a file that is no path.
     """
     shared = options[0]
     shapes, paths = shared.tool or [], shared.tool_path or []
@@ -161,7 +161,7 @@ def _check_drop(options: Sequence[argparse.Namespace]) -> None:
 
 
 def place_ground(touched: Touched, args: argparse.Namespace, bodies: Sequence[Body], gravity: Floats) -> None:
-    """Add the ground of ``--ground`` or ``--drop`` to what bodies touch.
+    """Add the ground of ``--ground`` or ``--drop`` to the obstacles.
 
     Raises:
         InputError: ``--touch`` for a single body.
@@ -179,7 +179,7 @@ def place_ground(touched: Touched, args: argparse.Namespace, bodies: Sequence[Bo
 
 
 def say_overlaps(touched: Touched, bodies: Sequence[Body], sim: Simulation) -> None:
-    """Note for each body what it overlaps before the run begins."""
+    """Add a note for each body on the obstacles that it overlaps before the run begins."""
     if sim.contact is None or not touched.obstacles:
         return
     obstacles = sim.contact.obstacles
@@ -201,7 +201,7 @@ def say_overlaps(touched: Touched, bodies: Sequence[Body], sim: Simulation) -> N
 
 
 def _holds_axis(mesh: object, obstacle: Obstacle, pose: Floats) -> bool:
-    """Whether a mesh holds a point of the axis of an obstacle, which may lie between its nodes."""
+    """Whether a mesh contains a point of an obstacle's axis, which may lie between its nodes."""
     shape = obstacle.shape if isinstance(obstacle, Tool) else obstacle
     half = shape.size[1] if isinstance(shape, Capsule | Cylinder) else 0.0
     x, y, z, w = pose[3:]

@@ -1,4 +1,4 @@
-"""``warp-corot view``: a body in a browser, to be taken hold of with the mouse."""
+"""``warp-corot view``: a body in a browser, which the mouse drags."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ exit status:
     )
     options.add_scene_options(parser)
     options.add_device(parser)
-    # What simulate writes is not asked for here, and may be in a run file all the same.
+    # There are no options here for the files that simulate writes; a run file may still name them.
     whole = argparse.ArgumentParser()
     options.add_options(whole)
     there = {action.dest for action in parser._actions}
@@ -113,10 +113,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _carry_over(ready: Run, shared: argparse.Namespace, sim: Simulation) -> None:
-    """Press the patches of bodies that are others now.
+    """Press the patches of the new bodies.
 
     Raises:
-        InputError: A body's mesh is another one, on which patches that are pressed are not known.
+        InputError: A pressed body has a new mesh, for which the pressed patches are not known.
     """
     for body, soft in zip(ready.bodies, sim.bodies, strict=True):
         if any(load.kind == "press" for load in body.loads) and soft.mesh is not body.subject.mesh:
@@ -127,9 +127,9 @@ def _carry_over(ready: Run, shared: argparse.Namespace, sim: Simulation) -> None
 
 
 def run_text(asked: Sequence[argparse.Namespace], sim: Simulation) -> bytes:
-    """What is on the page, as a run file for ``simulate``: what was asked for, with law and remeshing as they are now.
+    """The run on the page as a run file for ``simulate``: the given options, with the present law and remeshing.
 
-    A uniform material is the present one; what regions and labels have stays as it was asked for.
+    A uniform material is the present one; regions and labels keep the given materials.
     """
     found = []
     for args in asked:

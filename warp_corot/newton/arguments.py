@@ -1,4 +1,4 @@
-"""What users hand to ``SolverCorotated``, checked."""
+"""Checks of the arguments that users give to ``SolverCorotated``."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def check_step(step: Step, model: newton.Model, warm: bool) -> None:
         warm: Whether states must hold rotations.
 
     Raises:
-        InputError: Something is not of this model, or not on its device.
+        InputError: An argument belongs to another model, or is on another device.
     """
     for name, state in (("state_in", step.state_in), ("state_out", step.state_out)):
         _check_state(name, state, model, warm)
@@ -98,7 +98,7 @@ def checked_mask(world_mask: Any, model: newton.Model) -> wp.array:
     """A mask of worlds, bool [world_count + 1].
 
     Raises:
-        InputError: It is something else, or on another device.
+        InputError: It is not such an array, or is on another device.
     """
     wanted = f"it must be bool [{model.world_count + 1}] on {model.device}"
     if not isinstance(world_mask, wp.array):

@@ -33,7 +33,7 @@ ROUNDS = 4
 
 
 class Touch(NamedTuple):
-    """What launches of contact read in a substep.
+    """The input of contact's launches in a substep.
 
     Attributes:
         state: The state of the particles.
@@ -84,7 +84,7 @@ class Contacts:
         self._yielding = wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device)
         #: Wrenches of the particles on the bodies in the last substep [N, N m], spatial_vector [B].
         self.reactions = wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device)
-        #: Whether contacts of edges and triangles have been handed in.
+        #: Whether contacts of edges and triangles have occurred.
         self.crowded = False
         self.refresh()
 

@@ -103,8 +103,9 @@ class SoftPairs:
 
 
 def _facing(model: newton.Model, triangles: npt.NDArray[np.int32]) -> npt.NDArray[np.float32]:
-    """Whether triangles' normals point out of tetrahedra (1) or into them (-1); 0: they are no face of one, or of
-    two."""
+    """Whether triangles' normals point out of tetrahedra (1) or into them (-1); 0: the triangle is no face of one, or
+    of two.
+    """
     tets = model.tet_indices.numpy().reshape(-1, 4)
     faces = np.concatenate([np.delete(tets, k, axis=1) for k in range(4)])
     inner = np.concatenate([tets[:, k] for k in range(4)])

@@ -1,4 +1,4 @@
-"""Failures of worlds in a step, and what users hear of them."""
+"""Failures of worlds in a step, and the reports of them to users."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Report:
         self._found[worlds.UNSTABLE : worlds.UNSTABLE + 1].zero_()
 
     def launch(self) -> None:
-        """Launch what keeps the failures of a step, at its end."""
+        """Launch the kernel that stores the failures of a step, at its end."""
         if self.may_be_wrong:
             outputs = [self._found, self._seen_by_device]
             wp.launch(worlds.report_trouble, len(self.trouble), [self.trouble], outputs, device=self._device)

@@ -16,8 +16,8 @@ from .library import SolverBase, newton
 
 
 class SensorSoftContact:
-    """Measures the forces of soft bodies on chosen shapes or bodies, as ``newton.sensors.SensorContact`` does those of
-    rigid contacts.
+    """Measures the forces of soft bodies on chosen shapes or bodies, as ``newton.sensors.SensorContact`` does for rigid
+    contacts.
 
     Example::
 

@@ -1,4 +1,4 @@
-"""What Newton's records of soft contacts hold, and how many of them share each particle; see
+"""The content of Newton's records of soft contacts, and how many of them share each particle; see
 ``kernels.newton.touching``."""
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from .library import newton
 CROWD = 4.0
 
 
-#: Types of shapes with contacts of their vertices and edges, of which Newton tells nobody which repeat one another.
+#: Types of shapes with contacts of their vertices and edges. Newton does not tell which of these contacts repeat each
+#: other.
 MESHES = [int(newton.GeoType.MESH), int(newton.GeoType.CONVEX_MESH)]
 
 
@@ -25,7 +26,7 @@ def has_surfaces(model: newton.Model, contacts: newton.Contacts) -> bool:
     Raises:
         InputError: They may be, and particles collide with a triangle mesh.
     """
-    # Newton keeps this to itself. Without it, every model with triangles may have such records.
+    # This attribute is private to Newton. Without it, every model with triangles may have such records.
     if not getattr(contacts, "_enable_rigid_soft_full_surface_contact", model.tri_count > 0):
         return False
     if model.device.is_capturing:

@@ -301,7 +301,7 @@ def _unpack_state(body: SoftBody, described: dict[str, Any], prefix: str, arrays
 
 
 def _described(thing: Any, names: dict[str, Any]) -> dict[str, Any]:
-    """A listed dataclass of plain values, and of others of its kind, for JSON: its name in the list and its values."""
+    """A listed dataclass of plain values or of other listed ones, for JSON: its name in the list and its values."""
     values = dataclasses.asdict(thing)
     for name in values:
         if type(getattr(thing, name)) in names.values():

@@ -1,4 +1,4 @@
-"""Contact in checkpoints: obstacles, tools, grasps, and what steps go on from."""
+"""Contact in checkpoints: obstacles, tools, grasps, and the state from which steps continue."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from warp_corot.errors import InputError
 
 Arrays = dict[str, np.ndarray]
 
-#: How shapes are made again from their sizes; the place and the thickness are set afterwards.
+#: Functions that make shapes from their sizes; the place and the thickness are set afterwards.
 SHAPES = {
     "Ground": lambda size, arrays, prefix: Ground(),
     "Sphere": lambda size, arrays, prefix: Sphere(size[0]),
@@ -35,10 +35,10 @@ OF_SHAPES = ("points", "triangles", "values", "lower")
 
 
 def pack_contact(contacts: Contacts | None, grasps: Sequence[Grasp], arrays: Arrays) -> dict[str, Any] | None:
-    """Put contact into arrays; returns the remaining data for JSON, None where nothing touches.
+    """Put contact into arrays; returns the remaining data for JSON, None without contact.
 
     Raises:
-        InputError: A shape of another class, or something else that constrains the bodies.
+        InputError: A shape of a class of your own, or another constraint of the bodies.
     """
     if contacts is None:
         return None
@@ -68,7 +68,7 @@ def obstacles_of(described: dict[str, Any] | None, arrays: Arrays) -> dict[str, 
 
 
 def unpack_contact(contacts: Contacts | None, described: dict[str, Any] | None, arrays: Arrays) -> None:
-    """Let a simulation's contact go on as it was."""
+    """Restore the contact of a simulation."""
     if described is None or contacts is None:
         return
     kept = {name.removeprefix("contact."): values for name, values in arrays.items() if name.startswith("contact.")}

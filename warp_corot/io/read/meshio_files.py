@@ -20,7 +20,7 @@ ORDERS = {"tetra20": 3, "tetra35": 4, "hexahedron64": 3, "triangle10": 3, "quad1
 
 
 class _EndingText(io.StringIO):
-    """A text of which the end is given once; meshio's reader of Nastran waits for ever for a first card."""
+    """A text that fails at its second end: meshio's reader of Nastran waits for ever for a first card."""
 
     ended = False
 

@@ -91,7 +91,7 @@ def _mesh(
 
 
 def _rows(lines: Iterator[str], what: str, count: str | None = None) -> list[str]:
-    """The lines of a section, whose first line says their number."""
+    """The lines of a section, whose first line has their number."""
     said = next(lines, "") if count is None else count
     if not said.isdecimal():
         raise Unreadable(f"the number of {what} is {said[:20]!r}")

@@ -15,7 +15,7 @@ from warp_corot.contact.tool import Obstacle, Tool
 
 #: Points around a round shape, and from the pole of a ball to its equator.
 AROUND, TO_EQUATOR = 32, 8
-#: Half of a ground's edge that is drawn, in sizes of what lies on it.
+#: Half of the edge of a drawn ground, in sizes of the bodies on it.
 GROUND_SIZE = 1.2
 
 Floats = npt.NDArray[np.float64]

@@ -1,5 +1,6 @@
-"""Physics data of a stage that Newton's importer does not report: which values the file gives, and what gravity
-means."""
+"""Physics data of a stage that Newton's importer does not report: which values the file gives, and the meaning of
+gravity.
+"""
 
 from __future__ import annotations
 

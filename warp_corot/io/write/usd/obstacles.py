@@ -22,7 +22,7 @@ FORCE, TORQUE = "contact:force", "contact:torque"
 
 
 class ObstaclePrim:
-    """The prim of an obstacle: a Sphere, Capsule, Cylinder, Cube or Mesh; for a ground a Plane, as large as what lies
+    """The prim of an obstacle: a Sphere, Capsule, Cylinder, Cube or Mesh; for a ground a Plane, as large as the bodies
     on it.
 
     A tool has its place and turn in each frame, and ``contact:force`` [N] and ``contact:torque`` about its origin
@@ -70,7 +70,7 @@ class ObstaclePrim:
                 attribute.SetDocumentation(f"{said}, of the bodies on the tool, in the world's frame")
 
     def samples(self, frame: Frame) -> Samples:
-        """As in `TetPrims.samples`; where the tool is now, and what it feels."""
+        """As in `TetPrims.samples`: the tool's place, and the force and torque on it."""
         if not isinstance(self._obstacle, Tool):
             return {}
         place, turn = _place(self._obstacle.present_pose[self._world])
@@ -88,7 +88,9 @@ class ObstaclePrim:
 
 
 def obstacle_prims(obstacles: Sequence[Obstacle], points: NDArray[np.float64], world: int) -> list[ObstaclePrim]:
-    """A prim for each obstacle that has a form here; tools are tool_1, tool_2, ..., others are named by their shape."""
+    """A prim for each obstacle that OpenUSD can draw; tools are tool_1, tool_2, ..., others are named by their
+    shape.
+    """
     prims, taken = [], set()
     for each in obstacles:
         shape = shape_of(each)
@@ -134,6 +136,6 @@ def _gprim(stage: Any, path: str, shape: Shape, width: float) -> Any:
 
 
 def _place(pose: NDArray[np.float64]) -> tuple[Any, Any]:
-    """A pose, (x, y, z, w) its quaternion, as OpenUSD has it."""
+    """A pose, with the quaternion (x, y, z, w), as values of OpenUSD."""
     x, y, z, w = (float(value) for value in pose[3:])
     return Gf.Vec3d(*map(float, pose[:3])), Gf.Quatf(w, x, y, z)

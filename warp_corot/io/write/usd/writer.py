@@ -82,7 +82,7 @@ class UsdWriter:
         tets: Whether to write the TetMesh; None: only without skins.
         changing: Whether the mesh may change between frames (`change_mesh`).
         gravity: Acceleration [m/s^2], for a physics scene.
-        obstacles: What the body touches in a simulation.
+        obstacles: The obstacles of the simulation.
         world: The world in which tools are drawn.
 
     Attributes:
