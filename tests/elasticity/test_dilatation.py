@@ -112,6 +112,28 @@ def test_stiffness_is_minus_the_derivative_of_the_forces(law, kind, device, rng)
 
 
 @pytest.mark.parametrize(("law", "kind"), crossed(MODELS, ["level 3", "mixed levels", "general"], is_short))
+def test_what_a_tangent_keeps_is_the_stiffness(law, kind, device, rng):
+    """Products and diagonals of kept rows are those found anew, also where elements are held from turning over."""
+    mesh = MESHES[kind][0]()
+    _, field = bound(law, mesh, device)
+    u = strained(mesh, rng) + mesh.points @ np.diag([0.4, 0.3, -0.05])
+    p = vec4(rng.uniform(-1.0, 1.0, u.shape), device)
+    for exact in (False, True) if law == "corotated" else (True,):
+        options = {"exact": exact} if law == "corotated" else {}
+        tangent = field.tangent(exact=exact)
+        tangent.prepare(vec4(u, device))
+        tangent.take(vec4(u, device))
+        found, expected = (wp.zeros(len(u), dtype=wp.vec4, device=device) for _ in range(2))
+        tangent.add_product(p, found)
+        field.add_stiffness(vec4(u, device), p, expected, **options)
+        assert np.abs(nodal(found) - nodal(expected)).max() < 1e-5 * np.abs(nodal(expected)).max()
+        found, expected = (wp.zeros(len(u), dtype=wp.mat33, device=device) for _ in range(2))
+        tangent.add_diagonal(found)
+        field.add_diagonal(vec4(u, device), expected, **options)
+        assert np.abs(found.numpy() - expected.numpy()).max() < 1e-5 * np.abs(expected.numpy()).max()
+
+
+@pytest.mark.parametrize(("law", "kind"), crossed(MODELS, ["level 3", "mixed levels", "general"], is_short))
 def test_diagonal(law, kind, device, rng):
     """The blocks are those of K where groups share a dilatation; elsewhere K has no more."""
     mesh = MESHES[kind][0]()

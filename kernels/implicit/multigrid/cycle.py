@@ -45,16 +45,19 @@ def sum_over_lanes(part: wp.vec3, lanes: int) -> wp.vec3:
 #else
     typedef float float4 __attribute__((vector_size(16)));
     typedef float float4u __attribute__((vector_size(16), aligned(4)));
-    float4 total = {0.0f, 0.0f, 0.0f, 0.0f};
+    // Sums that do not wait for one another.
+    float4 a = {0.0f, 0.0f, 0.0f, 0.0f}, b = a, c = a;
     const float* m = &wp::index(blocks, first_entry + begin).data[0][0];
     const int* column = &wp::index(columns, begin);
     const float* values = &wp::index(x, first_node)[0];
     for (int p = begin; p < end; ++p, m += 9, ++column) {
         const float* v = values + 4 * *column;
-        total += *reinterpret_cast<const float4u*>(m) * v[0] + *reinterpret_cast<const float4u*>(m + 3) * v[1];
-        total += *reinterpret_cast<const float4u*>(m + 6) * v[2];
+        a += *reinterpret_cast<const float4u*>(m) * v[0];
+        b += *reinterpret_cast<const float4u*>(m + 3) * v[1];
+        c += *reinterpret_cast<const float4u*>(m + 6) * v[2];
     }
-    return wp::vec_t<3, wp::float32>(total[0], total[1], total[2]);
+    a += b + c;
+    return wp::vec_t<3, wp::float32>(a[0], a[1], a[2]);
 #endif
 """)
 def row_product(

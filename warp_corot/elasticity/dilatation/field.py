@@ -23,6 +23,7 @@ from warp_corot.kernels.subtrees.cuda import BLOCK
 from warp_corot.mesh import TetForest
 
 from .others import Others
+from .tangent import NodalTangent, SharedTangent
 
 
 class DilatationField(ForceField):
@@ -151,8 +152,8 @@ class DilatationField(ForceField):
 
     def add_shared_product(self, u: wp.array, p: wp.array, y: wp.array, exact: bool | None = None) -> None:
         """The part of ``add_stiffness`` that comes from the shared dilatation."""
-        inputs = [self.elements, self.isotropic, u, p, self._share(u, p), self._turning(exact)]
-        self.launch(kernels.add_product(self._kind, self.of), self.element_count, inputs, [y])
+        inputs = [self.elements, self.isotropic, u, p, self._share(u, p), self.turning(exact)]
+        self.launch(kernels.add_product(self.kind, self.of), self.element_count, inputs, [y])
 
     def add_diagonal(self, u: wp.array, blocks: wp.array, *, exact: bool | None = None) -> None:
         """Add the 3x3 blocks on the diagonal of the same K(u) to those of the nodes [N/m]; see ``add_stiffness``.
@@ -164,15 +165,15 @@ class DilatationField(ForceField):
 
     def add_shared_diagonal(self, u: wp.array, blocks: wp.array, exact: bool | None = None) -> None:
         """The part of ``add_diagonal`` that comes from the shared dilatation."""
-        turning, shared = self._turning(exact), self._share(u, self._still)
-        kernel = shared_diagonal.add_diagonal_of_groups(self._kind, self.of)
-        for starts, members, live, count in self._groups():
+        turning, shared = self.turning(exact), self._share(u, self._still)
+        kernel = shared_diagonal.add_diagonal_of_groups(self.kind, self.of)
+        for starts, members, live, count in self.batches_of_groups():
             inputs = [starts, members, live, self.elements, self.isotropic, u, shared, turning]
             self.launch(kernel, count, inputs, [blocks])
         self._others.add_nodal_diagonal(self.isotropic, u, shared, turning, blocks)
 
     def tangent(self, *, exact: bool = False) -> Tangent:
-        return SharedTangent(self, exact)
+        return (NodalTangent if self._others.are_nodal else SharedTangent)(self, exact)
 
     def _law(self, name: str, exact: bool | None) -> Callable[..., None]:
         method = getattr(self.shear, name)
@@ -180,7 +181,7 @@ class DilatationField(ForceField):
             return method
         return lambda *arrays: method(*arrays, exact=exact)
 
-    def _turning(self, exact: bool | None) -> float:
+    def turning(self, exact: bool | None) -> float:
         return 0.0 if self._has_rotations and not exact else 1.0
 
     @property
@@ -195,9 +196,9 @@ class DilatationField(ForceField):
     def unshare(self, u: wp.array, f: wp.array) -> None:
         """Add to forces f of displacements u what makes each element's dilatation its own."""
         shared = self._share(u, self._still)
-        self.launch(kernels.unshare(self._kind, self.of), self.element_count, [self.elements, u], [shared])
+        self.launch(kernels.unshare(self.kind, self.of), self.element_count, [self.elements, u], [shared])
         inputs = [self.elements, self._all, self._all, self.isotropic, u, shared]
-        self.launch(kernels.scatter_pressures(self._kind, self.of), self.element_count, inputs, [f])
+        self.launch(kernels.scatter_pressures(self.kind, self.of), self.element_count, inputs, [f])
 
     # --- energies and stresses ---------------------------------------------------------------------------------------
 
@@ -211,7 +212,7 @@ class DilatationField(ForceField):
 
     def _add_shared_energies(self, u: wp.array, energies: wp.array) -> None:
         inputs = [self.elements, self.isotropic, u, self._share(u, self._still)]
-        self.launch(kernels.add_energies(self._kind, self.of), self.element_count, inputs, [energies])
+        self.launch(kernels.add_energies(self.kind, self.of), self.element_count, inputs, [energies])
 
     @property
     def energy_count(self) -> int:
@@ -223,7 +224,7 @@ class DilatationField(ForceField):
     # --- what is shared ----------------------------------------------------------------------------------------------
 
     @property
-    def _kind(self) -> type:
+    def kind(self) -> type:
         return self.discretization.element_kind
 
     def prepare_sums(self, u: wp.array) -> None:
@@ -237,7 +238,7 @@ class DilatationField(ForceField):
     def groups(self) -> list[npt.NDArray[np.int32]]:
         """The elements of each group that shares a dilatation, of all worlds; none where they do at nodes."""
         found = []
-        for starts, members, _live, count in self._groups():
+        for starts, members, _live, count in self.batches_of_groups():
             begins, of_groups = starts.numpy(), members.numpy()
             for g in range(count):
                 if len(of_groups):
@@ -246,7 +247,7 @@ class DilatationField(ForceField):
                     found.append(np.arange(begins[g], begins[g] + 8, dtype=np.int32))
         return found
 
-    def _groups(self) -> list[tuple[wp.array, wp.array, wp.array, int]]:
+    def batches_of_groups(self) -> list[tuple[wp.array, wp.array, wp.array, int]]:
         """Subtrees and other groups, as ``kernels.share_in_groups`` takes them, and how many."""
         of_subtrees = [(b.subtrees.first, self._all, b.live or self._all, b.count) for b in self.plan.batches]
         return of_subtrees + self._others.groups
@@ -259,10 +260,10 @@ class DilatationField(ForceField):
     def _share(self, u: wp.array, p: wp.array, law: wp.Function | None = None) -> wp.array:
         """The second pass of ``kernels.elements.shared_dilatation``, of all elements."""
         shared, law = self._shared, law or kernels.law_at(self.of)
-        measure = kernels.measure_elements(self._kind, self.of)
+        measure = kernels.measure_elements(self.kind, self.of)
         self.launch(measure, self.element_count, [self.elements, self._all, self._all, u, p], [shared])
-        kernel = kernels.share_in_groups(self._kind, law)
-        for starts, members, live, count in self._groups():
+        kernel = kernels.share_in_groups(self.kind, law)
+        for starts, members, live, count in self.batches_of_groups():
             self.launch(kernel, count, [starts, members, live, self.elements, self.isotropic], [shared])
         self._others.share_at_nodes(self.isotropic, len(u), shared, law)
         return shared
@@ -283,35 +284,3 @@ class Unshared:
         """Add the forces [N] of displacements u to f; both vec4 [worlds * N]."""
         self._field.add_forces(u, f)
         self._field.unshare(u, f)
-
-
-class SharedTangent(Tangent):
-    """K of a field with a shared dilatation.
-
-    Args:
-        field: The field.
-        exact: As for ``ForceField.tangent``.
-    """
-
-    field: DilatationField
-
-    def __init__(self, field: DilatationField, exact: bool):
-        super().__init__(field)
-        self.shear, self._exact = field.shear.tangent(exact=exact), exact
-
-    def prepare(self, u: wp.array) -> None:
-        super().prepare(u)
-        self.shear.prepare(u)
-        self.field.prepare_sums(u)
-
-    def take(self, u: wp.array) -> None:
-        super().take(u)
-        self.shear.take(u)
-
-    def add_product(self, p: wp.array, y: wp.array) -> None:
-        self.shear.add_product(p, y)
-        self.field.add_shared_product(self.displacements, p, y, self._exact)
-
-    def add_diagonal(self, blocks: wp.array) -> None:
-        self.shear.add_diagonal(blocks)
-        self.field.add_shared_diagonal(self.displacements, blocks, self._exact)

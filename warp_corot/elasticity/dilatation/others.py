@@ -89,6 +89,11 @@ class Others:
             self._general = self._general or as_general(self._elements, rest_matrices, [self._elements])
 
     @property
+    def are_nodal(self) -> bool:
+        """Whether they have their dilatation at nodes."""
+        return self._groups is None and self.count > 0
+
+    @property
     def kernels(self) -> list[wp.Kernel]:
         """All that forces may launch."""
         if self.are_joined:

@@ -29,7 +29,7 @@ def _multigrid(operator: TangentOperator, short_cycles: bool) -> Multigrid:
     shares = operator.field.shares_dilatation
     # Where a product costs as much as a cycle, fewer iterations are worth longer ones; so are fewer launches on CUDA.
     short = SHORT if short_cycles and operator.device.is_cpu else {}
-    options = SHARED if shares else short
+    options = short | SHARED if shares else short
     most, is_turned = MOST_LAMBDA if shares else np.inf, not operator.field.is_linear
     return Multigrid(operator.body, is_turned=is_turned, stiffening=stiffening, most_lambda=most, **options)
 

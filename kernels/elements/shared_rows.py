@@ -1,0 +1,289 @@
+"""The stiffness of a dilatation that groups of elements share, as one row a group.
+
+A group adds c g g^T to K, with g the derivative of the sum of lambda_e V_e theta_e with respect to its nodes'
+displacements and c = w'' / sum of lambda_e V_e. The rows g are found once for each linearisation, so that a product
+reads ten nodes for eight elements and no element. What elements add besides is left to ``shared_dilatation`` and, where
+some of them are held from turning over, to ``add_held``.
+"""
+
+import functools
+
+import warp as wp
+
+from warp_corot.kernels.modules import unique_kernel
+
+from .constitutive import IsotropicMaterial
+from .dilatation import Dilatation, mean_of
+from .elements import nodal_forces, rest_volume
+from .forces import in_local_frame, own_gradient
+from .lanes import COMPILER_FLAGS
+from .shared_dilatation import is_live, place_of, range_of, scatter
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_FLAGS})
+
+#: Threads that share a group on CUDA.
+THREADS = 8
+
+
+@wp.struct
+class GroupRows:
+    """Groups, their elements and nodes, and the rows.
+
+    ``corners`` has for each member where its four nodes are among the group's, eight bits each.
+    """
+
+    ranges: wp.array[wp.vec2i]  # [groups] where a group's members begin and end
+    members: wp.array[wp.int32]  # elements, group after group
+    corners: wp.array[wp.int32]  # [members]
+    ends: wp.array[wp.int32]  # [groups] where a group's nodes end
+    nodes: wp.array[wp.int32]  # [entries]
+    rows: wp.array[wp.vec4]  # [entries] g [N/m]
+    factors: wp.array[wp.vec2]  # [groups] c [1/J], and whether an element is held: zero or more
+
+
+# --- the groups -------------------------------------------------------------------------------------------------------
+
+
+@wp.kernel(enable_backward=False)
+def list_members(
+    # In
+    starts: wp.array[wp.int32],
+    given: wp.array[wp.int32],
+    live: wp.array[wp.int32],
+    first_group: int,
+    first_place: int,
+    # Out
+    ranges: wp.array[wp.vec2i],
+    members: wp.array[wp.int32],
+):
+    """A thread a group; see ``shared_dilatation.range_of`` for what a group is."""
+    g = wp.tid()
+    if not is_live(live, g):
+        ranges[first_group + g] = wp.vec2i(0, 0)
+        return
+    begin, end = range_of(starts, given, g)
+    place = first_place + 8 * g
+    if given.shape[0] > 0:
+        place = first_place + begin
+    for i in range(begin, end):
+        members[place + i - begin] = place_of(given, i)
+    ranges[first_group + g] = wp.vec2i(place, place + end - begin)
+
+
+@wp.kernel(enable_backward=False)
+def count_nodes(
+    # In
+    ranges: wp.array[wp.vec2i],
+    members: wp.array[wp.int32],
+    nodes: wp.array[wp.vec4i],
+    # Out
+    counts: wp.array[wp.int32],
+):
+    """How many nodes a group has."""
+    g = wp.tid()
+    begin = ranges[g][0]
+    count = int(0)
+    for i in range(begin, ranges[g][1]):
+        own = nodes[members[i]]
+        for n in range(4):
+            is_new = int(1)
+            for j in range(begin, i):
+                other = nodes[members[j]]
+                if other[0] == own[n] or other[1] == own[n] or other[2] == own[n] or other[3] == own[n]:
+                    is_new = 0
+            count += is_new
+    counts[g] = count
+
+
+@wp.func
+def first_entry(ends: wp.array[wp.int32], g: int):
+    begin = int(0)
+    if g > 0:
+        begin = ends[g - 1]
+    return begin
+
+
+@wp.kernel(enable_backward=False)
+def name_nodes(
+    # In
+    element_nodes: wp.array[wp.vec4i],
+    # In and out
+    groups: GroupRows,
+):
+    """The nodes of a group, in the order in which its elements name them."""
+    g = wp.tid()
+    first = first_entry(groups.ends, g)
+    count = int(0)
+    for i in range(groups.ranges[g][0], groups.ranges[g][1]):
+        own = element_nodes[groups.members[i]]
+        packed = int(0)
+        for n in range(4):
+            corner = int(0)
+            while corner < count and groups.nodes[first + corner] != own[n]:
+                corner += 1
+            if corner == count:
+                groups.nodes[first + corner] = own[n]
+                count += 1
+            packed = packed | (corner << (8 * n))
+        groups.corners[i] = packed
+
+
+# --- the rows ---------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def add_row(rows: wp.array[wp.vec4], place: int, row: wp.vec3):
+    rows[place] = rows[place] + wp.vec4(row[0], row[1], row[2], 0.0)
+
+
+@functools.cache
+def write_rows(Elements: type, of: Dilatation) -> wp.Kernel:
+    """A thread a group, which also leaves (0, w', 0, 0) to its elements as ``shared_dilatation`` takes it."""
+    measure, slope_of, curvature_of, holding = of.measure, of.slope, of.curvature, of.holding
+
+    @unique_kernel()
+    def write_rows(
+        # In
+        elements: Elements,
+        material: IsotropicMaterial,
+        u: wp.array[wp.vec4],
+        # In and out
+        groups: GroupRows,
+        shared: wp.array[wp.vec4],
+    ):
+        g = wp.tid()
+        first = first_entry(groups.ends, g)
+        for k in range(first, groups.ends[g]):
+            groups.rows[k] = wp.vec4()
+        sum = float(0.0)
+        total = float(0.0)
+        held = float(0.0)
+        for i in range(groups.ranges[g][0], groups.ranges[g][1]):
+            t = groups.members[i]
+            theta, slope = measure(own_gradient(elements, t, u))
+            lam = material.lam[t * material.stride]
+            weight = lam * rest_volume(elements, t)
+            sum += weight * theta
+            total += weight
+            held = wp.max(held, holding(theta)[2])
+            # Forces are minus the derivative of the energy, and this is that of the sum.
+            f0, f1, f2, f3 = nodal_forces(elements, t, in_local_frame(elements, t, -lam * slope))
+            corners = groups.corners[i]
+            add_row(groups.rows, first + (corners & 255), f0)
+            add_row(groups.rows, first + ((corners >> 8) & 255), f1)
+            add_row(groups.rows, first + ((corners >> 16) & 255), f2)
+            add_row(groups.rows, first + ((corners >> 24) & 255), f3)
+        theta = mean_of(sum, total)
+        groups.factors[g] = wp.vec2(mean_of(curvature_of(theta), total), held)
+        for i in range(groups.ranges[g][0], groups.ranges[g][1]):
+            shared[groups.members[i]] = wp.vec4(0.0, slope_of(theta), 0.0, 0.0)
+
+    return write_rows
+
+
+# --- products ---------------------------------------------------------------------------------------------------------
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float part = 0.0f;
+    for (int k = begin + lane; k < end; k += lanes) {
+        const float4 v = *reinterpret_cast<const float4*>(&wp::index(p, wp::index(nodes, k)));
+        const float4 g = *reinterpret_cast<const float4*>(&wp::index(rows, k));
+        part += g.x * v.x + g.y * v.y + g.z * v.z;
+    }
+    const unsigned int together = ((1u << lanes) - 1u) << (threadIdx.x & 31 & ~(lanes - 1));
+    for (int step = lanes / 2; step > 0; step /= 2) part += __shfl_xor_sync(together, part, step);
+    part *= factor;
+    for (int k = begin + lane; k < end; k += lanes) {
+        const float4 g = *reinterpret_cast<const float4*>(&wp::index(rows, k));
+        const wp::vec_t<3, wp::float32> force(part * g.x, part * g.y, part * g.z);
+        float* to = &wp::index(y, wp::index(nodes, k))[0];
+        for (int a = 0; a < 3; ++a) atomicAdd(to + a, force[a]);
+    }
+#else
+    typedef float float4 __attribute__((vector_size(16), aligned(4)));
+    const int* node = nodes.data;
+    const float4* g = reinterpret_cast<const float4*>(rows.data);
+    const float4* from = reinterpret_cast<const float4*>(p.data);
+    float4* to = reinterpret_cast<float4*>(y.data);
+    float4 sum = {0.0f, 0.0f, 0.0f, 0.0f};
+    for (int k = begin; k < end; ++k) sum += g[k] * from[node[k]];
+    const float change = factor * (sum[0] + sum[1] + sum[2]);
+    for (int k = begin; k < end; ++k) to[node[k]] += change * g[k];
+#endif
+""")
+def add_group(
+    lane: int,
+    lanes: int,
+    begin: int,
+    end: int,
+    factor: float,
+    nodes: wp.array[wp.int32],
+    rows: wp.array[wp.vec4],
+    p: wp.array[wp.vec4],
+    y: wp.array[wp.vec4],
+):
+    """y += factor g (g . p) of the entries of a group, which ``lanes`` neighbouring threads share on CUDA."""
+    ...
+
+
+@wp.kernel(enable_backward=False)
+def add_row_products(
+    # In
+    lanes: int,
+    groups: GroupRows,
+    p: wp.array[wp.vec4],
+    # In and out
+    y: wp.array[wp.vec4],
+):
+    """y += c g (g . p)."""
+    thread = wp.tid()
+    g = thread / lanes
+    begin = first_entry(groups.ends, g)
+    add_group(thread % lanes, lanes, begin, groups.ends[g], groups.factors[g][0], groups.nodes, groups.rows, p, y)
+
+
+@functools.cache
+def add_held(Elements: type, of: Dilatation) -> wp.Kernel:
+    """y += K p of the elements that are held from turning over; a thread a group, most of which have none."""
+    measure, holding = of.measure, of.holding
+
+    @unique_kernel()
+    def add_held(
+        # In
+        elements: Elements,
+        material: IsotropicMaterial,
+        u: wp.array[wp.vec4],
+        p: wp.array[wp.vec4],
+        groups: GroupRows,
+        # In and out
+        y: wp.array[wp.vec4],
+    ):
+        g = wp.tid()
+        if groups.factors[g][1] == 0.0:
+            return
+        for i in range(groups.ranges[g][0], groups.ranges[g][1]):
+            t = groups.members[i]
+            theta, slope = measure(own_gradient(elements, t, u))
+            change = holding(theta)[2] * wp.ddot(slope, own_gradient(elements, t, p))
+            if change != 0.0:
+                stress = (material.lam[t * material.stride] * change) * slope
+                scatter(elements, elements.nodes[t], t, -stress, y)
+
+    return add_held
+
+
+@wp.kernel(enable_backward=False)
+def add_row_blocks(
+    # In
+    groups: GroupRows,
+    # In and out
+    blocks: wp.array[wp.mat33],
+):
+    """The diagonal blocks of c g g^T; a thread a group."""
+    g = wp.tid()
+    for k in range(first_entry(groups.ends, g), groups.ends[g]):
+        row = groups.rows[k]
+        v = wp.vec3(row[0], row[1], row[2])
+        wp.atomic_add(blocks, groups.nodes[k], groups.factors[g][0] * wp.outer(v, v))

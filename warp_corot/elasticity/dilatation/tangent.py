@@ -1,0 +1,134 @@
+"""The stiffness of a law with a shared dilatation at displacements that are kept: a row for each group."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from warp_corot.elasticity.tangent import Tangent
+from warp_corot.kernels.elements import shared_diagonal, shared_dilatation
+from warp_corot.kernels.elements import shared_rows as kernels
+from warp_corot.kernels.elements.dilatation import SMALL, not_held
+
+if TYPE_CHECKING:
+    from .field import DilatationField
+
+
+class SharedTangent(Tangent):
+    """K of a field whose elements share their dilatation in groups.
+
+    Args:
+        field: The field.
+        exact: As for ``ForceField.tangent``.
+    """
+
+    field: DilatationField
+
+    def __init__(self, field: DilatationField, exact: bool):
+        super().__init__(field)
+        self.shear, self._exact = field.shear.tangent(exact=exact), exact
+        # The differential of the gradient of a dilatation counts in each element by itself.
+        self._turns = bool(field.turning(exact)) and field.of is not SMALL
+        self._holds = field.of.holding is not not_held
+        self._version = -1
+        self._shared, self._empty = (wp.zeros(0, dtype=kind, device=field.device) for kind in (wp.vec4, wp.int32))
+
+    def prepare(self, u: wp.array) -> None:
+        super().prepare(u)
+        self.shear.prepare(u)
+        field, version = self.field, self.field.discretization.sizes.version
+        if self._version != version:
+            self._version = version
+            self._shared = wp.zeros(field.element_count, dtype=wp.vec4, device=field.device)
+            self._rows = self._groups()
+
+    def take(self, u: wp.array) -> None:
+        super().take(u)
+        self.shear.take(u)
+        field = self.field
+        inputs = [field.elements, field.isotropic, self.displacements, self._rows, self._shared]
+        field.launch(kernels.write_rows(field.kind, field.of), self._count, inputs, [])
+
+    def add_product(self, p: wp.array, y: wp.array) -> None:
+        self.shear.add_product(p, y)
+        field, u = self.field, self.displacements
+        lanes = kernels.THREADS if field.device.is_cuda else 1
+        field.launch(kernels.add_row_products, lanes * self._count, [lanes, self._rows, p], [y])
+        if self._turns:
+            inputs = [field.elements, field.isotropic, u, p, self._shared, 1.0]
+            kernel = shared_dilatation.add_product(field.kind, field.of)
+            field.launch(kernel, field.element_count, inputs, [y])
+        elif self._holds:
+            inputs = [field.elements, field.isotropic, u, p, self._rows]
+            field.launch(kernels.add_held(field.kind, field.of), self._count, inputs, [y])
+
+    def add_diagonal(self, blocks: wp.array) -> None:
+        self.shear.add_diagonal(blocks)
+        field = self.field
+        field.launch(kernels.add_row_blocks, self._count, [self._rows], [blocks])
+        if self._turns or self._holds:
+            inputs = [field.elements, self._empty, self._empty, field.isotropic, self.displacements, self._shared]
+            inputs += [float(self._turns)]
+            kernel = shared_diagonal.add_diagonal(field.kind, field.of)
+            field.launch(kernel, field.element_count, inputs, [blocks])
+
+    def _groups(self) -> kernels.GroupRows:
+        """The groups of the present mesh; waits for the device."""
+        field, device = self.field, self.field.device
+        batches = [
+            (*batch, 8 * batch[3] if len(batch[1]) == 0 else len(batch[1])) for batch in field.batches_of_groups()
+        ]
+        self._count = sum(count for *_, count, _ in batches)
+        rows = kernels.GroupRows()
+        rows.ranges = wp.zeros(self._count, dtype=wp.vec2i, device=device)
+        rows.members, rows.corners = (
+            wp.zeros(sum(places for *_, places in batches), dtype=wp.int32, device=device) for _ in range(2)
+        )
+        first_group = first_place = 0
+        for starts, members, live, count, places in batches:
+            inputs = [starts, members, live, first_group, first_place]
+            field.launch(kernels.list_members, count, inputs, [rows.ranges, rows.members])
+            first_group, first_place = first_group + count, first_place + places
+        nodes = field.elements.nodes
+        rows.ends = wp.zeros(self._count, dtype=wp.int32, device=device)
+        field.launch(kernels.count_nodes, self._count, [rows.ranges, rows.members, nodes], [rows.ends])
+        wp.utils.array_scan(rows.ends, rows.ends, inclusive=True)
+        entries = int(rows.ends[-1:].numpy()[0])
+        rows.nodes = wp.zeros(entries, dtype=wp.int32, device=device)
+        rows.rows = wp.zeros(entries, dtype=wp.vec4, device=device)
+        rows.factors = wp.zeros(self._count, dtype=wp.vec2, device=device)
+        field.launch(kernels.name_nodes, self._count, [nodes], [rows])
+        return rows
+
+
+class NodalTangent(Tangent):
+    """K of a field whose elements have their dilatation at nodes.
+
+    Args:
+        field: The field.
+        exact: As for ``ForceField.tangent``.
+    """
+
+    field: DilatationField
+
+    def __init__(self, field: DilatationField, exact: bool):
+        super().__init__(field)
+        self.shear, self._exact = field.shear.tangent(exact=exact), exact
+
+    def prepare(self, u: wp.array) -> None:
+        super().prepare(u)
+        self.shear.prepare(u)
+        self.field.prepare_sums(u)
+
+    def take(self, u: wp.array) -> None:
+        super().take(u)
+        self.shear.take(u)
+
+    def add_product(self, p: wp.array, y: wp.array) -> None:
+        self.shear.add_product(p, y)
+        self.field.add_shared_product(self.displacements, p, y, self._exact)
+
+    def add_diagonal(self, blocks: wp.array) -> None:
+        self.shear.add_diagonal(blocks)
+        self.field.add_shared_diagonal(self.displacements, blocks, self._exact)
