@@ -1,13 +1,27 @@
 """Elements that are turned inside out: more than a body bears."""
 
 import functools
+from typing import Any
 
 import warp as wp
 
 from warp_corot.kernels.elements.elements import frame, local_gradient
 from warp_corot.kernels.modules import unique_kernel
 
+from .near import CRUSHED, Near
+from .watch import Watch
+
 wp.set_module_options({"enable_backward": False})
+
+#: Of elements with less of their volume a body's surface does not touch itself.
+FLAT = wp.constant(0.05)
+
+
+@wp.func
+def volume_ratio(elements: Any, t: int, u: wp.array[wp.vec4]):
+    """det F."""
+    q = frame(elements, t)
+    return wp.determinant(q + local_gradient(elements, t, u)) * wp.determinant(q)
 
 
 @functools.cache
@@ -17,8 +31,26 @@ def count_crushed(Elements: type) -> wp.Kernel:
     @unique_kernel()
     def count_crushed(elements: Elements, u: wp.array[wp.vec4], count: wp.array[wp.int32]):
         t = wp.tid()
-        q = frame(elements, t)
-        if wp.determinant(q + local_gradient(elements, t, u)) * wp.determinant(q) < 0.0:
+        if volume_ratio(elements, t, u) < 0.0:
             wp.atomic_add(count, 0, 1)
 
     return count_crushed
+
+
+@functools.cache
+def mark_crushed(Elements: type) -> wp.Kernel:
+    """Mark the surface nodes of elements that are turned inside out, or nearly so, where ``places`` says [nodes]."""
+
+    @unique_kernel()
+    def mark_crushed(watch: Watch, elements: Elements, u: wp.array[wp.vec4], places: wp.array[wp.int32], near: Near):
+        t = wp.tid()
+        if watch.due[0] == 0:
+            return
+        if volume_ratio(elements, t, u) < FLAT:
+            nodes = elements.nodes[t]
+            for k in range(4):
+                place = places[nodes[k]]
+                if place >= 0:
+                    wp.atomic_or(near.flags, place, CRUSHED)
+
+    return mark_crushed

@@ -9,6 +9,8 @@ wp.set_module_options({"enable_backward": False})
 
 #: What is near a node: another soft surface, an obstacle, or an obstacle at a triangle around it.
 PAIRED, BESIDE, AROUND = wp.constant(1), wp.constant(2), wp.constant(4)
+#: Any of these; and that the node is of an element that is turned inside out.
+SOMETHING, CRUSHED = wp.constant(7), wp.constant(8)
 
 
 @wp.struct
@@ -24,7 +26,7 @@ class Near:
 
 @wp.func
 def mark(near: Near, s: int, flag: int):
-    if wp.atomic_or(near.flags, s, flag) == 0:
+    if (wp.atomic_or(near.flags, s, flag) & SOMETHING) == 0:
         near.nodes[wp.atomic_add(near.count, 0, 1)] = s
 
 

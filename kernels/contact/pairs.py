@@ -21,8 +21,7 @@ wp.set_module_options({"enable_backward": False})
 BAND = wp.constant(0.25)
 #: So far from a triangle's border, as a share of its size, a node still is at the triangle.
 BORDER = wp.constant(0.02)
-#: The ends of edges, as a share of these, where nodes are looked at instead; and the sine between edges that are not
-#: taken for parallel.
+#: The ends of edges where nodes are looked at instead, as a share; and the sine between edges that are not parallel.
 ENDS = wp.constant(1.0e-3)
 PARALLEL = wp.constant(0.05)
 
@@ -33,6 +32,7 @@ class Meeting:
 
     body: wp.array[wp.int32]  # [S]
     triangles: wp.array[wp.vec3i]  # [T]
+    opposite: wp.array[wp.int32]  # [T] the fourth nodes of their tetrahedra, -1 inside the body
     edges: wp.array[wp.vec2i]  # [E] places, -1 where there is none
     sides: wp.array[wp.vec2i]  # [E] their two triangles
     reach: wp.array[wp.float32]  # [S] how far a node may go until pairs are looked for again [m]

@@ -2,9 +2,10 @@
 
 import warp as wp
 
+from .boxes import edge_reach, triangle_reach, triangle_size
 from .closest import on_segments, on_triangle, point_of
 from .motion import Surface
-from .near import PAIRED, Near, mark
+from .near import CRUSHED, PAIRED, Near, mark
 from .pairs import BAND, Meeting, Rows, row_count, triangle_normal
 from .watch import Watch
 
@@ -12,8 +13,6 @@ wp.set_module_options({"enable_backward": False})
 
 #: The sine of the angle from which on an edge is sharp.
 SHARP = wp.constant(0.15)
-#: Where boxes of nothing are [m].
-NOWHERE = wp.constant(1.0e6)
 
 
 @wp.struct
@@ -24,55 +23,6 @@ class OldRows:
     counts: wp.array[wp.int32]  # [S + E]
     other: wp.array[wp.int32]
     force: wp.array[wp.vec3]
-
-
-@wp.func
-def triangle_size(surface: Surface, c: wp.vec3i):
-    a = surface.x[c[0]]
-    return wp.sqrt(wp.length(wp.cross(surface.x[c[1]] - a, surface.x[c[2]] - a)))
-
-
-@wp.func
-def triangle_reach(surface: Surface, meeting: Meeting, c: wp.vec3i):
-    return wp.max(meeting.reach[c[0]], wp.max(meeting.reach[c[1]], meeting.reach[c[2]]))
-
-
-@wp.func
-def edge_reach(meeting: Meeting, e: wp.vec2i):
-    return wp.max(meeting.reach[e[0]], meeting.reach[e[1]])
-
-
-@wp.kernel(enable_backward=False)
-def box_triangles(surface: Surface, meeting: Meeting, lower: wp.array[wp.vec3], upper: wp.array[wp.vec3]):
-    t = wp.tid()
-    c = meeting.triangles[t]
-    if c[0] < 0:
-        lower[t] = wp.vec3(NOWHERE, NOWHERE, NOWHERE)
-        upper[t] = lower[t]
-        return
-    a = surface.x[c[0]]
-    b = surface.x[c[1]]
-    e = surface.x[c[2]]
-    far = triangle_reach(surface, meeting, c) + BAND * triangle_size(surface, c)
-    beyond = wp.vec3(far, far, far)
-    lower[t] = wp.min(a, wp.min(b, e)) - beyond
-    upper[t] = wp.max(a, wp.max(b, e)) + beyond
-
-
-@wp.kernel(enable_backward=False)
-def box_edges(surface: Surface, meeting: Meeting, lower: wp.array[wp.vec3], upper: wp.array[wp.vec3]):
-    k = wp.tid()
-    e = meeting.edges[k]
-    if e[0] < 0:
-        lower[k] = wp.vec3(NOWHERE, NOWHERE, NOWHERE)
-        upper[k] = lower[k]
-        return
-    a = surface.x[e[0]]
-    b = surface.x[e[1]]
-    far = edge_reach(meeting, e) + BAND * wp.length(b - a)
-    beyond = wp.vec3(far, far, far)
-    lower[k] = wp.min(a, b) - beyond
-    upper[k] = wp.max(a, b) + beyond
 
 
 @wp.func
@@ -100,18 +50,20 @@ def is_sharp(surface: Surface, meeting: Meeting, k: int):
 
 
 @wp.func
-def may_meet(s: int, r: int, surface: Surface, meeting: Meeting):
+def may_meet(s: int, r: int, flags: int, surface: Surface, meeting: Meeting):
+    """Whether two places may. What is turned inside out has passed through the body it is of, and has to get back."""
     if surface.world[s] != surface.world[r]:
         return False
-    return meeting.meets_itself != 0 or meeting.body[s] != meeting.body[r]
+    return meeting.body[s] != meeting.body[r] or (meeting.meets_itself != 0 and (flags & CRUSHED) == 0)
 
 
 @wp.func
-def node_is_near(s: int, t: int, surface: Surface, meeting: Meeting):
+def node_is_near(s: int, t: int, surface: Surface, meeting: Meeting, near: Near):
     c = meeting.triangles[t]
-    if c[0] < 0 or c[0] == s or c[1] == s or c[2] == s:
+    if c[0] < 0 or c[0] == s or c[1] == s or c[2] == s or meeting.opposite[t] == s:
         return False
-    if not may_meet(s, c[0], surface, meeting):
+    flags = near.flags[s] | near.flags[c[0]] | near.flags[c[1]] | near.flags[c[2]]
+    if not may_meet(s, c[0], flags, surface, meeting):
         return False
     a = surface.x[c[0]]
     b = surface.x[c[1]]
@@ -125,12 +77,29 @@ def node_is_near(s: int, t: int, surface: Surface, meeting: Meeting):
 
 
 @wp.func
-def edge_is_near(k: int, m: int, surface: Surface, meeting: Meeting):
+def is_opposite(e: wp.vec2i, m: int, meeting: Meeting):
+    """Whether an edge lies opposite to edge m in a tetrahedron at one of its triangles."""
+    f = meeting.edges[m]
+    for k in range(2):
+        t = meeting.sides[m][k]
+        c = meeting.triangles[t]
+        a = meeting.opposite[t]
+        b = c[0] + c[1] + c[2] - f[0] - f[1]
+        if (e[0] == a and e[1] == b) or (e[0] == b and e[1] == a):
+            return True
+    return False
+
+
+@wp.func
+def edge_is_near(k: int, m: int, surface: Surface, meeting: Meeting, near: Near):
     e = meeting.edges[k]
     f = meeting.edges[m]
     if f[0] < 0 or e[0] == f[0] or e[0] == f[1] or e[1] == f[0] or e[1] == f[1]:
         return False
-    if not may_meet(e[0], f[0], surface, meeting):
+    flags = near.flags[e[0]] | near.flags[e[1]] | near.flags[f[0]] | near.flags[f[1]]
+    if not may_meet(e[0], f[0], flags, surface, meeting):
+        return False
+    if is_opposite(e, m, meeting):
         return False
     p = surface.x[e[0]]
     q = surface.x[e[1]]
@@ -157,7 +126,7 @@ def add_other(start: int, count: int, other: int, rows: Rows):
 
 
 @wp.func
-def near_node(i: int, start: int, of_triangles: wp.uint64, surface: Surface, meeting: Meeting, rows: Rows):
+def near_node(i: int, start: int, of_triangles: wp.uint64, surface: Surface, meeting: Meeting, near: Near, rows: Rows):
     """Count the triangles near a node; write them if there is a start."""
     count = int(0)
     reach = meeting.reach[i]
@@ -165,7 +134,7 @@ def near_node(i: int, start: int, of_triangles: wp.uint64, surface: Surface, mee
     query = wp.bvh_query_aabb(of_triangles, surface.x[i] - beyond, surface.x[i] + beyond)
     t = int(0)
     while wp.bvh_query_next(query, t):
-        if node_is_near(i, t, surface, meeting):
+        if node_is_near(i, t, surface, meeting, near):
             if start >= 0:
                 add_other(start, count, t, rows)
             count += 1
@@ -173,7 +142,7 @@ def near_node(i: int, start: int, of_triangles: wp.uint64, surface: Surface, mee
 
 
 @wp.func
-def near_edge(k: int, start: int, of_edges: wp.uint64, surface: Surface, meeting: Meeting, rows: Rows):
+def near_edge(k: int, start: int, of_edges: wp.uint64, surface: Surface, meeting: Meeting, near: Near, rows: Rows):
     """Count the edges near a sharp one; write them if there is a start."""
     count = int(0)
     e = meeting.edges[k]
@@ -184,7 +153,7 @@ def near_edge(k: int, start: int, of_edges: wp.uint64, surface: Surface, meeting
     query = wp.bvh_query_aabb(of_edges, wp.min(a, b) - beyond, wp.max(a, b) + beyond)
     m = int(0)
     while wp.bvh_query_next(query, m):
-        if edge_is_near(k, m, surface, meeting):
+        if edge_is_near(k, m, surface, meeting, near):
             if start >= 0:
                 add_other(start, count, m, rows)
             count += 1
@@ -199,15 +168,16 @@ def near_owner(
     of_edges: wp.uint64,
     surface: Surface,
     meeting: Meeting,
+    near: Near,
     rows: Rows,
 ):
     nodes = meeting.body.shape[0]
     count = int(0)
     if i < nodes:
         if surface.node[i] >= 0:
-            count = near_node(i, start, of_triangles, surface, meeting, rows)
+            count = near_node(i, start, of_triangles, surface, meeting, near, rows)
     elif is_sharp(surface, meeting, i - nodes):
-        count = near_edge(i - nodes, start, of_edges, surface, meeting, rows)
+        count = near_edge(i - nodes, start, of_edges, surface, meeting, near, rows)
     return count
 
 
@@ -247,7 +217,7 @@ def find_pairs(
     if watch.due[0] == 0:
         return
     room = rows.owner.shape[0]
-    count = near_owner(i, -1, of_triangles, of_edges, surface, meeting, rows)
+    count = near_owner(i, -1, of_triangles, of_edges, surface, meeting, near, rows)
     start = int(0)
     rows.counts[i] = 0
     if count > 0:
@@ -261,7 +231,7 @@ def find_pairs(
         return
     if count == 0:
         return
-    near_owner(i, start, of_triangles, of_edges, surface, meeting, rows)
+    near_owner(i, start, of_triangles, of_edges, surface, meeting, near, rows)
     rows.counts[i] = count
     before = old.starts[i]
     last = before + old.counts[i]

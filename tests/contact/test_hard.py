@@ -172,17 +172,18 @@ def square_rod(r, half):
 
 @pytest.mark.filterwarnings("ignore::warp_corot.StabilityWarning")
 @pytest.mark.parametrize(
-    ("kind", "radius", "speed", "seed"),
-    [("capsule", 0.003, 10.0, 2)]
+    ("kind", "radius", "speed", "seed", "itself"),
+    [("capsule", 0.003, 10.0, 2, False), ("box", 0.0025, 10.0, 0, True)]
     + [
-        pytest.param(kind, radius, speed, seed, marks=pytest.mark.slow)
+        pytest.param(kind, radius, speed, seed, itself, marks=pytest.mark.slow)
         for kind, radius in (("capsule", 5e-4), ("capsule", 5e-3), *((kind, 3e-3) for kind in SHARP))
         for seed, speed in enumerate((0.1, 1.0, 10.0, 50.0))
+        for itself in (False, True)
     ],
 )
-def test_a_thin_tool_stabs_an_organ(device, kind, radius, speed, seed):
+def test_a_thin_tool_stabs_an_organ(device, kind, radius, speed, seed, itself):
     """24 mm deep into a ball of 60 mm of elements larger than the tool, whose elements it turns inside out: the run
-    goes on, nothing is thrown, and the body is whole once the tool has gone."""
+    goes on, nothing is thrown, and the body is whole once the tool has gone, also where it touches itself."""
     mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.03, device=device), target_elements=1500, device=device)
     points = mesh.points
     body = wc.SoftBody(mesh, wc.Isotropic(2e4, 0.4, 1000.0), device=device)
@@ -196,7 +197,8 @@ def test_a_thin_tool_stabs_an_organ(device, kind, radius, speed, seed):
     turn = np.append(np.cross((0.0, 0.0, 1.0), way), 1.0 + way[2])
     tool.follow([0.0, taken, taken + 0.01, 2 * taken + 0.02], np.outer((begins, ends, ends, begins), way), turn)
     integrator = wc.SymplecticEuler(viscosity=2e-3)
-    sim = wc.Simulation(body, obstacles=tool, gravity=(0.0, 0.0, 0.0), integrator=integrator)
+    contact = wc.Contact(self_contact=itself)
+    sim = wc.Simulation(body, obstacles=tool, contact=contact, gravity=(0.0, 0.0, 0.0), integrator=integrator)
     felt = 0.0
     for _ in range(10):
         sim.advance(0.1 * (taken + 0.01))

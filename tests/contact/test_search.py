@@ -39,6 +39,8 @@ def within_reach(contacts, itself):
     c = corners[t]
     may = (c != s[:, None]).all(axis=1) & (world[s] == world[c[:, 0]])
     may &= itself | (body[s] != body[c[:, 0]])
+    # A node does not meet the face opposite to it in its own tetrahedron.
+    may &= surface.opposite.numpy()[t] != s
     s, t, c = s[may], t[may], c[may]
     far = closest(x[s], x[c[:, 0]], x[c[:, 1]], x[c[:, 2]])
     near = far <= step[s] + step[c].max(axis=1)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from warp_corot.kernels.contact import boxes
 from warp_corot.kernels.contact import pairs as kernels
 from warp_corot.kernels.contact import search as search_kernels
+from warp_corot.kernels.contact.crushed import mark_crushed
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.stepping.pace import Pace
 
@@ -54,6 +56,7 @@ class Pairs:
         meeting = kernels.Meeting()
         meeting.body = wp.array(surface.body_of_places(), dtype=wp.int32, device=device)
         meeting.triangles, meeting.edges, meeting.sides = surface.triangles, surface.edges, surface.sides
+        meeting.opposite = surface.opposite
         meeting.reach = self.search.watch.reach
         meeting.meets_itself, meeting.friction = int(self.meets_itself), self.friction
         self._meeting = meeting
@@ -145,13 +148,15 @@ class Pairs:
 
     def _box(self) -> None:
         inputs = [self.surface.arrays, self._meeting]
-        boxed = (search_kernels.box_triangles, search_kernels.box_edges)
+        boxed = (boxes.box_triangles, boxes.box_edges)
         for kernel, (lower, upper) in zip(boxed, self._boxes, strict=True):
             wp.launch(kernel, len(lower), inputs, [lower, upper], device=self.device)
 
     def _find(self) -> None:
         """Launch the search for pairs."""
         watch, rows, old, device = self.search.watch, self.rows, self._old, self.device
+        if self.meets_itself:
+            self._mark_crushed()
         self._box()
         for tree in self._trees:
             tree.refit()
@@ -161,6 +166,13 @@ class Pairs:
         inputs = [watch, *(tree.id for tree in self._trees), self.surface.arrays, self._meeting, old]
         outputs = [rows, self.search.near, self.search.most]
         wp.launch(search_kernels.find_pairs, owners, inputs, outputs, device=device)
+
+    def _mark_crushed(self) -> None:
+        near, watch = self.search.near, self.search.watch
+        for body, places in zip(self.surface.bodies, self.surface.places, strict=True):
+            kernel, elements = mark_crushed(body.discretization.element_kind), body.discretization.elements
+            inputs = [watch, elements, body.state.displacements, places]
+            wp.launch(kernel, body.sizes.launch_elements, inputs, [near], device=self.device)
 
     def _on_rows(self, kernel: wp.Kernel, inputs: list) -> None:
         threads = self.search.threads(self._room)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.kernels.contact.motion import Surface
+from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -31,19 +32,26 @@ class Skin:
         triangles: Their places in ``nodes``, int32 [t, 3], counter-clockwise seen from outside.
         edges: The same of their edges, int32 [e, 2].
         sides: The two triangles at each edge, int32 [e, 2].
+        opposite: The place of the fourth node of each triangle's tetrahedron, int32 [t]; -1 inside the body.
     """
 
     nodes: Ints
     triangles: Ints
     edges: Ints
     sides: Ints
+    opposite: Ints
 
     @classmethod
     def of(cls, body: SoftBody) -> Skin:
         """Of a body's present mesh."""
-        nodes, places = np.unique(body.surface_triangles, return_inverse=True)
+        tets = body.mesh.tets
+        faces, parents = boundary_faces(tets, body.mesh.points)
+        nodes, places = np.unique(faces, return_inverse=True)
         triangles = places.reshape(-1, 3).astype(np.int32)
-        return cls(nodes.astype(np.int32), triangles, *_edges_of(triangles))
+        fourth = tets[parents].sum(axis=1) - faces.sum(axis=1)
+        found = np.minimum(np.searchsorted(nodes, fourth), len(nodes) - 1)
+        opposite = np.where(nodes[found] == fourth, found, -1).astype(np.int32)
+        return cls(nodes.astype(np.int32), triangles, *_edges_of(triangles), opposite)
 
 
 def _edges_of(triangles: Ints) -> tuple[Ints, Ints]:
@@ -87,9 +95,11 @@ class ContactSurface:
     Attributes:
         arrays: The nodes, as kernels take them.
         triangles: Places of their corners, vec3i [T]; -1 where there is none.
+        opposite: For each triangle the fourth node of its tetrahedron, int32 [T]; -1 inside the body.
         edges, sides: Places of the ends of edges, and the two triangles of each, vec2i [E]; -1 where there is none.
         corner_starts, corners: For each node, from one start to the next: three times a triangle and which corner.
         parts: Where each body is.
+        places: For each body the place of each node, int32 [nodes]; -1 inside.
         revision: Changes whenever arrays are others.
     """
 
@@ -127,7 +137,8 @@ class ContactSurface:
         if not changed:
             return False
         skins = [Skin.of(body) if k in changed else self.parts[k].skin for k, body in enumerate(self.bodies)]
-        fits = all(
+        fits = all(len(body.state.rest) == len(own) for body, own in zip(self.bodies, self.places, strict=True))
+        fits = fits and all(
             len(skin.nodes) <= part.nodes and len(skin.triangles) <= part.triangles and len(skin.edges) <= part.edges
             for skin, part in zip(skins, self.parts, strict=True)
         )
@@ -184,9 +195,11 @@ class ContactSurface:
         arrays.yielding = wp.zeros(count, dtype=wp.float32, device=device)
         self.arrays = arrays
         self.triangles = wp.empty(triangle_start, dtype=wp.vec3i, device=device)
+        self.opposite = wp.empty(triangle_start, dtype=wp.int32, device=device)
         self.edges, self.sides = (wp.empty(edge_start, dtype=wp.vec2i, device=device) for _ in range(2))
         self.corner_starts = wp.empty(count + 1, dtype=wp.int32, device=device)
         self.corners = wp.empty(3 * triangle_start, dtype=wp.int32, device=device)
+        self.places = [wp.empty(len(body.state.rest), dtype=wp.int32, device=device) for body in self.bodies]
         self.revision += 1
         self._fill()
 
@@ -194,6 +207,7 @@ class ContactSurface:
         """Bring the skins to the device."""
         node, world = (np.full(self.count, NO_NODE, np.int32) for _ in range(2))
         triangles = np.full((self.triangle_count, 3), -1, np.int32)
+        opposite = np.full(self.triangle_count, -1, np.int32)
         edges, sides = (np.full((self.edge_count, 2), -1, np.int32) for _ in range(2))
         for body, part in zip(self.bodies, self.parts, strict=True):
             for w in range(self.worlds):
@@ -202,11 +216,19 @@ class ContactSurface:
                 node[first : first + len(skin.nodes)] = skin.nodes + w * body.world_node_count
                 world[first : first + part.nodes] = w
                 triangles[first_triangle : first_triangle + len(skin.triangles)] = skin.triangles + first
+                own = slice(first_triangle, first_triangle + len(skin.opposite))
+                opposite[own] = np.where(skin.opposite < 0, -1, skin.opposite + first)
                 own = slice(part.edge_start + w * part.edges, part.edge_start + w * part.edges + len(skin.edges))
                 edges[own], sides[own] = skin.edges + first, skin.sides + first_triangle
+        for k, own in enumerate(self.places):
+            places = np.full(len(own), -1, np.int32)
+            used = np.flatnonzero(node[self.places_of(k)] >= 0) + self.parts[k].start
+            places[node[used]] = used
+            own.assign(places)
         self.arrays.node.assign(node)
         self.arrays.world.assign(world)
         self.triangles.assign(triangles)
+        self.opposite.assign(opposite)
         self.edges.assign(edges)
         self.sides.assign(sides)
         ends = triangles.ravel()
