@@ -17,6 +17,7 @@ Functions here take the displacement gradient A as ``constitutive`` has it. The 
 those of subtrees' forces in ``subtrees.dilatation``.
 """
 
+import functools
 from typing import NamedTuple
 
 import warp as wp
@@ -161,3 +162,19 @@ LOG_VOLUME = Dilatation(
 def mean_of(sum: float, weight: float):
     """A weighted mean; zero where nothing has weight."""
     return wp.where(weight != 0.0, sum / wp.where(weight != 0.0, weight, 1.0), 0.0)
+
+
+@functools.cache
+def pressure_stress_of(of: Dilatation) -> wp.Function:
+    """First Piola-Kirchhoff stress of an element with displacement gradient A.
+
+    ``pressure`` is w' of the dilatation that it shares, ``weight`` is lambda or in proportion to it.
+    """
+    measure, holding = of.measure, of.holding
+
+    @wp.func
+    def pressure_stress(a: wp.mat33, pressure: float, weight: float):
+        theta, slope = measure(a)
+        return (weight * (pressure + holding(theta)[1])) * slope
+
+    return pressure_stress

@@ -16,7 +16,7 @@ import warp as wp
 from warp_corot.kernels.modules import unique_kernel
 
 from .constitutive import IsotropicMaterial
-from .dilatation import Dilatation, mean_of
+from .dilatation import Dilatation, mean_of, pressure_stress_of
 from .elements import add_force, add_nodal_forces, rest_volume
 from .forces import in_local_frame, own_gradient
 
@@ -226,7 +226,7 @@ def scatter(elements: Any, targets: wp.vec4i, t: int, stress: wp.mat33, f: wp.ar
 @functools.cache
 def scatter_pressures(Elements: type, of: Dilatation) -> wp.Kernel:
     """Add forces."""
-    measure, holding = of.measure, of.holding
+    pressure_stress = pressure_stress_of(of)
 
     @unique_kernel()
     def scatter_pressures(
@@ -243,9 +243,9 @@ def scatter_pressures(Elements: type, of: Dilatation) -> wp.Kernel:
         t = wp.tid()
         if not is_live(live, t):
             return
-        theta, slope = measure(own_gradient(elements, t, u))
         place = place_of(places, t)
-        stress = (material.lam[place * material.stride] * (shared[place][1] + holding(theta)[1])) * slope
+        lam = material.lam[place * material.stride]
+        stress = pressure_stress(own_gradient(elements, t, u), shared[place][1], lam)
         scatter(elements, elements.targets[t], t, stress, f)
 
     return scatter_pressures

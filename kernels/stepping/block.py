@@ -5,6 +5,9 @@ thread takes a complete subtree, or a part of its leaves where there are too few
 nodal forces to slots; then each thread sums up the slots of a node and moves it. Nothing is added atomically, so runs
 are reproducible bit by bit, and nothing leaves the multiprocessor but the state at the end.
 
+Where the leaves of a subtree share their dilatation, its threads leave their sums of it in shared memory, and add the
+forces of the pressure to their slots in a second pass.
+
 CUDA only. ``tables.block_layout`` says which thread does what.
 """
 
@@ -14,11 +17,15 @@ import warp as wp
 
 from warp_corot.kernels.corotated.algebraic import turned_stress
 from warp_corot.kernels.elements.constitutive import hooke, symmetric
+from warp_corot.kernels.elements.dilatation import VOLUME as VOLUME_CHANGE
+from warp_corot.kernels.elements.dilatation import mean_of
 from warp_corot.kernels.elements.elements import FRAME_SHIFT, LEVEL_MASK, Subtrees, load_node, mirror_sign, store_node
 from warp_corot.kernels.math.matrices import column, identity3
 from warp_corot.kernels.math.quaternion import robust_rotation
 from warp_corot.kernels.modules import unique_kernel
+from warp_corot.kernels.subtrees.dilatation import dilatation_sums_of, pressure_forces_of
 from warp_corot.kernels.subtrees.forces import columns_of, leaf_forces_of, mat10, near_forces, shared_forces
+from warp_corot.kernels.subtrees.laws import turn_in, turn_out
 from warp_corot.kernels.tables.block_layout import (
     FIRST_SHIFT,
     FOLLOWING_SHIFT,
@@ -151,6 +158,25 @@ def shared_vectors(count: int, tag: str) -> wp.Function:
 
     @wp.func_native(snippet)
     def memory(access: int, i: int, value: wp.vec3) -> wp.vec3: ...
+
+    return memory
+
+
+def shared_numbers(count: int, tag: str) -> wp.Function:
+    """An array of numbers in shared memory, as one function that reads or writes it."""
+    snippet = f"""
+#if defined(__CUDA_ARCH__)
+    // {tag}
+    __shared__ float memory[{count}];
+    if (access == {STORE}) memory[i] = value;
+    return memory[i];
+#else
+    return value;
+#endif
+"""
+
+    @wp.func_native(snippet)
+    def memory(access: int, i: int, value: float) -> float: ...
 
     return memory
 
@@ -305,6 +331,8 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
     """Symplectic Euler steps of the corotated model, a block a world; launch with ``layout.threads`` a block.
 
     Args:
+        layout: Who does what. Where leaves share their dilatation, the law's ``lam`` is zero, and that of the
+            dilatation is ``shared_lam``.
         load_vectors: What loads are an array of, vec3 or vec4.
     """
     shape, shared, uniform, parts = layout.shape, layout.shared, layout.uniform, layout.parts
@@ -314,6 +342,11 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
     needs, places = [layout.needs(part) for part in range(parts)], layout.places
     displacement, velocity = shared_vectors(layout.nodes, "displacements"), shared_vectors(layout.nodes, "velocities")
     slot = shared_vectors(zero_slot + 1, "forces")
+    dilating, of = layout.dilating, VOLUME_CHANGE
+    slope_of = of.slope
+    measure = [dilatation_sums_of(shape, uniform, of, layout.leaves(part)) for part in range(parts)]
+    press = [pressure_forces_of(shape, uniform, of, layout.leaves(part)) for part in range(parts)]
+    sums = shared_numbers(max(layout.sum_count, 1), "sums of dilatations")
     waiting, enlist, do_one, collect = _left_out_of(layout, displacement, slot)
 
     @unique_kernel(
@@ -328,6 +361,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
         gravity: wp.vec3,
         mu: wp.array[wp.float32],
         lam: wp.array[wp.float32],
+        shared_lam: wp.array[wp.float32],
         stride: int,
         mass: wp.array[wp.float32],
         inverse_mass: wp.array[wp.float32],
@@ -390,6 +424,11 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
                                     number_in(words[k // wp.static(NUMBERS)], k % wp.static(NUMBERS)),
                                     wp.vec3(),
                                 )
+                        if wp.static(dilating):
+                            y = turn_in(x, column(q, 0), column(q, 1), column(q, 2) * mirror, 1.0 / h)
+                            sum, weight = wp.static(measure[p])(y, shared_lam, material)
+                            sums(wp.static(STORE), wp.static(2 * p * capacity) + s, sum)
+                            sums(wp.static(STORE), wp.static((2 * p + 1) * capacity) + s, weight)
                         g = mat10()
                         if wp.static(shared):
                             g, left_out = wp.static(turned[p])(x, q, h, mirror, wp.mat33(), mu, lam, material)
@@ -408,6 +447,34 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
                     waiting(wp.static(CLEAR), 0, 0)
                 synchronize_block()
                 listed = enlist(thread, left_out)
+            if wp.static(dilating):
+                if s < body.subtree_count:
+                    sum = float(0.0)
+                    weight = float(0.0)
+                    for p in range(wp.static(parts)):
+                        sum += sums(wp.static(LOAD), wp.static(2 * p * capacity) + s, sum)
+                        weight += sums(wp.static(LOAD), wp.static((2 * p + 1) * capacity) + s, weight)
+                    pressure = slope_of(mean_of(sum, weight))
+                    for p in range(wp.static(parts)):
+                        if part == p:
+                            x = mat10()
+                            for k in range(10):
+                                if wp.static(needs[p][k]):
+                                    x[k] = displacement(
+                                        wp.static(LOAD_BYTES),
+                                        number_in(words[k // wp.static(NUMBERS)], k % wp.static(NUMBERS)),
+                                        wp.vec3(),
+                                    )
+                            q0 = column(q, 0)
+                            q1 = column(q, 1)
+                            q2 = column(q, 2) * mirror
+                            y = turn_in(x, q0, q1, q2, 1.0 / h)
+                            g = turn_out(wp.static(press[p])(y, h, pressure, shared_lam, material), q0, q1, q2)
+                            for k in range(10):
+                                if wp.static(places[p][k] >= 0):
+                                    at = s + wp.static(places[p][k] * capacity)
+                                    slot(wp.static(STORE), at, slot(wp.static(LOAD), at, g[k]) + g[k])
+                synchronize_block()
             task = thread
             while task < wp.static(layout.tasks):
                 if wp.static(layout.tasks > threads):

@@ -6,6 +6,10 @@ for those of its halo, the other corners of its elements. Each is one word of 16
 the last four; a reader that sees the number has the value, without fences or counters. Two buffers take turns: a block
 publishes step n + 1 only when it has seen step n of all its neighbours, who then have read its step n - 1.
 
+Where elements share their dilatation, a block also measures the other elements of its elements' groups. Each element
+leaves its dilatation in the row of its group; a thread a group adds them up; and a second pass adds the forces of the
+pressure.
+
 All blocks of a launch must be on the card at once, one to a multiprocessor. Sums have one order, so runs are
 reproducible bit by bit. CUDA only; ``solvers.patch_layout`` says which block does what.
 """
@@ -16,6 +20,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from warp_corot.kernels.corotated.algebraic import stretch_stress, turned_stress
+from warp_corot.kernels.elements.dilatation import VOLUME, pressure_stress_of
 from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.math.matrices import column, identity3
 from warp_corot.kernels.modules import unique_kernel
@@ -47,6 +52,7 @@ class Layout:
         elements, halo: Elements, and nodes of the halo, a thread.
         lanes: Threads that add up one node.
         nodes, slots: Room for displacements and for forces in shared memory; one more slot takes what nobody adds up.
+        groups, members: Room for groups that share a dilatation and for the elements of each; none: elements do not.
         overlaps: Whether a block computes the elements that need no halo before it waits for that.
     """
 
@@ -56,12 +62,18 @@ class Layout:
     lanes: int
     nodes: int
     slots: int
+    groups: int = 0
+    members: int = 0
     overlaps: bool = True
+
+    @property
+    def vectors(self) -> int:
+        return self.nodes + self.slots + 1
 
     @property
     def floats(self) -> int:
         """The shared memory for all of that, in numbers of four bytes."""
-        return 3 * (self.nodes + self.slots + 1)
+        return 3 * self.vectors + self.groups * (self.members + 2)
 
 
 @wp.struct
@@ -75,6 +87,8 @@ class PatchBody:
     elements: wp.array[wp.int32]  # [E]
     element_start: wp.array[wp.int32]
     interior: wp.array[wp.int32]  # [patches] how many of a patch's elements need no halo; they come first
+    computed: wp.array[wp.int32]  # [patches] how many it computes; it only measures the others
+    measures: wp.array[wp.int32]  # [E] where an element's dilatation goes: group by group, one row a member
     corners: wp.array[wp.uint64]  # [E] the four corners' places among the patch's nodes, 16 bits each
     slots: wp.array[wp.uint64]  # [E] the same of their forces
     bases: wp.array[wp.int32]
@@ -154,6 +168,25 @@ def vectors_at(first: int) -> wp.Function:
     return memory
 
 
+def numbers_at(first: int) -> wp.Function:
+    """An array of numbers in the same memory, from this number on."""
+    snippet = f"""
+#if defined(__CUDA_ARCH__)
+    extern __shared__ char dynamic_smem_base[];
+    float* at = (float*)dynamic_smem_base + {first} + i;
+    if (access == {STORE}) *at = value;
+    return *at;
+#else
+    return value;
+#endif
+"""
+
+    @wp.func_native(snippet)
+    def memory(access: int, i: int, value: float) -> float: ...
+
+    return memory
+
+
 @wp.func
 def rest_inverse(c: row):
     return wp.mat33(c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8])
@@ -178,9 +211,17 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
     """
     threads, each, halo_each, lanes = layout.threads, layout.elements, layout.halo, layout.lanes
     slot, displacement = vectors_at(0), vectors_at(layout.slots + 1)
+    # What elements of groups leave, the weights of groups, inverted, and their pressures.
+    shares, groups, members = layout.groups > 0, layout.groups, layout.members
+    first_number = 3 * layout.vectors
+    measured = numbers_at(first_number)
+    inverse_weight = numbers_at(first_number + groups * members)
+    pressure_of = numbers_at(first_number + groups * (members + 1))
+    measure, slope_of, pressure_stress = VOLUME.measure, VOLUME.slope, pressure_stress_of(VOLUME)
     words = wp.types.vector(length=each, dtype=wp.uint64)
     numbers = wp.types.matrix(shape=(each, CONSTANTS), dtype=wp.float32)
     places = wp.types.vector(length=halo_each, dtype=wp.int32)
+    group_places = wp.types.vector(length=each, dtype=wp.int32)
 
     @wp.func
     def displacement_gradient(corners: wp.uint64, c: row):
@@ -191,11 +232,33 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         return wp.matrix_from_cols(x1 - x0, x2 - x0, x3 - x0) * rest_inverse(c)
 
     @wp.func
-    def store_forces(targets: wp.uint64, c: row, p: wp.mat33):
+    def corner_forces(c: row, p: wp.mat33):
+        """Those on the corners but the first."""
         h = p * wp.transpose(rest_inverse(c))
-        f1 = -column(h, 0)
-        f2 = -column(h, 1)
-        f3 = -column(h, 2)
+        return -column(h, 0), -column(h, 1), -column(h, 2)
+
+    @wp.func
+    def add_to_slot(i: int, force: wp.vec3):
+        slot(wp.static(STORE), i, slot(wp.static(LOAD), i, force) + force)
+
+    @wp.func
+    def add_forces(targets: wp.uint64, c: row, p: wp.mat33):
+        f1, f2, f3 = corner_forces(c, p)
+        add_to_slot(number_in(targets, 0), -(f1 + f2 + f3))
+        add_to_slot(number_in(targets, 1), f1)
+        add_to_slot(number_in(targets, 2), f2)
+        add_to_slot(number_in(targets, 3), f3)
+
+    @wp.func
+    def sum_of_group(group: int):
+        sum = float(0.0)
+        for member in range(wp.static(members)):
+            sum += measured(wp.static(LOAD), wp.static(member * groups) + group, sum)
+        return sum
+
+    @wp.func
+    def store_forces(targets: wp.uint64, c: row, p: wp.mat33):
+        f1, f2, f3 = corner_forces(c, p)
         slot(wp.static(STORE), number_in(targets, 0), -(f1 + f2 + f3))
         slot(wp.static(STORE), number_in(targets, 1), f1)
         slot(wp.static(STORE), number_in(targets, 2), f2)
@@ -268,12 +331,14 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
 
         first_element = body.element_start[block]
         element_count = body.element_start[block + 1] - first_element
+        computed_count = body.computed[block]
         interior_count = int(0)
         if wp.static(layout.overlaps):
             interior_count = body.interior[block]
         corners = words()
         targets = words()
         constants = numbers()
+        group_place = group_places()
         for k in range(wp.static(each)):
             at = thread + k * wp.static(threads)
             if at < element_count:
@@ -286,6 +351,8 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                 t = body.elements[e] * stride
                 constants[k, 9] = volume * mu[t]
                 constants[k, 10] = volume * lam[t]
+                if wp.static(shares):
+                    group_place[k] = body.measures[e]
 
         # ``slot`` and ``displacement``; places that no corner has are read too, and stay zero.
         _memory = wp.tile_zeros(shape=wp.static(layout.floats), dtype=wp.float32, storage="shared")
@@ -293,6 +360,17 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         if moves:
             displacement(wp.static(STORE), place, x)
             publish(exchange.published, int(number & wp.uint32(1)) * node_count + i, x, number)
+        if wp.static(shares):
+            for k in range(wp.static(each)):
+                if thread + k * wp.static(threads) < element_count:
+                    measured(wp.static(STORE), group_place[k], constants[k, 10])
+            synchronize_block()
+            if thread < wp.static(groups):
+                weight = sum_of_group(thread)
+                inverse = float(0.0)
+                if weight != 0.0:
+                    inverse = 1.0 / weight
+                inverse_weight(wp.static(STORE), thread, inverse)
 
         gave_up = int(0)
         step = int(0)
@@ -321,11 +399,18 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                     at = thread + k * wp.static(threads)
                     if at >= begin and at < end:
                         c = constants[k]
-                        p, trusted = stretch_stress(displacement_gradient(corners[k], c), c[9], c[10])
-                        if trusted:
-                            store_forces(targets[k], c, p)
-                        else:
-                            left_out |= wp.static(1 << k)
+                        gradient = displacement_gradient(corners[k], c)
+                        lambda_part = c[10]
+                        if wp.static(shares):
+                            theta, _slope = measure(gradient)
+                            measured(wp.static(STORE), group_place[k], lambda_part * theta)
+                            lambda_part = 0.0
+                        if at < computed_count:
+                            p, trusted = stretch_stress(gradient, c[9], lambda_part)
+                            if trusted:
+                                store_forces(targets[k], c, p)
+                            else:
+                                left_out |= wp.static(1 << k)
                 phase += 1
             if gave_up != 0:
                 break
@@ -342,8 +427,23 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                         its_targets = targets[k]
                         c = constants[k]
                 f = identity3() + displacement_gradient(its_corners, c)
-                store_forces(its_targets, c, turned_stress(f, c[9], c[10]))
+                lambda_part = c[10]
+                if wp.static(shares):
+                    lambda_part = 0.0
+                store_forces(its_targets, c, turned_stress(f, c[9], lambda_part))
             synchronize_block()
+            if wp.static(shares):
+                if thread < wp.static(groups):
+                    mean = sum_of_group(thread) * inverse_weight(wp.static(LOAD), thread, 0.0)
+                    pressure_of(wp.static(STORE), thread, slope_of(mean))
+                synchronize_block()
+                for k in range(wp.static(each)):
+                    if thread + k * wp.static(threads) < computed_count:
+                        c = constants[k]
+                        pressure = pressure_of(wp.static(LOAD), group_place[k] % wp.static(groups), 0.0)
+                        p = pressure_stress(displacement_gradient(corners[k], c), pressure, c[10])
+                        add_forces(targets[k], c, p)
+                synchronize_block()
 
             elastic = wp.vec3()
             row = int(0)

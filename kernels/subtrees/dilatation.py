@@ -10,7 +10,7 @@ import functools
 import warp as wp
 
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
-from warp_corot.kernels.elements.dilatation import Dilatation, mean_of
+from warp_corot.kernels.elements.dilatation import Dilatation, mean_of, pressure_stress_of
 from warp_corot.kernels.elements.dilatation_lanes import law_of
 from warp_corot.kernels.elements.elements import FRAME_SHIFT, LEVEL_MASK, Subtrees, mirror_sign
 from warp_corot.kernels.elements.lanes import ISOTROPIC, native, scatter_lanes
@@ -37,20 +37,22 @@ def scatter_in_lanes(shape: int, of: Dilatation) -> wp.Kernel:
 
 
 @functools.cache
-def dilatation_forces_of(shape: int, uniform: bool, of: Dilatation) -> wp.Function:
-    """Forces of the shared dilatation from ten displacements, both in the frame of ``laws.turn_in``."""
-    measure, slope_of, holding = of.measure, of.slope, of.holding
-    columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
-    leaves, volume = LEAVES[shape], VOLUME[shape]
-    into_leaf, out_of_leaf = turns_of(shape)
+def dilatation_sums_of(shape: int, uniform: bool, of: Dilatation, chosen: range = range(8)) -> wp.Function:
+    """The sums of lambda theta and of lambda over the chosen leaves, whose volumes are equal.
+
+    Displacements are ten, in the frame of ``laws.turn_in``.
+    """
+    measure, columns = of.measure, columns_of(shape)
+    leaves, begin, end = LEAVES[shape], chosen.start, chosen.stop
+    into_leaf, _out_of_leaf = turns_of(shape)
 
     @wp.func
-    def dilatation_forces(y: mat10, h: float, lam: wp.array[wp.float32], first: int):
-        _generated_from = wp.static(fingerprint(leaves))
+    def dilatation_sums(y: mat10, lam: wp.array[wp.float32], first: int):
+        _generated_from = wp.static(fingerprint(leaves, begin, end))
         k = lam[first]
         sum = float(0.0)
         weight = float(0.0)
-        for leaf in range(8):
+        for leaf in range(wp.static(begin), wp.static(end)):
             if wp.static(not uniform):
                 k = lam[first + leaf]
             b0, b1, b2 = columns(
@@ -62,11 +64,27 @@ def dilatation_forces_of(shape: int, uniform: bool, of: Dilatation) -> wp.Functi
             theta, _slope = measure(into_leaf(leaf, wp.matrix_from_cols(b0, b1, b2)))
             sum += k * theta
             weight += k
-        pressure = slope_of(mean_of(sum, weight))
+        return sum, weight
+
+    return dilatation_sums
+
+
+@functools.cache
+def pressure_forces_of(shape: int, uniform: bool, of: Dilatation, chosen: range = range(8)) -> wp.Function:
+    """Forces of the chosen leaves from ten displacements as before, and from the slope of the energy at the dilatation
+    that all eight share."""
+    stress, columns, leaf_forces = pressure_stress_of(of), columns_of(shape), leaf_forces_of(shape)
+    leaves, volume, begin, end = LEAVES[shape], VOLUME[shape], chosen.start, chosen.stop
+    into_leaf, out_of_leaf = turns_of(shape)
+
+    @wp.func
+    def pressure_forces(y: mat10, h: float, pressure: float, lam: wp.array[wp.float32], first: int):
+        _generated_from = wp.static(fingerprint(leaves, begin, end))
+        k = lam[first]
         # P V / h is the stress times this.
         area = wp.static(volume) * h * h
         g = mat10()
-        for leaf in range(8):
+        for leaf in range(wp.static(begin), wp.static(end)):
             if wp.static(not uniform):
                 k = lam[first + leaf]
             b0, b1, b2 = columns(
@@ -75,8 +93,7 @@ def dilatation_forces_of(shape: int, uniform: bool, of: Dilatation) -> wp.Functi
                 y[wp.static(leaves[leaf][2])],
                 y[wp.static(leaves[leaf][3])],
             )
-            theta, slope = measure(into_leaf(leaf, wp.matrix_from_cols(b0, b1, b2)))
-            p = out_of_leaf(leaf, (k * area * (pressure + holding(theta)[1])) * slope)
+            p = out_of_leaf(leaf, stress(into_leaf(leaf, wp.matrix_from_cols(b0, b1, b2)), pressure, k * area))
             f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
             g[wp.static(leaves[leaf][0])] += f0
             g[wp.static(leaves[leaf][1])] += f1
@@ -84,14 +101,14 @@ def dilatation_forces_of(shape: int, uniform: bool, of: Dilatation) -> wp.Functi
             g[wp.static(leaves[leaf][3])] += f3
         return g
 
-    return dilatation_forces
+    return pressure_forces
 
 
 @functools.cache
 def scatter_dilatation(shape: int, grouped: bool, uniform: bool, of: Dilatation) -> wp.Kernel:
     """Add the forces of the shared dilatation of subtrees on CUDA. Launch with block_dim ``cuda.BLOCK``."""
     load, add = memory_of(shape, grouped)
-    forces = dilatation_forces_of(shape, uniform, of)
+    sums, forces, slope_of = dilatation_sums_of(shape, uniform, of), pressure_forces_of(shape, uniform, of), of.slope
 
     @unique_kernel(grid_stride=False)
     def scatter_dilatation(
@@ -110,7 +127,9 @@ def scatter_dilatation(shape: int, grouped: bool, uniform: bool, of: Dilatation)
         q1 = column(q, 1)
         q2 = column(q, 2) * mirror_sign(code)
         y = turn_in(load(subtrees, s, u), q0, q1, q2, 1.0 / h)
-        g = forces(y, h, lam, wp.where(wp.static(uniform), 0, subtrees.first[s]))
+        first = wp.where(wp.static(uniform), 0, subtrees.first[s])
+        sum, weight = sums(y, lam, first)
+        g = forces(y, h, slope_of(mean_of(sum, weight)), lam, first)
         add(subtrees, s, turn_out(g, q0, q1, q2), f)
 
     return scatter_dilatation

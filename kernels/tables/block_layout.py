@@ -41,6 +41,7 @@ class Layout:
         nodes: Room for nodes.
         tasks: Sums that make up the nodes' forces, whole warps of them; see ``TASK_SLOTS``.
         tolerance: How near the subtree root's rotation must be to be used in place of own ones [rad]; None: never.
+        dilating: Whether the leaves of a subtree share their dilatation.
     """
 
     shape: int
@@ -51,6 +52,7 @@ class Layout:
     nodes: int
     tasks: int = 0
     tolerance: float | None = None
+    dilating: bool = False
 
     @property
     def threads(self) -> int:
@@ -70,13 +72,18 @@ class Layout:
     def fits(self) -> bool:
         vectors = 2 * self.nodes + self.slot_count + 1
         # With the list of leaves that were left out, and their forces.
-        needed = VECTOR_BYTES * (vectors + 4 * self.room) + 4 * (self.room + 1)
+        needed = VECTOR_BYTES * (vectors + 4 * self.room) + 4 * (self.room + 1 + self.sum_count)
         return needed <= SHARED_BYTES and self.threads <= MAX_THREADS
 
     @property
     def slot_count(self) -> int:
         """Slots for forces; one more is always zero."""
         return self.subtrees * sum(place >= 0 for places in self.places for place in places)
+
+    @property
+    def sum_count(self) -> int:
+        """Two sums for each part of a subtree where its leaves share their dilatation."""
+        return 2 * self.parts * self.subtrees if self.dilating else 0
 
     def leaves(self, part: int) -> range:
         """The leaves of a part."""

@@ -13,6 +13,7 @@ import warp as wp
 from cases import CUBE, jittered, mixed_forest, oracle_mesh, random_displacement
 
 import warp_corot as wc
+from warp_corot.elasticity.dilatation.field import DilatationField
 from warp_corot.solvers.explicit.block import BlockSteps
 
 DEVICES = [str(device) for device in wp.get_cuda_devices()]
@@ -47,8 +48,8 @@ def forest(name):
     return wc.TetForest.box(cells, CUBE, level)
 
 
-def model_of(mesh, up):
-    return wc.Corotated(rotation_level=int(mesh.levels[0]) - up) if up else OWN
+def model_of(mesh, up, dilatation="auto"):
+    return wc.Corotated(rotation_level=int(mesh.levels[0]) - up if up else None, dilatation=dilatation)
 
 
 def material(form, mesh, worlds):
@@ -59,7 +60,9 @@ def material(form, mesh, worlds):
     return wc.Isotropic(rng.uniform(2e3, 8e3, size), rng.uniform(0.2, 0.45, size), rng.uniform(500, 1500, size))
 
 
-def made(device, mesh, up, *, launches, form="uniform", worlds=1, amount=0.1, dt=DT, start=None, loads=True):
+def made(
+    device, mesh, up, *, launches, form="uniform", worlds=1, amount=0.1, dt=DT, start=None, loads=True, shared=False
+):
     """A block fixed at one end, pulled at the other, with loads everywhere, from a random start."""
     rng = np.random.default_rng(9)
     n = len(mesh.points)
@@ -79,8 +82,10 @@ def made(device, mesh, up, *, launches, form="uniform", worlds=1, amount=0.1, dt
     integrator = wc.SymplecticEuler(dt=dt, damping=DAMPING)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", wc.StabilityWarning)
-        sim = wc.Simulation(body, model=model_of(mesh, up), integrator=integrator, gravity=GRAVITY)
+        model = model_of(mesh, up, "shared" if shared else "element")
+        sim = wc.Simulation(body, model=model, integrator=integrator, gravity=GRAVITY)
     assert BlockSteps.of(body, sim.fields[0]) is not None
+    assert isinstance(sim.fields[0], DilatationField) == shared
     return sim
 
 
@@ -135,6 +140,26 @@ def test_steps_of_worlds_equal_those_by_launches(form, worlds, up, device):
 
 
 @pytest.mark.parametrize("worlds", [1, MANY_WORLDS])
+@pytest.mark.parametrize(("name", "form"), [("type 0", "uniform"), ("type 1", "both"), ("type 2", "elements")])
+def test_steps_that_share_their_dilatation(name, form, worlds, up, device):
+    check_shared_steps(name, form, worlds, up, device)
+
+
+@pytest.mark.parametrize("worlds", [1, MANY_WORLDS])
+def test_steps_of_the_beam_that_shares_its_dilatation(worlds, device):
+    check_shared_steps("beam", "uniform", worlds, 0, device)
+
+
+def check_shared_steps(name, form, worlds, up, device):
+    """From a start that takes some elements beyond a quarter of their volume."""
+    sims = pair(device, forest(name), up, form=form, worlds=worlds, amount=0.25, dt=2e-5, shared=True)
+    for steps, most in ((1, ONE), (30, MANY)):
+        for sim in sims:
+            sim.advance_steps(steps)
+        assert_near(*sims, most)
+
+
+@pytest.mark.parametrize("worlds", [1, MANY_WORLDS])
 def test_a_step_is_that_of_float64(worlds, device):
     """v1 = (v0 + dt (f/m + g)) / (1 + dt damping), u1 = u0 + dt v1, reactions -(f + m g), f with the loads."""
     mesh = forest("type 1")
@@ -162,8 +187,9 @@ def test_a_step_is_that_of_float64(worlds, device):
             )
 
 
+@pytest.mark.parametrize("shared", [False, True], ids=["each", "shared"])
 @pytest.mark.parametrize("worlds", [1, MANY_WORLDS])
-def test_crushed_and_mirrored_subtrees_are_repaired(worlds, up, device):
+def test_crushed_and_mirrored_subtrees_are_repaired(worlds, shared, up, device):
     """Every second world is mirrored and squeezed, but all rotations stay defined."""
     mesh = forest("type 1")
     rng = np.random.default_rng(3)
@@ -174,7 +200,7 @@ def test_crushed_and_mirrored_subtrees_are_repaired(worlds, up, device):
     start = np.stack([mirrored if world % 2 == 0 else plain for world in range(worlds)])
     gradients = oracle_mesh(mesh).deformation_gradients(mesh.points + start[0])
     assert (np.linalg.det(gradients) < -0.1).all()
-    sims = pair(device, mesh, up, worlds=worlds, start=start, dt=2e-5)
+    sims = pair(device, mesh, up, worlds=worlds, start=start, dt=2e-5, shared=shared)
     for sim in sims:
         sim.step()
     assert_near(*sims, ONE)
@@ -330,6 +356,7 @@ def test_bodies_that_are_not_for_blocks(device):
         (beam, wc.Corotated(rotation="svd")),
         (beam, wc.Corotated(rotation_level=2)),
         (beam, wc.Corotated(rotation_level=4)),
+        (beam, wc.Linear(dilatation="shared")),
     ):
         body = wc.SoftBody(mesh, small, device=device)
         assert BlockSteps.of(body, model.bind(body)) is None

@@ -247,6 +247,15 @@ class DilatationField(ForceField):
                     found.append(np.arange(begins[g], begins[g] + 8, dtype=np.int32))
         return found
 
+    def group_numbers(self) -> npt.NDArray[np.int32] | None:
+        """The number of each element's group, int32 [T] of all worlds; None where elements share it at nodes."""
+        groups = self.groups()
+        if sum(map(len, groups)) < self.element_count:
+            return None
+        numbers = np.empty(self.element_count, np.int32)
+        numbers[np.concatenate(groups)] = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+        return numbers
+
     def batches_of_groups(self) -> list[tuple[wp.array, wp.array, wp.array, int]]:
         """Subtrees and other groups, as ``kernels.share_in_groups`` takes them, and how many."""
         of_subtrees = [(b.subtrees.first, self._all, b.live or self._all, b.count) for b in self.plan.batches]
@@ -267,6 +276,12 @@ class DilatationField(ForceField):
             self.launch(kernel, count, [starts, members, live, self.elements, self.isotropic], [shared])
         self._others.share_at_nodes(self.isotropic, len(u), shared, law)
         return shared
+
+
+def law_of(field: ForceField) -> tuple[ForceField, DilatationField | None]:
+    """The field of the law itself, and the field around it if elements share their dilatation: then the former has no
+    lambda."""
+    return (field.shear, field) if isinstance(field, DilatationField) else (field, None)
 
 
 class Unshared:

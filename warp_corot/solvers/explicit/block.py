@@ -11,6 +11,7 @@ import warp as wp
 from warp_corot.discretization.plan import Batch, Sharing
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.elasticity.corotated.subtrees import SubtreeField
+from warp_corot.elasticity.dilatation.field import law_of
 from warp_corot.kernels.stepping.block import BlockBody, step_block
 from warp_corot.kernels.tables.block_layout import (
     FIRST_SHIFT,
@@ -37,8 +38,9 @@ class BlockSteps:
     ``of`` makes it if the body fits.
     """
 
-    def __init__(self, body: SoftBody, batch: Batch, layout: Layout, slots: list[list[int]]):
+    def __init__(self, body: SoftBody, law: SubtreeField, batch: Batch, layout: Layout, slots: list[list[int]]):
         self.body = body
+        self._law = law
         tasks, numbers = _tasks(layout, slots)
         layout = dataclasses.replace(layout, tasks=len(tasks))
         device = body.device
@@ -58,22 +60,26 @@ class BlockSteps:
         """A body's steps in blocks; None if it is not on CUDA, too large, or has more than subtrees of one type."""
         if body.changing is not None or not body.device.is_cuda:
             return None
-        if not isinstance(field, SubtreeField) or not isinstance(body.mesh, TetForest):
+        law, sharing = law_of(field)
+        if not isinstance(law, SubtreeField) or not isinstance(body.mesh, TetForest):
             return None
         if not any(layout.fits for layout in _layouts(body, 0, False, len(body.mesh.tets) // 8)):
             return None
         plan = ForcePlan.of_forest(
-            body.mesh, field.rotation_level, body.device, elements=body.discretization.elements, grouped=False
+            body.mesh, law.rotation_level, body.device, elements=body.discretization.elements, grouped=False
         )
         if len(plan.batches) != 1 or len(plan.flat) or plan.batches[0].sharing is Sharing.ABOVE:
             return None
         batch = plan.batches[0]
-        layouts = _layouts(body, batch.shape, batch.sharing is Sharing.ROOT, batch.count, field.model.tolerance)
-        layout = next(layout for layout in layouts if layout.fits)
+        by_root, tolerance = batch.sharing is Sharing.ROOT, law.model.tolerance
+        layouts = _layouts(body, batch.shape, by_root, batch.count, tolerance, dilating=sharing is not None)
+        layout = next((layout for layout in layouts if layout.fits), None)
+        if layout is None:
+            return None
         slots = _slots_by_node(layout, batch.subtrees.nodes.numpy(), body.world_node_count)
         if max(map(len, slots)) > MOST_SLOTS:
             return None
-        return cls(body, batch, layout, slots)
+        return cls(body, law, batch, layout, slots)
 
     #: Whether the device has all that a launch reads of the body's controls.
     is_prepared = True
@@ -91,6 +97,7 @@ class BlockSteps:
                 damping,
                 system.gravity,
                 body.discretization.mu,
+                self._law.discretization.lam,
                 body.discretization.lam,
                 body.discretization.material_stride,
                 body.conditions.mass,
@@ -106,7 +113,9 @@ class BlockSteps:
         )
 
 
-def _layouts(body: SoftBody, shape: int, shared: bool, subtrees: int, tolerance: float | None = None) -> list[Layout]:
+def _layouts(
+    body: SoftBody, shape: int, shared: bool, subtrees: int, tolerance: float | None = None, *, dilating: bool = False
+) -> list[Layout]:
     """The layouts of a body in a block, the fastest first.
 
     A single world is fastest with the leaves of a subtree split between two threads. With more worlds than
@@ -115,8 +124,10 @@ def _layouts(body: SoftBody, shape: int, shared: bool, subtrees: int, tolerance:
     parts = (2, 1) if body.worlds <= body.device.sm_count else (1,)
     capacity = -(-subtrees // WARP) * WARP
     uniform = body.discretization.is_uniform
+    nodes = body.world_node_count
     return [
-        Layout(shape, shared, uniform, count, capacity, body.world_node_count, tolerance=tolerance) for count in parts
+        Layout(shape, shared, uniform, count, capacity, nodes, tolerance=tolerance, dilating=dilating)
+        for count in parts
     ]
 
 

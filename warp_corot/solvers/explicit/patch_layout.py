@@ -3,6 +3,8 @@
 Plain NumPy. A patch owns its nodes and computes every element with a corner there, so that it needs no forces from
 other patches; each patch computes the elements between patches for itself. In every step a patch needs only the
 positions of its halo, the other corners of its elements.
+
+Where elements share their dilatation in groups, a patch measures all elements of each group of which it computes one.
 """
 
 from __future__ import annotations
@@ -33,11 +35,16 @@ class Patches:
         lanes: Threads that add up one node: 1, 2, 4, 8, 16 or 32.
         own, own_start: Nodes that patches own, int32 [N].
         halo, halo_start: Nodes of other patches that patches read, int32 [H].
-        elements, element_start: Elements that patches compute, those without halo first, int32 [E].
+        elements, element_start: Elements of patches: those without halo, then the others that they compute, then those
+            that they only measure; int32 [E].
         interior: How many elements of each patch have no corner in the halo, int32 [patches].
+        computed: How many elements each patch computes, int32 [patches].
         corners: The four nodes of each element, numbered in the patch, int32 [E, 4].
         slots: The slot of each corner's force; ``NO_SLOT`` at corners of the halo; int32 [E, 4].
         bases, base_start: Where each warp's slots begin, and after a patch's last warp the number of its slots, int32.
+        groups: The group of each element, numbered in the patch, int32 [E]; zero where there are no groups.
+        ranks: Its place in that group, int32 [E].
+        group_counts: How many groups each patch has, int32 [patches].
     """
 
     lanes: int
@@ -48,13 +55,19 @@ class Patches:
     elements: np.ndarray
     element_start: np.ndarray
     interior: np.ndarray
+    computed: np.ndarray
     corners: np.ndarray
     slots: np.ndarray
     bases: np.ndarray
     base_start: np.ndarray
+    groups: np.ndarray
+    ranks: np.ndarray
+    group_counts: np.ndarray
 
     @classmethod
-    def of(cls, points: np.ndarray, tets: np.ndarray, count: int, threads: int) -> Patches:
+    def of(
+        cls, points: np.ndarray, tets: np.ndarray, count: int, threads: int, groups: np.ndarray | None = None
+    ) -> Patches:
         """Patches with about equal numbers of corners.
 
         Args:
@@ -62,6 +75,7 @@ class Patches:
             tets: int32 [T, 4].
             count: How many patches, at most the number of nodes.
             threads: Threads of a block; they determine how many add up one node.
+            groups: The group of each element, int [T]; None: there are none.
         """
         n = len(points)
         valence = np.bincount(tets.ravel(), minlength=n)
@@ -75,7 +89,7 @@ class Patches:
         place[own] = np.arange(n)
         place -= own_start[owner]
 
-        patch, element, element_start, interior = _elements_by_patch(owner[tets], count)
+        patch, element, element_start, interior, computed = _elements_by_patch(owner[tets], count, groups)
         nodes = tets[element]
         foreign = owner[nodes] != patch[:, None]
         halo, inverse = np.unique((patch[:, None] * n + nodes)[foreign], return_inverse=True)
@@ -99,10 +113,12 @@ class Patches:
             element,
             element_start,
             interior,
+            computed,
             corners,
             slots,
             bases,
             base_start,
+            *_groups_by_patch(patch, element, groups, count),
         )
         return cls(lanes, *(array.astype(np.int32) for array in arrays))
 
@@ -131,6 +147,16 @@ class Patches:
         return int(self.bases[self.base_start[1:] - 1].max())
 
     @property
+    def most_groups(self) -> int:
+        """The most groups of a patch."""
+        return int(self.group_counts.max())
+
+    @property
+    def most_members(self) -> int:
+        """The most elements of a group; zero where there are no groups."""
+        return int(self.ranks.max()) + 1 if self.most_groups else 0
+
+    @property
     def most_elements(self) -> int:
         """The most elements of a patch."""
         return int(np.diff(self.element_start).max())
@@ -157,12 +183,16 @@ def patch_of_nodes(points: np.ndarray, weight: np.ndarray, count: int) -> np.nda
     return patch
 
 
-def _elements_by_patch(owners: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs of a patch and an element with a corner there, patch by patch, inner elements first: both [E]; where each
-    patch begins, and how many inner elements it has.
+def _elements_by_patch(
+    owners: np.ndarray, count: int, groups: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs of a patch and an element, patch by patch, in the order of ``Patches.elements``: both [E]; where each patch
+    begins, how many inner elements it has, and how many it computes.
 
     Args:
         owners: The patches of the elements' nodes, [T, 4].
+        count: How many patches.
+        groups: As for ``Patches.of``.
     """
     new = np.ones(owners.shape, bool)
     for k in range(1, 4):
@@ -170,10 +200,42 @@ def _elements_by_patch(owners: np.ndarray, count: int) -> tuple[np.ndarray, np.n
             new[:, k] &= owners[:, k] != owners[:, earlier]
     element, corner = np.nonzero(new)
     patch = owners[element, corner]
-    shared = (new.sum(axis=1) > 1)[element]
-    order = np.lexsort((element, shared, patch))
-    interior = np.bincount(patch[~shared], minlength=count)
-    return patch[order], element[order], _starts(np.bincount(patch, minlength=count)), interior
+    kind = (new.sum(axis=1) > 1)[element].astype(np.int64)
+    if groups is not None:
+        others = _other_members(patch, element, groups)
+        patch, element = (np.concatenate(pair) for pair in zip((patch, element), others, strict=True))
+        kind = np.concatenate([kind, np.full(len(others[0]), 2)])
+    order = np.lexsort((element, kind, patch))
+    interior, computed = (np.bincount(patch[kind <= most], minlength=count) for most in (0, 1))
+    return patch[order], element[order], _starts(np.bincount(patch, minlength=count)), interior, computed
+
+
+def _other_members(patch: np.ndarray, element: np.ndarray, groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The elements in the groups of each patch's elements that are not among these, and their patches."""
+    order = np.argsort(groups, kind="stable")
+    sizes = np.bincount(groups)
+    first = _starts(sizes)
+    pairs = np.unique(patch * len(sizes) + groups[element])
+    of_patch, group = np.divmod(pairs, len(sizes))
+    size = sizes[group]
+    at = np.repeat(first[group] - _starts(size)[:-1], size) + np.arange(size.sum())
+    member, its_patch = order[at], np.repeat(of_patch, size)
+    is_new = ~np.isin(its_patch * len(groups) + member, patch * len(groups) + element)
+    return its_patch[is_new], member[is_new]
+
+
+def _groups_by_patch(
+    patch: np.ndarray, element: np.ndarray, groups: np.ndarray | None, count: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """``groups``, ``ranks`` and ``group_counts`` of pairs of a patch and an element; ranks in the elements' order."""
+    if groups is None:
+        return np.zeros(len(element)), np.zeros(len(element)), np.zeros(count)
+    pairs, of_pair = np.unique(patch * (groups.max() + 1) + groups[element], return_inverse=True)
+    counts = np.bincount(pairs // (groups.max() + 1), minlength=count)
+    order = np.lexsort((element, of_pair))
+    ranks = np.empty(len(element), np.int64)
+    ranks[order] = np.arange(len(element)) - _starts(np.bincount(of_pair))[of_pair[order]]
+    return of_pair - _starts(counts)[patch], ranks, counts
 
 
 def _slot_bases(valence: np.ndarray, own_start: np.ndarray, lanes: int) -> tuple[np.ndarray, np.ndarray]:

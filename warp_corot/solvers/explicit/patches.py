@@ -10,6 +10,7 @@ import warp as wp
 
 from warp_corot.body.trajectory import Trajectory
 from warp_corot.elasticity.corotated.subtrees import SubtreeField
+from warp_corot.elasticity.dilatation.field import law_of
 from warp_corot.elasticity.paths.general import CorotatedGeneralField
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.stepping.patches import Exchange, Layout, PatchBody, step_patches
@@ -36,7 +37,7 @@ LEAST_ARCH = 70
 #: Bytes of a block's shared memory that Warp reserves for its tiles.
 TILE_BYTES = 8192
 #: Room in kernels is a multiple of this, so that bodies share kernels.
-NODE_ROOM, SLOT_ROOM = 128, 512
+NODE_ROOM, SLOT_ROOM, GROUP_ROOM, MEMBER_ROOM = 128, 512, 64, 4
 
 
 class PatchSteps:
@@ -68,11 +69,15 @@ class PatchSteps:
             count: Patches, at most the number of multiprocessors; None: that many, or fewer for small bodies.
             threads: Threads of a block; None: chosen by its elements.
         """
-        if not _suits(body, field):
+        law, sharing = law_of(field)
+        if not _suits(body, law):
+            return None
+        groups = None if sharing is None else sharing.group_numbers()
+        if sharing is not None and groups is None:
             return None
         count = min(count or max(len(body.mesh.tets) // PATCH_ELEMENTS, 1), body.device.sm_count)
         for each, most in THREADS if threads is None else ((threads, MOST_ELEMENTS * threads),):
-            patches = Patches.of(body.mesh.points, body.mesh.tets, count, each)
+            patches = Patches.of(body.mesh.points, body.mesh.tets, count, each, groups)
             if patches.most_elements > most:
                 continue
             layout = layout_of(patches, each, body.device.max_shared_memory_per_block - TILE_BYTES)
@@ -136,8 +141,10 @@ def layout_of(patches: Patches, threads: int, most_bytes: int) -> Layout | None:
     halo = max(-(-patches.most_halo // threads), 1)
     nodes = -(-patches.most_nodes // NODE_ROOM) * NODE_ROOM
     slots = -(-(patches.most_slots + 1) // SLOT_ROOM) * SLOT_ROOM - 1
-    layout = Layout(threads, elements, halo, patches.lanes, nodes, slots)
-    fits = 4 * layout.floats <= most_bytes and patches.most_own * patches.lanes <= threads
+    groups = -(-patches.most_groups // GROUP_ROOM) * GROUP_ROOM
+    members = -(-patches.most_members // MEMBER_ROOM) * MEMBER_ROOM
+    layout = Layout(threads, elements, halo, patches.lanes, nodes, slots, groups, members)
+    fits = groups <= threads and 4 * layout.floats <= most_bytes and patches.most_own * patches.lanes <= threads
     return layout if fits and elements <= MOST_ELEMENTS and halo <= MOST_HALO else None
 
 
@@ -172,6 +179,7 @@ def _device_patches(body: SoftBody, patches: Patches, layout: Layout) -> PatchBo
         "elements",
         "element_start",
         "interior",
+        "computed",
         "bases",
         "base_start",
     ):
@@ -179,6 +187,8 @@ def _device_patches(body: SoftBody, patches: Patches, layout: Layout) -> PatchBo
     slots = np.where(patches.slots == NO_SLOT, layout.slots, patches.slots)
     tables.corners = wp.array(_packed(patches.corners), dtype=wp.uint64, device=device)
     tables.slots = wp.array(_packed(slots), dtype=wp.uint64, device=device)
+    measures = patches.ranks * layout.groups + patches.groups
+    tables.measures = wp.array(measures, dtype=wp.int32, device=device)
     rest = np.ascontiguousarray(rest_rows(body.mesh.points, body.mesh.tets)[:, patches.elements])
     tables.rest = wp.array(rest, dtype=wp.float32, device=device)
     return tables
