@@ -92,11 +92,13 @@ def held_by_default(
     if not (1.0 < holds.stiffer < np.inf):
         return held, 1.0
     if may_stiffen:
-        subject.notes.append(f"it is made {holds.stiffer:.2g} times as stiff as for its weight alone, to be carried")
+        subject.notes.append(
+            f"it is {holds.stiffer:.2g} times as stiff as the default for its weight, so that this supports it"
+        )
         return held, MORE * holds.stiffer
     sag = max(hold.sag for hold in holds.pieces)
     subject.notes.append(
-        f"so soft, the body sags by about {sag:.0%} of its height; {holds.stiffer:.2g} times as stiff it would be "
-        "carried (--young), or hold more of it (--fix)"
+        f"the body is so soft that it sags by about {sag:.0%} of its height; make it {holds.stiffer:.2g} times as "
+        "stiff (--young), or fix more of it (--fix)"
     )
     return held, 1.0

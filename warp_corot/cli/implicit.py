@@ -32,9 +32,11 @@ def check_implicit(args: argparse.Namespace, *, touches: bool, remeshes: bool) -
         if getattr(args, name) is not None:
             raise InputError(f"--static has no steps in time; leave out --{name}")
     if touches:
-        raise InputError("--static knows no contact; leave out --ground, --drop, --tool, --touch and --self-contact")
+        raise InputError(
+            "--static does not support contact; leave out --ground, --drop, --tool, --touch and --self-contact"
+        )
     if remeshes:
-        raise InputError("--static knows no remeshing; leave out --remesh")
+        raise InputError("--static does not support remeshing; leave out --remesh")
 
 
 def rest(args: argparse.Namespace, sim: Simulation) -> list[str]:

@@ -265,7 +265,7 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
         "of any length (default: symplectic-euler)",
     )
 
-    add_touch_options(parser.add_argument_group("what the body touches"))
+    add_touch_options(parser.add_argument_group("contact"))
     add_remesh_options(parser.add_argument_group("a mesh that follows the motion, of box, surfaces and scans"))
 
 

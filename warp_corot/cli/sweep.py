@@ -32,14 +32,14 @@ def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParse
     """Add the command to ``warp-corot``."""
     parser = subparsers.add_parser(
         "sweep",
-        help="make a run with many combinations of parameters, and a table of the results",
-        description="Makes the run of INPUT with every combination of the values of --vary, in several processes. A "
-        "sweep that was ended goes on where it was when the same command is given again.",
+        help="repeat a run with many combinations of parameters, and write a table of the results",
+        description="Runs INPUT with every combination of the values of --vary, in several processes. The same command "
+        "continues an interrupted sweep.",
         epilog="""examples:
   warp-corot sweep box --vary young=500,1kPa,2kPa -o results
   warp-corot sweep run.toml --vary young=1kPa:100kPa:64:log --vary poisson=0.3,0.45,0.49 -o results
 
-the folder gets table.csv, table.parquet (with pyarrow), results.png, runs.jsonl with what is done, and in runs/ a
+the folder gets table.csv, table.parquet (with pyarrow), results.png, runs.jsonl with the finished runs, and in runs/ a
 stage and a table for each run. Results are the last row of each run's table, and the largest displacement.""",
     )
     parser.add_argument("input", metavar="INPUT", help="as for simulate: a run file, a mesh, a surface, a scan or box")
@@ -52,9 +52,11 @@ stage and a table for each run. Results are the last row of each run's table, an
     )
     parser.add_argument("--probe", action="append", metavar="WHERE", help="as for simulate: its motion is a result")
     parser.add_argument("--duration", metavar="T", help="as for simulate")
-    parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="where the results go")
+    parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="folder for the results")
     parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one a card, or one a core)")
-    parser.add_argument("--retries", type=int, default=2, metavar="N", help="how often a failed run is made again (2)")
+    parser.add_argument(
+        "--retries", type=int, default=2, metavar="N", help="how often a failed run is repeated (default: 2)"
+    )
     parser.add_argument("--device", help="as for simulate")
     return parser
 
@@ -84,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
         function = partial(simulated, _input=args.input, _others=others, _folder=str(args.output))
         rows = sweep(function, varied, folder=args.output, workers=args.workers, retries=args.retries)
     except KeyboardInterrupt as signalled:
-        complain(f"interrupted; what is done is kept in {args.output}, and the same command goes on", kind="")
+        complain(f"interrupted; finished runs are kept in {args.output}, and the same command continues", kind="")
         return interrupt_status(signalled)
     except OSError as error:
         complain(f"{args.output}: {error.strerror or error}")

@@ -79,7 +79,7 @@ def add_touch_options(group: argparse._ArgumentGroup) -> None:
         "qz, qw; one row for a tool that stays; one path for each --tool, in the same order",
     )
     group.add_argument(
-        "--touch", action="store_true", help="let the bodies touch one another; with a ground or a tool they do"
+        "--touch", action="store_true", help="let the bodies touch one another; always on with a ground or a tool"
     )
     group.add_argument("--self-contact", action="store_true", help="let the bodies touch themselves, too")
     group.add_argument(

@@ -63,8 +63,8 @@ exit status:
     page.add_argument(
         "--token",
         metavar="WORD",
-        help="what visitors must bring, as in http://ADDRESS:N/?token=WORD (default: nothing on this computer, a word "
-        "that is made up where others can reach the address)",
+        help="word that visitors need, as in http://ADDRESS:N/?token=WORD (default: none on this computer; a random "
+        "word where others can reach the address)",
     )
     options.add_scene_options(parser)
     options.add_device(parser)

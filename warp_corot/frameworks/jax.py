@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 
 def static(body: SoftBody, *, options: dict[str, Any] | None = None, **values: Array) -> Array:
-    """Positions of a body at rest, differentiable with respect to what is given: one adjoint solve, in reverse mode.
+    """Positions of a body at rest, differentiable with respect to the given values: one adjoint solve, in reverse mode.
 
     ``wc.jax.static(body, young=young, loads=loads)`` has a ``jax.custom_vjp`` and may be in ``jax.jit`` and
-    ``jax.vmap``; the solves themselves are calls back to the host, and the backward one begins at the answer.
+    ``jax.vmap``; the solves themselves are calls back to the host, and the backward solve starts from the answer.
 
     Args:
         body, options: As for ``wc.torch.static``.
@@ -29,7 +29,7 @@ def static(body: SoftBody, *, options: dict[str, Any] | None = None, **values: A
         Positions [m], [worlds * N, 3], of the first array's dtype.
 
     Raises:
-        InputError: As ``static_gradient``, or JAX is not installed. Errors of a solve come as JAX's own.
+        InputError: As ``static_gradient``, or JAX is not installed. JAX raises its own errors for those of a solve.
     """
     try:
         import jax

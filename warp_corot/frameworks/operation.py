@@ -1,4 +1,4 @@
-"""A static answer as a function of arrays, with its vector-Jacobian product: what both frameworks wrap."""
+"""A static answer as a function of arrays, with its vector-Jacobian product; both frameworks wrap it."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ Array = npt.NDArray[np.floating]
 
 
 class StaticOperation:
-    """Positions at rest of a body as a function of some of what it is given.
+    """Positions at rest of a body as a function of some of its input.
 
     Args:
-        body: The body; it is copied, and left as it is.
-        names: Of the arguments, in order.
-        options: Of ``static_gradient``.
+        body: The body; it is copied and does not change.
+        names: Names of the arguments, in order.
+        options: Options of ``static_gradient``.
 
     Raises:
-        InputError: A name is none of ``REPLACED``, or there are none.
+        InputError: A name is not in ``REPLACED``, or there are no names.
     """
 
     def __init__(self, body: SoftBody, names: tuple[str, ...], options: Mapping[str, Any]):
@@ -55,8 +55,8 @@ class StaticOperation:
 
         Args:
             solved: The state of rest.
-            derivative: With respect to positions, [worlds * N, 3].
-            values: Those of the arguments that derivatives are wanted for.
+            derivative: The derivative with respect to positions, [worlds * N, 3].
+            values: The arguments for which derivatives are wanted.
         """
         places_are_given = "rest" in values and "boundary" in self.names
         names = {*values, "boundary"} if places_are_given else {*values}
@@ -69,7 +69,7 @@ class StaticOperation:
 
 
 def reduced(values: Array, shape: tuple[int, ...]) -> Array:
-    """Derivatives summed over what an argument of this shape was repeated for."""
+    """Derivatives summed over the repetitions of an argument of this shape."""
     if values.shape == shape:
         return values
     if values.size == int(np.prod(shape)):

@@ -15,15 +15,15 @@ if TYPE_CHECKING:
 
 
 def static(body: SoftBody, *, options: dict[str, Any] | None = None, **values: Tensor) -> Tensor:
-    """Positions of a body at rest, differentiable with respect to what is given: one adjoint solve in ``backward``.
+    """Positions of a body at rest, differentiable with respect to the given values: one adjoint solve in ``backward``.
 
     ``wc.torch.static(body, young=young, loads=loads)`` is a ``torch.autograd.Function`` of its tensors.
 
     Args:
-        body: The body; it is left as it is. What is not given is the body's.
+        body: The body; it does not change. Values that are not given are the body's own.
         options: ``model``, ``gravity``, ``precision`` and others of ``static_gradient``.
         values: Tensors, of any device, by name: ``young``, ``poisson`` and ``density`` in a shape that a material
-            takes; ``loads`` [N], [worlds * N, 3]; ``boundary``, positions of which those of held nodes are read
+            takes; ``loads`` [N], [worlds * N, 3]; ``boundary``, positions, of which only those of held nodes are read
             [m], [worlds * N, 3]; ``rest``, rest positions [m], [N, 3]; ``activation`` [Pa], [worlds, T];
             ``gravity`` [m/s^2], [3].
 
@@ -40,7 +40,7 @@ def static(body: SoftBody, *, options: dict[str, Any] | None = None, **values: T
 
 @cache
 def _function() -> Any:
-    """The operation, made once PyTorch is needed."""
+    """The operation, made when PyTorch is first needed."""
     try:
         import torch
     except ImportError:

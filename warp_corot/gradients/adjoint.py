@@ -1,4 +1,4 @@
-"""Adjoint motions: linear solves with the stiffness in a state, and inertia where a time step has it."""
+"""Adjoint motions: linear solves with the stiffness in a state, plus the inertia of a time step if there is one."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from warp_corot.solvers.implicit.tangent import TangentOperator
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
 
-#: Solves of one after another, each for what the last one left, and iterations of each.
+#: Maximum number of solves, each for the residual of the one before, and of iterations in each.
 REFINEMENTS, MOST = 3, 20000
-#: A residual above this is no answer: rounding of float32 leaves less.
+#: A larger residual means failure: the rounding of float32 leaves less.
 LARGEST_RESIDUAL = 1e-2
 
 
@@ -34,8 +34,8 @@ class Adjoint:
         tolerance: Norm of g - (K + s M) a over that of g.
 
     Attributes:
-        iterations: Of conjugate gradients, of the world that needed most.
-        residual: g - (K + s M) a over g, of the world with the largest.
+        iterations: Number of iterations of conjugate gradients in the world that needed most.
+        residual: Norm of g - (K + s M) a over that of g, the largest of all worlds.
     """
 
     def __init__(self, body: SoftBody, field: ForceField, preconditioner: str | None, tolerance: float):
@@ -49,7 +49,9 @@ class Adjoint:
         self.iterations, self.residual = 0, 0.0
 
     def take(self, u: wp.array, share: float = 0.0) -> None:
-        """Take the stiffness at displacements u [m], vec4 [worlds * N], with this share s of the mass [1/s^2]."""
+        """Set the stiffness to that at displacements u [m], vec4 [worlds * N], with the factor s of the mass
+        [1/s^2].
+        """
         self._share = share
         self.operator.set_scales(share, 0.0, 1.0)
         self.operator.take(u)
@@ -75,7 +77,7 @@ class Adjoint:
         return motion, self._product(motion)
 
     def _refined(self, right: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """The solution, to the digits of K's products, in float64."""
+        """The solution in float64, as accurate as products with K."""
         worlds, device = self.body.worlds, self.body.device
         x = wp.zeros(len(right), dtype=wp.vec4, device=device)
         solution, left = np.zeros_like(right), right

@@ -1,4 +1,4 @@
-"""Sums over adjoint motions of what elements' forces do in them, and derivatives of these."""
+"""Sums over adjoint motions of the work of elements' forces, and derivatives of these sums."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class ElementWork:
 
     Args:
         field: The forces f.
-        names: What ``add`` sums: "lame", "rest" and "activation".
+        names: The sums of ``add``: "lame", "rest" and "activation".
 
     Raises:
         InputError: The forces have no such derivative.
@@ -52,7 +52,7 @@ class ElementWork:
         self._unit_mu, self._unit_lam = (self._lame(*pair) for pair in ((1.0, 0.0), (0.0, 1.0)))
 
     def add(self, u: wp.array, adjoint: wp.array, scale: float = 1.0) -> None:
-        """Launch the sums of one pair; both vec4 [worlds * N]. ``scale`` multiplies all but those of "rest"."""
+        """Launch the sums of one pair; both vec4 [worlds * N]. ``scale`` multiplies all sums except "rest"."""
         if "lame" in self.names:
             self._add_lame(u, adjoint, scale)
         if "activation" in self.names:
@@ -82,7 +82,7 @@ class ElementWork:
         """The derivative with respect to rest positions of the work of weights, float64 [worlds * N, 3].
 
         Args:
-            densities: Of that work in elements [J/m^3], [worlds * T].
+            densities: Density of that work in elements [J/m^3], [worlds * T].
         """
         discretization = self.field.discretization
         rest = wp.zeros(discretization.sizes.launch_nodes, dtype=wp.vec4, device=self.device)

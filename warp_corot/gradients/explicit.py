@@ -1,4 +1,4 @@
-"""Runs of explicit steps forwards and backwards, with states kept at the beginnings of segments."""
+"""Runs of explicit steps forwards and backwards, which keep the states at the beginnings of segments."""
 
 from __future__ import annotations
 
@@ -21,19 +21,20 @@ if TYPE_CHECKING:
 class ExplicitRun:
     """Steps of symplectic Euler of one body, from its present state.
 
-    Only states at the beginnings of segments are kept. A segment's own states are found again when it is run backwards:
-    two runs forwards in all, and room for twice as many states as a segment and the run have parts.
+    Only states at the beginnings of segments are kept. The other states of a segment are computed again when it is run
+    backwards. So there are two runs forwards in all, and memory for the states of one segment and for one state of each
+    segment.
 
     Args:
         body, field: The body and its elastic forces.
-        integrator: With a given step.
+        integrator: The integrator, with a given step.
         gravity: [m/s^2].
-        sums: What is summed over steps.
-        ends: The numbers of steps at which segments end, increasing, the last one the run's.
+        sums: The sums over steps.
+        ends: The numbers of steps at which segments end, increasing; the last one is the end of the run.
 
     Attributes:
         displacements, velocities: At the beginning, and at each of the ends, vec4 each.
-        of_displacements, of_velocities: The adjoint of the state that the run backwards has come to, vec4.
+        of_displacements, of_velocities: The adjoint of the state that the run backwards has reached, vec4.
     """
 
     def __init__(
@@ -61,7 +62,7 @@ class ExplicitRun:
         self._tangent.prepare(self._u)
 
     def forward(self) -> None:
-        """Run to the end, which the body has then."""
+        """Run to the end, and leave the body in that state."""
         for length in self.lengths:
             self._replay("forward", length, self._forward)
             self.displacements.append(wp.clone(self._u))
@@ -72,7 +73,7 @@ class ExplicitRun:
         state.publish_positions()
 
     def backward(self, segment: int) -> None:
-        """Run a segment backwards, after those that follow it."""
+        """Run a segment backwards, after the segments that follow it."""
         length = self.lengths[segment]
         wp.copy(self._u, self.displacements[segment])
         wp.copy(self._v, self.velocities[segment])
@@ -100,7 +101,7 @@ class ExplicitRun:
             self._launch(kernels.subtract, [self._product], [self.of_displacements])
 
     def _replay(self, name: str, length: int, steps: Callable[[int], None]) -> None:
-        """Make the launches of so many steps, recorded once they have been made."""
+        """Launch a number of steps, and record them after the first time."""
         graph = self._graphs.get((name, length))
         if graph is not None:
             wp.capture_launch(graph)

@@ -1,4 +1,4 @@
-"""Copies of a body with some of what it was given replaced: what operations of other frameworks are functions of."""
+"""Copies of a body with some of its input replaced: the arguments of operations in other frameworks."""
 
 from __future__ import annotations
 
@@ -14,19 +14,20 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.errors import InputError
 from warp_corot.mesh import TetMesh
 
-#: What may be replaced; "gravity" is no part of a body.
+#: Names of the input that may be replaced; "gravity" does not belong to a body.
 REPLACED = ("young", "poisson", "density", "loads", "boundary", "rest", "activation", "gravity")
 
 Values = Mapping[str, npt.NDArray[Any]]
 
 
 def with_values(body: SoftBody, values: Values) -> SoftBody:
-    """A copy of a body: its mesh, material, displacements, supports, loads and active stress, or these values.
+    """A copy of a body: its mesh, material, displacements, supports, loads and active stress, or these values in their
+    place.
 
     Args:
-        body: The body, which is left as it is.
+        body: The body, which does not change.
         values: By name: "young", "poisson" and "density" as a material takes them; "loads" [N], [worlds * N, 3];
-            "boundary", positions of which those of held nodes are read, [worlds * N, 3]; "rest", rest positions
+            "boundary", positions, of which only those of held nodes are read, [worlds * N, 3]; "rest", rest positions
             [N, 3], with which the mesh is a general one; "activation" [worlds, T] or as ``activate`` takes it.
 
     Raises:
@@ -60,7 +61,7 @@ def with_values(body: SoftBody, values: Values) -> SoftBody:
 
 
 def given(values: npt.ArrayLike) -> float | npt.NDArray[np.float64]:
-    """A material's value: float64, a number where it has no dimensions."""
+    """A material's value: float64, a number if it has no dimensions."""
     array = np.asarray(values, np.float64)
     return array if array.ndim else float(array)
 

@@ -1,4 +1,4 @@
-"""Runs of implicit steps backwards: one adjoint solve a step, in the states that the run forwards has left."""
+"""Runs of implicit steps backwards: one adjoint solve for each step, in the states of the run forwards."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ class ImplicitRun:
 
     Args:
         body, field: The body and its elastic forces.
-        integrator: Whose steps these are.
-        sums: What is summed over steps.
-        displacements: Before the first step, and after each, vec4 each.
-        tolerance: Of the adjoint solves.
+        integrator: The integrator of the steps.
+        sums: The sums over steps.
+        displacements: The displacements before the first step and after each step, vec4.
+        tolerance: Tolerance of the adjoint solves.
 
     Attributes:
-        of_displacements, of_velocities: The adjoint of the state that the run backwards has come to, float64
+        of_displacements, of_velocities: The adjoint of the state that the run backwards has reached, float64
             [worlds * N, 3].
     """
 
@@ -60,7 +60,7 @@ class ImplicitRun:
         )
 
     def backward(self, step: int) -> None:
-        """Run a step backwards, 0 for the first one, after those that follow it."""
+        """Run a step backwards, 0 for the first one, after the steps that follow it."""
         table = self._tables[min(step, 1)]
         stage_share = table[int(rows.STAGE), 0]
         before, after = (self.displacements[k].numpy()[:, :3].astype(np.float64) for k in (step, step + 1))
@@ -73,7 +73,8 @@ class ImplicitRun:
         motion, product = self._adjoint.solve(np.where(self._held, 0.0, right))
         p = motion.numpy()[:, :3].astype(np.float64)
         of_u = self.of_displacements - product
-        # Held nodes keep their velocity, and move on with it; at the stage they have moved by its share.
+        # Held nodes keep their velocity and move with it; at the stage they have made the stage's fraction of that
+        # motion.
         moved = self._dt * (self.of_displacements - stage_share * product)
         of_v = np.where(self._held, self.of_velocities + moved, 0.0)
         parts = []

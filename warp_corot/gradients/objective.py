@@ -22,12 +22,11 @@ def value_and_derivative(objective: Objective, positions: wp.array) -> tuple[flo
     """The value of an objective, and its derivative with respect to positions, float64 [n, 3].
 
     Args:
-        objective: A function of positions. It gives a ``wp.array`` of one number, which kernels that it launches
-            compute, or a pair of a number and its derivative, [n, 3].
-        positions: vec3 or vec3d [n].
+        objective: A function of positions. It returns a ``wp.array`` of one number, computed by kernels that it
+        launches, or a pair of a number and its derivative, [n, 3]. positions: vec3 or vec3d [n].
 
     Raises:
-        InputError: The objective gives something else, or what is not finite.
+        InputError: The objective returns something else, or a value that is not finite.
     """
     if not callable(objective):
         raise InputError(f"objective is {shown(objective)}; it must be a function of positions that gives {WANTED}")

@@ -1,4 +1,4 @@
-"""From derivatives with respect to what kernels read to those with respect to what users gave."""
+"""Derivatives with respect to the users' input, from those with respect to the kernels' input."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 
-#: What each of these needs of ``ElementWork``.
+#: The sums of ``ElementWork`` that each of these needs.
 NEEDS = {
     "young": "lame",
     "poisson": "lame",
@@ -27,19 +27,19 @@ NEEDS = {
 
 
 def needed(names: Sequence[str]) -> set[str]:
-    """What ``ElementWork`` must sum for derivatives of these names."""
+    """The sums of ``ElementWork`` for derivatives of these names."""
     return {need for name in names if (need := NEEDS.get(name)) is not None}
 
 
 def of_young(body: SoftBody, of_mu: Array, of_lam: Array) -> Array | float:
-    """The derivative with respect to Young's modulus, of the shape that the material has it in."""
+    """The derivative with respect to Young's modulus, in the shape of the material's value."""
     _, nu = _young_and_poisson(body)
     d_mu, d_lam = 1.0 / (2.0 * (1.0 + nu)), nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
     return _of_shape(body, "young", d_mu * _filled(body, of_mu) + d_lam * _filled(body, of_lam))
 
 
 def of_poisson(body: SoftBody, of_mu: Array, of_lam: Array) -> Array | float:
-    """The derivative with respect to Poisson's ratio, of the shape that the material has it in."""
+    """The derivative with respect to Poisson's ratio, in the shape of the material's value."""
     young, nu = _young_and_poisson(body)
     d_mu = -young / (2.0 * (1.0 + nu) ** 2)
     d_lam = young * (1.0 + 2.0 * nu**2) / ((1.0 + nu) * (1.0 - 2.0 * nu)) ** 2
@@ -47,10 +47,10 @@ def of_poisson(body: SoftBody, of_mu: Array, of_lam: Array) -> Array | float:
 
 
 def of_density(body: SoftBody, work: Array) -> Array | float:
-    """The derivative with respect to density, of the shape that the material has it in.
+    """The derivative with respect to density, in the shape of the material's value.
 
     Args:
-        work: What accelerations of the nodes do in the adjoint motion for each unit of mass, [worlds * N].
+        work: The work of the nodes' accelerations in the adjoint motion for each unit of mass, [worlds * N].
     """
     return _of_shape(body, "density", _filled(body, body.mesh.volumes * means_of_elements(body, work)))
 
@@ -72,15 +72,16 @@ def _young_and_poisson(body: SoftBody) -> tuple[Array, Array]:
 
 
 def _filled(body: SoftBody, values: Array) -> Array:
-    """Values of elements times their filled share, [worlds, T]."""
+    """Values of elements times their filled fraction, [worlds, T]."""
     fill = body.discretization.fill
     of_worlds = values.reshape(body.worlds, -1)
     return of_worlds if fill is None else of_worlds * fill
 
 
 def _of_shape(body: SoftBody, name: str, values: Array) -> Array | float:
-    """Values of elements, [worlds, T], summed to the shape of a field of the material: of one value for many elements
-    the derivative is the sum of theirs."""
+    """Values of elements, [worlds, T], summed to the shape of a field of the material: the derivative with respect to a
+    value of many elements is a sum over them.
+    """
     shape = np.shape(getattr(body.material, name))
     if shape == ():
         return float(values.sum())

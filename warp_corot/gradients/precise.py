@@ -25,7 +25,8 @@ from .sums import derivatives
 Array = npt.NDArray[np.float64]
 
 FLOAT32, FLOAT64 = "float32", "float64"
-#: Newton's iterations at most, and the largest displacement of the last one over the largest displacement.
+#: Maximum number of Newton's iterations, and the tolerance of the last one: its largest displacement over the largest
+#: displacement.
 ITERATIONS, SMALL = 20, 1e-13
 
 
@@ -36,7 +37,7 @@ def solved_state(body: SoftBody, *, precision: str = FLOAT32, model: Model | Non
         body: The body.
         precision: As for ``static_gradient``.
         model: As for ``solve_static``.
-        options: Others of ``RestState``.
+        options: Other arguments of ``RestState``.
 
     Raises:
         InputError, ConvergenceError: As ``static_gradient``.
@@ -53,15 +54,15 @@ class PreciseState:
     """A body at rest in float64, and gradients there; as ``RestState``.
 
     Args:
-        solved: The state in float32; its body is moved to the answer.
+        solved: The state in float32; its body moves to the answer.
 
     Attributes:
-        body, report: Of that.
-        adjoint_iterations, adjoint_residual: None of conjugate gradients.
+        body, report: Those of ``solved``.
+        adjoint_iterations, adjoint_residual: Zero, since there are no conjugate gradients.
 
     Raises:
-        InputError: The model or the material is none of those in float64.
-        ConvergenceError: Newton's method does not converge from there, or K is singular.
+        InputError: The model or the material does not exist in float64.
+        ConvergenceError: Newton's method does not converge from the state in float32, or K is singular.
     """
 
     def __init__(self, solved: RestState):
@@ -76,7 +77,7 @@ class PreciseState:
             loads = loads + body.conditions.loads.numpy()[:count, :3]
         self._loads = loads.reshape(worlds, -1, 3)
         self._held = body.conditions.held_mask().reshape(worlds, -1)
-        # What is not held and belongs to no element stays.
+        # Free nodes of no element stay where they are.
         self._free = [
             np.flatnonzero(np.repeat(~held & (masses > 0.0), 3))
             for held, masses in zip(self._held, body.masses.reshape(worlds, -1), strict=True)
@@ -135,7 +136,7 @@ class PreciseState:
 
 
 class _Work:
-    """What elements' forces do in adjoint motions, of all worlds; as ``ElementWork``."""
+    """The work of elements' forces in adjoint motions, in all worlds; as ``ElementWork``."""
 
     def __init__(self, elements: list[PreciseElements], u: Array, moved: Array):
         self._elements = elements
@@ -160,7 +161,7 @@ def checked_host_law(body: SoftBody, law: Model) -> HostLaw:
     """The law in float64.
 
     Raises:
-        InputError: There is none.
+        InputError: The law does not exist in float64.
     """
     found = host_law(law)
     if found is None or not isinstance(body.material, Isotropic):

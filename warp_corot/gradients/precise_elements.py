@@ -23,8 +23,8 @@ class PreciseElements:
     Args:
         body: The body.
         law: Its law.
-        shared: The dilatation that its elements share, if they do: the law has none of its own then.
-        world: Which world.
+        shared: The dilatation that elements share, if they do; the law then excludes it.
+        world: The number of the world.
     """
 
     def __init__(self, body: SoftBody, law: HostLaw, shared: HostDilatation | None, world: int):
@@ -101,14 +101,16 @@ class PreciseElements:
     # --- a dilatation that elements share ----------------------------------------------------------------------------
 
     def _sharing(self, f: Array) -> tuple[Measured, Array, Array]:
-        """Elements' own dilatations, the sums of w' over those that they share, [T], and these, [groups]."""
+        """Elements' own dilatations and w' of the shared ones, [T], and the shared ones, [groups]."""
         assert self._shared
         measured = self._shared.measure(f)
         theta = self._shared.means(self._weights, measured.theta)
         return measured, self._shared.sharing.T @ self._shared.law(theta)[0], theta
 
     def _coupling(self, measured: Measured, _slope: Array, theta: Array) -> Any:
-        """The part of K that couples elements: of each group w'' / sum of q times the square of sum of q d theta_e."""
+        """The part of K that couples elements: for each group, w'' / sum of q times the square of sum of q d
+        theta_e.
+        """
         assert self._shared
         changes = np.einsum("tij,taj->tai", measured.slope, self.hats).reshape(-1, 12)
         rows = np.repeat(np.arange(len(self.tets)), 12)

@@ -1,4 +1,4 @@
-"""A body at rest, and what derivatives with respect to its positions say of what it was given."""
+"""A body at rest, and derivatives with respect to its input from those with respect to its positions."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ Array = npt.NDArray[np.float64]
 
 
 class RestState:
-    """Moves a body to where it is at rest, and gives gradients there while it stays.
+    """Moves a body to its state of rest, and gives gradients there as long as the body does not move.
 
     Args:
         body: The body; some nodes of each world must be held.
         model, gravity, preconditioner: As for ``solve_static``.
-        names: Of the derivatives that may be asked for, keys of ``parameters.NEEDS``.
+        names: Names of the possible derivatives, keys of ``parameters.NEEDS``.
         adjoint_tolerance: As for ``static_gradient``.
-        options: Others of ``solve_static``.
+        options: Other arguments of ``solve_static``.
 
     Attributes:
-        report: Of the solve.
+        report: The report of the solve.
         law, field: The model, and its elastic forces.
         gravity: [m/s^2], float64 [3].
-        adjoint_iterations, adjoint_residual: Of the last adjoint solve.
+        adjoint_iterations, adjoint_residual: Iterations and residual of the last adjoint solve.
 
     Raises:
         InputError, ConvergenceError: As ``static_gradient``.
@@ -78,11 +78,11 @@ class RestState:
         return self.body.rest_positions + self.body.state.displacements.numpy()[: self.body.sizes.nodes, :3]
 
     def pull_back(self, derivative: Array, names: Sequence[str]) -> dict[str, Any]:
-        """Derivatives of J with respect to what these names stand for, as ``StaticGradient`` has them.
+        """Derivatives of J of these names, as in ``StaticGradient``.
 
         Args:
-            derivative: Of J with respect to positions [1/m], [worlds * N, 3].
-            names: Of the names that the state was made with.
+            derivative: The derivative of J with respect to positions [1/m], [worlds * N, 3].
+            names: Some of the names that the state was made with.
         """
         if self._adjoint is None:
             self._adjoint = Adjoint(self.body, self.field, self._preconditioner, self._tolerance)
@@ -105,7 +105,7 @@ class RestState:
         work.add(body.state.displacements, motion)
         found = derivatives(body, work, names, moved, moved @ gravity)
         if "rest" in names:
-            # Held nodes keep their displacements, so that their places follow the rest shape.
+            # Held nodes keep their displacements, so their places follow the rest shape.
             found["rest"] = found["rest"] + boundary
         if "boundary" in names:
             found["boundary"] = boundary
@@ -113,7 +113,7 @@ class RestState:
 
 
 def bound(body: SoftBody, law: Model, names: Sequence[str]) -> tuple[ForceField, set[str]]:
-    """A law's forces, and what of them derivatives of these names need.
+    """A law's forces, and the parts of them that derivatives of these names need.
 
     Raises:
         InputError: The model shares rotations.
@@ -129,10 +129,10 @@ def bound(body: SoftBody, law: Model, names: Sequence[str]) -> tuple[ForceField,
 
 
 def check_held(body: SoftBody) -> None:
-    """See that some nodes of each world are held.
+    """Check that each world has held nodes.
 
     Raises:
-        InputError: None are.
+        InputError: A world has none.
     """
     free = np.logical_not(body.conditions.held_mask().reshape(body.worlds, -1).any(axis=1))
     if free.any():

@@ -31,19 +31,19 @@ from .sums import StepSums
 
 Array = npt.NDArray[np.float64]
 
-#: What derivatives of runs may be asked for.
+#: Names of the derivatives of runs.
 NAMES = ("young", "poisson", "density", "loads", "gravity", "rest", "activation", "displacements", "velocities")
 
 
 @dataclass(frozen=True)
 class RunGradient:
-    """What ``run_gradient`` found. Derivatives are float64; those that were not asked for are None.
+    """The result of ``run_gradient``. Derivatives are float64; those that were not requested are None.
 
     ``gradient["young"]`` is ``gradient.young``.
 
     Attributes:
         value: The objective J, or the sum of its values.
-        kept: How many states of the body were kept at once.
+        kept: The largest number of states of the body in memory at the same time.
         young, poisson, density, activation, gravity: As ``StaticGradient`` has them.
         loads: dJ/df of each node's load, which is the same in all steps [1/N], [worlds * N, 3].
         rest: dJ/dX of each node's rest position [1/m], [worlds * N, 3]. Displacements at the beginning, elements'
@@ -81,21 +81,19 @@ def run_gradient(
     every: int | None = None,
     adjoint_tolerance: float = 1e-6,
 ) -> RunGradient:
-    """The derivatives of an objective of where time steps take a body, by running the adjoint of the steps backwards.
+    """The derivatives of an objective of a body's positions after time steps, by running the adjoint of the steps
+    backwards.
 
-    The body moves by ``steps`` steps from its present state, as a ``Simulation`` with nothing else would. Explicit runs
-    keep some sqrt(steps) states and find those between again; implicit ones keep all displacements.
+    The body makes ``steps`` steps from its present state, as in a ``Simulation`` of this body alone. Explicit runs keep
+    about sqrt(steps) states and compute those between again; implicit ones keep all displacements.
 
     Args:
-        body: The body. Its held nodes keep the velocities that they have.
-        objective: As for ``static_gradient``, a function of the positions at the end.
-        integrator: ``SymplecticEuler(dt)`` with a step, or an implicit one with a tolerance of Newton's method, to
-            which gradients are right then; without viscosity.
-        steps: How many.
-        wrt: Names of derivatives of ``RunGradient``.
-        model, gravity: As for ``Simulation``.
-        every: J is the sum of the objective's values after every so many steps; None: the value at the end.
-        adjoint_tolerance: Of the linear solve of each implicit step backwards.
+        body: The body. Its held nodes keep their velocities. objective: As for ``static_gradient``, a function of the
+        positions at the end. integrator: ``SymplecticEuler(dt)`` with a given step, or an implicit one with a tolerance
+        of Newton's method, which then is the accuracy of gradients; without viscosity. steps: The number of steps. wrt:
+        Names of derivatives of ``RunGradient``. model, gravity: As for ``Simulation``. every: J is the sum of the
+        objective's values after each of this number of steps; None: the value at the end. adjoint_tolerance: Tolerance
+        of the linear solve of each implicit step backwards.
 
     Raises:
         InputError: As ``static_gradient``, or the integrator is none of these, the body is remeshed, or nodes or active
@@ -139,7 +137,7 @@ def _explicit(
     marks: set[int],
     seen: _Values,
 ) -> tuple[int, Array, Array]:
-    """How many states were kept, and the adjoint of the beginning."""
+    """The number of kept states, and the adjoint of the beginning."""
     length = math.isqrt(steps - 1) + 1
     ends = sorted({*range(length, steps, length), *marks, steps})
     run = ExplicitRun(body, field, integrator, gravity, sums, ends)
@@ -168,7 +166,7 @@ def _implicit(
     seen: _Values,
     tolerance: float,
 ) -> tuple[int, Array, Array]:
-    """The same of implicit steps."""
+    """The same for implicit steps."""
     sim = Simulation(body, model=law, integrator=integrator, gravity=gravity)
     states = [wp.clone(body.state.displacements)]
     for _ in range(steps):
@@ -184,7 +182,7 @@ def _implicit(
 
 
 class _Values:
-    """An objective's values, added up."""
+    """The sum of an objective's values."""
 
     def __init__(self, body: SoftBody, objective: Objective):
         self.body, self.objective, self.value = body, objective, 0.0
@@ -199,7 +197,7 @@ class _Values:
 
 
 def check_finite(body: SoftBody) -> None:
-    """See that a run has stayed finite.
+    """Check that a run has stayed finite.
 
     Raises:
         UnstableError: It has not.
@@ -209,7 +207,7 @@ def check_finite(body: SoftBody) -> None:
 
 
 def _checked(body: SoftBody, integrator: Integrator, steps: int, wrt: str | Sequence[str]) -> tuple[str, ...]:
-    """The names of derivatives, once all else is as it must be."""
+    """The names of derivatives, after a check of all arguments."""
     if not isinstance(body, SoftBody):
         raise InputError(f"body is {shown(body)}; it must be a SoftBody")
     if body.changing is not None:

@@ -25,15 +25,15 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class StaticGradient:
-    """What ``static_gradient`` found. Derivatives are float64; those that were not asked for are None.
+    """The result of ``static_gradient``. Derivatives are float64; those that were not requested are None.
 
     ``gradient["young"]`` is ``gradient.young``.
 
     Attributes:
         value: The objective J.
-        report: Of the state of rest.
+        report: The report on the state of rest.
         adjoint_iterations: Iterations of conjugate gradients in the adjoint solve; none in float64.
-        adjoint_residual: What that leaves of its right side, as a share.
+        adjoint_residual: Its residual over its right side.
         young: dJ/dE [1/Pa] in the shape of the material's values: a number, [T], [worlds, 1] or [worlds, T].
         poisson, density: The same of Poisson's ratio and of density [m^3/kg].
         loads: dJ/df of each node's load [1/N], [worlds * N, 3]; zero at held nodes.
@@ -77,22 +77,22 @@ def static_gradient(
     adjoint_tolerance: float = 1e-6,
     precision: str = FLOAT32,
 ) -> StaticGradient:
-    """The derivatives of an objective of where a body is at rest, by one adjoint solve for all of them together.
+    """The derivatives of an objective of a body's positions at rest, by one adjoint solve for all of them.
 
-    ``solve_static`` moves the body to where it is at rest. With K the stiffness there and g the objective's derivative
-    with respect to positions, K a = g gives an adjoint motion a, and each derivative is what the change of forces does
-    in it.
+    ``solve_static`` moves the body to its state of rest. With K the stiffness there and g the objective's derivative
+    with respect to positions, K a = g gives an adjoint motion a, and each derivative is the work of the change of
+    forces in it.
 
     Args:
-        body: The body; some nodes of each world must be held.
-        objective: A function of positions, vec3 [worlds * N] [m]. It gives a ``wp.array`` of one number, made with
-            ``requires_grad=True``, that kernels which it launches compute and a tape differentiates; or a pair of a
-            number and its derivative with respect to positions, [worlds * N, 3]; ``positions.numpy()`` are NumPy's.
-        wrt: Names of derivatives of ``StaticGradient``: "young", "poisson", "density", "loads", "boundary", "rest",
+        body: The body; some nodes of each world must be held. objective: A function of positions, vec3 [worlds * N]
+        [m]. It returns a ``wp.array`` of one number, made with ``requires_grad=True`` and computed by kernels that it
+        launches, which a tape differentiates; or a pair of a number and its derivative with respect to positions,
+        [worlds * N, 3], for example from ``positions.numpy()``. wrt: Names of derivatives of ``StaticGradient``:
+        "young", "poisson", "density", "loads", "boundary", "rest",
             "activation", "gravity".
-        model, gravity, tolerance, iterations, load_steps, preconditioner: As for ``solve_static``.
-        adjoint_tolerance: Of the adjoint solve, the residual over the right side.
-        precision: "float32": all on the body's device. "float64": the answer is refined on the host, by Newton's method
+        model, gravity, tolerance, iterations, load_steps, preconditioner: As for ``solve_static``. adjoint_tolerance:
+        Tolerance of the adjoint solve, its residual over the right side. precision: "float32": everything is computed
+        on the body's device. "float64": the answer is refined on the host, by Newton's method
             with a sparse direct solver, and the adjoint is solved there; positions are vec3d. For the models
             ``Corotated``, ``Linear``, ``StVenantKirchhoff`` and ``NeoHookean`` with isotropic materials, and bodies of
             some 10,000 nodes.

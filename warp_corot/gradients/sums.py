@@ -1,4 +1,4 @@
-"""What is summed over the steps of a run, and the derivatives that come of it."""
+"""Sums over the steps of a run, and the derivatives that they give."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ Array = npt.NDArray[np.float64]
 
 
 class StepSums:
-    """Sums of what forces do in the adjoint motions of all steps.
+    """Sums of the work of forces in the adjoint motions of all steps.
 
     Args:
         body, field: The body and its elastic forces.
-        names: Of the derivatives that are wanted.
+        names: Names of the requested derivatives.
 
     Attributes:
         loads: The loads of the run [N], vec4 [worlds * N].
@@ -44,7 +44,9 @@ class StepSums:
         self._of_mass = wp.zeros(len(like), dtype=wp.float64, device=body.device)
 
     def add(self, u: wp.array, p: wp.array) -> None:
-        """Launch the sums of one step but those of loads: of the adjoint motion p of forces at displacements u."""
+        """Launch the sums of one step, except those of loads, for the adjoint motion p and forces at displacements
+        u.
+        """
         self.work.add(u, p)
         if self._wants_mass:
             self._forces.zero_()
@@ -59,7 +61,7 @@ class StepSums:
         self._of_mass.zero_()
 
     def derivatives(self) -> dict[str, Any]:
-        """The derivatives with respect to all but the initial state, whose part "rest" lacks."""
+        """The derivatives with respect to everything but the initial state; "rest" lacks the part of that state."""
         count = self.body.sizes.nodes
         moved = self.of_loads.numpy()[:count, :3].astype(np.float64)
         return derivatives(self.body, self.work, self.names, moved, self._of_mass.numpy()[:count])
@@ -78,12 +80,12 @@ class Work(Protocol):
 
 
 def derivatives(body: SoftBody, work: Work, names: Sequence[str], moved: Array, of_mass: Array) -> dict[str, Any]:
-    """Derivatives of these names that are made of sums.
+    """Derivatives of these names from sums.
 
     Args:
         body: The body.
         work: The sums of elements.
-        names: Others than "boundary" and those of an initial state; "rest" is the derivative where positions stay.
+        names: Any except "boundary" and those of an initial state; "rest" is the derivative at constant positions.
         moved: The sum of adjoint motions, [worlds * N, 3].
         of_mass: The derivative with respect to the mass of each node, [worlds * N].
     """

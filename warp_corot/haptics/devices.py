@@ -37,13 +37,13 @@ class Device(Protocol):
 
 
 class ScriptedDevice:
-    """A device that a script moves along keyframes, in straight lines, and that records what it feels.
+    """A device that a script moves along keyframes, in straight lines, and that records its forces.
 
     Args:
         times: Increasing, at least two, from the first reading on [s], [K].
         positions: [m], [K, 3].
         quaternions: (x, y, z, w), [K, 4]; None: no rotation.
-        clock: A function that gives the seconds of a clock.
+        clock: A function that returns the seconds of a clock.
 
     Attributes:
         felt: The record: time [s], position [m], force [N] and torque [N m], ten numbers each.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-#: Readings that are remembered: more than a quarter of an hour at 1 kHz.
+#: Number of readings that are kept: more than a quarter of an hour at 1 kHz.
 MEMORY = 1 << 20
 
 Floats = npt.NDArray[np.float64]
@@ -21,7 +21,7 @@ class Report:
         readings: How often the device was read.
         missed: Periods in which it was not.
         period, period_99, period_most: Time from one reading to the next: median, 99 % and longest [s].
-        busy: Time that a reading takes with all that follows it, median [s].
+        busy: Time of a reading with everything that follows it, median [s].
         delay, delay_99, delay_most: Time from reading a position to the first force that comes from a step with the
             tool there: median, 99 % and longest [s]; NaN if the simulation published nothing.
         updates: States of the simulation that were read.
@@ -77,7 +77,7 @@ class Times:
         self.count += 1
 
     def share(self, percent: float) -> float:
-        """A percentile of the values that are remembered; NaN if there is none."""
+        """A percentile of the kept values; NaN if there is none."""
         values = self._values[: min(self.count, MEMORY)]
         return float(np.percentile(values, percent)) if len(values) else float("nan")
 

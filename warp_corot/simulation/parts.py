@@ -101,7 +101,7 @@ def check_implicit(integrator: Integrator, *, touches: bool, soft_touches: bool,
     if touches:
         _check_touching(integrator, soft_touches=soft_touches)
     if remeshes and isinstance(integrator, QuasiStatic):
-        raise InputError(f"{name} knows no remeshing; with remesh the integrator must be another one")
+        raise InputError(f"{name} does not support remeshing; with remesh the integrator must be another one")
     if ordered:
         raise InputError(f"{name} is not reproducible on CUDA; with deterministic=True it must be SymplecticEuler")
 
@@ -110,12 +110,13 @@ def _check_touching(integrator: Integrator, *, soft_touches: bool) -> None:
     name = type(integrator).__name__
     if not isinstance(integrator, BackwardEuler) or integrator.tolerance is not None:
         raise InputError(
-            f"{name} knows no contact; the integrator must be SymplecticEuler, or BackwardEuler without a tolerance"
+            f"{name} does not support contact; the integrator must be SymplecticEuler, or BackwardEuler without "
+            "a tolerance"
         )
     if soft_touches:
         raise InputError(
-            f"{name} knows no contact of soft surfaces; with several bodies, or self_contact, the integrator must be "
-            "SymplecticEuler"
+            f"{name} does not support contact of soft surfaces; with several bodies, or self_contact, the integrator "
+            "must be SymplecticEuler"
         )
 
 
@@ -126,7 +127,7 @@ def check_constraints(system: System, stepper: Stepper, integrator: Integrator) 
         InputError: It does not.
     """
     if system.constraints and not stepper.resolves_constraints:
-        raise InputError(f"{type(integrator).__name__} knows no contact; it must be SymplecticEuler")
+        raise InputError(f"{type(integrator).__name__} does not support contact; it must be SymplecticEuler")
 
 
 def checked_gravity(gravity: npt.ArrayLike | None, up_axis: str) -> tuple[float, float, float]:

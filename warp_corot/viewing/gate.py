@@ -24,7 +24,7 @@ from warp_corot.errors import InputError
 
 #: Names by which a browser may address its own computer.
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
-#: How long the server may take to answer when it is tested [s].
+#: The longest time that the server may take to answer a test [s].
 PATIENCE = 5.0
 #: Servers are started one at a time, because a name of the module ``websockets`` is replaced meanwhile.
 _starting = threading.Lock()
@@ -86,7 +86,7 @@ class Gate:
             if self.token is None or self._has_cookie(headers):
                 return None
             given = parse_qs(urlsplit(path).query).get("token", [])
-        except Exception:  # whatever cannot be read may not pass
+        except Exception:  # a request that cannot be read is refused
             return forbidden
         if len(given) != 1 or not self._is_token(given[0]):
             return forbidden

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 #: How often numbers and the plot are updated [1/s]; frames come more often.
 TOLD = 8.0
-#: Seconds that the plot shows, at most so many points.
+#: Seconds that the plot shows, and its maximum number of points.
 WINDOW, POINTS = 10.0, 400
 #: The plot's forces begin at zero.
 FROM_ZERO = {"min": {"soft": 0.0, "mode": 1}, "max": {"pad": 0.1, "soft": 0.01, "mode": 1}}
@@ -121,7 +121,8 @@ class Panel:
             flipped = self._gui.add_checkbox("other side", False)
 
             def cut(_: Any) -> None:
-                # Read when it is done: of many moves of the slider that wait all do the same, the last ones nothing.
+                # The value is read when the command runs: if many moves of the slider wait, the first one sets the last
+                # value.
                 def change() -> None:
                     there = None if axis.value == NOTHING else "xyz".index(axis.value)
                     session.change(plane=None if there is None else Plane(there, place.value, flipped.value))

@@ -11,11 +11,11 @@ from warp_corot.io.write.solids import solid_of
 
 
 def mesh_of(shape: Shape, extent: float) -> Any:
-    """A shape in its own frame as a mesh of trimesh, which viser brings along; None for one that has no picture.
+    """A shape in its own frame as a mesh of trimesh, which viser installs; None for a shape that cannot be drawn.
 
     Args:
         shape: A listed shape.
-        extent: How far a half-space is drawn each way [m].
+        extent: Half of the edge of a drawn half-space [m].
     """
     from trimesh import Trimesh, creation
 

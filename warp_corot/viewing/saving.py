@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 WIDTH, HEIGHT = 1280, 720
 #: How long a browser may take to draw a picture [s].
 PATIENCE = 20.0
-#: Frames a second of films and animations, and how long they are at first [s].
+#: Frames per second of films and animations, and their initial length [s].
 FPS, SECONDS = 24.0, 4.0
 
 
@@ -72,7 +72,7 @@ class Saving:
                 )
 
     def _asked(self, save: Callable[[Any], str | None]) -> Callable[[Any], None]:
-        """What has the session's thread save something for a client."""
+        """A function that makes the session's thread save something for a client."""
 
         def clicked(event: Any) -> None:
             self._session.ask(lambda: self._saved(save, event.client))
@@ -96,7 +96,7 @@ class Saving:
     # --- pictures --------------------------------------------------------------------------------------------------
 
     def _picture(self, event: Any) -> None:
-        """Save what the browser shows; called on viser's threads."""
+        """Save the picture that the browser shows; called on viser's threads."""
         try:
             found = io.BytesIO()
             _drawn(event.client).save(found, format="PNG")
@@ -106,7 +106,7 @@ class Saving:
             self._session.ask(lambda: setattr(self._session, "note", note))
 
     def _film(self, client: Any) -> None:
-        """Save frames at even intervals of simulated time, however long each takes."""
+        """Save frames at even intervals of simulated time, however long each one takes."""
         name = "film.mp4" if find_spec("imageio_ffmpeg") else "film.gif"
         count = frame_count(float(self._seconds.value), FPS)
         with tempfile.TemporaryDirectory() as folder:
@@ -166,10 +166,10 @@ class Saving:
 
 
 def _drawn(client: Any) -> Image:
-    """What a browser shows, without its panels.
+    """The picture that a browser shows, without its panels.
 
     Raises:
-        RuntimeError: It has gone, or does not draw.
+        RuntimeError: The browser has left, or does not draw.
     """
     from PIL import Image
 
@@ -177,7 +177,7 @@ def _drawn(client: Any) -> Image:
         drawn = Image.fromarray(client.get_render(HEIGHT, WIDTH, transport_format="png", timeout=PATIENCE))
     except TimeoutError:
         raise RuntimeError("the browser does not draw; its tab must be seen") from None
-    # Where there is nothing it is transparent, and films are not.
+    # The background is transparent, which films do not support.
     paper = Image.new("RGBA", drawn.size, "white")
     return Image.alpha_composite(paper, drawn.convert("RGBA")).convert("RGB")
 

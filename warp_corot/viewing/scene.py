@@ -87,7 +87,7 @@ class _Body:
             self._turns[hidden].glb_data = glb
         other = self._turns[self._seen]
         if other is not None:
-            # What was sent a frame ago has been read by now.
+            # The browser has read the last frame by now.
             other.visible = True
             self._turns[hidden].visible = False
         self._seen = hidden
@@ -137,14 +137,14 @@ class Scene:
     def _show_arrows(self, frame: Frame) -> None:
         if frame.ends:
             points = self._placed(np.array(list(frame.ends.values())))
-            # An arrow of no length has no direction.
+            # An arrow without length has no direction.
             points[:, 1] += 1e-4
             self._arrows.points = points
         if self._arrows.visible != bool(frame.ends):
             self._arrows.visible = bool(frame.ends)
 
     def _obstacle(self, number: int, shape: Shape) -> Any:
-        """The node of an obstacle; None for one that has no picture."""
+        """The node of an obstacle; None for an obstacle that cannot be drawn."""
         mesh = mesh_of(shape, self._session.size)
         if mesh is None:
             return None
@@ -163,7 +163,7 @@ class Scene:
         return ((points - self._middle) * self._scale).astype(np.float32)
 
     def _dragging(self, body: int) -> Callable[[Any], Any]:
-        """What is called while the mouse drags a body: in order, and without waiting for anything."""
+        """The function that is called while the mouse drags a body: in order, and without waiting."""
 
         async def dragged(event: Any) -> None:
             session, owner = self._session, event.client_id

@@ -182,7 +182,7 @@ class Session:
         self._steps_asked = 0
         frame = self.frame()
         simulated = self.sim.total_time - before
-        # What was sent since the last frame counts, and waiting for the next one does not.
+        # Sending counts as time of the frame; waiting for the next frame does not.
         self.pace.took(simulated, stepping, time.perf_counter() - started - stepping + self.sending)
         return frame
 

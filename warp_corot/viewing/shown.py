@@ -1,4 +1,4 @@
-"""What is shown of a body: a surface bound to its nodes, whose points are read once a frame."""
+"""The surface that is shown of a body: it is bound to the body's nodes, and its points are read once a frame."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from warp_corot.mesh.surfaces.bodies import boundary_surface
 from warp_corot.mesh.surfaces.bound import BoundPoints, DeviceBinding, SurfaceMesh
 from warp_corot.mesh.surfaces.locating import nearest_faces
 
-#: The surfaces that a body may have, the one that is shown first where there are several.
+#: The names of surfaces that a body may have; the first one there is is shown at first.
 INPUT, MARCHED, ELEMENTS = "input's own", "marched", "tetrahedra"
 
 
@@ -54,15 +54,14 @@ class Shown:
     """The shown surface of a body, first world.
 
     Args:
-        body: The body.
-        surface: Bound to the nodes of its present mesh. Its topology stays; where the body is remeshed its points are
-            bound to what holds them.
+        body: The body. surface: Bound to the nodes of its present mesh. Its topology stays; if the body is remeshed,
+        its points are bound again to the elements that contain them.
 
     Attributes:
         rest: Points at rest [m], float64 [V, 3].
         triangles: int32 [F, 3].
         binding: The points on the device.
-        positions: Where the points were when they were last read [m], float32 [V, 3].
+        positions: The points at the last reading [m], float32 [V, 3].
     """
 
     def __init__(self, body: SoftBody, surface: SurfaceMesh):
@@ -71,12 +70,12 @@ class Shown:
         if body.changing is not None:
             self.binding = body.bind(surface.points)
         else:
-            # Without triangles: browsers find normals by themselves.
+            # Without triangles, because browsers compute normals themselves.
             self.binding = BoundPoints(surface.points, surface.nodes, surface.weights).on_device(body.device)
         self.positions = surface.points.astype(np.float32)
 
     def close(self) -> None:
-        """The body need not keep the points bound any longer."""
+        """Release the points: the body no longer keeps them bound."""
         if self.binding in self.body.bindings:
             self.body.bindings.remove(self.binding)
 
@@ -87,7 +86,7 @@ class Shown:
         return self.positions
 
     def pick(self, body: int, position: npt.ArrayLike) -> Pick:
-        """The place of the surface, as it was last read, that is nearest to a position [m], [3].
+        """The place nearest to a position [m], [3], on the surface of the last reading.
 
         Args:
             body: The number of this surface's body.
@@ -104,15 +103,16 @@ class Shown:
         return pick.place @ values[self.triangles[pick.triangle]].astype(np.float64)
 
     def normal(self, pick: Pick) -> npt.NDArray[np.float64]:
-        """The outward unit normal at a place, of the surface as it was last read, float64 [3]."""
+        """The outward unit normal at a place on the surface of the last reading, float64 [3]."""
         a, b, c = self.positions[self.triangles[pick.triangle]].astype(np.float64)
         normal = np.cross(b - a, c - a)
         return normal / max(float(np.linalg.norm(normal)), 1e-300)
 
 
 def barycentric(corners: npt.NDArray[np.float64], x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Barycentric coordinates, float64 [3], of the place of a triangle [3, 3] that is near x [3]: its projection, drawn
-    in where that lies outside."""
+    """Barycentric coordinates, float64 [3], of the place of a triangle [3, 3] that is near x [3]: its projection, moved
+    into the triangle if that lies outside.
+    """
     edges = np.stack([corners[1] - corners[0], corners[2] - corners[0]], axis=1)
     later = np.linalg.lstsq(edges, x - corners[0], rcond=None)[0]
     place = np.clip([1.0 - later.sum(), *later], 0.0, None)

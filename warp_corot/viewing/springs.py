@@ -15,19 +15,19 @@ from warp_corot.simulation.simulation import Simulation
 
 from .shown import Shown
 
-#: Hands that can hold a body at the same time, and points that a patch has at most: one thread goes through them.
+#: Maximum number of hands on a body at the same time, and of points in a patch: one thread loops over them.
 MOST_HANDS, MOST_POINTS = 8, 64
-#: The spring's own frequency squared, times the longest step squared; elasticity takes up to 3.3 of the 4 there are.
+#: The square of the spring's own frequency times the longest step; the limit is 4, of which elasticity takes up to 3.3.
 STIFF = 0.2
 #: Damping of the spring over critical damping.
 DAMPED = 0.1
-#: The largest force on a patch over Young's modulus and the patch's area: beyond, elements turn over and stay so.
+#: The largest force on a patch over Young's modulus and the patch's area: beyond that, elements turn over for good.
 HARDEST = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """Points of a shown surface, and how much each counts.
+    """Points of a shown surface, and the weight of each.
 
     Attributes:
         points: int32 [k], at most MOST_POINTS.
@@ -67,7 +67,7 @@ class Springs:
             springs.launch()
 
     def complete_work(self) -> None:
-        """Launch that the work of all hands is counted up to the present state; may be recorded."""
+        """Launch the count of the work of all hands up to the present state; may be recorded."""
         for springs in self._bodies.values():
             springs.launch_completion()
 
@@ -77,11 +77,11 @@ class Springs:
         Args:
             body: Which body.
             patch: Points of its shown surface.
-            rigid: Whether every point is held; else their mean.
-            strength: Stiffness over the largest that the time step carries, 0 to 1.
+            rigid: Whether every point is held; otherwise only their mean is.
+            strength: Stiffness over the largest stable one at the time step, 0 to 1.
 
         Raises:
-            LookupError: As many hands as there can be hold the body already.
+            LookupError: The maximum number of hands hold the body already.
         """
         if body not in self._bodies:
             self._bodies[body] = _BodySprings(self.sim, self.shown[body])
@@ -112,12 +112,12 @@ class Spring:
         self.start: npt.NDArray[np.float64] = np.zeros(3)
 
     def move(self, motion: npt.ArrayLike) -> None:
-        """The hand is so far from where it took hold [m], [3]."""
+        """Set the hand's distance from where it took hold [m], [3]."""
         self.motion = np.asarray(motion, dtype=np.float64)
         self._owner.write(self.slot)
 
     def release(self) -> None:
-        """Let go; once more does no harm."""
+        """Release; further calls do nothing."""
         self._owner.release(self.slot, self)
 
     @property
@@ -127,7 +127,7 @@ class Spring:
 
     @property
     def ends(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Where the middle of the patch is and where the hand would have it [m], float64 [3] each."""
+        """The middle of the patch, and the place to which the hand pulls it [m], float64 [3] each."""
         middle = self.patch.shares @ self._owner.shown.rest[self.patch.points]
         return middle + self._owner.found()[self.slot, 1], middle + self.start + self.motion
 
@@ -192,7 +192,7 @@ class _BodySprings:
                 self.write(slot)
 
     def write(self, slot: int) -> None:
-        """Let the device have a hand as it is now."""
+        """Copy a hand to the device."""
         spring = self._held[slot]
         of_spring: Any = kernels.Spring
         row: Any = np.zeros(1, dtype=of_spring.numpy_dtype())
@@ -207,7 +207,7 @@ class _BodySprings:
         return self._found.numpy().astype(np.float64)
 
     def _fit(self, spring: Spring) -> None:
-        """The stiffness and the damping that the time step carries."""
+        """The stiffness and the damping that are stable at the time step."""
         # Copied, since a view of a device's array may be the array itself.
         nodes = np.array(self.shown.binding.nodes.numpy()[spring.patch.points])
         weights = np.array(self.shown.binding.weights.numpy()[spring.patch.points], dtype=np.float64)
@@ -217,8 +217,8 @@ class _BodySprings:
         self._parts[spring.slot, : len(nodes)].assign((1.0 / visits[place]).astype(np.float32))
         total = np.bincount(place.ravel(), np.abs(weights).ravel(), len(used))
         mass = self.body.masses[used]
-        # The largest eigenvalue of the spring over masses for a stiffness of one: exact where the patch is pulled as
-        # one, else a bound.
+        # The largest eigenvalue of the spring over masses for a stiffness of one: exact if the hand holds the mean,
+        # else a bound.
         softness = float((total / mass).max() if spring.rigid else (total**2 / mass).sum())
         safe = self.sim.safe_step
         dt = self.sim.dt if safe is None else safe.at_rest

@@ -1,4 +1,4 @@
-"""Controls that go on with another law, material or remeshing."""
+"""Controls that continue the motion with another law, material or remeshing."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ OWN = "own"
 
 
 class Tissue:
-    """The folder of these controls. What is chosen takes effect with a button, all at once.
+    """The folder of these controls. A button applies all choices at once.
 
     Args:
-        server: viser's.
-        session: What is switched.
+        server: viser's server.
+        session: The session of the page.
     """
 
     def __init__(self, server: ViserServer, session: Session):
@@ -77,10 +77,10 @@ class Tissue:
 
 
 def model_of(law: str, rotations: str, former: Model | None = None) -> Model:
-    """The model that the controls name; only the corotated one has rotations, and springs have no dilatation to share.
+    """The model that the controls name; only the corotated one shares rotations, and springs share no dilatation.
 
     Args:
-        former: The one before, whose dilatation goes on.
+        former: The present model, whose choice of dilatation is kept.
     """
     kind = MODELS[law]
     if kind in (Prestressed, Prony) and former is not None:
@@ -95,7 +95,9 @@ def model_of(law: str, rotations: str, former: Model | None = None) -> Model:
 
 
 def changed(material: Any, scale: float, poisson: float | None) -> Any:
-    """A material so many times as stiff, with another Poisson's ratio if one is given and it is isotropic."""
+    """The material with its stiffness times a factor and, if it is isotropic and one is given, another Poisson's
+    ratio.
+    """
     stiff = [name for name in vars(material) if name.startswith(("young", "shear", "k1"))]
     values = {name: getattr(material, name) * scale for name in stiff}
     if poisson is not None and type(material) is Isotropic:

@@ -1,4 +1,4 @@
-"""The page of a simulation: ``view`` opens it, ``View`` is what stays open."""
+"""The page of a simulation: ``view`` opens it, and ``View`` is the open page."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ from .scene import Scene
 from .server import open_server, stop
 from .session import Session
 
-#: The page's port where none is named: viser's own.
+#: The default port of the page: viser's own.
 PORT = 8080
 
 
 class View:
-    """A page that is open.
+    """An open page.
 
-    The simulation goes on in one thread: the one that calls ``run``, or one of the page's own after ``start``. Touch it
-    only inside ``with page.held():``.
+    The simulation runs in one thread: the caller of ``run``, or the page's own thread after ``start``. Use it only
+    inside ``with page.held():``.
 
     Args:
         sim: The simulation.
         host: The address to listen at.
-        port: Where, 0 for any free port.
-        token: What visitors must bring; see ``view``.
-        own: Of each body the user's own surface, or None.
-        made: Called with every simulation that takes the place of another.
-        run_file: What the page saves as a run file; None: nothing.
-        title: Of the page.
+        port: The port, 0 for any free one.
+        token: The word that visitors need; see ``view``.
+        own: The user's own surface of each body, or None.
+        made: Called with every simulation that replaces another.
+        run_file: The text of the run file that the page saves; None: it saves none.
+        title: The title of the page.
 
     Attributes:
-        address: What to open in a browser.
-        port: Where the page is.
-        session: What happens.
+        address: The address to open in a browser.
+        port: The port of the page.
+        session: The session.
 
     Raises:
         InputError: See ``view``.
@@ -99,19 +99,19 @@ class View:
             self._over.wait(max(period - (time.perf_counter() - started), 0.0))
 
     def start(self) -> None:
-        """Let time go on in a thread of the page's own."""
+        """Run the simulation in the page's own thread."""
         if self._thread is None:
             self._thread = threading.Thread(target=self.run, name="warp_corot page", daemon=True)
             self._thread.start()
 
     @contextmanager
     def held(self) -> Iterator[Simulation]:
-        """Inside, time stands still and the simulation may be looked at and changed."""
+        """Inside this block time stands still, and the caller may read and change the simulation."""
         with self._lock:
             yield self.session.sim
 
     def close(self) -> None:
-        """Close the page; the simulation is the caller's again. Once more does no harm."""
+        """Close the page; the simulation belongs to the caller again. Further calls do nothing."""
         self._over.set()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
@@ -153,25 +153,24 @@ def view(
     surface: Any = None,
     wait: bool | None = None,
 ) -> View:
-    """Open a page in which a person sees a simulation and takes hold of it with the mouse.
+    """Open a page that shows a simulation and lets a person drag it with the mouse.
 
     In a script the call returns when Ctrl-C ends the page. In a notebook, or with ``wait=False``, it returns at once,
-    and time goes on in a thread: look at the simulation inside ``with page.held() as sim:`` only.
+    and the simulation runs in a thread: use it only inside ``with page.held() as sim:``.
 
     Args:
-        sim: The simulation. Of several worlds the first is shown.
-        host: The address to listen at; the loopback address is reached from this computer alone.
-        port: Where, 0 for any free port.
-        token: What visitors must bring, as ``http://HOST:PORT/?token=…`` does. Without one only browsers on this
-            computer may come in; at an address that others reach one is made up, and is part of the page's address.
-        surface: The user's own surface of each body, as ``record`` takes it: a ``SurfaceMesh``, or None.
-        wait: Whether to return at the end of the page; None: unless Python is interactive.
+        sim: The simulation. The page shows its first world. host: The address to listen at; only this computer reaches
+        the loopback address. port: The port, 0 for any free one. token: The word that visitors need, as in
+        ``http://HOST:PORT/?token=…``. Without one, only browsers on this computer may enter; at an address that others
+        can reach, a random token is chosen and is part of the page's address. surface: The user's own surface of each
+        body, as ``record`` takes it: a ``SurfaceMesh``, or None. wait: Whether to return at the end of the page; None:
+        unless Python is interactive.
 
     Returns:
         The page; ``close`` ends it.
 
     Raises:
-        InputError: viser is not installed, the port is taken, or something above is out of its range.
+        InputError: viser is not installed, the port is taken, or an argument is out of its range.
     """
     own = None if surface is None else list(surface) if isinstance(surface, Sequence) else [surface]
     if own is not None and len(own) != len(getattr(sim, "bodies", own)):
@@ -191,5 +190,5 @@ def view(
 
 
 def _is_interactive() -> bool:
-    """Whether Python reads what a person types, as in a notebook."""
+    """Whether Python is interactive, as in a notebook."""
     return hasattr(sys, "ps1") or bool(sys.flags.interactive) or "ipykernel" in sys.modules

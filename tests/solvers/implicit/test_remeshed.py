@@ -65,5 +65,5 @@ def test_contact_follows_a_mesh_that_adapts(device):
 
 
 def test_quasi_static_steps_are_not_remeshed(device):
-    with pytest.raises(wc.InputError, match="QuasiStatic knows no remeshing"):
+    with pytest.raises(wc.InputError, match="QuasiStatic does not support remeshing"):
         wc.Simulation(bar(device), integrator=wc.QuasiStatic(dt=0.1), remesh=wc.OnlineRemesh())
