@@ -26,11 +26,13 @@ def volume_ratio(elements: Any, t: int, u: wp.array[wp.vec4]):
 
 @functools.cache
 def count_crushed(Elements: type) -> wp.Kernel:
-    """Count elements with det F < 0."""
+    """Count elements with det F < 0: all of them, or those that are nonzero in ``counted``."""
 
     @unique_kernel()
-    def count_crushed(elements: Elements, u: wp.array[wp.vec4], count: wp.array[wp.int32]):
+    def count_crushed(elements: Elements, u: wp.array[wp.vec4], counted: wp.array[wp.int32], count: wp.array[wp.int32]):
         t = wp.tid()
+        if counted.shape[0] > 0 and counted[t] == 0:
+            return
         if volume_ratio(elements, t, u) < 0.0:
             wp.atomic_add(count, 0, 1)
 

@@ -230,13 +230,14 @@ def solve_touch(
     surface: Surface,
     corners: wp.vec3i,
     crowd: wp.array[wp.float32],
+    corner_yielding: wp.array[wp.float32],
     touches: Touches,
 ):
     w = touches.shares[o, t]
     yielding = float(0.0)
     for k in range(3):
         s = corners[k]
-        yielding += w[k] * crowd[s] * surface.yielding[s]
+        yielding += w[k] * crowd[s] * corner_yielding[s]
     before = touches.force[o, t]
     touches.more[o, t] = wp.vec3()
     if yielding <= 0.0:
@@ -262,10 +263,15 @@ def solve_touches(
     surface: Surface,
     triangles: wp.array[wp.vec3i],
     crowd: wp.array[wp.float32],
+    corner_yielding: wp.array[wp.float32],
     # In and out
     touches: Touches,
 ):
-    """Correct the force of each that acts."""
+    """Correct the force of each that acts.
+
+    Args:
+        corner_yielding: That of the surface, also where another process moves the node.
+    """
     k = wp.tid()
     count = near.touch_count[0]
     dt = float(pace.seconds[DT])
@@ -274,7 +280,7 @@ def solve_touches(
         t = near.touches[k] % triangles.shape[0]
         k += threads
         if touches.acts[o, t] != 0:
-            solve_touch(o, t, shapes, law, dt, surface, triangles[t], crowd, touches)
+            solve_touch(o, t, shapes, law, dt, surface, triangles[t], crowd, corner_yielding, touches)
 
 
 @wp.func

@@ -1,22 +1,32 @@
 """Copies of nodal values: between a whole body and its part, and between a part and the buffers that are sent."""
 
+from typing import Any
+
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel(enable_backward=False)
-def gather_vectors(places: wp.array[wp.int32], source: wp.array[wp.vec4], found: wp.array[wp.vec4]):
+def gather_values(places: wp.array[wp.int32], source: wp.array[Any], found: wp.array[Any]):
     """found[i] = source[places[i]]."""
     i = wp.tid()
     found[i] = source[places[i]]
 
 
 @wp.kernel(enable_backward=False)
-def scatter_vectors(places: wp.array[wp.int32], source: wp.array[wp.vec4], found: wp.array[wp.vec4]):
+def scatter_values(places: wp.array[wp.int32], source: wp.array[Any], found: wp.array[Any]):
     """found[places[i]] = source[i]."""
     i = wp.tid()
     found[places[i]] = source[i]
+
+
+#: What cards exchange, and the kernels for each.
+EXCHANGED = (wp.float32, wp.vec3, wp.vec4)
+GATHER, SCATTER = (
+    {kind: wp.overload(kernel, [wp.array[wp.int32], wp.array[kind], wp.array[kind]]) for kind in EXCHANGED}
+    for kernel in (gather_values, scatter_values)
+)
 
 
 @wp.kernel(enable_backward=False)
@@ -48,6 +58,12 @@ def move_numbers(sources: wp.array[wp.int32], source: wp.array[wp.float32], foun
 def clear_energies(places: wp.array[wp.int32], energies: wp.array[wp.float64]):
     """Zero at some places."""
     energies[places[wp.tid()]] = wp.float64(0.0)
+
+
+@wp.kernel(enable_backward=False)
+def clear_forces(places: wp.array[wp.int32], forces: wp.array[wp.vec3]):
+    """Zero at some places."""
+    forces[places[wp.tid()]] = wp.vec3()
 
 
 @wp.kernel(enable_backward=False)

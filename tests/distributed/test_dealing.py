@@ -83,7 +83,12 @@ def test_directions_depend_on_a_nodes_number_alone():
         ([wc.MassSpring()], wc.SymplecticEuler(), {}, "MassSpring does not work"),
         ([wc.Corotated()], wc.SymplecticEuler(viscosity=1e-3), {}, "viscosity does not work"),
         ([wc.Corotated()], wc.SymplecticEuler(), {"remesh": wc.OnlineRemesh()}, "remeshing does not work"),
-        ([wc.Corotated()], wc.SymplecticEuler(), {"contact": wc.Contact()}, "contact does not work"),
+        (
+            [wc.Corotated()],
+            wc.SymplecticEuler(),
+            {"contact": wc.Contact(self_contact=True)},
+            "contact of soft",
+        ),
     ],
 )
 def test_what_does_not_work_is_refused(models, integrator, others, said):

@@ -39,7 +39,7 @@ def sizes_of(case):
 @pytest.mark.parametrize("case", ranked.CASES)
 def test_a_deterministic_run_is_the_same_bit_by_bit(runs, case):
     for size in sizes_of(case):
-        for what in ("x", "v", "numbers"):
+        for what in ("x", "v", "numbers", *(["wrench1"] if case == "touched" else [])):
             np.testing.assert_array_equal(runs[size][f"{case}.True.{what}"], runs[1][f"{case}.True.{what}"])
 
 
@@ -69,10 +69,12 @@ def test_energies_are_those_of_all_ranks(runs, case):
 @pytest.mark.parametrize("case", ranked.CASES)
 def test_ranks_do_what_one_process_does(runs, case):
     body = ranked.CASES[case]()
-    sim = wc.Simulation(body)
+    sim = wc.Simulation(body, obstacles=ranked.obstacles_of(case))
     sim.advance(0.03)
     body.load("z > 0.09 and z < 0.1", [0.0, 0.0, 0.0])
     sim.advance(0.01)
+    if case == "touched":
+        assert np.abs(runs[1]["touched.True.wrench1"]).max() > 0.01
     moved = np.abs(body.displacements.numpy()).max()
     assert moved > 0.01
     np.testing.assert_allclose(runs[3][f"{case}.True.x"], body.positions.numpy(), atol=2e-3 * moved)

@@ -38,10 +38,26 @@ def body_of(mesh: wc.TetForest | wc.TetMesh, poisson: float, worlds: int = 1) ->
     return body
 
 
+def touched() -> wc.SoftBody:
+    """A soft block."""
+    mesh = wc.TetForest.box((1, 1, 2), 0.05, level=4)
+    return wc.SoftBody(mesh, wc.Isotropic(2e3, 0.3, 1000.0), device="cpu")
+
+
+def obstacles_of(case: str) -> list[wc.Ground | wc.Tool]:
+    """What the block falls on, and what comes down on its edges, between its nodes."""
+    if case != "touched":
+        return []
+    tool = wc.Tool(wc.Capsule(0.004, 0.06))
+    tool.follow([0.0, 0.02, 0.05], [[0.03, 0.053, 0.04], [0.03, 0.047, 0.044], [0.03, 0.03, 0.05]])
+    return [wc.Ground((0.0, 1.0, 0.0), -0.002, friction=0.3), tool]
+
+
 CASES = {
     "forest": lambda: body_of(graded(), 0.49),
     "tets": lambda: body_of(jittered(), 0.49),
     "worlds": lambda: body_of(wc.TetForest.box((1, 1, 3), 0.064, level=4), 0.3, worlds=2),
+    "touched": touched,
 }
 
 
@@ -71,7 +87,8 @@ def main() -> None:
         make = CASES[name]
         for deterministic in (True, False) if name == "forest" and names != "forest" else (True,):
             body = make()
-            sim = wd.Simulation(body, deterministic=deterministic)
+            obstacles = obstacles_of(name)
+            sim = wd.Simulation(body, deterministic=deterministic, obstacles=obstacles)
             sim.advance(0.03)
             body.load("z > 0.09 and z < 0.1", [0.0, 0.0, 0.0])
             sim.advance(0.01)
@@ -79,6 +96,7 @@ def main() -> None:
             found |= {f"{kind}.x": wd.gather(body.positions), f"{kind}.v": wd.gather(body.velocities)}
             found |= {f"{kind}.numbers": np.array([sim.steps, sim.dt, sim.time, *sim.dt_range])}
             found |= {f"{kind}.energy": np.array(sim.energy())}
+            found |= {f"{kind}.wrench{k}": each.wrench.numpy() for k, each in enumerate(obstacles) if k}
     found |= saved_and_loaded(Path(results), before)
     if sim.rank == 0:
         np.savez(results, **found)

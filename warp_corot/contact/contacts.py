@@ -66,11 +66,14 @@ class Contacts:
         self.system, self.device, self.options = system, system.device, options
         self.obstacles = Obstacles(obstacles, options.friction, system, dt)
         self.surface = ContactSurface(system.bodies)
+        own = [self.surface.places_of(k) for k in range(len(system.bodies))]
+        system.ranks.take_surface(self.surface.arrays.node, own)
         self.law = self._law(stable_dt)
         self.search = Search(self.surface, self.obstacles, self.smallest)
         self.rigid: RigidForces | None = None
         if self.obstacles.count:
-            self.rigid = RigidForces(self.surface, self.obstacles, self.search, self.law, system.pace.arrays)
+            given = (self.surface, self.obstacles, self.search, self.law, system.pace.arrays, system.ranks)
+            self.rigid = RigidForces(*given)
         #: Soft surfaces that may touch one another; None without.
         self.pairs: Pairs | None = None
         if len(system.bodies) > 1 or options.self_contact:
@@ -147,6 +150,7 @@ class Contacts:
         self.search.launch(offset)
         self._solve()
         self.search.launch_after()
+        system.ranks.clear_surface(surface.arrays.f)
         for k, body in enumerate(system.bodies):
             outputs = [body.state.forces, body.state.contact_forces]
             inputs = [surface.parts[k].start, surface.arrays]
@@ -175,18 +179,22 @@ class Contacts:
         surface, obstacles = self.surface, self.obstacles
         if self.rigid is not None:
             forces = self.rigid.launch_totals()
+            for number in range(obstacles.count if self.rigid.have_edges else 0):
+                self.system.ranks.clear_surface(forces[number])
             threads = self._parts.shape[2] * self._lanes
             for part in surface.parts:
                 inputs = [part.start, part.nodes, self._lanes, threads, surface.arrays, obstacles.motions, forces]
                 wp.launch(
                     sums.sum_wrenches, (*obstacles.wrenches.shape, threads), inputs, [self._parts], device=self.device
                 )
+            self.system.ranks.add_up_wrenches(self._parts)
             wp.launch(
                 sums.fold_wrenches, obstacles.wrenches.shape, [self._parts], [obstacles.wrenches], device=self.device
             )
         self.search.launch_report()
         inputs = [surface.arrays, surface.triangles, surface.corner_starts, surface.corners]
         self._launch(sums.node_pressures, surface.count, inputs, [self._pressures])
+        self.system.ranks.complete_surface(self._pressures)
         for k, part in enumerate(surface.parts):
             inputs = [part.triangle_start, surface.arrays, surface.triangles, self._pressures]
             outputs = [self._triangle_pressures[k]]
@@ -226,7 +234,7 @@ class Contacts:
         return smallest_size([body.discretization.smallest_volume for body in self.system.bodies])
 
     def _law(self, stable_dt: float) -> Law:
-        points = [np.abs(body.mesh.points).max() for body in self.system.bodies]
+        points = [np.abs(self.system.ranks.whole(body).mesh.points).max() for body in self.system.bodies]
         law = Law()
         law.tolerance = ROUNDINGS * 2.0**-24 * max(*points, 1e-3)
         law.recovery = RECOVERY * self.smallest / stable_dt if np.isfinite(stable_dt) else 0.1
@@ -242,6 +250,8 @@ class Contacts:
             inputs += [state.rest, state.forces, state.displacements, state.velocities]
             kernel = motion.PREDICT_MOTION[conditions.loads.dtype]
             self._launch(kernel, self._count(k), inputs, [surface.arrays])
+        if self.rigid is not None and self.rigid.have_edges:
+            system.ranks.complete_surface(surface.arrays.d)
 
     def _solve(self) -> None:
         """Launch the forces in turn: of obstacles on nodes, of obstacles between these, and of soft surfaces."""

@@ -7,6 +7,7 @@ import warp as wp
 from warp_corot.kernels.contact import beside, triangles, vertices
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.stepping.pace import Pace
+from warp_corot.solvers.ranks import ALONE, Ranks
 
 from .obstacles import Obstacles
 from .search import Search
@@ -22,6 +23,7 @@ class RigidForces:
         search: Says when to look for what obstacles are near.
         law: How far contacts may come nearer in a step.
         pace: The clock.
+        ranks: Who moves the other nodes of the triangles here.
 
     Attributes:
         forces: Of each obstacle on each surface node itself in the last step [N], vec3 [O, S].
@@ -32,9 +34,17 @@ class RigidForces:
         have_edges: Whether any of the obstacles can come between the nodes.
     """
 
-    def __init__(self, surface: ContactSurface, obstacles: Obstacles, search: Search, law: Law, pace: Pace):
+    def __init__(
+        self,
+        surface: ContactSurface,
+        obstacles: Obstacles,
+        search: Search,
+        law: Law,
+        pace: Pace,
+        ranks: Ranks = ALONE,
+    ):
         self.surface, self.obstacles, self.search, self.device = surface, obstacles, search, surface.device
-        self._law, self._pace, self._taken = law, pace, -1
+        self._law, self._pace, self._ranks, self._taken = law, pace, ranks, -1
         self.have_edges = obstacles.have_edges
         search.finders.append(self._find)
         self.follow()
@@ -58,6 +68,7 @@ class RigidForces:
         self.touches.gap = wp.zeros(shape, dtype=wp.float32, device=device)
         self.touches.acts = wp.zeros(shape, dtype=wp.int32, device=device)
         self._crowd = wp.zeros(count, dtype=wp.float32, device=device)
+        self._yielding = self.surface.arrays.yielding
 
     def forget(self) -> None:
         """Forget the last step."""
@@ -77,6 +88,7 @@ class RigidForces:
     def launch_begin(self) -> None:
         """Launch the first forces: those between nodes that the last step has left, and those on nodes."""
         if self.have_edges:
+            self._yielding = self._ranks.completed_yielding(self.surface.arrays.yielding)
             rigid = [self.obstacles.shapes, self.obstacles.motions]
             inputs = [*rigid, self._law, self.surface.arrays, self.surface.triangles, self.touches]
             self._on_touches(triangles.find_touches, inputs)
@@ -88,10 +100,13 @@ class RigidForces:
         if not self.have_edges:
             return
         step = [self._law, self._pace, self.surface.arrays, self.surface.triangles]
+        self._ranks.complete_surface(self.surface.arrays.d)
         self._on_touches(triangles.judge_touches, [*step, self.touches])
         inputs = [self.surface.corner_starts, self.surface.corners, self.touches, self._crowd]
         self._on_nodes(triangles.crowd_nodes, inputs)
-        self._on_touches(triangles.solve_touches, [self.obstacles.shapes, *step, self._crowd, self.touches])
+        self._ranks.complete_surface(self._crowd)
+        inputs = [self.obstacles.shapes, *step, self._crowd, self._yielding, self.touches]
+        self._on_touches(triangles.solve_touches, inputs)
         self._apply()
 
     def launch_correction(self) -> None:

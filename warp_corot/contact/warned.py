@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -46,14 +47,27 @@ def warn_of_overlaps(contacts: Contacts, least: float) -> None:
         depths = wp.zeros(contacts.surface.count, dtype=wp.float32, device=contacts.device)
         inputs = [contacts.obstacles.shapes, contacts.obstacles.motions, contacts.surface.arrays]
         wp.launch(sums.find_depths, contacts.surface.count, inputs, [depths], device=contacts.device)
-        deep = depths.numpy()
-        count = int((deep > least).sum())
+        deep, ranks = depths.numpy(), contacts.system.ranks
+        count, deepest = int(ranks.together(int((deep > least).sum()))), ranks.most(float(deep.max(initial=0.0)))
         if count:
-            _warn(f"{count} surface nodes begin inside obstacles, by up to {1e3 * deep.max():.3g} mm; they are {speed}")
+            _warn(f"{count} surface nodes begin inside obstacles, by up to {1e3 * deepest:.3g} mm; they are {speed}")
     axes = [(tool, _axis(tool, contacts.obstacles.poses()[0, k])) for k, tool in enumerate(contacts.obstacles.tools)]
     axes = [(tool, points) for tool, points in axes if len(points)]
     if len(contacts.surface.parts) > 1 or axes:
         _warn_of_what_bodies_hold(contacts, axes, least, speed)
+
+
+def _own_surfaces(contacts: Contacts) -> Iterator[tuple[Floats, npt.NDArray[np.int32]]]:
+    """Where the surface nodes of each body are in its first world [m], and its triangles."""
+    places = contacts.surface.arrays.x.numpy().astype(float)
+    for body, part in zip(contacts.system.bodies, contacts.surface.parts, strict=True):
+        whole = contacts.system.ranks.whole(body)
+        if whole is body:
+            yield places[part.start : part.start + len(part.skin.nodes)], part.skin.triangles
+        else:
+            triangles = whole.surface_triangles
+            nodes, corners = np.unique(triangles, return_inverse=True)
+            yield whole.positions.numpy()[nodes].astype(float), corners.reshape(-1, 3).astype(np.int32)
 
 
 def warn_of_crushed(contacts: Contacts) -> bool:
@@ -64,11 +78,13 @@ def warn_of_crushed(contacts: Contacts) -> bool:
     """
     system = contacts.system
     count = wp.zeros(1, dtype=wp.int32, device=contacts.device)
-    for body in system.bodies:
+    for k, body in enumerate(system.bodies):
         kernel = count_crushed(body.discretization.element_kind)
-        inputs = [body.discretization.elements, body.state.displacements]
+        counted = system.ranks.counted(k)
+        counted = wp.empty(0, dtype=wp.int32, device=contacts.device) if counted is None else counted
+        inputs = [body.discretization.elements, body.state.displacements, counted]
         wp.launch(kernel, body.sizes.launch_elements, inputs, [count], device=contacts.device)
-    crushed = int(count.numpy()[0])
+    crushed = int(system.ranks.together(int(count.numpy()[0])))
     if crushed:
         _warn(
             f"{crushed} elements are turned inside out at t = {system.pace.time:.4g} s: something presses harder than "
@@ -83,22 +99,22 @@ def warn_of_crushed(contacts: Contacts) -> bool:
 
 def _warn_of_what_bodies_hold(contacts: Contacts, axes: list[tuple[Tool, Floats]], least: float, speed: str) -> None:
     """The same of the nodes of bodies, and of axes of tools, in other bodies."""
-    parts, places = contacts.surface.parts, contacts.surface.arrays.x.numpy().astype(float)
-    own = [places[part.start : part.start + len(part.skin.nodes)] for part in parts]
+    surfaces = list(_own_surfaces(contacts))
+    own = [points for points, _ in surfaces]
     ends = np.cumsum([0, *(len(points) for points in own), *(len(points) for _, points in axes)])
     points = np.concatenate(own + [each for _, each in axes])
     deepest = np.zeros(len(points))
-    for k, part in enumerate(parts):
-        depths = _depths(own[k], part.skin.triangles, points, contacts.device)
+    for k, (_, triangles) in enumerate(surfaces):
+        depths = _depths(own[k], triangles, points, contacts.device)
         depths[ends[k] : ends[k + 1]] = 0.0
         deepest = np.maximum(deepest, depths)
-    deep = deepest[: ends[len(parts)]]
+    deep = deepest[: ends[len(own)]]
     if count := int((deep > least).sum()):
         _warn(
             f"{count} surface nodes begin inside another soft body, by up to {1e3 * deep.max():.3g} mm; overlaps of up "
             f"to a quarter of an element are {speed}, deeper ones stay"
         )
-    for (tool, _), start, end in zip(axes, ends[len(parts) :], ends[len(parts) + 1 :], strict=False):
+    for (tool, _), start, end in zip(axes, ends[len(own) :], ends[len(own) + 1 :], strict=False):
         if (deepest[start:end] > least).any():
             _warn(f"a {tool.shape!r} begins inside a soft body, where nothing pushes it out; begin outside of it")
 

@@ -37,7 +37,7 @@ def nccl_of(alias: str) -> Any:
 
 
 class CardExchange:
-    """The exchange of a part's nodal vectors between cards.
+    """The exchange of a part's nodal values between cards.
 
     Args:
         halo: Who gets what.
@@ -47,23 +47,30 @@ class CardExchange:
     def __init__(self, halo: Halo, device: wp.Device):
         self._nccl, self._device = nccl_of(device.alias), device
         self._sent, self._received = (_joined(lists, device) for lists in (halo.sent, halo.received))
-        self._out, self._in = (
-            wp.zeros(len(nodes), dtype=wp.vec4, device=device) for nodes in (self._sent[0], self._received[0])
-        )
+        self._rooms = {kind: self._room_for(kind) for kind in kernels.EXCHANGED}
 
-    def launch(self, vectors: wp.array) -> None:
-        """Launch that ghosts get their values, in a nodal array vec4; may be recorded."""
+    def launch(self, nodal: wp.array) -> None:
+        """Launch that ghosts get their values, in a nodal array of float32, vec3 or vec4; may be recorded."""
         import nccl.core as nccl
 
         stream = wp.get_stream(self._device)
         (sent, to), (received, by) = self._sent, self._received
-        wp.launch(kernels.gather_vectors, len(sent), [sent, vectors], [self._out], device=self._device)
+        out, given = self._rooms[nodal.dtype]
+        gather, scatter = kernels.GATHER[nodal.dtype], kernels.SCATTER[nodal.dtype]
+        wp.launch(gather, len(sent), [sent, nodal], [out], device=self._device)
         with nccl.group():
             for rank, start, end in to:
-                self._nccl.send(_floats(self._out, start, end), rank, stream=stream)
+                self._nccl.send(_floats(out, start, end), rank, stream=stream)
             for rank, start, end in by:
-                self._nccl.recv(_floats(self._in, start, end), rank, stream=stream)
-        wp.launch(kernels.scatter_vectors, len(received), [received, self._in], [vectors], device=self._device)
+                self._nccl.recv(_floats(given, start, end), rank, stream=stream)
+        wp.launch(scatter, len(received), [received, given], [nodal], device=self._device)
+
+    def _room_for(self, kind: Any) -> tuple[wp.array, wp.array]:
+        """Buffers for what is sent and received."""
+        out, given = (
+            wp.zeros(len(nodes), dtype=kind, device=self._device) for nodes in (self._sent[0], self._received[0])
+        )
+        return out, given
 
 
 def take_most(values: wp.array) -> None:
@@ -72,6 +79,14 @@ def take_most(values: wp.array) -> None:
 
     own, stream = nccl_of(values.device.alias), wp.get_stream(values.device)
     own.allreduce(values, values, nccl.MAX, stream=stream)
+
+
+def add_up(values: wp.array) -> None:
+    """Launch that an array on a card holds the sums over all ranks, in place; may be recorded."""
+    import nccl.core as nccl
+
+    own, stream = nccl_of(values.device.alias), wp.get_stream(values.device)
+    own.allreduce(values, values, nccl.SUM, stream=stream)
 
 
 def _joined(lists: dict[int, Any], device: wp.Device) -> tuple[wp.array, list[tuple[int, int, int]]]:

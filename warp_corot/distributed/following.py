@@ -67,6 +67,34 @@ class Following:
             self._move(kernels.move_vectors, sources, targets, getattr(part.state, name), getattr(whole.state, name))
         whole.state.publish_positions()
         wp.copy(whole.conditions.world_starts, part.conditions.world_starts)
+        if part.state.is_touched:
+            self._publish_touch(targets, sources)
+
+    def _publish_touch(self, targets: wp.array, sources: wp.array) -> None:
+        """Give the whole body the contact forces of the nodes that this rank moves, and pressures around them."""
+        whole, part = self.whole.state, self.part.state
+        if not whole.is_touched:
+            whole.make_contact_forces()
+            count = self.whole.worlds * len(self.whole.surface_triangles)
+            whole.contact_pressures = wp.zeros(count, dtype=wp.float32, device=self.part.device)
+            here, _ = self.part.surface_here
+            shift = np.arange(self.whole.worlds, dtype=np.int32)[:, None]
+            self.triangles = (here + len(self.whole.surface_triangles) * shift).ravel()
+            self._triangles = wp.array(self.triangles, dtype=wp.int32, device=self.part.device)
+        self._move(kernels.move_vectors, sources, targets, part.contact_forces, whole.contact_forces)
+        inputs, found = [self._triangles, part.contact_pressures], [whole.contact_pressures]
+        wp.launch(kernels.SCATTER[wp.float32], len(self._triangles), inputs, found, device=self.part.device)
+
+    def collect_touch(self) -> None:
+        """Bring contact forces and pressures together on all ranks."""
+        state = self.whole.state
+        if not state.is_touched:
+            return
+        state.contact_forces.assign(self._comm.bcast(self.gather(state.contact_forces), root=0))
+        found = state.contact_pressures.numpy()
+        for triangles, pressures in self._comm.allgather((self.triangles, found[self.triangles])):
+            found[triangles] = pressures
+        state.contact_pressures.assign(found)
 
     def take_initial(self) -> None:
         """Take over what a reset restores."""

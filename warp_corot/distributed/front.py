@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.reading import ContactPoint
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.simulation.simulation import Simulation as OnOne
 
@@ -30,7 +31,10 @@ class LedSimulation(OnOne):
         self._comm = mpi.world()
         options = {name: value for name, value in options.items() if value is not None}
         self._on_all = Simulation(bodies, **options)
-        super().__init__(bodies, **options)
+        touching = {"obstacles", "contact"}
+        super().__init__(bodies, **{name: value for name, value in options.items() if name not in touching})
+        # Each tool is in one simulation.
+        self.contact = self._on_all.contact
         self._served = False
 
     # --- stepping --------------------------------------------------------------------------------------------------
@@ -56,6 +60,9 @@ class LedSimulation(OnOne):
 
     def reset(self, worlds: Any = None) -> None:
         raise InputError("reset does not work where rank 0 leads others")
+
+    def contacts(self) -> list[ContactPoint]:
+        raise InputError("contacts does not work where rank 0 leads others")
 
     def save(self, path: Any) -> None:
         raise InputError("save does not work where rank 0 leads others")

@@ -12,6 +12,8 @@ import warp as wp
 from .parts import Numbers
 
 Ints = npt.NDArray[np.int32]
+#: A buffer for each neighbour.
+Room = dict[int, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +61,7 @@ class Halo:
 
 
 class HostExchange:
-    """The exchange of a part's nodal vectors through MPI, on the CPU.
+    """The exchange of a part's nodal values through MPI, on the CPU.
 
     Args:
         halo: Who gets what.
@@ -69,21 +71,32 @@ class HostExchange:
 
     def __init__(self, halo: Halo, comm: Any, tag: int):
         self._halo, self._comm, self._tag = halo, comm, tag
-        self._out = {rank: np.zeros((len(nodes), 4), np.float32) for rank, nodes in halo.sent.items()}
-        self._in = {rank: np.zeros((len(nodes), 4), np.float32) for rank, nodes in halo.received.items()}
+        self._rooms: dict[tuple[Any, ...], tuple[Room, Room]] = {}
 
-    def launch(self, vectors: wp.array) -> None:
-        """Give ghosts their values, in a nodal array vec4."""
+    def launch(self, nodal: wp.array) -> None:
+        """Give ghosts their values, in a nodal array of any numbers or vectors."""
         comm, halo = self._comm, self._halo
-        values = vectors.numpy()
-        asked = [comm.Irecv(buffer, rank, self._tag) for rank, buffer in self._in.items()]
+        values = nodal.numpy()
+        out, received = self._room_for(values)
+        asked = [comm.Irecv(buffer, rank, self._tag) for rank, buffer in received.items()]
         for rank, nodes in halo.sent.items():
-            np.take(values, nodes, axis=0, out=self._out[rank])
-            asked.append(comm.Isend(self._out[rank], rank, self._tag))
+            np.take(values, nodes, axis=0, out=out[rank])
+            asked.append(comm.Isend(out[rank], rank, self._tag))
         for request in asked:
             request.Wait()
         for rank, nodes in halo.received.items():
-            values[nodes] = self._in[rank]
+            values[nodes] = received[rank]
+
+    def _room_for(self, values: npt.NDArray[Any]) -> tuple[Room, Room]:
+        """Buffers for what is sent and received."""
+        kind = (values.dtype, *values.shape[1:])
+        if kind not in self._rooms:
+            out, received = (
+                {rank: np.zeros((len(nodes), *values.shape[1:]), values.dtype) for rank, nodes in lists.items()}
+                for lists in (self._halo.sent, self._halo.received)
+            )
+            self._rooms[kind] = out, received
+        return self._rooms[kind]
 
 
 def _in_worlds(nodes: Ints, worlds: int, count: int) -> Ints:

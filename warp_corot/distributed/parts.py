@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -53,6 +54,7 @@ class Part(SoftBody):
         self.numbers = Numbers(
             nodes, elements, partition.rank_of_node[nodes], partition.rank_of_element[elements] == rank
         )
+        self._whole = whole
         self._is_own = np.tile(self.numbers.owner == rank, whole.worlds)
         material = part_of_material(whole.material, elements, len(whole.mesh.tets))
         super().__init__(mesh, material, worlds=whole.worlds, device=whole.device)
@@ -62,6 +64,23 @@ class Part(SoftBody):
     def masses(self) -> npt.NDArray[np.float64]:
         """Lumped masses of the nodes that this rank moves [kg], float64 [worlds * n]; zero for ghosts."""
         return np.where(self._is_own, super().masses, 0.0)
+
+    @property
+    def surface_triangles(self) -> Ints:
+        """The triangles of the whole body's surface around the nodes that this rank moves, int32 [f, 3], in the order
+        that they have there."""
+        return self.surface_here[1]
+
+    @functools.cached_property
+    def surface_here(self) -> tuple[Ints, Ints]:
+        """Which triangles of the whole body's surface these are, int32 [f], and their nodes in the part, [f, 3]."""
+        triangles = self._whole.surface_triangles
+        number = np.full(self._whole.world_node_count, -1, np.int32)
+        own = self._is_own[: len(self.numbers.nodes)]
+        number[self.numbers.nodes[own]] = 1
+        here = np.flatnonzero((number[triangles] >= 0).any(axis=1)).astype(np.int32)
+        number[self.numbers.nodes] = np.arange(len(self.numbers.nodes), dtype=np.int32)
+        return here, number[triangles[here]]
 
 
 def part_of_mesh(mesh: Mesh, kept: npt.NDArray[np.bool_], partition: Partition) -> tuple[Mesh, Ints]:

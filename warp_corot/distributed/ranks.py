@@ -17,11 +17,12 @@ from warp_corot.kernels.stepping import pace as clock
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.solvers.ranks import Floats, Ranks
 
-from .cards import CardExchange, take_most
+from .cards import CardExchange, add_up, take_most
 from .directions import normal_numbers
 from .halo import Halo, HostExchange
 from .parts import Part
 from .settled import settled_sums
+from .surfaces import SurfacePlaces
 
 
 class MpiRanks(Ranks):
@@ -44,12 +45,12 @@ class MpiRanks(Ranks):
         self._wholes = dict(zip(parts, wholes, strict=True))
         self._parts = parts
         self.halos = halos = [Halo.of(part.numbers, part.worlds, comm) for part in parts]
-        self._exchanges: list[HostExchange | CardExchange] = [
-            CardExchange(halo, self.device) if self.device.is_cuda else HostExchange(halo, comm, k)
-            for k, halo in enumerate(halos)
-        ]
+        self._exchanges = [self._exchange_of(halo, k) for k, halo in enumerate(halos)]
         self._copies = [wp.zeros_like(part.state.displacements) for part in parts]
         self._copied_energies = [self._places_of_copies(part) for part in parts]
+
+    def _exchange_of(self, halo: Halo, tag: int) -> HostExchange | CardExchange:
+        return CardExchange(halo, self.device) if self.device.is_cuda else HostExchange(halo, self.comm, tag)
 
     def _places_of_copies(self, part: Part) -> wp.array:
         """Elements that other ranks count, in all worlds, int32."""
@@ -105,6 +106,40 @@ class MpiRanks(Ranks):
         found = np.zeros(len(sums))
         found[0] = total
         sums.assign(found)
+
+    # --- contact ---------------------------------------------------------------------------------------------------
+
+    def take_surface(self, nodes: wp.array, places: Sequence[slice]) -> None:
+        sizes = [self._wholes[part].node_count for part in self._parts]
+        starts = [int(start) for start in np.cumsum([0, *sizes[:-1]])]
+        numbers = [self._numbers(k) for k in range(len(self._parts))]
+        self._places = SurfacePlaces(nodes, places, self._parts, starts, numbers, self.comm)
+        self._on_surface = self._exchange_of(self._places.halo, len(self._parts))
+        self._yielding = wp.zeros(len(nodes), dtype=wp.float32, device=self.device)
+
+    def complete_surface(self, values: wp.array) -> None:
+        self._on_surface.launch(values)
+
+    def completed_yielding(self, yielding: wp.array) -> wp.array:
+        wp.copy(self._yielding, yielding)
+        self.complete_surface(self._yielding)
+        return self._yielding
+
+    def clear_surface(self, forces: wp.array) -> None:
+        places = self._places.ghosts
+        wp.launch(kernels.clear_forces, len(places), [places], [forces], device=self.device)
+
+    def add_up_wrenches(self, parts: wp.array) -> None:
+        if self.device.is_cuda:
+            add_up(parts.view(wp.float64).flatten())
+            return
+        own = parts.numpy()
+        own[...] = np.sum(self.comm.allgather(own), axis=0)
+
+    def counted(self, k: int) -> wp.array:
+        part = self._parts[k]
+        own = np.tile(part.numbers.counted, part.worlds).astype(np.int32)
+        return wp.array(own, dtype=wp.int32, device=self.device)
 
     # --- numbers ---------------------------------------------------------------------------------------------------
 

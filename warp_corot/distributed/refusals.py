@@ -26,14 +26,14 @@ def check_supported(
     Raises:
         InputError: It cannot.
     """
-    refused = {
-        "remesh": "remeshing",
-        "obstacles": "contact with obstacles",
-        "contact": "contact",
-    }
-    for name, what in refused.items():
-        if others.get(name):
-            raise InputError(f"{what} does not work on several ranks yet; leave {name} out, or run on one process")
+    if others.get("remesh"):
+        raise InputError("remeshing does not work on several ranks yet; leave remesh out, or run on one process")
+    contact = others.get("contact")
+    if getattr(contact, "self_contact", False) or (len(bodies) > 1 and (contact or others.get("obstacles"))):
+        raise InputError(
+            "contact of soft surfaces does not work on several ranks yet; take one body and no self_contact, or run on "
+            "one process"
+        )
     if integrator.is_implicit:
         raise InputError(
             f"{type(integrator).__name__} does not work on several ranks yet; the integrator must be SymplecticEuler"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
@@ -14,6 +15,9 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.contacts import Contacts
+from warp_corot.contact.shapes import Shape
+from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.elasticity import Corotated, Model
 from warp_corot.elasticity.dilatation.options import ELEMENT, SHARED, shares_dilatation
 from warp_corot.errors import InputError, UnstableError
@@ -47,7 +51,8 @@ class Simulation:
         bodies, model, integrator, gravity: As for ``warp_corot.Simulation``.
         deterministic: Whether the run must come out the same bit by bit for any number of ranks.
         costs: What an element costs on each rank, in any unit, [ranks]; None: the same everywhere.
-        others: Other arguments of ``warp_corot.Simulation``, which do not work on several ranks yet.
+        others: ``obstacles`` and ``contact`` as for ``warp_corot.Simulation``; its further arguments do not work on
+            several ranks yet.
 
     Attributes:
         bodies: Tuple of the whole bodies.
@@ -82,7 +87,7 @@ class Simulation:
         self._following = [Following(body, part, comm) for body, part in zip(self.bodies, parts, strict=True)]
         for each in self._following:
             each.take_over()
-        _compile_once(comm, parts, model=models, integrator=integrator, gravity=self.gravity)
+        _compile_once(comm, parts, model=models, integrator=integrator, gravity=self.gravity, **others)
         for each in self._following:
             each.take_over()
         ranks = MpiRanks(comm, self.bodies, parts, settled=bool(deterministic))
@@ -238,6 +243,17 @@ class Simulation:
             for array in (state.displacements, state.velocities, state.reactions):
                 array.assign(self._comm.bcast(each.gather(array), root=0))
             state.publish_positions()
+            each.collect_touch()
+
+    @property
+    def contact(self) -> Contacts | None:
+        """Contact of this rank's parts; None without."""
+        return self._parts.contact
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """Shapes and tools that bodies touch, as they were given."""
+        return self._parts.obstacles
 
     # --- keeping ---------------------------------------------------------------------------------------------------
 
@@ -249,6 +265,8 @@ class Simulation:
         Raises:
             InputError: On all ranks, if rank 0 cannot write to the folder.
         """
+        if self._parts.contact is not None:
+            raise InputError("save does not work with contact on several ranks yet")
         self._take_over()
         self.collect()
         checkpoint.save(path, self.bodies, self._parts, self._following, self._comm)
@@ -267,8 +285,9 @@ class Simulation:
             InputError: As for ``warp_corot.Simulation.load``, or a run that does not work on several ranks.
         """
         loaded = on_one.Simulation.load(path, device=device)
-        others = {"remesh": any(loaded.remesh), "contact": loaded.contact}
-        check_supported(loaded.bodies, loaded.models, loaded.integrator, others)
+        if loaded.contact is not None:
+            raise InputError("a checkpoint with contact does not work on several ranks yet; load it on one process")
+        check_supported(loaded.bodies, loaded.models, loaded.integrator, {"remesh": any(loaded.remesh)})
         made = cls(
             loaded.bodies,
             model=loaded.models,
@@ -326,13 +345,19 @@ def _compile_once(comm: Any, parts: Sequence[Part], **options: Any) -> None:
     if here.rank == 0 and free:
         with warnings.catch_warnings(), suppress(UnstableError):
             warnings.simplefilter("ignore")
-            tried = on_one.Simulation(parts, **options)
+            tried = on_one.Simulation(parts, **(options | {"obstacles": _of_their_own(options.get("obstacles", ()))}))
             tried.advance_steps(TRIED_STEPS)
             tried.energy()
         for part in parts:
             part.state.reactions.zero_()
     here.Barrier()
     here.Free()
+
+
+def _of_their_own(obstacles: Obstacle | Sequence[Obstacle]) -> list[Obstacle]:
+    """The same obstacles for another simulation."""
+    given = [obstacles] if isinstance(obstacles, Shape | Tool) else list(obstacles)
+    return [copy.copy(each) for each in given]
 
 
 def _settled_model(model: Model, body: SoftBody) -> Model:

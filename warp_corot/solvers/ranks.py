@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -66,6 +67,33 @@ class Ranks:
             parts: Addends of this rank; if sums are settled, one for each node.
             sums: Their sums.
         """
+
+    # --- contact ---------------------------------------------------------------------------------------------------
+
+    def take_surface(self, nodes: wp.array, places: Sequence[slice]) -> None:
+        """Take the surfaces of the bodies, on which the following act.
+
+        Args:
+            nodes: The node of its body at each place, in all worlds, int32; -1 at places that are not in use.
+            places: Those of each body.
+        """
+
+    def complete_surface(self, values: wp.array) -> None:
+        """Launch that places of ghosts get their values, in an array of float32 or vec3 over the surface's places."""
+
+    def completed_yielding(self, yielding: wp.array) -> wp.array:
+        """How surface nodes yield, also ghosts, which are held here; in another array, if there are ghosts."""
+        return yielding
+
+    def clear_surface(self, forces: wp.array) -> None:
+        """Launch that forces on ghosts are zero, vec3 over the surface's places: their ranks have them."""
+
+    def add_up_wrenches(self, parts: wp.array) -> None:
+        """Launch that parts of wrenches on obstacles are those of all ranks, in place."""
+
+    def counted(self, k: int) -> wp.array | None:
+        """Elements of the k-th body that this rank counts, int32 [worlds * T], nonzero; None: all."""
+        return None
 
     # --- numbers ---------------------------------------------------------------------------------------------------
 

@@ -167,7 +167,8 @@ class Guard:
         """
         report = self._balance.wait()
         self.was_given = report.has_changed
-        if any(each.is_full for each in self.system.constraints):
+        full = any(each.is_full for each in self.system.constraints)
+        if self.system.constraints and self._ranks.most(float(full)):
             return Fault("more contacts than there is room for", np.arange(self.worlds), is_want_of_room=True)
         if report.has_changed:
             self._begin_before()

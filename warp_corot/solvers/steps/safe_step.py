@@ -142,6 +142,8 @@ class SafeStep:
         for each in self._system.constraints:
             each.measure()
         self._system.ranks.take_most(self._found)
+        if self._system.constraints:
+            self._system.ranks.take_most(self._system.motion_rates)
         inputs = [self._at_rest, self._found, self._system.motion_rates, self._control, self.pace.arrays]
         wp.launch(kernels.take_safe_step, dim=1, inputs=inputs, device=self.device)
 
