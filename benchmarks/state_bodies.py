@@ -6,6 +6,7 @@ are too large to step use the state of a coarser mesh of the same body, interpol
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,7 +19,8 @@ from measure import kind
 import warp_corot as wc
 from warp_corot.experiments import paper
 
-#: A soft tissue whose elements have a dilatation each by default; Young's modulus [Pa], density [kg/m^3].
+#: A soft tissue whose elements have a dilatation each by default; Young's modulus [Pa], density [kg/m^3]. From a
+#: Poisson's ratio of 0.45 on elements share it.
 MATERIAL = {"young": 5e3, "poisson": 0.44, "density": 1000.0}
 GRAVITY = (0.0, -9.81, 0.0)
 #: Time of motion before bodies are measured [s].
@@ -70,6 +72,7 @@ class Subject:
         coarser: Makes the same body with about an eighth of the elements.
         pulled: Nodes that are pulled along z in the state "pulled", bool [N].
         worlds: Number of copies.
+        poisson: Poisson's ratio.
     """
 
     name: str
@@ -79,6 +82,12 @@ class Subject:
     coarser: Callable[[], Subject] | None = None
     pulled: np.ndarray | None = None
     worlds: int = 1
+    poisson: float = MATERIAL["poisson"]
+
+    @property
+    def material(self) -> dict[str, float]:
+        """Young's modulus [Pa], Poisson's ratio and density [kg/m^3]."""
+        return MATERIAL | {"poisson": self.poisson}
 
     @property
     def points(self) -> np.ndarray:
@@ -172,7 +181,7 @@ def organ(name: str, count: int, worlds: int = 1) -> Subject:
 
 def new_body(subject: Subject, device: wp.Device) -> wc.SoftBody:
     """One copy with its fixed nodes."""
-    body = wc.SoftBody(subject.mesh, wc.Isotropic(**MATERIAL), device=device)
+    body = wc.SoftBody(subject.mesh, wc.Isotropic(**subject.material), device=device)
     body.fix(subject.held)
     return body
 
@@ -185,7 +194,7 @@ def _physics(
     def make(subject: Subject, device: wp.Device) -> tuple[str, np.ndarray]:
         if subject.coarser is None or len(subject.mesh.tets) <= STEPPED_ELEMENTS[kind(device)]:
             return move(subject, device)
-        coarse = subject.coarser()
+        coarse = dataclasses.replace(subject.coarser(), poisson=subject.poisson)
         how, u = make(coarse, device)
         elements, weights = coarse.mesh.embed(subject.points)
         found = np.einsum("na,nai->ni", weights, u[coarse.mesh.tets[elements]].astype(float))

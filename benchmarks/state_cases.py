@@ -11,12 +11,14 @@ import numpy as np
 import warp as wp
 from measure import WRONG, Case, kind
 from problem import SUBTREE_LEVELS, Sample, drawn_nodes, oracle, padded
+from shared_reference import pressure_forces
 from solver_cases import put_back
 from state_bodies import GRAVITY, MATERIAL, State, Subject
 
 import warp_corot as wc
 from warp_corot.discretization.elements import forest_elements
 from warp_corot.elasticity import ForceField, Model
+from warp_corot.elasticity.dilatation.field import DilatationField, law_of
 from warp_corot.errors import InputError
 
 #: Fibres along y, three times as stiff as across.
@@ -95,7 +97,11 @@ def flagged_share(field: ForceField) -> float | None:
 
 
 class Bench:
-    """The bodies of one subject: a forest and a general mesh, isotropic and with fibres."""
+    """The bodies of one subject: a forest and a general mesh, isotropic and with fibres.
+
+    Attributes:
+        groups: By path, the group of each element of one world that shares a dilatation; none where elements do not.
+    """
 
     def __init__(self, subject: Subject, states: list[State], device: wp.Device):
         self.subject, self.device = subject, device
@@ -108,12 +114,13 @@ class Bench:
             Sample(mesh.points, mesh.tets, nodes=np.append(drawn_nodes(len(mesh.points), count), single))
             for count in (NODES, FIBRE_NODES)
         )
-        self.mu, self.lam = (float(value) for value in oracle.lame(MATERIAL["young"], MATERIAL["poisson"]))
+        self.mu, self.lam = (float(value) for value in oracle.lame(MATERIAL["young"], subject.poisson))
+        self.groups: dict[str, np.ndarray] = {}
         self.C = oracle.elasticity(*oracle.transverse(*FIBRES), axes=np.roll(np.eye(3), 2, axis=0))
         #: The array for forces.
         self.f = wp.zeros(len(mesh.points) * subject.worlds, dtype=wp.vec4, device=device)
         self._u: dict[int, wp.array] = {}
-        self._forces: dict[tuple[int, str], np.ndarray] = {}
+        self._forces: dict[tuple[int, str, str | None], np.ndarray] = {}
         self._definite: dict[tuple[int, str], np.ndarray] = {}
 
     def meshes(self) -> Iterator[tuple[str, wc.TetForest | wc.TetMesh, np.ndarray | float]]:
@@ -127,7 +134,7 @@ class Bench:
         return wc.SoftBody(mesh, material, worlds=self.subject.worlds, device=self.device)
 
     def isotropic(self, share: np.ndarray | float) -> wc.Isotropic:
-        return wc.Isotropic(MATERIAL["young"] * share, MATERIAL["poisson"], MATERIAL["density"] * share)
+        return wc.Isotropic(MATERIAL["young"] * share, self.subject.poisson, MATERIAL["density"] * share)
 
     def fibres(self, share: np.ndarray | float) -> wc.TransverselyIsotropic:
         along, across, *ratios, shear = FIBRES
@@ -148,6 +155,9 @@ class Bench:
                 self.reference[name] = reference
                 fields = found.setdefault(name, {})
                 fields[path] = model.bind(body)
+                sharing = law_of(fields[path])[1]
+                if sharing is not None and path not in self.groups:
+                    self.groups[path] = numbers_of_one_world(sharing, len(mesh.tets))
                 if path == DEFAULT and "subtrees" in {f.name for f in dataclasses.fields(model)}:
                     fields[LEAF] = dataclasses.replace(model, subtrees=False).bind(body)
             fibres = self.body(mesh, self.fibres(share))
@@ -190,7 +200,8 @@ class Bench:
         def error() -> float:
             f.zero_()
             field.add_forces(u, f)
-            return self.error(state, self.reference[law], f.numpy()[self.checked_world, :3])
+            found = f.numpy()[self.checked_world, :3]
+            return self.error(state, self.reference[law], found, shared=self.sharing(law, path))
 
         # The oracle does not know rotations that the device chooses: the error is the effect of sharing.
         wrong = None if self.reference[law] == "auto" else WRONG
@@ -207,7 +218,8 @@ class Bench:
             sim.advance_steps(1)
             mass = body.masses[self.checked_world, None]
             found = mass * body.velocities.numpy()[self.checked_world] / sim.dt
-            return self.error(state, "corotated", found, mass * np.array(GRAVITY), ~self.subject.held)
+            loads, free = mass * np.array(GRAVITY), ~self.subject.held
+            return self.error(state, "corotated", found, loads, free, self.sharing("corotated", path))
 
         return Case(
             f"{self.subject.name}, {state.name}",
@@ -229,6 +241,11 @@ class Bench:
 
     # --- references ---------------------------------------------------------------------------------------------------
 
+    def sharing(self, law: str, path: str) -> str | None:
+        """The path whose groups a law's elements share their dilatation in, or None."""
+        of_path = GENERAL if path == GENERAL else DEFAULT
+        return of_path if of_path in self.groups and self.reference.get(law) != "fibres" else None
+
     def error(
         self,
         state: State,
@@ -236,17 +253,19 @@ class Bench:
         found: np.ndarray,
         loads: np.ndarray | None = None,
         free: np.ndarray | None = None,
+        shared: str | None = None,
     ) -> float:
         """Error of forces [N, 3] of one world, at the sample's nodes whose elements have definite rotations.
 
         Args:
             loads: Other forces included in them [N, 3].
             free: Nodes to compare, bool [N]; None for all.
+            shared: As ``sharing`` has it.
         """
         sample = self.few if reference == "fibres" else self.sample
         keep = self.definite(state, reference, sample) & (True if free is None else free[sample.nodes])
         nodes = sample.nodes[keep]
-        wanted = self.forces(state, reference)[keep] + (0.0 if loads is None else loads[nodes])
+        wanted = self.forces(state, reference, shared)[keep] + (0.0 if loads is None else loads[nodes])
         if not np.isfinite(found[nodes]).all():
             return float("inf")
         least = LEAST_STRAIN * MATERIAL["young"] * float(np.max(sample.mesh.volumes)) ** (2 / 3)
@@ -269,26 +288,31 @@ class Bench:
         """Positions of the nodes in a sample's elements, float64."""
         return self.subject.points[sample.used] + state.u[sample.used].astype(float)
 
-    def forces(self, state: State, reference: str) -> np.ndarray:
+    def forces(self, state: State, reference: str, shared: str | None = None) -> np.ndarray:
         """The float64 forces [n, 3] of a sample."""
-        key = id(state), reference
+        key = id(state), reference, shared
         if key not in self._forces:
-            self._forces[key] = self._found_forces(state, reference)
+            self._forces[key] = self._found_forces(state, reference, shared)
         return self._forces[key]
 
-    def _found_forces(self, state: State, reference: str) -> np.ndarray:
+    def _found_forces(self, state: State, reference: str, shared: str | None) -> np.ndarray:
         if reference == "fibres":
             sample, law, options = self.few, oracle.anisotropic, {}
             C = np.broadcast_to(self.C, (len(sample.elements), 3, 3, 3, 3))
             mu, lam = C * self._shares(sample)[:, None, None, None, None], None
         else:
             sample, options = self.sample, {}
-            law = oracle.DENSITIES[{"shared": "corotated", "auto": "corotated"}.get(reference, reference)]
-            mu, lam = (value * self._shares(sample) for value in (self.mu, self.lam))
+            name = {"shared": "corotated", "auto": "corotated"}.get(reference, reference)
+            law, of_law = oracle.DENSITIES[name], 0.0 if shared is not None else self.lam
+            mu, lam = (value * self._shares(sample) for value in (self.mu, of_law))
             if reference == "shared":
                 options = {"R": oracle.polar(self._ancestors_gradients(state))}
-        found = oracle.continuum(law, sample.mesh, self.x(state, sample), mu, lam, **options)
-        return found[1][sample.rows]
+        found = oracle.continuum(law, sample.mesh, self.x(state, sample), mu, lam, **options)[1][sample.rows]
+        if shared is not None:
+            mesh = self.subject.mesh
+            of_all = self.lam * np.broadcast_to(self.fill, len(mesh.tets))
+            found += pressure_forces(name, sample, mesh.points, mesh.tets, state.u, self.groups[shared], of_all)
+        return found
 
     def _shares(self, sample: Sample) -> np.ndarray:
         """The filled fraction of each element of a sample [m]."""
@@ -302,6 +326,14 @@ class Bench:
         used, local = np.unique(tets, return_inverse=True)
         at_rest = oracle.Mesh(mesh.points[used], local.reshape(-1, 4))
         return at_rest.deformation_gradients(mesh.points[used] + state.u[used].astype(float))
+
+
+def numbers_of_one_world(field: DilatationField, count: int) -> np.ndarray:
+    """The group of each element of the first world, int [count]."""
+    numbers = field.group_numbers()
+    if numbers is None:
+        raise RuntimeError("the elements share their dilatation at nodes, for which there is no reference")
+    return numbers[:count]
 
 
 def is_indefinite(F: np.ndarray) -> np.ndarray:
