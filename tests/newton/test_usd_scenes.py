@@ -329,3 +329,14 @@ def test_attachments_to_a_rigid_body_carry_it(tmp_path):
     assert drop > weight * HEIGHT / (YOUNG * AREA)
     assert drop < 2.0 * weight * HEIGHT / (YOUNG * AREA)
     assert state.von_mises[0].mean() == pytest.approx(weight / AREA, rel=0.1)
+
+
+def test_implicit_steps_take_a_stage_to_rest(tmp_path):
+    sim = simulated(standing(tmp_path / "stage.usda", height=0.02), 48, integrator="implicit")
+    state, model = sim.show(), sim.parts.model
+    assert sim.dt == pytest.approx(1 / 72)  # 24 frames a second
+    assert sim.solver.solves.unfinished == 0
+    assert np.abs(state.velocities[0]).max() < 1e-3
+    depth = np.maximum(-state.positions[0][:, 2], 0.0)
+    stiffness = 0.5 * (model.soft_contact_ke + model.shape_material_ke.numpy()[0])
+    assert stiffness * depth.sum() == pytest.approx(DENSITY * AREA * HEIGHT * G, rel=1e-3)

@@ -132,7 +132,16 @@ what is written, on top of OUT's sublayer INPUT, which must stay beside it unles
         metavar="F",
         help="frames per second (default: the stage's time codes per second, else 24)",
     )
-    motion.add_argument("--dt", type=quantities.seconds, help="longest time step [s] (default: a safe one)")
+    motion.add_argument(
+        "--integrator",
+        choices=("explicit", "implicit"),
+        default="explicit",
+        help="explicit: many short steps; implicit: steps of any length, for stiff bodies, by backward Euler, which "
+        "damps; soft bodies then pass through one another, and there is no cloth (default: explicit)",
+    )
+    motion.add_argument(
+        "--dt", type=quantities.seconds, help="longest time step [s] (default: a safe one; 1/60 s if implicit)"
+    )
     motion.add_argument(
         "--rigid",
         choices=("semi-implicit", "xpbd", "none"),
@@ -183,6 +192,7 @@ def run(args: argparse.Namespace) -> int:
             options=options,
             damping=args.damping,
             rigid=args.rigid,
+            integrator=args.integrator,
             device=device,
         )
     count = frame_count(args.duration, sim.fps)
@@ -269,7 +279,7 @@ def _summary(source: Path, sim: StageSimulation, writer: SceneWriter, done: Reco
     rows += [
         ("colliders", f"{parts.model.shape_count}" + (", with a ground" if parts.ground is not None else "")),
         ("gravity", f"{' '.join(f'{g:.4g}' for g in gravity)} m/s^2"),
-        ("time step", f"{milliseconds(sim.dt)}, largest stable one about {milliseconds(sim.solver.stable_dt)}"),
+        ("time step", _steps(sim)),
         ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"),
         ("wall time", f"{done.stepping:.2f} s stepping, {done.writing:.2f} s writing"),
         ("displacement", f"{length(_displacement(sim))} largest at the end"),
@@ -278,6 +288,14 @@ def _summary(source: Path, sim: StageSimulation, writer: SceneWriter, done: Reco
         ("written", f"{done.path}, {done.frames} frames, {done.simulated:.4g} s"),
     ]
     return "\n".join([str(source), *(f"  {name:<14}{text}" for name, text in rows)])
+
+
+def _steps(sim: StageSimulation) -> str:
+    solves = sim.solver.solves
+    if not solves.steps:
+        return f"{milliseconds(sim.dt)}, largest stable one about {milliseconds(sim.solver.stable_dt)}"
+    text = f"{milliseconds(sim.dt)}, implicit, {solves.linear_iterations / solves.steps:.0f} iterations each"
+    return text + (f"; {solves.unfinished} did not converge" if solves.unfinished else "")
 
 
 def _displacement(sim: StageSimulation) -> float:

@@ -15,6 +15,7 @@ from .state import STATE, attribute_of
 from .tetrahedra import LAME
 
 ROTATIONS = ("byers-xu", "warm")
+INTEGRATORS = ("explicit", "implicit")
 
 
 class Step(NamedTuple):
@@ -35,6 +36,7 @@ def check_options(
     lame: Any,
     rotation: Any,
     damping: Any,
+    integrator: Any,
     substeps: Any,
     stable_dt: Any,
     self_contact_margin: Any,
@@ -46,7 +48,8 @@ def check_options(
     """
     if not isinstance(model, newton.Model) and not isinstance(model, ModelView):
         raise InputError(f"model is {_named(model)}; it must be a newton.Model, the result of builder.finalize()")
-    for name, value, among in (("lame", lame, LAME), ("rotation", rotation, ROTATIONS)):
+    choices = (("lame", lame, LAME), ("rotation", rotation, ROTATIONS), ("integrator", integrator, INTEGRATORS))
+    for name, value, among in choices:
         if not isinstance(value, str) or value not in among:
             raise InputError(f"{name} is {value!r}; it must be one of {', '.join(among)}")
     if not (is_finite(damping) and damping >= 0):
@@ -57,6 +60,11 @@ def check_options(
         raise InputError(f"stable_dt is {stable_dt!r}; it must be a positive number of seconds or None")
     if self_contact_margin is not None and not (is_finite(self_contact_margin) and self_contact_margin > 0):
         raise InputError(f"self_contact_margin is {self_contact_margin!r}; it must be a positive distance in m or None")
+    if self_contact_margin is not None and integrator == "implicit":
+        raise InputError(
+            "self_contact_margin is given, and integrator is 'implicit', in whose steps soft bodies do not touch one "
+            "another: take integrator='explicit', or no self_contact_margin"
+        )
 
 
 def check_step(step: Step, model: newton.Model, warm: bool) -> None:

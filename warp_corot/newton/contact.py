@@ -159,9 +159,9 @@ class Contacts:
         """
         state, _, _, contacts, dt, reported = substep
         model = self.model
-        touching = contacts if contacts is not None and contacts.soft_contact_max and model.shape_count else None
+        touching = self.touching(contacts)
         attached = model.attachment_particle_body_count
-        law = self._law()
+        law = self.law()
         pairs = None if self.pairs is None or contacts is None else self.pairs.lists_of(contacts)
         if touching is not None or pairs is not None:
             wp.copy(self._before, f)
@@ -172,7 +172,7 @@ class Contacts:
         if touching is not None:
             rows = self._no_wrenches if reported is None else reported
             inputs = [law, dt, *self._found(touch), touching.soft_contact_body_vel]
-            inputs += [touching.soft_contact_normal, *self._shapes(), model.shape_material_kd]
+            inputs += [touching.soft_contact_normal, *self.shapes(), model.shape_material_kd]
             inputs += [model.shape_material_kf, model.shape_material_mu, model.particle_flags, model.particle_world]
             inputs += [model.particle_radius, model.particle_inv_mass, state.particle_q, state.particle_qd]
             inputs += [model.gravity, self._before, *bodies, share, touching.rigid_contact_max]
@@ -180,10 +180,21 @@ class Contacts:
         if pairs is not None and self.pairs is not None:
             self.pairs.add_forces(pairs, state, law, dt, self._loads.array, self._before, f, trouble)
         if attached:
-            inputs = [dt, *self._attachments(), model.attachment_particle_body_damping]
+            inputs = [dt, *self.attachments(), model.attachment_particle_body_damping]
             inputs += [model.attachment_particle_body_enabled, model.particle_inv_mass]
             inputs += [state.particle_q, state.particle_qd, *bodies]
             self._launch(scatter_attachments, attached, inputs, [f, self.reactions])
+
+    def touching(self, contacts: newton.Contacts | None) -> newton.Contacts | None:
+        """Contacts between particles and shapes, if there can be any."""
+        return contacts if contacts is not None and contacts.soft_contact_max and self.model.shape_count else None
+
+    def count_loads(self, step: Step, of_bodies: newton.State) -> tuple[list[wp.array], wp.array]:
+        """Records of contacts with shapes, and the loads of particles that share them, float32 [P] or empty."""
+        touching = self.touching(step.contacts)
+        records = [] if touching is None else records_of(touching)
+        self._count_loads(Touch(step.state_in, of_bodies, touching, records, self.law(), step.dt), None)
+        return records, self._loads.array
 
     def _count_loads(self, touch: Touch, pairs: PairLists | None) -> None:
         """Find how many contacts share each particle, if several may."""
@@ -218,12 +229,12 @@ class Contacts:
         bodies = [of_bodies.body_q, model.body_com]
         for number in range(ROUNDS if touching is not None else 1):
             if touching is not None:
-                inputs = [touch.law, *self._found(touch), touching.soft_contact_normal, *self._shapes()]
+                inputs = [touch.law, *self._found(touch), touching.soft_contact_normal, *self.shapes()]
                 inputs += [model.particle_flags, model.particle_radius, q, KINEMATIC, model.body_flags, *bodies]
                 inputs += [self._yielding, number]
                 self._launch(gather_soft_contacts, touching.soft_contact_max, inputs, outputs)
             if model.attachment_particle_body_count:
-                inputs = [*self._attachments(), model.attachment_particle_body_enabled, q, *bodies, number]
+                inputs = [*self.attachments(), model.attachment_particle_body_enabled, q, *bodies, number]
                 self._launch(gather_attachments, model.attachment_particle_body_count, inputs, outputs)
             inputs = [touch.dt, KINEMATIC, model.body_flags, model.body_inv_mass, model.body_inv_inertia]
             inputs += [of_bodies.body_q]
@@ -234,10 +245,10 @@ class Contacts:
         assert touching is not None
         return [*touch.records, self._loads.array, touching.soft_contact_shape, touching.soft_contact_body_pos]
 
-    def _shapes(self) -> list[wp.array]:
+    def shapes(self) -> list[wp.array]:
         return [self.model.shape_body, self._margins(), self.model.shape_material_ke]
 
-    def _law(self) -> ContactLaw:
+    def law(self) -> ContactLaw:
         law, model = ContactLaw(), self.model
         law.stiffness, law.damping = model.soft_contact_ke, model.soft_contact_kd
         law.friction_slope, law.friction = model.soft_contact_kf, model.soft_contact_mu
@@ -247,7 +258,7 @@ class Contacts:
     def _margins(self) -> wp.array:
         return self._no_numbers if self.model.shape_margin is None else self.model.shape_margin
 
-    def _attachments(self) -> list[wp.array]:
+    def attachments(self) -> list[wp.array]:
         model = self.model
         return [
             model.attachment_particle_body_particle,

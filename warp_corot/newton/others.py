@@ -37,11 +37,12 @@ class Others:
         has_particles: Whether particles are integrated here, because something besides tetrahedra acts on them.
         has_bodies: Whether bodies are integrated here.
         damped: Whether springs, triangles or bending edges have dampers.
+        is_own: Whether the bodies' solver is the one that is made here.
         contact: Stiffness [N/m] and damping [N s/m] of each contact between particles.
     """
 
     def __init__(self, model: newton.Model, rigid_solver: SolverBase | str | None, particle_contact: bool):
-        own = rigid_solver == "semi-implicit"
+        self.is_own = own = rigid_solver == "semi-implicit"
         if not own and rigid_solver is not None and not isinstance(rigid_solver, SolverBase):
             raise InputError(f"rigid_solver is {rigid_solver!r}; it must be 'semi-implicit', a solver or None")
         self.model = model

@@ -32,6 +32,8 @@ class Steps:
 
     Attributes:
         report: Failures of worlds.
+        totals: Of implicit steps: steps, linear solves, iterations of these, and steps in which one did not converge,
+            int64 [4].
     """
 
     def __init__(self, model: newton.Model, tetrahedra: Tetrahedra, contacts: Contacts, others: Others, damping: float):
@@ -42,6 +44,7 @@ class Steps:
         p, b = model.particle_count, model.body_count
         self._f = wp.zeros(p, dtype=wp.vec4, device=self.device)
         self.report = Report(model)
+        self.totals = wp.zeros(4, dtype=wp.int64, device=self.device)
         types = (wp.vec3, wp.vec3)
         self._particles_before = [wp.empty(p, dtype=dtype, device=self.device) for dtype in types]
         self._nothing = [wp.empty(0, dtype=dtype, device=self.device) for dtype in types]
@@ -213,11 +216,14 @@ class Steps:
             inputs = [dt, self.damping, model.particle_inv_mass, model.particle_flags]
             self._launch(kernels.damp_particles, model.particle_count, inputs, [out.particle_q, out.particle_qd])
         if others.has_bodies:
-            inputs = [out.body_q, out.body_qd, model.body_world, int(worlds.UNSTABLE)]
-            self._launch(worlds.check_bodies, model.body_count, inputs, [self.report.trouble])
+            self._check_bodies(out)
         if others.has_particles:
             inputs = [out.particle_q, out.particle_qd, fastest, particle_world]
             self._launch(worlds.check_particles, model.particle_count, inputs, [self.report.trouble])
+
+    def _check_bodies(self, out: newton.State) -> None:
+        inputs = [out.body_q, out.body_qd, self.model.body_world, int(worlds.UNSTABLE)]
+        self._launch(worlds.check_bodies, self.model.body_count, inputs, [self.report.trouble])
 
     def _launch_undoing(self, out: newton.State, particles: list[wp.array], bodies: list[wp.array]) -> None:
         """Restore the worlds with a failure."""

@@ -156,6 +156,11 @@ class Tetrahedra:
         self._launch(kernel, self.model.tet_count, [self.elements, material, u], [f])
 
     @property
+    def k_damp(self) -> wp.array:
+        """Viscosity of all tetrahedra [Pa s], float32 [T]."""
+        return self._materials[3]
+
+    @property
     def nodes_by_positions(self) -> npt.NDArray[np.integer]:
         """Particles of elements whose forces are found from positions."""
         return self._nodes[0]

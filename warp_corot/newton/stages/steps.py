@@ -34,6 +34,10 @@ RIGID = ("semi-implicit", "xpbd", "none")
 GAP = 3.0
 #: Number of triangles that a vertex can touch, and half the number of edges that an edge can.
 ROOM = 64
+#: Longest implicit step unless another is given [s].
+IMPLICIT_STEP = 1.0 / 60.0
+#: What comes at this speed is found before an implicit step in which it touches something [m/s].
+FAST = 10.0
 #: Longest step if rigid bodies touch something [s].
 RIGID_STEP = 5e-4
 
@@ -52,6 +56,8 @@ class StageSimulation:
         options: Values for what the stage does not define.
         damping: Rate of mass-proportional damping [1/s], which also damps free fall.
         rigid: Newton's solver for rigid bodies and joints: "semi-implicit", "xpbd", or "none".
+        integrator: "explicit", or "implicit", with steps of 1/60 s at most unless ``dt`` says otherwise; soft bodies
+            then pass through one another.
         device: The device of the simulation.
 
     Attributes:
@@ -76,6 +82,7 @@ class StageSimulation:
         options: StageOptions | None = None,
         damping: float = 0.0,
         rigid: str = "semi-implicit",
+        integrator: str = "explicit",
         device: Any = None,
     ):
         if dt is not None and not (math.isfinite(dt) and dt > 0):
@@ -86,11 +93,18 @@ class StageSimulation:
         self.fps = 24.0 if fps is None and self.scene.frame_rate is None else float(fps or self.scene.frame_rate or 0)
         if not (math.isfinite(self.fps) and self.fps > 0):
             raise InputError(f"fps is {self.fps:g}; it must be a positive number")
+        self._is_implicit = integrator == "implicit"
         self.parts = stage_model(self.scene, options or StageOptions(), checked_device(device))
         model = self.parts.model
+        if self._is_implicit and self.parts.thickness is not None:
+            self.parts.thickness = None
+            self.parts.notes.append("soft bodies pass through one another in implicit steps")
         self._given_dt, self.steps = dt, 0
-        self.solver = self._new_solver(rigid, damping)
-        self._pipeline = newton.CollisionPipeline(model, soft_contact_gap=self.parts.margin)
+        self.solver = self._new_solver(rigid, integrator, damping)
+        gap = self.parts.margin
+        if self._is_implicit:
+            gap += FAST / self.scene.units.metres * self._longest_step()
+        self._pipeline = newton.CollisionPipeline(model, soft_contact_gap=gap)
         self._touch = self.parts.thickness is not None
         if self.parts.thickness is not None:
             # Nothing else of Newton's filter of neighbours is needed: a body does not push itself in its first shape.
@@ -132,7 +146,7 @@ class StageSimulation:
             except InputError as error:
                 raise UnstableError(f"after {self.time:.3g} s: {error}") from None
             except UnstableError:
-                if self._given_dt is not None or attempt == RETRIES:
+                if self._is_implicit or self._given_dt is not None or attempt == RETRIES:
                     raise
             # From now on the solver uses half the step.
             self.state.assign(self._kept)
@@ -206,7 +220,7 @@ class StageSimulation:
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
-    def _new_solver(self, rigid: str, damping: float) -> SolverCorotated:
+    def _new_solver(self, rigid: str, integrator: str, damping: float) -> SolverCorotated:
         model = self.parts.model
         try:
             solver: Any = {"semi-implicit": rigid, "none": None}.get(rigid)
@@ -218,6 +232,7 @@ class StageSimulation:
             return SolverCorotated(
                 model,
                 damping=damping,
+                integrator=integrator,
                 substeps=substeps,
                 rigid_solver=solver,
                 self_contact_margin=self.parts.thickness,
@@ -232,6 +247,8 @@ class StageSimulation:
 
     def _longest_step(self) -> float:
         stable, dt = self.solver.stable_dt, self._given_dt
+        if self._is_implicit:
+            return IMPLICIT_STEP if dt is None else dt
         if dt is not None:
             if dt > stable:
                 raise InputError(f"dt is {dt:g} s; it must be at most the largest stable step, about {stable:.3g} s")
@@ -242,7 +259,8 @@ class StageSimulation:
     def _record_steps(self) -> None:
         """Record a chunk of steps that are safe in the current state, if their number has changed."""
         count = steps_per_frame(self.fps, self._longest_step())
-        chunks = -(-count // (CPU_CHUNK if self.parts.model.device.is_cpu else CHUNK))
+        largest = CPU_CHUNK if self.parts.model.device.is_cpu else CHUNK
+        chunks = count if self._is_implicit else -(-count // largest)
         self._chunk = -(-count // chunks)
         count = chunks * self._chunk
         if count != self.steps:

@@ -1,0 +1,98 @@
+"""The share of a linear solve's answer that contacts allow: the first at which the power along it vanishes.
+
+Along a change c from motions d, the power of all forces is g(s) = c . (b - A d) - s c . A c + links(s), with A without
+links. It falls with s, as everything has an energy that is convex. Worlds in which g(1) is not far below zero take all.
+"""
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.implicit.sums import add_up
+
+wp.set_module_options({"enable_backward": False})
+
+#: Columns of a world's search: the share that is tried, the ends of the bracket, and the power at these; the power at
+#: zero without links, and what it loses with the share.
+TRIED, LOW, HIGH, AT_LOW, AT_HIGH, POWER, LOSS = (wp.constant(k) for k in range(7))
+COLUMNS = 7
+#: Power at the end of the whole change, over that at its beginning, with which it is taken.
+ENOUGH = wp.constant(wp.float64(0.2))
+
+
+@wp.kernel(enable_backward=False)
+def begin_search(
+    # In
+    power: wp.array3d[wp.float64],
+    loss: wp.array3d[wp.float64],
+    lanes: int,
+    # Out
+    search: wp.array2d[wp.float64],
+    slopes: wp.array[wp.float64],
+):
+    """Begin with a share of nothing."""
+    world, lane = wp.tid()
+    first = add_up(power, world, lane, lanes, 0)
+    second = add_up(loss, world, lane, lanes, 0)
+    if lane == 0:
+        search[world, POWER] = first
+        search[world, LOSS] = second
+        search[world, TRIED] = wp.float64(0.0)
+        slopes[world] = wp.float64(0.0)
+
+
+@wp.kernel(enable_backward=False)
+def take_trial(
+    # In
+    number: int,
+    # In and out
+    search: wp.array2d[wp.float64],
+    slopes: wp.array[wp.float64],
+):
+    """Take the power at the share that was tried, first 0 and then 1, and choose the next one."""
+    world = wp.tid()
+    s = search[world, TRIED]
+    g = search[world, POWER] - s * search[world, LOSS] + slopes[world]
+    slopes[world] = wp.float64(0.0)
+    if number == 0:
+        search[world, LOW] = s
+        search[world, AT_LOW] = g
+        search[world, HIGH] = wp.float64(1.0)
+        search[world, AT_HIGH] = wp.float64(0.0)
+        search[world, TRIED] = wp.float64(1.0)
+        return
+    if number == 1:
+        if g >= -ENOUGH * search[world, AT_LOW]:
+            search[world, LOW] = s
+            search[world, AT_LOW] = wp.float64(0.0)
+        search[world, AT_HIGH] = g
+    elif g >= wp.float64(0.0):
+        # The power at the end that stays counts half, so that both ends close in.
+        search[world, LOW] = s
+        search[world, AT_LOW] = g
+        search[world, AT_HIGH] = wp.float64(0.5) * search[world, AT_HIGH]
+    else:
+        search[world, HIGH] = s
+        search[world, AT_HIGH] = g
+        search[world, AT_LOW] = wp.float64(0.5) * search[world, AT_LOW]
+    low = search[world, LOW]
+    high = search[world, HIGH]
+    fall = search[world, AT_LOW] - search[world, AT_HIGH]
+    share = high
+    if fall > wp.float64(0.0) and high > low:
+        share = low + (high - low) * search[world, AT_LOW] / fall
+    search[world, TRIED] = share
+
+
+@wp.kernel(enable_backward=False)
+def add_share(
+    # In
+    search: wp.array2d[wp.float64],
+    count: int,
+    change: wp.array[wp.vec4],
+    # In and out
+    d: wp.array[wp.vec4],
+):
+    """d += share of the change."""
+    k = wp.tid()
+    share = float(search[k / count, TRIED])
+    store_node(d, k, load_node(d, k) + share * load_node(change, k))
