@@ -162,6 +162,9 @@ class BesideField(ForceField):
     def derive(self) -> None:
         self.law.derive()
 
+    def take_material(self) -> None:
+        self.law.take_material()
+
     def follow(self) -> None:
         self.law.follow()
 

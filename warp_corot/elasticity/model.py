@@ -72,6 +72,7 @@ class ForceField(ABC):
     takes_anisotropic: ClassVar[bool] = False
     is_linear: bool = False
     shares_dilatation: ClassVar[bool] = False
+    _dilating: Dilating | None = None
 
     def __init__(self, body: Discretized | Discretization, deterministic: bool = False):
         discretization = discretization_of(body)
@@ -84,6 +85,8 @@ class ForceField(ABC):
         #: On the CPU there is one thread, and the order is always the same.
         self.deterministic = deterministic and discretization.device.is_cuda
         self._isotropic = Kept(lambda *values: isotropic_material(list(values)))
+        #: Leaves in no subtree, and copies of their Lamé's parameters.
+        self._flat_lame: tuple[wp.array, list[wp.array]] | None = None
         self.plan = self.plan_of(discretization)
         self.elements, self.slots = self.plan.elements, self.plan.slots
 
@@ -144,6 +147,15 @@ class ForceField(ABC):
 
         Called if plans change, each time after one is derived.
         """
+
+    def take_material(self) -> None:
+        """Copy again what the field keeps of Lamé's parameters, whose values have changed in their arrays."""
+        if self._flat_lame is not None:
+            leaves, own = self._flat_lame
+            for copy, values in zip(own, self._lame, strict=True):
+                copy.assign(chosen(values, leaves))
+        if self._dilating is not None:
+            self._dilating.derive(self.isotropic)
 
     def follow(self) -> None:  # noqa: B027 (most need nothing)
         """Adapt launches to the present sizes of the plan.
@@ -274,8 +286,13 @@ class ForceField(ABC):
             return isotropic_material([*kept, 1])
         if self.discretization.material_stride == 0 or not len(flat):
             return self.isotropic
-        own = [chosen(values, flat.leaves) for values in (self.discretization.mu, self.discretization.lam)]
+        own = [chosen(values, flat.leaves) for values in self._lame]
+        self._flat_lame = flat.leaves, own
         return isotropic_material([*own, 1])
+
+    @property
+    def _lame(self) -> tuple[wp.array, wp.array]:
+        return self.discretization.mu, self.discretization.lam
 
 
 class Model(ABC):

@@ -280,7 +280,6 @@ class LanesField(CorotatedField):
     def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
         super().__init__(discretization, model, deterministic)
         self._lanes = general_lanes(self.elements)
-        self._dilating: Dilating | None = None
 
     def share_dilatation(self, dilating: Dilating) -> bool:
         self._dilating = dilating

@@ -58,7 +58,6 @@ class SubtreeField(CorotatedField):
     def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
         super().__init__(discretization, model, deterministic)
         self._uniform = discretization.material_stride == 0
-        self._dilating: Dilating | None = None
         #: What adds the forces of all leaves, whatever they come to be.
         self._clusters: ChangingClusterScatter | None = None
         if self._listed and self.rotation_level is None:

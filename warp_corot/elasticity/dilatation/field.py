@@ -89,6 +89,9 @@ class DilatationField(ForceField):
         self._others.derive()
         self.shear.derive()
 
+    def take_material(self) -> None:
+        self.shear.take_material()
+
     def follow(self) -> None:
         self._others.follow()
         self._make_room()

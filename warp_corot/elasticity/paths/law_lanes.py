@@ -34,7 +34,6 @@ class LawLanesField(LawField):
         super().__init__(discretization, **functions)
         self._law = law
         self._lanes: Lanes | None = None
-        self._dilating: Dilating | None = None
         self._lanes_material = self.isotropic
         self.follow()
 

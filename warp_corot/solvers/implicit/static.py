@@ -1,4 +1,4 @@
-"""Static answers: Newton's method with load steps that get shorter where it does not converge."""
+"""Static answers: Newton's method, with smaller parts of the load where it does not converge."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from warp_corot.kernels.implicit import newton as kernels
 from .newton import Newton, NewtonReport
 from .preconditioners import preconditioner_of
 from .tangent import TangentOperator
+from .volume import limited, limits
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 SHIFT = 1.0
 #: The smallest share of the load that is added in one step.
 LEAST_SHARE = 1.0 / 64.0
+#: Newton's tolerance for states on the way.
+ROUGH = 1e-3
 
 
 class StaticSolver:
@@ -69,6 +72,7 @@ class StaticSolver:
         state = self.body.state
         self.operator.set_scales(self._keep_free_worlds(), 0.0, 1.0)
         graph = self._record()
+        self._limits = limits(self.field) if self._load_steps == 1 else []
         given, rest = wp.clone(state.displacements), self._free_nodes_at_rest()
         report = self._solve_from(given, graph)
         if np.array_equal(given.numpy(), rest) or (report.converged.all() and not self._turned_over()):
@@ -82,12 +86,19 @@ class StaticSolver:
         return report
 
     def _solve_from(self, start: wp.array, graph: wp.Graph) -> NewtonReport:
-        """Add the load in parts, smaller and smaller ones where Newton's method does not converge."""
+        """Add the load at once, or in parts, smaller and smaller ones where Newton's method does not converge."""
         newton = self.newton
         wp.copy(newton.base, start)
         newton.increment.zero_()
         good = wp.clone(newton.increment)
         self.share, step = 0.0, 1.0 / self._load_steps
+        if self._limits:
+            report = self._solve_at_once(start, graph)
+            if report.converged.all():
+                self.share = 1.0
+                return report
+            wp.copy(newton.increment, good)
+            step = 0.5
         while True:
             share = self.share + step
             share = 1.0 if share > 1.0 - 1e-9 else share
@@ -103,6 +114,23 @@ class StaticSolver:
             if step < LEAST_SHARE:
                 self._put_back(good)
                 return report
+
+    def _solve_at_once(self, start: wp.array, graph: wp.Graph) -> NewtonReport:
+        """Add the whole load to a body that hardly changes its volume: from a state that is not at rest directly, which
+        may be near, and else through states in which volumes change more easily."""
+        newton = self.newton
+        if start.numpy()[self.body.conditions.inverse_mass.numpy() > 0.0].any():
+            report = self._run(graph, 1.0)
+            if report.converged.all():
+                return report
+            newton.increment.zero_()
+        tolerance, newton.tolerance = newton.tolerance, ROUGH
+        rough = self._record()
+        newton.tolerance = tolerance
+        for limit in self._limits:
+            with limited(self.field, limit):
+                self._run(rough, 1.0)
+        return self._run(graph, 1.0)
 
     def _keep_free_worlds(self) -> float:
         """Let worlds that nothing holds stay where they are: a uniform acceleration takes what little their loads do
