@@ -1,7 +1,7 @@
 """States on the way to the static answer of a body that hardly changes its volume.
 
 Along the direction that Newton's method finds, volumes stay as they should to first order only. With a lambda of
-thousands of mu what is left costs so much that a line search takes short steps, hundreds of them where tissue turns far.
+thousands of mu what is left costs so much that a line search takes hundreds of short steps where tissue turns far.
 So bodies with a smaller lambda are solved for first, each from the answer of the one before.
 """
 
