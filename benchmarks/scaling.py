@@ -24,8 +24,13 @@ from typing import Any
 
 import numpy as np
 
-#: Steps in one measurement, measurements, and exchanges that are timed by themselves.
-STEPS, ROUNDS, EXCHANGES = 64, 7, 200
+#: Steps in one measurement on a card and on a CPU, measurements, and exchanges that are timed by themselves, on cards in
+#: one graph.
+STEPS, CPU_STEPS, ROUNDS, EXCHANGES = 512, 32, 7, 50
+#: Calls before measurements, until two agree to this share of their time; at most so many.
+AGREEMENT, MOST_CALLS = 0.03, 12
+#: What is assumed of a network between machines: the time of an exchange without data [us], and bytes in a microsecond.
+NETWORK_LATENCY, NETWORK_RATE = 15.0, 40e3
 #: A step far below every stable one [s]: steps of this length cost what others do.
 SHORT_STEP = 1e-7
 
@@ -45,12 +50,22 @@ def measured(cubes: int, level: int, device: str) -> dict[str, Any]:
     began = time.perf_counter()
     sim = wd.Simulation(body, integrator=wc.SymplecticEuler(dt=SHORT_STEP), gravity=(0, 0, 0))
     ready = time.perf_counter() - began
-    sim.advance_steps(2 * STEPS)
-    seconds = []
-    for _ in range(ROUNDS):
+
+    def timed() -> float:
+        """Seconds for a step."""
+        steps = STEPS if sim.device.is_cuda else CPU_STEPS
         began = time.perf_counter()
-        sim.advance_steps(STEPS)
-        seconds.append((time.perf_counter() - began) / STEPS)
+        sim.advance_steps(steps)
+        return (time.perf_counter() - began) / steps
+
+    before = timed()
+    for _ in range(MOST_CALLS if sim.device.is_cuda else 1):
+        # All ranks go on or stop together.
+        last = sum(sim.comm.allgather(timed())) / sim.size
+        if abs(last - before) <= AGREEMENT * last:
+            break
+        before = last
+    seconds = [timed() for _ in range(ROUNDS)]
     computed, copied = sim.elements_here
     return {
         "step_us": 1e6 * statistics.median(seconds),
@@ -88,13 +103,16 @@ def on_ranks(ranks: int, cubes: int, level: int, device: str) -> dict[str, Any]:
 
 
 def fitted(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """A step's time [us] as start + per_element * computed, of the runs on one rank, and an exchange's time [us] as
-    latency + per_byte * sent, of the others; by least squares, none negative."""
+    """The numbers of a model of a step's time [us], by least squares of relative errors, none negative.
+
+    A step on one rank takes start + per_element * computed, an exchange by itself latency + per_byte * sent. A step on
+    several ranks takes as long as its elements would on one, and besides the share ``exposed`` of the exchange.
+    """
     from scipy.optimize import nnls
 
     alone = [row for row in rows if row["ranks"] == 1]
     several = [row for row in rows if row["ranks"] > 1]
-    found = {}
+    found: dict[str, float] = {}
     for names, key, value, chosen in (
         (("start", "per_element"), "computed", "step_us", alone),
         (("latency", "per_byte"), "sent_bytes", "exchange_us", several),
@@ -104,11 +122,21 @@ def fitted(rows: list[dict[str, Any]]) -> dict[str, float]:
             weight = 1.0 / np.array([row[value] for row in chosen])
             solution, _ = nnls(system * weight[:, None], np.ones(len(chosen)))
             found |= dict(zip(names, solution.tolist(), strict=True))
+    if {"start", "latency"} <= found.keys():
+        more = [row["step_us"] - found["start"] - found["per_element"] * row["computed"] for row in several]
+        exchanges = [row["exchange_us"] for row in several]
+        weight = np.array([1.0 / row["step_us"] for row in several])
+        slope = np.sum(np.array(more) * exchanges * weight**2) / np.sum(np.square(exchanges) * weight**2)
+        found["exposed"] = max(float(slope), 0.0)
     return found
 
 
-def predicted(model: dict[str, float], ranks: int, level: int) -> dict[str, float]:
-    """Weak scaling that the model predicts: a cube of the level on each rank, copies and exchanges on two sides."""
+def predicted(model: dict[str, float], ranks: int, level: int, *, machines: int = 1) -> dict[str, float]:
+    """Weak scaling that the model predicts: a cube of the level on each rank, copies and exchanges on two sides.
+
+    With several machines, exchanges between them take what is assumed of a network. What they take beyond the time of
+    the elements cannot be hidden.
+    """
     elements = 6 * 2**level
     # A cut through a cube of edge 2^(level/3) cells meets so many nodes; copies stand on it in layers.
     nodes = (2.0 ** (level / 3) + 1.0) ** 2
@@ -117,8 +145,12 @@ def predicted(model: dict[str, float], ranks: int, level: int) -> dict[str, floa
     alone = model["start"] + model["per_element"] * elements
     step = model["start"] + model["per_element"] * computed
     if ranks > 1:
-        step += model["latency"] + model["per_byte"] * sides * 16.0 * nodes
-    return {"ranks": ranks, "level": level, "step_us": step, "efficiency": alone / step}
+        sent = sides * 16.0 * nodes
+        exchange = model["latency"] + model["per_byte"] * sent
+        if machines > 1:
+            exchange = max(exchange, NETWORK_LATENCY + sent / NETWORK_RATE)
+        step += max(model["exposed"] * exchange, exchange - model["per_element"] * elements)
+    return {"ranks": ranks, "machines": machines, "level": level, "step_us": step, "efficiency": alone / step}
 
 
 def main() -> int:
@@ -155,17 +187,16 @@ def main() -> int:
                     flush=True,
                 )
     model = fitted(rows)
-    print(
-        "model: " + ", ".join(f"{name} {value:.4g}" for name, value in model.items()) + " [us, us an element or byte]"
-    )
+    print("model [us, us an element or byte]: " + ", ".join(f"{name} {value:.4g}" for name, value in model.items()))
     predictions = []
     if {"start", "latency"} <= model.keys():
         levels = sorted({int(n) for n in options.weak.split(",") if n})
-        predictions = [predicted(model, ranks, level) for level in levels for ranks in (*counts, 8, 64)]
+        sizes = [(ranks, 1) for ranks in (*counts, 8)] + [(64, 8)]
+        predictions = [predicted(model, n, level, machines=machines) for level in levels for n, machines in sizes]
         for each in predictions:
             print(
-                f"predicted: level {each['level']}, {each['ranks']} ranks: {each['step_us']:.1f} us a step, "
-                f"{each['efficiency']:.1%}"
+                f"prediction, not measured: level {each['level']}, {each['ranks']} ranks on {each['machines']} "
+                f"machines: {each['step_us']:.1f} us a step, {each['efficiency']:.1%}"
             )
     if options.json is not None:
         found = {"benchmark": "scaling", "device": options.device, "rows": rows, "model": model}

@@ -1,12 +1,16 @@
 """Who computes what: dealing out, sums in any order, numbers of nodes. One process is enough."""
 
 import math
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
+import warp as wp
 from ranked import graded, jittered
 
 import warp_corot as wc
+from warp_corot.discretization.awaited import Awaited
+from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.distributed.directions import normal_numbers
 from warp_corot.distributed.partition import Partition
 from warp_corot.distributed.parts import Part
@@ -56,6 +60,20 @@ def test_masses_of_parts_are_those_of_the_body(make):
         np.add.at(found, part.numbers.nodes, part.masses)
         np.testing.assert_array_equal(body.mesh.points[part.numbers.nodes], part.mesh.points)
     np.testing.assert_array_equal(found, body.masses)
+
+
+def test_groups_that_await_nodes_are_apart_from_others():
+    mesh = wc.TetForest.box((1, 1, 2), level=9)
+    (batch,) = ForcePlan.of_forest(mesh, None, wp.get_device("cpu"), grouped=True).batches
+    awaited = Awaited(mesh.points[:, 2] > 1.4, nullcontext)
+    here, late = awaited.divided(batch)
+    assert here.count + late.count == batch.count
+    assert min(here.count, late.count) > 0
+    firsts = np.concatenate([each.subtrees.first.numpy() for each in (here, late)])
+    np.testing.assert_array_equal(np.sort(firsts), np.sort(batch.subtrees.first.numpy()))
+    for each in (here, late):
+        groups = mesh.tets.reshape(-1, 64 * 4)[each.subtrees.first.numpy()[::8] // 64]
+        np.testing.assert_array_equal(awaited.nodes[groups].any(axis=1), each is late)
 
 
 def test_sums_are_the_same_in_any_order(rng):

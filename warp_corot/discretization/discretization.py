@@ -18,6 +18,7 @@ from warp_corot.materials.directional import Directional
 from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest
 
+from .awaited import Awaited
 from .clock import Clock
 from .elements import ElementKind, Elements, Mesh, device_elements, element_kind, with_targets
 from .frames import parts
@@ -45,6 +46,7 @@ class Discretization(ABC):
         activation: Active stress of elements [Pa], float32; one entry until a stress is set.
         has_activation: Whether an active stress was set.
         smallest_volume: The volume of the smallest element [m^3].
+        awaited: Nodes that other processes move, if some wait for them; else None.
     """
 
     worlds: int
@@ -60,6 +62,7 @@ class Discretization(ABC):
     activation: wp.array
     has_activation: bool
     smallest_volume: float
+    awaited: Awaited | None = None
     _levels: Levels | None = None
 
     @property

@@ -6,6 +6,8 @@ NCCL is imported here only.
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -47,6 +49,9 @@ class CardExchange:
     def __init__(self, halo: Halo, device: wp.Device):
         self._nccl, self._device = nccl_of(device.alias), device
         self._sent, self._received = (_joined(lists, device) for lists in (halo.sent, halo.received))
+        #: Where it is launched beside other things, before them where there is a choice.
+        self.aside = wp.Stream(device, priority=-1)
+        self.is_under_way = False
         self._rooms = {kind: self._room_for(kind) for kind in kernels.EXCHANGED}
 
     def launch(self, nodal: wp.array) -> None:
@@ -64,6 +69,25 @@ class CardExchange:
             for rank, start, end in by:
                 self._nccl.recv(_floats(given, start, end), rank, stream=stream)
         wp.launch(scatter, len(received), [received, given], [nodal], device=self._device)
+
+    def begin(self, nodal: wp.array) -> None:
+        """Launch the same beside what follows."""
+        with wp.ScopedStream(self.aside):
+            self.launch(nodal)
+        self.is_under_way = True
+
+    def end(self) -> None:
+        """Launch that what follows waits for what was begun."""
+        if self.is_under_way:
+            wp.get_stream(self._device).wait_stream(self.aside)
+            self.is_under_way = False
+
+    @contextmanager
+    def later(self) -> Iterator[None]:
+        """Launches within come after what was begun, and before all that follows."""
+        with wp.ScopedStream(self.aside, sync_enter=not self.is_under_way, sync_exit=True):
+            yield
+        self.is_under_way = False
 
     def _room_for(self, kind: Any) -> tuple[wp.array, wp.array]:
         """Buffers for what is sent and received."""

@@ -56,7 +56,7 @@ class Simulation:
 
     Attributes:
         bodies: Tuple of the whole bodies.
-        rank, size: This rank's number, and how many there are.
+        rank, size, comm: This rank's number, how many there are, and their MPI communicator.
         worlds, device, stable_dt, gravity: As for ``warp_corot.Simulation``.
 
     Raises:
@@ -75,7 +75,7 @@ class Simulation:
         costs: npt.ArrayLike | None = None,
         **others: Any,
     ):
-        self._comm = comm = mpi.world()
+        self._comm = self.comm = comm = mpi.world()
         self.rank, self.size = comm.rank, comm.size
         self.bodies = checked_bodies(bodies)
         models = checked_models(Corotated() if model is None else model, len(self.bodies))

@@ -40,6 +40,12 @@ class Ranks:
     def complete(self, k: int, vectors: wp.array) -> None:
         """Launch that ghosts of the k-th body get their values, in a nodal array vec4."""
 
+    def begin_completion(self, k: int, vectors: wp.array) -> None:
+        """The same, but launches may go on before; ``end_completion`` must follow before any but forces read ghosts."""
+
+    def end_completion(self) -> None:
+        """Launch that everything that follows waits for what ``begin_completion`` has begun."""
+
     def completed(self, k: int, vectors: wp.array) -> wp.array:
         """The same in another array, if there are ghosts; the array itself stays as it is."""
         return vectors

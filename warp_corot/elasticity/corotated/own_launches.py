@@ -6,13 +6,14 @@ from collections.abc import Callable
 
 import warp as wp
 
+from warp_corot.discretization.awaited import Awaited
 from warp_corot.discretization.plan import FlatLeaves, Plan
 from warp_corot.discretization.subtrees import GROUPED_LEAVES, Batch
 from warp_corot.elasticity.paths.clusters import ChangingClusterScatter, ClusterScatter, grouped_and_others
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
-from warp_corot.kernels.subtrees.cuda import BLOCK, FLAT, Stretch, scatter_stretches
+from warp_corot.kernels.subtrees.cuda import BLOCK, FLAT, Stretch, scatter_stretches, scatter_subtrees_own
 from warp_corot.kernels.subtrees.repair import LeftOut
 
 #: Leaves of a uniform forest from which subtrees have a launch: fewer are sooner done in clusters, above all where some
@@ -32,6 +33,7 @@ class OwnLaunches:
         material: Lamé's parameters.
         tolerance: How near a subtree root's rotation must be to be used in place of own ones [rad]; None: never.
         changing: What adds the forces of all leaves in clusters where the mesh changes.
+        awaited: Nodes that come later; None where all are here.
 
     Attributes:
         batches: The subtrees that are launched as subtrees.
@@ -43,7 +45,9 @@ class OwnLaunches:
         material: IsotropicMaterial,
         tolerance: float | None = None,
         changing: ChangingClusterScatter | None = None,
+        awaited: Awaited | None = None,
     ):
+        self._elements = plan.elements
         self._device = plan.elements.nodes.device
         self._material, self._tolerance = material, tolerance
         batches, self._flat = list(plan.batches), plan.flat
@@ -54,12 +58,20 @@ class OwnLaunches:
                 self._clusters = ClusterScatter(plan.elements, isotropic_law(corotated_stress), chosen=leaves)
         elif changing is not None and 8 * sum(batch.count for batch in batches if batch.grouped) < GROUPED_LEAVES:
             batches, self._clusters = [], changing
+        self._awaited = awaited
+        if awaited is not None and len(batches) == 1 and batches[0].grouped and self._clusters is not None:
+            awaited.is_used = True
+            batches = list(awaited.divided(batches[0]))
         # The structs hold addresses alone: what these stand for must live as long as they do.
         self.batches = tuple(batches)
-        self._rows, self._blocks = _stretches(batches, None if self._clusters is not None else plan.flat)
+        #: Batches of one type have a kernel of their own, which is faster.
+        self._is_single = self._clusters is not None and len({batch.shape for batch in batches}) == 1
+        self._is_single = self._is_single and all(batch.grouped for batch in batches)
+        flat = None if self._clusters is not None else plan.flat
+        self._rows, self._blocks = ([], 0) if self._is_single else _stretches(batches, flat)
         self._stretches = wp.array(self._rows, dtype=Stretch, device=self._device) if self._rows else None
-        #: Number of subtrees and single leaves, with gaps; some of them may be left out.
-        self.places = self._blocks * BLOCK
+        #: Number of subtrees and single leaves of each launch, with gaps; some of them may be left out.
+        self.places = [batch.count for batch in batches] if self._is_single else [self._blocks * BLOCK]
 
     @staticmethod
     def suit(plan: Plan) -> bool:
@@ -76,6 +88,9 @@ class OwnLaunches:
     def scatter_forces(self, u: wp.array, f: wp.array, left_out: LeftOut) -> None:
         """Add the forces of displacements u to f, both vec4, and put subtrees with leaves left out on a list."""
         material = self._material
+        if self._is_single:
+            self._scatter_single(u, f, left_out)
+            return
         if self._stretches is not None:
             wp.launch(
                 scatter_stretches(material.stride == 0, self._tolerance),
@@ -87,6 +102,25 @@ class OwnLaunches:
             )
         if self._clusters is not None:
             self._clusters(material, u, f)
+
+    def _scatter_single(self, u: wp.array, f: wp.array, left_out: LeftOut) -> None:
+        assert self._clusters is not None
+        if self._awaited is None or not self._awaited.is_used:
+            for batch in self.batches:
+                self._launch(batch, u, f, left_out)
+            self._clusters(self._material, u, f)
+            return
+        here, late = self.batches
+        self._launch(here, u, f, left_out)
+        with self._awaited.later():
+            self._launch(late, u, f, left_out)
+            self._clusters(self._material, u, f)
+
+    def _launch(self, batch: Batch, u: wp.array, f: wp.array, left_out: LeftOut) -> None:
+        material = self._material
+        kernel = scatter_subtrees_own(batch.shape, True, material.stride == 0, True, self._tolerance)
+        inputs, outputs = [self._elements, batch.subtrees, material, u], [f, batch.flagged, left_out]
+        wp.launch(kernel, batch.count, inputs=inputs, outputs=outputs, device=self._device, block_dim=BLOCK)
 
 
 def _fewest_grouped(plan: Plan) -> int:

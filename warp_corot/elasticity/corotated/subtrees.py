@@ -119,8 +119,9 @@ class SubtreeField(CorotatedField):
         self._own_launches: OwnLaunches | None = None
         if self._listed:
             if self.rotation_level is None and OwnLaunches.suit(plan):
-                self._own_launches = OwnLaunches(plan, self.isotropic, self.model.tolerance, self._clusters)
-                self._left_out = LeftOutLeaves([self._own_launches.places], [], self.device)
+                given = (self.isotropic, self.model.tolerance, self._clusters, self.discretization.awaited)
+                self._own_launches = OwnLaunches(plan, *given)
+                self._left_out = LeftOutLeaves(self._own_launches.places, [], self.device)
                 return
             self._left_out = LeftOutLeaves.of(plan, self.device)
         self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]

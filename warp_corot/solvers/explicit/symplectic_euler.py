@@ -116,12 +116,14 @@ class SymplecticEulerStepper(Stepper):
             if offset > 0 or not forces_known:
                 for k in one_by_one:
                     self.system.add_elastic_forces(k, offset)
+                self.system.ranks.end_completion()
             self.system.add_other_forces(offset, self.damping, one_by_one)
             for k in one_by_one:
                 body = self.system.bodies[k]
                 self._move(body, offset)
-                self.system.ranks.complete(k, body.state.displacements)
+                self.system.ranks.begin_completion(k, body.state.displacements)
                 self.system.fields[k].complete_step(body.state.displacements, self.system.pace.arrays)
+        self.system.ranks.end_completion()
 
     def _move(self, body: SoftBody, offset: int) -> None:
         """Launch the motion of the ``offset``-th step since the clock was last advanced."""
