@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 
-#: Steps in one measurement on a card and on a CPU, measurements, and exchanges that are timed by themselves, on cards in
-#: one graph.
+#: Steps in one measurement on a card and on a CPU, measurements, and exchanges that are timed by themselves, in one
+#: graph on cards.
 STEPS, CPU_STEPS, ROUNDS, EXCHANGES = 512, 32, 7, 50
 #: Calls before measurements, until two agree to this share of their time; at most so many.
 AGREEMENT, MOST_CALLS = 0.03, 12
