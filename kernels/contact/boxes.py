@@ -3,7 +3,7 @@
 import warp as wp
 
 from .motion import Surface
-from .pairs import BAND, Meeting
+from .rows import BAND, Meeting
 
 wp.set_module_options({"enable_backward": False})
 

@@ -20,6 +20,7 @@ SETTLING = wp.constant(0.1)
 class Law:
     tolerance: float  # gaps that rounding leaves [m]
     recovery: float  # speed at which things that overlap are pushed apart [m/s]
+    grain: float  # forces on nodes are added up in multiples of this, so that no order matters [N]
 
 
 @wp.func

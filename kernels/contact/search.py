@@ -6,7 +6,7 @@ from .boxes import edge_reach, triangle_reach, triangle_size
 from .closest import on_segments, on_triangle, point_of
 from .motion import Surface
 from .near import CRUSHED, PAIRED, Near, mark
-from .pairs import BAND, Meeting, Rows, row_count, triangle_normal
+from .rows import BAND, Meeting, Rows, row_count, triangle_normal
 from .watch import Watch
 
 wp.set_module_options({"enable_backward": False})
@@ -210,7 +210,6 @@ def find_pairs(
     # Out
     rows: Rows,
     near: Near,
-    most: wp.array[wp.int32],
 ):
     """Find the pairs of each node and edge, each with the force that it had before."""
     i = wp.tid()
@@ -225,7 +224,6 @@ def find_pairs(
     rows.starts[i] = start
     if start + count > room:
         # The run is made again with more room.
-        wp.atomic_max(most, 0, start + count)
         for row in range(start, room):
             rows.owner[row] = -1
         return
@@ -266,3 +264,10 @@ def begin_rows(watch: Watch, rows: Rows):
     """There are none."""
     if watch.due[0] != 0:
         rows.total[0] = 0
+
+
+@wp.kernel(enable_backward=False)
+def end_rows(watch: Watch, rows: Rows, most: wp.array[wp.int32]):
+    """How many there are, or would be if there were room."""
+    if watch.due[0] != 0:
+        most[0] = wp.max(most[0], rows.total[0])

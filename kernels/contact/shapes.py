@@ -34,6 +34,7 @@ class Shapes:
     lower: wp.array[wp.vec3]
     values: wp.array[wp.float32]
     friction: wp.array[wp.float32]
+    thickness: wp.array[wp.float32]  # half of the smallest way through [m]
 
 
 @wp.func

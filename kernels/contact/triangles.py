@@ -23,6 +23,9 @@ CORNER = wp.constant(0.999)
 #: Places along a capsule whose gaps differ by so small a share of its radius are touched between them.
 BLUR = wp.constant(1.0e-3)
 
+#: Triangles that are deeper in an obstacle than this share of its thickness leave it on the side on which they were, if
+#: the nearest side is turned from that by more than this cosine: inside, it may be another one at every step.
+SKEWERED, TURNED = wp.constant(0.5), wp.constant(0.5)
 #: Share of the last step's push from which rounds begin: with more, nodes around an obstacle are held off by what lies
 #: between them, and bodies seem stiffer. Friction begins with all of it: what slips to bring it back would add up.
 WARMTH = wp.constant(0.5)
@@ -79,6 +82,8 @@ def find_touch(
 ):
     was = touches.force[o, t]
     side = touches.normal[o, t]
+    before = touches.shares[o, t]
+    was_near = before[0] + before[1] + before[2] > 0.0
     touches.shares[o, t] = wp.vec3()
     touches.force[o, t] = wp.vec3()
     touches.acts[o, t] = 0
@@ -102,6 +107,8 @@ def find_touch(
         # The axis has come through since the last step.
         n = -n
         gap = -2.0 * shapes.size[o][0] - gap
+    elif was_near and gap < -SKEWERED * shapes.thickness[o] and wp.dot(n, side) < TURNED:
+        n = side
     if gap > far or wp.max(w) > CORNER:
         return
     touches.shares[o, t] = w

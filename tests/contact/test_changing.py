@@ -63,19 +63,18 @@ def test_a_general_mesh_lies_on_a_forest(device, rng):
 
 
 def test_runs_come_out_the_same(device):
-    """Obstacles with deterministic=True on every device; soft surfaces are refused on CUDA."""
+    """Obstacles and soft surfaces, with deterministic=True on every device."""
     found = []
     for _ in range(2):
-        body, tool = block(device, 0.0), wc.Tool(wc.Capsule(0.002, 0.02))
-        tool.follow([0.0, 0.05], [(0.021, 0.02, 0.033), (0.023, 0.019, 0.03)])
-        sim = wc.Simulation(body, obstacles=[wc.Ground(), tool], gravity=DOWN, deterministic=True)
+        low, high, tool = block(device, 0.0), block(device, 0.0202), wc.Tool(wc.Capsule(0.002, 0.02))
+        tool.follow([0.0, 0.05], [(0.021, 0.02, 0.053), (0.023, 0.019, 0.05)])
+        contact = wc.Contact(self_contact=True)
+        sim = wc.Simulation(
+            [low, high], obstacles=[wc.Ground(), tool], contact=contact, gravity=DOWN, deterministic=True
+        )
         sim.advance(0.05)
-        found.append((body.positions.numpy(), tool.wrench.numpy()))
-    np.testing.assert_array_equal(found[0][0], found[1][0])
-    np.testing.assert_array_equal(found[0][1], found[1][1])
-    pair = [block(device, 0.0), block(device, 0.0205)]
-    if device == "cpu":
-        wc.Simulation(pair, contact=wc.Contact(), deterministic=True)
-    else:
-        with pytest.raises(wc.InputError, match="deterministic"):
-            wc.Simulation(pair, contact=wc.Contact(), deterministic=True)
+        assert sim.contact.search.pairs > 0
+        assert high.contact_forces.numpy()[:, 2].max() > 0.0
+        found.append((low.positions.numpy(), high.positions.numpy(), tool.wrench.numpy()))
+    for first, second in zip(*found, strict=True):
+        np.testing.assert_array_equal(first, second)

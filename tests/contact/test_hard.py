@@ -230,6 +230,24 @@ def volume_ratios(mesh, body):
     return now / rest
 
 
+@pytest.mark.filterwarnings("ignore::warp_corot.StabilityWarning")
+def test_what_a_rod_skewers_leaves_it_on_one_side(device):
+    """A square rod begins in the middle of a triangle, as far from one of its sides as from the others."""
+    body = wc.SoftBody(wc.TetForest.box((2, 2, 1), 0.02, 2), wc.Isotropic(2e4, 0.4, 1000.0), device=device)
+    body.fix("z == zmin")
+    rod = wc.Tool(wc.Box((0.004, 0.004, 0.02), position=(0.0233, 0.0267, 0.02)))
+    integrator = wc.SymplecticEuler(viscosity=2e-3)
+    sim = wc.Simulation(body, obstacles=rod, gravity=(0.0, 0.0, 0.0), integrator=integrator)
+    felt = []
+    for _ in range(60):
+        sim.advance_steps(1)
+        felt.append(rod.wrench.numpy()[0][:3])
+    sizes = np.linalg.norm(felt, axis=1)
+    assert sizes[1:].min() > 0.0
+    along = np.asarray(felt)[1:] @ felt[-1] / (sizes[1:] * sizes[-1])
+    assert along.min() > 0.5
+
+
 def test_elements_turned_inside_out_are_said(device):
     """Once; the run goes on."""
     body = wc.SoftBody(wc.TetForest.box((2, 2, 1), 0.02, 4), wc.Isotropic(2e4, 0.4, 1000.0), device=device)

@@ -219,4 +219,5 @@ def test_room_for_contacts_grows(device):
     sim.contact.pairs._make_room(3)
     sim.advance(0.1)
     assert sim.contact.pairs._room > 3
+    assert 0 < sim.contact.search.pairs <= sim.contact.pairs.room
     assert high.positions.numpy()[:, 2].min() > 0.019

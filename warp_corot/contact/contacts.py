@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from warp_corot.errors import InputError
 from warp_corot.kernels.contact import motion, sums
 from warp_corot.kernels.contact.law import Law
 from warp_corot.solvers.system import System
@@ -28,6 +27,8 @@ ROUNDINGS = 16.0
 RECOVERY = 0.05
 #: Rounds in which obstacles between the nodes are held off.
 ROUNDS = 3
+#: So many grains has the force that takes the heaviest node across the smallest element in a step; 2^63 is the most.
+GRAINS = 2.0**48
 #: Warps that add up a wrench.
 WARP, MOST_WARPS = 32, 64
 
@@ -41,7 +42,6 @@ class Contacts:
         options: How things touch.
         stable_dt: Largest stable step of the bodies at rest [s], which tells the speed of waves.
         dt: The length of a step, if it was given [s].
-        deterministic: Whether a run must come out the same bit by bit.
 
     Attributes:
         surface: The surface nodes and triangles of all bodies.
@@ -50,7 +50,7 @@ class Contacts:
         search: Says when to look for what is near.
 
     Raises:
-        InputError: As ``Obstacles``; or soft surfaces may touch, and the run must be deterministic on CUDA.
+        InputError: As ``Obstacles``.
     """
 
     def __init__(
@@ -61,7 +61,6 @@ class Contacts:
         *,
         stable_dt: float,
         dt: float | None = None,
-        deterministic: bool = False,
     ):
         self.system, self.device, self.options = system, system.device, options
         self.obstacles = Obstacles(obstacles, options.friction, system, dt)
@@ -77,10 +76,6 @@ class Contacts:
         #: Soft surfaces that may touch one another; None without.
         self.pairs: Pairs | None = None
         if len(system.bodies) > 1 or options.self_contact:
-            if deterministic and system.device.is_cuda:
-                raise InputError(
-                    "a deterministic run on CUDA cannot have soft surfaces touch: forces are added as threads come"
-                )
             self.pairs = Pairs(self.surface, self.search, options.friction, options.self_contact)
         self._revision = 0
         self._is_looked_at = self._has_crushed = False
@@ -238,6 +233,9 @@ class Contacts:
         law = Law()
         law.tolerance = ROUNDINGS * 2.0**-24 * max(*points, 1e-3)
         law.recovery = RECOVERY * self.smallest / stable_dt if np.isfinite(stable_dt) else 0.1
+        heaviest = max(float(body.masses.max()) for body in self.system.bodies)
+        step = stable_dt if np.isfinite(stable_dt) else 1.0
+        law.grain = heaviest * self.smallest / step**2 / GRAINS
         return law
 
     def _predict(self, offset: int, damping: float) -> None:
@@ -257,7 +255,7 @@ class Contacts:
         """Launch the forces in turn: of obstacles on nodes, of obstacles between these, and of soft surfaces."""
         rigid, pairs = self.rigid, self.pairs
         if pairs is not None:
-            pairs.launch_begin()
+            pairs.launch_begin(self.law)
         if rigid is not None:
             rigid.launch_begin()
         for _ in range(ROUNDS if self.obstacles.have_edges or pairs is not None else 0):

@@ -170,6 +170,8 @@ class Obstacles:
         made.size = wp.array(np.array([shape.size for shape in shapes]).reshape(-1, 3), dtype=wp.vec3, device=device)
         own = [friction if shape.friction is None else shape.friction for shape in shapes]
         made.friction = wp.array(own, dtype=wp.float32, device=device)
+        thickness = [min(shape.thickness, 1e6) for shape in shapes]
+        made.thickness = wp.array(thickness, dtype=wp.float32, device=device)
         count = max(len(shapes), 1)
         source, first = np.zeros(count, np.uint64), np.zeros(count, np.int32)
         counts, lower, values = np.zeros((count, 3), np.int32), np.zeros((count, 3)), [np.zeros(1, np.float32)]

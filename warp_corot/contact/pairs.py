@@ -10,6 +10,7 @@ from warp_corot.kernels.contact import pairs as kernels
 from warp_corot.kernels.contact import search as search_kernels
 from warp_corot.kernels.contact.crushed import mark_crushed
 from warp_corot.kernels.contact.law import Law
+from warp_corot.kernels.contact.rows import Meeting, Rows
 from warp_corot.kernels.stepping.pace import Pace
 
 from .search import Search
@@ -53,15 +54,15 @@ class Pairs:
             return
         self._taken = surface.revision
         count, edges = surface.count, surface.edge_count
-        meeting = kernels.Meeting()
+        meeting = Meeting()
         meeting.body = wp.array(surface.body_of_places(), dtype=wp.int32, device=device)
         meeting.triangles, meeting.edges, meeting.sides = surface.triangles, surface.edges, surface.sides
         meeting.opposite = surface.opposite
         meeting.reach = self.search.watch.reach
         meeting.meets_itself, meeting.friction = int(self.meets_itself), self.friction
         self._meeting = meeting
-        self._crowd = wp.zeros(count, dtype=wp.float32, device=device)
-        self._added = wp.zeros(count, dtype=wp.vec3, device=device)
+        self._crowd = wp.zeros(count, dtype=wp.int32, device=device)
+        self._added = wp.zeros(count, dtype=wp.vec3l, device=device)
         self._boxes = [
             tuple(wp.zeros(max(number, 1), dtype=wp.vec3, device=device) for _ in range(2))
             for number in (surface.triangle_count, edges)
@@ -72,7 +73,7 @@ class Pairs:
     def _make_room(self, room: int) -> None:
         """Have room for so many pairs. There are none until the next search."""
         self._room, device, owners = room, self.device, self.surface.count + self.surface.edge_count
-        rows, old = kernels.Rows(), search_kernels.OldRows()
+        rows, old = Rows(), search_kernels.OldRows()
         rows.total = wp.zeros(1, dtype=wp.int32, device=device)
         for kept in (rows, old):
             kept.starts, kept.counts = (wp.zeros(owners, dtype=wp.int32, device=device) for _ in range(2))
@@ -108,7 +109,6 @@ class Pairs:
         """Make room for what the last run needed."""
         if self.is_full:
             self._make_room(int(GROWTH * self.search.pairs))
-            self.search.forget_most()
 
     @property
     def is_planted(self) -> bool:
@@ -134,17 +134,17 @@ class Pairs:
 
     # --- launches --------------------------------------------------------------------------------------------------
 
-    def launch_begin(self) -> None:
+    def launch_begin(self, law: Law) -> None:
         """Launch where all pairs are."""
-        self._on_rows(kernels.locate_rows, [self.surface.arrays, self._meeting, self.rows, self._added])
-        self._apply()
+        self._on_rows(kernels.locate_rows, [law, self.surface.arrays, self._meeting, self.rows, self._added])
+        self._apply(law)
 
     def launch_round(self, law: Law, pace: Pace) -> None:
         """Launch one round of the forces between pairs."""
         arrays = self.surface.arrays
         self._on_rows(kernels.judge_rows, [law, pace, arrays, self.rows, self._crowd])
         self._on_rows(kernels.solve_rows, [law, pace, arrays, self.friction, self._crowd, self.rows, self._added])
-        self._apply()
+        self._apply(law)
 
     def _box(self) -> None:
         inputs = [self.surface.arrays, self._meeting]
@@ -164,8 +164,8 @@ class Pairs:
         wp.launch(search_kernels.keep_rows, max(owners, self._room), [watch, rows, old], device=device)
         wp.launch(search_kernels.begin_rows, 1, [watch, rows], device=device)
         inputs = [watch, *(tree.id for tree in self._trees), self.surface.arrays, self._meeting, old]
-        outputs = [rows, self.search.near, self.search.most]
-        wp.launch(search_kernels.find_pairs, owners, inputs, outputs, device=device)
+        wp.launch(search_kernels.find_pairs, owners, inputs, [rows, self.search.near], device=device)
+        wp.launch(search_kernels.end_rows, 1, [watch, rows], [self.search.most], device=device)
 
     def _mark_crushed(self) -> None:
         near, watch = self.search.near, self.search.watch
@@ -178,10 +178,10 @@ class Pairs:
         threads = self.search.threads(self._room)
         wp.launch(kernel, threads, [threads, *inputs], device=self.device)
 
-    def _apply(self) -> None:
+    def _apply(self, law: Law) -> None:
         """Launch that nodes get what was added."""
         among = self.search.at_nodes
-        inputs = [*among, self.surface.arrays, self._added, self._crowd]
+        inputs = [*among, law, self.surface.arrays, self._added, self._crowd]
         wp.launch(kernels.apply_added, among[0], inputs, device=self.device)
 
 

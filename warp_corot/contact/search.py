@@ -129,11 +129,6 @@ class Search:
             )
         self.watch.least.fill_(least)
 
-    def forget_most(self) -> None:
-        """Forget how many pairs there were."""
-        self.most.zero_()
-        self._report.values[PAIRS] = 0.0
-
     # --- launches --------------------------------------------------------------------------------------------------
 
     def launch(self, offset: int) -> None:

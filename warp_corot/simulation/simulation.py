@@ -135,9 +135,7 @@ class Simulation:
         #: Keeps bodies out of obstacles and out of one another; None without contact.
         self.contact: Contacts | None = None
         if touching is not None:
-            self.contact = Contacts(
-                self.system, *touching, stable_dt=self.stable_dt, dt=given, deterministic=self.deterministic
-            )
+            self.contact = Contacts(self.system, *touching, stable_dt=self.stable_dt, dt=given)
             self.system.constraints.append(self.contact)
         #: Chooses the step, if none was given.
         self.safe_step = SafeStep(self.system, self.models, stable) if given is None else None

@@ -1,0 +1,93 @@
+"""Where nodes are at triangles, and edges at edges."""
+
+import warp as wp
+
+from .closest import on_segments, on_triangle, point_of
+from .motion import Surface
+from .rows import BAND, Meeting, Rows, triangle_normal
+
+wp.set_module_options({"enable_backward": False})
+
+#: So far from a triangle's border, as a share of its size, a node still is at the triangle.
+BORDER = wp.constant(0.02)
+#: The ends of edges where nodes are looked at instead, as a share; and the sine between edges that are not parallel.
+ENDS = wp.constant(1.0e-3)
+PARALLEL = wp.constant(0.05)
+
+
+@wp.func
+def edge_normal(surface: Surface, meeting: Meeting, e: int):
+    sides = meeting.sides[e]
+    first = triangle_normal(surface, meeting.triangles[sides[0]])
+    second = triangle_normal(surface, meeting.triangles[sides[1]])
+    return wp.normalize(first + second)
+
+
+@wp.func
+def deepest(size: float, is_self: bool, apart: wp.vec3):
+    band = BAND * size
+    if is_self:
+        band = wp.min(band, BAND * wp.length(apart))
+    return -band
+
+
+@wp.func
+def locate_node(row: int, s: int, t: int, surface: Surface, meeting: Meeting, rows: Rows):
+    """A node at a triangle."""
+    c = meeting.triangles[t]
+    a = surface.x[c[0]]
+    b = surface.x[c[1]]
+    e = surface.x[c[2]]
+    x = surface.x[s]
+    w = on_triangle(x, a, b, e)
+    way = x - point_of(w, a, b, e)
+    n = triangle_normal(surface, c)
+    size = wp.sqrt(wp.length(wp.cross(b - a, e - a)))
+    length = wp.length(way)
+    gap = wp.dot(way, n)
+    if wp.min(w) <= 0.0 and length > BORDER * size:
+        if gap < 0.0:
+            return False
+        n = way / length
+        gap = length
+    apart = surface.rest[s] - point_of(w, surface.rest[c[0]], surface.rest[c[1]], surface.rest[c[2]])
+    rows.places[row] = wp.vec4i(s, c[0], c[1], c[2])
+    rows.shares[row] = wp.vec4(1.0, -w[0], -w[1], -w[2])
+    rows.normal[row] = n
+    rows.gap[row] = gap
+    return gap > deepest(size, meeting.body[s] == meeting.body[c[0]], apart)
+
+
+@wp.func
+def locate_edge(row: int, first: int, second: int, surface: Surface, meeting: Meeting, rows: Rows):
+    """Two edges that cross."""
+    f = meeting.edges[first]
+    g = meeting.edges[second]
+    p = surface.x[f[0]]
+    q = surface.x[f[1]]
+    a = surface.x[g[0]]
+    b = surface.x[g[1]]
+    s, t = on_segments(p, q, a, b)
+    if wp.min(s, t) < ENDS or wp.max(s, t) > 1.0 - ENDS:
+        return False
+    n = wp.cross(q - p, b - a)
+    size = wp.min(wp.length(q - p), wp.length(b - a))
+    length = wp.length(n)
+    if length < PARALLEL * wp.length(q - p) * wp.length(b - a):
+        return False
+    n = n / length
+    out_of_first = edge_normal(surface, meeting, first)
+    out_of_second = edge_normal(surface, meeting, second)
+    if wp.dot(n, out_of_second - out_of_first) < 0.0:
+        n = -n
+    # Out of the second, into the first: others face one another somewhere else.
+    if wp.dot(n, out_of_second) < 0.1 or wp.dot(n, out_of_first) > -0.1:
+        return False
+    gap = wp.dot(n, p + s * (q - p) - a - t * (b - a))
+    apart = surface.rest[f[0]] + s * (surface.rest[f[1]] - surface.rest[f[0]])
+    apart -= surface.rest[g[0]] + t * (surface.rest[g[1]] - surface.rest[g[0]])
+    rows.places[row] = wp.vec4i(f[0], f[1], g[0], g[1])
+    rows.shares[row] = wp.vec4(1.0 - s, s, -(1.0 - t), -t)
+    rows.normal[row] = n
+    rows.gap[row] = gap
+    return gap > deepest(size, meeting.body[f[0]] == meeting.body[g[0]], apart)
