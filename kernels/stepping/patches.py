@@ -429,7 +429,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                 f = identity3() + displacement_gradient(its_corners, c)
                 lambda_part = c[10]
                 if wp.static(shares):
-                    lambda_part = 0.0
+                    lambda_part = float(0.0)
                 store_forces(its_targets, c, turned_stress(f, c[9], lambda_part))
             synchronize_block()
             if wp.static(shares):
