@@ -6,6 +6,8 @@ import os
 # Each worker has a core: threads of linear algebra would wait for one another. NumPy reads this when it is imported.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+# Programs that tests start need not compile the package's modules again each time.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import pytest
 import warp as wp

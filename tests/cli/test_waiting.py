@@ -73,40 +73,49 @@ def test_a_run_of_many_worlds_shows_how_far_it_is(tmp_path):
     assert "of 10, " in said
 
 
-def test_nothing_is_shown_without_a_terminal(tmp_path):
-    done = subprocess.run([sys.executable, "-c", MANY_WORLDS], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0
-    assert "simulating" not in done.stderr
+def test_nothing_is_shown_without_a_terminal(folder, capfd):
+    exec(MANY_WORLDS, {})
+    assert "simulating" not in "".join(capfd.readouterr())
 
 
 ADVANCE = """
-import time
+import sys
 import warp_corot as wc
 from warp_corot.simulation import progress
 progress.SILENT = 0.0
 body = wc.SoftBody(wc.TetForest.box((1, 1, 1), 0.1, 3), wc.Isotropic(1e4, 0.4, 1e3), device="cpu")
 body.fix("z < 0.01")
 sim = wc.Simulation(body)
-BEFORE
-sim.advance(0.5)
-sim.advance_steps(500)
+def advance():
+    sim.advance(0.5)
+    sim.advance_steps(500)
+    print("NEXT", file=sys.stderr)
+advance()
+"""
+QUIETLY = """
+wc.show_progress(False)
+advance()
+wc.show_progress(True)
+sim.on_step(lambda sim: None)
+advance()
 """
 
 
-def test_a_run_in_python_shows_how_far_it_is(tmp_path):
-    said = on_terminal(ADVANCE.replace("BEFORE", ""), tmp_path)
-    assert "of 0.5 s, " in said
-    assert "of 500 steps, " in said
+def test_a_run_in_python_shows_how_far_it_is_and_is_quiet_where_it_should_be(tmp_path):
+    """No bar is shown where the user says so, and where hooks are called."""
+    shown, told, hooked, _ = on_terminal(ADVANCE + QUIETLY, tmp_path).split("NEXT\r\n")
+    assert "of 0.5 s, " in shown
+    assert "of 500 steps, " in shown
     # The bars are gone at the end.
-    assert said.rstrip().rpartition("\r")[2].strip() == "" or said.endswith("\r")
+    assert shown.rstrip().rpartition("\r")[2].strip() == "" or shown.endswith("\r")
+    assert "simulating" not in told + hooked
 
 
-@pytest.mark.parametrize("before", ["wc.show_progress(False)", "sim.on_step(lambda sim: None)"])
-def test_a_run_in_python_is_quiet_where_it_should_be(tmp_path, before):
-    assert "simulating" not in on_terminal(ADVANCE.replace("BEFORE", before), tmp_path)
+def test_a_run_in_python_is_quiet_in_files(capfd, monkeypatch):
+    from warp_corot.simulation import progress
 
-
-def test_a_run_in_python_is_quiet_in_files(tmp_path):
-    done = subprocess.run([sys.executable, "-c", ADVANCE.replace("BEFORE", "")], cwd=tmp_path, capture_output=True)
-    assert done.returncode == 0
-    assert b"simulating" not in done.stderr + done.stdout
+    monkeypatch.setattr(progress, "SILENT", progress.SILENT)
+    exec(ADVANCE, {})
+    said = "".join(capfd.readouterr())
+    assert "NEXT" in said
+    assert "simulating" not in said
