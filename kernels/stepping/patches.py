@@ -232,6 +232,11 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         return wp.matrix_from_cols(x1 - x0, x2 - x0, x3 - x0) * rest_inverse(c)
 
     @wp.func
+    def law_lam(c: row):
+        """What the law by itself has of lambda times the volume."""
+        return wp.static(0.0 if shares else 1.0) * c[10]
+
+    @wp.func
     def corner_forces(c: row, p: wp.mat33):
         """Those on the corners but the first."""
         h = p * wp.transpose(rest_inverse(c))
@@ -400,13 +405,11 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                     if at >= begin and at < end:
                         c = constants[k]
                         gradient = displacement_gradient(corners[k], c)
-                        lambda_part = c[10]
                         if wp.static(shares):
                             theta, _slope = measure(gradient)
-                            measured(wp.static(STORE), group_place[k], lambda_part * theta)
-                            lambda_part = 0.0
+                            measured(wp.static(STORE), group_place[k], c[10] * theta)
                         if at < computed_count:
-                            p, trusted = stretch_stress(gradient, c[9], lambda_part)
+                            p, trusted = stretch_stress(gradient, c[9], law_lam(c))
                             if trusted:
                                 store_forces(targets[k], c, p)
                             else:
@@ -427,10 +430,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                         its_targets = targets[k]
                         c = constants[k]
                 f = identity3() + displacement_gradient(its_corners, c)
-                lambda_part = c[10]
-                if wp.static(shares):
-                    lambda_part = float(0.0)
-                store_forces(its_targets, c, turned_stress(f, c[9], lambda_part))
+                store_forces(its_targets, c, turned_stress(f, c[9], law_lam(c)))
             synchronize_block()
             if wp.static(shares):
                 if thread < wp.static(groups):
