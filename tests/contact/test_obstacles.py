@@ -316,6 +316,7 @@ def test_a_tool_that_is_too_fast_for_the_given_step_is_refused(device):
     ("make", "says"),
     [
         (lambda: wc.Contact(friction=-0.1), "friction"),
+        (lambda: wc.Contact(self_contact="yes"), "self_contact"),
         (lambda: wc.Sphere(0.0), "radius"),
         (lambda: wc.Ground(normal=(0, 0, 0)), "normal"),
         (lambda: wc.Box((0.1, 0.1)), "size"),

@@ -221,3 +221,21 @@ def test_room_for_contacts_grows(device):
     assert sim.contact.pairs._room > 3
     assert 0 < sim.contact.search.pairs <= sim.contact.pairs.room
     assert high.positions.numpy()[:, 2].min() > 0.019
+
+
+def test_more_contacts_than_memory_end_the_run_at_the_last_good_state(device, monkeypatch):
+    low, high = block(device, 0.0), block(device, 0.0202)
+    sim = wc.Simulation([low, high], contact=wc.Contact(), gravity=DOWN, integrator=CALM)
+    sim.advance(0.001)
+    sim.contact.pairs._make_room(3)
+    before = high.positions.numpy()
+
+    def refuse(room):
+        raise RuntimeError(f"Failed to allocate {room} bytes")
+
+    monkeypatch.setattr(sim.contact.pairs, "_rows_for", refuse)
+    with pytest.raises(wc.UnstableError, match=r"^\d+ pairs of soft surfaces .* no memory .* larger where"):
+        sim.advance(0.1)
+    np.testing.assert_array_equal(high.positions.numpy(), before)
+    monkeypatch.undo()
+    sim.advance(0.01)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number
 
@@ -26,6 +28,8 @@ class Contact:
 
     def __post_init__(self) -> None:
         checked_friction(self.friction)
+        if not isinstance(self.self_contact, bool | np.bool_):
+            raise InputError(f"self_contact is {self.self_contact!r}; it must be True or False")
 
 
 def checked_friction(given: float) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from warp_corot.errors import UnstableError
 from warp_corot.kernels.contact import boxes
 from warp_corot.kernels.contact import pairs as kernels
 from warp_corot.kernels.contact import search as search_kernels
@@ -71,8 +72,24 @@ class Pairs:
         self._make_room(max(self._room, PAIRS_EACH * (count + edges)))
 
     def _make_room(self, room: int) -> None:
-        """Have room for so many pairs. There are none until the next search."""
-        self._room, device, owners = room, self.device, self.surface.count + self.surface.edge_count
+        """Have room for so many pairs. There are none until the next search.
+
+        Raises:
+            UnstableError: There is no memory for them.
+        """
+        try:
+            self.rows, self._old = self._rows_for(room)
+        except (MemoryError, RuntimeError) as error:
+            raise UnstableError(
+                f"{room} pairs of soft surfaces come near one another, and {self.device} has no memory for so many; "
+                "elements must be larger where surfaces meet"
+            ) from error
+        self._room = room
+        self.search.forget()
+        self.revision += 1
+
+    def _rows_for(self, room: int) -> tuple[Rows, search_kernels.OldRows]:
+        device, owners = self.device, self.surface.count + self.surface.edge_count
         rows, old = Rows(), search_kernels.OldRows()
         rows.total = wp.zeros(1, dtype=wp.int32, device=device)
         for kept in (rows, old):
@@ -84,9 +101,7 @@ class Pairs:
         rows.places = wp.zeros(room, dtype=wp.vec4i, device=device)
         rows.shares = wp.zeros(room, dtype=wp.vec4, device=device)
         rows.gap = wp.zeros(room, dtype=wp.float32, device=device)
-        self.rows, self._old = rows, old
-        self.search.forget()
-        self.revision += 1
+        return rows, old
 
     @property
     def room(self) -> int:
