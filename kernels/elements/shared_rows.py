@@ -26,8 +26,8 @@ THREADS = 8
 
 
 @wp.struct
-class GroupRows:
-    """Groups, their elements and nodes, and the rows.
+class GroupNodes:
+    """Groups, their elements and their nodes.
 
     ``corners`` has for each member where its four nodes are among the group's, eight bits each.
     """
@@ -37,6 +37,12 @@ class GroupRows:
     corners: wp.array[wp.int32]  # [members]
     ends: wp.array[wp.int32]  # [groups] where a group's nodes end
     nodes: wp.array[wp.int32]  # [entries]
+
+
+@wp.struct
+class GroupRows:
+    """The rows of groups."""
+
     rows: wp.array[wp.vec4]  # [entries] g [N/m]
     factors: wp.array[wp.vec2]  # [groups] c [1/J], and whether an element is held: zero or more
 
@@ -52,16 +58,20 @@ def list_members(
     live: wp.array[wp.int32],
     first_group: int,
     first_place: int,
+    below: int,
     # Out
     ranges: wp.array[wp.vec2i],
     members: wp.array[wp.int32],
 ):
-    """A thread a group; see ``shared_dilatation.range_of`` for what a group is."""
+    """A thread a group; see ``shared_dilatation.range_of`` for what a group is. Those of elements from ``below`` on are
+    left empty."""
     g = wp.tid()
+    ranges[first_group + g] = wp.vec2i(0, 0)
     if not is_live(live, g):
-        ranges[first_group + g] = wp.vec2i(0, 0)
         return
     begin, end = range_of(starts, given, g)
+    if place_of(given, begin) >= below:
+        return
     place = first_place + 8 * g
     if given.shape[0] > 0:
         place = first_place + begin
@@ -108,7 +118,7 @@ def name_nodes(
     # In
     element_nodes: wp.array[wp.vec4i],
     # In and out
-    groups: GroupRows,
+    groups: GroupNodes,
 ):
     """The nodes of a group, in the order in which its elements name them."""
     g = wp.tid()
@@ -147,14 +157,15 @@ def write_rows(Elements: type, of: Dilatation) -> wp.Kernel:
         elements: Elements,
         material: IsotropicMaterial,
         u: wp.array[wp.vec4],
-        # In and out
-        groups: GroupRows,
+        groups: GroupNodes,
+        # Out
+        found: GroupRows,
         shared: wp.array[wp.vec4],
     ):
         g = wp.tid()
         first = first_entry(groups.ends, g)
         for k in range(first, groups.ends[g]):
-            groups.rows[k] = wp.vec4()
+            found.rows[k] = wp.vec4()
         sum = float(0.0)
         total = float(0.0)
         held = float(0.0)
@@ -169,12 +180,12 @@ def write_rows(Elements: type, of: Dilatation) -> wp.Kernel:
             # Forces are minus the derivative of the energy, and this is that of the sum.
             f0, f1, f2, f3 = nodal_forces(elements, t, in_local_frame(elements, t, -lam * slope))
             corners = groups.corners[i]
-            add_row(groups.rows, first + (corners & 255), f0)
-            add_row(groups.rows, first + ((corners >> 8) & 255), f1)
-            add_row(groups.rows, first + ((corners >> 16) & 255), f2)
-            add_row(groups.rows, first + ((corners >> 24) & 255), f3)
+            add_row(found.rows, first + (corners & 255), f0)
+            add_row(found.rows, first + ((corners >> 8) & 255), f1)
+            add_row(found.rows, first + ((corners >> 16) & 255), f2)
+            add_row(found.rows, first + ((corners >> 24) & 255), f3)
         theta = mean_of(sum, total)
-        groups.factors[g] = wp.vec2(mean_of(curvature_of(theta), total), held)
+        found.factors[g] = wp.vec2(mean_of(curvature_of(theta), total), held)
         for i in range(groups.ranges[g][0], groups.ranges[g][1]):
             shared[groups.members[i]] = wp.vec4(0.0, slope_of(theta), 0.0, 0.0)
 
@@ -232,7 +243,8 @@ def add_group(
 def add_row_products(
     # In
     lanes: int,
-    groups: GroupRows,
+    groups: GroupNodes,
+    found: GroupRows,
     p: wp.array[wp.vec4],
     # In and out
     y: wp.array[wp.vec4],
@@ -241,7 +253,7 @@ def add_row_products(
     thread = wp.tid()
     g = thread / lanes
     begin = first_entry(groups.ends, g)
-    add_group(thread % lanes, lanes, begin, groups.ends[g], groups.factors[g][0], groups.nodes, groups.rows, p, y)
+    add_group(thread % lanes, lanes, begin, groups.ends[g], found.factors[g][0], groups.nodes, found.rows, p, y)
 
 
 @functools.cache
@@ -256,12 +268,13 @@ def add_held(Elements: type, of: Dilatation) -> wp.Kernel:
         material: IsotropicMaterial,
         u: wp.array[wp.vec4],
         p: wp.array[wp.vec4],
-        groups: GroupRows,
+        groups: GroupNodes,
+        found: GroupRows,
         # In and out
         y: wp.array[wp.vec4],
     ):
         g = wp.tid()
-        if groups.factors[g][1] == 0.0:
+        if found.factors[g][1] == 0.0:
             return
         for i in range(groups.ranges[g][0], groups.ranges[g][1]):
             t = groups.members[i]
@@ -277,13 +290,14 @@ def add_held(Elements: type, of: Dilatation) -> wp.Kernel:
 @wp.kernel(enable_backward=False)
 def add_row_blocks(
     # In
-    groups: GroupRows,
+    groups: GroupNodes,
+    found: GroupRows,
     # In and out
     blocks: wp.array[wp.mat33],
 ):
     """The diagonal blocks of c g g^T; a thread a group."""
     g = wp.tid()
     for k in range(first_entry(groups.ends, g), groups.ends[g]):
-        row = groups.rows[k]
+        row = found.rows[k]
         v = wp.vec3(row[0], row[1], row[2])
-        wp.atomic_add(blocks, groups.nodes[k], groups.factors[g][0] * wp.outer(v, v))
+        wp.atomic_add(blocks, groups.nodes[k], found.factors[g][0] * wp.outer(v, v))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.members import Members
 from warp_corot.discretization.plan import Plan
 from warp_corot.kernels.elements.forces import add_energies, scatter_forces
 
@@ -130,6 +131,10 @@ class BesideField(ForceField):
     def shares_dilatation(self) -> bool:  # type: ignore[override]
         """Whether the law's elements do."""
         return self.law.shares_dilatation
+
+    @property
+    def find_members(self) -> Callable[[int], Members] | None:
+        return self.law.find_members
 
     @property
     def rotation_level(self) -> int | None:

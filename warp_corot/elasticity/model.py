@@ -12,6 +12,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization, Discretized, discretization_of
+from warp_corot.discretization.members import Members
 from warp_corot.discretization.plan import FlatLeaves, Plan
 from warp_corot.discretization.subtrees import chosen
 from warp_corot.errors import InputError
@@ -89,6 +90,11 @@ class ForceField(ABC):
         self._flat_lame: tuple[wp.array, list[wp.array]] | None = None
         self.plan = self.plan_of(discretization)
         self.elements, self.slots = self.plan.elements, self.plan.slots
+
+    @property
+    def find_members(self) -> Callable[[int], Members] | None:
+        """Gives the groups, of elements below a number, that share their dilatation; None: there are none."""
+        return None
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
         """Add the elastic nodal forces [N] of displacements u to f; both vec4 [worlds * N]."""

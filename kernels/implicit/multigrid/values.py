@@ -24,10 +24,12 @@ from warp_corot.kernels.elements.elements import (
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.modules import unique_kernel
 
+from .shared import row_at
+
 wp.set_module_options({"enable_backward": False})
 
 #: Determinant of a block over the cube of a third of its trace, below which the block is not inverted as it is.
-LEAST_DETERMINANT = wp.constant(1.0e-5)
+LEAST_DETERMINANT = wp.constant(1.0e-8)
 
 
 @wp.kernel(enable_backward=False)
@@ -100,18 +102,37 @@ def gather_leaves(
     starts: wp.array[wp.int32],
     codes: wp.array[wp.int32],
     places: wp.array[wp.vec2i],
+    ranks: int,
+    row_entries: int,
+    pairs: wp.array[wp.vec2i],
+    rows: wp.array[wp.vec4],
     # Out
     blocks: wp.array[wp.mat33],
+    more: wp.array[wp.mat33],
 ):
     """The entries off the diagonal; ``gradients`` are those of ``tables.shapes``, [shape, node]; viscous damping counts
-    as ``stiffening`` b K, and lambda as ``most_lambda`` mu at most."""
+    as ``stiffening`` b K, and lambda as ``most_lambda`` mu at most. Pairs and rows are those of ``shared``;
+    ``more`` is what their weights add to the diagonal, by rank; one entry where there are none."""
     world, u = wp.tid()
+    scale = scales[2] + scales[1] * stiffening
     if upper[u][0] == upper[u][1]:
+        if more.shape[0] > 1:
+            weighted = wp.mat33()
+            for at in range(starts[u], starts[u + 1]):
+                if codes[at] < -1:
+                    place = world * row_entries + pairs[-2 - codes[at]][0]
+                    weighted += wp.outer(rows[place][3] * row_at(rows, place), row_at(rows, place))
+            more[world * ranks + upper[u][0]] = scale * weighted
         return
     first = world * world_elements
     total = wp.mat33()
     for at in range(starts[u], starts[u + 1]):
         code = codes[at]
+        if code < 0:
+            pair = pairs[-2 - code]
+            first_row = world * row_entries
+            total += wp.outer(row_at(rows, first_row + pair[0]), row_at(rows, first_row + pair[1]))
+            continue
         t = first + (code >> 4)
         row = 4 * shape_of(elements.code[t])
         q = frames[t]
@@ -123,7 +144,7 @@ def gather_leaves(
         total[0, 0] += d
         total[1, 1] += d
         total[2, 2] += d
-    total = (scales[2] + scales[1] * stiffening) * total
+    total = scale * total
     where = places[u]
     blocks[world * entries + where[0]] = wp.transpose(total)
     blocks[world * entries + where[1]] = total
@@ -165,6 +186,7 @@ def finish_leaves(
     columns: wp.array[wp.int32],
     diagonal: wp.array[wp.int32],
     others: wp.array[wp.mat33],
+    more: wp.array[wp.mat33],
     # In and out
     blocks: wp.array[wp.mat33],
     # Out
@@ -192,7 +214,10 @@ def finish_leaves(
                 block = others[world * mesh_nodes + node]
                 if wp.trace(block) != 0.0:
                     total += scales[2] * semidefinite(block)
-        inverse = inverse_block(total)
+        smoothed = total
+        if more.shape[0] > 1:
+            smoothed += more[world * ranks + i]
+        inverse = inverse_block(smoothed)
     else:
         total = wp.mat33()
     blocks[first + own] = total

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.members import Members
 from warp_corot.discretization.plan import Plan
 from warp_corot.discretization.shear_only import ShearOnly
 from warp_corot.elasticity.model import ForceField, SmallForces
@@ -263,6 +264,14 @@ class DilatationField(ForceField):
         """Subtrees and other groups, as ``kernels.share_in_groups`` takes them, and how many."""
         of_subtrees = [(b.subtrees.first, self._all, b.live or self._all, b.count) for b in self.plan.batches]
         return of_subtrees + self._others.groups
+
+    @property
+    def find_members(self) -> Callable[[int], Members] | None:
+        return None if self._others.are_nodal else self.members
+
+    def members(self, below: int | None = None) -> Members:
+        """The nodes of groups, of all elements or those below a number; waits for the device."""
+        return Members.of(self.batches_of_groups(), self.elements.nodes, below)
 
     def share_weights(self, u: wp.array, p: wp.array) -> wp.array:
         """What derivatives with respect to elements' weights need of the shared dilatation, vec4 [T]; see

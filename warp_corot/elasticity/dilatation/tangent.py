@@ -41,65 +41,43 @@ class SharedTangent(Tangent):
         if self._version != version:
             self._version = version
             self._shared = wp.zeros(field.element_count, dtype=wp.vec4, device=field.device)
-            self._rows = self._groups()
+            self._members = field.members()
+            self._rows = kernels.GroupRows()
+            self._rows.rows = wp.zeros(self._members.entries, dtype=wp.vec4, device=field.device)
+            self._rows.factors = wp.zeros(self._members.count, dtype=wp.vec2, device=field.device)
 
     def take(self, u: wp.array) -> None:
         super().take(u)
         self.shear.take(u)
         field = self.field
-        inputs = [field.elements, field.isotropic, self.displacements, self._rows, self._shared]
-        field.launch(kernels.write_rows(field.kind, field.of), self._count, inputs, [])
+        inputs = [field.elements, field.isotropic, self.displacements, self._members.arrays]
+        outputs = [self._rows, self._shared]
+        field.launch(kernels.write_rows(field.kind, field.of), self._members.count, inputs, outputs)
 
     def add_product(self, p: wp.array, y: wp.array) -> None:
         self.shear.add_product(p, y)
         field, u = self.field, self.displacements
         lanes = kernels.THREADS if field.device.is_cuda else 1
-        field.launch(kernels.add_row_products, lanes * self._count, [lanes, self._rows, p], [y])
+        groups, count = [self._members.arrays, self._rows], self._members.count
+        field.launch(kernels.add_row_products, lanes * count, [lanes, *groups, p], [y])
         if self._turns:
             inputs = [field.elements, field.isotropic, u, p, self._shared, 1.0]
             kernel = shared_dilatation.add_product(field.kind, field.of)
             field.launch(kernel, field.element_count, inputs, [y])
         elif self._holds:
-            inputs = [field.elements, field.isotropic, u, p, self._rows]
-            field.launch(kernels.add_held(field.kind, field.of), self._count, inputs, [y])
+            inputs = [field.elements, field.isotropic, u, p, *groups]
+            field.launch(kernels.add_held(field.kind, field.of), count, inputs, [y])
 
     def add_diagonal(self, blocks: wp.array) -> None:
         self.shear.add_diagonal(blocks)
         field = self.field
-        field.launch(kernels.add_row_blocks, self._count, [self._rows], [blocks])
+        inputs = [self._members.arrays, self._rows]
+        field.launch(kernels.add_row_blocks, self._members.count, inputs, [blocks])
         if self._turns or self._holds:
             inputs = [field.elements, self._empty, self._empty, field.isotropic, self.displacements, self._shared]
             inputs += [float(self._turns)]
             kernel = shared_diagonal.add_diagonal(field.kind, field.of)
             field.launch(kernel, field.element_count, inputs, [blocks])
-
-    def _groups(self) -> kernels.GroupRows:
-        """The groups of the present mesh; waits for the device."""
-        field, device = self.field, self.field.device
-        batches = [
-            (*batch, 8 * batch[3] if len(batch[1]) == 0 else len(batch[1])) for batch in field.batches_of_groups()
-        ]
-        self._count = sum(count for *_, count, _ in batches)
-        rows = kernels.GroupRows()
-        rows.ranges = wp.zeros(self._count, dtype=wp.vec2i, device=device)
-        rows.members, rows.corners = (
-            wp.zeros(sum(places for *_, places in batches), dtype=wp.int32, device=device) for _ in range(2)
-        )
-        first_group = first_place = 0
-        for starts, members, live, count, places in batches:
-            inputs = [starts, members, live, first_group, first_place]
-            field.launch(kernels.list_members, count, inputs, [rows.ranges, rows.members])
-            first_group, first_place = first_group + count, first_place + places
-        nodes = field.elements.nodes
-        rows.ends = wp.zeros(self._count, dtype=wp.int32, device=device)
-        field.launch(kernels.count_nodes, self._count, [rows.ranges, rows.members, nodes], [rows.ends])
-        wp.utils.array_scan(rows.ends, rows.ends, inclusive=True)
-        entries = int(rows.ends[-1:].numpy()[0])
-        rows.nodes = wp.zeros(entries, dtype=wp.int32, device=device)
-        rows.rows = wp.zeros(entries, dtype=wp.vec4, device=device)
-        rows.factors = wp.zeros(self._count, dtype=wp.vec2, device=device)
-        field.launch(kernels.name_nodes, self._count, [nodes], [rows])
-        return rows
 
 
 class NodalTangent(Tangent):

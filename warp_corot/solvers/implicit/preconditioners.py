@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
 from warp_corot.kernels.elements.elements import ForestElements
@@ -16,10 +14,9 @@ from .multigrid import Multigrid
 from .operator import Preconditioner
 from .tangent import TangentOperator
 
-#: Plain elements lock where those that share their dilatation do not: these are preconditioned by compressible ones.
-MOST_LAMBDA = 4.0
-#: As the two differ, better smoothing saves no iterations there: its degree, and by how much it rises.
-SHARED: dict[str, int] = {"degree": 2, "rise": 0}
+#: Where elements have their dilatation at nodes, they are preconditioned by plain ones, compressible since these lock.
+#: As the two differ, better smoothing saves no iterations there.
+AT_NODES: dict[str, Any] = {"degree": 2, "rise": 0, "most_lambda": 4.0}
 #: Of a short cycle: the smoother's degree, by how much it rises, and the nodes of a level that is not made coarser.
 SHORT: dict[str, int] = {"degree": 2, "rise": 1, "few_nodes": 24}
 
@@ -29,9 +26,12 @@ def _multigrid(operator: TangentOperator, short_cycles: bool) -> Multigrid:
     shares = operator.field.shares_dilatation
     # Where a product costs as much as a cycle, fewer iterations are worth longer ones; so are fewer launches on CUDA.
     short = SHORT if short_cycles and operator.device.is_cpu else {}
-    options = short | SHARED if shares else short
-    most, is_turned = MOST_LAMBDA if shares else np.inf, not operator.field.is_linear
-    return Multigrid(operator.body, is_turned=is_turned, stiffening=stiffening, most_lambda=most, **options)
+    options: dict[str, Any] = dict(short)
+    members = operator.field.find_members
+    if shares and members is None:
+        options |= AT_NODES
+    is_turned = not operator.field.is_linear
+    return Multigrid(operator.body, is_turned=is_turned, stiffening=stiffening, members=members, **options)
 
 
 #: By name.

@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.implicit.multigrid import cycle, values
+from warp_corot.kernels.implicit.multigrid import cycle, shared, values
 
 from .pattern import Midpoints, Pattern
 
@@ -40,6 +40,8 @@ class Level:
         ranks: Nodes of all levels, M.
         free: Which nodes are free, by rank, uint8 [worlds * M].
         degree: Of the smoother.
+        is_bounded: Whether the bound on the eigenvalues of D^-1 A must be kept by smaller inverses, as where groups of
+            more than four nodes share a dilatation.
 
     Attributes:
         blocks: Values of the entries, transposed, mat33 [worlds * entries + 1].
@@ -49,13 +51,22 @@ class Level:
         lanes: How many threads share a row.
     """
 
-    def __init__(self, pattern: Pattern, worlds: int, ranks: int, free: wp.array, degree: int):
+    def __init__(
+        self,
+        pattern: Pattern,
+        worlds: int,
+        ranks: int,
+        free: wp.array,
+        degree: int,
+        is_bounded: bool = False,
+    ):
         self.pattern, self.worlds, self.ranks, self.free = pattern, worlds, ranks, free
         self.device = pattern.starts.device
         self.count = pattern.count
         # One more, since products read past the last.
         self.blocks = wp.zeros(worlds * pattern.entries + 1, dtype=wp.mat33, device=self.device)
         self.inverses = wp.zeros(worlds * self.count, dtype=wp.mat33, device=self.device)
+        self._unbounded = wp.zeros_like(self.inverses) if is_bounded else None
         self.r, self.z, self.other = (
             wp.zeros(worlds * self.count, dtype=wp.vec4, device=self.device) for _ in range(3)
         )
@@ -82,7 +93,11 @@ class Level:
         pattern = self.pattern
         inputs = [self.ranks, self.count, pattern.entries, fine.pattern.entries, self.free, pattern.upper]
         inputs += [pattern.sum_starts, pattern.codes, pattern.places, fine.blocks]
-        self.launch(values.gather_products, len(pattern.upper), inputs, [self.blocks, self.inverses])
+        inverses = self.inverses if self._unbounded is None else self._unbounded
+        self.launch(values.gather_products, len(pattern.upper), inputs, [self.blocks, inverses])
+        if self._unbounded is not None:
+            inputs = [self.count, pattern.entries, *self.matrix, inverses]
+            self.launch(shared.bound_diagonal, self.count, inputs, [self.inverses])
 
     def restrict_from(self, fine: Level, midpoints: Midpoints) -> None:
         """Take over the finer level's residual, and make the smoother's first step."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -10,9 +11,10 @@ import warp as wp
 
 from warp_corot.discretization.discretization import Discretization, Discretized, discretization_of
 from warp_corot.discretization.levels import Levels
+from warp_corot.discretization.members import Members
 from warp_corot.errors import InputError
 from warp_corot.kernels.elements.elements import ForestElements
-from warp_corot.kernels.implicit.multigrid import cycle, pattern, values
+from warp_corot.kernels.implicit.multigrid import cycle, pattern, shared, values
 from warp_corot.kernels.tables.shapes import GRADIENT
 from warp_corot.solvers.implicit.operator import LinearOperator
 
@@ -51,6 +53,7 @@ class Multigrid:
         few_nodes: Levels of more nodes than this are made coarser, while there are coarser ones.
         stiffening: Viscous over elastic stress at one strain [s], as in the operator's D.
         most_lambda: Up to how many times mu lambda counts.
+        members: Gives the groups of elements, of those below a number, that share their dilatation; None: none do.
 
     Attributes:
         discretization: The body's.
@@ -71,6 +74,7 @@ class Multigrid:
         few_nodes: int = MOST_DENSE,
         stiffening: float = 0.0,
         most_lambda: float = np.inf,
+        members: Callable[[int], Members] | None = None,
     ):
         if stride not in (1, 2, 3):
             raise InputError(f"stride is {stride!r}; it must be 1, 2 or 3")
@@ -79,6 +83,7 @@ class Multigrid:
         self.discretization = discretization_of(body)
         self.is_turned, self.stride, self.degree, self.stiffening = is_turned, stride, degree, stiffening
         self.most_lambda, self.rise, self.few_nodes = most_lambda, rise, few_nodes
+        self._find_members = members
         self.revision, self._version = -1, -1
         self.follow()
 
@@ -107,13 +112,18 @@ class Multigrid:
         inputs: list[Any] = [elements, operator.displacements]
         wp.launch(kernel, dim=leaves, inputs=inputs, outputs=[self._frames], device=self.device)
         found = finest.pattern
+        if self._members is not None:
+            inputs = [discretization.sizes.world_elements, self._members.entries, self._members.arrays, elements]
+            inputs += [self._frames, self._gradients, discretization.lam, discretization.material_stride]
+            finest.launch(shared.write_rows, self._members.count, inputs, [self._rows])
         inputs = [discretization.sizes.world_elements, found.entries, elements, self._frames, self._gradients]
         inputs += [discretization.mu, discretization.lam, discretization.material_stride, scales, self.stiffening]
-        inputs += [self.most_lambda]
-        inputs += [found.upper, found.sum_starts, found.codes, found.places]
-        finest.launch(values.gather_leaves, len(found.upper), inputs, [finest.blocks])
+        inputs += [self.most_lambda if self._members is None else 0.0]
+        inputs += [found.upper, found.sum_starts, found.codes, found.places, self.count]
+        inputs += [0 if self._members is None else self._members.entries, self._pairs, self._rows]
+        finest.launch(values.gather_leaves, len(found.upper), inputs, [finest.blocks, self._more])
         inputs = [self.count, self._mesh_nodes, found.entries, self._nodes, inverse_mass, scales, self._free]
-        inputs += [found.starts, found.columns, found.diagonal, operator.other_blocks()]
+        inputs += [found.starts, found.columns, found.diagonal, operator.other_blocks(), self._more]
         finest.launch(values.finish_leaves, self.count, inputs, [finest.blocks, finest.inverses])
         for transfer in self._transfers:
             transfer.coarse.gather_from(transfer.fine)
@@ -154,7 +164,11 @@ class Multigrid:
         finder = PatternFinder(self._ends)
         elements = cast("ForestElements", self.discretization.elements)
         counts = self._counts(levels)
-        found = finder.of_leaves(elements.nodes, sizes.world_elements, rank)
+        members = self._members = self._find_members and self._find_members(sizes.world_elements)
+        found, self._pairs = finder.of_leaves(elements.nodes, sizes.world_elements, rank, members)
+        rows, nodes = (0, 1) if members is None else (sizes.worlds * members.entries, sizes.worlds * self.count)
+        self._rows = wp.zeros(rows, dtype=wp.vec4, device=device)
+        self._more = wp.zeros(nodes, dtype=wp.mat33, device=device)
         self.levels = [self._level(found, counts)]
         self._transfers = []
         for count in counts[1:]:
@@ -168,7 +182,8 @@ class Multigrid:
         """A level with its smoother; the coarsest one's is only used where it is not inverted."""
         k = counts.index(found.count)
         degree = COARSEST_DEGREE if k == len(counts) - 1 else self.degree + self.rise * k
-        return Level(found, self.discretization.worlds, self.count, self._free, degree)
+        is_bounded = k > 0 and self._members is not None
+        return Level(found, self.discretization.worlds, self.count, self._free, degree, is_bounded)
 
     def _counts(self, levels: Levels) -> list[int]:
         """Numbers of nodes of the levels that the cycle has, finest first."""

@@ -7,7 +7,9 @@ from typing import Any
 
 import warp as wp
 
+from warp_corot.discretization.members import Members
 from warp_corot.kernels.implicit.multigrid import pattern as kernels
+from warp_corot.kernels.implicit.multigrid import shared
 from warp_corot.kernels.meshing.growth import gather_flagged
 from warp_corot.kernels.plan.levels import flag_first
 
@@ -66,13 +68,35 @@ class PatternFinder:
         # One more than there are ranks, for keys past all.
         self.bits = len(ends).bit_length()
 
-    def of_leaves(self, tets: wp.array, leaves: int, rank: wp.array) -> Pattern:
-        """Of the finest level, from the nodes of the first leaves by number and the rank of each number."""
+    def of_leaves(
+        self, tets: wp.array, leaves: int, rank: wp.array, members: Members | None = None
+    ) -> tuple[Pattern, wp.array]:
+        """Of the finest level, from the nodes of the first leaves by number and the rank of each number.
+
+        Args:
+            tets: Of all leaves, vec4i.
+            leaves: How many count.
+            rank: int32.
+            members: Groups whose nodes are all coupled, if there are any.
+
+        Returns:
+            The pattern, and the pairs of the groups' nodes as ``kernels.implicit.multigrid.shared`` has them, vec2i.
+        """
         nodes = len(rank)
-        keys, codes = self._keys(6 * leaves + nodes)
+        before, pairs = 6 * leaves + nodes, 0
+        if members is not None:
+            sums = self._ints(members.count)
+            self._launch(shared.count_pairs, members.count, [members.arrays], [sums])
+            wp.utils.array_scan(sums, sums, inclusive=True)
+            pairs = int(sums[-1:].numpy()[0])
+        keys, codes = self._keys(before + pairs)
         self._launch(kernels.list_leaf_pairs, leaves, [self.bits, tets, rank], [keys, codes])
         self._launch(kernels.list_diagonal, nodes, [6 * leaves, self.bits], [keys, codes])
-        return self._pattern(nodes, 6 * leaves + nodes, keys, codes)
+        found = wp.empty(pairs, dtype=wp.vec2i, device=self.device)
+        if members is not None:
+            inputs = [before, self.bits, members.arrays, rank, sums]
+            self._launch(shared.list_pairs, members.count, inputs, [found, keys, codes])
+        return self._pattern(nodes, before + pairs, keys, codes), found
 
     def of_products(self, fine: Pattern, coarse: int) -> Pattern:
         """Of the level of so many nodes, from the next finer one."""

@@ -1,0 +1,137 @@
+"""The part of the finest matrix that comes from a dilatation that groups of elements share.
+
+A group adds r r^T, with r = sum of lambda V grad N / sqrt(sum of lambda V) at its nodes, turned by the elements'
+rotations: the rows of ``kernels.elements.shared_rows`` where nothing but a rotation changes volumes. So each pair of a
+group's nodes contributes to an entry.
+
+A group of k nodes couples all of them: r r^T may be k times its own diagonal blocks. It is at most 4 times these with
+weights w_n = sum of |r_m| / (4 |r_n|), since (sum of r_n . p_n)^2 <= sum of |r_m| times sum of (r_n . p_n)^2 / |r_n|.
+Smoothing takes the diagonal with these weights, and so keeps its bound. On coarser levels, where most groups have four
+nodes and few have more, ``bound_diagonal`` keeps it.
+"""
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import ForestElements, rest_volume, shape_of
+from warp_corot.kernels.elements.shared_rows import GroupNodes, first_entry
+
+from .pattern import key_of
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel(enable_backward=False)
+def count_pairs(groups: GroupNodes, counts: wp.array[wp.int32]):
+    """Pairs of a group's nodes, each with itself, too."""
+    g = wp.tid()
+    nodes = groups.ends[g] - first_entry(groups.ends, g)
+    counts[g] = nodes * (nodes + 1) / 2
+
+
+@wp.kernel(enable_backward=False)
+def list_pairs(
+    # In
+    first: int,
+    bits: int,
+    groups: GroupNodes,
+    rank: wp.array[wp.int32],
+    sums: wp.array[wp.int32],
+    # Out
+    pairs: wp.array[wp.vec2i],
+    keys: wp.array[wp.int64],
+    codes: wp.array[wp.int32],
+):
+    """Each pair's places in the rows, that of the lower rank first; its key; and as its code -2 minus its number.
+    ``first`` is how many keys stand before."""
+    g = wp.tid()
+    at = first_entry(sums, g)
+    for k in range(first_entry(groups.ends, g), groups.ends[g]):
+        for m in range(k, groups.ends[g]):
+            i = rank[groups.nodes[k]]
+            j = rank[groups.nodes[m]]
+            if i <= j:
+                pairs[at] = wp.vec2i(k, m)
+                keys[first + at] = key_of(i, j, bits)
+            else:
+                pairs[at] = wp.vec2i(m, k)
+                keys[first + at] = key_of(j, i, bits)
+            codes[first + at] = -2 - at
+            at += 1
+
+
+@wp.func
+def row_at(rows: wp.array[wp.vec4], place: int):
+    row = rows[place]
+    return wp.vec3(row[0], row[1], row[2])
+
+
+@wp.kernel(enable_backward=False)
+def write_rows(
+    # In
+    world_elements: int,
+    entries: int,
+    groups: GroupNodes,
+    elements: ForestElements,
+    frames: wp.array[wp.mat33],
+    gradients: wp.array[wp.vec3],
+    lam: wp.array[float],
+    stride: int,
+    # Out
+    rows: wp.array[wp.vec4],
+):
+    """The rows, and w - 1 in the fourth lane; frames and gradients as ``values.gather_leaves`` takes them."""
+    world, g = wp.tid()
+    first = first_entry(groups.ends, g)
+    end = groups.ends[g]
+    total = float(0.0)
+    for k in range(first, end):
+        rows[world * entries + k] = wp.vec4()
+    for i in range(groups.ranges[g][0], groups.ranges[g][1]):
+        t = world * world_elements + groups.members[i]
+        volume = rest_volume(elements, t)
+        modulus = lam[t * stride]
+        total += modulus * volume
+        q = (modulus * wp.sqrt(volume)) * frames[t]
+        for n in range(4):
+            part = q * gradients[4 * shape_of(elements.code[t]) + n]
+            at = world * entries + first + ((groups.corners[i] >> (8 * n)) & 255)
+            rows[at] = rows[at] + wp.vec4(part[0], part[1], part[2], 0.0)
+    factor = float(0.0)
+    if total > 0.0:
+        factor = 1.0 / wp.sqrt(total)
+    sum = float(0.0)
+    for k in range(first, end):
+        row = factor * row_at(rows, world * entries + k)
+        rows[world * entries + k] = wp.vec4(row[0], row[1], row[2], 0.0)
+        sum += wp.length(row)
+    for k in range(first, end):
+        row = row_at(rows, world * entries + k)
+        size = wp.length(row)
+        weight = float(1.0)
+        if size > 0.0:
+            weight = 0.25 * sum / size
+        rows[world * entries + k] = wp.vec4(row[0], row[1], row[2], weight - 1.0)
+
+
+@wp.kernel(enable_backward=False)
+def bound_diagonal(
+    # In
+    count: int,
+    entries: int,
+    starts: wp.array[wp.int32],
+    columns: wp.array[wp.int32],
+    blocks: wp.array[wp.mat33],
+    given: wp.array[wp.mat33],
+    # Out
+    inverses: wp.array[wp.mat33],
+):
+    """Inverses of diagonal blocks, of which a row's is divided by a quarter of the sum of its |D^-1/2 A D^-1/2|, if
+    that is more than one: A is at most 4 D, since 4 D - A is diagonally dominant."""
+    world, i = wp.tid()
+    first = world * count
+    own = given[first + i]
+    sum = float(0.0)
+    for p in range(starts[i], starts[i + 1]):
+        block = wp.transpose(blocks[world * entries + p])
+        sum += wp.sqrt(wp.max(wp.ddot(own * block, block * given[first + columns[p]]), 0.0))
+    inverses[first + i] = own / wp.max(0.25 * sum, 1.0)

@@ -1,0 +1,59 @@
+"""The nodes of groups of elements that share their dilatation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_corot.kernels.elements import shared_rows as kernels
+
+#: Starts, members, how many there are if launches go through more, and how many launches go through: as
+#: ``kernels.elements.shared_dilatation.share_in_groups`` takes groups.
+Batch = tuple[wp.array, wp.array, wp.array, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Members:
+    """Groups, their elements and their nodes.
+
+    Attributes:
+        count: How many groups launches go through; some may be empty.
+        entries: How many nodes all have together.
+        arrays: On the device.
+    """
+
+    count: int
+    entries: int
+    arrays: kernels.GroupNodes
+
+    @classmethod
+    def of(cls, batches: list[Batch], nodes: wp.array, below: int | None = None) -> Members:
+        """Of the present mesh; waits for the device.
+
+        Args:
+            batches: Groups.
+            nodes: Of all elements, vec4i.
+            below: Groups of elements from this number on are left empty; None: all count.
+        """
+        device = nodes.device
+        # Subtrees name their first leaf alone.
+        places = [len(members) or 8 * groups for _, members, _, groups in batches]
+        count, room = sum(groups for *_, groups in batches), sum(places)
+        found = kernels.GroupNodes()
+        found.ranges = wp.zeros(count, dtype=wp.vec2i, device=device)
+        found.members, found.corners = (wp.zeros(room, dtype=wp.int32, device=device) for _ in range(2))
+        first_group = first_place = 0
+        for (starts, members, live, groups), more in zip(batches, places, strict=True):
+            inputs = [starts, members, live, first_group, first_place]
+            inputs += [np.iinfo(np.int32).max if below is None else below]
+            wp.launch(kernels.list_members, groups, inputs, [found.ranges, found.members], device=device)
+            first_group, first_place = first_group + groups, first_place + more
+        found.ends = wp.zeros(count, dtype=wp.int32, device=device)
+        wp.launch(kernels.count_nodes, count, [found.ranges, found.members, nodes], [found.ends], device=device)
+        wp.utils.array_scan(found.ends, found.ends, inclusive=True)
+        entries = int(found.ends[-1:].numpy()[0]) if count else 0
+        found.nodes = wp.zeros(entries, dtype=wp.int32, device=device)
+        wp.launch(kernels.name_nodes, count, [nodes], [found], device=device)
+        return cls(count, entries, found)
