@@ -49,7 +49,7 @@ class Layout:
 
     Attributes:
         threads: Threads a block.
-        elements, halo: Elements, and nodes of the halo, a thread.
+        elements, halo: Elements that it computes, and nodes of the halo, a thread.
         lanes: Threads that add up one node.
         nodes, slots: Room for displacements and for forces in shared memory; one more slot takes what nobody adds up.
         groups, members: Room for groups that share a dilatation and for the elements of each; none: elements do not.
@@ -73,7 +73,7 @@ class Layout:
     @property
     def floats(self) -> int:
         """The shared memory for all of that, in numbers of four bytes."""
-        return 3 * self.vectors + self.groups * (self.members + 2)
+        return 3 * self.vectors + self.groups * (2 * self.members + 2)
 
 
 @wp.struct
@@ -211,12 +211,13 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
     """
     threads, each, halo_each, lanes = layout.threads, layout.elements, layout.halo, layout.lanes
     slot, displacement = vectors_at(0), vectors_at(layout.slots + 1)
-    # What elements of groups leave, the weights of groups, inverted, and their pressures.
+    # What elements of groups leave, their weights, those of groups, inverted, and the pressures of groups.
     shares, groups, members = layout.groups > 0, layout.groups, layout.members
     first_number = 3 * layout.vectors
     measured = numbers_at(first_number)
-    inverse_weight = numbers_at(first_number + groups * members)
-    pressure_of = numbers_at(first_number + groups * (members + 1))
+    weight_of = numbers_at(first_number + groups * members)
+    inverse_weight = numbers_at(first_number + groups * 2 * members)
+    pressure_of = numbers_at(first_number + groups * (2 * members + 1))
     measure, slope_of, pressure_stress = VOLUME.measure, VOLUME.slope, pressure_stress_of(VOLUME)
     words = wp.types.vector(length=each, dtype=wp.uint64)
     numbers = wp.types.matrix(shape=(each, CONSTANTS), dtype=wp.float32)
@@ -346,7 +347,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         group_place = group_places()
         for k in range(wp.static(each)):
             at = thread + k * wp.static(threads)
-            if at < element_count:
+            if at < computed_count:
                 e = first_element + at
                 corners[k] = body.corners[e]
                 targets[k] = body.slots[e]
@@ -366,9 +367,13 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
             displacement(wp.static(STORE), place, x)
             publish(exchange.published, int(number & wp.uint32(1)) * node_count + i, x, number)
         if wp.static(shares):
-            for k in range(wp.static(each)):
-                if thread + k * wp.static(threads) < element_count:
-                    measured(wp.static(STORE), group_place[k], constants[k, 10])
+            at = thread
+            while at < element_count:
+                e = first_element + at
+                weight = body.rest[wp.static(VOLUME_ROW), e] * lam[body.elements[e] * stride]
+                measured(wp.static(STORE), body.measures[e], weight)
+                weight_of(wp.static(STORE), body.measures[e], weight)
+                at += wp.static(threads)
             synchronize_block()
             if thread < wp.static(groups):
                 weight = sum_of_group(thread)
@@ -391,7 +396,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                     synchronize_block()
                 else:
                     begin = interior_count
-                    end = element_count
+                    end = computed_count
                     for k in range(wp.static(halo_each)):
                         at = thread + k * wp.static(threads)
                         if at < halo_count:
@@ -408,12 +413,11 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                         if wp.static(shares):
                             theta, _slope = measure(gradient)
                             measured(wp.static(STORE), group_place[k], c[10] * theta)
-                        if at < computed_count:
-                            p, trusted = stretch_stress(gradient, c[9], law_lam(c))
-                            if trusted:
-                                store_forces(targets[k], c, p)
-                            else:
-                                left_out |= wp.static(1 << k)
+                        p, trusted = stretch_stress(gradient, c[9], law_lam(c))
+                        if trusted:
+                            store_forces(targets[k], c, p)
+                        else:
+                            left_out |= wp.static(1 << k)
                 phase += 1
             if gave_up != 0:
                 break
@@ -431,6 +435,18 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                         c = constants[k]
                 f = identity3() + displacement_gradient(its_corners, c)
                 store_forces(its_targets, c, turned_stress(f, c[9], law_lam(c)))
+            if wp.static(shares):
+                # Elements that are only measured; what is known of them comes from the nearest cache.
+                at = computed_count + thread
+                while at < element_count:
+                    e = first_element + at
+                    c = row()
+                    for j in range(9):
+                        c[j] = body.rest[j, e]
+                    theta, _slope = measure(displacement_gradient(body.corners[e], c))
+                    weight = weight_of(wp.static(LOAD), body.measures[e], 0.0)
+                    measured(wp.static(STORE), body.measures[e], weight * theta)
+                    at += wp.static(threads)
             synchronize_block()
             if wp.static(shares):
                 if thread < wp.static(groups):
@@ -446,10 +462,10 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                 synchronize_block()
 
             elastic = wp.vec3()
-            row = int(0)
-            while row < rows:
-                elastic += slot(wp.static(LOAD), first_slot + row * wp.static(WARP), elastic)
-                row += 1
+            r = int(0)
+            while r < rows:
+                elastic += slot(wp.static(LOAD), first_slot + r * wp.static(WARP), elastic)
+                r += 1
             distance = int(wp.static(lanes // 2))
             while distance > 0:
                 elastic += shuffle_down(elastic, distance)

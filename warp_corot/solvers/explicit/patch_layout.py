@@ -157,6 +157,11 @@ class Patches:
         return int(self.ranks.max()) + 1 if self.most_groups else 0
 
     @property
+    def most_computed(self) -> int:
+        """The most elements that a patch computes."""
+        return int(self.computed.max())
+
+    @property
     def most_elements(self) -> int:
         """The most elements of a patch."""
         return int(np.diff(self.element_start).max())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -28,8 +29,10 @@ if TYPE_CHECKING:
 FEWEST, MOST = 500, 150_000
 #: The fewest elements of a patch: with fewer, the blocks of small bodies mostly wait for one another.
 PATCH_ELEMENTS = 32
-#: Threads of a block, each for patches of at most this many elements; more threads have fewer registers.
+#: Threads of a block, each for patches that compute at most this many elements; more threads have fewer registers.
 THREADS = ((256, 512), (512, 1024), (384, 1536), (512, 2048))
+#: How many elements a thread measures if there are enough threads, and at most.
+SOON_MEASURED, MOST_MEASURED = 3, 8
 #: How many elements' constants a thread keeps in registers, and how many nodes of the halo it waits for.
 MOST_ELEMENTS, MOST_HALO = 4, 3
 #: The first architecture whose reads and writes of 16 bytes are atomic.
@@ -76,11 +79,13 @@ class PatchSteps:
         if sharing is not None and groups is None:
             return None
         count = min(count or max(len(body.mesh.tets) // PATCH_ELEMENTS, 1), body.device.sm_count)
-        for each, most in THREADS if threads is None else ((threads, MOST_ELEMENTS * threads),):
+        room = body.device.max_shared_memory_per_block - TILE_BYTES
+        sizes = THREADS if threads is None else ((threads, MOST_ELEMENTS * threads),)
+        for at_once, (each, most) in itertools.product((SOON_MEASURED, MOST_MEASURED), sizes):
             patches = Patches.of(body.mesh.points, body.mesh.tets, count, each, groups)
-            if patches.most_elements > most:
+            if patches.most_computed > most or patches.most_elements > at_once * each:
                 continue
-            layout = layout_of(patches, each, body.device.max_shared_memory_per_block - TILE_BYTES)
+            layout = layout_of(patches, each, room)
             if layout is not None:
                 return cls(body, patches, layout)
         return None
@@ -137,7 +142,7 @@ class PatchSteps:
 
 def layout_of(patches: Patches, threads: int, most_bytes: int) -> Layout | None:
     """The layout for which the kernel is generated; None if the patches do not fit into the memory of a block."""
-    elements = -(-patches.most_elements // threads)
+    elements = -(-patches.most_computed // threads)
     halo = max(-(-patches.most_halo // threads), 1)
     nodes = -(-patches.most_nodes // NODE_ROOM) * NODE_ROOM
     slots = -(-(patches.most_slots + 1) // SLOT_ROOM) * SLOT_ROOM - 1
