@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 from measure import Case, Parser, Result, checked, finish, machine, measure, number, parser, percent, table, tell
-from state_bodies import MATERIAL, State, Subject, beam, cube, notched_beam, organ
+from state_bodies import MAKERS, MATERIAL, State, Subject, beam, cube, notched_beam, organ
 from state_cases import DEFAULT, GENERAL, LEAF, Row, rows_of
 
 import warp_corot as wc
@@ -49,7 +49,8 @@ def subjects(options: Any, where: str) -> Iterator[Subject]:
         if time.perf_counter() - begin > options.seconds:
             print(f"left out, after {options.seconds:g} s: {subject.name} and all that follow", flush=True)
             return
-        yield dataclasses.replace(subject, poisson=options.poisson)
+        chosen = tuple(name for name in subject.states if options.states is None or name in options.states)
+        yield dataclasses.replace(subject, poisson=options.poisson, states=chosen)
 
 
 def made(options: Any, where: str) -> Iterator[Subject]:
@@ -159,6 +160,7 @@ def command_line() -> Parser:
     of.add_argument("--levels", type=int, nargs="+", help="several (default: 6 12, on CUDA 6 9 12 15 18)")
     of.add_argument("--organs", type=int, nargs="*", help="approximate numbers of elements of balls and bunnies")
     of.add_argument("--bodies", nargs="+", choices=BODIES, default=BODIES)
+    of.add_argument("--states", nargs="+", choices=MAKERS, help="only these, besides that at rest")
     of.add_argument("--laws", nargs="+", help="only these laws, by their names in the table")
     of.add_argument(
         "--poisson", type=float, default=MATERIAL["poisson"], help="from 0.45 on elements share their dilatation"
