@@ -42,6 +42,7 @@ class Level:
         degree: Of the smoother.
         is_bounded: Whether the bound on the eigenvalues of D^-1 A must be kept by smaller inverses, as where groups of
             more than four nodes share a dilatation.
+        is_half: Whether the cycle takes the matrix in half precision.
 
     Attributes:
         blocks: Values of the entries, transposed, mat33 [worlds * entries + 1].
@@ -59,6 +60,7 @@ class Level:
         free: wp.array,
         degree: int,
         is_bounded: bool = False,
+        is_half: bool = False,
     ):
         self.pattern, self.worlds, self.ranks, self.free = pattern, worlds, ranks, free
         self.device = pattern.starts.device
@@ -66,6 +68,13 @@ class Level:
         # One more, since products read past the last.
         self.blocks = wp.zeros(worlds * pattern.entries + 1, dtype=wp.mat33, device=self.device)
         self.inverses = wp.zeros(worlds * self.count, dtype=wp.mat33, device=self.device)
+        self.rows = cycle.Rows()
+        self.rows.starts, self.rows.columns, self.rows.blocks = pattern.starts, pattern.columns, self.blocks
+        if is_half:
+            self.rows.packed = wp.zeros(12 * worlds * pattern.entries, dtype=wp.uint16, device=self.device)
+            self.rows.sums = wp.zeros_like(self.inverses)
+            self.rows.units = wp.zeros(worlds * self.count, dtype=wp.float32, device=self.device)
+        self._is_half = is_half
         self._unbounded = wp.zeros_like(self.inverses) if is_bounded else None
         self.r, self.z, self.other = (
             wp.zeros(worlds * self.count, dtype=wp.vec4, device=self.device) for _ in range(3)
@@ -74,17 +83,20 @@ class Level:
         few = LANES if worlds * self.count > MANY_ROWS else MOST_LANES
         self.lanes = 1 if self.device.is_cpu else few
 
-    @property
-    def matrix(self) -> list[Any]:
-        """The matrix as kernels take it."""
-        return [self.pattern.starts, self.pattern.columns, self.blocks]
+    def pack(self) -> None:
+        """Launch what the cycle takes of the matrix."""
+        if not self._is_half:
+            return
+        pattern, rows = self.pattern, self.rows
+        inputs: list[Any] = [self.count, pattern.entries, pattern.starts, pattern.columns, self.blocks]
+        self.launch(cycle.pack_rows, self.count, inputs, [rows.packed, rows.sums, rows.units])
 
     def smooth(self, from_step: int = 0) -> None:
         """Go on with ``z`` from a step of the smoother."""
         for step in range(from_step, len(self.factors)):
             alpha, beta = self.factors[step]
-            inputs = [self.lanes, self.count, self.pattern.entries, alpha, beta if step else 0.0, step == from_step]
-            inputs += [*self.matrix, self.inverses, self.r, self.z]
+            inputs: list[Any] = [self.lanes, self.count, self.pattern.entries]
+            inputs += [alpha, beta if step else 0.0, step == from_step, self.rows, self.inverses, self.r, self.z]
             self.launch(cycle.smooth, self.count * self.lanes, inputs, [self.other])
             self.z, self.other = self.other, self.z
 
@@ -96,12 +108,12 @@ class Level:
         inverses = self.inverses if self._unbounded is None else self._unbounded
         self.launch(values.gather_products, len(pattern.upper), inputs, [self.blocks, inverses])
         if self._unbounded is not None:
-            inputs = [self.count, pattern.entries, *self.matrix, inverses]
+            inputs = [self.count, pattern.entries, pattern.starts, pattern.columns, self.blocks, inverses]
             self.launch(shared.bound_diagonal, self.count, inputs, [self.inverses])
 
     def restrict_from(self, fine: Level, midpoints: Midpoints) -> None:
         """Take over the finer level's residual, and make the smoother's first step."""
-        inputs = [fine.lanes, fine.count, fine.pattern.entries, *fine.matrix, fine.r, fine.z]
+        inputs = [fine.lanes, fine.count, fine.pattern.entries, fine.rows, fine.r, fine.z]
         fine.launch(cycle.find_residual, fine.count * fine.lanes, inputs, [fine.other])
         inputs = [self.ranks, self.count, fine.count, self.factors[0][0], self.free]
         inputs += [midpoints.starts, midpoints.midpoints, self.inverses, fine.other]

@@ -54,6 +54,7 @@ class Multigrid:
         stiffening: Viscous over elastic stress at one strain [s], as in the operator's D.
         most_lambda: Up to how many times mu lambda counts.
         members: Gives the groups of elements, of those below a number, that share their dilatation; None: none do.
+        half: Whether the cycle takes matrices in half precision; only where lambda is not many times mu.
 
     Attributes:
         discretization: The body's.
@@ -75,6 +76,7 @@ class Multigrid:
         stiffening: float = 0.0,
         most_lambda: float = np.inf,
         members: Callable[[int], Members] | None = None,
+        half: bool = False,
     ):
         if stride not in (1, 2, 3):
             raise InputError(f"stride is {stride!r}; it must be 1, 2 or 3")
@@ -84,6 +86,7 @@ class Multigrid:
         self.is_turned, self.stride, self.degree, self.stiffening = is_turned, stride, degree, stiffening
         self.most_lambda, self.rise, self.few_nodes = most_lambda, rise, few_nodes
         self._find_members = members
+        self._is_half = half
         self.revision, self._version = -1, -1
         self.follow()
 
@@ -127,6 +130,8 @@ class Multigrid:
         finest.launch(values.finish_leaves, self.count, inputs, [finest.blocks, finest.inverses])
         for transfer in self._transfers:
             transfer.coarse.gather_from(transfer.fine)
+        for level in self.levels if self._coarsest is None else self.levels[:-1]:
+            level.pack()
         if self._coarsest is not None:
             self._coarsest.update()
 
@@ -183,7 +188,7 @@ class Multigrid:
         k = counts.index(found.count)
         degree = COARSEST_DEGREE if k == len(counts) - 1 else self.degree + self.rise * k
         is_bounded = k > 0 and self._members is not None
-        return Level(found, self.discretization.worlds, self.count, self._free, degree, is_bounded)
+        return Level(found, self.discretization.worlds, self.count, self._free, degree, is_bounded, self._is_half)
 
     def _counts(self, levels: Levels) -> list[int]:
         """Numbers of nodes of the levels that the cycle has, finest first."""
