@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.options import Contact
@@ -14,7 +16,8 @@ from warp_corot.contact.shapes import Shape
 from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.elasticity import Model
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_things, shown
+from warp_corot.inputs.checks import checked_number, checked_things, shown
+from warp_corot.inputs.indices import checked_indices
 from warp_corot.solvers import BackwardEuler, Integrator, QuasiStatic, Stepper
 from warp_corot.solvers.ranks import ALONE, Ranks
 from warp_corot.solvers.system import System
@@ -148,3 +151,38 @@ def checked_gravity(gravity: npt.ArrayLike | None, up_axis: str) -> tuple[float,
             raise InputError(f"gravity is {gravity!r}; it must be three finite accelerations in m/s^2")
     x, y, z = (float(a) for a in down)
     return x, y, z
+
+
+def checked_curvature(forces: Any) -> float:
+    """The number ``curvature`` of forces that a user adds [1/s^2]; zero if they have none.
+
+    Raises:
+        InputError: They have no method ``add_forces``, or the number is negative or not finite.
+    """
+    if not callable(getattr(forces, "add_forces", None)):
+        raise InputError(f"forces is {shown(forces)}; it must have a method add_forces that launches them")
+    curvature = getattr(forces, "curvature", 0.0)
+    if not 0.0 <= checked_number(curvature, "curvature", "1/s^2") < math.inf:
+        raise InputError(f"curvature is {curvature}; it must be zero or a positive number [1/s^2]")
+    return curvature
+
+
+def chosen_worlds(worlds: npt.ArrayLike | wp.array | None, count: int, device: wp.Device) -> wp.array:
+    """Nonzero for each chosen world, int32 [count]; an array on the device is returned as it is.
+
+    Args:
+        worlds: None for all; an index, indices or a mask bool [count]; or a Warp array int32 [count].
+
+    Raises:
+        InputError: There is no such world, or the array has another type, length or device.
+    """
+    if isinstance(worlds, wp.array):
+        if worlds.dtype != wp.int32 or worlds.shape != (count,) or worlds.device != device:
+            raise InputError(
+                f"worlds is {worlds.dtype.__name__} {list(worlds.shape)} on {worlds.device}; "
+                f"it must be int32 [{count}] on {device}"
+            )
+        return worlds
+    mask = np.zeros(count, np.int32)
+    mask[slice(None) if worlds is None else checked_indices(worlds, count, "world")] = 1
+    return wp.array(mask, dtype=wp.int32, device=device)

@@ -103,7 +103,7 @@ class Running:
 
     def _bar(self, total: float, unit: str) -> AbstractContextManager[Callable[[float], None]]:
         """A bar for long waits; none where hooks may print lines of their own."""
-        silent = self._sim.hook_intervals or not self._sim.ranks.speaks
+        silent = self._sim.hooks.intervals or not self._sim.ranks.speaks
         return nullcontext(lambda _: None) if silent else bar_of(total, unit)
 
     def look(self) -> None:
@@ -150,9 +150,9 @@ class Running:
         if sim.remeshing.is_due(now):
             sim.follow_motion()
             sim.guard.forget()
-        if any(now % every == 0 for every in sim.hook_intervals) and sim.total_steps > self._steps_called:
+        if any(now % every == 0 for every in sim.hooks.intervals) and sim.total_steps > self._steps_called:
             self._steps_called = sim.total_steps
-            sim.call_hooks()
+            sim.hooks.call(sim)
         return reached
 
     def _is_to_be_judged(self, steps: int) -> bool:
@@ -165,7 +165,7 @@ class Running:
     def _until_due(self, done: int) -> int:
         """Steps until a check, a pass or a hook is due."""
         sim = self._sim
-        every = [self._check_steps, *sim.hook_intervals]
+        every = [self._check_steps, *sim.hooks.intervals]
         if sim.remeshing.every:
             every.append(sim.remeshing.every)
         return min(n - done % n for n in every)

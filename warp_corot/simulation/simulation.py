@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from os import PathLike
 
 import numpy as np
@@ -21,8 +20,7 @@ from warp_corot.contact.tool import Obstacle
 from warp_corot.discretization.nodal import vec3_view
 from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import InputError, StabilityWarning, depth_of_user
-from warp_corot.inputs.checks import checked_count, checked_number, refuse_tape, shown
-from warp_corot.inputs.indices import checked_indices
+from warp_corot.inputs.checks import checked_count, checked_number, refuse_tape
 from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.remesh.remeshing import Remeshing
 from warp_corot.solvers import Integrator, SymplecticEuler, largest_frequency
@@ -33,27 +31,25 @@ from warp_corot.solvers.steps.pace import Pace
 from warp_corot.solvers.steps.safe_step import ANY_STEP, SafeStep
 from warp_corot.solvers.system import NEVER, Forces, System
 
+from .clock import Clock
 from .energy import Energy, WorldEnergies, find_energies
+from .hooks import Hooks
 from .parts import (
     check_constraints,
     check_implicit,
     checked_bodies,
     checked_contact,
+    checked_curvature,
     checked_gravity,
     checked_integrator,
     checked_models,
+    chosen_worlds,
 )
 from .running import Running
 from .solves import Solves
 
 
-@dataclass(frozen=True)
-class _Hook:
-    callback: Callable[[Simulation], None]
-    every: int
-
-
-class Simulation:
+class Simulation(Clock):
     """One or several soft bodies, stepped together.
 
     Args:
@@ -125,9 +121,8 @@ class Simulation:
         bound = zip(self.models, self.bodies, strict=True)
         self.fields = tuple(m.bind(body, deterministic=self.deterministic) for m, body in bound)
         self.remeshing.serve(self.fields)
-        self.time_before_reset = 0.0
-        self.steps_before_reset = 0
-        self._hooks: list[_Hook] = []
+        #: Functions that are called after steps.
+        self.hooks = Hooks()
         given = self.integrator.dt
         self.pace = Pace(ANY_STEP if given is None else float(given), self.device)
         self.system = System(self.bodies, self.fields, self.pace, self.gravity, self.ranks)
@@ -158,16 +153,6 @@ class Simulation:
         return tuple(None if each is None else each.options for each in self.remeshing.changing)
 
     @property
-    def dt(self) -> float:
-        """The time step [s]; if none was given, the one that the present state allows."""
-        return self.pace.dt if self.safe_step is None else self.safe_step.allowed
-
-    @property
-    def dt_range(self) -> tuple[float, float]:
-        """The shortest and the longest time step so far [s]."""
-        return (self.dt, self.dt) if self.safe_step is None else self.safe_step.range
-
-    @property
     def solves(self) -> Solves | None:
         """The cost of an implicit integrator's solves so far; None for others. Waits for the device."""
         totals = getattr(self.stepper, "totals", None)
@@ -177,26 +162,6 @@ class Simulation:
     def kept(self) -> dict[str, wp.array]:
         """Everything that a checkpoint keeps, by name, besides the states of bodies and fields."""
         return self.pace.state | ({} if self.safe_step is None else self.safe_step.state) | self.stepper.kept
-
-    @property
-    def steps(self) -> int:
-        """Time steps since the last ``reset()``, or since the beginning."""
-        return self.pace.steps
-
-    @property
-    def total_steps(self) -> int:
-        """Time steps since the beginning; resets do not change it."""
-        return self.steps_before_reset + self.steps
-
-    @property
-    def time(self) -> float:
-        """Simulated time since the last ``reset()``, or since the beginning [s]."""
-        return self.pace.time
-
-    @property
-    def total_time(self) -> float:
-        """Simulated time since the beginning [s]; resets do not change it."""
-        return self.time_before_reset + self.time
 
     def step(self) -> None:
         """Advance by one time step.
@@ -220,11 +185,11 @@ class Simulation:
             self.recorded.launch(Segment(1, adopts=True, publishes=True))
             return
         self._running.step()
-        if self.device.is_cpu or self._hooks or self.remeshing.every:
+        if self.device.is_cpu or self.hooks.intervals or self.remeshing.every:
             self._running.look()
             if self.remeshing.every:
                 self.follow_motion()
-            self.call_hooks()
+            self.hooks.call(self)
 
     def advance(self, seconds: float) -> None:
         """Advance by ``seconds``; the state is ready when the call returns.
@@ -267,9 +232,7 @@ class Simulation:
         Raises:
             InputError: ``every`` is not a positive whole number, or the callback is not callable.
         """
-        if not callable(callback):
-            raise InputError(f"callback is {callback!r}; it must be a function of the simulation")
-        self._hooks.append(_Hook(callback, checked_count(every, "every", least=1)))
+        self.hooks.add(callback, every)
 
     def reset(self, worlds: npt.ArrayLike | wp.array | None = None) -> None:
         """Put worlds back to their initial state: rest, or the state at ``SoftBody.set_initial_state``.
@@ -285,17 +248,7 @@ class Simulation:
         Raises:
             InputError: There is no such world, or the array has another type, length or device.
         """
-        if isinstance(worlds, wp.array):
-            if worlds.dtype != wp.int32 or worlds.shape != (self.worlds,) or worlds.device != self.device:
-                raise InputError(
-                    f"worlds is {worlds.dtype.__name__} {list(worlds.shape)} on {worlds.device}; "
-                    f"it must be int32 [{self.worlds}] on {self.device}"
-                )
-            chosen = worlds
-        else:
-            mask = np.zeros(self.worlds, np.int32)
-            mask[slice(None) if worlds is None else checked_indices(worlds, self.worlds, "world")] = 1
-            chosen = wp.array(mask, dtype=wp.int32, device=self.device)
+        chosen = chosen_worlds(worlds, self.worlds, self.device)
         if worlds is None:
             self.steps_before_reset, self.time_before_reset = self.total_steps, self.total_time
             self.pace.restart()
@@ -418,11 +371,7 @@ class Simulation:
         Warns:
             StabilityWarning: The given step is now larger than the stable one.
         """
-        if not callable(getattr(forces, "add_forces", None)):
-            raise InputError(f"forces is {shown(forces)}; it must have a method add_forces that launches them")
-        curvature = getattr(forces, "curvature", 0.0)
-        if not 0.0 <= checked_number(curvature, "curvature", "1/s^2") < math.inf:
-            raise InputError(f"curvature is {curvature}; it must be zero or a positive number [1/s^2]")
+        curvature = checked_curvature(forces)
         self.system.forces.append(forces)
         self.system.changes += 1
         if curvature > 0.0:
@@ -449,15 +398,3 @@ class Simulation:
         if body not in self.bodies:
             raise InputError("the body is not one of this simulation's")
         return self.bodies.index(body)
-
-    @property
-    def hook_intervals(self) -> list[int]:
-        """Steps between the calls of each hook."""
-        return [hook.every for hook in self._hooks]
-
-    def call_hooks(self) -> None:
-        """Call the hooks that are due now."""
-        steps = self.steps if self._hooks else 0
-        for hook in tuple(self._hooks):
-            if steps % hook.every == 0:
-                hook.callback(self)
