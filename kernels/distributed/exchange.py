@@ -67,6 +67,12 @@ def clear_forces(places: wp.array[wp.int32], forces: wp.array[wp.vec3]):
 
 
 @wp.kernel(enable_backward=False)
+def clear_vectors(places: wp.array[wp.int32], vectors: wp.array[wp.vec4]):
+    """The same for vec4."""
+    vectors[places[wp.tid()]] = wp.vec4()
+
+
+@wp.kernel(enable_backward=False)
 def forget_length(changed: wp.array[wp.int32], before: wp.array[wp.float64]):
     """Note that velocities were written by a user and so belong to steps of any length."""
     if changed[0] != 0:

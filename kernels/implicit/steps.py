@@ -10,7 +10,7 @@ from typing import Any
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
-from warp_corot.kernels.stepping.integrate import add_support_work, by_vectors, is_finite, vector_at
+from warp_corot.kernels.stepping.integrate import by_vectors, count_support_work, is_finite, vector_at
 from warp_corot.kernels.stepping.pace import DONE, Pace
 
 from .conjugate_gradients import BROKEN
@@ -238,7 +238,7 @@ def count_supports(
         if has_load != 0:
             total += vector_at(load, i)
         store_node(reactions, i, -total)
-        add_support_work(force, load_node(increment, i), support_work)
+        count_support_work(force, load_node(increment, i), i, support_work)
 
 
 @wp.kernel(enable_backward=False)

@@ -53,11 +53,19 @@ def obstacles_of(case: str) -> list[wc.Ground | wc.Tool]:
     return [wc.Ground((0.0, 1.0, 0.0), -0.002, friction=0.3), tool]
 
 
+#: Integrators of cases that are not stepped by the default one.
+INTEGRATORS = {
+    "implicit": lambda: wc.BackwardEuler(0.01, preconditioner="diagonal"),
+    "newmark": lambda: wc.Newmark(0.01, preconditioner="diagonal", tolerance=1e-3),
+}
+
 CASES = {
     "forest": lambda: body_of(graded(), 0.49),
     "tets": lambda: body_of(jittered(), 0.49),
     "worlds": lambda: body_of(wc.TetForest.box((1, 1, 3), 0.064, level=4), 0.3, worlds=2),
     "touched": touched,
+    "implicit": lambda: body_of(graded(), 0.3),
+    "newmark": lambda: body_of(jittered(), 0.3),
 }
 
 
@@ -88,7 +96,8 @@ def main() -> None:
         for deterministic in (True, False) if name == "forest" and names != "forest" else (True,):
             body = make()
             obstacles = obstacles_of(name)
-            sim = wd.Simulation(body, deterministic=deterministic, obstacles=obstacles)
+            options = {"obstacles": obstacles, "integrator": INTEGRATORS.get(name, wc.SymplecticEuler)()}
+            sim = wd.Simulation(body, deterministic=deterministic, **options)
             sim.advance(0.03)
             body.load("z > 0.09 and z < 0.1", [0.0, 0.0, 0.0])
             sim.advance(0.01)

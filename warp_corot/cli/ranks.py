@@ -59,12 +59,12 @@ def one_first() -> Iterator[None]:
 
     comm = mpi.world()
     if comm.rank > 0:
-        comm.Barrier()
+        mpi.meet(comm)
     try:
         yield
     finally:
         if comm.rank == 0:
-            comm.Barrier()
+            mpi.meet(comm)
 
 
 def led_simulation(**options: Any) -> Any:

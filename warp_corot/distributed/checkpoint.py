@@ -19,8 +19,8 @@ from .following import Following
 if TYPE_CHECKING:
     from warp_corot.simulation.simulation import Simulation
 
-#: The arrays besides nodal ones of what is kept that are the same on all ranks begin otherwise.
-NODAL = "directions"
+#: How the names of nodal arrays of what is kept begin; others are the same on all ranks.
+DIRECTIONS, VELOCITIES, HISTORY = "directions", "velocities.", "history."
 GUARD = ("scale", "drift", "lately", "counted")
 
 
@@ -52,8 +52,9 @@ def save(
     kept = {}
     for name, array in parts.kept.items():
         values = array.numpy()
-        if name.startswith(NODAL):
-            values = following[int(name.removeprefix(NODAL))].whole_values(values)
+        k = body_of(name, parts)
+        if k is not None:
+            values = following[k].whole_values(values)
         kept[name] = _Values(values)
     guard, failed = parts.guard.state, None
     if comm.rank == 0:
@@ -76,6 +77,17 @@ def save(
         raise InputError(failed)
 
 
+def body_of(name: str, parts: Simulation) -> int | None:
+    """Which body a kept array is of, if it has an entry for each node."""
+    if name.startswith(HISTORY):
+        count = sum(each.startswith(HISTORY) for each in parts.kept)
+        return int(name.removeprefix(HISTORY)) * len(parts.bodies) // count
+    for first in (DIRECTIONS, VELOCITIES):
+        if name.startswith(first):
+            return int(name.removeprefix(first))
+    return None
+
+
 def resume(path: str | PathLike[str], loaded: Simulation, parts: Simulation, following: list[Following]) -> None:
     """Let a simulation of parts go on where a saved one was.
 
@@ -87,8 +99,9 @@ def resume(path: str | PathLike[str], loaded: Simulation, parts: Simulation, fol
     """
     for name, array in parts.kept.items():
         values = loaded.kept[name].numpy()
-        if name.startswith(NODAL):
-            values = following[int(name.removeprefix(NODAL))].part_values(values)
+        k = body_of(name, parts)
+        if k is not None:
+            values = following[k].part_values(values)
         array.assign(values)
     parts.steps_before_reset, parts.time_before_reset = loaded.steps_before_reset, loaded.time_before_reset
     parts.stable_dt = loaded.stable_dt

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import sys
+import time
 import traceback
 from types import TracebackType
 from typing import Any
@@ -12,6 +13,9 @@ import warp as wp
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.processes import process_count
+
+#: How long a rank sleeps between two looks at what it waits for [s].
+REST = 0.01
 
 
 @functools.cache
@@ -54,6 +58,13 @@ def choose_device() -> None:
     if count:
         wp.set_device(f"cuda:{local.rank % count}")
     local.Free()
+
+
+def meet(comm: Any) -> None:
+    """Wait until all ranks have come here, without keeping a core busy, as MPI's own calls do."""
+    request = comm.Ibarrier()
+    while not request.Test():
+        time.sleep(REST)
 
 
 def _end_all(comm: Any, kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

@@ -38,15 +38,16 @@ class MpiRanks(Ranks):
         wholes: The bodies.
         parts: This rank's part of each.
         settled: Whether sums are the same bit by bit for any number of ranks.
+        records: Whether steps can be recorded on cards, as they cannot where numbers of iterations are not known.
     """
 
     is_alone = False
 
-    def __init__(self, comm: Any, wholes: Sequence[SoftBody], parts: Sequence[Part], *, settled: bool):
+    def __init__(self, comm: Any, wholes: Sequence[SoftBody], parts: Sequence[Part], *, settled: bool, records: bool):
         self.comm, self.is_settled = comm, settled
         self.speaks = comm.rank == 0
         self.device = parts[0].device
-        self.can_record = self.device.is_cuda
+        self.can_record = self.device.is_cuda and records
         self._wholes = dict(zip(parts, wholes, strict=True))
         self._parts = parts
         self.halos = halos = [Halo.of(part.numbers, part.worlds, comm) for part in parts]
@@ -56,10 +57,16 @@ class MpiRanks(Ranks):
                 ghosts = np.tile(part.numbers.owner != comm.rank, part.worlds)
                 part.discretization.awaited = Awaited(ghosts, exchange.later)
         self._copies = [wp.zeros_like(part.state.displacements) for part in parts]
+        self._ghosts = [self._places_of_ghosts(part) for part in parts]
         self._copied_energies = [self._places_of_copies(part) for part in parts]
 
     def _exchange_of(self, halo: Halo, tag: int) -> HostExchange | CardExchange:
         return CardExchange(halo, self.device) if self.device.is_cuda else HostExchange(halo, self.comm, tag)
+
+    def _places_of_ghosts(self, part: Part) -> wp.array:
+        """Nodes that other ranks move, in all worlds, int32."""
+        ghosts = np.tile(part.numbers.owner != self.comm.rank, part.worlds)
+        return wp.array(np.flatnonzero(ghosts).astype(np.int32), dtype=wp.int32, device=self.device)
 
     def _places_of_copies(self, part: Part) -> wp.array:
         """Elements that other ranks count, in all worlds, int32."""
@@ -127,6 +134,28 @@ class MpiRanks(Ranks):
         found = np.zeros(len(sums))
         found[0] = total
         sums.assign(found)
+
+    # --- implicit steps --------------------------------------------------------------------------------------------
+
+    def take_in_parts(self, parts: wp.array, columns: Sequence[int], most: bool) -> None:
+        chosen = list(columns)
+        values = parts.numpy()
+        own = values[:, :, chosen]
+        if most:
+            total = np.max(self.comm.allgather(own.max(axis=1)), axis=0)
+        elif self.is_settled:
+            addends = np.moveaxis(own, 0, 1).reshape(own.shape[1], -1)
+            total = settled_sums(addends, self.comm).reshape(len(own), -1)
+        else:
+            total = np.sum(self.comm.allgather(own.sum(axis=1)), axis=0)
+        values[:, :, chosen] = 0.0
+        values[:, 0, chosen] = total
+        if self.device.is_cuda:
+            parts.assign(values)
+
+    def clear_ghosts(self, k: int, vectors: wp.array) -> None:
+        places = self._ghosts[k]
+        wp.launch(kernels.clear_vectors, len(places), [places], [vectors], device=self.device)
 
     # --- contact ---------------------------------------------------------------------------------------------------
 

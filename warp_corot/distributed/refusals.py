@@ -13,6 +13,9 @@ from warp_corot.solvers import Integrator
 #: Models whose forces need nothing but the elements around a node.
 MODELS = (Corotated, Linear, NeoHookean, StVenantKirchhoff)
 
+#: The preconditioner of linear solves.
+DIAGONAL = "diagonal"
+
 
 def check_supported(
     bodies: Sequence[SoftBody], models: Sequence[Model], integrator: Integrator, others: dict[str, Any]
@@ -34,9 +37,15 @@ def check_supported(
             "contact of soft surfaces does not work on several ranks yet; take one body and no self_contact, or run on "
             "one process"
         )
-    if integrator.is_implicit:
+    if getattr(integrator, "preconditioner", None) not in (None, DIAGONAL):
         raise InputError(
-            f"{type(integrator).__name__} does not work on several ranks yet; the integrator must be SymplecticEuler"
+            f"the preconditioner {integrator.preconditioner!r} does not work on several ranks yet; "  # type: ignore[attr-defined]
+            f"it must be None or {DIAGONAL!r}"
+        )
+    if integrator.is_implicit and (contact or others.get("obstacles")):
+        raise InputError(
+            f"contact under {type(integrator).__name__} does not work on several ranks yet; the integrator must be "
+            "SymplecticEuler"
         )
     if getattr(integrator, "viscosity", 0.0):
         raise InputError("viscosity does not work on several ranks yet; it must be 0")

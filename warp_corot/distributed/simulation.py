@@ -25,7 +25,9 @@ from warp_corot.inputs.checks import checked_count
 from warp_corot.simulation import simulation as on_one
 from warp_corot.simulation.energy import Energy, WorldEnergies
 from warp_corot.simulation.parts import checked_bodies, checked_gravity, checked_integrator, checked_models
+from warp_corot.simulation.solves import Solves
 from warp_corot.solvers import Integrator, SymplecticEuler
+from warp_corot.solvers.implicit.schemes import ImplicitIntegrator
 
 from . import checkpoint, mpi
 from .following import Following
@@ -33,7 +35,7 @@ from .gathering import register
 from .partition import Partition
 from .parts import Part
 from .ranks import MpiRanks
-from .refusals import check_supported
+from .refusals import DIAGONAL, check_supported
 
 #: Parts of so many elements are tried by one rank first; larger ones take longer than several ranks' compiling.
 FEW_ELEMENTS = 200_000
@@ -81,6 +83,8 @@ class Simulation:
         models = checked_models(Corotated() if model is None else model, len(self.bodies))
         integrator = checked_integrator(SymplecticEuler() if integrator is None else integrator)
         check_supported(self.bodies, models, integrator, others)
+        if isinstance(integrator, ImplicitIntegrator):
+            integrator = dataclasses.replace(integrator, preconditioner=DIAGONAL)
         models = tuple(_settled_model(m, body) for m, body in zip(models, self.bodies, strict=True))
         self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
         parts = [_part_of(body, m, comm, costs) for body, m in zip(self.bodies, models, strict=True)]
@@ -90,7 +94,8 @@ class Simulation:
         _compile_once(comm, parts, model=models, integrator=integrator, gravity=self.gravity, **others)
         for each in self._following:
             each.take_over()
-        ranks = MpiRanks(comm, self.bodies, parts, settled=bool(deterministic))
+        records = not integrator.is_implicit
+        ranks = MpiRanks(comm, self.bodies, parts, settled=bool(deterministic), records=records)
         self._parts: _OfParts = _OfParts(
             ranks,
             parts,
@@ -246,6 +251,11 @@ class Simulation:
             each.collect_touch()
 
     @property
+    def solves(self) -> Solves | None:
+        """The cost of an implicit integrator's solves so far; as ``warp_corot.Simulation.solves``."""
+        return self._parts.solves
+
+    @property
     def contact(self) -> Contacts | None:
         """Contact of this rank's parts; None without."""
         return self._parts.contact
@@ -343,14 +353,14 @@ def _compile_once(comm: Any, parts: Sequence[Part], **options: Any) -> None:
     here = comm.Split_type(mpi.library().COMM_TYPE_SHARED)
     free = all((part.conditions.inverse_mass.numpy() > 0.0).any() for part in parts)
     if here.rank == 0 and free:
-        with warnings.catch_warnings(), suppress(UnstableError):
+        with warnings.catch_warnings(), suppress(UnstableError, InputError):
             warnings.simplefilter("ignore")
             tried = on_one.Simulation(parts, **(options | {"obstacles": _of_their_own(options.get("obstacles", ()))}))
-            tried.advance_steps(TRIED_STEPS)
+            tried.advance_steps(1 if tried.integrator.is_implicit else TRIED_STEPS)
             tried.energy()
         for part in parts:
             part.state.reactions.zero_()
-    here.Barrier()
+    mpi.meet(here)
     here.Free()
 
 

@@ -74,6 +74,15 @@ class Ranks:
             sums: Their sums.
         """
 
+    # --- implicit steps --------------------------------------------------------------------------------------------
+
+    def take_in_parts(self, parts: wp.array, columns: Sequence[int], most: bool) -> None:
+        """Let columns of parts of sums, float64 [worlds, parts, columns], be those of all ranks: what they add up to,
+        or the largest."""
+
+    def clear_ghosts(self, k: int, vectors: wp.array) -> None:
+        """Launch that a nodal array of the k-th body, vec4, is zero at ghosts."""
+
     # --- contact ---------------------------------------------------------------------------------------------------
 
     def take_surface(self, nodes: wp.array, places: Sequence[slice]) -> None:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.kernels.implicit import conjugate_gradients as kernels
+from warp_corot.solvers.ranks import ALONE, Ranks
 
 from .operator import LinearOperator, Preconditioner
 from .sums import WorldSums
@@ -43,6 +44,7 @@ class ConjugateGradients:
         operator: A, for its sizes.
         length: Entries of vectors.
         most: Iterations at most.
+        ranks: Who has other nodes of the same worlds.
 
     Attributes:
         tolerance: Norm of the residual over that of b at which a world stops, float64 [worlds] on the device.
@@ -50,11 +52,11 @@ class ConjugateGradients:
         status: How it ended, as in ``kernels.implicit.conjugate_gradients``, int32 [worlds] on the device.
     """
 
-    def __init__(self, operator: LinearOperator, length: int, *, most: int = 1000):
+    def __init__(self, operator: LinearOperator, length: int, *, most: int = 1000, ranks: Ranks = ALONE):
         self.operator, self.device, self.worlds, self.most = operator, operator.device, operator.worlds, most
         self._count = operator.node_count
         self._r, self._z, self._p, self._q = (wp.zeros(length, dtype=wp.vec4, device=self.device) for _ in range(4))
-        self._sums = WorldSums(self.worlds, self._count, kernels.COLUMNS, self.device)
+        self._sums = WorldSums(self.worlds, self._count, kernels.COLUMNS, self.device, ranks)
         shape = (self.worlds, kernels.SCALARS)
         self._scalars = wp.zeros(shape, dtype=wp.float64, device=self.device)
         self.tolerance = wp.full(self.worlds, 1e-6, dtype=wp.float64, device=self.device)
@@ -84,9 +86,11 @@ class ConjugateGradients:
         if guessed:
             self.operator.apply(x, q)
             wp.launch(kernels.measure_guess, sums.shape, [b, x, q, *sums.sizes], [sums.parts], device=self.device)
+            sums.take_in(int(kernels.PRODUCT), int(kernels.CURVATURE))
             sums.launch_scalars(kernels.take_guess, [], [self._scalars])
         inputs = [b, b if like is None else like, q, self._scalars, int(guessed), *sums.sizes, x]
         wp.launch(kernels.begin, sums.shape, inputs, [r, sums.parts], device=self.device)
+        sums.take_in(int(kernels.SQUARE), int(kernels.RIGHT))
         self._running.zero_()
         outputs = [self._scalars, self.iterations, self.status, self._running]
         sums.launch_scalars(kernels.take_first, [self.tolerance], outputs)
@@ -104,6 +108,7 @@ class ConjugateGradients:
         sums.launch_scalars(kernels.take_alpha, [], outputs)
         inputs = [p, q, self._scalars, *sums.sizes, x, r]
         wp.launch(kernels.advance, sums.shape, inputs, [sums.parts], device=self.device)
+        sums.take_in(int(kernels.SQUARE))
         outputs = [self._scalars, self.status, self._running]
         sums.launch_scalars(kernels.judge, [self.most, self.iterations], outputs)
 

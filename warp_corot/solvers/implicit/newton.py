@@ -98,9 +98,10 @@ class Newton:
         self.forces, self.residual, self._outer, self.step, self.base, self.increment, self.pull = (
             wp.zeros_like(like) for _ in range(7)
         )
-        self.solver = ConjugateGradients(operator, len(like), most=most_linear)
+        self.ranks = operator.ranks
+        self.solver = ConjugateGradients(operator, len(like), most=most_linear, ranks=self.ranks)
         self._count = operator.node_count
-        self._sums = WorldSums(self.worlds, self._count, kernels.COLUMNS, self.device)
+        self._sums = WorldSums(self.worlds, self._count, kernels.COLUMNS, self.device, self.ranks)
         self._energies = wp.zeros(self.field.energy_count, dtype=wp.float64, device=self.device)
         self._scalars = wp.zeros((self.worlds, kernels.SCALARS), dtype=wp.float64, device=self.device)
         self.inertia = wp.zeros(1, dtype=wp.float32, device=self.device)
@@ -129,6 +130,8 @@ class Newton:
         self.launch_solve()
         inputs = [self.body.conditions.mass, self.residual, self._outer, self.step, u, *sums.sizes]
         wp.launch(kernels.measure_step, sums.shape, inputs, [sums.parts], device=self.device)
+        sums.take_in(int(kernels.SLOPE), int(kernels.OUTER), int(kernels.INERTIA))
+        sums.take_in(int(kernels.STEP), int(kernels.REACH), most=True)
         self._searching.zero_()
         self._accepted.zero_()
         inputs = [self.solver.iterations]
@@ -143,6 +146,7 @@ class Newton:
         """Launch the forces that are out of balance in the present state."""
         body, sums, conditions = self.body, self._sums, self.body.conditions
         self.field.add_forces(body.state.displacements, self.forces)
+        self.ranks.clear_ghosts(self.operator.number, self.forces)
         if self._others is not None:
             self._others()
         inputs: list[Any] = [self.gravity, conditions.mass, conditions.inverse_mass, int(conditions.has_loads)]
@@ -150,6 +154,7 @@ class Newton:
         outputs = [self.forces, body.state.forces, self.residual, self._outer, sums.parts]
         kernel = kernels.FIND_RESIDUAL[conditions.loads.dtype]
         wp.launch(kernel, sums.shape, inputs, outputs, device=self.device)
+        sums.take_in(int(kernels.SQUARE), int(kernels.REFERENCE))
 
     def launch_solve(self, *, guessed: bool = False) -> None:
         """Launch the linearisation, and the step that it gives, from a guess of it in ``step`` if there is one."""
@@ -166,14 +171,17 @@ class Newton:
     def _launch_energies(self) -> None:
         self._energies.zero_()
         self.field.write_potentials(self.body.state.displacements, self._energies)
+        self.ranks.leave_own(self.operator.number, self._energies)
         sums = self._sums
         inputs = [self._energies, len(self._energies) // self.worlds, *sums.sizes[1:]]
         wp.launch(kernels.sum_energies, sums.shape, inputs, [sums.parts], device=self.device)
+        sums.take_in(int(kernels.ENERGY))
 
     def _try_step(self, *, commits: bool) -> None:
         inputs = [self._scalars, self.base, self.step, self._count, int(commits)]
         outputs = [self.increment, self.body.state.displacements]
         wp.launch(kernels.try_step, self.worlds * self._count, inputs, outputs, device=self.device)
+        self.ranks.complete(self.operator.number, self.body.state.displacements)
 
     # --- on the host -------------------------------------------------------------------------------------------------
 

@@ -116,7 +116,9 @@ class BodySteps:
         self.device = self.body.device
         self.viscosity = Viscosity(self.body, self.field, options.viscosity) if options.viscosity else None
         exact = options.tolerance is not None
-        self.operator = TangentOperator(self.body, self.field, viscosity=self.viscosity, exact=exact)
+        self.operator = TangentOperator(
+            self.body, self.field, viscosity=self.viscosity, exact=exact, ranks=system.ranks, number=k
+        )
         self._preconditioner = preconditioner_of(options.preconditioner, self.operator, short_cycles=not exact)
         self.lagged: Lagged | None = None
         if not exact and isinstance(self._preconditioner, Multigrid):
@@ -192,6 +194,7 @@ class BodySteps:
             if self.lagged is not None:
                 self.lagged.judge(iterations, solver.status)
             self._launch(kernels.take_step, [newton.step], [newton.increment, self.body.state.displacements])
+            self.system.ranks.complete(self.k, self.body.state.displacements)
             counts, good = [self._one, iterations, solver.status], conjugate_gradients.CONVERGED
         else:
             newton.launch_begin()
@@ -208,11 +211,12 @@ class BodySteps:
         for each in body.conditions.trajectories:
             inputs = [each.nodes, each.times, each.displacements, system.pace.arrays, body.conditions.world_starts]
             inputs += [body.world_node_count, offset, body.state.forces, body.state.displacements]
-            outputs = [body.state.velocities, system.support_work]
+            outputs = [body.state.velocities, system.support_work_of(body)]
             wp.launch(follow_trajectory, len(each.nodes), inputs, outputs, device=self.device)
 
     def _begin(self) -> None:
         """Launch what the step is solved from."""
+        system = self.system
         state, conditions, newton, options = (
             self.body.state,
             self.body.conditions,
@@ -223,6 +227,7 @@ class BodySteps:
         if self.history:
             inputs = [conditions.inverse_mass, state.displacements, state.velocities, *self._left]
             self._launch(kernels.find_changes, inputs, [self._begins])
+            system.ranks.take_most(self._begins)
         inputs = [self._begins, self._table, options.damping]
         outputs = [self.operator.scales, newton.inertia]
         wp.launch(kernels.choose_scales, 1, inputs, outputs, device=self.device)
@@ -234,6 +239,7 @@ class BodySteps:
         outputs = [state.displacements, self.before, newton.base, newton.increment, newton.pull]
         outputs += [newton.step, self._drift]
         self._launch(kernels.begin_step, inputs, outputs)
+        system.ranks.complete(self.k, state.displacements)
 
     def _add_others(self) -> None:
         """Launch forces besides elasticity at the stage."""
@@ -252,6 +258,7 @@ class BodySteps:
         inputs += [newton.base, newton.increment, system.pace.arrays, offset]
         outputs = [state.velocities, *self._h, state.displacements, *self._left, system.bad_step]
         self._launch(kernels.end_step, inputs, outputs)
+        system.ranks.complete(self.k, state.displacements)
         self.field.complete_step(state.displacements, system.pace.arrays)
         if system.counted:
             self.stepper.add_counted_forces()
@@ -265,7 +272,7 @@ class BodySteps:
         inputs = [system.gravity, conditions.mass, conditions.inverse_mass, int(conditions.has_loads)]
         inputs += [conditions.loads, newton.forces, state.forces, newton.increment]
         kernel = kernels.COUNT_SUPPORTS[conditions.loads.dtype]
-        self._launch(kernel, inputs, [state.reactions, system.support_work])
+        self._launch(kernel, inputs, [state.reactions, system.support_work_of(body)])
         newton.forces.zero_()
         self.stepper.forget_forces()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_corot.kernels.implicit.sums import sum_products
+from warp_corot.solvers.ranks import ALONE, Ranks
 
 #: Lanes of a warp, nodes of a thread at least, and warps of all worlds at most.
 WARP, NODES, WARPS = 32, 4, 512
@@ -18,6 +19,7 @@ class WorldSums:
         count: Nodes of each.
         columns: How many sums there are side by side.
         device: Where.
+        ranks: Who has other nodes of the same worlds.
 
     Attributes:
         parts: Parts of the sums, float64 [worlds, parts, columns].
@@ -25,11 +27,14 @@ class WorldSums:
         sizes: The arguments count, threads and lanes of its kernel.
     """
 
-    def __init__(self, worlds: int, count: int, columns: int, device: wp.Device):
-        self.device, self.worlds = device, worlds
-        self.lanes = 1 if device.is_cpu else WARP
+    def __init__(self, worlds: int, count: int, columns: int, device: wp.Device, ranks: Ranks = ALONE):
+        self.device, self.worlds, self._ranks = device, worlds, ranks
+        self.lanes = 1 if device.is_cpu or ranks.is_settled else WARP
         wanted = -(-count // (NODES * WARP))
         warps = 1 if device.is_cpu else max(min(wanted, WARPS // worlds), 1)
+        if ranks.is_settled:
+            # Every node is an addend: sums of theirs are the same in any order.
+            warps = count
         threads = warps * self.lanes
         self.parts = wp.zeros((worlds, warps, columns), dtype=wp.float64, device=device)
         self.shape, self.sizes = (worlds, threads), [count, threads, self.lanes]
@@ -38,6 +43,16 @@ class WorldSums:
         """Launch a . b of each world, vec4."""
         inputs = [a, b, *self.sizes, column]
         wp.launch(sum_products, self.shape, inputs, [self.parts], device=self.device)
+        self.take_in(column)
+
+    def take_in(self, *columns: int, most: bool = False) -> None:
+        """Let columns of new parts be those of all ranks.
+
+        Args:
+            columns: Which.
+            most: Whether their largest parts are asked for, not their sums.
+        """
+        self._ranks.take_in_parts(self.parts, columns, most)
 
     def launch_scalars(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         """Launch a kernel that adds the parts up, the lanes of a warp for each world."""

@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_corot.elasticity import ForceField
 from warp_corot.kernels.implicit.tangent import finish_blocks, finish_rows
+from warp_corot.solvers.ranks import ALONE, Ranks
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -25,6 +26,8 @@ class TangentOperator:
         stiff_forces: Other forces that have a stiffness: ``add_stiffness(body, p, y)`` and
             ``add_diagonal(body, blocks)``, as ``ForceField`` but at the body's present state.
         exact: Whether K is the exact derivative, which may be indefinite, where the law has two.
+        ranks: Who has other nodes of the body.
+        number: Which of their bodies it is.
 
     Attributes:
         tangent: The elastic K.
@@ -38,8 +41,11 @@ class TangentOperator:
         viscosity: Viscosity | None = None,
         stiff_forces: Sequence[Any] = (),
         exact: bool = False,
+        ranks: Ranks = ALONE,
+        number: int = 0,
     ):
         self.body, self.field, self.viscosity = body, field, viscosity
+        self.ranks, self.number = ranks, number
         self.stiff_forces = tuple(stiff_forces)
         self.device, self.worlds = body.device, body.worlds
         self.tangent = field.tangent(exact=exact)
@@ -83,7 +89,7 @@ class TangentOperator:
 
     def apply(self, x: wp.array, y: wp.array) -> None:
         y.zero_()
-        self.tangent.add_product(x, y)
+        self.tangent.add_product(self.ranks.completed(self.number, x), y)
         for forces in self.stiff_forces:
             forces.add_stiffness(self.body, x, y)
         if self.viscosity is not None:
