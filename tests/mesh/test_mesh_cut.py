@@ -60,14 +60,21 @@ def test_slivers_without_other_neighbours_go_to_the_fullest():
     assert np.flatnonzero(after > volumes).tolist() == [taker]
 
 
+def of_labels(values, labels, count):
+    """Shares of the labels 0 to count [n, count + 1]."""
+    found = np.zeros((len(values), count + 1))
+    np.add.at(found, (np.arange(len(values))[:, None], labels), label_shares(values, labels))
+    return found
+
+
 def test_label_shares_fill_what_is_inside():
     rng = np.random.default_rng(6)
     values, labels = rng.standard_normal((500, 4)), rng.integers(1, 4, (500, 4))
-    shares = label_shares(values, labels, 3)
+    shares = of_labels(values, labels, 3)
     assert np.allclose(shares.sum(axis=1), inside_shares(values), atol=1e-12)
     assert (shares >= 0).all()
     pure = np.ptp(labels, axis=1) == 0
     assert np.allclose(shares[pure, labels[pure, 0]], inside_shares(values[pure]))
     # Two labels, all inside: the corner at one node is an eighth, the wedge at two nodes a half.
-    shares = label_shares(-np.ones((2, 4)), np.array([[1, 2, 2, 2], [1, 2, 1, 2]]), 2)
+    shares = of_labels(-np.ones((2, 4)), np.array([[1, 2, 2, 2], [1, 2, 1, 2]]), 2)
     assert np.allclose(shares, [[0, 1 / 8, 7 / 8], [0, 1 / 2, 1 / 2]])

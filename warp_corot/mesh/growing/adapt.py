@@ -65,6 +65,7 @@ class Grown:
         wished: The mesh in it, as the first child of each tetrahedron there was before the body was looked at more
             closely, int32 [m]; it is all of the tree where it was not.
         growth: On the device.
+        deepest: From which level on elements were not compared with the surface.
     """
 
     cells: tuple[int, int, int]
@@ -76,6 +77,7 @@ class Grown:
     need: np.ndarray
     wished: np.ndarray
     growth: Growth
+    deepest: int
 
 
 def grid_around(bounds: np.ndarray, cell_size: float) -> tuple[tuple[int, int, int], tuple[float, float, float]]:
@@ -206,7 +208,7 @@ class Growing:
         phi, need = judge.phi[: growth.node_count].numpy(), judge.need[: growth.element_count].numpy()
         tree = growth.tree()
         wished = tree.first_child if wished is None else wished
-        return Grown(self.cells, self.origin, lattice, ends, tree, phi, need, wished, growth)
+        return Grown(self.cells, self.origin, lattice, ends, tree, phi, need, wished, growth, judge.max_level)
 
     def chosen(self, wished: wp.array) -> wp.array:
         """The elements that need bisection most, as many as there is room for."""

@@ -24,14 +24,17 @@ if TYPE_CHECKING:
     from warp_corot.domain import Domain
 
 #: What share of the number asked for is aimed at and is enough; after how many sizes of cubes any is.
-NEAR, NEAR_ENOUGH = 0.985, 0.92
-MOST_CUBES = 4
+NEAR, NEAR_ENOUGH = 0.985, 0.905
+MOST_CUBES = 3
 #: Along flat sides nothing is bisected; more sizes are tried then, which takes little time.
 MOST_CUBES_OF_BOXES = 7
 #: With between so many elements a size of cubes is given up early that comes to between these shares of them.
 SEEN, MISSED = (5_000, 300_000), (0.6, 0.85)
 #: What an element counts as being off by between such pieces, as a share of its edge.
 GAP_NEED = 0.5
+#: The thinner of two parts is bisected first: what it needs is larger by up to this share, which is what elements lose
+#: of their length in a bisection; thicknesses are told apart in so many steps, so that what is equally thin remains so.
+THINNEST_FIRST, THIN_STEPS = 0.26, 16
 #: The surface that is drawn is this much closer to the body's than the mesh's threshold, for which the forest must be
 #: finer still; of many elements it is the mesh's own.
 FINER_SURFACE, FINER_FOREST = 0.3, 0.2
@@ -48,9 +51,11 @@ AMPLE, SLOW = 1.3, 2.0
 MAX_LEVEL, MANY, MAX_LEVEL_THIN = 7, 300_000, 13
 #: How closely the body is looked at: from which surface error over a cube's edge to which, and to how many
 #: tetrahedra of all levels for each one asked for, or a fixed number if that is more.
-FIRST_ERROR, CLOSE_ERROR, CLOSE_LEVEL = 0.1, 0.01, 8
+FIRST_ERROR, CLOSE_ERROR, CLOSE_LEVEL = 0.25, 0.01, 8
 CLOSER_LEVELS, CLOSER_ERROR = 6, 0.2
 CLOSE_ELEMENTS, CLOSE_ELEMENTS_OF_MANY = 5, 2
+#: Where there is room for fewer more than this, the body is not looked at closely: to see where would take long.
+LEAST_CLOSER = 1000
 
 
 @dataclass(frozen=True)
@@ -210,7 +215,8 @@ def _of_cubes(
             return found
     growing.run_finer(FINER_FOREST if target <= MANY else 1.0)
     room = (CLOSE_ELEMENTS if target <= MANY else CLOSE_ELEMENTS_OF_MANY) * target + 40_000
-    growing.look_closer(Closer(CLOSER_LEVELS, CLOSER_ERROR, room))
+    if growing.growth.element_count + LEAST_CLOSER < room:
+        growing.look_closer(Closer(CLOSER_LEVELS, CLOSER_ERROR, room))
     return meshes(domain, spread)
 
 
@@ -227,8 +233,10 @@ def needs_of(resolved: Resolved, domain: Domain, layers: float, most: int, deepe
     level, length = resolved.grown.tree.level, resolved.lengths
     needs = np.where(level < most, resolved.grown.need, 0.0)
     if layers > 0:
-        thin = (layers * length > resolved.thin(domain, layers)) & (level < deepest)
-        needs[thin] = np.maximum(needs[thin], THIN_NEED * length[thin])
+        missing = 1.0 - resolved.thin(domain, layers) / (layers * length)
+        thin = (missing > 0.0) & (level < deepest)
+        first = 1.0 + THINNEST_FIRST * np.round(missing[thin] * THIN_STEPS) / THIN_STEPS
+        needs[thin] = np.maximum(needs[thin], THIN_NEED * length[thin]) * first
     gaps = resolved.gaps()
     if gaps is not None:
         # Pieces come apart where elements of both, and one between them, have room; where none can have, it is in vain.

@@ -70,16 +70,16 @@ def inside_shares(values: Array) -> Array:
     return shares(values < 0, crossing)
 
 
-def label_shares(values: Array, labels: Array, count: int) -> Array:
-    """Share of each element's volume that each label takes, float64 [n, count + 1], the first column for no label.
+def label_shares(values: Array, labels: Array) -> Array:
+    """Share of each element's volume that the label of each of its nodes takes, float64 [n, 4].
 
-    Between nodes of two labels the border is halfway, towards the outside it is where the interpolant is zero. Each
-    label is cut out by itself; where three meet those cuts leave a gap, which they share in proportion.
+    The share of a label that several nodes inside have stands at the first of them. Between nodes of two labels the
+    border is halfway, towards the outside it is where the interpolant is zero. Each label is cut out by itself; where
+    three meet those cuts leave a gap, which they share in proportion.
 
     Args:
         values: Signed function at the nodes [n, 4].
         labels: int32 [n, 4].
-        count: How many labels there are.
     """
     inside = values < 0
 
@@ -87,9 +87,12 @@ def label_shares(values: Array, labels: Array, count: int) -> Array:
         own, other = values[elements[:, None], ends].T.astype(np.float64)
         return np.divide(own, own - other, out=np.full(len(own), 0.5), where=other >= 0)
 
-    found = np.zeros((len(values), count + 1))
-    for label in np.unique(labels[inside]):
-        found[:, label] = shares(inside & (labels == label), crossing)
+    found = np.zeros(values.shape)
+    counted = np.zeros(values.shape, bool)
+    for node in range(4):
+        alike = inside & (labels == labels[:, [node]])
+        found[:, node] = np.where(inside[:, node] & ~counted[:, node], shares(alike, crossing), 0.0)
+        counted |= alike & inside[:, [node]]
     total = found.sum(axis=1, keepdims=True)
     return np.divide(found * inside_shares(values)[:, None], total, out=np.zeros_like(found), where=total > 0)
 

@@ -236,12 +236,11 @@ def _labels(resolved: Resolved, child: np.ndarray, elements: np.ndarray, domain:
     values, own = grown.phi[tets], at_nodes[tets]
     alike = (own == own[:, :1]).all(axis=1)
     mixed = np.flatnonzero(~alike)
-    shares = label_shares(values[mixed], own[mixed], count)
-    shares = _sampled_labels(resolved, resolved.leaves[mixed], shares, domain) * size[mixed, None]
-    some = np.nonzero(shares)
-    keys = np.concatenate([owner[alike] * (count + 1) + own[alike, 0], owner[mixed][some[0]] * (count + 1) + some[1]])
-    weights = np.concatenate([(resolved.shares * size)[alike], shares[some]])
-    there = np.concatenate([owner[alike], owner[mixed][some[0]]]) >= 0
+    shares = label_shares(values[mixed], own[mixed])
+    row, label, share = _sampled_labels(resolved, resolved.leaves[mixed], own[mixed], shares, domain)
+    keys = np.concatenate([owner[alike] * (count + 1) + own[alike, 0], owner[mixed[row]] * (count + 1) + label])
+    weights = np.concatenate([(resolved.shares * size)[alike], share * size[mixed[row]]])
+    there = np.concatenate([owner[alike], owner[mixed[row]]]) >= 0
     found, index = np.unique(keys[there], return_inverse=True)
     total = np.bincount(index.ravel(), weights[there])
     whose, label = found // (count + 1), found % (count + 1)
@@ -256,22 +255,35 @@ def _labels(resolved: Resolved, child: np.ndarray, elements: np.ndarray, domain:
     return labels
 
 
-def _sampled_labels(resolved: Resolved, elements: np.ndarray, shares: np.ndarray, domain: Domain) -> np.ndarray:
+def _sampled_labels(
+    resolved: Resolved, elements: np.ndarray, own: np.ndarray, shares: np.ndarray, domain: Domain
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What share of elements each label takes, by random points in them; a little at least of what is at a corner.
 
     Args:
         resolved: The forest.
         elements: Those in which labels vary [n].
-        shares: What they would be, were borders halfway between corners [n, labels + 1].
+        own: Labels of their nodes [n, 4].
+        shares: What they would take, were borders halfway between nodes; see `label_shares` [n, 4].
         domain: The body.
+
+    Returns:
+        Places in ``elements``, labels and shares, [m] each, without those of no share.
     """
-    rng, found = np.random.default_rng(0), np.zeros_like(shares)
+    rng, stride = np.random.default_rng(0), len(domain.label_names) + 1
     each = int(np.clip(MOST_POINTS // max(len(elements), 1), 1, MOST_POINTS_EACH))
+    seen = []
     for part in np.array_split(np.arange(len(elements)), len(elements) * each // MOST_POINTS + 1):
         points = points_within(resolved.grown, elements[part], resolved.cell_size, each, rng).reshape(-1, 3)
         labels = domain.labels_at(points)
-        np.add.at(found, (np.repeat(part, each), labels), 1.0)
-    found[:, 0] = 0.0  # outside
-    total = found.sum(axis=1, keepdims=True)
-    found = np.divide(found * shares.sum(axis=1, keepdims=True), total, out=shares.copy(), where=total > 0)
-    return np.maximum(found, LEAST * shares)
+        seen.append((np.repeat(part, each) * stride + labels)[labels > 0])
+    keys, counts = np.unique(np.concatenate(seen), return_counts=True)
+    total = np.bincount(keys // stride, counts, len(elements))
+    sampled = counts * (shares.sum(axis=1) / np.maximum(total, 1.0))[keys // stride]
+    at_nodes = np.where(total[:, None] > 0, LEAST * shares, shares)
+    row, node = np.nonzero(at_nodes)
+    keys, place = np.unique(np.concatenate([keys, row * stride + own[row, node]]), return_inverse=True)
+    found = np.zeros(len(keys))
+    np.maximum.at(found, place.ravel(), np.concatenate([sampled, at_nodes[row, node]]))
+    kept = found > 0.0
+    return keys[kept] // stride, keys[kept] % stride, found[kept]

@@ -62,7 +62,7 @@ class Resolved:
         leaves = np.flatnonzero(tree.first_child == LIVE)
         shares = inside_shares(grown.phi[tree.tets[leaves]])
         if domain is not None:
-            rough = grown.need[leaves] > ROUGH * self.lengths[leaves]
+            rough = self._rough(leaves)
             shares[rough] = _sampled_shares(grown, leaves[rough], cell_size, domain, shares[rough])
         self.leaves, self.shares = leaves[shares > 0.0], shares[shares > 0.0]
         self.volume = volume_shares(tree.level)
@@ -74,6 +74,16 @@ class Resolved:
     def lengths(self) -> np.ndarray:
         """Edge of a cube whose eighth levels below is as large, for each tetrahedron [m]: halves in three levels."""
         return self.cell_size * 0.5 ** (self.grown.tree.level / 3.0)
+
+    def _rough(self, leaves: np.ndarray) -> np.ndarray:
+        """Which leaves are off too far for their corners to tell what they hold, bool [n]. Where this was not looked
+        at, as nothing is bisected there, it is taken from their parents."""
+        tree, need, lengths = self.grown.tree, self.grown.need, self.lengths
+        parents = np.maximum(tree.parent[leaves], 0)
+        unknown = (need[leaves] == 0.0) & (tree.level[leaves] >= self.grown.deepest)
+        near = (np.abs(self.grown.phi[tree.tets[leaves]]) < lengths[leaves, None]).any(axis=1)
+        looked_at = np.where(unknown & near, parents, leaves)
+        return need[looked_at] > ROUGH * lengths[looked_at]
 
     def summed(self, values: np.ndarray) -> np.ndarray:
         """Values of leaves added up to all that lies above them."""
@@ -151,7 +161,8 @@ class Resolved:
             other = np.flatnonzero(at_surface & (piece != number) & np.isin(piece, real))
             own, other = own[_near(x[own], x[other], reach)], other[_near(x[other], x[own], reach)]
             if len(own) and len(other):
-                found[self.leaves[own]], _ = cKDTree(x[other]).query(x[own], distance_upper_bound=reach)
+                tree = cKDTree(x[other], compact_nodes=False, balanced_tree=False)
+                found[self.leaves[own]], _ = tree.query(x[own], distance_upper_bound=reach)
         return self.smallest(found)
 
     def _upwards(self, values: np.ndarray, ufunc: np.ufunc) -> np.ndarray:

@@ -72,9 +72,11 @@ class _Surface:
         self.replaced: list[tuple[int, tuple[int, ...], bool]] = []
 
     def arrays(self) -> tuple[Array, Array]:
-        kept = [t for t in range(self.count) if t in self.local or t < len(self.given)]
-        triangles = [self.local.get(t) or tuple(self.given[t]) for t in kept]
-        return np.array(self.x), np.array(triangles, np.int32)
+        old, new = ([t for t in self.local if (t < len(self.given)) == given] for given in (True, False))
+        triangles = self.given.copy()
+        triangles[old] = [self.local[t] for t in old]
+        added = np.array([self.local[t] for t in sorted(new)], np.int32).reshape(-1, 3)
+        return np.array(self.x), np.concatenate([triangles, added]).astype(np.int32)
 
     def meet(self, point: Array, vertices: Array) -> None:
         """Have a vertex at a point, if that brings the surface nearer to the body's."""
