@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 SCRIPT = Path(fuzzing.__file__)
-FEW, MANY = 40, 10_000
+FEW, MANY = 25, 10_000
 #: Formats whose reader is tested by another format in the short run.
 LONG_ONLY = {
     *("ply-text", "off", "stl-text", "usdz", "usda-tets", "scene", "nii", "mgh", "nrrd-gz", "mhd", "checkpoint"),

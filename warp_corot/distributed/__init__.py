@@ -1,4 +1,4 @@
-"""One body over many processes: MPI starts and controls them, MPI and NCCL carry what they exchange.
+"""One body over many processes: MPI starts and controls them; MPI and NCCL exchange their data.
 
 ``mpirun -n 4 python script.py`` runs the script on four ranks. ``Simulation`` has the names of
 ``warp_corot.Simulation`` and is called on every rank.

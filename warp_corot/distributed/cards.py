@@ -22,10 +22,10 @@ from .halo import Halo
 
 @functools.cache
 def nccl_of(alias: str) -> Any:
-    """NCCL's communicator of all ranks, of which this one has the card of this name.
+    """NCCL's communicator of all ranks; this rank has the card of this name.
 
     Raises:
-        InputError: ``nccl4py`` is not there.
+        InputError: ``nccl4py`` is not installed.
     """
     try:
         import nccl.core as nccl
@@ -42,8 +42,7 @@ class CardExchange:
     """The exchange of a part's nodal values between cards.
 
     Args:
-        halo: Who gets what.
-        device: The card.
+        halo: The lists of nodes to send and to receive. device: The card.
     """
 
     def __init__(self, halo: Halo, device: wp.Device):
@@ -98,7 +97,9 @@ class CardExchange:
 
 
 def take_most(values: wp.array) -> None:
-    """Launch that an array on a card holds the largest values of all ranks, in place; may be recorded."""
+    """Launch a reduction in place, after which an array on a card has the largest values of all ranks; may be
+    recorded.
+    """
     import nccl.core as nccl
 
     own, stream = nccl_of(values.device.alias), wp.get_stream(values.device)
@@ -114,7 +115,7 @@ def add_up(values: wp.array) -> None:
 
 
 def _joined(lists: dict[int, Any], device: wp.Device) -> tuple[wp.array, list[tuple[int, int, int]]]:
-    """All lists in one array, and where each rank's begins and ends."""
+    """All lists in one array, and the begin and the end of each rank's list."""
     ends = np.cumsum([len(nodes) for nodes in lists.values()])
     nodes = np.concatenate([*lists.values(), np.zeros(0, np.int32)]).astype(np.int32)
     places = [(rank, int(end) - len(lists[rank]), int(end)) for rank, end in zip(lists, ends, strict=True)]

@@ -1,4 +1,4 @@
-"""Checkpoints of a run on several ranks: files as one process writes them, from which any number of ranks goes on."""
+"""Checkpoints of a run on several ranks: the same files as of one process, from which any number of ranks resumes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .following import Following
 if TYPE_CHECKING:
     from warp_corot.simulation.simulation import Simulation
 
-#: How the names of nodal arrays of what is kept begin; others are the same on all ranks.
+#: How the names of kept nodal arrays begin; other kept arrays are the same on all ranks.
 DIRECTIONS, VELOCITIES, HISTORY = "directions", "velocities.", "history."
 GUARD = ("scale", "drift", "lately", "counted")
 
@@ -89,11 +89,11 @@ def body_of(name: str, parts: Simulation) -> int | None:
 
 
 def resume(path: str | PathLike[str], loaded: Simulation, parts: Simulation, following: list[Following]) -> None:
-    """Let a simulation of parts go on where a saved one was.
+    """Resume a simulation of parts from a saved one.
 
     Args:
         path: The checkpoint.
-        loaded: What one process makes of it.
+        loaded: The simulation that one process loads from it.
         parts: This rank's simulation of parts of the same bodies.
         following: Of each body.
     """

@@ -1,4 +1,4 @@
-"""Random numbers that depend on a node's number in the whole body alone."""
+"""Random numbers that depend only on a node's number in the whole body."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ def normal_numbers(numbers: npt.NDArray[np.int64], seed: int) -> npt.NDArray[np.
     By SplitMix64 (Steele, Lea and Flood 2014) and Box and Muller's transform.
 
     Args:
-        numbers: Of the nodes, int64 [n].
-        seed: Another one gives other numbers.
+        numbers: Numbers of the nodes, int64 [n].
+        seed: The seed of the numbers.
     """
     found = np.empty((len(numbers), 3))
     for axis in range(3):

@@ -1,4 +1,4 @@
-"""A whole body, as users hold it on every rank, and the part of it that the rank computes."""
+"""A whole body, which users hold on every rank, and the part of it that the rank computes."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from .parts import Part
 
 
 class Following:
-    """Takes what users write to a whole body over to its part, and gives them what became of the part.
+    """Copies users' changes of a whole body to its part, and the results of the part back.
 
-    On each rank the whole body has the present state of the nodes that this rank moves; of other nodes it is out of
-    date. What users do to the body they must do on every rank.
+    On each rank the whole body has the present state only of the nodes that this rank moves. Users must make every
+    change of the body on all ranks.
 
     Args:
         whole, part: The body and this rank's part of it.
@@ -46,7 +46,7 @@ class Following:
         self._trajectories: list[Trajectory] = []
 
     def take_over(self) -> None:
-        """Take what users have written: the state, supports, loads and keyframes."""
+        """Copy users' changes to the part: the state, supports, loads and keyframes."""
         whole, part = self.whole, self.part
         whole.state.adopt_positions()
         (sources, targets), (own_sources, own_targets) = self._all, self._own
@@ -61,7 +61,7 @@ class Following:
         wp.copy(part.conditions.world_starts, whole.conditions.world_starts)
 
     def publish(self) -> None:
-        """Give the whole body the state of the nodes that this rank moves."""
+        """Copy the state of the nodes that this rank moves to the whole body."""
         whole, part, (targets, sources) = self.whole, self.part, self._own
         for name in ("displacements", "velocities", "reactions"):
             self._move(kernels.move_vectors, sources, targets, getattr(part.state, name), getattr(whole.state, name))
@@ -97,7 +97,7 @@ class Following:
         state.contact_pressures.assign(found)
 
     def take_initial(self) -> None:
-        """Take over what a reset restores."""
+        """Copy the state that a reset restores to the part."""
         given = self.whole.state.initial
         if given is None:
             self.part.state.initial = None
@@ -110,7 +110,9 @@ class Following:
         self.part.state.initial = (found[0], found[1])
 
     def gather(self, array: wp.array) -> npt.NDArray[Any] | None:
-        """A nodal array of the whole body with every node from the rank that moves it, on rank 0; None elsewhere."""
+        """A nodal array of the whole body on rank 0, with each node's value from the rank that moves it; None
+        elsewhere.
+        """
         values = array.numpy()
         given = self._comm.gather((self.own_nodes, values[self.own_nodes]), root=0)
         if given is None:
@@ -121,15 +123,16 @@ class Following:
         return found
 
     def whole_values(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Values of the part's nodes, [n, …], as those of all nodes of the whole body on all ranks; zero at nodes of no
-        element."""
+        """Values of all nodes of the whole body on all ranks, from those of the parts' nodes, [n, …]; zero at nodes of
+        no element.
+        """
         found = np.zeros((self.whole.node_count, *values.shape[1:]), values.dtype)
         for nodes, own in self._comm.allgather((self.own_nodes, values[self._number[self.own_nodes]])):
             found[nodes] = own
         return found
 
     def part_values(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Values of all nodes of the whole body as those of the part's nodes; zero at ghosts."""
+        """Values of the part's nodes from those of all nodes of the whole body; zero at ghosts."""
         found = np.zeros((self.part.node_count, *values.shape[1:]), values.dtype)
         found[self._number[self.own_nodes]] = values[self.own_nodes]
         return found

@@ -1,4 +1,4 @@
-"""A simulation of whole bodies, as one process has it, whose steps all ranks make."""
+"""A simulation of whole bodies, as on one process; all ranks make its steps."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .simulation import Simulation
 
 
 class LedSimulation(OnOne):
-    """What writers and tables read: a simulation of whole bodies on every rank, which rank 0 leads.
+    """A simulation of whole bodies on every rank, for writers and tables; rank 0 leads it.
 
     Rank 0 uses it like any other simulation. The other ranks call ``serve``, which makes the steps that rank 0 asks
     for. After each call all nodes are up to date on all ranks.
@@ -79,7 +79,7 @@ class LedSimulation(OnOne):
             self._make(*told)
 
     def end(self) -> None:
-        """On rank 0: let the other ranks go, whatever has ended the run; once."""
+        """On rank 0: release the other ranks once, whatever has ended the run."""
         if not self._served:
             self._served = True
             self._comm.bcast(None, root=0)
@@ -92,7 +92,7 @@ class LedSimulation(OnOne):
         try:
             getattr(self._on_all, name)(amount)
         except UnstableError:
-            # All ranks have the same error, and end by themselves.
+            # All ranks have the same error and end without a message.
             self._served = True
             raise
         finally:

@@ -17,7 +17,7 @@ _all: weakref.WeakSet[Following] = weakref.WeakSet()
 
 
 def register(following: Iterable[Following]) -> None:
-    """Let ``gather`` know bodies and their parts."""
+    """Register bodies and their parts for ``gather``."""
     for each in following:
         _all.add(each)
 
@@ -26,17 +26,17 @@ def gather(array: wp.array) -> npt.NDArray[Any] | None:
     """A nodal array of a body, such as ``body.positions``, with the values of all ranks. All ranks must call.
 
     Args:
-        array: Of a body in a ``Simulation`` of this package, [worlds * N] in the mesh's node order.
+        array: An array of a body in a ``Simulation`` of this package, [worlds * N] in the mesh's node order.
 
     Returns:
         On rank 0 a copy, float32 [worlds * N, 3] for vectors; None on other ranks.
 
     Raises:
-        InputError: The array is of no such body.
+        InputError: The array belongs to no such body.
     """
     known = [each for each in _all if each.owns(array)]
     if not known:
-        # A copy, such as body.displacements, shows by its length alone whose it is.
+        # Only the length of a copy, such as body.displacements, tells to which body it belongs.
         known = [each for each in _all if len(array) == each.whole.node_count]
     if len(known) != 1:
         raise InputError(

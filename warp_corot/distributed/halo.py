@@ -1,4 +1,4 @@
-"""Whose values travel to whom: lists of nodes, and the exchange through the host's memory."""
+"""Lists of the nodes whose values are sent to each neighbour, and the exchange through the host's memory."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Halo:
     """What a part sends and receives, neighbour by neighbour in ascending order of ranks.
 
     Attributes:
-        sent: Neighbours, and the nodes whose values each gets, numbers within the part, int32.
-        received: Neighbours, and the ghosts whose values each has.
+        sent: Neighbours, and the nodes whose values each gets, as numbers within the part, int32.
+        received: Neighbours, and the ghosts whose values each sends.
     """
 
     sent: dict[int, Ints]
@@ -30,10 +30,10 @@ class Halo:
 
     @classmethod
     def of(cls, numbers: Numbers, worlds: int, comm: Any) -> Halo:
-        """Find out what neighbours want; all ranks must call.
+        """Make the lists; all ranks must call.
 
         Args:
-            numbers: The part's.
+            numbers: The numbers of the part.
             worlds: Copies of the body.
             comm: The ranks.
         """
@@ -56,7 +56,7 @@ class Halo:
 
     @property
     def sent_bytes(self) -> int:
-        """What one exchange of nodal vectors sends."""
+        """Bytes that one exchange of nodal vectors sends."""
         return 16 * sum(map(len, self.sent.values()))
 
 
@@ -64,9 +64,7 @@ class HostExchange:
     """The exchange of a part's nodal values through MPI, on the CPU.
 
     Args:
-        halo: Who gets what.
-        comm: The ranks.
-        tag: Of its messages.
+        halo: The lists of nodes to send and to receive. comm: The ranks. tag: The tag of its messages.
     """
 
     def __init__(self, halo: Halo, comm: Any, tag: int):

@@ -1,4 +1,4 @@
-"""What a sweep has done so far: a line of JSON for each run that ended, on the disk before the next one counts."""
+"""The journal of a sweep: a line of JSON for each finished run, on the disk before the next one is noted."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Journal:
     """Rows of runs, kept in a folder.
 
     Args:
-        folder: The folder, which is made if need be; None: rows are kept in memory alone.
+        folder: The folder, made if necessary; None: rows are kept in memory only.
 
     Raises:
         InputError: The folder or its journal cannot be written to, or the journal is of another kind.
@@ -52,15 +52,15 @@ class Journal:
             os.truncate(self._path, len(data) - len(torn))
 
     def is_done(self, run: Mapping[str, Any]) -> bool:
-        """Whether a run has ended well."""
+        """Whether a run has succeeded."""
         return self._rows.get(key_of(run), {"error": "not made"})["error"] == ""
 
     def row(self, run: Mapping[str, Any]) -> Row:
-        """What came of a run."""
+        """The row of a run."""
         return self._rows[key_of(run)]
 
     def note(self, run: Mapping[str, Any], row: Row) -> None:
-        """Keep what came of a run, on the disk when the call returns.
+        """Keep the row of a run; it is on the disk when the call returns.
 
         Raises:
             OSError: It cannot be written, for example because the disk is full.

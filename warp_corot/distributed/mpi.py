@@ -1,4 +1,4 @@
-"""MPI: who the ranks are. It is imported here only."""
+"""MPI, which only this module imports."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def library() -> Any:
     """The module ``mpi4py.MPI``, which starts MPI when it is first imported.
 
     Raises:
-        InputError: It is not there.
+        InputError: It is not installed.
     """
     try:
         from mpi4py import MPI
@@ -36,12 +36,12 @@ def library() -> Any:
 
 @functools.cache
 def world() -> Any:
-    """A communicator of all ranks of our own.
+    """The program's own communicator of all ranks.
 
-    An error that nobody catches on one rank ends all of them with one line; the others would wait for ever.
+    An uncaught error on one rank ends all of them with one line; otherwise the others would wait for ever.
 
     Raises:
-        InputError: MPI is not there.
+        InputError: MPI is not installed.
     """
     comm = library().COMM_WORLD.Dup()
     if comm.size > 1:
@@ -50,7 +50,7 @@ def world() -> Any:
 
 
 def choose_device() -> None:
-    """Give each process of one machine a card of its own, if there are cards: Warp's default device."""
+    """Give each process of one machine its own card, if there are cards, as Warp's default device."""
     if process_count() == 1:
         return
     local = library().COMM_WORLD.Split_type(library().COMM_TYPE_SHARED)
@@ -68,7 +68,7 @@ def meet(comm: Any) -> None:
 
 
 def _end_all(comm: Any, kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """End all ranks; they cannot go on without this one."""
+    """End all ranks, because they cannot continue without this one."""
     if not isinstance(error, InputError | KeyboardInterrupt):
         traceback.print_exception(kind, error, trace)
     stream = sys.__stderr__ or sys.stderr

@@ -1,4 +1,4 @@
-"""Which rank computes which elements, which rank moves which nodes, and what a rank needs of others."""
+"""Which rank computes which elements and moves which nodes, and which elements of others it needs."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from warp_corot.mesh.tree import UniformTree
 
 Ints = npt.NDArray[np.int32]
 
-#: Bits of each coordinate of a place on the curve along which general elements are dealt out.
+#: Bits of each coordinate on the curve along which general elements are divided.
 CURVE_BITS = 20
 
 
 @dataclass(frozen=True, eq=False)
 class Partition:
-    """How a mesh is dealt out.
+    """How a mesh is divided.
 
     Attributes:
-        groups: Elements that stay together, since they are computed together: the group of each, int32 [T].
-        rank_of_element: Who counts the element's energy, int32 [T].
-        rank_of_node: Who moves the node, int32 [N]; -1 for nodes of no element.
+        groups: The group of each element, int32 [T]; elements of a group are computed together.
+        rank_of_element: The rank that counts the element's energy, int32 [T].
+        rank_of_node: The rank that moves the node, int32 [N]; -1 for nodes of no element.
     """
 
     groups: Ints
@@ -36,16 +36,15 @@ class Partition:
 
     @classmethod
     def of(cls, mesh: Mesh, ranks: int, costs: npt.ArrayLike | None = None, *, grouped: bool = False) -> Partition:
-        """Deal a mesh out.
+        """Divide a mesh.
 
-        Leaves of a forest are dealt out along the tree's order, which is a space-filling curve, in whole groups;
-        general meshes by METIS if ``pymetis`` is there, else along a curve. A node goes with the lowest rank around it.
+        Leaves of a forest are divided along the tree's order, which is a space-filling curve, in whole groups; general
+        meshes by METIS if ``pymetis`` is installed, else along a curve. The lowest rank around a node moves it.
 
         Args:
-            mesh: The whole mesh.
-            ranks: Number of ranks.
-            costs: What an element costs on each rank, in any unit, [ranks]; None: the same everywhere.
-            grouped: Whether elements of a general mesh share something in groups, as leaves may always do.
+            mesh: The whole mesh. ranks: Number of ranks. costs: The cost of an element on each rank, in any unit,
+            [ranks]; None: the same everywhere. grouped: Whether elements of a general mesh share their dilatation in
+            groups; for leaves it is always possible.
 
         Raises:
             InputError: Fewer groups than ranks, or costs that are not positive.
@@ -57,7 +56,7 @@ class Partition:
             raise InputError(f"the body has {len(sizes)} groups of elements for {ranks} ranks; take fewer ranks")
         if isinstance(mesh, TetMesh):
             rank = _dealt_general(mesh, ranks, shares)
-            # Each group goes where its first element goes.
+            # A group belongs to the rank of its first element.
             _, first, place = np.unique(groups, return_index=True, return_inverse=True)
             rank = rank[first][place]
         else:

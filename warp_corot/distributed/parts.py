@@ -39,12 +39,12 @@ class Numbers:
 
 
 class Part(SoftBody):
-    """A rank's part of a body. Ghosts have no mass, so that they never move by themselves.
+    """A rank's part of a body. Ghosts have no mass, so steps do not move them.
 
     Args:
         whole: The body.
-        partition: How its mesh is dealt out.
-        rank: Whose part.
+        partition: The division of its mesh.
+        rank: The rank of the part.
     """
 
     def __init__(self, whole: SoftBody, partition: Partition, rank: int):
@@ -84,7 +84,7 @@ class Part(SoftBody):
 
 
 def part_of_mesh(mesh: Mesh, kept: npt.NDArray[np.bool_], partition: Partition) -> tuple[Mesh, Ints]:
-    """The mesh of some elements, bool [T], in the order that they have; and its nodes' numbers in the whole mesh."""
+    """The mesh of some elements, bool [T], in their order; and its nodes' numbers in the whole mesh."""
     if isinstance(mesh, TetForest):
         return _part_of_forest(mesh, kept, partition.groups[kept])
     nodes = np.unique(mesh.tets[kept]).astype(np.int32)

@@ -1,4 +1,4 @@
-"""The ranks of a run on several processes, as steps and checks know them (``solvers.ranks.Ranks``)."""
+"""The ranks of a run on several processes, in the form for steps and checks (``solvers.ranks.Ranks``)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class MpiRanks(Ranks):
         comm: The communicator.
         wholes: The bodies.
         parts: This rank's part of each.
-        settled: Whether sums are the same bit by bit for any number of ranks.
+        settled: Whether sums are the same bit for bit for any number of ranks.
         records: Whether steps can be recorded on cards, as they cannot where numbers of iterations are not known.
     """
 

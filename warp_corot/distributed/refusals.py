@@ -1,4 +1,4 @@
-"""What does not work on several ranks yet, each in one line."""
+"""Refusals, one line each, of everything that does not work on several ranks yet."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from warp_corot.elasticity import Corotated, Linear, Model, NeoHookean, StVenant
 from warp_corot.errors import InputError
 from warp_corot.solvers import Integrator
 
-#: Models whose forces need nothing but the elements around a node.
+#: Models whose forces need only the elements around a node.
 MODELS = (Corotated, Linear, NeoHookean, StVenantKirchhoff)
 
 #: The preconditioner of linear solves.
@@ -20,7 +20,7 @@ DIAGONAL = "diagonal"
 def check_supported(
     bodies: Sequence[SoftBody], models: Sequence[Model], integrator: Integrator, others: dict[str, Any]
 ) -> None:
-    """See that a simulation can be made on several ranks.
+    """Check that a simulation can be made on several ranks.
 
     Args:
         bodies, models, integrator: As for ``Simulation``.

@@ -1,6 +1,6 @@
-"""Sums that are the same bit by bit in any order, and so for any number of ranks.
+"""Sums that are the same bit for bit in any order, and so for any number of ranks.
 
-Each addend is taken apart into whole numbers of ever smaller units, powers of two below the largest addend of all
+Each addend is split into whole numbers of smaller and smaller units, powers of two below the largest addend of all
 ranks. Sums of whole numbers are exact.
 """
 

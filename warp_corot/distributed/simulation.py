@@ -1,4 +1,4 @@
-"""Bodies in motion on several processes, each of which computes its part of every body."""
+"""Bodies in motion on several processes; each process computes its part of every body."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ class Simulation:
     """One or several soft bodies, stepped together by all ranks of an MPI run.
 
     Every rank makes the same bodies and calls the same methods in the same order. A rank computes its part of every
-    body. Of the whole bodies, which users hold, each rank keeps the nodes up to date that it moves; ``gather`` brings
-    all of them together on rank 0, and ``collect`` brings them into the bodies of all ranks.
+    body. In the whole bodies, which users hold, only the nodes that the rank moves are up to date; ``gather`` collects
+    an array on rank 0, and ``collect`` brings all nodes up to date on all ranks.
 
     Args:
         bodies, model, integrator, gravity: As for ``warp_corot.Simulation``.
-        deterministic: Whether the run must come out the same bit by bit for any number of ranks.
-        costs: What an element costs on each rank, in any unit, [ranks]; None: the same everywhere.
+        deterministic: Whether the run must be the same bit for bit for any number of ranks.
+        costs: The cost of an element on each rank, in any unit, [ranks]; None: the same everywhere.
         others: ``obstacles`` and ``contact`` as for ``warp_corot.Simulation``; its further arguments do not work on
             several ranks yet.
 
@@ -127,7 +127,7 @@ class Simulation:
         self._publish()
 
     def advance_until(self, total_time: float) -> None:
-        """Advance until ``total_time`` [s], nowhere if that is past; as ``advance``."""
+        """Advance until ``total_time`` [s], as ``advance``; do nothing if that time is past."""
         self._take_over()
         self._parts.advance_until(total_time)
         self._publish()
@@ -176,7 +176,7 @@ class Simulation:
 
     @property
     def device(self) -> wp.Device:
-        """Where this rank computes."""
+        """The device of this rank."""
         return self._parts.device
 
     @property
@@ -223,11 +223,11 @@ class Simulation:
 
     @property
     def sent_bytes(self) -> int:
-        """What this rank sends in one exchange [bytes]."""
+        """The bytes that this rank sends in one exchange."""
         return sum(each.sent_bytes for each in self._parts.ranks.halos)
 
     def exchange_seconds(self, count: int) -> float:
-        """How long one exchange takes by itself, the mean of so many in a row [s]; all ranks must call."""
+        """The mean time of one exchange alone, over a number of them in a row [s]; all ranks must call."""
         probes = [wp.zeros_like(each.part.state.displacements) for each in self._following]
         return self._parts.ranks.exchange_seconds(probes, checked_count(count, "count", least=1))
 
@@ -289,7 +289,7 @@ class Simulation:
 
         Args:
             path: The file, which every rank reads.
-            device: Where to go on; None: where it was saved, or on the rank's own card.
+            device: The device; None: the one on which it was saved, or the rank's own card.
 
         Raises:
             InputError: As for ``warp_corot.Simulation.load``, or a run that does not work on several ranks.
@@ -322,7 +322,7 @@ class Simulation:
 
 
 class _OfParts(on_one.Simulation):
-    """A rank's own simulation, of parts, which asks other ranks where it must."""
+    """A rank's own simulation of parts, which exchanges data with other ranks."""
 
     def __init__(self, ranks: MpiRanks, parts: Sequence[Part], **options: Any):
         self.ranks: MpiRanks = ranks
@@ -347,7 +347,9 @@ def _part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | Non
 
 
 def _compile_once(comm: Any, parts: Sequence[Part], **options: Any) -> None:
-    """Let one rank of each machine compile the kernels, by some steps of its parts; the others wait and find them."""
+    """Let one rank of each machine compile the kernels in some steps of its parts; the others wait and then find them
+    in the cache.
+    """
     if comm.size == 1 or comm.allreduce(max(part.element_count for part in parts), op=max) > FEW_ELEMENTS:
         return
     here = comm.Split_type(mpi.library().COMM_TYPE_SHARED)
@@ -371,7 +373,7 @@ def _of_their_own(obstacles: Obstacle | Sequence[Obstacle]) -> list[Obstacle]:
 
 
 def _settled_model(model: Model, body: SoftBody) -> Model:
-    """The model with what "auto" means for the whole body, since a part may hold other materials."""
+    """The model with the meaning of "auto" for the whole body, because a part may have other materials."""
     if not hasattr(model, "dilatation"):
         return model
     shares = shares_dilatation(model.dilatation, body.discretization)

@@ -1,4 +1,4 @@
-"""Many runs with other parameters, side by side: which there are, which are done, and what came of them."""
+"""Many runs with different parameters at the same time: which there are, which are finished, and their results."""
 
 from __future__ import annotations
 
@@ -34,28 +34,26 @@ def sweep(
 ) -> list[Row]:
     """Call a function with every combination of parameters, in several processes.
 
-    With a folder, each result is noted there as soon as it is known. Called again with the same folder, the sweep makes
-    what is missing: what is done is not done twice, and what has failed is tried again.
+    With a folder, each result is noted there as soon as it is known. Called again with the same folder, the sweep
+    continues: it does not repeat finished runs, and tries failed ones again.
 
     Args:
-        function: Called as ``function(young=1e3, poisson=0.45)``; gives a number, or a dictionary of numbers and texts.
-            A function at the top of a module, since other processes must find it.
-        parameters: Values of each parameter, of which all combinations are made; or a list with the parameters of each
-            run.
-        folder: Where results are noted, and tables (CSV and, with pyarrow, Parquet) and a picture are written.
-        workers: Processes; None: one for each card, or for each core where there is none.
-        retries: How often a run that failed, or whose process died, is made again.
+        function: Called as ``function(young=1e3, poisson=0.45)``; returns a number, or a dictionary of numbers and
+        texts. It must be at the top of a module, because other processes must find it. parameters: Values of each
+        parameter, for all combinations; or a list with the parameters of each run. folder: The folder for the journal,
+        tables (CSV and, with pyarrow, Parquet) and a picture. workers: Number of processes; None: one for each card, or
+        for each core without cards. retries: How often a run is repeated that failed or whose process died.
         executor: Another engine in place of processes of this machine: any ``concurrent.futures.Executor``, such as
             ``mpi4py.futures.MPIPoolExecutor()`` or ``dask.distributed.Client(…).get_executor()``.
         progress: Whether to show a bar; None: on a terminal.
 
     Returns:
-        For each run, in order, a dictionary of its parameters, results, ``seconds`` and ``error`` (empty if all is
-        well).
+        For each run, in order, a dictionary of its parameters, results, ``seconds`` and ``error`` (empty if it
+        succeeded).
 
     Raises:
-        InputError: No parameters, values that are no numbers or texts, a folder that cannot be written to, or numbers
-            out of range.
+        InputError: No parameters, values that are neither numbers nor texts, a folder that cannot be written to, or
+        numbers out of range.
     """
     runs = combinations(parameters)
     checked_count(retries, "retries", least=0)
@@ -79,7 +77,7 @@ def combinations(parameters: Parameters) -> list[dict[str, Any]]:
     """The parameters of each run.
 
     Raises:
-        InputError: There are none, or they are of another form.
+        InputError: There are none, or they have another form.
     """
     if isinstance(parameters, Mapping):
         for name, values in parameters.items():
@@ -109,7 +107,7 @@ def _plain(value: Any) -> Any:
 def _made(
     function: Callable[..., Any], runs: Sequence[dict[str, Any]], executor: Executor | None, workers: int, retries: int
 ) -> Iterator[Row]:
-    """Rows of runs as they come to an end. An engine of our own whose worker has died is made anew."""
+    """Rows of runs as they finish. The package's own engine is made again if a worker has died."""
     waiting = deque((run, 0) for run in runs)
     while waiting:
         engine = local_executor(workers) if executor is None else executor
@@ -125,11 +123,11 @@ def _made(
 def _until_broken(
     function: Callable[..., Any], engine: Executor, waiting: deque[tuple[Row, int]], window: int, retries: int
 ) -> Iterator[Row]:
-    """Rows of runs as they come to an end, until none waits or a worker has died."""
+    """Rows of runs as they finish, until none waits or a worker has died."""
     under_way: dict[Future[Row], tuple[Row, int]] = {}
     broken = False
     while under_way or (waiting and not broken):
-        # No more at a time than workers: those under way when one dies are those that may have killed it.
+        # No more runs at a time than workers: when a worker dies, one of the running runs may have killed it.
         while waiting and not broken and len(under_way) < window:
             run, tries = waiting.popleft()
             try:

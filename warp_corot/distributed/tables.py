@@ -13,7 +13,7 @@ from warp_corot.io.files.whole import written_whole
 
 from .journal import Row
 
-#: Columns that are drawn at most.
+#: Maximum number of columns that are drawn.
 MOST_DRAWN = 6
 
 
@@ -21,9 +21,9 @@ def write_tables(rows: Sequence[Row], parameters: Sequence[str], folder: Path) -
     """Write ``table.csv``; with pyarrow ``table.parquet``; with matplotlib ``results.png``. Each is written whole.
 
     Args:
-        rows: Of all runs.
+        rows: The rows of all runs.
         parameters: Names of the parameters, which come first.
-        folder: Where.
+        folder: The folder.
 
     Returns:
         The files.
@@ -52,7 +52,7 @@ def write_tables(rows: Sequence[Row], parameters: Sequence[str], folder: Path) -
 
 
 def _draw(rows: Sequence[Row], parameters: Sequence[str], drawn: Sequence[str], path: Path) -> None:
-    """Each result over the first parameter, a line for each combination of the others."""
+    """Draw each result over the first parameter, with a line for each combination of the others."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

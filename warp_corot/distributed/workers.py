@@ -1,4 +1,4 @@
-"""The processes of a sweep on this machine: one for each card, or for each core where there is none."""
+"""The processes of a sweep on this machine: one for each card, or for each core without cards."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count
 
-#: Runs handed over at a time to an engine of the user's, whose size is not known.
+#: Number of runs given at a time to a user's engine, whose size is not known.
 HANDED_OVER = 256
 
 
 def worker_count(workers: int | None, runs: int, executor: Executor | None) -> int:
-    """How many runs are under way at a time."""
+    """The number of runs at a time."""
     if workers is not None:
         return checked_count(workers, "workers", least=1)
     if executor is not None:
@@ -30,17 +30,17 @@ def worker_count(workers: int | None, runs: int, executor: Executor | None) -> i
 
 
 def local_executor(workers: int) -> ProcessPoolExecutor:
-    """New processes, not copies of this one, which CUDA and Warp would not survive."""
+    """New processes, because CUDA and Warp do not work in forked ones."""
     context = multiprocessing.get_context("spawn")
     turn = context.Value("i", 0)
     return ProcessPoolExecutor(workers, mp_context=context, initializer=_begin, initargs=(turn,))
 
 
 def timed(function: Callable[..., Any], run: Mapping[str, Any]) -> dict[str, Any]:
-    """What a function gives for some parameters as a row of a table, with the time that it took.
+    """The results of a function for some parameters as a row of a table, with its time.
 
     Raises:
-        InputError: It gives neither a number nor a dictionary of numbers and texts.
+        InputError: The function returns neither a number nor a dictionary of numbers and texts.
     """
     began = time.perf_counter()
     given = function(**run)
@@ -56,7 +56,7 @@ def timed(function: Callable[..., Any], run: Mapping[str, Any]) -> dict[str, Any
 
 
 def _begin(turn: Any) -> None:
-    """Take a card of one's own, if there are cards."""
+    """Choose a card for this process, if there are cards."""
     with turn.get_lock():
         number, turn.value = turn.value, turn.value + 1
     wp.config.quiet = True
