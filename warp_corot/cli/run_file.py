@@ -122,7 +122,7 @@ def option_of(name: str) -> Callable[[str], Any]:
 
     Raises:
         InputError: There is no such option, or it does not have one value. The function raises it for a text that the
-        option does not accept.
+            option does not accept.
     """
     _, actions = _parser(Path("--vary"))
     action = actions.get(name)

@@ -42,7 +42,8 @@ class CardExchange:
     """The exchange of a part's nodal values between cards.
 
     Args:
-        halo: The lists of nodes to send and to receive. device: The card.
+        halo: The lists of nodes to send and to receive.
+        device: The card.
     """
 
     def __init__(self, halo: Halo, device: wp.Device):

@@ -64,7 +64,9 @@ class HostExchange:
     """The exchange of a part's nodal values through MPI, on the CPU.
 
     Args:
-        halo: The lists of nodes to send and to receive. comm: The ranks. tag: The tag of its messages.
+        halo: The lists of nodes to send and to receive.
+        comm: The ranks.
+        tag: The tag of its messages.
     """
 
     def __init__(self, halo: Halo, comm: Any, tag: int):

@@ -42,9 +42,11 @@ class Partition:
         meshes by METIS if ``pymetis`` is installed, else along a curve. The lowest rank around a node moves it.
 
         Args:
-            mesh: The whole mesh. ranks: Number of ranks. costs: The cost of an element on each rank, in any unit,
-            [ranks]; None: the same everywhere. grouped: Whether elements of a general mesh share their dilatation in
-            groups; for leaves it is always possible.
+            mesh: The whole mesh.
+            ranks: Number of ranks.
+            costs: The cost of an element on each rank, in any unit, [ranks]; None: the same everywhere.
+            grouped: Whether elements of a general mesh share their dilatation in groups; for leaves it is always
+                possible.
 
         Raises:
             InputError: Fewer groups than ranks, or costs that are not positive.

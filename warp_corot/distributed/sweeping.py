@@ -39,10 +39,11 @@ def sweep(
 
     Args:
         function: Called as ``function(young=1e3, poisson=0.45)``; returns a number, or a dictionary of numbers and
-        texts. It must be at the top of a module, because other processes must find it. parameters: Values of each
-        parameter, for all combinations; or a list with the parameters of each run. folder: The folder for the journal,
-        tables (CSV and, with pyarrow, Parquet) and a picture. workers: Number of processes; None: one for each card, or
-        for each core without cards. retries: How often a run is repeated that failed or whose process died.
+            texts. It must be at the top of a module, because other processes must find it.
+        parameters: Values of each parameter, for all combinations; or a list with the parameters of each run.
+        folder: The folder for the journal, tables (CSV and, with pyarrow, Parquet) and a picture.
+        workers: Number of processes; None: one for each card, or for each core without cards.
+        retries: How often a run is repeated that failed or whose process died.
         executor: Another engine in place of processes of this machine: any ``concurrent.futures.Executor``, such as
             ``mpi4py.futures.MPIPoolExecutor()`` or ``dask.distributed.Client(…).get_executor()``.
         progress: Whether to show a bar; None: on a terminal.
@@ -53,7 +54,7 @@ def sweep(
 
     Raises:
         InputError: No parameters, values that are neither numbers nor texts, a folder that cannot be written to, or
-        numbers out of range.
+            numbers out of range.
     """
     runs = combinations(parameters)
     checked_count(retries, "retries", least=0)

@@ -23,7 +23,8 @@ def value_and_derivative(objective: Objective, positions: wp.array) -> tuple[flo
 
     Args:
         objective: A function of positions. It returns a ``wp.array`` of one number, computed by kernels that it
-        launches, or a pair of a number and its derivative, [n, 3]. positions: vec3 or vec3d [n].
+            launches, or a pair of a number and its derivative, [n, 3].
+        positions: vec3 or vec3d [n].
 
     Raises:
         InputError: The objective returns something else, or a value that is not finite.

@@ -88,12 +88,15 @@ def run_gradient(
     about sqrt(steps) states and compute those between again; implicit ones keep all displacements.
 
     Args:
-        body: The body. Its held nodes keep their velocities. objective: As for ``static_gradient``, a function of the
-        positions at the end. integrator: ``SymplecticEuler(dt)`` with a given step, or an implicit one with a tolerance
-        of Newton's method, which then is the accuracy of gradients; without viscosity. steps: The number of steps. wrt:
-        Names of derivatives of ``RunGradient``. model, gravity: As for ``Simulation``. every: J is the sum of the
-        objective's values after each of this number of steps; None: the value at the end. adjoint_tolerance: Tolerance
-        of the linear solve of each implicit step backwards.
+        body: The body. Its held nodes keep their velocities.
+        objective: As for ``static_gradient``, a function of the positions at the end.
+        integrator: ``SymplecticEuler(dt)`` with a given step, or an implicit one with a tolerance of Newton's method,
+            which then is the accuracy of gradients; without viscosity.
+        steps: The number of steps.
+        wrt: Names of derivatives of ``RunGradient``.
+        model, gravity: As for ``Simulation``.
+        every: J is the sum of the objective's values after each of this number of steps; None: the value at the end.
+        adjoint_tolerance: Tolerance of the linear solve of each implicit step backwards.
 
     Raises:
         InputError: As ``static_gradient``, or the integrator is none of these, the body is remeshed, or nodes or active

@@ -84,18 +84,19 @@ def static_gradient(
     forces in it.
 
     Args:
-        body: The body; some nodes of each world must be held. objective: A function of positions, vec3 [worlds * N]
-        [m]. It returns a ``wp.array`` of one number, made with ``requires_grad=True`` and computed by kernels that it
-        launches, which a tape differentiates; or a pair of a number and its derivative with respect to positions,
-        [worlds * N, 3], for example from ``positions.numpy()``. wrt: Names of derivatives of ``StaticGradient``:
-        "young", "poisson", "density", "loads", "boundary", "rest",
+        body: The body; some nodes of each world must be held.
+        objective: A function of positions, vec3 [worlds * N] [m]. It returns a ``wp.array`` of one number, made with
+            ``requires_grad=True`` and computed by kernels that it launches, which a tape differentiates; or a pair of a
+            number and its derivative with respect to positions, [worlds * N, 3], for example from
+            ``positions.numpy()``.
+        wrt: Names of derivatives of ``StaticGradient``: "young", "poisson", "density", "loads", "boundary", "rest",
             "activation", "gravity".
-        model, gravity, tolerance, iterations, load_steps, preconditioner: As for ``solve_static``. adjoint_tolerance:
-        Tolerance of the adjoint solve, its residual over the right side. precision: "float32": everything is computed
-        on the body's device. "float64": the answer is refined on the host, by Newton's method
-            with a sparse direct solver, and the adjoint is solved there; positions are vec3d. For the models
-            ``Corotated``, ``Linear``, ``StVenantKirchhoff`` and ``NeoHookean`` with isotropic materials, and bodies of
-            some 10,000 nodes.
+        model, gravity, tolerance, iterations, load_steps, preconditioner: As for ``solve_static``.
+        adjoint_tolerance: Tolerance of the adjoint solve, its residual over the right side.
+        precision: "float32": everything is computed on the body's device. "float64": the answer is refined on the host,
+            by Newton's method with a sparse direct solver, and the adjoint is solved there; positions are vec3d. For
+            the models ``Corotated``, ``Linear``, ``StVenantKirchhoff`` and ``NeoHookean`` with isotropic materials, and
+            bodies of some 10,000 nodes.
 
     Raises:
         InputError: As ``solve_static``, a name is none of these, the model or the material has no such derivative, a

@@ -54,8 +54,9 @@ class Shown:
     """The shown surface of a body, first world.
 
     Args:
-        body: The body. surface: Bound to the nodes of its present mesh. Its topology stays; if the body is remeshed,
-        its points are bound again to the elements that contain them.
+        body: The body.
+        surface: Bound to the nodes of its present mesh. Its topology stays; if the body is remeshed, its points are
+            bound again to the elements that contain them.
 
     Attributes:
         rest: Points at rest [m], float64 [V, 3].

@@ -159,12 +159,14 @@ def view(
     and the simulation runs in a thread: use it only inside ``with page.held() as sim:``.
 
     Args:
-        sim: The simulation. The page shows its first world. host: The address to listen at; only this computer reaches
-        the loopback address. port: The port, 0 for any free one. token: The word that visitors need, as in
-        ``http://HOST:PORT/?token=…``. Without one, only browsers on this computer may enter; at an address that others
-        can reach, a random token is chosen and is part of the page's address. surface: The user's own surface of each
-        body, as ``record`` takes it: a ``SurfaceMesh``, or None. wait: Whether to return at the end of the page; None:
-        unless Python is interactive.
+        sim: The simulation. The page shows its first world.
+        host: The address to listen at; only this computer reaches the loopback address.
+        port: The port, 0 for any free one.
+        token: The word that visitors need, as in ``http://HOST:PORT/?token=…``. Without one, only browsers on this
+            computer may enter; at an address that others can reach, a random token is chosen and is part of the page's
+            address.
+        surface: The user's own surface of each body, as ``record`` takes it: a ``SurfaceMesh``, or None.
+        wait: Whether to return at the end of the page; None: unless Python is interactive.
 
     Returns:
         The page; ``close`` ends it.
