@@ -1,18 +1,19 @@
 #!/usr/bin/env python3
-"""The same press here and in MuJoCo's flex: time, how deep the tool sinks in, and what it feels; one CPU core.
+"""The same press here, in MuJoCo's flex and in Newton's VBD: time, depth of the tool in the body, force; one CPU core.
 
     python benchmarks/contact_peers.py [--level 9] [--finer 3] [--json FILE]
 
 A rigid ball of 30 mm radius goes 10 mm into the upper face of a cube of 0.1 m, 5 kPa, that is held below, in 0.1 s, and
 stays there until 0.3 s; no friction. What is told is the mean force of the last 25 ms and the deepest node at the end.
-Elastic laws differ: corotated here, St. Venant-Kirchhoff on edges there. The last row is ours on
-a finer mesh, for how far the others are from converged.
+Elastic laws differ: corotated here, St. Venant-Kirchhoff on edges in MuJoCo, neo-Hookean in VBD. The last row is ours
+on a finer mesh, for how far the others are from converged. Newton is left out where it is not installed.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from pathlib import Path
 
@@ -30,6 +31,8 @@ ARRIVES, ENDS, LOOKED = 0.1, 0.3, 0.025
 HIGH, LOW = SIZE + RADIUS + GAP, SIZE + RADIUS - DEPTH
 #: Radius of its nodes, with which they touch [m].
 SKIN = 5e-4
+#: Contact of VBD: Newton's own stiffness for soft contacts and a hundred times as much [N/m]; its step [s].
+VBD_STIFFNESSES, VBD_STEP = (1e3, 1e5), 1e-3
 
 XML = """
 <mujoco>
@@ -111,6 +114,25 @@ def _force_on_tool(model: mujoco.MjModel, data: mujoco.MjData) -> float:
     return abs(total)
 
 
+def newton_rows(mesh: wc.TetForest) -> dict[str, tuple[float, int, float, float]]:
+    """VBD with Newton's own contact stiffness and with a large one."""
+    try:
+        import contact_newton_peer as peer
+    except ImportError as error:
+        print(f"Newton: left out ({error})", file=sys.stderr)
+        return {}
+
+    def place(t: float) -> tuple[float, float, float]:
+        return 0.5 * SIZE, 0.5 * SIZE, HIGH + (LOW - HIGH) * min(t / ARRIVES, 1.0)
+
+    masses = wc.SoftBody(mesh, wc.Isotropic(YOUNG, POISSON, 1000.0), device="cpu").masses
+    rows = {}
+    for stiffness in VBD_STIFFNESSES:
+        found = peer.vbd(mesh, (YOUNG, POISSON), (RADIUS, place), masses, SKIN, stiffness, VBD_STEP, ENDS, LOOKED)
+        rows[f"{peer.NAME}, {stiffness:g} N/m, {1e3 * VBD_STEP:g} ms"] = (*found[:3], deepest(found[3], RADIUS + SKIN))
+    return rows
+
+
 def _joined(values: np.ndarray) -> str:
     return " ".join(map(repr, values.ravel().tolist()))
 
@@ -131,6 +153,7 @@ def main() -> None:
         "warp-corot": ours(mesh),
         f"{flexed}, discrete, 1 ms": flex(mesh, "discrete", 1e-3),
         f"{flexed}, Euler, 0.2 ms": flex(mesh, "Euler", 2e-4),
+        **newton_rows(mesh),
     }
     rows = [[name, len(mesh.tets), *row[:3], 1e3 * row[3]] for name, row in found.items()]
     if options.finer > 0:

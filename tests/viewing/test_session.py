@@ -306,6 +306,69 @@ def test_a_simulation_with_tools_is_not_switched():
     assert tool.wrench.numpy()[0, 2] > 0.0
 
 
+def with_tool(device="cpu", **options):
+    """A ball of 4 cm that lies on the top of a block."""
+    tool = wc.Tool(wc.Sphere(radius=0.02, position=(0.05, 0.05, 0.2202)))
+    return Session(block(device, obstacles=[tool, wc.Ground(offset=-0.5)], **options)), tool
+
+
+def test_a_visitor_moves_a_tool_and_feels_the_tissue(device):
+    page, tool = with_tool(device)
+    page.press_tool(1, 0)
+    page.move(1, (0.0, 0.0, -0.01))
+    frame = still(page, 0.3)
+    assert frame.poses[0][2] == pytest.approx(0.2102, abs=1e-6)
+    (force,) = frame.forces.values()
+    np.testing.assert_allclose(force, -tool.wrench.numpy()[0][:3], rtol=1e-6)
+    assert force[2] < -0.1
+    np.testing.assert_allclose(frame.ends[1][0], frame.ends[1][1], atol=1e-6)
+    page.let_go(1)
+    assert still(page, 0.05).poses[0][2] == pytest.approx(0.2102, abs=1e-6)
+    page.press_tool(2, 0)
+    assert list(page.hands) == [2]
+    page.move(2, (0.0, 0.0, 0.03))
+    page.let_go(2)
+    assert still(page, 0.3).forces
+    page.release_all()
+    assert not page.frame().forces
+
+
+def test_a_visitor_grasps_with_a_tool(device):
+    page, _ = with_tool(device)
+    page.change(hand="grasp", radius=0.02)
+    page.press_tool(1, 0)
+    page.move(1, (0.0, 0.0, 0.005))
+    page.let_go(1)
+    frame = still(page, 0.3)
+    (force,) = frame.forces.values()
+    assert force[2] > 0.01
+    (grasp,) = page.sim.grasps
+    moved = page.sim.body.displacements.numpy()[grasp.nodes]
+    np.testing.assert_allclose(moved[:, 2], 0.005, atol=1e-5)
+    page.release_all()
+    assert page.sim.grasps == ()
+    assert still(page, 0.5).forces == {}
+    assert np.abs(page.sim.body.displacements.numpy()).max() < 5e-4
+
+
+def test_what_no_visitor_moves_is_said():
+    page, tool = with_tool()
+    page.ask(lambda: page.press_tool(1, 1))
+    page.take_commands()
+    assert "does not move" in page.note
+    tool.follow([0.0, 1.0], [(0.05, 0.05, 0.25), (0.05, 0.05, 0.2)])
+    page.ask(lambda: page.press_tool(1, 0))
+    page.take_commands()
+    assert "follows keyframes" in page.note
+    page, tool = with_tool()
+    tool.move((0.05, 0.05, 0.5))
+    still(page, 0.5)
+    page.change(hand="grasp")
+    page.ask(lambda: page.press_tool(1, 0))
+    page.take_commands()
+    assert "no tissue is within" in page.note
+
+
 def test_closed_the_simulation_is_free():
     page = session()
     page.press(1, 0, TOP)

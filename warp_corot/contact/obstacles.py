@@ -10,6 +10,7 @@ import warp as wp
 
 from warp_corot.errors import InputError
 from warp_corot.kernels.contact import motion as kernels
+from warp_corot.kernels.contact.overlaps import find_gaps
 from warp_corot.kernels.contact.shapes import Shapes
 from warp_corot.solvers.system import System
 
@@ -154,6 +155,14 @@ class Obstacles:
         if self.tools:
             inputs = [chosen, self.initial, self.motions]
             wp.launch(kernels.reset_obstacles, (self.worlds, self.count), inputs, device=self.device)
+
+    def gaps(self, points: npt.NDArray[np.float64], most: float) -> npt.NDArray[np.float32]:
+        """Distances of points [m], [n, 3], from the obstacles of the first world [m], negative inside, [O, n]; what is
+        more than ``most`` need not be right. Waits for the device."""
+        found = wp.zeros((self.count, len(points)), dtype=wp.float32, device=self.device)
+        asked = wp.array(points, dtype=wp.vec3, device=self.device)
+        wp.launch(find_gaps, found.shape, [self.shapes, self.motions, asked, most], [found], device=self.device)
+        return found.numpy()
 
     def poses(self) -> npt.NDArray[np.float64]:
         """Where they are, float64 [worlds, O, 7]; waits for the device."""

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.contact.shapes import Shape, Sphere
+from warp_corot.contact.tool import Tool
 from warp_corot.io.pictures.colors import TISSUE
 
 from .frames import Frame
@@ -105,7 +106,9 @@ class Scene:
         self._server, self._session = server, session
         low, high = session.bounds
         self._middle, self._scale = 0.5 * (low + high), EXTENT / session.size
-        self._bodies = [_Body(server, f"/body{k}", self._dragging(k)) for k in range(len(session.sim.bodies))]
+        self._bodies = [
+            _Body(server, f"/body{k}", self._dragging(self._holding(k))) for k in range(len(session.sim.bodies))
+        ]
         self._obstacles = [self._obstacle(k, tool.shape) for k, tool in enumerate(session.tools)]
         self._arrows = server.scene.add_arrows(
             "/hands",
@@ -148,7 +151,7 @@ class Scene:
         mesh = mesh_of(shape, self._session.size)
         if mesh is None:
             return None
-        return self._server.scene.add_mesh_simple(
+        node = self._server.scene.add_mesh_simple(
             f"/obstacle{number}",
             self._scale * mesh.vertices,
             mesh.faces,
@@ -157,20 +160,31 @@ class Scene:
             cast_shadow=False,
             receive_shadow=False,
         )
+        session = self._session
+        if isinstance(session.sim.obstacles[number], Tool):
+            node.on_drag(self._dragging(lambda owner, _: session.press_tool(owner, number)))
+        return node
 
     def _placed(self, points: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
         """Positions [m] in the scene."""
         return ((points - self._middle) * self._scale).astype(np.float32)
 
-    def _dragging(self, body: int) -> Callable[[Any], Any]:
-        """The function that is called while the mouse drags a body: in order, and without waiting."""
+    def _holding(self, body: int) -> Callable[[Any, Any], None]:
+        return lambda owner, position: self._session.press(owner, body, position)
+
+    def _dragging(self, press: Callable[[Any, Any], None]) -> Callable[[Any], Any]:
+        """The function that is called while the mouse drags something: in order, and without waiting.
+
+        Args:
+            press: Called with the visitor and the place that was pressed [m].
+        """
 
         async def dragged(event: Any) -> None:
             session, owner = self._session, event.client_id
             start, end = (np.asarray(p, dtype=np.float64) for p in (event.start_position, event.end_position))
             if event.phase == "start":
                 position = start / self._scale + self._middle
-                session.ask(lambda: session.press(owner, body, position))
+                session.ask(lambda: press(owner, position))
             if event.phase == "end":
                 session.ask(lambda: session.let_go(owner))
             else:

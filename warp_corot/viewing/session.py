@@ -27,6 +27,7 @@ from .hands import HANDS, SpringHand
 from .pacing import Pace
 from .shown import Shown, surfaces_of
 from .springs import Springs
+from .tools import ToolHand
 
 
 class Session:
@@ -57,7 +58,7 @@ class Session:
         self._own = list(own or [None] * len(sim.bodies))
         self._made = made
         self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self.hands: dict[Any, SpringHand] = {}
+        self.hands: dict[Any, SpringHand | ToolHand] = {}
         self.pace, self.sending = Pace(), 0.0
         self.number = 0
         self._versions: list[int] = []
@@ -132,7 +133,9 @@ class Session:
         """
         pick = self.shown[body].pick(body, position)
         for held, hand in list(self.hands.items()):
-            if hand.stays and hand.pick.body == body and self._is_near(hand, pick):
+            if not isinstance(hand, SpringHand) or not hand.stays:
+                continue
+            if hand.pick.body == body and self._is_near(hand, pick):
                 self.hands[owner] = self.hands.pop(held)
                 hand.begin()
                 return
@@ -140,6 +143,24 @@ class Session:
         kind = HANDS[self.controls.hand]
         radius = self.controls.radius * self.size
         self.hands[owner] = kind(self.springs, self.shown[body], pick, radius, self.controls.strength)
+
+    def press_tool(self, owner: Any, number: int) -> None:
+        """Take an obstacle with a mouse. With the hand ``grasp`` the tool also holds the tissue that is near it.
+
+        Raises:
+            InputError: It is no ``Tool``, something else moves it, or there is no tissue to grasp.
+        """
+        given = self.sim.obstacles[number]
+        if not isinstance(given, Tool):
+            raise InputError(f"the {given!r} does not move; a Tool of its shape would")
+        self.let_go(owner)
+        held = [key for key, hand in self.hands.items() if isinstance(hand, ToolHand) and hand.tool is given]
+        hand = self.hands.pop(held[0]) if held else ToolHand(given)
+        assert isinstance(hand, ToolHand)
+        self.hands[owner] = hand
+        hand.begin()
+        if self.controls.hand == "grasp":
+            hand.grasp(self.sim.bodies, self.controls.radius * self.size)
 
     def move(self, owner: Any, motion: npt.ArrayLike) -> None:
         """Move a hand to the mouse's present distance from where it was pressed [m], [3]."""
