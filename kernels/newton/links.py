@@ -9,9 +9,9 @@ that is open then has neither force nor stiffness, so forces are found again aft
 import warp as wp
 
 from warp_corot.kernels.elements.elements import add_force, load_node
+from warp_corot.kernels.implicit.line_search import TRIED
 
 from .contacts import ContactLaw
-from .line_search import TRIED
 from .touching import contact_gap, is_active, largest_of, mean_of, point_of, share_of
 
 wp.set_module_options({"enable_backward": False})

@@ -12,6 +12,7 @@ from warp_corot.kernels.contact.law import Law
 from warp_corot.solvers.system import System
 
 from .active_set import ActiveSet
+from .joined_rows import JoinedRows
 from .obstacles import Obstacles
 from .options import Contact
 from .pairs import Pairs, smallest_size
@@ -156,9 +157,13 @@ class Contacts:
         if self.obstacles.count:
             self.obstacles.launch_motion(offset)
 
-    def active_set(self, k: int) -> ActiveSet:
-        """The contact of a body in implicit steps; there must be obstacles."""
-        return ActiveSet(self, k)
+    def active_set(self, k: int) -> ActiveSet | None:
+        """The contact of a body with obstacles in implicit steps; None without obstacles."""
+        return None if self.rigid is None else ActiveSet(self, k)
+
+    def joined_rows(self) -> JoinedRows | None:
+        """The contact of soft surfaces in implicit steps, if they may touch."""
+        return None if self.pairs is None else JoinedRows(self.system, self.pairs, self.law)
 
     def measure(self) -> None:
         thinnest = self.obstacles.thinnest

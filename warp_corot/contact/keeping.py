@@ -12,7 +12,7 @@ from warp_corot.errors import InputError
 from .contacts import Contacts
 
 #: What the shapes and the meshes give again.
-GIVEN = {"_meeting", "shapes"}
+GIVEN = {"meeting", "shapes"}
 
 
 def kept_arrays(contacts: Contacts) -> dict[str, wp.array]:

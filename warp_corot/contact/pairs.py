@@ -35,6 +35,7 @@ class Pairs:
 
     Attributes:
         rows: The pairs, as kernels take them.
+        meeting: What may meet, as kernels take it.
         revision: Changes whenever launches do.
     """
 
@@ -61,7 +62,7 @@ class Pairs:
         meeting.opposite = surface.opposite
         meeting.reach = self.search.watch.reach
         meeting.meets_itself, meeting.friction = int(self.meets_itself), self.friction
-        self._meeting = meeting
+        self.meeting = meeting
         self._crowd = wp.zeros(count, dtype=wp.int32, device=device)
         self._added = wp.zeros(count, dtype=wp.vec3l, device=device)
         self._boxes = [
@@ -151,7 +152,7 @@ class Pairs:
 
     def launch_begin(self, law: Law) -> None:
         """Launch where all pairs are."""
-        self._on_rows(kernels.locate_rows, [law, self.surface.arrays, self._meeting, self.rows, self._added])
+        self._on_rows(kernels.locate_rows, [law, self.surface.arrays, self.meeting, self.rows, self._added])
         self._apply(law)
 
     def launch_round(self, law: Law, pace: Pace) -> None:
@@ -162,7 +163,7 @@ class Pairs:
         self._apply(law)
 
     def _box(self) -> None:
-        inputs = [self.surface.arrays, self._meeting]
+        inputs = [self.surface.arrays, self.meeting]
         boxed = (boxes.box_triangles, boxes.box_edges)
         for kernel, (lower, upper) in zip(boxed, self._boxes, strict=True):
             wp.launch(kernel, len(lower), inputs, [lower, upper], device=self.device)
@@ -178,7 +179,7 @@ class Pairs:
         owners = len(rows.starts)
         wp.launch(search_kernels.keep_rows, max(owners, self._room), [watch, rows, old], device=device)
         wp.launch(search_kernels.begin_rows, 1, [watch, rows], device=device)
-        inputs = [watch, *(tree.id for tree in self._trees), self.surface.arrays, self._meeting, old]
+        inputs = [watch, *(tree.id for tree in self._trees), self.surface.arrays, self.meeting, old]
         wp.launch(search_kernels.find_pairs, owners, inputs, [rows, self.search.near], device=device)
         wp.launch(search_kernels.end_rows, 1, [watch, rows], [self.search.most], device=device)
 

@@ -13,11 +13,11 @@ from warp_corot.kernels.implicit import conjugate_gradients
 from warp_corot.kernels.implicit.tangent import add_vectors
 from warp_corot.kernels.newton import implicit as kernels
 from warp_corot.solvers.implicit.conjugate_gradients import ConjugateGradients
+from warp_corot.solvers.implicit.line_search import LineSearch
 
 from .arguments import Step
 from .contact import KINEMATIC, Contacts
 from .library import newton
-from .line_search import LineSearch
 from .links import LinkForces
 from .others import Others
 from .state import NAMESPACE
@@ -68,7 +68,7 @@ class ImplicitSteps(Steps):
         self._still = wp.zeros(model.particle_count, dtype=wp.vec3, device=self.device)
         self._solver = ConjugateGradients(self._operator, count, most=ITERATIONS)  # type: ignore[arg-type]
         self._solver.tolerance.fill_(TOLERANCE)
-        self._search = LineSearch(self._unknowns, self._links, self.device)
+        self._search = LineSearch(self._unknowns.worlds, self._unknowns.count, self._links, self.device)
         self._rounds, self._going = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
         self._iterations = wp.zeros(self._unknowns.worlds, dtype=wp.int32, device=self.device)
 

@@ -60,7 +60,7 @@ class LinkForces:
         self._launch(kernels.update_links, [self._dt, self._adhesion, d], [self._links])
 
     def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None:
-        """Launch the power of links along a change of motions; see ``LineSearch``."""
+        """Launch the power of links along a change of motions; see ``solvers.implicit.line_search``."""
         inputs = [self._dt, self._adhesion, self._links, self._unknowns.count, d, change, search]
         self._launch(kernels.add_link_slopes, inputs, [slopes])
 

@@ -87,12 +87,12 @@ def checked_contact(
     return given, Contact() if contact is None else contact
 
 
-def check_implicit(integrator: Integrator, *, touches: bool, soft_touches: bool, remeshes: bool, ordered: bool) -> None:
+def check_implicit(integrator: Integrator, *, touches: bool, remeshes: bool, ordered: bool) -> None:
     """Check that an implicit integrator supports what the simulation needs.
 
     Args:
         integrator: Any integrator.
-        touches, soft_touches, remeshes: Whether bodies touch something, other bodies or themselves, or are remeshed.
+        touches, remeshes: Whether bodies touch something, or are remeshed.
         ordered: Whether sums must have a fixed order on CUDA, which products with the stiffness do not have.
 
     Raises:
@@ -101,26 +101,15 @@ def check_implicit(integrator: Integrator, *, touches: bool, soft_touches: bool,
     if not integrator.is_implicit:
         return
     name = type(integrator).__name__
-    if touches:
-        _check_touching(integrator, soft_touches=soft_touches)
-    if remeshes and isinstance(integrator, QuasiStatic):
-        raise InputError(f"{name} does not support remeshing; with remesh the integrator must be another one")
-    if ordered:
-        raise InputError(f"{name} is not reproducible on CUDA; with deterministic=True it must be SymplecticEuler")
-
-
-def _check_touching(integrator: Integrator, *, soft_touches: bool) -> None:
-    name = type(integrator).__name__
-    if not isinstance(integrator, BackwardEuler) or integrator.tolerance is not None:
+    if touches and (not isinstance(integrator, BackwardEuler) or integrator.tolerance is not None):
         raise InputError(
             f"{name} does not support contact; the integrator must be SymplecticEuler, or BackwardEuler without "
             "a tolerance"
         )
-    if soft_touches:
-        raise InputError(
-            f"{name} does not support contact of soft surfaces; with several bodies, or self_contact, the integrator "
-            "must be SymplecticEuler"
-        )
+    if remeshes and isinstance(integrator, QuasiStatic):
+        raise InputError(f"{name} does not support remeshing; with remesh the integrator must be another one")
+    if ordered:
+        raise InputError(f"{name} is not reproducible on CUDA; with deterministic=True it must be SymplecticEuler")
 
 
 def check_constraints(system: System, stepper: Stepper, integrator: Integrator) -> None:

@@ -112,7 +112,6 @@ class Simulation(Clock):
         check_implicit(
             self.integrator,
             touches=touching is not None,
-            soft_touches=touching is not None and (len(self.bodies) > 1 or touching[1].self_contact),
             remeshes=remesh is not None,
             ordered=ordered,
         )

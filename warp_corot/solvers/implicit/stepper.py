@@ -15,12 +15,13 @@ from warp_corot.kernels.implicit import steps as kernels
 from warp_corot.kernels.stepping.integrate import follow_trajectory
 from warp_corot.solvers.integrator import Stepper
 
+from .joined import JoinedSolve
 from .lagged import Lagged
 from .multigrid import Multigrid
 from .newton import Newton
 from .preconditioners import preconditioner_of
 from .tangent import TangentOperator
-from .touching import Touching, TouchingSolve
+from .touching import Held, Touching, TouchingSolve
 
 if TYPE_CHECKING:
     from warp_corot.solvers.system import System
@@ -39,6 +40,7 @@ class ImplicitStepper(Stepper):
         totals: Steps, iterations of Newton's method and of linear solves, and steps that did not come within the
             tolerance, of all bodies, int64 [4].
         touching: The constraints.
+        rows: What acts between bodies, or None.
     """
 
     graph_steps = 8
@@ -49,6 +51,8 @@ class ImplicitStepper(Stepper):
         system.lag, system.is_implicit = 0.0, True
         self.totals = wp.zeros(4, dtype=wp.int64, device=system.device)
         self.touching = cast("list[Touching]", list(system.constraints))
+        self.rows = next((rows for each in self.touching if (rows := each.joined_rows()) is not None), None)
+        self._joined: JoinedSolve | None = None
         self._bodies = [BodySteps(self, k) for k in range(len(system.bodies))]
         system.histories += [array for body in self._bodies for array in body.history]
 
@@ -61,8 +65,13 @@ class ImplicitStepper(Stepper):
         return kept | {f"setup.{k}.{name}": array for k, each in lagged for name, array in each.state.items()}
 
     def prepare(self) -> None:
+        before = [body.newton for body in self._bodies]
         for body in self._bodies:
             body.prepare()
+        if self.rows is not None:
+            self.rows.prepare()
+            if self._joined is None or before != [body.newton for body in self._bodies]:
+                self._join()
 
     def forces(self, offset: int = 0) -> None:
         for k in range(len(self._bodies)):
@@ -76,7 +85,33 @@ class ImplicitStepper(Stepper):
             for each in self.touching:
                 each.launch_motion(offset)
             for body in self._bodies:
-                body.launch(offset)
+                body.launch_begin(offset)
+                if self._joined is None:
+                    body.launch_residual()
+                    body.launch_solve()
+                    body.launch_end(offset)
+            if self._joined is not None:
+                self._launch_joined(offset, self._joined)
+
+    def _launch_joined(self, offset: int, joined: JoinedSolve) -> None:
+        """Launch a step of all bodies together, once all have begun it."""
+        for body in self._bodies:
+            body.launch_residual()
+        joined.launch(offset)
+        for body in self._bodies:
+            body.take_solved(joined)
+            body.launch_end(offset)
+
+    def _join(self) -> None:
+        assert self.rows is not None
+        self._joined = JoinedSolve(
+            [body.newton for body in self._bodies],
+            [body.held for body in self._bodies],
+            self.rows,
+            worlds=self.system.bodies[0].worlds,
+            tolerance=self.integrator.linear_tolerance,
+            most=self.integrator.linear_iterations,
+        )
 
     def add_other_forces(self) -> None:
         """Launch all forces besides elasticity in the present state to ``state.forces`` of the bodies."""
@@ -104,6 +139,7 @@ class BodySteps:
         k: Which body of the system.
 
     Attributes:
+        held: What holds nodes, or None.
         history: What a step leaves for the next one, and the state in which it left the body, vec4 each.
         before: Velocities before the last step, of which the guess of the next one is made, vec4; NaN before the first.
         lagged: The preconditioner if it is kept over many steps, else None.
@@ -111,6 +147,8 @@ class BodySteps:
 
     def __init__(self, stepper: ImplicitStepper, k: int):
         self.stepper, self.k = stepper, k
+        self._counts: list[wp.array] = []
+        self._good = 0
         system, options = stepper.system, stepper.integrator
         self.body, self.field, self.system = system.bodies[k], system.fields[k], system
         self.device = self.body.device
@@ -123,7 +161,8 @@ class BodySteps:
         self.lagged: Lagged | None = None
         if not exact and isinstance(self._preconditioner, Multigrid):
             self._preconditioner = self.lagged = Lagged(self._preconditioner, self.operator)
-        self._held = [each.active_set(k) for each in stepper.touching]
+        sets = [each.active_set(k) for each in stepper.touching]
+        self.held: Held | None = next((each for each in sets if each is not None), None)
         self._make_solvers()
         like = self.body.state.displacements
         self._none = wp.zeros(1, dtype=wp.vec4, device=self.device)
@@ -153,8 +192,8 @@ class BodySteps:
             others=self._add_others,
         )
         self.touching: TouchingSolve | None = None
-        for held in self._held:
-            self.touching = TouchingSolve(self.newton, held)
+        if self.held is not None and self.stepper.rows is None:
+            self.touching = TouchingSolve(self.newton, self.held)
 
     def prepare(self) -> None:
         """Have all that launches use, so that they can be recorded."""
@@ -163,8 +202,8 @@ class BodySteps:
             self.lagged.prepare()
         elif isinstance(self._preconditioner, Multigrid):
             self._preconditioner.follow()
-        for held in self._held:
-            held.prepare()
+        if self.held is not None:
+            self.held.prepare()
         if self._version != self.body.version:
             if self._is_prepared:
                 self.before.fill_(np.nan)
@@ -177,31 +216,50 @@ class BodySteps:
         self.field.elastic_forces(u)
         self.field.potentials(u)
 
-    def launch(self, offset: int) -> None:
-        """Launch the ``offset``-th step since the clock was last advanced."""
-        newton, solver = self.newton, self.newton.solver
+    def launch_begin(self, offset: int) -> None:
+        """Launch what the ``offset``-th step since the clock was last advanced begins with."""
         self.body.conditions.follow_activations(self.system.pace, offset + 1)
         self._follow_trajectories(offset)
         self._begin()
+
+    def launch_residual(self) -> None:
+        """Launch the forces that are out of balance, if the step is solved for by itself."""
         if self.stepper.integrator.tolerance is None:
-            newton.launch_residual()
-            iterations = solver.iterations
-            if self.touching is None:
-                newton.launch_solve(guessed=True)
-            else:
-                self.touching.launch()
-                iterations = self.touching.iterations
-            if self.lagged is not None:
-                self.lagged.judge(iterations, solver.status)
-            self._launch(kernels.take_step, [newton.step], [newton.increment, self.body.state.displacements])
-            self.system.ranks.complete(self.k, self.body.state.displacements)
-            counts, good = [self._one, iterations, solver.status], conjugate_gradients.CONVERGED
-        else:
+            self.newton.launch_residual()
+
+    def launch_solve(self) -> None:
+        """Launch the solve for the step."""
+        newton, solver = self.newton, self.newton.solver
+        if self.stepper.integrator.tolerance is not None:
             newton.launch_begin()
             wp.capture_while(newton.running, newton.launch_iteration)
-            counts, good = [newton.iterations, newton.solved, newton.status], kernels_of_newton.CONVERGED
-        self._end(offset, counts[-1])
-        wp.launch(kernels.count_solves, 1, [*counts, int(good)], [self.stepper.totals], device=self.device)
+            self._counts = [newton.iterations, newton.solved, newton.status]
+            self._good = int(kernels_of_newton.CONVERGED)
+            return
+        iterations = solver.iterations
+        if self.touching is None:
+            newton.launch_solve(guessed=True)
+        else:
+            self.touching.launch()
+            iterations = self.touching.iterations
+        self._take(iterations, solver.status)
+
+    def take_solved(self, joined: JoinedSolve) -> None:
+        """Launch that the step is that of a solve of all bodies."""
+        self._take(joined.iterations, joined.status)
+
+    def _take(self, iterations: wp.array, status: wp.array) -> None:
+        newton = self.newton
+        if self.lagged is not None:
+            self.lagged.judge(iterations, status)
+        self._launch(kernels.take_step, [newton.step], [newton.increment, self.body.state.displacements])
+        self.system.ranks.complete(self.k, self.body.state.displacements)
+        self._counts, self._good = [self._one, iterations, status], int(conjugate_gradients.CONVERGED)
+
+    def launch_end(self, offset: int) -> None:
+        """Launch the state after the step, and what it has cost."""
+        self._end(offset, self._counts[-1])
+        wp.launch(kernels.count_solves, 1, [*self._counts, self._good], [self.stepper.totals], device=self.device)
 
     # --- pieces ------------------------------------------------------------------------------------------------------
 

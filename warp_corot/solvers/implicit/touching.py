@@ -34,6 +34,33 @@ class Held(Protocol):
     def launch_end(self, d: wp.array) -> None: ...
 
 
+class Rows(Protocol):
+    """Forces between bodies, such as ``contact.joined_rows.JoinedRows``, which says what its members do."""
+
+    locates: wp.array
+
+    @property
+    def total(self) -> wp.array: ...
+
+    def prepare(self) -> None: ...
+
+    def launch_begin(self, k: int, first: int, blocks: wp.array, increment: wp.array, guess: wp.array) -> None: ...
+
+    def launch_search(self, offset: int) -> None: ...
+
+    def launch_located(self, d: wp.array, *, is_first: bool) -> None: ...
+
+    def update(self, d: wp.array) -> None: ...
+
+    def add_forces(self, y: wp.array) -> None: ...
+
+    def add_products(self, x: wp.array, y: wp.array) -> None: ...
+
+    def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None: ...
+
+    def launch_end(self, d: wp.array) -> None: ...
+
+
 class Touching(Protocol):
     """A constraint that implicit steps resolve, such as ``contact.contacts.Contacts``."""
 
@@ -41,8 +68,12 @@ class Touching(Protocol):
         """Launch where obstacles go in the ``offset``-th step since the clock was last advanced."""
         ...
 
-    def active_set(self, k: int) -> Held:
-        """The contact of the k-th body."""
+    def active_set(self, k: int) -> Held | None:
+        """The contact of the k-th body with obstacles, if there are any."""
+        ...
+
+    def joined_rows(self) -> Rows | None:
+        """The contact of bodies with one another, if they may touch."""
         ...
 
 

@@ -1,18 +1,20 @@
 """The share of a linear solve's answer that contacts allow: the first at which the power along it vanishes.
 
-Along a change c from motions d, the power of all forces is g(s) = c . (b - A d) - s c . A c + links(s), with A without
-links. It falls with s, as everything has an energy that is convex. Worlds in which g(1) is not far below zero take all.
+Along a change c from motions d, the power of all forces is g(s) = c . (b - A d) - s c . A c + contacts(s), with A
+without contacts. It falls with s, as everything has an energy that is convex. Worlds in which g(1) is not far below
+zero take all.
 """
 
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
-from warp_corot.kernels.implicit.sums import add_up
+
+from .sums import add_up
 
 wp.set_module_options({"enable_backward": False})
 
 #: Columns of a world's search: the share that is tried, the ends of the bracket, and the power at these; the power at
-#: zero without links, and what it loses with the share.
+#: zero without contacts, and what it loses with the share.
 TRIED, LOW, HIGH, AT_LOW, AT_HIGH, POWER, LOSS = (wp.constant(k) for k in range(7))
 COLUMNS = 7
 #: Power at the end of the whole change, over that at its beginning, with which it is taken.

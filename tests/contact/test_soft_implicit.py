@@ -1,0 +1,139 @@
+"""Soft bodies against one another and against themselves, in implicit steps of 16 ms."""
+
+import numpy as np
+import pytest
+from half_balls import CONTACT, POISSON, RADIUS, YOUNG, half_ball
+from soft_surfaces import DOWN, block, force_on, horseshoe, roof, weight
+
+import warp_corot as wc
+
+EULER = wc.BackwardEuler(dt=0.016)
+
+
+@pytest.mark.parametrize("alike", [True, False], ids=["alike", "unlike"])
+def test_a_block_on_a_block_carries_its_weight(device, alike):
+    low = block(device, 0.0)
+    high = block(device, 0.0202) if alike else block(device, 0.0202, cells=(1, 1, 1), level=4, at=0.011)
+    ground = wc.Ground()
+    sim = wc.Simulation([low, high], obstacles=ground, gravity=DOWN, integrator=EULER)
+    sim.advance_steps(25)
+    assert force_on(high)[2] == pytest.approx(weight(high), rel=1e-3)
+    on_ground = ground.wrench.numpy()[0].astype(float)[:3]
+    assert on_ground[2] == pytest.approx(-weight(high) - weight(low), rel=1e-3)
+    np.testing.assert_allclose(force_on(low) + force_on(high) + on_ground, 0.0, atol=1e-5 * weight(low))
+    felt = sum(point.force[2] for point in sim.contacts() if point.body is high)
+    felt -= sum(point.force[2] for point in sim.contacts() if point.other is high)
+    assert felt == pytest.approx(weight(high), rel=1e-3)
+    assert high.positions.numpy()[:, 2].min() > 0.0195
+
+
+def test_two_elastic_balls_touch_as_hertz_says(device):
+    """Meshes that do not fit one another, one turned against the other; as in explicit steps."""
+    radius = 4.0 * RADIUS
+    depth = CONTACT**2 / (0.5 * radius)
+    force = 4.0 / 3.0 * (0.5 * YOUNG / (1.0 - POISSON**2)) * np.sqrt(0.5 * radius) * depth**1.5
+    both = [half_ball(device, level, radius, force, 0.5 * depth, 0.3 * k) for k, level in enumerate((12, 9))]
+    contact, integrator = wc.Contact(friction=0.0), wc.BackwardEuler(dt=0.02)
+    sim = wc.Simulation(both, contact=contact, gravity=(0.0, 0.0, 0.0), integrator=integrator)
+    sim.advance_steps(12)
+    low, high = (body.contact_forces.numpy().astype(float).sum(axis=0) for body in both)
+    assert high[2] == pytest.approx(force, rel=0.03)
+    np.testing.assert_allclose(low, -high, atol=1e-6 * force)
+
+
+@pytest.mark.parametrize("speed", [1.0, 5.0])
+def test_nothing_passes(device, speed):
+    """A block that goes up to four times its own height in a step falls on one as thick."""
+    low, high = block(device, 0.0), block(device, 0.05, cells=(1, 1, 1), level=4, at=0.011)
+    low.fix("z == zmin")
+    high.velocities = np.tile((0.0, 0.0, -speed), (high.node_count, 1))
+    sim = wc.Simulation([low, high], contact=wc.Contact(), gravity=DOWN, integrator=EULER)
+    for _ in range(6):
+        sim.advance_steps(2)
+        assert high.positions.numpy()[:, 2].min() > 0.012
+        assert high.positions.numpy()[:, 2].mean() > low.positions.numpy()[:, 2].max()
+        np.testing.assert_allclose(force_on(high)[:2], 0.0, atol=0.5 * max(force_on(high)[2], weight(high)))
+
+
+@pytest.mark.parametrize("speed", [0.2, 3.0])
+def test_an_edge_does_not_pass_an_edge(device, speed):
+    low = roof(device, 0, 0.0)
+    top = np.sqrt(2.0) * 0.01
+    high = roof(device, 1, top + 0.0005)
+    moved = high.positions.numpy()
+    moved[:, :2] += 0.0017
+    high.positions = moved
+    low.fix("z < zmin + 0.003")
+    high.velocities = np.tile((0.0, 0.0, -speed), (high.node_count, 1))
+    sim = wc.Simulation([low, high], contact=wc.Contact(), gravity=(0.0, 0.0, 0.0), integrator=wc.BackwardEuler(0.004))
+    touched, edges = 0.0, 0
+    for _ in range(5):
+        sim.advance_steps(1)
+        touched = max(touched, force_on(high)[2])
+        edges += sum(len(point.nodes) == 2 for point in sim.contacts())
+        np.testing.assert_allclose(force_on(low) + force_on(high), 0.0, atol=1e-5 * (touched + 1e-3))
+    assert touched > 0.0
+    assert edges > 0
+    crossing = [
+        np.linalg.norm((each.mesh.points - each.mesh.points.mean(axis=0)), axis=1) < 0.006 for each in (low, high)
+    ]
+    heights = [each.positions.numpy()[near, 2].mean() for each, near in zip((low, high), crossing, strict=True)]
+    assert heights[1] - heights[0] > 0.5 * top
+
+
+def test_a_soft_block_rests_on_a_soft_slope(device):
+    """At 0.95 of the angle of friction, on a mesh unlike its own."""
+    angle = 0.95 * np.arctan(0.4)
+    low, high = block(device, 0.0), block(device, 0.0200005, cells=(1, 1, 1), at=0.0107)
+    low.fix("z == zmin")
+    gravity = (9.81 * np.sin(angle), 0.0, -9.81 * np.cos(angle))
+    sim = wc.Simulation([low, high], contact=wc.Contact(friction=0.4), gravity=gravity, integrator=EULER)
+    sim.advance_steps(30)
+    before = high.positions.numpy().astype(float)
+    sim.advance_steps(30)
+    assert np.abs(high.positions.numpy() - before).max() < 2e-6
+    along = force_on(high)[0] / force_on(high)[2]
+    assert along == pytest.approx(-np.tan(angle), rel=2e-3)
+
+
+@pytest.mark.parametrize("itself", [True, False])
+def test_a_folded_body_touches_itself(device, itself):
+    """The arms of a horseshoe are bent together by more than the gap between them; without contact they cross."""
+    body = horseshoe(device)
+    x = body.mesh.points
+    arms = [np.flatnonzero((np.abs(x[:, 0] - side) < 1e-6) & (x[:, 2] > 0.03)) for side in (0.0, 0.05)]
+    for nodes, sign in zip(arms, (1.0, -1.0), strict=True):
+        body.prescribe(nodes, times=[0.0, 0.1], displacements=[(0, 0, 0), (sign * 0.007, 0, 0)])
+    contact = wc.Contact(self_contact=itself)
+    sim = wc.Simulation(body, contact=contact, gravity=(0.0, 0.0, 0.0), integrator=EULER)
+    sim.advance_steps(12)
+    now = body.positions.numpy().astype(float)
+    left = np.flatnonzero((np.abs(x[:, 0] - 0.02) < 1e-6) & (x[:, 2] > 0.015))
+    right = np.flatnonzero((np.abs(x[:, 0] - 0.03) < 1e-6) & (x[:, 2] > 0.015))
+    crossing = now[left, 0].max() - now[right, 0].min()
+    if itself:
+        assert crossing < 2e-5
+        np.testing.assert_allclose(force_on(body), 0.0, atol=1e-5)
+        assert np.abs(body.contact_forces.numpy()).max() > 1e-3
+    else:
+        assert crossing > 1e-3
+
+
+def test_worlds_and_saved_runs(device, tmp_path):
+    """Blocks of several worlds lie in the same place and do not meet; a run that is loaded goes on bit by bit."""
+    low, high = (block(device, z, cells=(1, 1, 1), worlds=2) for z in (0.0, 0.0202))
+    low.fix("z == zmin")
+    lifted = high.positions.numpy()
+    lifted[high.world_node_count :, 2] += 0.1
+    high.positions = lifted
+    sim = wc.Simulation([low, high], contact=wc.Contact(), gravity=DOWN, integrator=EULER)
+    sim.advance_steps(4)
+    forces = high.contact_forces.numpy().reshape(2, -1, 3)
+    assert forces[0, :, 2].sum() > 0.0
+    assert not forces[1].any()
+    sim.save(tmp_path / "state.npz")
+    sim.advance_steps(3)
+    later = wc.Simulation.load(tmp_path / "state.npz")
+    later.advance_steps(3)
+    error = np.abs(later.bodies[1].displacements.numpy() - high.displacements.numpy()).max()
+    assert error <= (0.0 if high.device.is_cpu else 1e-6)

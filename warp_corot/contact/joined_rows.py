@@ -1,0 +1,124 @@
+"""Soft surfaces against one another in implicit steps; see ``kernels.contact.joined``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import warp as wp
+
+from warp_corot.kernels.contact import joined as kernels
+from warp_corot.kernels.contact.law import Law
+from warp_corot.solvers.system import System
+
+from .pairs import Pairs
+
+#: Fields of ``Joined`` for places and for pairs.
+OF_PLACES = {"entry": wp.int32, "start": wp.vec3, "carried": wp.vec3, "compliance": wp.float32, "crowd": wp.float32}
+OF_PAIRS = {
+    "base": wp.vec3,
+    "given": wp.vec3,
+    "target": wp.float32,
+    "stiffness": wp.float32,
+    "multiplier": wp.vec3,
+    "most": wp.float32,
+    "force": wp.vec3,
+    "derivative": wp.mat33,
+}
+
+
+class JoinedRows:
+    """Pairs of soft surfaces as springs between the bodies of an implicit step.
+
+    Args:
+        system: The bodies.
+        pairs: Pairs of their surfaces.
+        law: How fast things that overlap are pushed apart.
+
+    Attributes:
+        locates: Whether pairs are located in the next round, int32 [1].
+        total: How many pairs there are, int32 [1].
+    """
+
+    def __init__(self, system: System, pairs: Pairs, law: Law):
+        self._system, self._pairs, self._law, self.device = system, pairs, law, system.device
+        self.locates = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self._made = (-1, -1)
+        self.prepare()
+
+    @property
+    def total(self) -> wp.array:
+        return self._pairs.rows.total
+
+    def prepare(self) -> None:
+        """Take the present surfaces and rooms; not while launches are recorded."""
+        sizes = (self._pairs.surface.count, self._pairs.room)
+        if sizes == self._made:
+            return
+        self._made, joined = sizes, kernels.Joined()
+        for fields, size in ((OF_PLACES, sizes[0]), (OF_PAIRS, sizes[1])):
+            for name, dtype in fields.items():
+                setattr(joined, name, wp.zeros(size, dtype=dtype, device=self.device))
+        joined.locates = self.locates
+        self._joined = joined
+        self._added = wp.zeros(sizes[0], dtype=wp.vec3, device=self.device)
+
+    # --- launches ----------------------------------------------------------------------------------------------------
+
+    def launch_begin(self, k: int, first: int, blocks: wp.array, increment: wp.array, guess: wp.array) -> None:
+        """Launch where the k-th body begins.
+
+        Args:
+            k: Which body.
+            first: Its first entry in vectors of all bodies.
+            blocks: The blocks on the diagonal of its matrix, mat33.
+            increment: How far held nodes have gone in the step [m], vec4.
+            guess: How far nodes may go [m], vec4.
+        """
+        body = self._system.bodies[k]
+        state = body.state
+        inputs = [first, body.conditions.inverse_mass, blocks, state.rest, state.displacements, increment, guess]
+        self._on_body(k, kernels.begin_places, inputs, [self._pairs.surface.arrays, self._joined])
+
+    def launch_search(self, offset: int) -> None:
+        """Launch a search for pairs, if it is due."""
+        self._pairs.search.launch(offset)
+
+    def launch_located(self, d: wp.array, *, is_first: bool) -> None:
+        """Launch where pairs are closest, at the beginning of the step or after motions d, if it is time to."""
+        surface, joined = self._pairs.surface.arrays, self._joined
+        inputs = [int(is_first), d, joined, surface]
+        wp.launch(kernels.place_nodes, self._pairs.surface.count, inputs, device=self.device)
+        inputs = [int(is_first), self._law, self._system.pace.arrays, d, surface, self._pairs.meeting]
+        self._on_rows(kernels.locate_rows, [*inputs, self._pairs.rows, joined])
+        self._on_rows(kernels.stiffen_rows, [self._pairs.rows, joined])
+
+    def update(self, d: wp.array) -> None:
+        """Launch forces and their derivatives after motions d."""
+        self._on_rows(kernels.update_rows, [self._pairs.friction, d, self._pairs.rows, self._joined])
+
+    def add_forces(self, y: wp.array) -> None:
+        self._on_rows(kernels.add_row_forces, [self._pairs.rows, self._joined, y])
+
+    def add_products(self, x: wp.array, y: wp.array) -> None:
+        self._on_rows(kernels.add_row_products, [self._pairs.rows, self._joined, x, y])
+
+    def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None:
+        """Launch the power along a change; see ``solvers.implicit.line_search``."""
+        self._on_rows(kernels.add_row_slopes, [self._pairs.rows, self._joined, d, change, search, slopes])
+
+    def launch_end(self, d: wp.array) -> None:
+        """Launch what users read of contact, and whether it is time to search again."""
+        self._on_rows(kernels.end_rows, [self._pairs.rows, self._joined, self._added])
+        for k, body in enumerate(self._system.bodies):
+            outputs = [self._added, self._pairs.surface.arrays, body.state.contact_forces]
+            self._on_body(k, kernels.end_places, [d, self._joined], outputs)
+        self._pairs.search.launch_after()
+
+    def _on_rows(self, kernel: wp.Kernel, inputs: Sequence) -> None:
+        threads = self._pairs.search.threads(self._pairs.room)
+        wp.launch(kernel, threads, [threads, *inputs], device=self.device)
+
+    def _on_body(self, k: int, kernel: wp.Kernel, inputs: Sequence, outputs: Sequence) -> None:
+        part = self._pairs.surface.parts[k]
+        count = self._system.worlds * part.nodes
+        wp.launch(kernel, count, [part.start, *inputs], list(outputs), device=self.device)

@@ -1,0 +1,203 @@
+"""One implicit step of all bodies together, whose soft surfaces touch one another or themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import warp as wp
+
+from warp_corot.kernels.contact import joined as kernels
+from warp_corot.kernels.implicit.tangent import find_rest
+
+from .conjugate_gradients import ConjugateGradients
+from .line_search import LineSearch
+from .newton import Newton
+from .operator import LinearOperator, Preconditioner
+from .touching import Held, Rows
+
+#: Linear solves of a step at most.
+ROUNDS = 40
+
+
+class Parts:
+    """The bodies' parts of vectors that they share.
+
+    Args:
+        lengths: How many entries each body has.
+        device: Where.
+    """
+
+    def __init__(self, lengths: Sequence[int], device: wp.Device):
+        self.device, self.count = device, sum(lengths)
+        self.starts = [sum(lengths[:k]) for k in range(len(lengths))]
+        self._lengths = list(lengths)
+        self._views: dict[int, list[wp.array]] = {}
+
+    def of(self, vector: wp.array) -> list[wp.array]:
+        """Each body's part of a vector."""
+        if vector.ptr not in self._views:
+            ends = zip(self.starts, self._lengths, strict=True)
+            self._views[vector.ptr] = [vector[start : start + length] for start, length in ends]
+        return self._views[vector.ptr]
+
+
+class JoinedOperator:
+    """S (A + D + R) of all bodies: A of each, the drag D of obstacles, and the derivative R of forces between them."""
+
+    def __init__(self, operators: Sequence[LinearOperator], held: Sequence[Held | None], rows: Rows, parts: Parts):
+        self._operators, self._held, self._rows, self._parts = operators, held, rows, parts
+        self.device, self.worlds, self.node_count = parts.device, 1, parts.count
+
+    def apply(self, x: wp.array, y: wp.array) -> None:
+        self._apply_each(x, y)
+        self._rows.add_products(x, y)
+        self._drag(x, y)
+
+    def apply_apart(self, x: wp.array, y: wp.array) -> None:
+        """Launch y = S (A + D) x."""
+        self._apply_each(x, y)
+        self._drag(x, y)
+
+    def apply_freely(self, x: wp.array, y: wp.array) -> None:
+        """Launch y = A x."""
+        self._apply_each(x, y)
+
+    def _apply_each(self, x: wp.array, y: wp.array) -> None:
+        for operator, a, b in zip(self._operators, self._parts.of(x), self._parts.of(y), strict=True):
+            operator.apply(a, b)
+
+    def _drag(self, x: wp.array, y: wp.array) -> None:
+        for held, a, b in zip(self._held, self._parts.of(x), self._parts.of(y), strict=True):
+            if held is not None:
+                held.launch_drag(a, b)
+
+
+class JoinedPreconditioner:
+    """S B of each body's own preconditioner B."""
+
+    def __init__(self, preconditioners: Sequence[Preconditioner], held: Sequence[Held | None], parts: Parts):
+        self._preconditioners, self._held, self._parts = preconditioners, held, parts
+
+    def update(self, operator: LinearOperator) -> None:
+        """Bodies' own are kept up to date by ``JoinedSolve``."""
+
+    def apply(self, r: wp.array, z: wp.array) -> None:
+        each = zip(self._preconditioners, self._held, self._parts.of(r), self._parts.of(z), strict=True)
+        for preconditioner, held, a, b in each:
+            preconditioner.apply(a, b)
+            if held is not None:
+                held.launch_free(b)
+
+
+class JoinedSolve:
+    """Solves for the steps of all bodies, with one linearisation of each.
+
+    Args:
+        newtons: Of the bodies; their operators, residuals, steps and preconditioners are used.
+        held: Obstacles at each body, or None.
+        rows: What acts between them.
+        worlds: How many worlds bodies have; they are solved together.
+        tolerance: Residual of a linear solve over the forces that are out of balance at the beginning.
+        most: Iterations of a linear solve at most.
+
+    Attributes:
+        iterations, status: Of the linear solves of the step, the same for every world, int32 [worlds].
+    """
+
+    def __init__(
+        self,
+        newtons: Sequence[Newton],
+        held: Sequence[Held | None],
+        rows: Rows,
+        *,
+        worlds: int,
+        tolerance: float,
+        most: int,
+    ):
+        self._newtons, self._held, self._rows, self._worlds = newtons, held, rows, worlds
+        self.device = newtons[0].device
+        self._parts = parts = Parts([len(newton.step) for newton in newtons], self.device)
+        self._d, self._b, self._rest, self._r, self._q, self._change = (
+            wp.zeros(parts.count, dtype=wp.vec4, device=self.device) for _ in range(6)
+        )
+        for newton, step, residual in zip(newtons, parts.of(self._d), parts.of(self._b), strict=True):
+            newton.step, newton.residual = step, residual
+        self._operator = JoinedOperator([newton.operator for newton in newtons], held, rows, parts)
+        self._preconditioner = JoinedPreconditioner([newton.preconditioner for newton in newtons], held, parts)
+        self._solver = ConjugateGradients(self._operator, parts.count, most=most)  # type: ignore[arg-type]
+        self._solver.tolerance.fill_(tolerance)
+        self._search = LineSearch(1, parts.count, rows, self.device)
+        self._going, self._rounds, self._linear, self._changed = (
+            wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(4)
+        )
+        self._both = wp.zeros((2, worlds), dtype=wp.int32, device=self.device)
+        self.iterations, self.status = self._both[0], self._both[1]
+
+    def launch(self, offset: int) -> None:
+        """Launch the steps of all bodies, from guesses of them, after their residuals."""
+        rows = self._rows
+        for k, newton in enumerate(self._newtons):
+            operator = newton.operator
+            operator.take(newton.body.state.displacements)
+            rows.launch_begin(k, self._parts.starts[k], operator.diagonal_blocks(), newton.increment, newton.step)
+            newton.preconditioner.update(operator)
+        rows.launch_search(offset)
+        for held, d in self._each_held(self._d):
+            held.launch_begin(d)
+        rows.locates.fill_(1)
+        rows.launch_located(self._d, is_first=True)
+        self._rounds.zero_()
+        self._linear.zero_()
+        self._changed.zero_()
+        rows.locates.zero_()
+        self._going.fill_(1)
+        wp.capture_while(self._going, self._round)
+        for held, d in self._each_held(self._d):
+            held.launch_end(d)
+        rows.launch_end(self._d)
+        wp.launch(kernels.spread, self._worlds, [self._linear, self._solver.status, self._both], device=self.device)
+
+    def _round(self) -> None:
+        rows, d = self._rows, self._d
+        for held, part in self._each_held(d):
+            held.launch_imposed(part)
+        rows.launch_located(d, is_first=False)
+        rows.update(d)
+        self._operator.apply_freely(d, self._q)
+        self._launch(find_rest, [self._b, self._q, self._rest])
+        for (held, part), rest in zip(self._each_held(d), self._held_parts(self._rest), strict=True):
+            held.launch_friction(part, rest)
+        wp.copy(self._r, self._rest)
+        rows.add_forces(self._r)
+        for held, r in self._each_held(self._r):
+            held.launch_free(r)
+        self._solver.launch(self._preconditioner, self._r, self._change, like=self._b)
+        self._operator.apply_apart(self._change, self._q)
+        self._search.launch(self._rest, self._q, self._change, d)
+        self._judge()
+
+    def _judge(self) -> None:
+        """Launch which nodes obstacles hold from now on, and whether another round is needed."""
+        rows, d = self._rows, self._d
+        rows.update(d)
+        self._operator.apply_freely(d, self._q)
+        wp.copy(self._r, self._b)
+        rows.add_forces(self._r)
+        each = zip(self._each_held(d), self._held_parts(self._r), self._held_parts(self._q), strict=True)
+        for (held, part), b, q in each:
+            held.launch_judgement(b, q, part)
+            wp.launch(kernels.gather_change, 1, [held.changed, self._changed], device=self.device)
+        inputs = [self._solver.iterations, self._changed, rows.total, ROUNDS]
+        outputs = [rows.locates, self._rounds, self._linear, self._going]
+        wp.launch(kernels.judge_round, 1, inputs, outputs, device=self.device)
+
+    def _each_held(self, vector: wp.array) -> list[tuple[Held, wp.array]]:
+        """Obstacles at bodies, and these bodies' parts of a vector."""
+        each = zip(self._held, self._parts.of(vector), strict=True)
+        return [(held, part) for held, part in each if held is not None]
+
+    def _held_parts(self, vector: wp.array) -> list[wp.array]:
+        return [part for _, part in self._each_held(vector)]
+
+    def _launch(self, kernel: wp.Kernel, arguments: list) -> None:
+        wp.launch(kernel, self._parts.count, arguments, device=self.device)

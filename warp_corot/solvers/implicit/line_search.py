@@ -1,0 +1,62 @@
+"""Line searches of steps with contacts that open and close; see ``kernels.implicit.line_search``."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import warp as wp
+
+from warp_corot.kernels.implicit import line_search as kernels
+
+from .sums import WorldSums
+
+#: Shares that are tried, with 0 and 1.
+TRIALS = 10
+
+
+class Contacts(Protocol):
+    """Forces of contacts as functions of the motions in a step."""
+
+    def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None:
+        """Launch that the power along a change from motions d, at the share in ``search``, is added to that of its
+        world, float64 [worlds]."""
+        ...
+
+
+class LineSearch:
+    """Finds how much of a change of the motions to take, in each world.
+
+    Args:
+        worlds: How many worlds.
+        count: Entries of each.
+        contacts: What opens and closes.
+        device: Where.
+    """
+
+    def __init__(self, worlds: int, count: int, contacts: Contacts, device: wp.Device):
+        self._worlds, self._count, self._contacts, self.device = worlds, count, contacts, device
+        self._power, self._loss = (WorldSums(worlds, count, 1, device) for _ in range(2))
+        self._search = wp.zeros((worlds, kernels.COLUMNS), dtype=wp.float64, device=device)
+        self._slopes = wp.zeros(worlds, dtype=wp.float64, device=device)
+
+    def launch(self, rest: wp.array, product: wp.array, change: wp.array, d: wp.array) -> None:
+        """Launch d += share of the change.
+
+        Args:
+            rest: b - A d, where A has no contacts.
+            product: A change.
+            change: The change, zero at entries that are not free.
+            d: Motions.
+        """
+        self._power.launch_products(change, rest, 0)
+        self._loss.launch_products(change, product, 0)
+        lanes = self._power.lanes
+        inputs = [self._power.parts, self._loss.parts, lanes]
+        wp.launch(kernels.begin_search, (self._worlds, lanes), inputs, [self._search, self._slopes], device=self.device)
+        for number in range(TRIALS):
+            self._contacts.add_slopes(d, change, self._search, self._slopes)
+            self._launch(kernels.take_trial, self._worlds, [number, self._search, self._slopes])
+        self._launch(kernels.add_share, self._worlds * self._count, [self._search, self._count, change, d])
+
+    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list) -> None:
+        wp.launch(kernel, dim, inputs, device=self.device)
