@@ -14,8 +14,9 @@ from warp_corot.kernels.implicit.line_search import TRIED
 from warp_corot.kernels.stepping.pace import DT, Pace
 
 from .law import SETTLING, Law, held_back
+from .locate import locate_edge, locate_node
 from .motion import Surface
-from .pairs import Meeting, Rows, locate_edge, locate_node, row_count
+from .rows import Meeting, Rows, row_count
 from .vertices import across
 
 wp.set_module_options({"enable_backward": False})
