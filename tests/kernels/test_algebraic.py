@@ -6,6 +6,7 @@ import pytest
 import warp as wp
 
 from warp_corot.kernels.corotated.algebraic import corotated_stress, stretch_stress
+from warp_corot.kernels.corotated.energy import corotated_energy
 
 MU, LAM = 1.0, 9.0
 
@@ -28,6 +29,26 @@ def stress_of(A, device):
     inputs = [wp.array(A, dtype=wp.mat33, device=device), MU, LAM]
     wp.launch(stresses, len(A), inputs=inputs, outputs=[p, q, ok], device=device)
     return p.numpy(), q.numpy(), ok.numpy().astype(bool)
+
+
+@wp.kernel(enable_backward=False)
+def energies(a: wp.array[wp.mat33], mu: float, lam: float, density: wp.array[wp.float32]):
+    i = wp.tid()
+    density[i] = corotated_energy(a[i], mu, lam)
+
+
+def assert_energies(A, device, most):
+    """Relative to the energy of each, whatever part of it lambda makes: for lambda of zero and for a large one."""
+    F = np.eye(3) + A.astype(float)
+    strain = np.swapaxes(oracle.polar(F), 1, 2) @ F - np.eye(3)
+    strain = 0.5 * (strain + np.swapaxes(strain, 1, 2))
+    for lam in (0.0, LAM):
+        found = wp.empty(len(A), dtype=wp.float32, device=device)
+        inputs = [wp.array(A, dtype=wp.mat33, device=device), MU, lam]
+        wp.launch(energies, len(A), inputs=inputs, outputs=[found], device=device)
+        traces = np.trace(strain, axis1=1, axis2=2)
+        exact = MU * np.sum(strain**2, axis=(1, 2)) + 0.5 * lam * traces**2
+        assert (np.abs(found.numpy() - exact) / exact).max() < most
 
 
 def expected(A):
@@ -89,3 +110,25 @@ def test_anything_is_finite(device, rng):
     P, Q, ok = stress_of((F - np.eye(3)).astype(np.float32), device)
     assert (P[~ok] == 0).all()
     assert np.isfinite(Q).all()
+
+
+@pytest.mark.parametrize("size", [1e-6, 1e-4, 1e-2, 0.1, 0.3])
+def test_energies_of_small_strains_keep_their_digits(size, device, rng):
+    assert_energies((size * rng.uniform(-1, 1, (5000, 3, 3))).astype(np.float32), device, 1e-5)
+
+
+def test_energies_of_turned_strains(device, rng):
+    """In float32 F has the strain only to 1e-7."""
+    assert_energies(of_stretches(rng, 0.95, 1.05), device, 2e-4)
+    assert_energies(of_stretches(rng, 0.4, 3.0), device, 2e-4)
+
+
+def test_energies_of_crushed_and_turned_over_elements(device, rng):
+    A = of_stretches(rng, 0.01, 3.0)
+    assert_energies(A[np.linalg.det(np.eye(3) + A) > 1e-4], device, 1e-4)
+    F = np.eye(3) + of_stretches(rng, 0.3, 3.0)
+    F[:, 0] *= -1.0
+    s = np.linalg.svd(F, compute_uv=False)
+    definite = s[:, 1] - s[:, 2] > 0.05 * s[:, 0]
+    assert definite.mean() > 0.5
+    assert_energies((F[definite] - np.eye(3)).astype(np.float32), device, 1e-4)

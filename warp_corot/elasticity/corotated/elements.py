@@ -28,12 +28,13 @@ from warp_corot.kernels.corotated.corotated import (
     reset_quaternions,
     scatter_matrix_product,
 )
+from warp_corot.kernels.corotated.energy import own_density
 from warp_corot.kernels.corotated.tangent import exact_differential, given_differential, own_differential
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.forces import element_energies, element_von_mises, repair_forces, scatter_forces
 from warp_corot.kernels.elements.general_cpu import scatter_law_elements
-from warp_corot.kernels.math.rotation import byers_xu
+from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
 
 from .tangents import ExactTangent, KeptTangent, RotatedTangent
 
@@ -118,6 +119,8 @@ class CorotatedField(ForceField):
         else:
             self._forces = scatter_matrix_product(model.stiffness == "sparse")
         self._energies = element_energies(kind, RotatedMaterial, given_density)
+        in_one = model.level is None and model.rotation != "warm" and model.own_rotation is quick_rotation
+        self._own_energies = element_energies(kind, IsotropicMaterial, own_density) if in_one else None
         self._von_mises = element_von_mises(kind, RotatedMaterial, given_cauchy)
 
     @property
@@ -234,6 +237,9 @@ class CorotatedField(ForceField):
         return StressLaw(own_stress(rotation), exact_differential(rotation), self.isotropic)
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
+        if self._own_energies is not None:
+            self.launch(self._own_energies, self.element_count, [self.elements, self.isotropic, u], [energies])
+            return
         self.extract_rotations(u)
         self._launch_with_rotations(self._energies, self.isotropic, u, energies)
 
