@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import time
 
 import warp as wp
 
@@ -17,6 +18,8 @@ def end(sim: wd.Simulation) -> None:
     if sim.rank == 1 and sim.steps >= 16:
         if sys.argv[1] == "killed":
             os.kill(os.getpid(), signal.SIGKILL)
+        if sys.argv[1] == "hung":
+            time.sleep(1e4)
         raise ValueError("rank 1 has had enough")
 
 

@@ -75,7 +75,7 @@ class LedSimulation(OnOne):
         Raises:
             UnstableError: As on rank 0.
         """
-        while (told := self._comm.bcast(None, root=0)) is not None:
+        while (told := self._comm.unwatched.bcast(None, root=0)) is not None:
             self._make(*told)
 
     def end(self) -> None:

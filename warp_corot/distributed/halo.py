@@ -82,8 +82,9 @@ class HostExchange:
         for rank, nodes in halo.sent.items():
             np.take(values, nodes, axis=0, out=out[rank])
             asked.append(comm.Isend(out[rank], rank, self._tag))
-        for request in asked:
-            request.Wait()
+        with comm.waiting("an exchange"):
+            for request in asked:
+                request.Wait()
         for rank, nodes in halo.received.items():
             values[nodes] = received[rank]
 

@@ -14,6 +14,8 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.inputs.processes import process_count
 
+from .patience import Patient, patience
+
 #: How long a rank sleeps between two looks at what it waits for [s].
 REST = 0.01
 
@@ -35,15 +37,16 @@ def library() -> Any:
 
 
 @functools.cache
-def world() -> Any:
+def world() -> Patient:
     """The program's own communicator of all ranks.
 
-    An uncaught error on one rank ends all of them with one line; otherwise the others would wait for ever.
+    An uncaught error on one rank ends all of them with one line; otherwise the others would wait for ever. So does a
+    rank that has waited too long for others.
 
     Raises:
-        InputError: MPI is not installed.
+        InputError: MPI is not installed, or ``WARP_COROT_PATIENCE`` is no positive number.
     """
-    comm = library().COMM_WORLD.Dup()
+    comm = Patient(library().COMM_WORLD.Dup(), patience())
     if comm.size > 1:
         sys.excepthook = functools.partial(_end_all, comm)
     return comm
