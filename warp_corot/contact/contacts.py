@@ -69,7 +69,7 @@ class Contacts:
         own = [self.surface.places_of(k) for k in range(len(system.bodies))]
         system.ranks.take_surface(self.surface.arrays.node, own)
         self.law = self._law(stable_dt)
-        self.search = Search(self.surface, self.obstacles, self.smallest)
+        self.search = Search(self.surface, self.obstacles, self.smallest, branches=system.ranks.is_alone)
         self.rigid: RigidForces | None = None
         if self.obstacles.count:
             given = (self.surface, self.obstacles, self.search, self.law, system.pace.arrays, system.ranks)

@@ -34,6 +34,8 @@ class Search:
         surface: The bodies' surfaces.
         obstacles: What is rigid.
         size: Of the smallest element [m].
+        branches: Whether a recorded search may be left out by a branch of the graph, which NCCL's launches after it
+            do not bear.
 
     Attributes:
         watch: Where things were at the last search, as kernels take it.
@@ -43,7 +45,7 @@ class Search:
         farthest: What may be reserved at least for any motion, at most [m].
     """
 
-    def __init__(self, surface: ContactSurface, obstacles: Obstacles, size: float):
+    def __init__(self, surface: ContactSurface, obstacles: Obstacles, size: float, *, branches: bool = True):
         self.surface, self.obstacles, self.device = surface, obstacles, surface.device
         self.farthest = MOST * size
         self.finders: list[Callable[[], None]] = []
@@ -60,7 +62,7 @@ class Search:
         self.watch, self.near = watch, near_kernels.Near()
         self._taken = -1
         #: Whether a device can leave out what was recorded; else every kernel of a search sees whether it is due.
-        self._branches = device.is_cpu or wp.is_conditional_graph_supported()
+        self._branches = device.is_cpu or (branches and wp.is_conditional_graph_supported())
         self.follow()
 
     def threads(self, room: int) -> int:

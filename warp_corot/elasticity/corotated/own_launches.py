@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 
 import warp as wp
 
@@ -59,14 +60,14 @@ class OwnLaunches:
         elif changing is not None and 8 * sum(batch.count for batch in batches if batch.grouped) < GROUPED_LEAVES:
             batches, self._clusters = [], changing
         self._awaited = awaited
-        if awaited is not None and len(batches) == 1 and batches[0].grouped and self._clusters is not None:
+        #: Batches of one type have a kernel of their own, which is faster.
+        self._is_single = self._clusters is not None or not len(plan.flat)
+        self._is_single = self._is_single and [batch.grouped for batch in batches] == [True]
+        if awaited is not None and self._is_single:
             awaited.is_used = True
             batches = list(awaited.divided(batches[0]))
         # The structs hold addresses alone: what these stand for must live as long as they do.
         self.batches = tuple(batches)
-        #: Batches of one type have a kernel of their own, which is faster.
-        self._is_single = self._clusters is not None and len({batch.shape for batch in batches}) == 1
-        self._is_single = self._is_single and all(batch.grouped for batch in batches)
         flat = None if self._clusters is not None else plan.flat
         self._rows, self._blocks = ([], 0) if self._is_single else _stretches(batches, flat)
         self._stretches = wp.array(self._rows, dtype=Stretch, device=self._device) if self._rows else None
@@ -104,17 +105,12 @@ class OwnLaunches:
             self._clusters(material, u, f)
 
     def _scatter_single(self, u: wp.array, f: wp.array, left_out: LeftOut) -> None:
-        assert self._clusters is not None
-        if self._awaited is None or not self._awaited.is_used:
-            for batch in self.batches:
-                self._launch(batch, u, f, left_out)
-            self._clusters(self._material, u, f)
-            return
-        here, late = self.batches
-        self._launch(here, u, f, left_out)
-        with self._awaited.later():
-            self._launch(late, u, f, left_out)
-            self._clusters(self._material, u, f)
+        self._launch(self.batches[0], u, f, left_out)
+        with nullcontext() if self._awaited is None else self._awaited.later():
+            for late in self.batches[1:]:
+                self._launch(late, u, f, left_out)
+            if self._clusters is not None:
+                self._clusters(self._material, u, f)
 
     def _launch(self, batch: Batch, u: wp.array, f: wp.array, left_out: LeftOut) -> None:
         material = self._material

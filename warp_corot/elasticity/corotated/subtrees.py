@@ -118,7 +118,7 @@ class SubtreeField(CorotatedField):
         self._left_out: LeftOutLeaves | None = None
         self._own_launches: OwnLaunches | None = None
         if self._listed:
-            if self.rotation_level is None and OwnLaunches.suit(plan):
+            if self.rotation_level is None and (OwnLaunches.suit(plan) or self.discretization.awaited is not None):
                 given = (self.isotropic, self.model.tolerance, self._clusters, self.discretization.awaited)
                 self._own_launches = OwnLaunches(plan, *given)
                 self._left_out = LeftOutLeaves(self._own_launches.places, [], self.device)
