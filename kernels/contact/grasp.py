@@ -1,4 +1,8 @@
-"""Nodes that a tool holds: each at its place in the tool's frame, rigidly or by a spring."""
+"""Nodes that a tool holds: each at its place in the tool's frame, rigidly or by a spring.
+
+In implicit steps both are springs to where the tool is at the end of the step. The rigid one is stiffer than the body,
+and has the force of the last step as a multiplier, so that what holds still is where it must be.
+"""
 
 from typing import Any
 
@@ -92,6 +96,54 @@ def hold_in_tool(
     forces[k] = force
     store_node(f, i, pull + force)
     store_node(contact_forces, i, load_node(contact_forces, i) + force)
+
+
+@wp.kernel(enable_backward=False)
+def pull_to_tool(
+    # In
+    nodes: wp.array[wp.int32],
+    per_world: int,
+    o: int,
+    motions: Motions,
+    places: wp.array[wp.vec3],
+    stiffness: float,
+    multipliers: wp.array[wp.vec3],
+    inverse_mass: wp.array[wp.float32],
+    rest: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    # In and out
+    f: wp.array[wp.vec4],
+    # Out
+    forces: wp.array[wp.vec3],
+):
+    """Add the springs' forces in a state of the body, with the tool at the end of the step."""
+    k = wp.tid()
+    i = nodes[k]
+    force = wp.vec3()
+    if inverse_mass[i] > 0.0:
+        there = wp.transform_point(motions.later[k / per_world, o], places[k])
+        force = multipliers[k] + stiffness * (there - load_node(rest, i) - load_node(u, i))
+        store_node(f, i, load_node(f, i) + force)
+    forces[k] = force
+
+
+@wp.kernel(enable_backward=False)
+def add_hold_product(nodes: wp.array[wp.int32], stiffness: float, p: wp.array[wp.vec4], y: wp.array[wp.vec4]):
+    i = nodes[wp.tid()]
+    store_node(y, i, load_node(y, i) + stiffness * load_node(p, i))
+
+
+@wp.kernel(enable_backward=False)
+def add_hold_blocks(nodes: wp.array[wp.int32], stiffness: float, blocks: wp.array[wp.mat33]):
+    i = nodes[wp.tid()]
+    blocks[i] = blocks[i] + stiffness * wp.identity(3, dtype=wp.float32)
+
+
+@wp.kernel(enable_backward=False)
+def add_held_forces(nodes: wp.array[wp.int32], forces: wp.array[wp.vec3], contact_forces: wp.array[wp.vec4]):
+    k = wp.tid()
+    i = nodes[k]
+    store_node(contact_forces, i, load_node(contact_forces, i) + forces[k])
 
 
 @wp.kernel(enable_backward=False)

@@ -6,21 +6,23 @@ import pytest
 import warp_corot as wc
 
 SOFT = wc.Isotropic(young=2e4, poisson=0.4, density=1000.0)
-CALM = wc.SymplecticEuler(viscosity=2e-3)
+CALM, EULER = wc.SymplecticEuler(viscosity=2e-3), wc.BackwardEuler(dt=0.01)
+BOTH = pytest.mark.parametrize("integrator", [CALM, EULER], ids=["explicit", "implicit"])
 
 
-def held_block(device, worlds=1, stiffness=None, gravity=(0.0, 0.0, 0.0), fixed=True):
+def held_block(device, worlds=1, stiffness=None, gravity=(0.0, 0.0, 0.0), fixed=True, integrator=CALM):
     mesh = wc.TetForest.box(cells=(2, 2, 1), cell_size=0.02, level=3)
     body = wc.SoftBody(mesh, SOFT, device=device, worlds=worlds)
     if fixed:
         body.fix("z == zmin")
     tool = wc.Tool(wc.Sphere(0.002, position=(0.02, 0.02, 0.03)), speed=0.1)
-    sim = wc.Simulation(body, obstacles=[tool], gravity=gravity, integrator=CALM)
+    sim = wc.Simulation(body, obstacles=[tool], gravity=gravity, integrator=integrator)
     return body, tool, sim, wc.Grasp(body, "z == zmax", tool=tool, stiffness=stiffness)
 
 
-def test_a_grasped_patch_goes_along(device):
-    body, tool, sim, grasp = held_block(device)
+@BOTH
+def test_a_grasped_patch_goes_along(device, integrator):
+    body, tool, sim, grasp = held_block(device, integrator=integrator)
     top = body.mesh.points[:, 2] > 0.0199
     tool.move((0.02, 0.022, 0.032))
     sim.advance(0.3)
@@ -30,8 +32,9 @@ def test_a_grasped_patch_goes_along(device):
     np.testing.assert_allclose(felt[:3], held, atol=1e-3 * np.abs(held).max())
 
 
-def test_a_turning_tool_turns_the_patch(device):
-    body, tool, sim, _grasp = held_block(device)
+@BOTH
+def test_a_turning_tool_turns_the_patch(device, integrator):
+    body, tool, sim, _grasp = held_block(device, integrator=integrator)
     top = body.mesh.points[:, 2] > 0.0199
     angle = 0.1
     tool.move((0.02, 0.02, 0.03), (0.0, 0.0, np.sin(angle / 2), np.cos(angle / 2)))
@@ -41,16 +44,20 @@ def test_a_turning_tool_turns_the_patch(device):
     np.testing.assert_allclose(body.displacements.numpy()[top], turned - rest, atol=2e-6)
 
 
-def test_a_hanging_body_weighs_what_it_weighs(device):
-    body, _tool, sim, grasp = held_block(device, worlds=2, gravity=(0.0, 0.0, -9.81), fixed=False)
+@BOTH
+def test_a_hanging_body_weighs_what_it_weighs(device, integrator):
+    body, _tool, sim, grasp = held_block(
+        device, worlds=2, gravity=(0.0, 0.0, -9.81), fixed=False, integrator=integrator
+    )
     sim.advance(0.6)
     weight = 9.81 * body.masses.sum() / 2
     np.testing.assert_allclose(grasp.wrench.numpy()[:, 2], -weight, rtol=1e-3)
 
 
-def test_a_springy_hold_gives_way(device):
+@BOTH
+def test_a_springy_hold_gives_way(device, integrator):
     """A rigid patch on a spring: the tool's way is shared between the spring and the body."""
-    body, tool, sim, grasp = held_block(device, stiffness=200.0)
+    body, tool, sim, grasp = held_block(device, stiffness=200.0, integrator=integrator)
     tool.move((0.02, 0.02, 0.034))
     sim.advance(0.4)
     top = body.mesh.points[:, 2] > 0.0199
@@ -59,8 +66,9 @@ def test_a_springy_hold_gives_way(device):
     assert -grasp.wrench.numpy()[0, 2] == pytest.approx(200.0 * given, rel=1e-3)
 
 
-def test_a_released_patch_falls_back(device):
-    body, tool, sim, grasp = held_block(device)
+@BOTH
+def test_a_released_patch_falls_back(device, integrator):
+    body, tool, sim, grasp = held_block(device, integrator=integrator)
     tool.move((0.02, 0.02, 0.033))
     sim.advance(0.1)
     assert grasp.is_holding
@@ -72,13 +80,15 @@ def test_a_released_patch_falls_back(device):
     assert np.abs(body.displacements.numpy()).max() < 1e-4
 
 
-def test_a_grasped_patch_is_remeshed(device):
+@BOTH
+def test_a_grasped_patch_is_remeshed(device, integrator):
     """New nodes between those that are held are held; where elements are joined, what is left is."""
     body = wc.SoftBody(wc.TetForest.box((2, 2, 1), 0.02, 1), SOFT, device=device)
     body.fix("z == zmin")
     tool = wc.Tool(wc.Sphere(0.002, position=(0.02, 0.02, 0.03)), speed=0.1)
-    remesh = wc.OnlineRemesh(every=32, max_level=5, refine_above=1.04, simplify_below=1.01)
-    sim = wc.Simulation(body, obstacles=[tool], gravity=(0.0, 0.0, 0.0), integrator=CALM, remesh=remesh)
+    every = 32 if integrator is CALM else 4
+    remesh = wc.OnlineRemesh(every=every, max_level=5, refine_above=1.04, simplify_below=1.01)
+    sim = wc.Simulation(body, obstacles=[tool], gravity=(0.0, 0.0, 0.0), integrator=integrator, remesh=remesh)
     grasp = wc.Grasp(body, "z == zmax", tool=tool)
     counts = [len(grasp.nodes)]
     for height, turn in ((0.032, 0.1), (0.03, 0.0)):

@@ -105,7 +105,3 @@ def test_what_implicit_steps_cannot_touch_is_refused(device):
     first = block(device)
     with pytest.raises(wc.InputError, match="BDF2 does not support contact"):
         wc.Simulation(first, obstacles=wc.Ground(), integrator=wc.BDF2(dt=0.01))
-    tool = wc.Tool(wc.Sphere(0.02))
-    wc.Simulation(first, obstacles=tool, integrator=EULER)
-    with pytest.raises(wc.InputError, match="a grasp needs SymplecticEuler"):
-        wc.Grasp(first, [0], tool=tool)

@@ -18,11 +18,15 @@ from warp_corot.mesh import TetForest
 
 from .tool import Tool
 
+#: Stiffness of a node that is held rigidly in implicit steps, over that of an element.
+RIGID = 1000.0
+
 
 class Grasp:
     """A patch of a body's surface that goes along with a tool, from where both are now until it is released.
 
-    It is one of the simulation's constraints from the moment it is made. ``tool.wrench`` has what the tool feels
+    It is one of the simulation's constraints from the moment it is made. In implicit steps what is held rigidly gives
+    way a little while forces change. ``tool.wrench`` has what the tool feels
     besides.
 
     Args:
@@ -33,7 +37,7 @@ class Grasp:
 
     Raises:
         InputError: The tool is in no simulation or the body in another, no node of the surface is meant, a body that is
-            remeshed in several worlds, implicit steps, or a stiffness that is not positive.
+            remeshed in several worlds, or a stiffness that is not positive.
     """
 
     def __init__(self, body: SoftBody, patch: Nodes, *, tool: Tool, stiffness: float | None = None):
@@ -45,8 +49,6 @@ class Grasp:
         system = self._obstacles.system
         if body not in system.bodies:
             raise InputError("the body is in no simulation with this tool; both must be in one")
-        if system.is_implicit:
-            raise InputError("steps of the simulation are implicit; a grasp needs SymplecticEuler")
         if body.changing is not None and body.worlds > 1:
             raise InputError(
                 f"the body is remeshed in {body.worlds} worlds; a grasp of one that is must be in one world"
@@ -136,6 +138,32 @@ class Grasp:
         kernel = kernels.HOLD_IN_TOOL[conditions.loads.dtype]
         wp.launch(kernel, len(self._nodes), inputs, outputs, device=self.device)
 
+    def launch_begin(self) -> None:
+        """Launch what an implicit step begins with."""
+        if self.stiffness is None and len(self._nodes):
+            wp.copy(self._multipliers, self._forces)
+
+    def add_forces(self) -> None:
+        """Launch its forces in implicit steps, in the present state with the tool at the end of the step."""
+        state = self.body.state
+        inputs = [self._nodes, self._per_world, self._number, self._obstacles.motions, self._places]
+        inputs += [self._implicit_stiffness, self._multipliers, self.body.conditions.inverse_mass]
+        inputs += [state.rest, state.displacements]
+        self._launch(kernels.pull_to_tool, inputs, [state.forces, self._forces])
+
+    def add_stiffness(self, body: SoftBody, p: wp.array, y: wp.array) -> None:
+        if body is self.body:
+            self._launch(kernels.add_hold_product, [self._nodes, self._implicit_stiffness, p], [y])
+
+    def add_diagonal(self, body: SoftBody, blocks: wp.array) -> None:
+        if body is self.body:
+            self._launch(kernels.add_hold_blocks, [self._nodes, self._implicit_stiffness], [blocks])
+
+    def launch_held(self, body: SoftBody) -> None:
+        """Launch that its forces at the end of an implicit step are among those of contact."""
+        if body is self.body:
+            self._launch(kernels.add_held_forces, [self._nodes, self._forces], [body.state.contact_forces])
+
     def measure(self) -> None:
         """It goes no faster than its tool."""
 
@@ -154,6 +182,16 @@ class Grasp:
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
+    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+        if len(self._nodes):
+            wp.launch(kernel, len(self._nodes), inputs, outputs, device=self.device)
+
+    def _rigid_stiffness(self) -> float:
+        """Of a node that is held rigidly in implicit steps [N/m]."""
+        mesh = self.body.mesh
+        size = float(np.mean(mesh.volumes)) ** (1.0 / 3.0)
+        return RIGID * float(np.max(self.body.material.isotropic.young)) * size
+
     def _take(self, nodes: npt.NDArray[np.integer]) -> None:
         """Hold these nodes of each world, at places to be told."""
         body, device = self.body, self.device
@@ -163,9 +201,12 @@ class Grasp:
         if body.changing is not None and isinstance(mesh, TetForest):
             self._lattice = list(map(tuple, mesh.lattice[nodes].tolist()))
         self._stiffness = 0.0 if self.stiffness is None else self.stiffness / max(len(nodes), 1)
+        self._implicit_stiffness = self._stiffness or self._rigid_stiffness()
         everywhere = (nodes + body.world_node_count * np.arange(body.worlds)[:, None]).ravel()
         self._nodes = wp.array(everywhere, dtype=wp.int32, device=device)
-        self._places, self._forces = (wp.zeros(len(everywhere), dtype=wp.vec3, device=device) for _ in range(2))
+        self._places, self._forces, self._multipliers = (
+            wp.zeros(len(everywhere), dtype=wp.vec3, device=device) for _ in range(3)
+        )
         self.launch_revision += 1
 
 

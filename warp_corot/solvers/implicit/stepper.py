@@ -21,7 +21,7 @@ from .multigrid import Multigrid
 from .newton import Newton
 from .preconditioners import preconditioner_of
 from .tangent import TangentOperator
-from .touching import Held, Touching, TouchingSolve
+from .touching import Held, Hold, Touching, TouchingSolve
 
 if TYPE_CHECKING:
     from warp_corot.solvers.system import System
@@ -50,7 +50,7 @@ class ImplicitStepper(Stepper):
         self.system, self.integrator = system, integrator
         system.lag, system.is_implicit = 0.0, True
         self.totals = wp.zeros(4, dtype=wp.int64, device=system.device)
-        self.touching = cast("list[Touching]", list(system.constraints))
+        self.touching = cast("list[Touching]", [each for each in system.constraints if hasattr(each, "active_set")])
         self.rows = next((rows for each in self.touching if (rows := each.joined_rows()) is not None), None)
         self._joined: JoinedSolve | None = None
         self._bodies = [BodySteps(self, k) for k in range(len(system.bodies))]
@@ -84,6 +84,8 @@ class ImplicitStepper(Stepper):
                 self.forget_forces()
             for each in self.touching:
                 each.launch_motion(offset)
+            for hold in self.holds:
+                hold.launch_begin()
             for body in self._bodies:
                 body.launch_begin(offset)
                 if self._joined is None:
@@ -116,8 +118,13 @@ class ImplicitStepper(Stepper):
     def add_other_forces(self) -> None:
         """Launch all forces besides elasticity in the present state to ``state.forces`` of the bodies."""
         self.forget_forces()
-        for forces in self.system.forces:
+        for forces in [*self.system.forces, *self.holds]:
             forces.add_forces()
+
+    @property
+    def holds(self) -> list[Hold]:
+        """Constraints that are springs."""
+        return cast("list[Hold]", [each for each in self.system.constraints if hasattr(each, "add_stiffness")])
 
     def add_counted_forces(self) -> None:
         """The same of those whose work is counted for them."""
@@ -209,7 +216,10 @@ class BodySteps:
                 self.before.fill_(np.nan)
             self._make_solvers()
         self._is_prepared = True
-        self.operator.stiff_forces = tuple(each for each in self.system.forces if hasattr(each, "add_stiffness"))
+        self.operator.stiff_forces = (
+            *(each for each in self.system.forces if hasattr(each, "add_stiffness")),
+            *self.stepper.holds,
+        )
         if self.stepper.integrator.tolerance is None:
             self.newton.solver.tolerance.fill_(self.stepper.integrator.linear_tolerance)
         u = self.body.state.displacements
@@ -322,6 +332,10 @@ class BodySteps:
             self.stepper.add_counted_forces()
             account = system.accounts[self.k]
             self._launch(kernels.count_work, [conditions.inverse_mass, state.forces, newton.increment], [account])
+        if self.stepper.holds:
+            self.stepper.add_other_forces()
+            for hold in self.stepper.holds:
+                hold.launch_held(body)
         for account in system.constraint_accounts(self.k):
             inputs = [conditions.inverse_mass, state.contact_forces, newton.increment]
             self._launch(kernels.count_work, inputs, [account])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import warp as wp
 
@@ -10,6 +10,9 @@ from warp_corot.kernels.implicit.tangent import add_counts, add_vectors, find_re
 
 from .newton import Newton
 from .operator import LinearOperator, Preconditioner
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
 
 
 class Held(Protocol):
@@ -59,6 +62,24 @@ class Rows(Protocol):
     def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None: ...
 
     def launch_end(self, d: wp.array) -> None: ...
+
+
+class Hold(Protocol):
+    """A constraint that is a spring in implicit steps, such as ``contact.grasp.Grasp``."""
+
+    def launch_begin(self) -> None:
+        """Launch what a step begins with."""
+        ...
+
+    def add_forces(self) -> None: ...
+
+    def add_stiffness(self, body: SoftBody, p: wp.array, y: wp.array) -> None: ...
+
+    def add_diagonal(self, body: SoftBody, blocks: wp.array) -> None: ...
+
+    def launch_held(self, body: SoftBody) -> None:
+        """Launch that its forces on a body after the step are among those of contact."""
+        ...
 
 
 class Touching(Protocol):
