@@ -30,28 +30,10 @@ GATHER, SCATTER = (
 
 
 @wp.kernel(enable_backward=False)
-def move_vectors(
-    sources: wp.array[wp.int32], targets: wp.array[wp.int32], source: wp.array[wp.vec4], found: wp.array[wp.vec4]
-):
+def move_values(sources: wp.array[wp.int32], targets: wp.array[wp.int32], source: wp.array[Any], found: wp.array[Any]):
     """found[targets[i]] = source[sources[i]]."""
     i = wp.tid()
     found[targets[i]] = source[sources[i]]
-
-
-@wp.kernel(enable_backward=False)
-def move_marks(
-    sources: wp.array[wp.int32], targets: wp.array[wp.int32], source: wp.array[wp.uint8], found: wp.array[wp.uint8]
-):
-    """The same for uint8."""
-    i = wp.tid()
-    found[targets[i]] = source[sources[i]]
-
-
-@wp.kernel(enable_backward=False)
-def move_numbers(sources: wp.array[wp.int32], source: wp.array[wp.float32], found: wp.array[wp.float32]):
-    """found[i] = source[sources[i]]."""
-    i = wp.tid()
-    found[i] = source[sources[i]]
 
 
 @wp.kernel(enable_backward=False)

@@ -14,6 +14,7 @@ from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.distributed.directions import normal_numbers
 from warp_corot.distributed.partition import Partition
 from warp_corot.distributed.parts import Part
+from warp_corot.distributed.places import Places
 from warp_corot.distributed.refusals import check_supported
 from warp_corot.distributed.settled import settled_sums
 
@@ -74,6 +75,21 @@ def test_groups_that_await_nodes_are_apart_from_others():
     for each in (here, late):
         groups = mesh.tets.reshape(-1, 64 * 4)[each.subtrees.first.numpy()[::8] // 64]
         np.testing.assert_array_equal(awaited.nodes[groups].any(axis=1), each is late)
+
+
+@pytest.mark.parametrize("direct", [True, False])
+def test_values_go_to_the_part_and_back(direct):
+    cpu = wp.get_device("cpu")
+    places = Places(np.array([4, 1], np.int32), np.array([0, 2], np.int32), cpu, cpu, direct=direct)
+    for kind, row in ((wp.uint8, 1), (wp.float32, 1), (wp.vec4, [1.0, 2.0, 3.0, 4.0])):
+        whole = wp.array([np.multiply(k, row) for k in range(6)], dtype=kind, device="cpu")
+        part = wp.zeros(3, dtype=kind, device="cpu")
+        places.to_part(whole, part)
+        np.testing.assert_array_equal(part.numpy(), whole.numpy()[[4, 0, 1]])
+        back = wp.zeros(6, dtype=kind, device="cpu")
+        places.to_whole(part, back)
+        np.testing.assert_array_equal(back.numpy()[[1, 4]], whole.numpy()[[1, 4]])
+        assert not back.numpy()[[0, 2, 3, 5]].any()
 
 
 def test_sums_are_the_same_in_any_order(rng):

@@ -11,9 +11,9 @@ import warp as wp
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.body.trajectory import NodeKeyframes, Trajectory
 from warp_corot.errors import InputError
-from warp_corot.kernels.distributed import exchange as kernels
 
 from .parts import Part
+from .places import Places
 
 
 class Following:
@@ -35,11 +35,11 @@ class Following:
         own = np.tile(part.numbers.owner == comm.rank, worlds)
         #: This rank's nodes among those of all worlds of the whole body, int32, and of its part.
         self.own_nodes = everywhere[own]
-        device = part.device
-        self._all = [wp.array(a, dtype=wp.int32, device=device) for a in (everywhere, np.arange(worlds * n))]
-        self._own = [wp.array(a, dtype=wp.int32, device=device) for a in (self.own_nodes, np.flatnonzero(own))]
+        devices = whole.device, part.device
+        self._all = Places(everywhere, np.arange(worlds * n, dtype=np.int32), *devices)
+        self._own = Places(self.own_nodes, np.flatnonzero(own).astype(np.int32), *devices)
         elements = (part.numbers.elements + whole.world_element_count * shift).ravel()
-        self._elements = wp.array(elements, dtype=wp.int32, device=device)
+        self._elements = Places(elements, np.arange(len(elements), dtype=np.int32), *devices)
         #: The number in the part of each node that this rank moves, -1 for others.
         self._number = np.full(worlds * count, -1, np.int32)
         self._number[self.own_nodes] = np.flatnonzero(own)
@@ -49,41 +49,40 @@ class Following:
         """Copy users' changes to the part: the state, supports, loads and keyframes."""
         whole, part = self.whole, self.part
         whole.state.adopt_positions()
-        (sources, targets), (own_sources, own_targets) = self._all, self._own
-        self._move(kernels.move_vectors, sources, targets, whole.state.displacements, part.state.displacements)
-        self._move(kernels.move_vectors, own_sources, own_targets, whole.state.velocities, part.state.velocities)
-        self._move(kernels.move_marks, own_sources, own_targets, whole.conditions.held, part.conditions.held)
+        self._all.to_part(whole.state.displacements, part.state.displacements)
+        self._own.to_part(whole.state.velocities, part.state.velocities)
+        self._own.to_part(whole.conditions.held, part.conditions.held)
         part.conditions.find_inverse_masses()
         part.state.publish_positions()
         self._take_loads()
         self._take_keyframes()
         self._take_activation()
-        wp.copy(part.conditions.world_starts, whole.conditions.world_starts)
+        part.conditions.world_starts.assign(whole.conditions.world_starts)
 
     def publish(self) -> None:
         """Copy the state of the nodes that this rank moves to the whole body."""
-        whole, part, (targets, sources) = self.whole, self.part, self._own
+        whole, part = self.whole, self.part
         for name in ("displacements", "velocities", "reactions"):
-            self._move(kernels.move_vectors, sources, targets, getattr(part.state, name), getattr(whole.state, name))
+            self._own.to_whole(getattr(part.state, name), getattr(whole.state, name))
         whole.state.publish_positions()
-        wp.copy(whole.conditions.world_starts, part.conditions.world_starts)
+        whole.conditions.world_starts.assign(part.conditions.world_starts)
         if part.state.is_touched:
-            self._publish_touch(targets, sources)
+            self._publish_touch()
 
-    def _publish_touch(self, targets: wp.array, sources: wp.array) -> None:
+    def _publish_touch(self) -> None:
         """Give the whole body the contact forces of the nodes that this rank moves, and pressures around them."""
         whole, part = self.whole.state, self.part.state
         if not whole.is_touched:
             whole.make_contact_forces()
             count = self.whole.worlds * len(self.whole.surface_triangles)
-            whole.contact_pressures = wp.zeros(count, dtype=wp.float32, device=self.part.device)
+            whole.contact_pressures = wp.zeros(count, dtype=wp.float32, device=self.whole.device)
             here, _ = self.part.surface_here
             shift = np.arange(self.whole.worlds, dtype=np.int32)[:, None]
-            self.triangles = (here + len(self.whole.surface_triangles) * shift).ravel()
-            self._triangles = wp.array(self.triangles, dtype=wp.int32, device=self.part.device)
-        self._move(kernels.move_vectors, sources, targets, part.contact_forces, whole.contact_forces)
-        inputs, found = [self._triangles, part.contact_pressures], [whole.contact_pressures]
-        wp.launch(kernels.SCATTER[wp.float32], len(self._triangles), inputs, found, device=self.part.device)
+            everywhere = (here + len(self.whole.surface_triangles) * shift).ravel()
+            own = np.arange(len(everywhere), dtype=np.int32)
+            self._triangles = Places(everywhere, own, self.whole.device, self.part.device)
+        self._own.to_whole(part.contact_forces, whole.contact_forces)
+        self._triangles.to_whole(part.contact_pressures, whole.contact_pressures)
 
     def collect_touch(self) -> None:
         """Bring contact forces and pressures together on all ranks."""
@@ -92,7 +91,8 @@ class Following:
             return
         state.contact_forces.assign(self._comm.bcast(self.gather(state.contact_forces), root=0))
         found = state.contact_pressures.numpy()
-        for triangles, pressures in self._comm.allgather((self.triangles, found[self.triangles])):
+        own = self._triangles.whole
+        for triangles, pressures in self._comm.allgather((own, found[own])):
             found[triangles] = pressures
         state.contact_pressures.assign(found)
 
@@ -102,11 +102,10 @@ class Following:
         if given is None:
             self.part.state.initial = None
             return
-        sources, targets = self._own
         found = []
         for array in given:
             found.append(wp.zeros_like(self.part.state.displacements))
-            self._move(kernels.move_vectors, sources, targets, array, found[-1])
+            self._own.to_part(array, found[-1])
         self.part.state.initial = (found[0], found[1])
 
     def gather(self, array: wp.array) -> npt.NDArray[Any] | None:
@@ -145,17 +144,13 @@ class Following:
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
-    def _move(self, kernel: wp.Kernel, sources: wp.array, targets: wp.array, source: wp.array, found: wp.array) -> None:
-        wp.launch(kernel, len(sources), [sources, targets, source], [found], device=self.part.device)
-
     def _take_loads(self) -> None:
         whole, part = self.whole.conditions, self.part.conditions
         if whole.loads.dtype != wp.vec4 or self.whole.state.positions.dtype != wp.vec4:
             raise InputError("use_loads and use_positions do not work on several ranks; use_…(None) ends them")
         if whole.has_loads:
             part.make_loads()
-            sources, targets = self._own
-            self._move(kernels.move_vectors, sources, targets, whole.loads, part.loads)
+            self._own.to_part(whole.loads, part.loads)
         elif part.has_loads:
             part.use_loads(part.loads, False)
 
@@ -182,9 +177,7 @@ class Following:
             raise InputError("active stress along keyframes does not work on several ranks yet; set it between steps")
         if whole.discretization.has_activation:
             part.conditions.make_activation()
-            inputs = [self._elements, whole.discretization.activation]
-            device, found = part.device, part.discretization.activation
-            wp.launch(kernels.move_numbers, len(self._elements), inputs, [found], device=device)
+            self._elements.to_part(whole.discretization.activation, part.discretization.activation)
 
 
 def _same(a: Trajectory, b: Trajectory) -> bool:

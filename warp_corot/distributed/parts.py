@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.discretization.elements import Mesh
@@ -45,9 +46,10 @@ class Part(SoftBody):
         whole: The body.
         partition: The division of its mesh.
         rank: The rank of the part.
+        device: Where it is computed; None: where the body is.
     """
 
-    def __init__(self, whole: SoftBody, partition: Partition, rank: int):
+    def __init__(self, whole: SoftBody, partition: Partition, rank: int, device: wp.Device | None = None):
         kept = partition.needed(whole.mesh, rank)
         mesh, nodes = part_of_mesh(whole.mesh, kept, partition)
         elements = np.flatnonzero(kept).astype(np.int32)
@@ -57,7 +59,7 @@ class Part(SoftBody):
         self._whole = whole
         self._is_own = np.tile(self.numbers.owner == rank, whole.worlds)
         material = part_of_material(whole.material, elements, len(whole.mesh.tets))
-        super().__init__(mesh, material, worlds=whole.worlds, device=whole.device)
+        super().__init__(mesh, material, worlds=whole.worlds, device=device or whole.device)
         self.discretization.smallest_volume = whole.discretization.smallest_volume
 
     @property

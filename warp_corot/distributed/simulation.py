@@ -22,6 +22,7 @@ from warp_corot.elasticity import Corotated, Model
 from warp_corot.elasticity.dilatation.options import ELEMENT, SHARED, shares_dilatation
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.checks import checked_count
+from warp_corot.inputs.device import checked_device
 from warp_corot.simulation import simulation as on_one
 from warp_corot.simulation.energy import Energy, WorldEnergies
 from warp_corot.simulation.parts import checked_bodies, checked_gravity, checked_integrator, checked_models
@@ -53,6 +54,8 @@ class Simulation:
         bodies, model, integrator, gravity: As for ``warp_corot.Simulation``.
         deterministic: Whether the run must be the same bit for bit for any number of ranks.
         costs: The cost of an element on each rank, in any unit, [ranks]; None: the same everywhere.
+        device: Where this rank computes; None: where the bodies are. With bodies on the CPU and "cuda" here, a card
+            holds this rank's parts alone.
         others: ``obstacles`` and ``contact`` as for ``warp_corot.Simulation``; its further arguments do not work on
             several ranks yet.
 
@@ -75,6 +78,7 @@ class Simulation:
         gravity: npt.ArrayLike | None = None,
         deterministic: bool = False,
         costs: npt.ArrayLike | None = None,
+        device: str | wp.Device | None = None,
         **others: Any,
     ):
         self._comm = self.comm = comm = mpi.world()
@@ -87,7 +91,8 @@ class Simulation:
             integrator = dataclasses.replace(integrator, preconditioner=DIAGONAL)
         models = tuple(_settled_model(m, body) for m, body in zip(models, self.bodies, strict=True))
         self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
-        parts = [_part_of(body, m, comm, costs) for body, m in zip(self.bodies, models, strict=True)]
+        here = None if device is None else checked_device(device)
+        parts = [_part_of(body, m, comm, costs, here) for body, m in zip(self.bodies, models, strict=True)]
         self._following = [Following(body, part, comm) for body, part in zip(self.bodies, parts, strict=True)]
         for each in self._following:
             each.take_over()
@@ -341,9 +346,9 @@ class _OfParts(on_one.Simulation):
         return found._replace(elastic=elastic)
 
 
-def _part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None) -> Part:
+def _part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None, device: wp.Device | None) -> Part:
     grouped = getattr(model, "dilatation", ELEMENT) == SHARED
-    return Part(body, Partition.of(body.mesh, comm.size, costs, grouped=grouped), comm.rank)
+    return Part(body, Partition.of(body.mesh, comm.size, costs, grouped=grouped), comm.rank, device)
 
 
 def _compile_once(comm: Any, parts: Sequence[Part], **options: Any) -> None:
