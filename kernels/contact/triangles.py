@@ -23,9 +23,10 @@ CORNER = wp.constant(0.999)
 #: Places along a capsule whose gaps differ by so small a share of its radius are touched between them.
 BLUR = wp.constant(1.0e-3)
 
-#: Triangles that are deeper in an obstacle than this share of its thickness leave it on the side on which they were, if
-#: the nearest side is turned from that by more than this cosine: inside, it may be another one at every step.
-SKEWERED, TURNED = wp.constant(0.5), wp.constant(0.5)
+#: Triangles that are deeper in an obstacle than this share of its thickness are skewered, and slide off without friction.
+#: They leave it on the side on which they were, if the nearest side is turned from that by more than this cosine, and
+#: the way out is no more than so many times as long: inside, the nearest side may be another one at every step.
+SKEWERED, TURNED, LONGER = wp.constant(0.1), wp.constant(0.5), wp.constant(1.5)
 #: Share of the last step's push from which rounds begin: with more, nodes around an obstacle are held off by what lies
 #: between them, and bodies seem stiffer. Friction begins with all of it: what slips to bring it back would add up.
 WARMTH = wp.constant(0.5)
@@ -70,6 +71,11 @@ def nearest(shapes: Shapes, o: int, pose: wp.transform, most: float, a: wp.vec3,
 
 
 @wp.func
+def friction_at(gap: float, o: int, shapes: Shapes):
+    return wp.where(gap < -SKEWERED * shapes.thickness[o], 0.0, shapes.friction[o])
+
+
+@wp.func
 def find_touch(
     o: int,
     t: int,
@@ -108,7 +114,9 @@ def find_touch(
         n = -n
         gap = -2.0 * shapes.size[o][0] - gap
     elif was_near and gap < -SKEWERED * shapes.thickness[o] and wp.dot(n, side) < TURNED:
-        n = side
+        beyond, _out = distance_to(shapes, o, pose, point_of(w, a, b, c) - LONGER * gap * side, size + far)
+        if beyond > 0.0:
+            n = side
     if gap > far or wp.max(w) > CORNER:
         return
     touches.shares[o, t] = w
@@ -119,7 +127,7 @@ def find_touch(
     push = WARMTH * was_push
     if push > 0.0:
         touches.acts[o, t] = 1
-        force = push * n + held_back(across(was, n), was_push, shapes.friction[o])
+        force = push * n + held_back(across(was, n), was_push, friction_at(gap, o, shapes))
         touches.force[o, t] = force
         touches.more[o, t] = force
 
@@ -253,7 +261,8 @@ def solve_touch(
     d = approach(touches, o, t, surface, corners)
     wanted = least_motion(touches.gap[o, t], law, dt) - wp.dot(d, n)
     normal_force = wp.max(wp.dot(before, n) + wanted / yielding, 0.0)
-    sideways = held_back(across(before, n) - across(d, n) / yielding, normal_force, shapes.friction[o])
+    friction = friction_at(touches.gap[o, t], o, shapes)
+    sideways = held_back(across(before, n) - across(d, n) / yielding, normal_force, friction)
     force = normal_force * n + sideways
     touches.force[o, t] = force
     touches.more[o, t] = force - before
