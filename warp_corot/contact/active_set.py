@@ -12,9 +12,9 @@ from warp_corot.kernels.contact import active as kernels
 if TYPE_CHECKING:
     from .contacts import Contacts
 
-#: Way in a step, as a share of the smallest element's size, below which friction gets smaller.
+#: Motion in a step, as a fraction of the smallest element's size, below which friction decreases.
 LEAST_SLIP = 1e-4
-#: In the place of an infinite thickness [m].
+#: Stands for an infinite thickness [m].
 THICK = 1e6
 
 
@@ -22,8 +22,8 @@ class ActiveSet:
     """Contact of a body with obstacles in implicit steps.
 
     Args:
-        contacts: Of the system.
-        k: Which body.
+        contacts: The contact of the system.
+        k: The number of the body.
     """
 
     def __init__(self, contacts: Contacts, k: int):
@@ -39,7 +39,7 @@ class ActiveSet:
         self.prepare()
 
     def prepare(self) -> None:
-        """Take the present surface; not while launches are recorded."""
+        """Update to the present surface; not while launches are recorded."""
         rigid, holding = self._rigid, kernels.Holding()
         holding.kinds, holding.forces, holding.drag = rigid.kinds, rigid.forces, rigid.drag
         shape, device = rigid.kinds.shape, self.device
@@ -54,7 +54,7 @@ class ActiveSet:
     # --- launches ----------------------------------------------------------------------------------------------------
 
     def launch_begin(self, d: wp.array) -> None:
-        """Launch what a step begins with: nodes are held as the last one has left them. d is a guess [m], vec4."""
+        """Launch the begin of a step: nodes are held as at the end of the last one. d is a guess [m], vec4."""
         state, conditions = self.body.state, self.body.conditions
         inputs = [conditions.inverse_mass, state.rest, state.displacements, self._surface, self._holding]
         self._launch(kernels.begin_places, inputs)
@@ -68,7 +68,7 @@ class ActiveSet:
         self._launch(kernels.leave_free, [self._surface, self._holding, v])
 
     def launch_imposed(self, d: wp.array) -> None:
-        """Launch that d has the motion that is given in these directions."""
+        """Launch the assignment of the given motion to d in these directions."""
         self._launch(kernels.impose, [self._surface, self._holding, d])
 
     def launch_drag(self, x: wp.array, y: wp.array) -> None:
@@ -81,7 +81,7 @@ class ActiveSet:
         self._launch(kernels.add_friction, [motions, self._surface, self._holding, d, r])
 
     def launch_judgement(self, b: wp.array, q: wp.array, d: wp.array) -> None:
-        """Launch which nodes are held from now on, and ``changed``.
+        """Launch the decision which nodes are held from now on, and ``changed``.
 
         Args:
             b: Forces at the beginning of the step without contact [N].
@@ -99,7 +99,7 @@ class ActiveSet:
         self._hold()
 
     def launch_end(self, d: wp.array) -> None:
-        """Launch what users read of contact."""
+        """Launch the results of contact for users."""
         self._launch(kernels.end_places, [d, self._holding, self._surface, self.body.state.contact_forces])
 
     # --- pieces ------------------------------------------------------------------------------------------------------

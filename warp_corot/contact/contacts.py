@@ -22,15 +22,16 @@ from .surface import ContactSurface
 from .tool import Obstacle
 from .warned import OVERLAP, warn_of_crushed, warn_of_overlaps
 
-#: Gaps that rounding leaves, in roundings of the largest coordinate.
+#: Gaps that come from rounding, in roundings of the largest coordinate.
 ROUNDINGS = 16.0
-#: Things that overlap are pushed apart at this share of the speed of waves.
+#: Overlapping surfaces are pushed apart at this fraction of the speed of waves.
 RECOVERY = 0.05
-#: Rounds in which obstacles between the nodes are held off.
+#: Number of rounds for obstacles between the nodes.
 ROUNDS = 3
-#: So many grains has the force that takes the heaviest node across the smallest element in a step; 2^63 is the most.
+#: Number of grains in the force that moves the heaviest node across the smallest element in a step; the maximum is
+#: 2^63.
 GRAINS = 2.0**48
-#: Warps that add up a wrench.
+#: Number of warps that add up a wrench.
 WARP, MOST_WARPS = 32, 64
 
 
@@ -40,15 +41,15 @@ class Contacts:
     Args:
         system: The bodies.
         obstacles: Shapes and tools.
-        options: How things touch.
-        stable_dt: Largest stable step of the bodies at rest [s], which tells the speed of waves.
+        options: The options of contact.
+        stable_dt: Largest stable step of the bodies at rest [s], from which the speed of waves follows.
         dt: The length of a step, if it was given [s].
 
     Attributes:
         surface: The surface nodes and triangles of all bodies.
-        obstacles: What is rigid.
+        obstacles: The rigid obstacles.
         rigid: Forces of obstacles; None without.
-        search: Says when to look for what is near.
+        search: The search for nearby surfaces.
 
     Raises:
         InputError: As ``Obstacles``.
@@ -74,7 +75,7 @@ class Contacts:
         if self.obstacles.count:
             given = (self.surface, self.obstacles, self.search, self.law, system.pace.arrays, system.ranks)
             self.rigid = RigidForces(*given)
-        #: Soft surfaces that may touch one another; None without.
+        #: Contact between soft surfaces; None if they cannot touch one another.
         self.pairs: Pairs | None = None
         if len(system.bodies) > 1 or options.self_contact:
             self.pairs = Pairs(self.surface, self.search, options.friction, options.self_contact)
@@ -120,10 +121,10 @@ class Contacts:
             self.pairs.forget()
 
     def check_start(self) -> None:
-        """See once what begins inside something else; what overlaps is pushed apart slowly.
+        """Check once whether anything begins inside something else; overlaps are pushed apart slowly.
 
         Warns:
-            StabilityWarning: Something does.
+            StabilityWarning: There are overlaps.
         """
         if not self._is_looked_at:
             self._is_looked_at = True
@@ -131,10 +132,10 @@ class Contacts:
             warn_of_overlaps(self, OVERLAP * self.smallest)
 
     def look(self) -> None:
-        """See whether elements are turned inside out, until some were; waits for the device.
+        """Check whether elements are turned inside out, until the first time; waits for the device.
 
         Warns:
-            StabilityWarning: Some are.
+            StabilityWarning: Some elements are.
         """
         self._has_crushed = self._has_crushed or warn_of_crushed(self)
 
@@ -153,7 +154,7 @@ class Contacts:
             self._launch(motion.add_contact_forces, self._count(k), inputs, outputs)
 
     def launch_motion(self, offset: int) -> None:
-        """Launch where obstacles go in an implicit step."""
+        """Launch the motion of obstacles in an implicit step."""
         if self.obstacles.count:
             self.obstacles.launch_motion(offset)
 
@@ -208,7 +209,7 @@ class Contacts:
         self._is_looked_at = False
 
     def take_rooms(self, rooms: Sequence[Sequence[int]], room: int) -> None:
-        """Have as much room as there was: ``surface.rooms``, and ``pairs.room`` if soft surfaces may touch."""
+        """Reserve the former room: ``surface.rooms``, and ``pairs.room`` if soft surfaces may touch."""
         before = self.surface.revision
         self.surface.make_room(rooms)
         self._follow(before)
@@ -218,7 +219,7 @@ class Contacts:
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _follow(self, revision: int) -> None:
-        """Take the present surfaces, which were others at that revision."""
+        """Update to the present surfaces, which have changed since that revision."""
         if self.surface.revision != revision:
             self._make_arrays()
         self._share_arrays()
@@ -244,7 +245,7 @@ class Contacts:
         return law
 
     def _predict(self, offset: int, damping: float) -> None:
-        """Launch where the surfaces go without contact."""
+        """Launch the motion of the surfaces without contact."""
         system, surface = self.system, self.surface
         for k, body in enumerate(system.bodies):
             state, conditions = body.state, body.conditions
@@ -288,7 +289,7 @@ class Contacts:
         self._share_arrays()
 
     def _share_arrays(self) -> None:
-        """Let bodies have what users read of them."""
+        """Give bodies the arrays that users read."""
         for body, part, pressures in zip(self.system.bodies, self.surface.parts, self._triangle_pressures, strict=True):
             body.state.make_contact_forces()
             body.state.contact_forces.zero_()
@@ -296,7 +297,7 @@ class Contacts:
             body.state.contact_pressures = pressures if self.system.worlds > 1 else pressures[:triangles]
 
     def _count(self, k: int) -> int:
-        """Places of a body in all worlds."""
+        """Number of places of a body in all worlds."""
         return self.system.worlds * self.surface.parts[k].nodes
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:

@@ -23,17 +23,16 @@ RIGID = 1000.0
 
 
 class Grasp:
-    """A patch of a body's surface that goes along with a tool, from where both are now until it is released.
+    """A patch of a body's surface that moves with a tool, from the present places of both until it is released.
 
-    It is one of the simulation's constraints from the moment it is made. In implicit steps what is held rigidly gives
-    way a little while forces change. ``tool.wrench`` has what the tool feels
-    besides.
+    It is one of the simulation's constraints as soon as it is made. In implicit steps a rigidly held patch gives way a
+    little while forces change. ``tool.wrench`` does not include the force of a grasp.
 
     Args:
         body: The body.
-        patch: Its nodes, as ``SoftBody.fix`` takes them; those inside it are left out.
-        tool: What holds them; an obstacle of the same simulation.
-        stiffness: Of the whole patch [N/m]; None: it is held rigidly.
+        patch: Its nodes, as for ``SoftBody.fix``; nodes inside the body are left out.
+        tool: The tool that holds them; an obstacle of the same simulation.
+        stiffness: Stiffness of the whole patch [N/m]; None: the patch is held rigidly.
 
     Raises:
         InputError: The tool is in no simulation or the body in another, no node of the surface is meant, a body that is
@@ -73,7 +72,7 @@ class Grasp:
 
     @property
     def is_holding(self) -> bool:
-        """Whether it has not been released."""
+        """Whether the patch is held."""
         return self in self._system.constraints
 
     @property
@@ -83,10 +82,10 @@ class Grasp:
         return self._wrenches
 
     def release(self) -> None:
-        """Let the patch go; again is not wrong."""
+        """Release the patch; further calls do nothing."""
         if self.is_holding:
             self._system.constraints.remove(self)
-            # Their sum must not come back to what it was.
+            # The sum must not return to an earlier value.
             self._system.changes += 1 + self.launch_revision
             self._forces.zero_()
             self._wrenches.zero_()
@@ -101,14 +100,14 @@ class Grasp:
 
     @property
     def kept(self) -> dict[str, wp.array]:
-        """What a checkpoint holds: where nodes are in the tool's frame, and the last forces."""
+        """The arrays for a checkpoint: the nodes' places in the tool's frame, and the last forces."""
         return {"places": self._places, "forces": self._forces, "wrenches": self._wrenches}
 
     def prepare(self) -> None:
-        """Hold the same patch of another mesh: the nodes that are left of it, and new ones between two of them.
+        """Hold the same patch of a changed mesh: its remaining nodes, and new ones between two of them.
 
         Warns:
-            StabilityWarning: None is left, and it holds nothing.
+            StabilityWarning: No node remains, so that it holds nothing.
         """
         if self.body.version == self._version:
             return
@@ -165,7 +164,7 @@ class Grasp:
             self._launch(kernels.add_held_forces, [self._nodes, self._forces], [body.state.contact_forces])
 
     def measure(self) -> None:
-        """It goes no faster than its tool."""
+        """A grasp is no faster than its tool."""
 
     def publish(self) -> None:
         inputs = [self._per_world, self._number, self._obstacles.motions, self._places, self._forces]
@@ -178,7 +177,7 @@ class Grasp:
         """It keeps nothing."""
 
     def reset(self, chosen: wp.array) -> None:
-        """It goes on holding."""
+        """A grasp keeps holding."""
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
@@ -193,7 +192,7 @@ class Grasp:
         return RIGID * float(np.max(self.body.material.isotropic.young)) * size
 
     def _take(self, nodes: npt.NDArray[np.integer]) -> None:
-        """Hold these nodes of each world, at places to be told."""
+        """Hold these nodes of each world; their places are set afterwards."""
         body, device = self.body, self.device
         self.nodes, self._per_world, self._version = nodes, len(nodes), body.version
         mesh = body.mesh
@@ -216,7 +215,7 @@ Place = npt.NDArray[np.float32]
 def patch_of(
     mesh: TetForest, surface: npt.NDArray[np.integer], places: dict[tuple[int, ...], Place]
 ) -> dict[int, Place]:
-    """Which nodes of a forest's surface belong to a patch, and their places in the tool's frame.
+    """The nodes of a forest's surface that belong to a patch, with their places in the tool's frame.
 
     Args:
         mesh: The present mesh.
@@ -224,7 +223,7 @@ def patch_of(
         places: Of the patch's nodes on the mesh before, by their lattice points.
 
     Returns:
-        By node: those that were there, and new ones halfway between two of the patch.
+        Places by node: of former nodes, and of new ones halfway between two nodes of the patch.
     """
     points = list(map(tuple, mesh.lattice.tolist()))
     held = {node: places[points[node]] for node in surface.tolist() if points[node] in places}

@@ -1,4 +1,4 @@
-"""What contact goes on from, for checkpoints."""
+"""The state of contact, for checkpoints."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from warp_corot.errors import InputError
 
 from .contacts import Contacts
 
-#: What the shapes and the meshes give again.
+#: Arrays that follow from the shapes and the meshes.
 GIVEN = {"meeting", "shapes"}
 
 
 def kept_arrays(contacts: Contacts) -> dict[str, wp.array]:
-    """All arrays in which contact keeps something from one step to the next, by name."""
+    """All arrays that contact keeps from one step to the next, by name."""
     owners = {name: getattr(contacts, name) for name in ("search", "rigid", "pairs", "obstacles")}
     found = {
         f"{owner}.{name}": array
@@ -30,12 +30,12 @@ def kept_arrays(contacts: Contacts) -> dict[str, wp.array]:
 
 
 def keep_again(contacts: Contacts, rooms: list[list[int]], room: int, kept: dict[str, Any]) -> None:
-    """Go on from what ``kept_arrays`` gave.
+    """Restore the arrays of ``kept_arrays``.
 
     Args:
-        contacts: Of the same bodies and obstacles.
-        rooms: ``contacts.surface.rooms`` as it was.
-        room: ``contacts.pairs.room`` as it was; 0 without.
+        contacts: Contact of the same bodies and obstacles.
+        rooms: The former ``contacts.surface.rooms``.
+        room: The former ``contacts.pairs.room``; 0 without pairs.
         kept: The arrays' values.
 
     Raises:
@@ -51,7 +51,7 @@ def keep_again(contacts: Contacts, rooms: list[list[int]], room: int, kept: dict
 
 
 def _arrays_in(name: str, value: Any) -> Iterator[tuple[str, wp.array]]:
-    """An array, those of a list, or those of a Warp struct."""
+    """An array, the arrays of a list, or those of a Warp struct."""
     if isinstance(value, wp.array):
         yield name, value
     elif isinstance(value, list):

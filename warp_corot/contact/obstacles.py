@@ -1,4 +1,4 @@
-"""The obstacles of a simulation on the device: their shapes, how they move, and what they feel."""
+"""The obstacles of a simulation on the device: their shapes, their motion, and the wrenches on them."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from .sampled import SignedDistance, TriangleMesh
 from .shapes import Ground, Shape
 from .tool import Obstacle, Tool, as_tool
 
-#: Share of half a tool's thickness that it may go in a step of a given length.
+#: Fraction of half its thickness by which a tool may move in a step of a given length.
 LARGEST_SHARE = 0.5
-#: A tool that has to catch up with its keyframes goes so many times as fast as they ever do.
+#: A tool that has to catch up with its keyframes moves at this many times their highest speed.
 CATCHING_UP = 2.0
 
 
 class Obstacles:
-    """Obstacles of all worlds, each of which may be at another place in each.
+    """Obstacles of all worlds; each may have a different place in each world.
 
     Args:
         given: Shapes and tools.
-        friction: Of those that have none of their own.
-        system: The simulation's.
+        friction: Friction of obstacles without their own.
+        system: The simulation's system.
         dt: The length of a step, if it was given [s].
 
     Attributes:
-        system: As given.
-        given: As they were given.
-        tools: All as tools.
-        shapes, motions: As kernels take them.
+        system: The system.
+        given: The obstacles, as they were given.
+        tools: All of them as tools.
+        shapes, motions: Their structs for kernels.
         thinnest: Half of the smallest way through any of them [m].
         revision: Changes whenever launches do.
 
@@ -82,19 +82,19 @@ class Obstacles:
 
     @property
     def have_edges(self) -> bool:
-        """Whether any of them can come between the nodes of a body; a half-space cannot."""
+        """Whether any of them can pass between the nodes of a body; a half-space cannot."""
         return any(not isinstance(tool.shape, Ground) for tool in self.tools)
 
     @property
     def state(self) -> dict[str, wp.array]:
-        """Where they are."""
+        """The arrays of their poses."""
         return {"later": self.motions.later, "target": self.motions.target} if self.tools else {}
 
     def update(self) -> None:
-        """Take how the tools are to move.
+        """Update the motion of the tools.
 
         Raises:
-            InputError: One is too fast for the given step.
+            InputError: A tool is too fast for the given step.
         """
         rates = [tool.fastest() / tool.shape.thickness for tool in self.tools]
         if self._dt is not None and max(rates, default=0.0) * self._dt > LARGEST_SHARE:
@@ -130,13 +130,13 @@ class Obstacles:
         self.revision += 1
 
     def send(self, number: int, pose: npt.NDArray[np.float64]) -> None:
-        """Let a tool go to a place in all worlds."""
+        """Send a tool to a place in all worlds."""
         given = wp.array(pose.astype(np.float32).reshape(1, 7), dtype=wp.transform, device=self.device)
         inputs = [given, number, self.motions.target]
         wp.launch(kernels.take_targets, self.worlds, inputs, device=self.device)
 
     def launch_motion(self, offset: int) -> None:
-        """Launch where obstacles go in this step."""
+        """Launch the motion of obstacles in this step."""
         for number, tool in enumerate(self.tools):
             if tool.poses is not None:
                 if tool.poses.device != self.device or len(tool.poses) not in (1, self.worlds):
@@ -165,11 +165,11 @@ class Obstacles:
         return found.numpy()
 
     def poses(self) -> npt.NDArray[np.float64]:
-        """Where they are, float64 [worlds, O, 7]; waits for the device."""
+        """Their poses, float64 [worlds, O, 7]; waits for the device."""
         return self.motions.later.numpy().astype(np.float64)
 
     def wrench(self, number: int) -> wp.array:
-        """What one of them feels [N, N m], spatial vectors [worlds]."""
+        """The wrench on one of them [N, N m], spatial vectors [worlds]."""
         return self.wrenches[number]
 
     def _shapes(self, shapes: Sequence[Shape], friction: float) -> Shapes:
@@ -204,7 +204,7 @@ class Obstacles:
 
 
 def _first_pose(tool: Tool) -> npt.NDArray[np.float64]:
-    """Where a tool is at time zero."""
+    """The pose of a tool at time zero."""
     if tool.keys is None:
         return tool.pose
     times, poses = tool.keys

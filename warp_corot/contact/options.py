@@ -1,4 +1,4 @@
-"""How things touch."""
+"""The options of contact."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Contact:
     """Contact of a simulation's bodies with obstacles and with one another.
 
     Attributes:
-        friction: Coulomb's coefficient of friction >= 0 of all contacts; an obstacle may have one of its own.
+        friction: Coulomb's coefficient of friction >= 0 of all contacts; an obstacle may have its own.
         self_contact: Whether bodies touch themselves, too. They touch one another in any case.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Soft surfaces against one another: pairs that are near, and forces between them."""
+"""Soft surfaces against one another: nearby pairs, and forces between them."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from warp_corot.kernels.stepping.pace import Pace
 from .search import Search
 from .surface import ContactSurface
 
-#: Pairs that there is room for at first, over nodes and edges; and growth where that is too few.
+#: Initial room for pairs, over the number of nodes and edges; and its growth if it is too small.
 PAIRS_EACH = 2
 GROWTH = 2.0
-#: Searches after which trees of boxes are built again: things may lie beside others by then.
+#: Number of searches after which trees of boxes are built again, because neighbours may have changed by then.
 REBUILT = 100
 
 
@@ -29,12 +29,12 @@ class Pairs:
 
     Args:
         surface: The bodies' surfaces.
-        search: Says when to look for pairs.
+        search: The search for nearby surfaces.
         friction: Coulomb's coefficient.
         meets_itself: Whether a body touches itself.
 
     Attributes:
-        rows: The pairs, as kernels take them.
+        rows: The pairs, as a struct for kernels.
         meeting: What may meet, as kernels take it.
         revision: Changes whenever launches do.
     """
@@ -49,7 +49,7 @@ class Pairs:
     # --- what is there ---------------------------------------------------------------------------------------------
 
     def follow(self) -> None:
-        """Take the present surfaces."""
+        """Update to the present surfaces."""
         surface, device = self.surface, self.device
         if surface.revision == self._taken:
             self.forget()
@@ -73,7 +73,7 @@ class Pairs:
         self._make_room(max(self._room, PAIRS_EACH * (count + edges)))
 
     def _make_room(self, room: int) -> None:
-        """Have room for so many pairs. There are none until the next search.
+        """Reserve room for a number of pairs. There are no pairs until the next search.
 
         Raises:
             UnstableError: There is no memory for them.
@@ -106,11 +106,11 @@ class Pairs:
 
     @property
     def room(self) -> int:
-        """How many pairs there is room for."""
+        """The number of pairs that there is room for."""
         return self._room
 
     def take_room(self, room: int) -> None:
-        """Have room for so many pairs, of which there are none until the next search."""
+        """Reserve room for a number of pairs; there are no pairs until the next search."""
         if room != self._room:
             self._make_room(room)
 
@@ -118,11 +118,11 @@ class Pairs:
 
     @property
     def is_full(self) -> bool:
-        """Whether the last run needed more room than there is; known once the device has come so far."""
+        """Whether the last run needed more room than there is; known after the device has finished it."""
         return self.search.pairs > self._room
 
     def grow(self) -> None:
-        """Make room for what the last run needed."""
+        """Reserve the room that the last run needed."""
         if self.is_full:
             self._make_room(int(GROWTH * self.search.pairs))
 
@@ -132,7 +132,7 @@ class Pairs:
         return bool(self._trees)
 
     def prepare(self) -> None:
-        """Have all that launches need."""
+        """Make everything that launches need."""
         if not self._trees:
             self._box()
             self._trees = [wp.Bvh(lower, upper) for lower, upper in self._boxes]
@@ -151,7 +151,7 @@ class Pairs:
     # --- launches --------------------------------------------------------------------------------------------------
 
     def launch_begin(self, law: Law) -> None:
-        """Launch where all pairs are."""
+        """Launch the places of all pairs."""
         self._on_rows(kernels.locate_rows, [law, self.surface.arrays, self.meeting, self.rows, self._added])
         self._apply(law)
 
@@ -195,7 +195,7 @@ class Pairs:
         wp.launch(kernel, threads, [threads, *inputs], device=self.device)
 
     def _apply(self, law: Law) -> None:
-        """Launch that nodes get what was added."""
+        """Launch the addition of these forces to the nodes."""
         among = self.search.at_nodes
         inputs = [*among, law, self.surface.arrays, self._added, self._crowd]
         wp.launch(kernels.apply_added, among[0], inputs, device=self.device)

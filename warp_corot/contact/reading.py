@@ -24,20 +24,20 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ContactPoint:
-    """One place where a body was touched in the last step.
+    """A place at which a body was touched in the last step.
 
     Attributes:
         body: The soft body.
-        other: What touches it: an obstacle as it was given, or a soft body, which may be the same.
-        world: In which world.
+        other: The other side: an obstacle as it was given, or a soft body, which may be the same.
+        world: The world.
         nodes: The body's nodes at that place: one, the ends of an edge, or the corners of a triangle; numbered within
             the world.
-        shares: Of each of them in the point [1], [2] or [3].
-        point: Where [m], [3].
+        shares: The weight of each of them in the point, [1], [2] or [3].
+        point: The place [m], [3].
         normal: From the other to the body, [3].
-        gap: Between them at the beginning of the step, negative where they overlapped [m].
-        normal_force: On the body along the normal [N], never negative.
-        friction_force: On the body across the normal [N], [3].
+        gap: The gap at the beginning of the step, negative for an overlap [m].
+        normal_force: The force on the body along the normal [N], never negative.
+        friction_force: The force on the body across the normal [N], [3].
         other_nodes: The nodes of the other, if that is a soft body.
     """
 

@@ -1,4 +1,4 @@
-"""Forces of obstacles on soft surfaces: on their nodes, and between these."""
+"""Forces of obstacles on soft surfaces: on nodes, and between nodes."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ class RigidForces:
 
     Args:
         surface: The bodies' surfaces.
-        obstacles: What is rigid.
-        search: Says when to look for what obstacles are near.
-        law: How far contacts may come nearer in a step.
+        obstacles: The obstacles.
+        search: The search for nearby surfaces.
+        law: The law of contact: how far gaps may close in a step.
         pace: The clock.
         ranks: Who moves the other nodes of the triangles here.
 
     Attributes:
-        forces: Of each obstacle on each surface node itself in the last step [N], vec3 [O, S].
+        forces: The force of each obstacle on each surface node itself in the last step [N], vec3 [O, S].
         totals: The same with the nodes' shares of the forces between them, when they were last published.
         touches: Obstacles at triangles.
-        kinds, drag: How each surface node is with each obstacle in implicit steps; see ``kernels.contact.active``,
-            [O, S].
-        have_edges: Whether any of the obstacles can come between the nodes.
+        kinds, drag: The state of each surface node with each obstacle in implicit steps; see
+            ``kernels.contact.active``, [O, S].
+        have_edges: Whether any of the obstacles can pass between the nodes.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class RigidForces:
         self.follow()
 
     def follow(self) -> None:
-        """Take the present surfaces."""
+        """Update to the present surfaces."""
         if self.surface.revision == self._taken:
             self.forget()
             return
@@ -78,7 +78,7 @@ class RigidForces:
 
     @property
     def state(self) -> dict[str, wp.array]:
-        """Arrays from which it goes on."""
+        """The arrays that it keeps from step to step."""
         touches = self.touches
         sides = {"touch_normals": touches.normal.flatten(), "touch_forces": touches.force.flatten()}
         return {"anchors": self.anchors.flatten(), **sides}
@@ -86,7 +86,7 @@ class RigidForces:
     # --- launches --------------------------------------------------------------------------------------------------
 
     def launch_begin(self) -> None:
-        """Launch the first forces: those between nodes that the last step has left, and those on nodes."""
+        """Launch the first forces: those between nodes from the last step, and those on nodes."""
         if self.have_edges:
             self._yielding = self._ranks.completed_yielding(self.surface.arrays.yielding)
             rigid = [self.obstacles.shapes, self.obstacles.motions]
@@ -110,11 +110,11 @@ class RigidForces:
         self._apply()
 
     def launch_correction(self) -> None:
-        """Launch the forces on nodes again, which others have moved since."""
+        """Launch the forces on nodes again, because other forces have moved them since."""
         self._touch_nodes(0)
 
     def launch_end(self) -> None:
-        """Launch where nodes stick from now on."""
+        """Launch the places at which nodes stick from now on."""
         rigid = [self.obstacles.shapes, self.obstacles.motions]
         self._on_nodes(vertices.keep_anchors, [*rigid, self.surface.arrays, self.forces, self.anchors])
 
@@ -127,7 +127,7 @@ class RigidForces:
         return self.totals
 
     def _find(self) -> None:
-        """Launch the search for what obstacles are near."""
+        """Launch the search for nodes and triangles near obstacles."""
         watch, near, arrays = self.search.watch, self.search.near, self.surface.arrays
         inputs = [watch, self.obstacles.shapes, self.obstacles.motions, self._law, arrays]
         outputs = [near, self.forces, self.anchors]
@@ -143,7 +143,7 @@ class RigidForces:
         self._on_nodes(vertices.touch_obstacles, inputs)
 
     def _apply(self) -> None:
-        """Launch that nodes get what was added."""
+        """Launch the addition of these forces to the nodes."""
         inputs = [self.surface.corner_starts, self.surface.corners, self.touches, self.surface.arrays]
         self._on_nodes(triangles.apply_touches, inputs)
 

@@ -28,7 +28,7 @@ class TriangleMesh(Shape):
         triangles: Their corners, counter-clockwise seen from outside, [F, 3].
 
     Raises:
-        InputError: Wrong shapes, corners that are not there, a surface that is open or inside out.
+        InputError: Wrong shapes, corners that do not exist, or a surface that is open or inside out.
     """
 
     kind = int(kernels.MESH)
@@ -63,15 +63,15 @@ class SignedDistance(Shape):
     """A signed distance, negative inside, between samples on a grid.
 
     Args:
-        distance: Samples [nx, ny, nz] [m]; or a function of points [n, 3] [m] that gives as many distances [m].
+        distance: Samples [nx, ny, nz] [m]; or a function of points [n, 3] [m] that returns their distances [n] [m].
         lower: The first sample's place, or the lower corner of the box in which the function is sampled [m].
-        spacing: From sample to sample along each axis [m]; with samples only.
+        spacing: The distance of samples along each axis [m]; with samples only.
         upper: The upper corner of the box [m]; with a function only. The shape must lie within it.
         resolution: Samples along the longest side of the box; with a function only.
 
     Raises:
-        InputError: Arguments that do not go together, distances that are not finite, nothing inside, or a shape that
-            reaches the border of the grid, as one that is inside out does.
+        InputError: Arguments that exclude each other, distances that are not finite, no point inside, or a shape that
+            reaches the border of the grid, for example because it is inside out.
     """
 
     kind = int(kernels.GRID)
@@ -114,7 +114,7 @@ class SignedDistance(Shape):
 
 
 def _check_closed(triangles: npt.NDArray[np.int32]) -> None:
-    """See that every edge is there once in each direction.
+    """Check that every edge occurs once in each direction.
 
     Raises:
         InputError: The surface is open, or turns over.

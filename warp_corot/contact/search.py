@@ -1,4 +1,4 @@
-"""When to look for what is near: once something has gone far enough since it was last looked."""
+"""The search for nearby surfaces, repeated once something has moved far enough since the last one."""
 
 from __future__ import annotations
 
@@ -14,35 +14,35 @@ from warp_corot.solvers.guarding.mapped import Mapped
 from .obstacles import Obstacles
 from .surface import ContactSurface
 
-#: The least that anything may go between two searches, as a share of the smallest element's size; at first, and at
-#: most, where what is hit goes farther in one step than was reserved for it.
+#: The least motion that is reserved for anything between two searches, as a fraction of the smallest element's size: at
+#: first, and at most after something that was hit has moved farther in one step than was reserved.
 LEAST, MOST = 0.05, 4.0
 WIDER = 4.0
-#: Threads that go through lists on CUDA, at most.
+#: Maximum number of threads that process a list on CUDA.
 MOST_THREADS = 1 << 18
-#: What the device tells the host: see ``kernels.contact.watch.report_search``.
+#: The report of the device to the host: see ``kernels.contact.watch.report_search``.
 PAIRS, MISSED, SEARCHES = range(3)
 
 
 class Search:
-    """What is near is found with a margin, and again before anything has gone beyond half of it.
+    """A search finds nearby surfaces with a margin, and is repeated before anything has moved beyond half of it.
 
-    Whether it has is known on the device: a search is part of the recorded step, which leaves it out while there is
-    nothing to look for. What goes beyond all of its margin in one step is found out at the end of a run.
+    The device knows whether it is due: a search is part of the recorded step, which skips it while it is not due.
+    Motion beyond the whole margin in one step is noticed at the end of a run.
 
     Args:
         surface: The bodies' surfaces.
-        obstacles: What is rigid.
-        size: Of the smallest element [m].
+        obstacles: The obstacles.
+        size: The size of the smallest element [m].
         branches: Whether a recorded search may be left out by a branch of the graph, which NCCL's launches after it
             do not bear.
 
     Attributes:
-        watch: Where things were at the last search, as kernels take it.
-        near: The nodes that something is near.
-        finders: What is launched in a search.
-        most: How many pairs there were at most, int32 [1].
-        farthest: What may be reserved at least for any motion, at most [m].
+        watch: The places at the last search, as a struct for kernels.
+        near: The nodes that have something near them.
+        finders: The launches of a search.
+        most: The largest number of pairs so far, int32 [1].
+        farthest: The largest value of the least motion that is reserved [m].
     """
 
     def __init__(self, surface: ContactSurface, obstacles: Obstacles, size: float, *, branches: bool = True):
@@ -61,28 +61,28 @@ class Search:
         watch.reach_of = wp.zeros(shape, dtype=wp.float32, device=device)
         self.watch, self.near = watch, near_kernels.Near()
         self._taken = -1
-        #: Whether a device can leave out what was recorded; else every kernel of a search sees whether it is due.
+        #: Whether the device can skip recorded launches; otherwise every kernel of a search tests whether it is due.
         self._branches = device.is_cpu or (branches and wp.is_conditional_graph_supported())
         self.follow()
 
     def threads(self, room: int) -> int:
-        """Threads for what is in a list with room for so many."""
+        """Number of threads for a list with this room."""
         return 1 if self.device.is_cpu else min(max(room, 1), MOST_THREADS)
 
     @property
     def at_nodes(self) -> list:
-        """How many threads are to go through the nodes that something is near, and these."""
+        """The number of threads for the nodes that have something near them, and these nodes."""
         return [self.threads(self.surface.count), self.near]
 
     @property
     def at_touches(self) -> list:
-        """The same of obstacles at triangles."""
+        """The same for obstacles at triangles."""
         return [self.threads(len(self.near.touches)), self.near]
 
     # --- what the host sees ----------------------------------------------------------------------------------------
 
     def follow(self) -> None:
-        """Take the present surfaces."""
+        """Update to the present surfaces."""
         if self.surface.revision != self._taken:
             count, device = self.surface.count, self.device
             self.watch.places = wp.zeros(count, dtype=wp.vec3, device=device)
@@ -95,29 +95,29 @@ class Search:
         self.forget()
 
     def forget(self) -> None:
-        """Look again before the next step, wherever things are now."""
+        """Search again before the next step."""
         self.watch.due.fill_(1)
 
     @property
     def pairs(self) -> int:
-        """How many pairs there were at most, as the last run has told."""
+        """The largest number of pairs, by the report of the last run."""
         return int(self._report.values[PAIRS])
 
     @property
     def has_missed(self) -> bool:
-        """Whether something went farther in the last run than what is near was looked for."""
+        """Whether something moved beyond its margin in the last run."""
         return bool(self._report.values[MISSED] > 0)
 
     @property
     def count(self) -> int:
-        """How often it was looked so far, as the last run has told."""
+        """The number of searches so far, by the report of the last run."""
         return int(self._report.values[SEARCHES])
 
     def widen(self) -> None:
-        """Look farther from now on, if something has gone too far.
+        """Search with a larger margin from now on, if something has moved too far.
 
         Raises:
-            UnstableError: It went farther than anything goes in a stable step.
+            UnstableError: It moved farther than anything moves in a stable step.
         """
         if not self.has_missed:
             return
@@ -147,12 +147,12 @@ class Search:
             self._search()
 
     def launch_after(self) -> None:
-        """Launch after a step whether it is time to look again."""
+        """Launch the test after a step whether a search is due."""
         if self.finders:
             self._on_nodes(kernels.follow_nodes, [self.surface.arrays, self.watch])
 
     def launch_report(self) -> None:
-        """Launch what the host sees after a run."""
+        """Launch the report to the host after a run."""
         wp.launch(kernels.report_search, 1, [self.watch, self.most, self._report.array], device=self.device)
 
     def _search(self) -> None:

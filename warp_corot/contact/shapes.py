@@ -1,4 +1,4 @@
-"""Rigid obstacles: shapes in a frame of their own, which a pose takes to the world."""
+"""Rigid obstacles: shapes in their own frames, which a pose maps to the world."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NO_TURN = (0.0, 0.0, 0.0, 1.0)
 
 
 class Feeling(Protocol):
-    """What knows the wrench on an obstacle."""
+    """The source of the wrench on an obstacle."""
 
     @property
     def wrench(self) -> wp.array: ...
@@ -32,16 +32,16 @@ class Shape:
     """A rigid obstacle.
 
     Args:
-        position: Where the origin of its frame is in the world [m].
-        quaternion: How its frame is turned, (x, y, z, w).
+        position: The origin of its frame in the world [m].
+        quaternion: The rotation of its frame, (x, y, z, w).
         friction: Coulomb's coefficient; None: the simulation's.
 
     Attributes:
-        kind: As ``kernels.contact.shapes`` has it.
-        size: Its numbers there [m].
-        thickness: Half of the smallest way through it [m]; infinite for a half-space. No step is so long that things
-            pass it.
-        reach: How far its points are from its origin at most [m]; infinite for a half-space.
+        kind: Its kind in ``kernels.contact.shapes``.
+        size: Its sizes there [m].
+        thickness: Half of the shortest way through it [m]; infinite for a half-space. Steps are so short that nothing
+            passes it.
+        reach: The largest distance of its points from its origin [m]; infinite for a half-space.
 
     Raises:
         InputError: A value out of its range.
@@ -58,15 +58,15 @@ class Shape:
         self.position = checked_vector(position, "position")
         self.quaternion = checked_quaternion(quaternion)
         self.friction = None if friction is None else checked_friction(friction)
-        #: What a simulation made of it.
+        #: The simulation's tool for it.
         self.felt: Feeling | None = None
 
     @property
     def wrench(self) -> wp.array:
-        """As ``Tool.wrench``, of a shape that stays where it is.
+        """As ``Tool.wrench``, for a shape that does not move.
 
         Raises:
-            InputError: No simulation has it.
+            InputError: It belongs to no simulation.
         """
         if self.felt is None:
             raise InputError(f"no simulation has this {self!r}; name it among obstacles of a Simulation")
@@ -85,8 +85,8 @@ class Ground(Shape):
     """The half-space below a plane: the points x with normal . x <= offset.
 
     Args:
-        normal: Out of the ground, of any length but zero.
-        offset: Of the plane from the origin, along the normal [m].
+        normal: The direction out of the ground, of any length except zero.
+        offset: The distance of the plane from the origin, along the normal [m].
         friction: As ``Shape``.
     """
 
@@ -173,7 +173,7 @@ def checked_vector(given: Any, name: str) -> npt.NDArray[np.float64]:
     """Three finite numbers.
 
     Raises:
-        InputError: They are not.
+        InputError: They are not three finite numbers.
     """
     vector = checked_numbers(given, name, "[3]")
     if vector.shape != (3,) or not np.isfinite(vector).all():
@@ -182,10 +182,10 @@ def checked_vector(given: Any, name: str) -> npt.NDArray[np.float64]:
 
 
 def checked_quaternion(given: Any) -> npt.NDArray[np.float64]:
-    """A turn, (x, y, z, w), of length one.
+    """A unit quaternion, (x, y, z, w).
 
     Raises:
-        InputError: Not four finite numbers, or all are zero.
+        InputError: They are not four finite numbers, or all are zero.
     """
     q = checked_numbers(given, "quaternion", "[4]")
     length = float(np.linalg.norm(q)) if q.shape == (4,) else math.nan
@@ -206,7 +206,7 @@ def checked_length(given: Any, name: str) -> float:
 
 
 def turn_from_z(n: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """The shortest turn of the z axis to a unit vector, (x, y, z, w); exactly none for z itself."""
+    """The shortest rotation of the z axis to a unit vector, (x, y, z, w); exactly the identity for z itself."""
     q = np.array([-n[1], n[0], 0.0, 1.0 + n[2]])
     length = np.linalg.norm(q)
     return q / length if length > 1e-6 else np.array([1.0, 0.0, 0.0, 0.0])

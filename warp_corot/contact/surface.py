@@ -16,7 +16,7 @@ from warp_corot.mesh.surfaces.boundary import boundary_faces
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
 
-#: Room for a body whose mesh changes, over what its surface has when room is made.
+#: Room for a body whose mesh changes, over the size of its surface when the room is reserved.
 ROOM = 1.5
 NO_NODE = -1
 
@@ -30,7 +30,7 @@ class Skin:
     Attributes:
         nodes: Its nodes, int32 [n].
         triangles: Their places in ``nodes``, int32 [t, 3], counter-clockwise seen from outside.
-        edges: The same of their edges, int32 [e, 2].
+        edges: The same for their edges, int32 [e, 2].
         sides: The two triangles at each edge, int32 [e, 2].
         opposite: The place of the fourth node of each triangle's tetrahedron, int32 [t]; -1 inside the body.
     """
@@ -43,7 +43,7 @@ class Skin:
 
     @classmethod
     def of(cls, body: SoftBody) -> Skin:
-        """Of a body's present mesh."""
+        """The surface of a body's present mesh."""
         tets = body.mesh.tets
         faces, parents = boundary_faces(tets, body.mesh.points)
         nodes, places = np.unique(faces, return_inverse=True)
@@ -60,20 +60,20 @@ def _edges_of(triangles: Ints) -> tuple[Ints, Ints]:
     order = np.lexsort((ends[:, 1], ends[:, 0]))
     edges, first = np.unique(ends[order], axis=0, return_index=True)
     owners = order // 3
-    # Where more than two triangles meet in an edge, as where two bodies touch in one, the first two of them count.
+    # If more than two triangles meet in an edge, as where two bodies share one, the first two of them count.
     sides = np.column_stack([owners[first], owners[np.minimum(first + 1, len(owners) - 1)]])
     return edges.astype(np.int32), sides.astype(np.int32)
 
 
 @dataclass
 class Part:
-    """Where a body's surface lies in the arrays of all, world after world, and how much room it has in each world.
+    """The place of a body's surface in the common arrays, world after world, and its room in each world.
 
     Attributes:
         start, triangle_start, edge_start: Its first place, its first triangle and its first edge.
-        nodes, triangles, edges: Places for one world.
-        skin: What is there.
-        version: Of the mesh.
+        nodes, triangles, edges: Number of places for one world.
+        skin: The surface.
+        version: The version of the mesh.
     """
 
     start: int
@@ -90,17 +90,17 @@ class ContactSurface:
     """The surfaces of bodies, which follow their meshes.
 
     Args:
-        bodies: All of them, in as many worlds.
+        bodies: All bodies, with the same number of worlds.
 
     Attributes:
-        arrays: The nodes, as kernels take them.
+        arrays: The nodes, as a struct for kernels.
         triangles: Places of their corners, vec3i [T]; -1 where there is none.
         opposite: For each triangle the fourth node of its tetrahedron, int32 [T]; -1 inside the body.
         edges, sides: Places of the ends of edges, and the two triangles of each, vec2i [E]; -1 where there is none.
         corner_starts, corners: For each node, from one start to the next: three times a triangle and which corner.
-        parts: Where each body is.
+        parts: The place of each body.
         places: For each body the place of each node, int32 [nodes]; -1 inside.
-        revision: Changes whenever arrays are others.
+        revision: Changes whenever arrays are replaced.
     """
 
     def __init__(self, bodies: Sequence[SoftBody]):
@@ -111,19 +111,19 @@ class ContactSurface:
 
     @property
     def count(self) -> int:
-        """Places for nodes."""
+        """Number of places for nodes."""
         last = self.parts[-1]
         return last.start + self.worlds * last.nodes
 
     @property
     def triangle_count(self) -> int:
-        """Places for triangles."""
+        """Number of places for triangles."""
         last = self.parts[-1]
         return last.triangle_start + self.worlds * last.triangles
 
     @property
     def edge_count(self) -> int:
-        """Places for edges."""
+        """Number of places for edges."""
         last = self.parts[-1]
         return last.edge_start + self.worlds * last.edges
 
@@ -132,7 +132,7 @@ class ContactSurface:
         return np.repeat(np.arange(len(self.parts)), [self.worlds * part.nodes for part in self.parts]).astype(np.int32)
 
     def follow(self) -> bool:
-        """Take the present meshes; whether any is another."""
+        """Update to the present meshes; returns whether any has changed."""
         changed = [k for k, body in enumerate(self.bodies) if body.version != self.parts[k].version]
         if not changed:
             return False
@@ -152,11 +152,11 @@ class ContactSurface:
 
     @property
     def rooms(self) -> list[list[int]]:
-        """Places for nodes, triangles and edges of each body in a world."""
+        """Number of places for nodes, triangles and edges of each body in a world."""
         return [[part.nodes, part.triangles, part.edges] for part in self.parts]
 
     def make_room(self, rooms: Sequence[Sequence[int]]) -> None:
-        """Take the present meshes, with as much room as ``rooms`` was."""
+        """Update to the present meshes, with the room of a former ``rooms``."""
         self._make_room([Skin.of(body) for body in self.bodies], rooms)
 
     def places_of(self, k: int) -> slice:
@@ -204,7 +204,7 @@ class ContactSurface:
         self._fill()
 
     def _fill(self) -> None:
-        """Bring the skins to the device."""
+        """Copy the surfaces to the device."""
         node, world = (np.full(self.count, NO_NODE, np.int32) for _ in range(2))
         triangles = np.full((self.triangle_count, 3), -1, np.int32)
         opposite = np.full(self.triangle_count, -1, np.int32)

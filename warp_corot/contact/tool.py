@@ -1,4 +1,4 @@
-"""Obstacles that move as they are told."""
+"""Obstacles with prescribed motion."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 
 #: Times [s], [K], and poses, [K, 7].
 Keys = tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
-#: The highest speed of a tool whose poses are given from step to step, where none is named [m/s].
+#: The default of the highest speed of a tool with given poses [m/s].
 SPEED = 1.0
 
 
 class Tool:
-    """A rigid obstacle that moves along keyframes, to where it is sent, or as an array on the device says.
+    """A rigid obstacle that moves along keyframes, to a target, or to poses in an array on the device.
 
     Args:
-        shape: What it is. Its pose is the tool's first one.
-        speed: How fast it goes where it is sent, at most [m/s]. It bounds the length of steps, so that nothing passes
-            through it.
+        shape: Its shape. The shape's pose is the tool's first one.
+        speed: The highest speed at which it moves to a target [m/s]. It bounds the length of steps, so that nothing
+            passes through it.
 
     Raises:
         InputError: Not a shape, or a speed that is not positive.
@@ -45,7 +45,7 @@ class Tool:
         self.pose = shape.pose
         #: Keyframes: times [s], float64 [K], and poses, float64 [K, 7]; None without.
         self.keys: Keys | None = None
-        #: Somebody's array of poses that steps read; None without.
+        #: A user's array of poses that steps read; None without one.
         self.poses: wp.array | None = None
         self.is_sent = False
         self._bound: tuple[Obstacles, int] | None = None
@@ -56,12 +56,12 @@ class Tool:
     # --- how it moves ----------------------------------------------------------------------------------------------
 
     def follow(self, times: npt.ArrayLike, positions: npt.ArrayLike, quaternions: npt.ArrayLike | None = None) -> None:
-        """Move along keyframes: on straight lines between them, and not at all before the first and after the last.
+        """Move along keyframes: on straight lines between them, at rest before the first and after the last.
 
         Args:
-            times: Increasing, at least two [s], [K].
+            times: Increasing times, at least two [s], [K].
             positions: [m], [K, 3].
-            quaternions: (x, y, z, w), [K, 4], or one for all; None: as it is turned now.
+            quaternions: (x, y, z, w), [K, 4], or one for all; None: its present rotation.
 
         Raises:
             InputError: Wrong shapes, times that do not increase, or numbers that are not finite.
@@ -78,7 +78,7 @@ class Tool:
         self._move_by((t, np.hstack([p, q])), None, False)
 
     def move(self, position: Vector, quaternion: Vector | None = None) -> None:
-        """Go to a place, straight and at no more than ``speed``; at once if no simulation has the tool yet.
+        """Move to a place on a straight line, no faster than ``speed``; at once if no simulation has the tool yet.
 
         Raises:
             InputError: Not three finite numbers, or not a quaternion (x, y, z, w).
@@ -93,9 +93,9 @@ class Tool:
             obstacles.send(number, self.pose)
 
     def use_poses(self, poses: wp.array) -> None:
-        """Go where an array on the device says, which every step reads, at no more than ``speed``.
+        """Move to the poses in an array on the device, which every step reads, no faster than ``speed``.
 
-        A pose that is not finite, or whose quaternion is zero, is passed over: the tool goes on to the last good one.
+        A pose that is not finite, or whose quaternion is zero, is ignored: the tool continues to the last good one.
 
         Args:
             poses: ``wp.transform`` [1], or [worlds] with one for each.
@@ -122,7 +122,7 @@ class Tool:
 
     @property
     def present_pose(self) -> npt.NDArray[np.float64]:
-        """Where it is in each world: position and quaternion, float64 [worlds, 7]; waits for the device.
+        """Its pose in each world: position and quaternion, float64 [worlds, 7]; waits for the device.
 
         Raises:
             InputError: No simulation has the tool.
@@ -131,7 +131,7 @@ class Tool:
         return obstacles.poses()[:, number]
 
     def place_among_obstacles(self) -> tuple[Obstacles, int]:
-        """The obstacles of the tool's simulation, and which of them it is.
+        """The obstacles of the tool's simulation, and its number among them.
 
         Raises:
             InputError: No simulation has the tool.
@@ -143,10 +143,10 @@ class Tool:
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def bind(self, obstacles: Obstacles, number: int) -> None:
-        """Be an obstacle of a simulation, which calls this.
+        """Become an obstacle of a simulation, which calls this.
 
         Raises:
-            InputError: It is another's already.
+            InputError: Another simulation has it already.
         """
         if self._bound is not None:
             raise InputError("a tool is in two simulations; make another one of its shape")
@@ -165,7 +165,7 @@ class Tool:
         return float((far / np.diff(times)).max())
 
     def _move_by(self, keys: Keys | None, poses: wp.array | None, is_sent: bool) -> None:
-        """Move in another way from now on; or as before, if the simulation refuses."""
+        """Change its motion; if the simulation refuses, the motion stays as before."""
         before = self.keys, self.poses, self.is_sent
         self.keys, self.poses, self.is_sent = keys, poses, is_sent
         try:
@@ -180,7 +180,7 @@ Obstacle = Shape | Tool
 
 
 def as_tool(given: Any) -> Tool:
-    """A tool, or a shape that stays where it is.
+    """A tool, or a tool at rest for a shape.
 
     Raises:
         InputError: Something else.

@@ -1,4 +1,4 @@
-"""What users are warned of: things that overlap before anything moves, and elements that tools turn inside out."""
+"""Warnings: of overlaps before anything moves, and of elements that tools turn inside out."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from .contacts import Contacts
     from .tool import Tool
 
-#: Overlaps that are told, as a share of the smallest element's size.
+#: Overlaps larger than this fraction of the smallest element's size are reported.
 OVERLAP = 0.01
-#: Points of a tool's axis that are looked for in bodies.
+#: Number of points of a tool's axis that are searched in bodies.
 ALONG = 9
 
 Floats = npt.NDArray[np.float64]
