@@ -10,10 +10,10 @@ from .operator import LinearOperator
 
 
 class BlockDiagonal:
-    """z = B r with the inverse of each node's own block, made positive definite where it is not.
+    """z = B r with the inverse of each node's own block; blocks are made positive definite if necessary.
 
     Args:
-        operator: For its sizes.
+        operator: The operator, for its sizes.
     """
 
     def __init__(self, operator: LinearOperator):

@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients as launches: no scalar comes to the host, so that a solve can be recorded."""
+"""Preconditioned conjugate gradients as launches: the host reads no scalar, so that a solve can be recorded."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class SolveReport:
 
     Attributes:
         iterations: int32 [worlds].
-        residual: Norm of b - A x over that of b, as the iteration has it, float64 [worlds].
+        residual: Norm of b - A x over that of b, as the iteration computes it, float64 [worlds].
         converged: Whether that is within the tolerance, bool [worlds].
         negative: Whether a direction p with p . A p <= 0 ended the iteration, bool [worlds].
         broken: Whether something was not finite, or the preconditioner not positive definite, bool [worlds].
@@ -35,7 +35,7 @@ class SolveReport:
 
 
 class ConjugateGradients:
-    """Solves A x = b in all worlds side by side, each until its own residual is small.
+    """Solves A x = b in all worlds together, each until its own residual is small.
 
     A world whose A shows negative curvature keeps the iterate before that, or the preconditioned b if there is none:
     a direction of descent in either case.
@@ -43,12 +43,12 @@ class ConjugateGradients:
     Args:
         operator: A, for its sizes.
         length: Entries of vectors.
-        most: Iterations at most.
-        ranks: Who has other nodes of the same worlds.
+        most: Maximum number of iterations.
+        ranks: The ranks with other nodes of the same worlds.
 
     Attributes:
         tolerance: Norm of the residual over that of b at which a world stops, float64 [worlds] on the device.
-        iterations: Of the last solve, int32 [worlds] on the device.
+        iterations: Number of iterations of the last solve, int32 [worlds] on the device.
         status: How it ended, as in ``kernels.implicit.conjugate_gradients``, int32 [worlds] on the device.
     """
 
@@ -75,12 +75,12 @@ class ConjugateGradients:
         """Launch a solve, recorded or at once.
 
         Args:
-            preconditioner: Up to date with the operator.
+            preconditioner: A preconditioner that is up to date with the operator.
             b: Right side, zero at nodes that are not free, vec4 [worlds * nodes].
             x: The solution.
-            guessed: Whether x has a first guess, zero at nodes that are not free; the share of it is used that leaves
-                the least energy.
-            like: What the residual is compared with, vec4 [worlds * nodes]; None: b.
+            guessed: Whether x has a first guess, zero at nodes that are not free; it is scaled so that the energy is
+                least.
+            like: The vector with which the residual is compared, vec4 [worlds * nodes]; None: b.
         """
         r, q, sums = self._r, self._q, self._sums
         if guessed:

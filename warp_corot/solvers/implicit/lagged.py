@@ -25,7 +25,7 @@ class CostlySetUp(Preconditioner, Protocol):
     def apply(self, r: wp.array, z: wp.array) -> None: ...
 
     def follow(self) -> bool:
-        """Follow the mesh; whether launches are others now."""
+        """Follow the mesh; returns whether launches have changed."""
         ...
 
 
@@ -40,15 +40,14 @@ class At:
 
 
 class Lagged:
-    """The preconditioner of an earlier state, while it serves.
+    """The preconditioner of an earlier state, as long as it is good enough.
 
     Args:
-        preconditioner: What is set up now and then.
-        operator: Of all solves.
+        preconditioner: The preconditioner that is set up now and then.
+        operator: The operator of all solves.
 
     Attributes:
-        state: What it goes on from, by name: to be kept with the state of the body, so that a run that goes on from a
-            file is the same.
+        state: Arrays by name to be kept with the state of the body, so that a resumed run is the same.
     """
 
     def __init__(self, preconditioner: CostlySetUp, operator: LinearOperator):
@@ -67,7 +66,7 @@ class Lagged:
         return {"at": self._kept, "counts": self._counts, "due": self._due}
 
     def prepare(self) -> None:
-        """Follow the mesh; not while launches are recorded. Launches are to be recorded again after this."""
+        """Follow the mesh; not while launches are recorded. Launches must be recorded again after this."""
         self.preconditioner.follow()
         if self._is_prepared:
             self._due.fill_(int(kernels.PRESENT))
@@ -89,10 +88,10 @@ class Lagged:
         self.preconditioner.apply(r, z)
 
     def judge(self, iterations: wp.array, status: wp.array) -> None:
-        """Launch what decides after a solve whether the next one is worth a set-up.
+        """Launch the decision, after a solve, whether the next one is worth a set-up.
 
         Args:
-            iterations, status: Of the solve, int32 [worlds].
+            iterations, status: Results of the solve, int32 [worlds].
         """
         wp.launch(kernels.judge_solve, 1, [iterations, status, self._counts, self._due], device=self.device)
 

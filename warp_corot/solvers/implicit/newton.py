@@ -25,10 +25,9 @@ class NewtonReport:
     """How Newton's method ended in each world.
 
     Attributes:
-        iterations: Newton's, int32 [worlds].
-        linear_iterations: Of all its linear solves together, int32 [worlds].
-        residual: Norm of the forces that are out of balance over that of external and reaction forces, float64
-            [worlds].
+        iterations: Iterations of Newton's method, int32 [worlds].
+        linear_iterations: Iterations of all its linear solves together, int32 [worlds].
+        residual: Norm of the unbalanced forces over that of external and reaction forces, float64 [worlds].
         correction: The largest displacement of the last step over the largest displacement, float64 [worlds].
         status: As in ``kernels.implicit.newton``, int32 [worlds].
     """
@@ -50,29 +49,29 @@ class NewtonReport:
 
 
 class Newton:
-    """Minimises the energy of one body, each world by itself; see ``kernels.implicit.newton``.
+    """Minimises the energy of one body, separately in each world; see ``kernels.implicit.newton``.
 
     The unknown is ``increment``; ``body.state.displacements`` follow it as base + increment.
 
     Args:
         operator: The tangent operator. Its scale a is that of the inertia, or larger, to shorten steps.
-        preconditioner: Of the linear solves.
+        preconditioner: The preconditioner of the linear solves.
         gravity: [m/s^2].
-        tolerance: Of the residual, and of the last step; see ``NewtonReport``.
-        most: Iterations at most.
-        most_linear: Of one linear solve.
-        others: Launches forces besides elasticity to ``body.state.forces``.
+        tolerance: Tolerance of the residual, and of the last step; see ``NewtonReport``.
+        most: Maximum number of iterations.
+        most_linear: Maximum number of iterations of one linear solve.
+        others: A function that launches other forces than elastic ones to ``body.state.forces``.
 
     Attributes:
-        residual: Forces that are out of balance [N], vec4.
+        residual: Unbalanced forces [N], vec4.
         forces: Room for elastic forces, zero between launches [N], vec4.
         step: The last step [m], vec4.
-        iterations, solved, status: Of each world, as ``NewtonReport`` has them, int32 [worlds].
-        base, increment: What displacements are made of [m], vec4.
+        iterations, solved, status: Results of each world, as in ``NewtonReport``, int32 [worlds].
+        base, increment: The two parts of displacements [m], vec4.
         inertia: The scale a of the inertia [1/s^2], float32 [1].
-        pull: a h, acceleration that the inertia of a time step asks for [m/s^2], vec4.
-        external_share: What loads and gravity are multiplied by, float32 [1].
-        running: How many worlds go on, int32 [1].
+        pull: a h, the acceleration in the inertia of a time step [m/s^2], vec4.
+        external_share: The factor of loads and gravity, float32 [1].
+        running: The number of worlds that are still iterated, int32 [1].
     """
 
     def __init__(
@@ -114,7 +113,7 @@ class Newton:
     # --- launches ----------------------------------------------------------------------------------------------------
 
     def launch_begin(self) -> None:
-        """Launch that all worlds begin from ``base`` and ``increment``."""
+        """Launch the begin of all worlds, from ``base`` and ``increment``."""
         self.running.zero_()
         outputs = [self._scalars, self.iterations, self.solved, self.status, self.running]
         wp.launch(kernels.begin_worlds, self.worlds, [], outputs, device=self.device)
@@ -143,7 +142,7 @@ class Newton:
         sums.launch_scalars(kernels.judge_step, inputs, [self._scalars, self.status, self.running])
 
     def launch_residual(self) -> None:
-        """Launch the forces that are out of balance in the present state."""
+        """Launch the unbalanced forces in the present state."""
         body, sums, conditions = self.body, self._sums, self.body.conditions
         self.field.add_forces(body.state.displacements, self.forces)
         self.ranks.clear_ghosts(self.operator.number, self.forces)
@@ -157,7 +156,7 @@ class Newton:
         sums.take_in(int(kernels.SQUARE), int(kernels.REFERENCE))
 
     def launch_solve(self, *, guessed: bool = False) -> None:
-        """Launch the linearisation, and the step that it gives, from a guess of it in ``step`` if there is one."""
+        """Launch the linearisation and its step, from a guess of it in ``step`` if there is one."""
         self.operator.take(self.body.state.displacements)
         self.preconditioner.update(self.operator)
         self.solver.launch(self.preconditioner, self.residual, self.step, guessed=guessed)
@@ -186,7 +185,7 @@ class Newton:
     # --- on the host -------------------------------------------------------------------------------------------------
 
     def report(self) -> NewtonReport:
-        """How all worlds stand; waits for the device."""
+        """The report on all worlds; waits for the device."""
         scalars = self._scalars.numpy()
         compared = scalars[:, int(kernels.COMPARED)]
         return NewtonReport(

@@ -1,4 +1,4 @@
-"""What iterative solvers and preconditioners know of a linear system.
+"""The interface of a linear system for iterative solvers and preconditioners.
 
 Vectors over nodes are ``wp.vec4`` arrays like those of ``body.state.State``: [worlds * nodes], world after world, the
 fourth lane zero. Vectors that A and preconditioners are applied to are zero at nodes that are not free. All methods
@@ -18,11 +18,11 @@ class LinearOperator(Protocol):
     Rows of nodes that are not free are those of the identity, and their diagonal blocks too.
 
     Attributes:
-        device: Of the arrays.
-        worlds: Copies of the body, which do not interact.
-        node_count: Nodes of one world, at least; vectors have ``worlds * node_count`` entries or more.
+        device: The device of the arrays.
+        worlds: Number of copies of the body, which do not interact.
+        node_count: Number of nodes of one world; vectors have ``worlds * node_count`` entries or more.
         inverse_mass: Zero at nodes that are not free, float32 [worlds * nodes] [1/kg].
-        displacements: Where A is taken, vec4 [worlds * nodes] [m]; new values with each linearisation.
+        displacements: The displacements of the linearisation, vec4 [worlds * nodes] [m]; they change with each one.
         scales: a [1/s^2], b [1/s] and c, float32 [3] on the device, so that recorded launches stay valid.
         revision: Changes whenever launches do, so that they must be recorded again: other arrays, other elements. A
             new linearisation or new scales do not change it.
@@ -54,7 +54,7 @@ class LinearOperator(Protocol):
         ...
 
     def diagonal_blocks(self) -> wp.array:
-        """Launch the 3x3 blocks on the diagonal of A, and give their array, mat33 [worlds * nodes]."""
+        """Launch the 3x3 blocks on the diagonal of A, and return their array, mat33 [worlds * nodes]."""
         ...
 
     def other_blocks(self) -> wp.array:
@@ -66,11 +66,11 @@ class LinearOperator(Protocol):
 class Preconditioner(Protocol):
     """An approximate inverse B of an operator: linear, symmetric and positive definite.
 
-    Where nodes are not free, B leaves zeros of r as they are.
+    At nodes that are not free, B keeps the zeros of r.
     """
 
     def update(self, operator: LinearOperator) -> None:
-        """Launch what follows a new linearisation or new scales of the operator."""
+        """Launch the update after a new linearisation or new scales of the operator."""
         ...
 
     def apply(self, r: wp.array, z: wp.array) -> None:

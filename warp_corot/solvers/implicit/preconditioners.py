@@ -1,4 +1,4 @@
-"""The preconditioners that users name."""
+"""The preconditioners by the names that users pass."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ PRECONDITIONERS: dict[str, Callable[[TangentOperator, bool], Preconditioner]] = 
 
 
 def preconditioner_of(name: Any, operator: TangentOperator, *, short_cycles: bool = False) -> Preconditioner:
-    """A preconditioner by its name; for None multigrid where the mesh is a forest, else the block diagonal.
+    """A preconditioner by its name; for None, multigrid if the mesh is a forest, else the block diagonal.
 
     Args:
         name: One of ``PRECONDITIONERS``, or None.
@@ -50,7 +50,7 @@ def preconditioner_of(name: Any, operator: TangentOperator, *, short_cycles: boo
         short_cycles: Whether solves begin near the answer and need few digits.
 
     Raises:
-        InputError: There is none of this name, or it is multigrid and the mesh is no forest.
+        InputError: There is none with this name, or it is multigrid and the mesh is not a forest.
     """
     check_preconditioner(name)
     if name is None:

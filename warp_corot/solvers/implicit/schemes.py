@@ -1,4 +1,4 @@
-"""Implicit time integrators as tables of coefficients; ``kernels.implicit.steps`` says what rows and columns are."""
+"""Implicit time integrators as tables of coefficients; ``kernels.implicit.steps`` defines rows and columns."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from .preconditioners import check_preconditioner
 if TYPE_CHECKING:
     from warp_corot.solvers.system import System
 
-#: The shortest step of which float32 holds the square of the inverse [s].
+#: The shortest step whose inverse square float32 can hold [s].
 SHORTEST = 1e-15
 
-#: The tolerance of the schemes of second order by default.
+#: The default tolerance of schemes of second order.
 TOLERANCE = 1e-4
 
 Table = npt.NDArray[np.float64]
@@ -31,7 +31,7 @@ Table = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ImplicitIntegrator(Integrator):
-    """What all implicit integrators have in common. Steps are stable whatever their length.
+    """The common part of all implicit integrators. Steps of any length are stable.
 
     Each step solves M a + D v + f(u) = loads by Newton's method, with conjugate gradients for the linear systems.
 
@@ -43,10 +43,10 @@ class ImplicitIntegrator(Integrator):
             ``BackwardEuler`` bears that with long steps, and it is the default there; the others need short ones. A
             number: iterations with a line search on the energy until the residual is less than this share of the
             forces, or the last one moves no node by more than this share of the largest displacement.
-        iterations: Iterations of Newton's method in a step at most, with a tolerance.
+        iterations: Maximum number of iterations of Newton's method in a step, with a tolerance.
         linear_tolerance: Residual of the linear solve over its right side, without a tolerance.
-        linear_iterations: Iterations of a linear solve at most.
-        preconditioner: Of the linear solves, as for ``solve_static``.
+        linear_iterations: Maximum number of iterations of a linear solve.
+        preconditioner: The preconditioner of the linear solves, as for ``solve_static``.
 
     Raises:
         InputError: A value out of its range.
@@ -62,7 +62,7 @@ class ImplicitIntegrator(Integrator):
     preconditioner: str | None = None
 
     is_implicit: ClassVar[bool] = True
-    #: How many vectors a step leaves for the next.
+    #: The number of vectors that a step keeps for the next one.
     history: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
@@ -86,10 +86,10 @@ class ImplicitIntegrator(Integrator):
 
     @abstractmethod
     def scheme(self, dt: float) -> Table:
-        """Coefficients of a step that goes on from the one before, float64 [ROWS, COLUMNS]."""
+        """Coefficients of a step that continues from the one before, float64 [ROWS, COLUMNS]."""
 
     def start(self, dt: float) -> Table:
-        """The same of a step that begins: backward Euler's."""
+        """The same for a first step: backward Euler's."""
         return backward_euler(dt)
 
     def bind(self, system: System) -> Stepper:
@@ -109,7 +109,7 @@ def table(**rows: tuple[float, ...]) -> Table:
 def backward_euler(
     dt: float, *, first: tuple[float, ...] = (), second: tuple[float, ...] = (), guess: float = 0.0
 ) -> Table:
-    """a = (v_after - v) / dt, v_after = d / dt, with what it leaves for another scheme."""
+    """a = (v_after - v) / dt, v_after = d / dt, with the vectors for another scheme."""
     inverse = 1.0 / dt
     return table(
         ACCELERATION=(inverse**2, -inverse),
@@ -123,7 +123,7 @@ def backward_euler(
 
 @dataclass(frozen=True)
 class BackwardEuler(ImplicitIntegrator):
-    """v_after = v + dt a(u_after), u_after = u + dt v_after: first order, and damps what it does not resolve."""
+    """v_after = v + dt a(u_after), u_after = u + dt v_after: first order; damps motion that it does not resolve."""
 
     def scheme(self, dt: float) -> Table:
         return backward_euler(dt)
@@ -131,10 +131,10 @@ class BackwardEuler(ImplicitIntegrator):
 
 @dataclass(frozen=True)
 class GeneralizedAlpha(ImplicitIntegrator):
-    """The method of Chung and Hulbert (1993): second order, with the damping of fast vibrations that one asks for.
+    """The method of Chung and Hulbert (1993): second order, with a chosen damping of fast vibrations.
 
     Attributes:
-        spectral_radius: What a step leaves of the fastest vibrations, 0 to 1: 1 keeps energy, 0 damps most.
+        spectral_radius: The factor of the fastest vibrations in each step, 0 to 1: 1 keeps energy, 0 damps most.
     """
 
     tolerance: float | None = TOLERANCE
@@ -204,7 +204,7 @@ def generalized_alpha(dt: float, beta: float, gamma: float, mass_share: float, f
 
 @dataclass(frozen=True)
 class BDF2(ImplicitIntegrator):
-    """The backward differentiation formula of two steps: second order, and damps what it does not resolve."""
+    """The backward differentiation formula of two steps: second order; damps motion that it does not resolve."""
 
     tolerance: float | None = TOLERANCE
 
@@ -228,9 +228,9 @@ class BDF2(ImplicitIntegrator):
 
 @dataclass(frozen=True)
 class QuasiStatic(ImplicitIntegrator):
-    """A body that is at rest at every time: motion so slow that there is no inertia.
+    """A body at rest at every time: motion so slow that inertia is negligible.
 
-    ``dt`` only says how far keyframes move on from one state of rest to the next; velocities are zero. ``damping`` and
+    ``dt`` is only the time of keyframes from one state of rest to the next; velocities are zero. ``damping`` and
     ``viscosity`` do nothing. ``Simulation.solves`` counts steps that did not come to rest. Every body needs held nodes.
     """
 

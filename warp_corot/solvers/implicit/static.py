@@ -1,4 +1,4 @@
-"""Static answers: Newton's method, with smaller parts of the load where it does not converge."""
+"""Static answers: Newton's method, with smaller parts of the load if it does not converge."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from .volume import limited, limits
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
 
-#: Mass in the operator of a body that nothing holds, as a share of what its slowest vibration has.
+#: Mass in the operator of a free body, as a fraction of that of its slowest vibration.
 SHIFT = 1.0
-#: The smallest share of the load that is added in one step.
+#: The smallest fraction of the load that is added in one step.
 LEAST_SHARE = 1.0 / 64.0
-#: Newton's tolerance for states on the way.
+#: Newton's tolerance for intermediate states.
 ROUGH = 1e-3
 
 
 class StaticSolver:
-    """Finds where a body is at rest under its loads, from its present displacements.
+    """Finds the state of rest of a body under its loads, from its present displacements.
 
     Args:
         body: The body.
         field: Its elastic forces.
         gravity: [m/s^2].
-        tolerance: As for ``Newton``.
-        most: Iterations of each load step at most.
-        load_steps: Equal steps in which loads and gravity are added.
-        preconditioner: The name of one, or None.
+        tolerance: The tolerance, as for ``Newton``.
+        most: Maximum number of iterations of each load step.
+        load_steps: Number of equal steps in which loads and gravity are added.
+        preconditioner: The name of a preconditioner, or None.
 
     Attributes:
-        iterations, linear_iterations: Of all load steps, of the world that needed most.
-        share: How much of the load the last good state carries.
+        iterations, linear_iterations: Sums over all load steps, of the world that needed most.
+        share: The fraction of the load in the last good state.
     """
 
     def __init__(
@@ -66,8 +66,8 @@ class StaticSolver:
     def solve(self) -> NewtonReport:
         """Find the state of rest; the body has the last good state then. Waits for the device.
 
-        Where the search begins with elements turned over, such elements may be held in place by their neighbours. Then
-        another search begins with all free nodes at rest, and the state with less energy is taken.
+        If the search begins with elements turned over, their neighbours may hold such elements in place. Then another
+        search begins with all free nodes at rest, and the state with less energy is used.
         """
         state = self.body.state
         self.operator.set_scales(self._keep_free_worlds(), 0.0, 1.0)
@@ -133,8 +133,9 @@ class StaticSolver:
         return self._run(graph, 1.0)
 
     def _keep_free_worlds(self) -> float:
-        """Let worlds that nothing holds stay where they are: a uniform acceleration takes what little their loads do
-        not balance (inertia relief). The share of the mass in the operator that makes it definite there [1/s^2]."""
+        """Keep free worlds where they are: a uniform acceleration balances the small rest of their loads (inertia
+        relief). Returns the factor of the mass that makes the operator definite there [1/s^2].
+        """
         body, worlds = self.body, self.body.worlds
         free = np.logical_not(body.conditions.held_mask().reshape(worlds, -1).any(axis=1))
         if not free.any():
@@ -149,7 +150,7 @@ class StaticSolver:
         return SHIFT * float(body.discretization.mu.numpy().mean()) / (density * size**2)
 
     def _free_nodes_at_rest(self) -> npt.NDArray[np.float32]:
-        """Displacements of held nodes as they are, and zero at others [n, 4]."""
+        """Displacements of held nodes, and zero at others [n, 4]."""
         u = self.body.state.displacements.numpy().copy()
         u[self.body.conditions.inverse_mass.numpy() > 0.0] = 0.0
         return u
@@ -193,7 +194,7 @@ class StaticSolver:
         return report
 
     def _record(self) -> wp.Graph:
-        """Record an iteration, once all that it uses is there."""
+        """Record an iteration, after everything that it uses exists."""
         newton, u = self.newton, self.body.state.displacements
         self.field.elastic_forces(u)
         self.field.potentials(u)
@@ -209,7 +210,7 @@ class StaticSolver:
 
 
 def status_words(report: NewtonReport) -> str:
-    """Why Newton's method ended in the worlds that did not converge."""
+    """The reason why Newton's method ended in the worlds that did not converge."""
     status = set(report.status[~report.converged].tolist())
     if int(kernels.BROKEN) in status:
         return "the state is not finite"

@@ -34,7 +34,7 @@ class ImplicitStepper(Stepper):
 
     Args:
         system: The bodies; velocities are at the time of displacements.
-        integrator: The description.
+        integrator: The integrator.
 
     Attributes:
         totals: Steps, iterations of Newton's method and of linear solves, and steps that did not come within the
@@ -116,7 +116,7 @@ class ImplicitStepper(Stepper):
         )
 
     def add_other_forces(self) -> None:
-        """Launch all forces besides elasticity in the present state to ``state.forces`` of the bodies."""
+        """Launch all forces except elastic ones in the present state to ``state.forces`` of the bodies."""
         self.forget_forces()
         for forces in [*self.system.forces, *self.holds]:
             forces.add_forces()
@@ -127,13 +127,13 @@ class ImplicitStepper(Stepper):
         return cast("list[Hold]", [each for each in self.system.constraints if hasattr(each, "add_stiffness")])
 
     def add_counted_forces(self) -> None:
-        """The same of those whose work is counted for them."""
+        """The same for forces whose work is counted separately."""
         self.forget_forces()
         for forces in self.system.counted:
             forces.add_forces()
 
     def forget_forces(self) -> None:
-        """Launch that no forces act yet."""
+        """Launch the reset of all forces."""
         for body in self.system.bodies:
             body.state.forces.zero_()
 
@@ -142,14 +142,14 @@ class BodySteps:
     """Steps of one body.
 
     Args:
-        stepper: Of all.
-        k: Which body of the system.
+        stepper: The stepper of all bodies.
+        k: The number of the body in the system.
 
     Attributes:
         held: What holds nodes, or None.
-        history: What a step leaves for the next one, and the state in which it left the body, vec4 each.
-        before: Velocities before the last step, of which the guess of the next one is made, vec4; NaN before the first.
-        lagged: The preconditioner if it is kept over many steps, else None.
+        history: The vectors that a step keeps for the next one, and the body's state after it, vec4 each.
+        before: Velocities before the last step, for the guess of the next one, vec4; NaN before the first.
+        lagged: The preconditioner, if it is kept over many steps, else None.
     """
 
     def __init__(self, stepper: ImplicitStepper, k: int):
@@ -186,7 +186,7 @@ class BodySteps:
         self._table = wp.array(tables, dtype=wp.float32, device=self.device)
 
     def _make_solvers(self) -> None:
-        """Make what depends on the mesh."""
+        """Make everything that depends on the mesh."""
         options = self.stepper.integrator
         self._version = self.body.version
         self.newton = Newton(
@@ -203,7 +203,7 @@ class BodySteps:
             self.touching = TouchingSolve(self.newton, self.held)
 
     def prepare(self) -> None:
-        """Have all that launches use, so that they can be recorded."""
+        """Make everything that launches use, so that they can be recorded."""
         self.operator.prepare()
         if self.lagged is not None:
             self.lagged.prepare()
@@ -274,7 +274,7 @@ class BodySteps:
     # --- pieces ------------------------------------------------------------------------------------------------------
 
     def _follow_trajectories(self, offset: int) -> None:
-        """Launch the velocities that take nodes to their keyframes at the end of the step."""
+        """Launch the velocities that move nodes to their keyframes at the end of the step."""
         body, system = self.body, self.system
         for each in body.conditions.trajectories:
             inputs = [each.nodes, each.times, each.displacements, system.pace.arrays, body.conditions.world_starts]
@@ -283,7 +283,7 @@ class BodySteps:
             wp.launch(follow_trajectory, len(each.nodes), inputs, outputs, device=self.device)
 
     def _begin(self) -> None:
-        """Launch what the step is solved from."""
+        """Launch the input of the step's solve."""
         system = self.system
         state, conditions, newton, options = (
             self.body.state,
@@ -310,7 +310,7 @@ class BodySteps:
         system.ranks.complete(self.k, state.displacements)
 
     def _add_others(self) -> None:
-        """Launch forces besides elasticity at the stage."""
+        """Launch forces other than elastic ones at the stage."""
         self.stepper.add_other_forces()
         if self.viscosity is not None:
             inputs = [self.operator.scales, self.newton.increment, self._drift]

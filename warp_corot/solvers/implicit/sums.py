@@ -7,23 +7,23 @@ import warp as wp
 from warp_corot.kernels.implicit.sums import sum_products
 from warp_corot.solvers.ranks import ALONE, Ranks
 
-#: Lanes of a warp, nodes of a thread at least, and warps of all worlds at most.
+#: Number of lanes in a warp, minimum number of nodes of a thread, and maximum number of warps of all worlds.
 WARP, NODES, WARPS = 32, 4, 512
 
 
 class WorldSums:
-    """Room for sums, and how their launches are made.
+    """Arrays for sums, and the sizes of their launches.
 
     Args:
-        worlds: How many worlds.
-        count: Nodes of each.
-        columns: How many sums there are side by side.
-        device: Where.
-        ranks: Who has other nodes of the same worlds.
+        worlds: Number of worlds.
+        count: Number of nodes in each.
+        columns: Number of sums.
+        device: The device.
+        ranks: The ranks with other nodes of the same worlds.
 
     Attributes:
         parts: Parts of the sums, float64 [worlds, parts, columns].
-        shape: Threads of a launch over all nodes [2].
+        shape: The threads of a launch over all nodes [2].
         sizes: The arguments count, threads and lanes of its kernel.
     """
 
@@ -33,7 +33,7 @@ class WorldSums:
         wanted = -(-count // (NODES * WARP))
         warps = 1 if device.is_cpu else max(min(wanted, WARPS // worlds), 1)
         if ranks.is_settled:
-            # Every node is an addend: sums of theirs are the same in any order.
+            # Every node is an addend, because their sums are the same in any order.
             warps = count
         threads = warps * self.lanes
         self.parts = wp.zeros((worlds, warps, columns), dtype=wp.float64, device=device)
@@ -55,6 +55,6 @@ class WorldSums:
         self._ranks.take_in_parts(self.parts, columns, most)
 
     def launch_scalars(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-        """Launch a kernel that adds the parts up, the lanes of a warp for each world."""
+        """Launch a kernel that adds the parts up, with the lanes of a warp for each world."""
         dim = (self.worlds, self.lanes)
         wp.launch(kernel, dim, [self.parts, self.lanes, *inputs], outputs, device=self.device)

@@ -22,12 +22,12 @@ class TangentOperator:
     Args:
         body: The body.
         field: Its elastic forces.
-        viscosity: Its viscous forces, D; None for none.
+        viscosity: Its viscous forces, D, or None.
         stiff_forces: Other forces that have a stiffness: ``add_stiffness(body, p, y)`` and
             ``add_diagonal(body, blocks)``, as ``ForceField`` but at the body's present state.
-        exact: Whether K is the exact derivative, which may be indefinite, where the law has two.
-        ranks: Who has other nodes of the body.
-        number: Which of their bodies it is.
+        exact: Whether K is the exact derivative, which may be indefinite, if the law has two.
+        ranks: The ranks with other nodes of the body.
+        number: The number of the body.
 
     Attributes:
         tangent: The elastic K.

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 
 class Held(Protocol):
-    """What holds nodes along directions, such as ``contact.active_set.ActiveSet``, which says what its members do."""
+    """Something that holds nodes along directions, such as ``contact.active_set.ActiveSet``, which explains the
+    members.
+    """
 
     changed: wp.array
 
@@ -86,7 +88,7 @@ class Touching(Protocol):
     """A constraint that implicit steps resolve, such as ``contact.contacts.Contacts``."""
 
     def launch_motion(self, offset: int) -> None:
-        """Launch where obstacles go in the ``offset``-th step since the clock was last advanced."""
+        """Launch the motion of obstacles in the ``offset``-th step since the clock was last advanced."""
         ...
 
     def active_set(self, k: int) -> Held | None:
@@ -103,7 +105,7 @@ class FreeOperator:
 
     Args:
         operator: A.
-        held: What has S.
+        held: The source of S.
     """
 
     def __init__(self, operator: LinearOperator, held: Held):
@@ -135,7 +137,7 @@ class TouchingSolve:
     """Solves for the step of ``newton`` with one linearisation.
 
     Args:
-        newton: Its operator, residual, preconditioner and linear solver are used.
+        newton: Newton's method with the operator, residual, preconditioner and linear solver.
         held: The contact of its body.
 
     Attributes:

@@ -1,8 +1,8 @@
 """States on the way to the static answer of a body that hardly changes its volume.
 
-Along the direction that Newton's method finds, volumes stay as they should to first order only. With a lambda of
-thousands of mu what is left costs so much that a line search takes hundreds of short steps where tissue turns far.
-So bodies with a smaller lambda are solved for first, each from the answer of the one before.
+Along the direction of Newton's method, volumes are kept to first order only. With a lambda of thousands of mu, the rest
+costs so much energy that a line search takes hundreds of short steps where tissue turns far. So bodies with a smaller
+lambda are solved first, each from the answer of the one before.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ FIRST, FACTOR = 4.0, 10.0
 
 
 def limits(field: ForceField) -> list[float]:
-    """Ascending limits of lambda over mu on the way to a field's own, without that; empty where it needs none."""
+    """Ascending limits of lambda over mu up to a field's own, which is not included; empty if it needs none."""
     discretization = field.discretization
     if discretization.is_anisotropic or field.is_linear:
         return []
@@ -35,7 +35,9 @@ def limits(field: ForceField) -> list[float]:
 
 @contextmanager
 def limited(field: ForceField, limit: float) -> Iterator[None]:
-    """Within it lambda of a field is at most so many times mu; launches that were recorded before see it, too."""
+    """Inside this block, lambda of a field is at most this many times mu; launches that were recorded before use it,
+    too.
+    """
     discretization = field.discretization
     mu, lam = discretization.mu.numpy(), discretization.lam.numpy().copy()
     discretization.lam.assign(np.minimum(lam, limit * mu))

@@ -8,7 +8,7 @@ from warp_corot.kernels.implicit.multigrid import dense as kernels
 
 from .level import Level
 
-#: Threads of the block that inverts a world's matrix on CUDA, and those that share one of its rows.
+#: Number of threads in the block that inverts a world's matrix on CUDA, and of those that share one of its rows.
 BLOCK, LANES = 1024, 8
 
 
@@ -23,7 +23,7 @@ class DenseInverse:
         self.inverse = wp.zeros((worlds, size, size), dtype=wp.float32, device=device)
 
     def update(self) -> None:
-        """Launch what inverts the present matrix."""
+        """Launch the inversion of the present matrix."""
         level, pattern = self.level, self.level.pattern
         inputs = [pattern.entries, pattern.starts, pattern.columns, pattern.diagonal, level.blocks]
         level.launch(kernels.fill_dense, level.count, inputs, [self._matrix, self._scale])

@@ -1,4 +1,4 @@
-"""One level: its matrix, what the cycle works with, and the launches that go from it to the next coarser one."""
+"""One level: its matrix, the vectors of the cycle, and the launches from it to the next coarser one."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ MANY_ROWS, LANES, MOST_LANES = 50_000, 8, 32
 
 
 def smoothing_factors(degree: int) -> list[tuple[float, float]]:
-    """How much of the preconditioned residual, and of the step before, each step of Chebyshev's iteration takes.
+    """The factors of the preconditioned residual, and of the step before, in each step of Chebyshev's iteration.
 
-    It works over the upper part of the eigenvalues of D^-1 A, a part that is larger for more steps.
+    The iteration reduces the upper part of the eigenvalues of D^-1 A; with more steps this part is larger.
     """
     largest, least = LARGEST_EIGENVALUE, LARGEST_EIGENVALUE / max(2.0 * degree**2, 4.0)
     middle, half = 0.5 * (largest + least), 0.5 * (largest - least)
@@ -35,11 +35,11 @@ class Level:
     """A level's matrix and vectors.
 
     Args:
-        pattern: Of its matrix.
-        worlds: Copies.
-        ranks: Nodes of all levels, M.
+        pattern: The pattern of its matrix.
+        worlds: Number of worlds.
+        ranks: Number of nodes of all levels, M.
         free: Which nodes are free, by rank, uint8 [worlds * M].
-        degree: Of the smoother.
+        degree: The degree of the smoother.
         is_bounded: Whether the bound on the eigenvalues of D^-1 A must be kept by smaller inverses, as where groups of
             more than four nodes share a dilatation.
         is_half: Whether the cycle takes the matrix in half precision.
@@ -48,8 +48,8 @@ class Level:
         blocks: Values of the entries, transposed, mat33 [worlds * entries + 1].
         inverses: Of the diagonal blocks, mat33 [worlds * n].
         r, z, other: Residual, correction, and a vector to work with, vec4 [worlds * n].
-        factors: Of the smoother's steps.
-        lanes: How many threads share a row.
+        factors: The factors of the smoother's steps.
+        lanes: Number of threads that share a row.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Level:
         self.launch(cycle.pack_rows, self.count, inputs, [rows.packed, rows.sums, rows.units])
 
     def smooth(self, from_step: int = 0) -> None:
-        """Go on with ``z`` from a step of the smoother."""
+        """Continue with ``z`` from a step of the smoother."""
         for step in range(from_step, len(self.factors)):
             alpha, beta = self.factors[step]
             inputs: list[Any] = [self.lanes, self.count, self.pattern.entries]
@@ -101,7 +101,7 @@ class Level:
             self.z, self.other = self.other, self.z
 
     def gather_from(self, fine: Level) -> None:
-        """Find the matrix P^T A P of the finer level's."""
+        """Compute the matrix P^T A P from the finer level's matrix A."""
         pattern = self.pattern
         inputs = [self.ranks, self.count, pattern.entries, fine.pattern.entries, self.free, pattern.upper]
         inputs += [pattern.sum_starts, pattern.codes, pattern.places, fine.blocks]
@@ -112,7 +112,7 @@ class Level:
             self.launch(shared.bound_diagonal, self.count, inputs, [self.inverses])
 
     def restrict_from(self, fine: Level, midpoints: Midpoints) -> None:
-        """Take over the finer level's residual, and make the smoother's first step."""
+        """Restrict the finer level's residual, and make the smoother's first step."""
         inputs = [fine.lanes, fine.count, fine.pattern.entries, fine.rows, fine.r, fine.z]
         fine.launch(cycle.find_residual, fine.count * fine.lanes, inputs, [fine.other])
         inputs = [self.ranks, self.count, fine.count, self.factors[0][0], self.free]
@@ -125,5 +125,5 @@ class Level:
         self.launch(cycle.prolongate_correction, fine.count, inputs, [fine.z])
 
     def launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch a kernel over so many things in each world."""
+        """Launch a kernel over a number of things in each world."""
         wp.launch(kernel, dim=(self.worlds, count), inputs=inputs, outputs=outputs, device=self.device)

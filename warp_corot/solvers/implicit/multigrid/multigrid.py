@@ -24,13 +24,13 @@ from .pattern import Midpoints, Pattern, PatternFinder
 
 #: The largest coarsest level that is inverted [nodes].
 MOST_DENSE = 64
-#: The smoother's degree on a coarsest level that is not inverted, as of a grid of many cubes.
+#: The smoother's degree on a coarsest level that is not inverted, for example of a grid of many cubes.
 COARSEST_DEGREE = 24
 
 
 @dataclass(frozen=True, eq=False)
 class Transfer:
-    """Between a level and the next coarser one."""
+    """Transfers between a level and the next coarser one."""
 
     fine: Level
     coarse: Level
@@ -48,20 +48,20 @@ class Multigrid:
         body: A body on a forest, or its discretization.
         is_turned: Whether elements turn; False: linear elasticity.
         stride: Number of bisections from one level to the next, 1 to 3.
-        degree: Of the smoother on the finest level, before and after.
-        rise: By how much the degree rises from a level to the next coarser one, which costs little.
-        few_nodes: Levels of more nodes than this are made coarser, while there are coarser ones.
+        degree: The degree of the smoother on the finest level, before and after.
+        rise: The increase of the degree from a level to the next coarser one, which costs little.
+        few_nodes: Levels with more nodes than this get a coarser one, if there is one.
         stiffening: Viscous over elastic stress at one strain [s], as in the operator's D.
-        most_lambda: Up to how many times mu lambda counts.
-        members: Gives the groups of elements, of those below a number, that share their dilatation; None: none do.
+        most_lambda: Lambda is at most this many times mu.
+        members: Returns the groups of elements, among those below a number, that share their dilatation; None: none do.
         half: Whether the cycle takes matrices in half precision; only where lambda is not many times mu.
 
     Attributes:
-        discretization: The body's.
+        discretization: The body's discretization.
         revision: Changes whenever launches do.
 
     Raises:
-        InputError: The mesh is no forest, or a stride or degree is out of its range.
+        InputError: The mesh is not a forest, or a stride or degree is out of its range.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Multigrid:
         return self.discretization.device
 
     def follow(self) -> bool:
-        """Follow the mesh, if it has changed; returns whether launches are others now. Waits for the device."""
+        """Follow the mesh, if it has changed; returns whether launches have changed. Waits for the device."""
         if self._version == self.discretization.sizes.version:
             return False
         self._version = self.discretization.sizes.version
@@ -104,7 +104,7 @@ class Multigrid:
         return True
 
     def update(self, operator: LinearOperator) -> None:
-        """Launch what finds all matrices at the operator's displacements and scales."""
+        """Launch the computation of all matrices at the operator's displacements and scales."""
         discretization, finest = self.discretization, self.levels[0]
         elements = cast("ForestElements", discretization.elements)
         inverse_mass, scales = operator.inverse_mass, operator.scales

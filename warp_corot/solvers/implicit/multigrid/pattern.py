@@ -1,4 +1,4 @@
-"""The pattern of each level's matrix: found by launches and a few counts that come to the host."""
+"""The pattern of each level's matrix, found by launches; the host reads a few counts."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ class Pattern:
     """The entries of a level's matrix, one world's, by rank.
 
     Attributes:
-        count: Nodes of the level, n.
-        entries: How many entries there are.
-        starts: Where rows begin, and where the last one ends, int32 [n + 1].
+        count: Number of nodes of the level, n.
+        entries: Number of entries.
+        starts: The begin of each row, and the end of the last one, int32 [n + 1].
         columns: int32 [entries], ascending in a row.
         pairs: Row and column of each entry, vec2i [entries].
-        diagonal: Where each row's diagonal entry is, int32 [n].
+        diagonal: The place of each row's diagonal entry, int32 [n].
         upper: Rank and higher or equal rank of each entry in the upper triangle, vec2i [U].
-        places: Where each of these and its mirror image are among the entries, vec2i [U].
-        sum_starts: Where the contributions to each of these begin, and where the last one's end, int32 [U + 1].
+        places: The places of each of these and of its mirror image among the entries, vec2i [U].
+        sum_starts: The begin of the contributions to each of these, and the end of the last ones, int32 [U + 1].
         codes: The contributions, int32: see ``kernels.implicit.multigrid.pattern``.
     """
 
@@ -45,10 +45,10 @@ class Pattern:
 
 @dataclass(frozen=True, eq=False)
 class Midpoints:
-    """For each node of a level the finer level's nodes on whose edges it is an end.
+    """For each node of a level, the finer level's nodes whose edges end there.
 
     Attributes:
-        starts: Where each node's begin, and where the last one's end, int32 [n + 1].
+        starts: The begin of each node's list, and the end of the last one, int32 [n + 1].
         midpoints: Ranks, ascending for each node, int32.
     """
 
@@ -65,17 +65,17 @@ class PatternFinder:
 
     def __init__(self, ends: wp.array):
         self.ends, self.device = ends, ends.device
-        # One more than there are ranks, for keys past all.
+        # One more than the number of ranks, for keys past all others.
         self.bits = len(ends).bit_length()
 
     def of_leaves(
         self, tets: wp.array, leaves: int, rank: wp.array, members: Members | None = None
     ) -> tuple[Pattern, wp.array]:
-        """Of the finest level, from the nodes of the first leaves by number and the rank of each number.
+        """The pattern of the finest level, from the nodes of the first leaves by number and the rank of each number.
 
         Args:
             tets: Of all leaves, vec4i.
-            leaves: How many count.
+            leaves: The number of leaves that count.
             rank: int32.
             members: Groups whose nodes are all coupled, if there are any.
 
@@ -99,7 +99,7 @@ class PatternFinder:
         return self._pattern(nodes, before + pairs, keys, codes), found
 
     def of_products(self, fine: Pattern, coarse: int) -> Pattern:
-        """Of the level of so many nodes, from the next finer one."""
+        """The pattern of a level with this number of nodes, from the next finer one."""
         counts = self._ints(fine.entries)
         self._launch(kernels.count_products, fine.entries, [coarse, fine.pairs, self.ends], [counts])
         wp.utils.array_scan(counts, counts, inclusive=True)
@@ -110,7 +110,7 @@ class PatternFinder:
         return self._pattern(coarse, total, keys, codes)
 
     def midpoints(self, coarse: int, fine: int) -> Midpoints:
-        """Of levels of so many nodes."""
+        """The midpoints of levels with these numbers of nodes."""
         count = 2 * (fine - coarse)
         keys, midpoints = self._keys(count)
         self._launch(kernels.list_midpoints, fine - coarse, [coarse, self.bits, self.ends], [keys, midpoints])
@@ -156,7 +156,7 @@ class PatternFinder:
         return starts
 
     def _keys(self, count: int) -> tuple[wp.array, wp.array]:
-        """Keys and values, with twice the room, as sorting needs it."""
+        """Keys and values with twice the room, which sorting needs."""
         return wp.empty(2 * count, dtype=wp.int64, device=self.device), self._ints(2 * count)
 
     def _sort(self, keys: wp.array, values: wp.array, count: int) -> None:
