@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, ClassVar, Protocol
 
@@ -14,7 +14,7 @@ import warp as wp
 from warp_corot.discretization.discretization import Discretization, Discretized, discretization_of
 from warp_corot.discretization.members import Members
 from warp_corot.discretization.plan import FlatLeaves, Plan
-from warp_corot.discretization.subtrees import chosen
+from warp_corot.discretization.subtrees import Batch, chosen
 from warp_corot.errors import InputError
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.forces import (
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
     from warp_corot.kernels.stepping.pace import Pace
 
+    from .paths.clusters import ClusterScatter
     from .paths.dilating import Dilating
 
 
@@ -270,6 +271,12 @@ class ForceField(ABC):
         with self.state_kept():
             self.write_von_mises(u, stress)
         return stress.numpy()[: self.discretization.sizes.elements]
+
+    @property
+    def in_clusters(self) -> tuple[ClusterScatter, Sequence[Batch]] | None:
+        """What adds the forces of elements in clusters, and the subtrees that do not go there; None where there are
+        no clusters, or they change."""
+        return None
 
     def launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

@@ -74,6 +74,12 @@ class OwnLaunches:
         #: Number of subtrees and single leaves of each launch, with gaps; some of them may be left out.
         self.places = [batch.count for batch in batches] if self._is_single else [self._blocks * BLOCK]
 
+    @property
+    def in_clusters(self) -> tuple[ClusterScatter, tuple[Batch, ...]] | None:
+        """The clusters of a mesh that stays as it is, and the subtrees beside them, if those are the plan's."""
+        is_divided = self._awaited is not None and self._awaited.is_used
+        return (self._clusters, self.batches) if isinstance(self._clusters, ClusterScatter) and not is_divided else None
+
     @staticmethod
     def suit(plan: Plan) -> bool:
         """Whether a plan of own rotations has more than one large batch, or may come to have."""

@@ -6,14 +6,14 @@ left out.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, TypeAlias
 
 import warp as wp
 
 from warp_corot.discretization.plan import FlatLeaves
 from warp_corot.discretization.subtrees import Batch, Sharing
-from warp_corot.elasticity.paths.clusters import ChangingClusterScatter
+from warp_corot.elasticity.paths.clusters import ChangingClusterScatter, ClusterScatter
 from warp_corot.elasticity.paths.dilating import Dilating
 from warp_corot.elasticity.paths.grouped import GroupedLanes
 from warp_corot.elasticity.paths.lanes import Lanes, as_general
@@ -95,6 +95,10 @@ class SubtreeField(CorotatedField):
         self.derive()
         self.follow()
         return True
+
+    @property
+    def in_clusters(self) -> tuple[ClusterScatter, Sequence[Batch]] | None:
+        return None if self._own_launches is None else self._own_launches.in_clusters
 
     @property
     def _groups(self) -> GroupedLanes | None:

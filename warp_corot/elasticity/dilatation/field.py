@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +13,7 @@ from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.members import Members
 from warp_corot.discretization.plan import Plan
 from warp_corot.discretization.shear_only import ShearOnly
+from warp_corot.discretization.subtrees import Batch
 from warp_corot.elasticity.model import ForceField, SmallForces
 from warp_corot.elasticity.paths.dilating import Dilating
 from warp_corot.elasticity.tangent import Tangent
@@ -23,6 +25,7 @@ from warp_corot.kernels.subtrees import dilatation as subtrees
 from warp_corot.kernels.subtrees.cuda import BLOCK
 from warp_corot.mesh import TetForest
 
+from .clustered import ClusteredGroups
 from .others import Others
 from .tangent import NodalTangent, SharedTangent
 
@@ -59,8 +62,8 @@ class DilatationField(ForceField):
         self.of = of
         self._all, self._still = (wp.empty(0, dtype=kind, device=self.device) for kind in (wp.int32, wp.vec4))
         self._others = Others(discretization, self.plan, of)
-        #: Whether the law's own launches add the forces of subtrees and of groups.
-        self._joined = False
+        #: Whether the law's own launches add the forces of subtrees and of groups, or those in clusters theirs.
+        self._joined, self._clustered = False, cast("ClusteredGroups | None", None)
         self.join_launches()
         self._make_room()
 
@@ -78,6 +81,25 @@ class DilatationField(ForceField):
             self._joined = self.shear.share_dilatation(dilating)
         self._others.are_joined = self._joined and self._others.grouped is not None
         self._others.follow()
+        self._clustered = self._join_clusters()
+
+    def _join_clusters(self) -> ClusteredGroups | None:
+        """Let the launch of elements in clusters add the forces of what these share, if there is one (CUDA)."""
+        found = self.shear.in_clusters
+        if found is None or self.slots is not None or self._others.are_nodal:
+            return None
+        scatter, kept = found
+        there = [batch for batch in self.plan.batches if not any(batch is other for other in kept)]
+        self._kept, self._others.are_joined = kept, True
+        batches = self._of_subtrees(there) + self._others.groups
+        return ClusteredGroups(scatter, self.elements, batches, self.of, lambda: self.discretization.lam)
+
+    @property
+    def _batches(self) -> Sequence[Batch]:
+        """The subtrees for whose dilatation the law's own launches add no forces."""
+        if self._joined:
+            return ()
+        return self.plan.batches if self._clustered is None else self._kept
 
     def load_kernels(self) -> None:
         self.shear.load_kernels()
@@ -108,6 +130,7 @@ class DilatationField(ForceField):
     # --- forces ------------------------------------------------------------------------------------------------------
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
+        self._find_pressures(u)
         self.shear.add_forces(u, f)
         if self.slots is None:
             self._scatter(u, f)
@@ -117,11 +140,16 @@ class DilatationField(ForceField):
             self.slots.gather(f)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        self._find_pressures(u)
         self.shear.scatter_forces(u, f)
         self._scatter(u, f)
 
+    def _find_pressures(self, u: wp.array) -> None:
+        if self._clustered is not None:
+            self._clustered.find_pressures(self.discretization.material_stride, u)
+
     def _scatter(self, u: wp.array, f: wp.array) -> None:
-        for batch in () if self._joined else self.plan.batches:
+        for batch in self._batches:
             kernel, subtree = self._kernel(batch.shape, batch.grouped), batch.subtrees
             if self.device.is_cuda:
                 inputs = [subtree, self.discretization.lam, u]
@@ -262,8 +290,10 @@ class DilatationField(ForceField):
 
     def batches_of_groups(self) -> list[tuple[wp.array, wp.array, wp.array, int]]:
         """Subtrees and other groups, as ``kernels.share_in_groups`` takes them, and how many."""
-        of_subtrees = [(b.subtrees.first, self._all, b.live or self._all, b.count) for b in self.plan.batches]
-        return of_subtrees + self._others.groups
+        return self._of_subtrees(self.plan.batches) + self._others.groups
+
+    def _of_subtrees(self, batches: Sequence[Batch]) -> list[tuple[wp.array, wp.array, wp.array, int]]:
+        return [(b.subtrees.first, self._all, b.live or self._all, b.count) for b in batches]
 
     @property
     def find_members(self) -> Callable[[int], Members] | None:

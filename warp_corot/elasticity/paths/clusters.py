@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -116,6 +117,13 @@ class ClusterScatter:
         is_large = sum(table.capacity for table in tables) >= LARGE
         self.layout = replace(layout, ahead=AHEAD) if is_large else layout
         self._kernel = scatter_pairs(self.Pairs, Material, law, self.layout)
+        self._wrapped: Callable[[Any], Any] | None = None
+
+    def use_law(self, law: wp.Function, Material: type, wrapped: Callable[[Any], Any]) -> None:
+        """From now on add the forces of a law that takes more registers, whose material is made of that which callers
+        give."""
+        self.layout = replace(self.layout, resident=self.layout.resident - 1)
+        self._kernel, self._wrapped = scatter_pairs(self.Pairs, Material, law, self.layout), wrapped
 
     def __call__(self, material: IsotropicMaterial | ActiveMaterial, u: wp.array, f: wp.array) -> None:
         """Add the forces [N] of displacements u to f, both vec4 [N]; ``material`` is what the law takes."""
@@ -123,7 +131,7 @@ class ClusterScatter:
         wp.launch(
             self._kernel,
             dim=self.count * threads,
-            inputs=[self.clusters, self.pairs, material, u],
+            inputs=[self.clusters, self.pairs, material if self._wrapped is None else self._wrapped(material), u],
             outputs=[f],
             device=self._device,
             block_dim=threads,

@@ -18,7 +18,10 @@ from warp_corot.mesh import TetForest
 from .clusters import ClusterScatter
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from warp_corot.discretization.discretization import Discretization
+    from warp_corot.discretization.subtrees import Batch
 
 
 def clustered(discretization: Discretization) -> np.ndarray:
@@ -49,6 +52,10 @@ class LawGeneralField(LawField):
         super().__init__(discretization, stress=stress, deterministic=deterministic, **functions)
         self._scatter = ClusterScatter(self.elements, isotropic_law(stress), chosen=clustered(discretization))
 
+    @property
+    def in_clusters(self) -> tuple[ClusterScatter, Sequence[Batch]]:
+        return self._scatter, ()
+
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         self._scatter(self.isotropic, u, f)
 
@@ -60,6 +67,10 @@ class CorotatedGeneralField(LeafField):
         super().__init__(discretization, model, deterministic=False)
         law = isotropic_law(corotated_law(model.own_rotation))
         self._scatter = ClusterScatter(self.elements, law, chosen=clustered(discretization))
+
+    @property
+    def in_clusters(self) -> tuple[ClusterScatter, Sequence[Batch]]:
+        return self._scatter, ()
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         self._scatter(self.isotropic, u, f)

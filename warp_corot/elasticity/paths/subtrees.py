@@ -16,7 +16,11 @@ from warp_corot.kernels.subtrees.laws import scatter_subtrees
 from .clusters import others_in_clusters
 
 if TYPE_CHECKING:
-    from warp_corot.discretization.discretization import Discretization
+    from collections.abc import Sequence
+
+    from warp_corot.discretization.subtrees import Batch
+
+    from .clusters import ClusterScatter
 
 
 class LawSubtreeField(LawField):
@@ -54,6 +58,10 @@ class LawSubtreeField(LawField):
         self._batches, self._flat, self._clusters = others_in_clusters(self.plan, isotropic_law(self._stress))
         self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in self._batches]
         self._flat_material = self.isotropic_of(self.plan.flat)
+
+    @property
+    def in_clusters(self) -> tuple[ClusterScatter, Sequence[Batch]] | None:
+        return None if self._clusters is None else (self._clusters, self._batches)
 
     def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
         return scatter_subtrees(shape, grouped, self._uniform, self._stress)
