@@ -40,6 +40,18 @@ def test_every_combination_is_made_once_and_has_a_row(folder):
     assert len(calls(folder)) == 8
 
 
+def test_runs_go_together_as_worlds_of_one_call_do(folder):
+    grid = {"a": [1, 2, 3], "b": [1, 2, 3], "folder": [str(folder)]}
+    with ThreadPoolExecutor(1) as engine:
+        rows = wd.sweep(swept.side_by_side, grid, together=4, retries=0, folder="results", executor=engine)
+        assert [row["product"] for row in rows] == [a * b for a in (1, 2, 3) for b in (1, 2, 3)]
+        assert [row["error"] for row in rows] == [""] * 9
+        # Four, four with a three that fails, the last one; then each of the second call.
+        assert calls(folder) == sorted(["4", "4", "1"] + ["1"] * 4)
+        rows = wd.sweep(swept.product, grid, together=4, retries=0, folder="others", executor=engine)
+    assert all("TypeError" in row["error"] or "InputError" in row["error"] for row in rows)
+
+
 def test_a_journal_that_ends_within_a_line_goes_on(folder):
     grid = {"a": [1, 2, 3], "b": [1], "folder": [str(folder)]}
     with ThreadPoolExecutor(1) as engine:

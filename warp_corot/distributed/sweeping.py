@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from contextlib import contextmanager
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,12 @@ from warp_corot.inputs.checks import checked_count
 
 from .journal import Journal, Row, key_of
 from .tables import write_tables
-from .workers import local_executor, timed, worker_count
+from .workers import local_executor, timed, timed_together, worker_count
 
 Parameters = Mapping[str, Sequence[Any]] | Sequence[Mapping[str, Any]]
+#: The parameters of runs that one call makes, and such a call.
+Share = tuple[dict[str, Any], ...]
+Call = Callable[[Share], list[Row]]
 
 
 def sweep(
@@ -29,6 +33,7 @@ def sweep(
     folder: str | PathLike[str] | None = None,
     workers: int | None = None,
     retries: int = 2,
+    together: int | None = None,
     executor: Executor | None = None,
     progress: bool | None = None,
 ) -> list[Row]:
@@ -44,6 +49,9 @@ def sweep(
         folder: The folder for the journal, tables (CSV and, with pyarrow, Parquet) and a picture.
         workers: Number of processes; None: one for each card, or for each core without cards.
         retries: How often a run is repeated that failed or whose process died.
+        together: How many runs one call makes at most, such as the worlds of one simulation: the function is called
+            with a list of values for each parameter, and returns a list of results, or a dictionary of such lists.
+            After a call that fails, its runs are made one by one. None: one run a call, without lists.
         executor: Another engine in place of processes of this machine: any ``concurrent.futures.Executor``, such as
             ``mpi4py.futures.MPIPoolExecutor()`` or ``dask.distributed.Client(…).get_executor()``.
         progress: Whether to show a bar; None: on a terminal.
@@ -60,12 +68,15 @@ def sweep(
     checked_count(retries, "retries", least=0)
     if not callable(function):
         raise InputError(f"function is {function!r}; it must be a function of the parameters")
-    window = worker_count(workers, len(runs), executor)
+    size = 1 if together is None else checked_count(together, "together", least=1)
+    window = worker_count(workers, -(-len(runs) // size), executor)
     journal = Journal(None if folder is None else Path(folder))
     left = [run for run in runs if not journal.is_done(run)]
     with _bar(len(runs), progress) as show:
         show(len(runs) - len(left))
-        for done in _made(function, left, executor, window, retries):
+        of_runs = partial(timed if together is None else timed_together, function)
+        shares = [tuple(left[k : k + size]) for k in range(0, len(left), size)]
+        for done in _made(of_runs, shares, executor, window, retries):
             journal.note({name: done[name] for name in runs[0]}, done)
             show(1)
     rows = [journal.row(run) for run in runs]
@@ -106,14 +117,14 @@ def _plain(value: Any) -> Any:
 
 
 def _made(
-    function: Callable[..., Any], runs: Sequence[dict[str, Any]], executor: Executor | None, workers: int, retries: int
+    of_runs: Call, shares: Sequence[Share], executor: Executor | None, workers: int, retries: int
 ) -> Iterator[Row]:
     """Rows of runs as they finish. The package's own engine is made again if a worker has died."""
-    waiting = deque((run, 0) for run in runs)
+    waiting = deque((share, 0) for share in shares)
     while waiting:
         engine = local_executor(workers) if executor is None else executor
         try:
-            yield from _until_broken(function, engine, waiting, workers, retries)
+            yield from _until_broken(of_runs, engine, waiting, workers, retries)
         finally:
             if executor is None:
                 engine.shutdown(wait=False, cancel_futures=True)
@@ -122,31 +133,34 @@ def _made(
 
 
 def _until_broken(
-    function: Callable[..., Any], engine: Executor, waiting: deque[tuple[Row, int]], window: int, retries: int
+    of_runs: Call, engine: Executor, waiting: deque[tuple[Share, int]], window: int, retries: int
 ) -> Iterator[Row]:
     """Rows of runs as they finish, until none waits or a worker has died."""
-    under_way: dict[Future[Row], tuple[Row, int]] = {}
+    under_way: dict[Future[list[Row]], tuple[Share, int]] = {}
     broken = False
     while under_way or (waiting and not broken):
-        # No more runs at a time than workers: when a worker dies, one of the running runs may have killed it.
+        # No more calls at a time than workers: when a worker dies, one of the running calls may have killed it.
         while waiting and not broken and len(under_way) < window:
-            run, tries = waiting.popleft()
+            share, tries = waiting.popleft()
             try:
-                under_way[engine.submit(timed, function, run)] = (run, tries)
+                under_way[engine.submit(of_runs, share)] = (share, tries)
             except BrokenExecutor:
-                waiting.appendleft((run, tries))
+                waiting.appendleft((share, tries))
                 broken = True
         for future in wait(under_way, return_when=FIRST_COMPLETED).done:
-            run, tries = under_way.pop(future)
+            share, tries = under_way.pop(future)
             error = future.exception()
             broken = broken or isinstance(error, BrokenExecutor)
             if error is None:
-                yield {**run, **future.result(), "error": ""}
+                for run, found in zip(share, future.result(), strict=True):
+                    yield {**run, **found, "error": ""}
+            elif len(share) > 1:
+                waiting.extend(((run,), tries) for run in share)
             elif tries < retries:
-                waiting.append((run, tries + 1))
+                waiting.append((share, tries + 1))
             else:
                 what = "its process died" if isinstance(error, BrokenExecutor) else " ".join(str(error).split())
-                yield {**run, "error": f"{type(error).__name__}: {what}"}
+                yield {**share[0], "error": f"{type(error).__name__}: {what}"}
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from typing import Any
 
@@ -36,23 +36,47 @@ def local_executor(workers: int) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(workers, mp_context=context, initializer=_begin, initargs=(turn,))
 
 
-def timed(function: Callable[..., Any], run: Mapping[str, Any]) -> dict[str, Any]:
-    """The results of a function for some parameters as a row of a table, with its time.
+def timed(function: Callable[..., Any], runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The results of a function for the parameters of one run as a row of a table, with its time.
 
     Raises:
         InputError: The function returns neither a number nor a dictionary of numbers and texts.
     """
+    (run,) = runs
     began = time.perf_counter()
-    given = function(**run)
+    found = _named(function(**run))
     seconds = time.perf_counter() - began
-    found = given if isinstance(given, Mapping) else {"result": given}
-    row = {}
-    for name, value in found.items():
-        value = value.item() if isinstance(value, np.generic) else value
-        if name in run or name in ("seconds", "error") or not isinstance(value, str | int | float | bool | None):
-            raise InputError(f"the function gives {name} = {value!r}; it must be a number or text of another name")
-        row[name] = value
-    return row | {"seconds": seconds}
+    return [{name: _checked(value, name, run) for name, value in found.items()} | {"seconds": seconds}]
+
+
+def timed_together(function: Callable[..., Any], runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The same of several runs that one call makes; each has an equal share of the time.
+
+    Raises:
+        InputError: The function returns neither a list for all runs nor a dictionary of such lists.
+    """
+    began = time.perf_counter()
+    given = _named(function(**{name: [run[name] for run in runs] for name in runs[0]}))
+    seconds = (time.perf_counter() - began) / len(runs)
+    for name, values in given.items():
+        if isinstance(values, str) or not hasattr(values, "__len__") or len(values) != len(runs):
+            raise InputError(f"the function gives {name} = {values!r}; it must be a list of {len(runs)}, one a run")
+    return [
+        {name: _checked(values[k], name, run) for name, values in given.items()} | {"seconds": seconds}
+        for k, run in enumerate(runs)
+    ]
+
+
+def _named(given: Any) -> Mapping[str, Any]:
+    return given if isinstance(given, Mapping) else {"result": given}
+
+
+def _checked(value: Any, name: str, run: Mapping[str, Any]) -> Any:
+    """A number or text of Python's own."""
+    value = value.item() if isinstance(value, np.generic) else value
+    if name in run or name in ("seconds", "error") or not isinstance(value, str | int | float | bool | None):
+        raise InputError(f"the function gives {name} = {value!r}; it must be a number or text of another name")
+    return value
 
 
 def _begin(turn: Any) -> None:
