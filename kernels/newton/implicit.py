@@ -147,8 +147,10 @@ def begin_particles(
             m = 1.0 / inverse_mass[i]
             free[k] = 1.0
             inertia[k] = (m * (1.0 / dt + damping) / dt) * wp.identity(3, dtype=wp.float32)
-            right = (m / dt) * qd[i] + load_node(f, i) + m * gravity[place_of(world[i], gravity.shape[0])]
-            motion = motion / (1.0 + dt * damping)
+            g = gravity[place_of(world[i], gravity.shape[0])]
+            right = (m / dt) * qd[i] + load_node(f, i) + m * g
+            # That of free fall, which a solve to a share of large forces would not find.
+            motion = (motion + (dt * dt) * g) / (1.0 + dt * damping)
     store_node(b, k, right)
     store_node(d, k, motion)
 
@@ -197,7 +199,9 @@ def begin_bodies(
             free[k] = 1.0
             inertia[k] = (1.0 / (w * dt * dt)) * wp.identity(3, dtype=wp.float32)
             right = linear / (w * dt * dt) + wp.spatial_top(body_f[i])
-            right += gravity[place_of(world[i], gravity.shape[0])] / w
+            g = gravity[place_of(world[i], gravity.shape[0])]
+            right += g / w
+            linear += (dt * dt) * g
             if wp.determinant(inverse_inertia[i]) > 0.0:
                 turn = wp.quat_to_matrix(wp.transform_get_rotation(q[i]))
                 free[k + 1] = 1.0

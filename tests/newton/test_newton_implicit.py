@@ -67,6 +67,16 @@ def test_steps_agree_with_short_explicit_ones(device):
     assert ends[0] > 1.7 * ends[1] > 1.7**2 * ends[2] > 0.0
 
 
+@pytest.mark.parametrize(("young", "poisson", "dt"), [(1e9, 0.49999, DT), (1.0, 0.3, DT), (3e4, 0.4, 1e3)])
+def test_free_fall_is_right_whatever_falls(device, young, poisson, dt):
+    made = builder()
+    forest = wc.TetForest.box(cells=(2, 2, 1), cell_size=0.1, level=0)
+    wn.add_forest(made, forest, wc.Isotropic(young, poisson, 1000.0))
+    model = made.finalize(device=device)
+    _, state, _ = stepped(model, 5, dt=dt)
+    assert state.particle_qd.numpy().mean(axis=0)[2] == pytest.approx(-9.81 * 5 * dt, rel=1e-2)
+
+
 def test_a_block_rests_on_the_ground(device):
     made = builder()
     made.add_ground_plane()
