@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.kernels.elements import shared_rows as kernels
+from warp_corot.kernels.elements.dilatation import Dilatation
 
 #: Starts, members, how many there are if launches go through more, and how many launches go through: as
 #: ``kernels.elements.shared_dilatation.share_in_groups`` takes groups.
@@ -22,17 +23,20 @@ class Members:
         count: How many groups launches go through; some may be empty.
         entries: How many nodes all have together.
         arrays: On the device.
+        law: What is shared.
     """
 
     count: int
     entries: int
     arrays: kernels.GroupNodes
+    law: Dilatation
 
     @classmethod
-    def of(cls, batches: list[Batch], nodes: wp.array, below: int | None = None) -> Members:
+    def of(cls, law: Dilatation, batches: list[Batch], nodes: wp.array, below: int | None = None) -> Members:
         """Of the present mesh; waits for the device.
 
         Args:
+            law: What is shared.
             batches: Groups.
             nodes: Of all elements, vec4i.
             below: Groups of elements from this number on are left empty; None: all count.
@@ -56,4 +60,4 @@ class Members:
         entries = int(found.ends[-1:].numpy()[0]) if count else 0
         found.nodes = wp.zeros(entries, dtype=wp.int32, device=device)
         wp.launch(kernels.name_nodes, count, [nodes], [found], device=device)
-        return cls(count, entries, found)
+        return cls(count, entries, found, law)

@@ -1,8 +1,7 @@
 """The part of the finest matrix that comes from a dilatation that groups of elements share.
 
-A group adds r r^T, with r = sum of lambda V grad N / sqrt(sum of lambda V) at its nodes, turned by the elements'
-rotations: the rows of ``kernels.elements.shared_rows`` where nothing but a rotation changes volumes. So each pair of a
-group's nodes contributes to an entry.
+A group adds r r^T with r = sqrt(c) g of ``kernels.elements.shared_rows``, so each pair of its nodes contributes to an
+entry. Rows are those of the present state, as lambda may be thousands of times mu.
 
 A group of k nodes couples all of them: r r^T may be k times its own diagonal blocks. It is at most 4 times these with
 weights w_n = sum of |r_m| / (4 |r_n|), since (sum of r_n . p_n)^2 <= sum of |r_m| times sum of (r_n . p_n)^2 / |r_n|.
@@ -10,10 +9,15 @@ Smoothing takes the diagonal with these weights, and so keeps its bound. On coar
 nodes and few have more, ``bound_diagonal`` keeps it.
 """
 
+import functools
+
 import warp as wp
 
-from warp_corot.kernels.elements.elements import ForestElements, rest_volume, shape_of
+from warp_corot.kernels.elements.dilatation import Dilatation
+from warp_corot.kernels.elements.elements import ForestElements, nodal_forces, rest_volume
+from warp_corot.kernels.elements.forces import in_local_frame, own_gradient
 from warp_corot.kernels.elements.shared_rows import GroupNodes, first_entry
+from warp_corot.kernels.modules import unique_kernel
 
 from .pattern import key_of
 
@@ -65,52 +69,66 @@ def row_at(rows: wp.array[wp.vec4], place: int):
     return wp.vec3(row[0], row[1], row[2])
 
 
-@wp.kernel(enable_backward=False)
-def write_rows(
-    # In
-    world_elements: int,
-    entries: int,
-    groups: GroupNodes,
-    elements: ForestElements,
-    frames: wp.array[wp.mat33],
-    gradients: wp.array[wp.vec3],
-    lam: wp.array[float],
-    stride: int,
-    # Out
-    rows: wp.array[wp.vec4],
-):
-    """The rows, and w - 1 in the fourth lane; frames and gradients as ``values.gather_leaves`` takes them."""
-    world, g = wp.tid()
-    first = first_entry(groups.ends, g)
-    end = groups.ends[g]
-    total = float(0.0)
-    for k in range(first, end):
-        rows[world * entries + k] = wp.vec4()
-    for i in range(groups.ranges[g][0], groups.ranges[g][1]):
-        t = world * world_elements + groups.members[i]
-        volume = rest_volume(elements, t)
-        modulus = lam[t * stride]
-        total += modulus * volume
-        q = (modulus * wp.sqrt(volume)) * frames[t]
-        for n in range(4):
-            part = q * gradients[4 * shape_of(elements.code[t]) + n]
-            at = world * entries + first + ((groups.corners[i] >> (8 * n)) & 255)
-            rows[at] = rows[at] + wp.vec4(part[0], part[1], part[2], 0.0)
-    factor = float(0.0)
-    if total > 0.0:
-        factor = 1.0 / wp.sqrt(total)
-    sum = float(0.0)
-    for k in range(first, end):
-        row = factor * row_at(rows, world * entries + k)
-        rows[world * entries + k] = wp.vec4(row[0], row[1], row[2], 0.0)
-        sum += wp.length(row)
-    for k in range(first, end):
-        row = row_at(rows, world * entries + k)
-        size = wp.length(row)
-        weight = float(1.0)
-        if size > 0.0:
-            weight = 0.25 * sum / size
-        rows[world * entries + k] = wp.vec4(row[0], row[1], row[2], weight - 1.0)
+@wp.func
+def add_row(rows: wp.array[wp.vec4], place: int, part: wp.vec3):
+    rows[place] = rows[place] + wp.vec4(part[0], part[1], part[2], 0.0)
+
+
+@functools.cache
+def write_rows(of: Dilatation) -> wp.Kernel:
+    """The rows at displacements u, and w - 1 in the fourth lane."""
+    measure, curvature_of = of.measure, of.curvature
+
+    @unique_kernel()
+    def write_rows(
+        # In
+        world_elements: int,
+        entries: int,
+        groups: GroupNodes,
+        elements: ForestElements,
+        u: wp.array[wp.vec4],
+        lam: wp.array[float],
+        stride: int,
+        # Out
+        rows: wp.array[wp.vec4],
+    ):
+        world, g = wp.tid()
+        first = world * entries + first_entry(groups.ends, g)
+        end = world * entries + groups.ends[g]
+        for k in range(first, end):
+            rows[k] = wp.vec4()
+        sum = float(0.0)
+        total = float(0.0)
+        for i in range(groups.ranges[g][0], groups.ranges[g][1]):
+            t = world * world_elements + groups.members[i]
+            theta, slope = measure(own_gradient(elements, t, u))
+            modulus = lam[t * stride]
+            weight = modulus * rest_volume(elements, t)
+            sum += weight * theta
+            total += weight
+            f0, f1, f2, f3 = nodal_forces(elements, t, in_local_frame(elements, t, -modulus * slope))
+            corners = groups.corners[i]
+            add_row(rows, first + (corners & 255), f0)
+            add_row(rows, first + ((corners >> 8) & 255), f1)
+            add_row(rows, first + ((corners >> 16) & 255), f2)
+            add_row(rows, first + ((corners >> 24) & 255), f3)
+        factor = float(0.0)
+        if total > 0.0:
+            factor = wp.sqrt(wp.max(curvature_of(sum / total), 0.0) / total)
+        size = float(0.0)
+        for k in range(first, end):
+            row = factor * row_at(rows, k)
+            rows[k] = wp.vec4(row[0], row[1], row[2], 0.0)
+            size += wp.length(row)
+        for k in range(first, end):
+            row = row_at(rows, k)
+            own = wp.length(row)
+            weight = float(1.0)
+            if own > 0.0:
+                weight = 0.25 * size / own
+            rows[k] = wp.vec4(row[0], row[1], row[2], weight - 1.0)
+
+    return write_rows
 
 
 @wp.kernel(enable_backward=False)

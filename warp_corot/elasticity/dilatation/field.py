@@ -301,7 +301,7 @@ class DilatationField(ForceField):
 
     def members(self, below: int | None = None) -> Members:
         """The nodes of groups, of all elements or those below a number; waits for the device."""
-        return Members.of(self.batches_of_groups(), self.elements.nodes, below)
+        return Members.of(self.of, self.batches_of_groups(), self.elements.nodes, below)
 
     def share_weights(self, u: wp.array, p: wp.array) -> wp.array:
         """What derivatives with respect to elements' weights need of the shared dilatation, vec4 [T]; see

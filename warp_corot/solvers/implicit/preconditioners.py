@@ -17,8 +17,8 @@ from .tangent import TangentOperator
 #: Where elements have their dilatation at nodes, they are preconditioned by plain ones, compressible since these lock.
 #: As the two differ, better smoothing saves no iterations there.
 AT_NODES: dict[str, Any] = {"degree": 2, "rise": 0, "most_lambda": 4.0}
-#: Of a short cycle: the smoother's degree, by how much it rises, and the nodes of a level that is not made coarser.
-SHORT: dict[str, int] = {"degree": 2, "rise": 1, "few_nodes": 24}
+#: Of a short cycle on the CPU: sweeps, and the nodes of a level that is not made coarser.
+SHORT: dict[str, Any] = {"sweeps": 1, "few_nodes": 24}
 
 
 def _multigrid(operator: TangentOperator, short_cycles: bool) -> Multigrid:

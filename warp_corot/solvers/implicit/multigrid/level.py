@@ -91,6 +91,19 @@ class Level:
         inputs: list[Any] = [self.count, pattern.entries, pattern.starts, pattern.columns, self.blocks]
         self.launch(cycle.pack_rows, self.count, inputs, [rows.packed, rows.sums, rows.units])
 
+    def smooth_before(self) -> None:
+        """Smooth from zero, of which ``z`` has the first step."""
+        self.smooth(1)
+
+    def smooth_after(self) -> None:
+        """Go on with ``z`` as the transpose of ``smooth_before``."""
+        self.smooth()
+
+    def find_residual(self) -> None:
+        """Launch other = r - A z after ``smooth_before``."""
+        inputs = [self.lanes, self.count, self.pattern.entries, self.rows, self.r, self.z]
+        self.launch(cycle.find_residual, self.count * self.lanes, inputs, [self.other])
+
     def smooth(self, from_step: int = 0) -> None:
         """Continue with ``z`` from a step of the smoother."""
         for step in range(from_step, len(self.factors)):
@@ -113,9 +126,8 @@ class Level:
 
     def restrict_from(self, fine: Level, midpoints: Midpoints) -> None:
         """Restrict the finer level's residual, and make the smoother's first step."""
-        inputs = [fine.lanes, fine.count, fine.pattern.entries, fine.rows, fine.r, fine.z]
-        fine.launch(cycle.find_residual, fine.count * fine.lanes, inputs, [fine.other])
-        inputs = [self.ranks, self.count, fine.count, self.factors[0][0], self.free]
+        fine.find_residual()
+        inputs: list[Any] = [self.ranks, self.count, fine.count, self.factors[0][0], self.free]
         inputs += [midpoints.starts, midpoints.midpoints, self.inverses, fine.other]
         self.launch(cycle.restrict_residual, self.count, inputs, [self.r, self.z])
 

@@ -21,11 +21,12 @@ from warp_corot.solvers.implicit.operator import LinearOperator
 from .coarsest import DenseInverse
 from .level import Level
 from .pattern import Midpoints, Pattern, PatternFinder
+from .swept import SweptLevel
 
 #: The largest coarsest level that is inverted [nodes].
 MOST_DENSE = 64
-#: The smoother's degree on a coarsest level that is not inverted, for example of a grid of many cubes.
-COARSEST_DEGREE = 24
+#: The smoother's degree or sweeps on a coarsest level that is not inverted, for example of a grid of many cubes.
+COARSEST_DEGREE, COARSEST_SWEEPS = 24, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +56,7 @@ class Multigrid:
         most_lambda: Lambda is at most this many times mu.
         members: Returns the groups of elements, among those below a number, that share their dilatation; None: none do.
         half: Whether the cycle takes matrices in half precision; only where lambda is not many times mu.
+        sweeps: Smoothing by so many sweeps of Gauss and Seidel; on the CPU. Zero: Chebyshev's iteration.
 
     Attributes:
         discretization: The body's discretization.
@@ -77,6 +79,7 @@ class Multigrid:
         most_lambda: float = np.inf,
         members: Callable[[int], Members] | None = None,
         half: bool = False,
+        sweeps: int = 0,
     ):
         if stride not in (1, 2, 3):
             raise InputError(f"stride is {stride!r}; it must be 1, 2 or 3")
@@ -86,7 +89,7 @@ class Multigrid:
         self.is_turned, self.stride, self.degree, self.stiffening = is_turned, stride, degree, stiffening
         self.most_lambda, self.rise, self.few_nodes = most_lambda, rise, few_nodes
         self._find_members = members
-        self._is_half = half
+        self._is_half, self.sweeps = half, sweeps
         self.revision, self._version = -1, -1
         self.follow()
 
@@ -117,8 +120,8 @@ class Multigrid:
         found = finest.pattern
         if self._members is not None:
             inputs = [discretization.sizes.world_elements, self._members.entries, self._members.arrays, elements]
-            inputs += [self._frames, self._gradients, discretization.lam, discretization.material_stride]
-            finest.launch(shared.write_rows, self._members.count, inputs, [self._rows])
+            inputs += [operator.displacements, discretization.lam, discretization.material_stride]
+            finest.launch(shared.write_rows(self._members.law), self._members.count, inputs, [self._rows])
         inputs = [discretization.sizes.world_elements, found.entries, elements, self._frames, self._gradients]
         inputs += [discretization.mu, discretization.lam, discretization.material_stride, scales, self.stiffening]
         inputs += [self.most_lambda if self._members is None else 0.0]
@@ -141,15 +144,15 @@ class Multigrid:
         inputs = [self.count, self._mesh_nodes, finest.factors[0][0], self._nodes, self._free, finest.inverses, r]
         finest.launch(cycle.take_in, self.count, inputs, [finest.r, finest.z])
         for transfer in self._transfers:
-            transfer.fine.smooth(1)
+            transfer.fine.smooth_before()
             transfer.coarse.restrict_from(transfer.fine, transfer.midpoints)
         if self._coarsest is None:
-            self.levels[-1].smooth(1)
+            self.levels[-1].smooth_before()
         else:
             self._coarsest.solve()
         for transfer in reversed(self._transfers):
             transfer.coarse.correct(transfer.fine, self._ends)
-            transfer.fine.smooth()
+            transfer.fine.smooth_after()
         inputs = [self.count, self._mesh_nodes, self._nodes, self._free, r, finest.z]
         finest.launch(cycle.hand_out, self.count, inputs, [z])
 
@@ -171,7 +174,9 @@ class Multigrid:
         counts = self._counts(levels)
         members = self._members = self._find_members and self._find_members(sizes.world_elements)
         found, self._pairs = finder.of_leaves(elements.nodes, sizes.world_elements, rank, members)
-        rows, nodes = (0, 1) if members is None else (sizes.worlds * members.entries, sizes.worlds * self.count)
+        rows = 0 if members is None else sizes.worlds * members.entries
+        # Sweeps need no bound on eigenvalues.
+        nodes = 1 if members is None or self.sweeps else sizes.worlds * self.count
         self._rows = wp.zeros(rows, dtype=wp.vec4, device=device)
         self._more = wp.zeros(nodes, dtype=wp.mat33, device=device)
         self.levels = [self._level(found, counts)]
@@ -186,9 +191,13 @@ class Multigrid:
     def _level(self, found: Pattern, counts: list[int]) -> Level:
         """A level with its smoother; the coarsest one's is only used where it is not inverted."""
         k = counts.index(found.count)
-        degree = COARSEST_DEGREE if k == len(counts) - 1 else self.degree + self.rise * k
+        is_coarsest = k == len(counts) - 1
+        worlds, ranks = self.discretization.worlds, self.count
+        if self.sweeps:
+            return SweptLevel(found, worlds, ranks, self._free, COARSEST_SWEEPS if is_coarsest else self.sweeps)
+        degree = COARSEST_DEGREE if is_coarsest else self.degree + self.rise * k
         is_bounded = k > 0 and self._members is not None
-        return Level(found, self.discretization.worlds, self.count, self._free, degree, is_bounded, self._is_half)
+        return Level(found, worlds, ranks, self._free, degree, is_bounded, self._is_half)
 
     def _counts(self, levels: Levels) -> list[int]:
         """Numbers of nodes of the levels that the cycle has, finest first."""
