@@ -76,7 +76,9 @@ def test_momentum_is_exchanged(device):
     np.testing.assert_allclose(turned[1], first[1], atol=1e-2 * 0.1 * ball)
 
 
-@pytest.mark.parametrize("at", [(0.06, 0.13), (0.05, 0.1), (0.07, 0.14)])
+@pytest.mark.parametrize(
+    "at", [(0.06, 0.13), *(pytest.param(at, marks=pytest.mark.slow) for at in ((0.05, 0.1), (0.07, 0.14)))]
+)
 def test_a_bounce_adds_no_energy(device, at):
     """Without damping and friction, over a triangle, an edge, and off the middle."""
     model = ball_on_block(device, at=at, speed=-1.0, gravity=0.0, kd=0.0)

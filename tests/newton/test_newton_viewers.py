@@ -57,7 +57,8 @@ def run(made, frames=FRAMES):
     return np.array(drawn)
 
 
-@pytest.mark.parametrize("name", ["drop", "gripper"])
+# Newton's collisions of the gripper's boxes take a quarter of a minute to compile.
+@pytest.mark.parametrize("name", ["drop", pytest.param("gripper", marks=pytest.mark.slow)])
 def test_usd_has_every_frame(example, tmp_path, name):
     """Meshes in the stage are at the particles' positions, frame by frame."""
     path = tmp_path / "out.usd"
