@@ -81,6 +81,12 @@ def test_ranks_do_what_one_process_does(runs, case):
     np.testing.assert_allclose(runs[3][f"{case}.True.x"], body.positions.numpy(), atol=2e-3 * moved)
 
 
+def test_costs_of_all_ranks_are_measured(runs):
+    for size in SIZES:
+        assert len(runs[size]["costs"]) == size
+        assert (runs[size]["costs"] > 0.0).all()
+
+
 def test_a_checkpoint_goes_on_with_any_number_of_ranks(runs):
     for size in SIZES:
         found = runs[size]

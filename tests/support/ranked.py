@@ -106,7 +106,7 @@ def main() -> None:
             found |= {f"{kind}.numbers": np.array([sim.steps, sim.dt, sim.time, *sim.dt_range])}
             found |= {f"{kind}.energy": np.array(sim.energy())}
             found |= {f"{kind}.wrench{k}": each.wrench.numpy() for k, each in enumerate(obstacles) if k}
-    found |= saved_and_loaded(Path(results), before)
+    found |= saved_and_loaded(Path(results), before) | {"costs": np.array(sim.measured_costs())}
     if sim.rank == 0:
         np.savez(results, **found)
     else:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
-import warnings
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from os import PathLike
 from typing import Any
 
@@ -16,11 +13,9 @@ import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.contacts import Contacts
-from warp_corot.contact.shapes import Shape
-from warp_corot.contact.tool import Obstacle, Tool
+from warp_corot.contact.tool import Obstacle
 from warp_corot.elasticity import Corotated, Model
-from warp_corot.elasticity.dilatation.options import ELEMENT, SHARED, shares_dilatation
-from warp_corot.errors import InputError, UnstableError
+from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count
 from warp_corot.inputs.device import checked_device
 from warp_corot.simulation import simulation as on_one
@@ -33,14 +28,9 @@ from warp_corot.solvers.implicit.schemes import ImplicitIntegrator
 from . import checkpoint, mpi
 from .following import Following
 from .gathering import register
-from .partition import Partition
-from .parts import Part
+from .of_parts import SimulationOfParts, compile_once, part_of, settled_model
 from .ranks import MpiRanks
 from .refusals import DIAGONAL, check_supported
-
-#: Parts of so many elements are tried by one rank first; larger ones take longer than several ranks' compiling.
-FEW_ELEMENTS = 200_000
-TRIED_STEPS = 10
 
 
 class Simulation:
@@ -89,19 +79,19 @@ class Simulation:
         check_supported(self.bodies, models, integrator, others)
         if isinstance(integrator, ImplicitIntegrator):
             integrator = dataclasses.replace(integrator, preconditioner=DIAGONAL)
-        models = tuple(_settled_model(m, body) for m, body in zip(models, self.bodies, strict=True))
+        models = tuple(settled_model(m, body) for m, body in zip(models, self.bodies, strict=True))
         self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
         here = None if device is None else checked_device(device)
-        parts = [_part_of(body, m, comm, costs, here) for body, m in zip(self.bodies, models, strict=True)]
+        parts = [part_of(body, m, comm, costs, here) for body, m in zip(self.bodies, models, strict=True)]
         self._following = [Following(body, part, comm) for body, part in zip(self.bodies, parts, strict=True)]
         for each in self._following:
             each.take_over()
-        _compile_once(comm, parts, model=models, integrator=integrator, gravity=self.gravity, **others)
+        compile_once(comm, parts, model=models, integrator=integrator, gravity=self.gravity, **others)
         for each in self._following:
             each.take_over()
         records = not integrator.is_implicit
         ranks = MpiRanks(comm, self.bodies, parts, settled=bool(deterministic), records=records)
-        self._parts: _OfParts = _OfParts(
+        self._parts: SimulationOfParts = SimulationOfParts(
             ranks,
             parts,
             model=models,
@@ -236,6 +226,12 @@ class Simulation:
         probes = [wp.zeros_like(each.part.state.displacements) for each in self._following]
         return self._parts.ranks.exchange_seconds(probes, checked_count(count, "count", least=1))
 
+    def measured_costs(self, count: int = 20) -> list[float]:
+        """What an element's forces take on each rank [s], the median of so many times: for ``costs`` of another
+        simulation of the same bodies. All ranks must call."""
+        self._take_over()
+        return self._parts.measured_costs(checked_count(count, "count", least=1))
+
     def energy(self) -> Energy:
         """Kinetic, elastic and gravitational energy of all bodies on all ranks in the present state [J]."""
         return self.world_energies().together
@@ -324,62 +320,3 @@ class Simulation:
     def _publish(self) -> None:
         for each in self._following:
             each.publish()
-
-
-class _OfParts(on_one.Simulation):
-    """A rank's own simulation of parts, which exchanges data with other ranks."""
-
-    def __init__(self, ranks: MpiRanks, parts: Sequence[Part], **options: Any):
-        self.ranks: MpiRanks = ranks
-        super().__init__(parts, **options)
-
-    def world_energies(self) -> WorldEnergies:
-        """This rank's share."""
-        found = super().world_energies()
-        elastic = np.zeros(self.worlds)
-        for k, (part, field) in enumerate(zip(self.bodies, self.fields, strict=True)):
-            energies = wp.zeros(field.energy_count, dtype=wp.float64, device=self.device)
-            with field.state_kept():
-                field.write_energies(part.state.displacements, energies)
-            self.ranks.leave_own(k, energies)
-            elastic += energies.numpy().reshape(self.worlds, -1).sum(axis=1)
-        return found._replace(elastic=elastic)
-
-
-def _part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None, device: wp.Device | None) -> Part:
-    grouped = getattr(model, "dilatation", ELEMENT) == SHARED
-    return Part(body, Partition.of(body.mesh, comm.size, costs, grouped=grouped), comm.rank, device)
-
-
-def _compile_once(comm: Any, parts: Sequence[Part], **options: Any) -> None:
-    """Let one rank of each machine compile the kernels in some steps of its parts; the others wait and then find them
-    in the cache.
-    """
-    if comm.size == 1 or comm.allreduce(max(part.element_count for part in parts), op=max) > FEW_ELEMENTS:
-        return
-    here = comm.Split_type(mpi.library().COMM_TYPE_SHARED)
-    free = all((part.conditions.inverse_mass.numpy() > 0.0).any() for part in parts)
-    if here.rank == 0 and free:
-        with warnings.catch_warnings(), suppress(UnstableError, InputError):
-            warnings.simplefilter("ignore")
-            tried = on_one.Simulation(parts, **(options | {"obstacles": _of_their_own(options.get("obstacles", ()))}))
-            tried.advance_steps(1 if tried.integrator.is_implicit else TRIED_STEPS)
-            tried.energy()
-        for part in parts:
-            part.state.reactions.zero_()
-    mpi.meet(here)
-    here.Free()
-
-
-def _of_their_own(obstacles: Obstacle | Sequence[Obstacle]) -> list[Obstacle]:
-    """The same obstacles for another simulation."""
-    given = [obstacles] if isinstance(obstacles, Shape | Tool) else list(obstacles)
-    return [copy.copy(each) for each in given]
-
-
-def _settled_model(model: Model, body: SoftBody) -> Model:
-    """The model with the meaning of "auto" for the whole body, because a part may have other materials."""
-    if not hasattr(model, "dilatation"):
-        return model
-    shares = shares_dilatation(model.dilatation, body.discretization)
-    return dataclasses.replace(model, dilatation=SHARED if shares else ELEMENT)  # type: ignore[type-var]

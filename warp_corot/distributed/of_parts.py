@@ -1,0 +1,111 @@
+"""A rank's own simulation of its parts, and what makes it."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import statistics
+import time
+import warnings
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.shapes import Shape
+from warp_corot.contact.tool import Obstacle, Tool
+from warp_corot.elasticity import Model
+from warp_corot.elasticity.dilatation.options import ELEMENT, SHARED, shares_dilatation
+from warp_corot.errors import InputError, UnstableError
+from warp_corot.simulation import simulation as on_one
+from warp_corot.simulation.energy import WorldEnergies
+
+from . import mpi
+from .partition import Partition
+from .parts import Part
+from .ranks import MpiRanks
+
+#: Parts of so many elements are tried by one rank first; larger ones take longer than several ranks' compiling.
+FEW_ELEMENTS = 200_000
+TRIED_STEPS = 10
+
+
+class SimulationOfParts(on_one.Simulation):
+    """A rank's own simulation of parts, which exchanges data with other ranks."""
+
+    def __init__(self, ranks: MpiRanks, parts: Sequence[Part], **options: Any):
+        self.ranks: MpiRanks = ranks
+        super().__init__(parts, **options)
+
+    def measured_costs(self, count: int) -> list[float]:
+        """As ``Simulation.measured_costs``, of displacements that are up to date."""
+        times = []
+        for _ in range(count + 1):
+            wp.synchronize_device(self.device)
+            began = time.perf_counter()
+            for part, field in zip(self.bodies, self.fields, strict=True):
+                with field.state_kept():
+                    field.add_forces(part.state.displacements, part.state.forces)
+            wp.synchronize_device(self.device)
+            times.append(time.perf_counter() - began)
+        for part in self.bodies:
+            part.state.forces.zero_()
+        elements = sum(part.element_count for part in self.bodies)
+        # The first time may compile.
+        return self.ranks.comm.allgather(statistics.median(times[1:]) / elements)
+
+    def world_energies(self) -> WorldEnergies:
+        """This rank's share."""
+        found = super().world_energies()
+        elastic = np.zeros(self.worlds)
+        for k, (part, field) in enumerate(zip(self.bodies, self.fields, strict=True)):
+            energies = wp.zeros(field.energy_count, dtype=wp.float64, device=self.device)
+            with field.state_kept():
+                field.write_energies(part.state.displacements, energies)
+            self.ranks.leave_own(k, energies)
+            elastic += energies.numpy().reshape(self.worlds, -1).sum(axis=1)
+        return found._replace(elastic=elastic)
+
+
+def part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None, device: wp.Device | None) -> Part:
+    """This rank's part of a body, on a device; None: where the body is."""
+    grouped = getattr(model, "dilatation", ELEMENT) == SHARED
+    return Part(body, Partition.of(body.mesh, comm.size, costs, grouped=grouped), comm.rank, device)
+
+
+def compile_once(comm: Any, parts: Sequence[Part], **options: Any) -> None:
+    """Let one rank of each machine compile the kernels in some steps of its parts; the others wait and then find them
+    in the cache.
+    """
+    if comm.size == 1 or comm.allreduce(max(part.element_count for part in parts), op=max) > FEW_ELEMENTS:
+        return
+    here = comm.Split_type(mpi.library().COMM_TYPE_SHARED)
+    free = all((part.conditions.inverse_mass.numpy() > 0.0).any() for part in parts)
+    if here.rank == 0 and free:
+        with warnings.catch_warnings(), suppress(UnstableError, InputError):
+            warnings.simplefilter("ignore")
+            tried = on_one.Simulation(parts, **(options | {"obstacles": _of_their_own(options.get("obstacles", ()))}))
+            tried.advance_steps(1 if tried.integrator.is_implicit else TRIED_STEPS)
+            tried.energy()
+        for part in parts:
+            part.state.reactions.zero_()
+    mpi.meet(here)
+    here.Free()
+
+
+def _of_their_own(obstacles: Obstacle | Sequence[Obstacle]) -> list[Obstacle]:
+    """The same obstacles for another simulation."""
+    given = [obstacles] if isinstance(obstacles, Shape | Tool) else list(obstacles)
+    return [copy.copy(each) for each in given]
+
+
+def settled_model(model: Model, body: SoftBody) -> Model:
+    """The model with the meaning of "auto" for the whole body, because a part may have other materials."""
+    if not hasattr(model, "dilatation"):
+        return model
+    shares = shares_dilatation(model.dilatation, body.discretization)
+    return dataclasses.replace(model, dilatation=SHARED if shares else ELEMENT)  # type: ignore[type-var]
