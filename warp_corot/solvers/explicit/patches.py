@@ -81,7 +81,12 @@ class PatchSteps:
         count = min(count or max(len(body.mesh.tets) // PATCH_ELEMENTS, 1), body.device.sm_count)
         room = body.device.max_shared_memory_per_block - TILE_BYTES
         sizes = THREADS if threads is None else ((threads, MOST_ELEMENTS * threads),)
-        for at_once, (each, most) in itertools.product((SOON_MEASURED, MOST_MEASURED), sizes):
+        measured = (MOST_MEASURED,) if groups is None else (SOON_MEASURED, MOST_MEASURED)
+        patches: Patches | None = None
+        for at_once, (each, most) in itertools.product(measured, sizes):
+            # Numbers of elements do not depend on the threads.
+            if patches and (patches.most_computed > most or patches.most_elements > at_once * each):
+                continue
             patches = Patches.of(body.mesh.points, body.mesh.tets, count, each, groups)
             if patches.most_computed > most or patches.most_elements > at_once * each:
                 continue
