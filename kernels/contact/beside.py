@@ -6,7 +6,7 @@ from .law import Law
 from .motion import Motions, Surface
 from .near import AROUND, BESIDE, Near, mark
 from .shapes import GROUND, Shapes, distance_to
-from .triangles import Touches
+from .touches import Touches
 from .watch import Watch
 
 wp.set_module_options({"enable_backward": False})

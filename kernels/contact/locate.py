@@ -4,7 +4,7 @@ import warp as wp
 
 from .closest import on_segments, on_triangle, point_of
 from .motion import Surface
-from .rows import BAND, Meeting, Rows, triangle_normal
+from .rows import BAND, BAND_AT_REST, Meeting, Rows, triangle_normal
 
 wp.set_module_options({"enable_backward": False})
 
@@ -27,7 +27,7 @@ def edge_normal(surface: Surface, meeting: Meeting, e: int):
 def deepest(size: float, is_self: bool, apart: wp.vec3):
     band = BAND * size
     if is_self:
-        band = wp.min(band, BAND * wp.length(apart))
+        band = wp.min(band, BAND_AT_REST * wp.length(apart))
     return -band
 
 

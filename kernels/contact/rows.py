@@ -11,8 +11,9 @@ from .motion import Surface
 wp.set_module_options({"enable_backward": False})
 
 #: Overlaps up to this share of a triangle's or an edge's size are pushed apart; what is deeper is another part of the
-#: body. Of a body with itself also this share of the way between the two at rest.
-BAND = wp.constant(0.25)
+#: body. Of a body with itself also this share of the way between the two at rest: neighbours that have passed one
+#: another must get back.
+BAND, BAND_AT_REST = wp.constant(0.25), wp.constant(0.1)
 
 
 @wp.struct

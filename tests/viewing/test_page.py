@@ -31,8 +31,9 @@ def chromium():
 
 @pytest.fixture
 def page(chromium, request):
-    options = getattr(request, "param", {})
-    with View(block(level=6), port=0, run_file=lambda sim: b'input = "box"\n', **options) as opened:
+    options = dict(getattr(request, "param", {}))
+    sim = options.pop("sim", block)(level=6)
+    with View(sim, port=0, run_file=lambda sim: b'input = "box"\n', **options) as opened:
         opened.session.change(fps=10.0)
         opened.start()
         yield opened
@@ -125,6 +126,34 @@ def test_a_drag_moves_tissue_and_the_plot_shows_its_force(tab, page, tmp_path):
     until(lambda: not held(page)[1] and held(page)[0] < 1e-4, "the tissue goes back")
     until(lambda: newtons(tab) == 0.0, "no force is told")
     tab.screenshot(path=tmp_path / "released.png")
+    assert tab.errors == []
+
+
+def below_a_ball(level):
+    """A block and a ball above it."""
+    return block(level=level, obstacles=wc.Tool(wc.Sphere(radius=0.05, position=(0.05, 0.05, 0.252))))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [{"sim": below_a_ball}], indirect=True)
+def test_a_tool_follows_the_mouse_and_presses(tab, page, tmp_path):
+    until(lambda: drawn(tab).any(), "the scene is drawn")
+    # The ball is nearest to the viewer, on the left; away from there it goes into the block.
+    rows, columns = np.nonzero(drawn(tab))
+    start = np.array([columns.min() + 80.0, np.median(rows[columns < columns.min() + 80])])
+    tab.mouse.move(*start)
+    tab.mouse.down()
+    for share in (0.3, 0.7, 1.0):
+        tab.mouse.move(*(start + share * np.array([40.0, -15.0])))
+        time.sleep(0.1)
+    (tool,) = page.sim.obstacles
+    until(lambda: held(page)[1] and held(page)[1][0][2] < -0.1, "the ball presses")
+    assert held(page)[0] > 0.002
+    until(lambda: newtons(tab) > 0.1, "the force is told")
+    tab.screenshot(path=tmp_path / "pressed.png")
+    tab.mouse.up()
+    with page.held():
+        assert tool.present_pose[0][2] < 0.25
     assert tab.errors == []
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from warp_corot.kernels.contact import beside, triangles, vertices
+from warp_corot.kernels.contact import beside, touches, triangles, vertices
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.solvers.ranks import ALONE, Ranks
@@ -61,7 +61,7 @@ class RigidForces:
         self.kinds = wp.zeros((obstacles, count), dtype=wp.int32, device=device)
         self.drag = wp.zeros((obstacles, count), dtype=wp.float32, device=device)
         self.anchors = wp.zeros((obstacles, count), dtype=wp.vec4, device=device)
-        self.touches = triangles.Touches()
+        self.touches = touches.Touches()
         shape = (obstacles, self.surface.triangle_count if self.have_edges else 0)
         for name in ("shares", "normal", "moved", "force", "more"):
             setattr(self.touches, name, wp.zeros(shape, dtype=wp.vec3, device=device))
@@ -91,7 +91,7 @@ class RigidForces:
             self._yielding = self._ranks.completed_yielding(self.surface.arrays.yielding)
             rigid = [self.obstacles.shapes, self.obstacles.motions]
             inputs = [*rigid, self._law, self.surface.arrays, self.surface.triangles, self.touches]
-            self._on_touches(triangles.find_touches, inputs)
+            self._on_touches(touches.find_touches, inputs)
             self._apply()
         self._touch_nodes(1)
 

@@ -1,0 +1,156 @@
+"""Where obstacles touch the edges and the insides of triangles."""
+
+import warp as wp
+
+from .closest import deepest_on_triangle, on_triangle, point_of, segment_to_triangle
+from .law import Law, held_back
+from .motion import Motions, Surface
+from .near import Near
+from .shapes import CAPSULE, SPHERE, Shapes, carried, distance_to
+from .vertices import across
+
+wp.set_module_options({"enable_backward": False})
+
+#: A point with so large a share of one corner is that corner, which is looked after.
+CORNER = wp.constant(0.999)
+#: Places along a capsule whose gaps differ by so small a share of its radius are touched between them.
+BLUR = wp.constant(1.0e-3)
+
+#: Triangles that are deeper in an obstacle than this share of its thickness are skewered and slide off frictionless.
+#: They leave it on the side on which they were, if the nearest side is turned from that by more than this cosine, and
+#: the way out is no more than so many times as long: inside, the nearest side may be another one at every step.
+SKEWERED, TURNED, LONGER = wp.constant(0.1), wp.constant(0.5), wp.constant(1.5)
+#: Share of the last step's push from which rounds begin: with more, nodes around an obstacle are held off by what lies
+#: between them, and bodies seem stiffer. Friction begins with all of it: what slips to bring it back would add up.
+WARMTH = wp.constant(0.5)
+
+
+@wp.struct
+class Touches:
+    """Obstacles at triangles, [O, T]."""
+
+    shares: wp.array2d[wp.vec3]  # of the corners in the point that is touched; zero where nothing is near
+    normal: wp.array2d[wp.vec3]  # from the obstacle to the triangle
+    gap: wp.array2d[wp.float32]
+    moved: wp.array2d[wp.vec3]  # how far the obstacle's point goes in this step [m]
+    acts: wp.array2d[wp.int32]
+    force: wp.array2d[wp.vec3]  # on the triangle [N]
+    more: wp.array2d[wp.vec3]  # what was added to it in this round
+
+
+@wp.func
+def nearest(shapes: Shapes, o: int, pose: wp.transform, most: float, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """Shares of the corners in the closest point, the gap there, and the way out of the obstacle."""
+    kind = shapes.kind[o]
+    size = shapes.size[o]
+    centre = wp.transform_get_translation(pose)
+    if kind == SPHERE or kind == CAPSULE:
+        w = wp.vec3()
+        if kind == CAPSULE:
+            half = wp.quat_rotate(wp.transform_get_rotation(pose), wp.vec3(0.0, 0.0, size[1]))
+            along, w = segment_to_triangle(centre - half, centre + half, a, b, c, BLUR * size[0])
+            centre = centre + (2.0 * along - 1.0) * half
+        else:
+            w = on_triangle(centre, a, b, c)
+        d = point_of(w, a, b, c) - centre
+        length = wp.length(d)
+        if length > 1.0e-4 * size[0]:
+            return w, length - size[0], d / length
+        # The axis goes through: the obstacle came from outside.
+        return w, -size[0], -wp.normalize(wp.cross(b - a, c - a))
+    w = deepest_on_triangle(shapes, o, pose, most, a, b, c)
+    gap, n = distance_to(shapes, o, pose, point_of(w, a, b, c), most)
+    return w, gap, n
+
+
+@wp.func
+def friction_at(gap: float, o: int, shapes: Shapes):
+    return wp.where(gap < -SKEWERED * shapes.thickness[o], 0.0, shapes.friction[o])
+
+
+@wp.func
+def find_touch(
+    o: int,
+    t: int,
+    shapes: Shapes,
+    motions: Motions,
+    law: Law,
+    surface: Surface,
+    triangles: wp.array[wp.vec3i],
+    touches: Touches,
+):
+    was = touches.force[o, t]
+    side = touches.normal[o, t]
+    before = touches.shares[o, t]
+    was_near = before[0] + before[1] + before[2] > 0.0
+    touches.shares[o, t] = wp.vec3()
+    touches.force[o, t] = wp.vec3()
+    touches.acts[o, t] = 0
+    corners = triangles[t]
+    pose = motions.now[surface.world[corners[0]], o]
+    later = motions.later[surface.world[corners[0]], o]
+    a = surface.x[corners[0]]
+    b = surface.x[corners[1]]
+    c = surface.x[corners[2]]
+    middle = (a + b + c) / 3.0
+    size = wp.max(wp.length(a - middle), wp.max(wp.length(b - middle), wp.length(c - middle)))
+    far = wp.max(
+        wp.length(surface.d[corners[0]]), wp.max(wp.length(surface.d[corners[1]]), wp.length(surface.d[corners[2]]))
+    )
+    far += wp.length(carried(pose, later, middle)) + law.tolerance
+    distance, _away = distance_to(shapes, o, pose, middle, size + far)
+    if distance > size + far:
+        return
+    w, gap, n = nearest(shapes, o, pose, size + far, a, b, c)
+    if wp.dot(was, was) > 0.0 and wp.dot(n, side) < 0.0 and shapes.kind[o] == CAPSULE:
+        # The axis has come through since the last step.
+        n = -n
+        gap = -2.0 * shapes.size[o][0] - gap
+    elif was_near and gap < -SKEWERED * shapes.thickness[o] and wp.dot(n, side) < TURNED:
+        beyond, _out = distance_to(shapes, o, pose, point_of(w, a, b, c) - LONGER * gap * side, size + far)
+        if beyond > 0.0:
+            n = side
+    if gap > far or wp.max(w) > CORNER:
+        return
+    touches.shares[o, t] = w
+    touches.normal[o, t] = n
+    touches.gap[o, t] = gap
+    touches.moved[o, t] = carried(pose, later, point_of(w, a, b, c))
+    was_push = wp.max(wp.dot(was, n), 0.0)
+    push = WARMTH * was_push
+    if push > 0.0:
+        touches.acts[o, t] = 1
+        force = push * n + held_back(across(was, n), was_push, friction_at(gap, o, shapes))
+        touches.force[o, t] = force
+        touches.more[o, t] = force
+
+
+@wp.kernel(enable_backward=False)
+def find_touches(
+    # In
+    threads: int,
+    near: Near,
+    shapes: Shapes,
+    motions: Motions,
+    law: Law,
+    surface: Surface,
+    triangles: wp.array[wp.vec3i],
+    # In and out
+    touches: Touches,
+):
+    """Where obstacles come close to triangles but not to their corners."""
+    k = wp.tid()
+    count = near.touch_count[0]
+    while k < count:
+        place = near.touches[k]
+        k += threads
+        find_touch(
+            place // triangles.shape[0],
+            place % triangles.shape[0],
+            shapes,
+            motions,
+            law,
+            surface,
+            triangles,
+            touches,
+        )
