@@ -11,6 +11,7 @@ from stages import TETS
 
 import warp_corot as wc
 from warp_corot.cli.opened import open_input
+from warp_corot.mesh.surfaces.boundary import signed_volumes
 
 
 def bounds(said: str) -> str:
@@ -56,6 +57,7 @@ def test_regions_have_materials(folder, suffix, materials, capsys):
     ("args", "said"),
     [
         (["--materials", "8=3kPa"], "--materials names 8, not a region by 'physical group'; there are: 7, 9"),
+        (["--materials", "0=3kPa"], "there are: 7, 9; 0 is none of them and has --young"),
         (["--materials", "liver=3kPa"], "--materials names 'liver', not a region"),
         (["--materials", "a@7=3kPa,b@7=4kPa"], "the number 7 is given twice"),
         (
@@ -162,7 +164,8 @@ def test_frames_for_paraview(folder, capsys):
     shown = np.array(prim.GetPointsAttr().Get(stage.GetEndTimeCode()))
     last = meshio.read("a.vtu")
     assert np.allclose(last.points + last.point_data["displacement"], shown, atol=1e-6)
-    assert np.array_equal(last.cells_dict["tetra"], np.array(prim.GetTetVertexIndicesAttr().Get()))
+    tets = last.cells_dict["tetra"]
+    assert np.array_equal(tets, np.array(prim.GetTetVertexIndicesAttr().Get()))
     assert set(last.cell_data["region"][0].tolist()) == {1, 2}
     mises = UsdGeom.PrimvarsAPI(prim).GetPrimvar("vonMises").Get(stage.GetEndTimeCode())
     assert np.allclose(last.cell_data["von_mises"][0], mises, rtol=1e-5)
@@ -174,6 +177,9 @@ def test_frames_for_paraview(folder, capsys):
     assert [line.split('timestep="')[1].split('"')[0] for line in listed] == ["0", "0.025", "0.05"]
     final = meshio.read(folder / listed[-1].split('file="')[1].split('"')[0])
     assert np.array_equal(final.point_data["velocity"], last.point_data["velocity"])
+    assert simulate("box", "--level", 1, "--also", "box.vtu", "-o", "b.usda", *SHORT) == 0
+    box = meshio.read("box.vtu")
+    assert (signed_volumes(box.points, box.cells_dict["tetra"]) > 0.0).all()
     text = (folder / "c.xdmf").read_text(encoding="utf-8")
     assert text.count("<Grid Name=") == 3
     with h5py.File("c.h5") as numbers:
@@ -222,6 +228,8 @@ def test_joined_nodes(folder, capsys):
     out, err = capsys.readouterr()
     assert "3 nodes coincide with others and are merged" in err
     assert "5 nodes, 2 tetrahedra" in out
+    assert simulate("two.msh", "--fix", "x + y + z < 0.05", "-o", "a.usd", *SHORT) == 0
+    assert "no two tetrahedra share a node (--join" in capsys.readouterr().err
     write_gmsh_1(folder / "one.msh", points[:4], [(4, 1, [0, 1, 2, 3])])
     assert simulate("one.msh", "--join", "-o", "b.usd", *SHORT) == 2
     assert "no two nodes coincide" in capsys.readouterr().err

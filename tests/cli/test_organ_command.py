@@ -4,6 +4,7 @@ import os
 import sys
 from dataclasses import replace
 
+import nibabel
 import numpy as np
 import pytest
 import trimesh
@@ -139,6 +140,16 @@ def test_material_follows_the_labels(folder, labels, noted, capsys):
         values = np.array(primvars.GetPrimvar(name).Get())
         np.testing.assert_allclose(values[away < 0.013], inside)
         np.testing.assert_allclose(values[away > 0.029], outside)
+
+
+def test_voxels_that_are_not_numbers_are_outside(folder, capsys):
+    values = np.full((8, 8, 8), np.nan, np.float32)
+    values[2:6, 2:6, 2:6] = 1.0
+    nibabel.save(nibabel.Nifti1Image(values, np.diag([10.0, 10.0, 10.0, 1.0])), folder / "scan.nii.gz")
+    assert simulate("scan.nii.gz", "-o", "a.usd", "--tets", 300, *SHORT) == 0
+    out, err = capsys.readouterr()
+    assert "448 voxels are not a number and count as outside" in err
+    assert "64 in 1 piece" in out
 
 
 def test_labels_are_drawn_and_left_out(folder, capsys):

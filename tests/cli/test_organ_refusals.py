@@ -17,6 +17,10 @@ def refused_files(folder: Path) -> None:
     write_scan(folder / "scan.nii.gz")
     grey = nibabel.Nifti1Image(np.resize(np.arange(-20, 281), (12, 12, 12)).astype(np.int16), np.eye(4))
     nibabel.save(grey, folder / "grey.nii.gz")
+    for name, values in (("zeros", np.zeros((4, 4, 4), np.uint8)), ("halves", np.full((4, 4, 4), 0.5, np.float32))):
+        nibabel.save(nibabel.Nifti1Image(values, np.eye(4)), folder / f"{name}.nii.gz")
+    colours = np.zeros((4, 4, 4), [("R", "u1"), ("G", "u1"), ("B", "u1")])
+    nibabel.save(nibabel.Nifti1Image(colours, np.eye(4)), folder / "colours.nii.gz")
     half = trimesh.creation.icosphere(2, 0.05)
     half.update_faces(half.triangles_center[:, 2] > 0)
     half.export(folder / "half.ply")
@@ -50,6 +54,11 @@ REFUSED = [
     (["scan.nii.gz", "--threshold", "1", "--labels", "2=3kPa"], "--threshold is for scans without --labels"),
     (["scan.nii.gz", "--regions-by", "tissue"], "--regions-by is for --materials on meshes"),
     (["grey.nii.gz"], "grey.nii.gz: has 301 different values or more, -20 to 280, as intensities do"),
+    (["zeros.nii.gz", "--unit", "mm"], "the volume is empty: all of its voxels are 0"),
+    (["halves.nii.gz"], "halves.nii.gz: has values such as 0.5, as probabilities and intensities do"),
+    (["colours.nii.gz"], "colours.nii.gz: has voxels of type"),
+    (["organ.obj", "--tets", "999999999"], "--tets is 999999999; it must be at most 100000000"),
+    (["organ.obj", "--pull", "right", "0", "0", "1cm", "--tets", "500"], "--pull: expression 'right': 'right' is not"),
     (["organ.obj", "--labels", "liver=3kPa"], "--labels is for scans, and organ.obj is not one"),
     (["organ.obj", "--draw-labels"], "--draw-labels is for scans"),
     (["box", "--unit", "mm"], "--unit is for files, and box is not one; say --scale"),

@@ -95,7 +95,8 @@ def _main(argv: Sequence[str] | None) -> int:
             stream.reconfigure(errors="backslashreplace")
     try:
         with terminable(), warnings.catch_warnings():
-            warnings.showwarning = lambda message, *_, **__: complain(str(message), kind="warning")
+            said: set[str] = set()
+            warnings.showwarning = lambda message, *_, **__: _warn(str(message), said)
             status = _run(argv)
             sys.stdout.flush()
         return status
@@ -115,6 +116,13 @@ def _main(argv: Sequence[str] | None) -> int:
         silence(sys.stdout)
         complain(f"{error.filename or 'standard output'}: {error.strerror or error}")
         return 1
+
+
+def _warn(message: str, said: set[str]) -> None:
+    """Print a warning, once."""
+    if message not in said:
+        said.add(message)
+        complain(message, kind="warning")
 
 
 def _run(argv: Sequence[str] | None) -> int:

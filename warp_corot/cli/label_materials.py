@@ -147,7 +147,10 @@ def of_regions(entries: Sequence[LabelMaterial], regions: Regions) -> tuple[tupl
                 name if name == str(number) else f"{name} ({number})"
                 for name, number in zip(regions.names[:40], regions.numbers, strict=False)
             )
-            raise InputError(f"--materials names {missing[0]!r}, not a region by {regions.array!r}; there are: {known}")
+            rest = "; 0 is none of them and has --young, --poisson and --density" if missing[0] == 0 else ""
+            raise InputError(
+                f"--materials names {missing[0]!r}, not a region by {regions.array!r}; there are: {known}{rest}"
+            )
         places = [keys.index(key) for key in wanted]
         if len(places) == 1 and not entry.name.isdecimal() and entry.name not in names:
             names[places[0]] = entry.name

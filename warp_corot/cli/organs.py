@@ -106,6 +106,8 @@ def _scan(opened: Opened, args: argparse.Namespace, entries: list[LabelMaterial]
     from warp_corot.domain import Domain
 
     volume, unit = placed_volume(opened, args)
+    if args.threshold is None:
+        volume = _without_nan(volume, opened.notes)
     option, text = ("--labels", args.labels) if args.labels is not None else ("--materials", args.materials)
     numbers: dict[str, Any] | None = None
     if text is not None:
@@ -126,6 +128,14 @@ def _scan(opened: Opened, args: argparse.Namespace, entries: list[LabelMaterial]
     return Domain.from_labels(volume, labels=numbers, unit=unit, smoothing=smoothing, up_axis=up, device=args.device)
 
 
+def _without_nan(volume: LoadedVolume, notes: list[str]) -> LoadedVolume:
+    """The volume with 0, which is outside, in place of values that are not numbers."""
+    if volume.values.dtype.kind != "f" or not (missing := np.isnan(volume.values)).any():
+        return volume
+    notes.append(f"{np.count_nonzero(missing)} voxels are not a number and count as outside")
+    return replace(volume, values=np.where(missing, 0.0, volume.values))
+
+
 def _see_labels(volume: LoadedVolume) -> None:
     """Check that a scan holds labels.
 
@@ -134,6 +144,12 @@ def _see_labels(volume: LoadedVolume) -> None:
     """
     values = np.ravel(volume.values)
     found = np.unique(values[:: max(1, len(values) // LOOKED_AT)])
+    fractions = found[found != np.round(found)]
+    if len(fractions):
+        raise InputError(
+            f"{volume.source}: has values such as {fractions[0]:g}, as probabilities and intensities do, not labels; say "
+            "--threshold LOW[:HIGH] for the voxels that make up the body"
+        )
     if np.isfinite(found).all() and (len(found) > MOST_LABELS or found[0] < 0):
         raise InputError(
             f"{volume.source}: has {len(found)} different values or more, {found[0]:g} to {found[-1]:g}, as "

@@ -88,7 +88,10 @@ class Patches:
         Raises:
             InputError: It is empty, or as in `nodes`.
         """
-        mask = self.nodes(expression)
+        try:
+            mask = self.nodes(expression)
+        except InputError as error:
+            raise InputError(f"{option}: {error}") from None
         if not mask.any():
             raise InputError(f"{option} {expression!r}: there are no nodes in it")
         return mask

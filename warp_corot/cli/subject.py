@@ -148,6 +148,8 @@ def find_subject(opened: Opened, args: argparse.Namespace) -> Subject:
     asset = opened.asset
     if asset:
         subject.take(asset, args)
+    if not args.join and not loaded.objects and len(tets) > 1 and np.unique(tets).size == tets.size:
+        subject.notes.append("no two tetrahedra share a node (--join merges nodes that coincide)")
     return subject
 
 

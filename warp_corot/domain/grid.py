@@ -109,6 +109,8 @@ def numbered_labels(
     """
     values = _whole(values)
     there = np.unique(values)
+    if labels is None and not there.any():
+        raise InputError("the volume is empty: all of its voxels are 0")
     if labels is None:
         labels = {str(number): int(number) for number in there if number != 0}
     if not isinstance(labels, Mapping) or not labels:

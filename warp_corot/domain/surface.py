@@ -263,7 +263,7 @@ def _given(
     if unit is not None:
         metres = metres_per_unit(unit)
         other = loaded.metres is not None and not np.isclose(loaded.metres, metres)
-        notes.append(f"unit {unit}, as asked for" + (f", though the file says {loaded.metres:g} m" if other else ""))
+        notes.append(f"unit {unit}" + (f", as asked for, though the file says {loaded.metres:g} m" if other else ""))
     elif loaded.metres is not None:
         metres = loaded.metres
         notes.append(f"unit {length(metres)}, as the file says")

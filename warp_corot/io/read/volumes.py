@@ -90,6 +90,10 @@ def _checked(
         values = values[..., 0]
     if values.ndim != 3:
         raise InputError(f"{source}: has shape {values.shape}; it must be a volume [nx, ny, nz] of single numbers")
+    if values.dtype.kind not in "biuf":
+        raise InputError(
+            f"{source}: has voxels of type {values.dtype}, as colours or vectors do; it must be one number"
+        )
     if not values.size:
         raise InputError(f"{source}: has no voxels, its shape is {values.shape}")
     return LoadedVolume(values, affine, unit, name, source, notes)

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.elasticity.tensors import cauchy_stress, gradients, green_strain, has_tensor
+from warp_corot.mesh.surfaces.boundary import right_handed, signed_volumes
 
 if TYPE_CHECKING:
     from warp_corot.simulation.simulation import Simulation
@@ -22,7 +23,7 @@ class Fields:
     Attributes:
         time: Time [s].
         points: Rest positions [m], float64 [N, 3].
-        tets: int32 [T, 4].
+        tets: int32 [T, 4], none mirrored.
         nodal: Fields of nodes by name, [N] or [N, 3].
         elemental: Fields of elements by name, [T] or [T, 9], tensors row by row.
     """
@@ -71,10 +72,12 @@ def fields_of(sim: Simulation, worlds: Sequence[Any], time: float) -> Fields:
             labels = getattr(mesh, "labels", None)
             own = np.zeros(len(mesh.tets), np.int32) if labels is None else labels
             elemental.setdefault("region", []).append(own.astype(np.int32))
+    points = np.concatenate([mesh.points for mesh in meshes])
+    tets = np.concatenate([mesh.tets + n for mesh, n in zip(meshes, offsets[:-1], strict=True)]).astype(np.int32)
     return Fields(
         time,
-        np.concatenate([mesh.points for mesh in meshes]),
-        np.concatenate([mesh.tets + n for mesh, n in zip(meshes, offsets[:-1], strict=True)]).astype(np.int32),
+        points,
+        right_handed(tets, signed_volumes(points, tets) < 0.0),
         {name: np.concatenate(parts) for name, parts in nodal.items()},
         {name: np.concatenate(parts) for name, parts in elemental.items()},
     )

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 #: How often a cube is bisected by default.
 MAX_LEVEL_BY_DEFAULT = 12
+#: More elements are refused: their number would not fit into the arrays of a forest.
+MOST_ELEMENTS = 100_000_000
 #: With more root cubes in the body's box for each element that is allowed, no body fits.
 CUBES_PER_ELEMENT = 1000
 #: After how many meshes one of nearly so many elements is good enough.
@@ -119,6 +121,8 @@ def _check(cell_size, min_level, max_level, surface_error, field_tolerance, targ
         raise InputError(f"field_tolerance is {field_tolerance}; it must not be negative")
     if target is not None:
         checked_count(target, "target_elements", 1)
+        if target > MOST_ELEMENTS:
+            raise InputError(f"target_elements is {target}; it must be at most {MOST_ELEMENTS}")
     if not 0 <= sliver < 1:
         raise InputError(f"sliver is {sliver}; it must be a share of an element's volume, from 0 to below 1")
 

@@ -10,6 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 FACES_OF_TET = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int32)
 
 
+def right_handed(tets: NDArray[np.int32], mirrored: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Tetrahedra of which the mirrored ones have two nodes exchanged, int32 [T, 4]: formats require this order."""
+    turned = tets.copy()
+    turned[mirrored, 2], turned[mirrored, 3] = tets[mirrored, 3], tets[mirrored, 2]
+    return turned
+
+
 def signed_volumes(points: ArrayLike, tets: ArrayLike) -> NDArray[np.float64]:
     """Volumes [m³] of tetrahedra, negative for mirrored ones.
 

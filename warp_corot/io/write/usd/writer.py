@@ -15,7 +15,7 @@ from warp_corot.errors import InputError
 from warp_corot.io.pictures.colors import COLORMAP_NAME, VertexAverage, round_limit
 from warp_corot.io.write.provenance import KEY
 from warp_corot.io.write.skins import Skin
-from warp_corot.mesh.surfaces.boundary import signed_volumes
+from warp_corot.mesh.surfaces.boundary import right_handed, signed_volumes
 
 from .materials import declare_physics
 from .obstacles import ObstaclePrim, obstacle_prims
@@ -298,14 +298,8 @@ class UsdWriter:
 def _present(mesh: Mesh, fixed: ArrayLike | None, material: Any) -> Present:
     points = np.asarray(mesh.points, dtype=np.float64)
     volumes = signed_volumes(points, mesh.tets)
-    tets = _right_handed(np.asarray(mesh.tets, dtype=np.int32), volumes < 0.0)
+    tets = right_handed(np.asarray(mesh.tets, dtype=np.int32), volumes < 0.0)
     return Present(points, tets, VertexAverage(tets, np.abs(volumes), len(points)), fixed, material)
-
-
-def _right_handed(tets: NDArray[np.int32], mirrored: NDArray[np.bool_]) -> NDArray[np.int32]:
-    turned = tets.copy()
-    turned[mirrored, 2], turned[mirrored, 3] = tets[mirrored, 3], tets[mirrored, 2]
-    return turned
 
 
 def _nbytes(values: Any) -> int:
