@@ -147,8 +147,8 @@ def _see_labels(volume: LoadedVolume) -> None:
     fractions = found[found != np.round(found)]
     if len(fractions):
         raise InputError(
-            f"{volume.source}: has values such as {fractions[0]:g}, as probabilities and intensities do, not labels; say "
-            "--threshold LOW[:HIGH] for the voxels that make up the body"
+            f"{volume.source}: has values such as {fractions[0]:g}, as probabilities and intensities do, not labels; "
+            "say --threshold LOW[:HIGH] for the voxels that make up the body"
         )
     if np.isfinite(found).all() and (len(found) > MOST_LABELS or found[0] < 0):
         raise InputError(
