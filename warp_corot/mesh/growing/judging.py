@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_corot.errors import InputError
 from warp_corot.kernels.meshing import elements as kernels
+from warp_corot.kernels.meshing import leaves
 from warp_corot.kernels.tables.shapes import CIRCUMRADIUS, EDGE_LENGTHS
 from warp_corot.mesh.lattice import LATTICE_BITS, MAX_LEVEL
 from warp_corot.mesh.side_by_side import in_parts
@@ -129,7 +130,7 @@ class Judge:
         growth = self.growth
         flags = wp.empty(growth.element_count, dtype=wp.int32, device=self.device)
         inputs = [growth.first_child, growth.level, self.need, self._on_device(self.tolerances), self.max_level]
-        growth.launch(kernels.flag_off, growth.element_count, inputs, [flags])
+        growth.launch(leaves.flag_off, growth.element_count, inputs, [flags])
         return growth.flagged(flags)
 
     def unresolved(self, levels: int, error: float) -> wp.array:
@@ -147,7 +148,7 @@ class Judge:
         states = wp.empty(growth.element_count, dtype=wp.int32, device=self.device)
         inputs = [growth.first_child, growth.level, growth.parent, growth.tets, self.phi, self.need, self.circumradius]
         inputs += [float(self.domain.lipschitz), before, ROUGH]
-        growth.launch(kernels.open_leaves, growth.element_count, inputs, [states])
+        growth.launch(leaves.open_leaves, growth.element_count, inputs, [states])
         self._judge_all(0, states)
         return self.of_state(states, kernels.SPLIT, 0)
 
@@ -156,7 +157,7 @@ class Judge:
         growth = self.growth
         count = wp.zeros(1, dtype=wp.int32, device=self.device)
         inputs = [growth.first_child, growth.tets, self.phi]
-        growth.launch(kernels.count_holding, growth.element_count, inputs, [count])
+        growth.launch(leaves.count_holding, growth.element_count, inputs, [count])
         return int(count.numpy()[0])
 
     def of_state(self, states: wp.array, state: int, first: int) -> wp.array:
