@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.options import Contact
+from warp_corot.contact.shapes import Shape
 from warp_corot.elasticity import Corotated, ForceField, Model
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count, checked_number, refuse_tape, shown
@@ -17,6 +20,7 @@ from warp_corot.solvers.implicit.preconditioners import check_preconditioner
 from warp_corot.solvers.implicit.static import StaticSolver, status_words
 
 from .parts import checked_gravity, checked_models
+from .resting import checked_obstacles, rest_on
 
 #: Loads on a free body balance if their sum is less than this share of the sum of their magnitudes.
 BALANCED = 1e-5
@@ -61,6 +65,8 @@ def solve_static(
     iterations: int = 100,
     load_steps: int = 1,
     preconditioner: str | None = None,
+    obstacles: Shape | Sequence[Shape] = (),
+    contact: Contact | None = None,
 ) -> StaticReport:
     """Find the state in which a body is at rest under gravity and its loads, by Newton's method.
 
@@ -81,6 +87,9 @@ def solve_static(
             follow the path of a growing load.
         preconditioner: Of conjugate gradients: "multigrid" on the levels of a forest, "diagonal" with each node's own
             3x3 block, or None: multigrid for forests, the diagonal for general meshes.
+        obstacles: Shapes at rest on which the body may rest; their ``wrench`` is that of the answer. The search then
+            is one of long steps of backward Euler, each from rest, without a line search; ``load_steps`` must be 1.
+        contact: Friction; with ``self_contact`` the body may touch itself.
 
     Raises:
         InputError: An argument has another type or is out of its range, the model does not support the mesh, the body
@@ -105,6 +114,11 @@ def solve_static(
     field = law.bind(body)
     field.relax_fully()
     answer = _Answer(body, field, down)
+    things = checked_obstacles(obstacles)
+    if things or contact is not None:
+        if steps != 1:
+            raise InputError(f"load_steps is {steps}; with obstacles or contact it must be 1")
+        return _rest_on(answer, law, down, things, contact, tolerance, most, preconditioner, began)
     if answer.falls():
         message = "no node is held, and the loads do not balance: the body has no state of rest; fix some nodes"
         return answer.report(began, message)
@@ -123,6 +137,44 @@ def solve_static(
         correction=float(found.correction.max()),
         load_share=solver.share,
         world_converged=converged,
+    )
+
+
+def _rest_on(
+    answer: _Answer,
+    law: Model,
+    gravity: tuple[float, float, float],
+    obstacles: tuple[Shape, ...],
+    contact: Contact | None,
+    tolerance: float,
+    most: int,
+    preconditioner: str | None,
+    began: float,
+) -> StaticReport:
+    """The answer in contact."""
+    found = rest_on(
+        answer.body,
+        law,
+        answer.field,
+        answer.loads,
+        gravity,
+        obstacles,
+        contact,
+        tolerance=tolerance,
+        most=most,
+        preconditioner=preconditioner,
+    )
+    answer.finish()
+    message = "the body is at rest" if found.converged.all() else "not converged: the steps were not enough"
+    return answer.report(
+        began,
+        message,
+        iterations=found.iterations,
+        linear_iterations=found.linear_iterations,
+        residual=found.residual,
+        correction=found.correction,
+        load_share=1.0 if found.converged.all() else 0.0,
+        world_converged=found.converged,
     )
 
 

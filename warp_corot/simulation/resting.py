@@ -1,0 +1,136 @@
+"""Where a body comes to rest on obstacles: steps so long that inertia hardly counts, each from rest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.options import Contact
+from warp_corot.contact.shapes import Shape
+from warp_corot.elasticity import ForceField, Model
+from warp_corot.errors import UnstableError
+from warp_corot.inputs.checks import checked_things
+from warp_corot.solvers import BackwardEuler
+
+from .simulation import Simulation
+
+#: Lengths of steps that are tried, over the time of a wave through the body.
+LENGTHS = (1e3, 1e1, 1.0)
+#: Residual of each linear solve, and of forces that are in balance.
+LINEAR, BALANCED = 1e-5, 1e-3
+
+
+class Rest(NamedTuple):
+    """How a search ended.
+
+    Attributes:
+        converged: Whether forces are in balance, and the last step moved no node by more than the tolerance, bool
+            [worlds].
+        iterations, linear_iterations: Steps, and iterations of conjugate gradients.
+        correction: The largest motion of the last step over the largest displacement.
+        residual: The norm of forces that are out of balance, contact included, over that of the loads, of the world
+            where it is largest.
+    """
+
+    converged: npt.NDArray[np.bool_]
+    iterations: int
+    linear_iterations: int
+    correction: float
+    residual: float
+
+
+def checked_obstacles(given: Shape | Sequence[Shape]) -> tuple[Shape, ...]:
+    """Shapes at rest.
+
+    Raises:
+        InputError: There is something else.
+    """
+    return checked_things(
+        given, Shape, "an obstacle", "a shape at rest such as Ground(); in static answers tools are not"
+    )
+
+
+def rest_on(
+    body: SoftBody,
+    law: Model,
+    field: ForceField,
+    loads: npt.NDArray[np.float64],
+    gravity: tuple[float, float, float],
+    obstacles: Sequence[Shape],
+    contact: Contact | None,
+    *,
+    tolerance: float,
+    most: int,
+    preconditioner: str | None,
+) -> Rest:
+    """Move the body to where it rests on obstacles, from its present displacements.
+
+    Where steps do not come to rest, shorter ones are tried from the beginning, which search more carefully. Where these
+    do not either, the body is left where it began.
+
+    Args:
+        body: The body.
+        law, field: Its elasticity.
+        loads: Loads and weight [N], [worlds * N, 3].
+        gravity: [m/s^2].
+        obstacles: What it rests on.
+        contact: How things touch.
+        tolerance: Of the last step: the largest motion over the largest displacement.
+        most: Steps at most.
+        preconditioner: Of the linear solves.
+    """
+    start = body.displacements.numpy().copy()
+    steps = linear = 0
+    correction, converged = np.full(body.worlds, np.inf), np.zeros(body.worlds, bool)
+    for length in LENGTHS:
+        dt = length * _wave_time(body)
+        euler = BackwardEuler(dt=dt, linear_tolerance=LINEAR, preconditioner=preconditioner)
+        sim = Simulation(body, model=law, integrator=euler, gravity=gravity, obstacles=obstacles, contact=contact)
+        still = np.zeros_like(start)
+        try:
+            for _ in range(most):
+                body.velocities = still
+                sim.advance_steps(1)
+                correction = _correction(body, dt)
+                steps += 1
+                if (correction <= tolerance).all():
+                    converged = _residuals(body, field, loads) <= BALANCED
+                    if converged.all():
+                        break
+        except UnstableError:
+            converged = np.zeros(body.worlds, bool)
+        linear += sim.solves.linear_iterations if sim.solves is not None else 0
+        if converged.all():
+            break
+        body.displacements = start
+    return Rest(converged, steps, linear, float(correction.max()), float(_residuals(body, field, loads).max()))
+
+
+def _wave_time(body: SoftBody) -> float:
+    """How long a wave takes through the softest part of the body [s]."""
+    size = float(np.ptp(body.mesh.points, axis=0).max())
+    stiffness = float(body.discretization.mu.numpy().min())
+    density = float(body.masses.sum()) / (body.worlds * float(np.sum(body.mesh.volumes)))
+    return size * float(np.sqrt(density / stiffness))
+
+
+def _correction(body: SoftBody, dt: float) -> npt.NDArray[np.float64]:
+    """The largest motion of the last step over the largest displacement, of each world."""
+    worlds = body.worlds
+    moved = dt * np.linalg.norm(body.velocities.numpy().reshape(worlds, -1, 3).astype(np.float64), axis=2).max(axis=1)
+    reach = np.linalg.norm(body.displacements.numpy().reshape(worlds, -1, 3).astype(np.float64), axis=2).max(axis=1)
+    return np.asarray(moved / np.where(reach > 0.0, reach, 1.0))
+
+
+def _residuals(body: SoftBody, field: ForceField, loads: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """The norm of forces that are out of balance over that of the loads, of each world."""
+    state, count, worlds = body.state, body.sizes.nodes, body.worlds
+    forces = field.elastic_forces(state.displacements).numpy()[:count, :3] + loads
+    forces = forces + state.contact_forces.numpy()[:count, :3]
+    forces[body.conditions.held_mask()] = 0.0
+    rest, scale = (np.linalg.norm(each.reshape(worlds, -1), axis=1) for each in (forces, loads))
+    return np.asarray(rest / np.where(scale > 0.0, scale, 1.0))
