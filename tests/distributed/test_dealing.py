@@ -116,7 +116,6 @@ def test_directions_depend_on_a_nodes_number_alone():
         ([wc.Corotated()], wc.BackwardEuler(0.01), {"contact": wc.Contact()}, "contact under BackwardEuler"),
         ([wc.Corotated(rotation_level=2)], wc.SymplecticEuler(), {}, "shared rotations do not work"),
         ([wc.MassSpring()], wc.SymplecticEuler(), {}, "MassSpring does not work"),
-        ([wc.Corotated()], wc.SymplecticEuler(viscosity=1e-3), {}, "viscosity does not work"),
         ([wc.Corotated()], wc.SymplecticEuler(), {"remesh": wc.OnlineRemesh()}, "remeshing does not work"),
         (
             [wc.Corotated()],

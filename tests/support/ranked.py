@@ -56,7 +56,8 @@ def obstacles_of(case: str) -> list[wc.Ground | wc.Tool]:
 #: Integrators of cases that are not stepped by the default one.
 INTEGRATORS = {
     "implicit": lambda: wc.BackwardEuler(0.01, preconditioner="diagonal"),
-    "newmark": lambda: wc.Newmark(0.01, preconditioner="diagonal", tolerance=1e-3),
+    "newmark": lambda: wc.Newmark(0.01, preconditioner="diagonal", tolerance=1e-3, viscosity=2e-3),
+    "worlds": lambda: wc.SymplecticEuler(viscosity=2e-3),
 }
 
 CASES = {

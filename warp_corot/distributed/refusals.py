@@ -47,8 +47,6 @@ def check_supported(
             f"contact under {type(integrator).__name__} does not work on several ranks yet; the integrator must be "
             "SymplecticEuler"
         )
-    if getattr(integrator, "viscosity", 0.0):
-        raise InputError("viscosity does not work on several ranks yet; it must be 0")
     for model in models:
         if not isinstance(model, MODELS):
             raise InputError(f"{type(model).__name__} does not work on several ranks yet; take a law of elements")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import warp as wp
@@ -21,13 +22,20 @@ class Viscosity:
         body: The body.
         field: Its elastic forces, whose elements are followed where the mesh changes.
         seconds: Viscosities over Lamé's parameters [s].
+        complete: Returns velocities with those of nodes that other processes move; None: there are no such nodes.
     """
 
     #: It takes energy out of the body and never puts any in.
     is_dissipative = True
 
-    def __init__(self, body: SoftBody, field: ForceField, seconds: float):
-        self.body, self.field, self.seconds = body, field, seconds
+    def __init__(
+        self,
+        body: SoftBody,
+        field: ForceField,
+        seconds: float,
+        complete: Callable[[wp.array], wp.array] | None = None,
+    ):
+        self.body, self.field, self.seconds, self._complete = body, field, seconds, complete
         self._kernel = scatter_viscous(body.discretization.element_kind)
         #: Where sums must come out the same every time, the elements' own places for them.
         self._slotted = body.discretization.plan(subtrees=False, deterministic=True) if field.deterministic else None
@@ -35,7 +43,8 @@ class Viscosity:
     def add_forces(self) -> None:
         """Launch what adds the forces of the present displacements and velocities to the body's [N]."""
         state = self.body.state
-        self.scatter(state.displacements, state.velocities, state.forces)
+        velocities = state.velocities if self._complete is None else self._complete(state.velocities)
+        self.scatter(state.displacements, velocities, state.forces)
 
     def scatter(self, u: wp.array, v: wp.array, f: wp.array) -> None:
         """Launch what adds the forces of displacements u and velocities v, in which they are linear, to f [N]."""

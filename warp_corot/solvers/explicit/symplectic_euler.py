@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -76,8 +77,10 @@ class SymplecticEulerStepper(Stepper):
         self.system = system
         self.damping = damping
         if viscosity:
-            bound = zip(system.bodies, system.fields, strict=True)
-            system.forces += [Viscosity(body, field, viscosity) for body, field in bound]
+            bound = enumerate(zip(system.bodies, system.fields, strict=True))
+            system.forces += [
+                Viscosity(body, field, viscosity, partial(system.ranks.completed, k)) for k, (body, field) in bound
+            ]
         self._many = [_steps_in_one_launch(system, k) for k in range(len(system.bodies))]
 
     @property

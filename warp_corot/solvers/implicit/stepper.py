@@ -315,6 +315,7 @@ class BodySteps:
         if self.viscosity is not None:
             inputs = [self.operator.scales, self.newton.increment, self._drift]
             self._launch(kernels.find_rates, inputs, [self._rates])
+            self.system.ranks.complete(self.k, self._rates)
             state = self.body.state
             self.viscosity.scatter(state.displacements, self._rates, state.forces)
 

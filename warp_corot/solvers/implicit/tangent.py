@@ -89,12 +89,13 @@ class TangentOperator:
 
     def apply(self, x: wp.array, y: wp.array) -> None:
         y.zero_()
-        self.tangent.add_product(self.ranks.completed(self.number, x), y)
+        everywhere = self.ranks.completed(self.number, x)
+        self.tangent.add_product(everywhere, y)
         for forces in self.stiff_forces:
             forces.add_stiffness(self.body, x, y)
         if self.viscosity is not None:
             self._damped.zero_()
-            self.viscosity.scatter(self.displacements, x, self._damped)
+            self.viscosity.scatter(self.displacements, everywhere, self._damped)
         conditions = self.body.conditions
         inputs = [self.scales, conditions.mass, conditions.inverse_mass, x, self._damped]
         self._launch(finish_rows, inputs, [y])
