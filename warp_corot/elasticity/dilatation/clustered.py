@@ -25,6 +25,7 @@ class ClusteredGroups:
     Args:
         scatter: What adds the forces.
         elements: All elements of the mesh.
+        kind: Their struct.
         batches: Groups as ``kernels.elements.shared_dilatation.share_in_groups`` takes them, and how many; together
             they have all elements that the clusters have.
         of: What is shared.
@@ -35,6 +36,7 @@ class ClusteredGroups:
         self,
         scatter: ClusterScatter,
         elements: Elements,
+        kind: type,
         batches: Sequence[tuple[wp.array, wp.array, wp.array, int]],
         of: Dilatation,
         lam: Callable[[], wp.array],
@@ -50,7 +52,6 @@ class ClusteredGroups:
             wp.array(values, dtype=wp.int32, device=self._device) for values in (starts, members, listed)
         )
         self._pressures = wp.zeros(len(sizes), dtype=wp.float32, device=self._device)
-        kind: type = type(elements)
         self._kernel = find_pressures(kind, of)
         made = Kept(_sharing_material)
         scatter.use_law(

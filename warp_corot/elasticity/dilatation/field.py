@@ -92,7 +92,7 @@ class DilatationField(ForceField):
         there = [batch for batch in self.plan.batches if not any(batch is other for other in kept)]
         self._kept, self._others.are_joined = kept, True
         batches = self._of_subtrees(there) + self._others.groups
-        return ClusteredGroups(scatter, self.elements, batches, self.of, lambda: self.discretization.lam)
+        return ClusteredGroups(scatter, self.elements, self.kind, batches, self.of, lambda: self.discretization.lam)
 
     @property
     def _batches(self) -> Sequence[Batch]:
