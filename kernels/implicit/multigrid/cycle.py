@@ -146,9 +146,23 @@ def pack_entry(packed: wp.array[wp.uint16], entry: int, column: int, block: wp.m
     ...
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const unsigned int first = threadIdx.x & 31 & ~(lanes - 1);
+    const unsigned int together = (lanes < 32 ? (1u << lanes) - 1u : ~0u) << first;
+    for (int step = lanes / 2; step > 0; step /= 2) value = fmaxf(value, __shfl_xor_sync(together, value, step));
+#endif
+    return value;
+""")
+def most_over_lanes(value: float, lanes: int) -> float:
+    """The largest value of neighbouring threads, as ``sum_over_lanes``."""
+    ...
+
+
 @wp.kernel(enable_backward=False)
 def pack_rows(
     # In
+    lanes: int,
     count: int,
     entries: int,
     starts: wp.array[wp.int32],
@@ -165,29 +179,40 @@ def pack_rows(
     translation has no error. Units are powers of two, so that a block and its mirror image are rounded alike. What
     is not symmetric is the sum of rounding errors on the diagonal, some ten-thousandths of it.
     """
-    world, i = wp.tid()
+    world, thread = wp.tid()
+    i, lane = thread / lanes, thread % lanes
     first = world * entries
-    total = wp.mat33()
+    # Entries are transposed: the sum of their rows is that of the blocks' columns.
+    column0 = wp.vec3()
+    column1 = wp.vec3()
+    column2 = wp.vec3()
     largest = float(0.0)
-    for p in range(starts[i], starts[i + 1]):
+    for p in range(starts[i] + lane, starts[i + 1], lanes):
         block = blocks[first + p]
-        total += wp.transpose(block)
+        column0 += block[0]
+        column1 += block[1]
+        column2 += block[2]
         if columns[p] != i:
             for a in range(3):
-                for b in range(3):
-                    largest = wp.max(largest, wp.abs(block[a, b]))
+                row = wp.abs(block[a])
+                largest = wp.max(largest, wp.max(row[0], wp.max(row[1], row[2])))
+    column0 = sum_over_lanes(column0, lanes)
+    column1 = sum_over_lanes(column1, lanes)
+    column2 = sum_over_lanes(column2, lanes)
+    largest = most_over_lanes(largest, lanes)
     unit = float(0.0)
     inverse = float(0.0)
     if largest > 1.0e-30:
         unit = wp.pow(2.0, wp.floor(wp.log2(largest)) - 12.0)
         inverse = 1.0 / unit
-    for p in range(starts[i], starts[i + 1]):
+    for p in range(starts[i] + lane, starts[i + 1], lanes):
         block = inverse * blocks[first + p]
         if columns[p] == i:
             block = wp.mat33()
         pack_entry(packed, first + p, columns[p], block)
-    sums[world * count + i] = total
-    units[world * count + i] = unit
+    if lane == 0:
+        sums[world * count + i] = wp.matrix_from_cols(column0, column1, column2)
+        units[world * count + i] = unit
 
 
 @wp.struct

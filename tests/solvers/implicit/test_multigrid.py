@@ -153,7 +153,7 @@ def test_coarse_matrices_are_the_products(name, stride, device, rng):
         np.testing.assert_allclose(dense(coarse), expected, rtol=0, atol=20 * ROUNDING * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("options", [{}, {"half": True}, {"sweeps": 1}, {"sweeps": 2}], ids=str)
+@pytest.mark.parametrize("options", [{"half": False}, {"half": True}, {"sweeps": 1}, {"sweeps": 2}], ids=str)
 @pytest.mark.parametrize("name", FORESTS)
 def test_each_cycle_is_symmetric_positive_definite_and_a_good_inverse(name, options, device, rng):
     if "sweeps" in options and device != "cpu":
@@ -165,7 +165,7 @@ def test_each_cycle_is_symmetric_positive_definite_and_a_good_inverse(name, opti
     free = np.repeat(operator.inverse_mass.numpy() > 0.0, 3)
     B = as_matrix(multigrid.apply, count, device)
     # Half precision rounds a block and its mirror image alike, but not their sums on the diagonal.
-    assert np.abs(B - B.T).max() < (1e-3 if "half" in options else 50 * ROUNDING) * np.abs(B).max()
+    assert np.abs(B - B.T).max() < (1e-3 if options.get("half") else 50 * ROUNDING) * np.abs(B).max()
     np.testing.assert_array_equal(B[~free][:, ~free], np.eye((~free).sum()))
     assert not B[~free][:, free].any()
     B = B[np.ix_(free, free)]
@@ -201,14 +201,14 @@ def largest_eigenvalue(level):
 def test_half_precision_takes_as_many_iterations(poisson, device):
     mesh = wc.TetForest.box((1, 1, 3), 0.064, 9)
     operator = operator_of(mesh, device, fixed=mesh.points[:, 2] < 1e-9, poisson=poisson)
-    assert abs(iterations(operator, half=True) - iterations(operator)) <= 1
+    assert abs(iterations(operator, half=True) - iterations(operator, half=False)) <= 1
 
 
 @pytest.mark.parametrize(("poisson", "most"), [(0.3, 8), (0.45, 10), (0.49, 18)])
 def test_iterations_hardly_grow_with_the_level(poisson, most, device):
-    """A clamped beam at levels 6 and 9: to 1e-5; block diagonal preconditioning takes twice as many at each halving."""
+    """A clamped beam at levels 6 to 9: to 1e-5; block diagonal preconditioning takes twice as many at each halving."""
     counts = []
-    for level in (6, 9):
+    for level in (6, 7, 9):
         mesh = wc.TetForest.box((1, 1, 3), 0.064, level)
         operator = operator_of(mesh, device, fixed=mesh.points[:, 2] < 1e-9, poisson=poisson)
         counts.append(iterations(operator))

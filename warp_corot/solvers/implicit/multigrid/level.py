@@ -12,8 +12,9 @@ from .pattern import Midpoints, Pattern
 
 #: A bound on the eigenvalues of D^-1 A: every part of A is positive semidefinite and couples four nodes.
 LARGEST_EIGENVALUE = 4.0
-#: Lanes that share a row of a matrix on CUDA: of levels with many rows, which keep the card busy, and of others.
-MANY_ROWS, LANES, MOST_LANES = 50_000, 8, 32
+#: Lanes that share a row of a matrix on CUDA: of levels with more rows than this, and of others. Many rows keep the
+#: card busy; a small level takes no longer than its longest sum.
+LANES, MOST_LANES = ((100_000, 4), (5_000, 8)), 32
 
 
 def smoothing_factors(degree: int) -> list[tuple[float, float]]:
@@ -80,16 +81,18 @@ class Level:
             wp.zeros(worlds * self.count, dtype=wp.vec4, device=self.device) for _ in range(3)
         )
         self.factors = smoothing_factors(degree)
-        few = LANES if worlds * self.count > MANY_ROWS else MOST_LANES
-        self.lanes = 1 if self.device.is_cpu else few
+        rows = worlds * self.count
+        self.lanes = next((lanes for most, lanes in LANES if rows > most), MOST_LANES)
+        if self.device.is_cpu:
+            self.lanes = 1
 
     def pack(self) -> None:
         """Launch what the cycle takes of the matrix."""
         if not self._is_half:
             return
         pattern, rows = self.pattern, self.rows
-        inputs: list[Any] = [self.count, pattern.entries, pattern.starts, pattern.columns, self.blocks]
-        self.launch(cycle.pack_rows, self.count, inputs, [rows.packed, rows.sums, rows.units])
+        inputs: list[Any] = [self.lanes, self.count, pattern.entries, pattern.starts, pattern.columns, self.blocks]
+        self.launch(cycle.pack_rows, self.count * self.lanes, inputs, [rows.packed, rows.sums, rows.units])
 
     def smooth_before(self) -> None:
         """Smooth from zero, of which ``z`` has the first step."""

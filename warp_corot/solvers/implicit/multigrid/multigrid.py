@@ -25,6 +25,10 @@ from .swept import SweptLevel
 
 #: The largest coarsest level that is inverted [nodes].
 MOST_DENSE = 64
+#: Up to how many times mu lambda may be where the cycle takes matrices in half precision.
+MOST_HALF = 64.0
+#: By how much degrees are smaller where the second level has more than half of the finest one's nodes.
+STEPS_LESS = 2
 #: The smoother's degree or sweeps on a coarsest level that is not inverted, for example of a grid of many cubes.
 COARSEST_DEGREE, COARSEST_SWEEPS = 24, 8
 
@@ -55,7 +59,7 @@ class Multigrid:
         stiffening: Viscous over elastic stress at one strain [s], as in the operator's D.
         most_lambda: Lambda is at most this many times mu.
         members: Returns the groups of elements, among those below a number, that share their dilatation; None: none do.
-        half: Whether the cycle takes matrices in half precision; only where lambda is not many times mu.
+        half: Whether the cycle takes matrices in half precision; None: on CUDA, unless lambda is many times mu.
         sweeps: Smoothing by so many sweeps of Gauss and Seidel; on the CPU. Zero: Chebyshev's iteration.
 
     Attributes:
@@ -78,7 +82,7 @@ class Multigrid:
         stiffening: float = 0.0,
         most_lambda: float = np.inf,
         members: Callable[[int], Members] | None = None,
-        half: bool = False,
+        half: bool | None = None,
         sweeps: int = 0,
     ):
         if stride not in (1, 2, 3):
@@ -89,7 +93,7 @@ class Multigrid:
         self.is_turned, self.stride, self.degree, self.stiffening = is_turned, stride, degree, stiffening
         self.most_lambda, self.rise, self.few_nodes = most_lambda, rise, few_nodes
         self._find_members = members
-        self._is_half, self.sweeps = half, sweeps
+        self._is_half, self.sweeps = self._takes_half() if half is None else half, sweeps
         self.revision, self._version = -1, -1
         self.follow()
 
@@ -188,6 +192,13 @@ class Multigrid:
             self.levels.append(coarse)
         self._coarsest = DenseInverse(self.levels[-1]) if counts[-1] <= MOST_DENSE else None
 
+    def _takes_half(self) -> bool:
+        """Rounding is a share of lambda, and must stay small against mu."""
+        if self.device.is_cpu:
+            return False
+        mu, lam = self.discretization.mu.numpy(), self.discretization.lam.numpy()
+        return bool(np.all(np.minimum(lam, self.most_lambda * mu) <= MOST_HALF * mu))
+
     def _level(self, found: Pattern, counts: list[int]) -> Level:
         """A level with its smoother; the coarsest one's is only used where it is not inverted."""
         k = counts.index(found.count)
@@ -195,7 +206,9 @@ class Multigrid:
         worlds, ranks = self.discretization.worlds, self.count
         if self.sweeps:
             return SweptLevel(found, worlds, ranks, self._free, COARSEST_SWEEPS if is_coarsest else self.sweeps)
-        degree = COARSEST_DEGREE if is_coarsest else self.degree + self.rise * k
+        # A level that is hardly coarser helps the finest one, unless that has couplings of its own.
+        less = STEPS_LESS if len(counts) > 1 and 2 * counts[1] > counts[0] and self._members is None else 0
+        degree = COARSEST_DEGREE if is_coarsest else max(self.degree + self.rise * k - less, 1)
         is_bounded = k > 0 and self._members is not None
         return Level(found, worlds, ranks, self._free, degree, is_bounded, self._is_half)
 
@@ -203,8 +216,8 @@ class Multigrid:
         """Numbers of nodes of the levels that the cycle has, finest first."""
         counts, level = [levels.node_count], levels.depth
         while level > 0 and counts[-1] > self.few_nodes:
-            # Three bisections of the third shape also bisect an edge that the first of them makes.
-            stride = 2 if level % 3 == 2 and self.stride == 3 else self.stride
+            # Coarser levels are multiples of three: with others conjugate gradients take 10 iterations in place of 6.
+            stride = (level % 3 or 3) if self.stride == 3 else self.stride
             level = max(level - stride, 0)
             counts.append(levels.starts[level + 1])
         return counts
