@@ -4,6 +4,7 @@ import warp as wp
 
 from .motion import Surface
 from .rows import BAND, Meeting
+from .watch import Watch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -58,3 +59,82 @@ def box_edges(surface: Surface, meeting: Meeting, lower: wp.array[wp.vec3], uppe
     beyond = wp.vec3(far, far, far)
     lower[k] = wp.min(a, b) - beyond
     upper[k] = wp.max(a, b) + beyond
+
+
+@wp.func
+def place_of(i: int, of_edges: int, meeting: Meeting):
+    """A node of a triangle or an edge; -1 where there is none."""
+    if of_edges != 0:
+        return meeting.edges[i][0]
+    return meeting.triangles[i][0]
+
+
+@wp.kernel(enable_backward=False)
+def clear_bounds(watch: Watch, lower: wp.array2d[wp.vec3], upper: wp.array2d[wp.vec3]):
+    """Bounds of bodies, [worlds, bodies], that hold nothing yet."""
+    world, k = wp.tid()
+    if watch.due[0] != 0:
+        lower[world, k] = wp.vec3(NOWHERE, NOWHERE, NOWHERE)
+        upper[world, k] = -wp.vec3(NOWHERE, NOWHERE, NOWHERE)
+
+
+@wp.kernel(enable_backward=False)
+def bound_bodies(
+    # In
+    threads: int,
+    watch: Watch,
+    surface: Surface,
+    meeting: Meeting,
+    boxes_lower: wp.array[wp.vec3],
+    boxes_upper: wp.array[wp.vec3],
+    of_edges: int,
+    # Out
+    lower: wp.array2d[wp.vec3],
+    upper: wp.array2d[wp.vec3],
+):
+    """The bounds of all boxes of each body, of its triangles or of its edges."""
+    i = wp.tid()
+    if watch.due[0] == 0:
+        return
+    count = meeting.triangles.shape[0]
+    if of_edges != 0:
+        count = meeting.edges.shape[0]
+    low = wp.vec3(NOWHERE, NOWHERE, NOWHERE)
+    high = -low
+    world = int(-1)
+    body = int(-1)
+    while i < count:
+        place = place_of(i, of_edges, meeting)
+        if place >= 0:
+            # Bodies lie one after another, so that threads rarely go from one to the next.
+            if meeting.body[place] != body or surface.world[place] != world:
+                if body >= 0:
+                    wp.atomic_min(lower, world, body, low)
+                    wp.atomic_max(upper, world, body, high)
+                body = meeting.body[place]
+                world = surface.world[place]
+                low = boxes_lower[i]
+                high = boxes_upper[i]
+            else:
+                low = wp.min(low, boxes_lower[i])
+                high = wp.max(high, boxes_upper[i])
+        i += threads
+    if body >= 0:
+        wp.atomic_min(lower, world, body, low)
+        wp.atomic_max(upper, world, body, high)
+
+
+@wp.func
+def may_reach_others(s: int, low: wp.vec3, high: wp.vec3, surface: Surface, meeting: Meeting):
+    """Whether a box of something at place ``s`` meets the bounds of another body, if a body does not meet itself."""
+    if meeting.meets_itself != 0:
+        return True
+    world = surface.world[s]
+    for k in range(meeting.lower.shape[1]):
+        if k != meeting.body[s]:
+            a = meeting.lower[world, k]
+            b = meeting.upper[world, k]
+            is_apart = a[0] > high[0] or a[1] > high[1] or a[2] > high[2]
+            if not (is_apart or b[0] < low[0] or b[1] < low[1] or b[2] < low[2]):
+                return True
+    return False

@@ -26,6 +26,8 @@ class Meeting:
     edges: wp.array[wp.vec2i]  # [E] places, -1 where there is none
     sides: wp.array[wp.vec2i]  # [E] their two triangles
     reach: wp.array[wp.float32]  # [S] how far a node may go until pairs are looked for again [m]
+    lower: wp.array2d[wp.vec3]  # [worlds, bodies] bounds of all that a body may reach [m]
+    upper: wp.array2d[wp.vec3]
     meets_itself: int
     friction: float
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .boxes import edge_reach, triangle_reach, triangle_size
+from .boxes import edge_reach, may_reach_others, triangle_reach, triangle_size
 from .closest import on_segments, on_triangle, point_of
 from .motion import Surface
 from .near import CRUSHED, PAIRED, Near, mark
@@ -40,13 +40,6 @@ def bend(surface: Surface, meeting: Meeting, k: int):
     if wp.dot(first, middle - surface.x[e[0]]) > 0.0:
         return -turn
     return turn
-
-
-@wp.func
-def is_sharp(surface: Surface, meeting: Meeting, k: int):
-    if meeting.edges[k][0] < 0:
-        return False
-    return bend(surface, meeting, k) > SHARP
 
 
 @wp.func
@@ -131,6 +124,8 @@ def near_node(i: int, start: int, of_triangles: wp.uint64, surface: Surface, mee
     count = int(0)
     reach = meeting.reach[i]
     beyond = wp.vec3(reach, reach, reach)
+    if not may_reach_others(i, surface.x[i] - beyond, surface.x[i] + beyond, surface, meeting):
+        return 0
     query = wp.bvh_query_aabb(of_triangles, surface.x[i] - beyond, surface.x[i] + beyond)
     t = int(0)
     while wp.bvh_query_next(query, t):
@@ -150,6 +145,10 @@ def near_edge(k: int, start: int, of_edges: wp.uint64, surface: Surface, meeting
     b = surface.x[e[1]]
     reach = edge_reach(meeting, e)
     beyond = wp.vec3(reach, reach, reach)
+    if not may_reach_others(e[0], wp.min(a, b) - beyond, wp.max(a, b) + beyond, surface, meeting):
+        return 0
+    if bend(surface, meeting, k) <= SHARP:
+        return 0
     query = wp.bvh_query_aabb(of_edges, wp.min(a, b) - beyond, wp.max(a, b) + beyond)
     m = int(0)
     while wp.bvh_query_next(query, m):
@@ -176,7 +175,7 @@ def near_owner(
     if i < nodes:
         if surface.node[i] >= 0:
             count = near_node(i, start, of_triangles, surface, meeting, near, rows)
-    elif is_sharp(surface, meeting, i - nodes):
+    elif meeting.edges[i - nodes][0] >= 0:
         count = near_edge(i - nodes, start, of_edges, surface, meeting, near, rows)
     return count
 

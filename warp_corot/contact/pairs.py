@@ -22,6 +22,8 @@ PAIRS_EACH = 2
 GROWTH = 2.0
 #: Number of searches after which trees of boxes are built again, because neighbours may have changed by then.
 REBUILT = 100
+#: Threads that find the bounds of bodies on CUDA, at most: each ends with atomic minima.
+BOUNDING_THREADS = 4096
 
 
 class Pairs:
@@ -61,6 +63,8 @@ class Pairs:
         meeting.triangles, meeting.edges, meeting.sides = surface.triangles, surface.edges, surface.sides
         meeting.opposite = surface.opposite
         meeting.reach = self.search.watch.reach
+        shape = (surface.worlds, len(surface.parts))
+        meeting.lower, meeting.upper = (wp.zeros(shape, dtype=wp.vec3, device=device) for _ in range(2))
         meeting.meets_itself, meeting.friction = int(self.meets_itself), self.friction
         self.meeting = meeting
         self._crowd = wp.zeros(count, dtype=wp.int32, device=device)
@@ -174,6 +178,8 @@ class Pairs:
         if self.meets_itself:
             self._mark_crushed()
         self._box()
+        if not self.meets_itself:
+            self._bound()
         for tree in self._trees:
             tree.refit()
         owners = len(rows.starts)
@@ -182,6 +188,16 @@ class Pairs:
         inputs = [watch, *(tree.id for tree in self._trees), self.surface.arrays, self.meeting, old]
         wp.launch(search_kernels.find_pairs, owners, inputs, [rows, self.search.near], device=device)
         wp.launch(search_kernels.end_rows, 1, [watch, rows], [self.search.most], device=device)
+
+    def _bound(self) -> None:
+        """Launch what each body may reach: all others need no search there."""
+        watch, meeting, device = self.search.watch, self.meeting, self.device
+        bounds = [meeting.lower, meeting.upper]
+        wp.launch(boxes.clear_bounds, meeting.lower.shape, [watch], bounds, device=device)
+        for of_edges, (lower, upper) in enumerate(self._boxes):
+            threads = 1 if device.is_cpu else min(len(lower), BOUNDING_THREADS)
+            inputs = [threads, watch, self.surface.arrays, meeting, lower, upper, of_edges]
+            wp.launch(boxes.bound_bodies, threads, inputs, bounds, device=device)
 
     def _mark_crushed(self) -> None:
         near, watch = self.search.near, self.search.watch
