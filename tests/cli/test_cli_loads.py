@@ -279,6 +279,7 @@ BAD_RUNS = [
     ("input = ", "is not TOML"),
     ("duration = 1", "a body has no 'input'"),
     ("input = 'bar.vtk'\ncolour = 'red'", "'colour' is not an option"),
+    ("input = 'bar.vtk'\nyuong = '5kPa'", "'yuong' is not an option, 'young' is; see"),
     ("input = 'bar.vtk'\nyoung = []", "young = [] does not fit the option"),
     ("input = 'bar.vtk'\nyoung = 'soft'", "run.toml: argument --young"),
     ("input = 7", "input = 7 must be a name"),

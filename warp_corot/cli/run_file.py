@@ -7,6 +7,7 @@ import json
 import os
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -167,7 +168,8 @@ def _body_of(
     for key, value in table.items():
         name = key.replace("-", "_")
         if name not in actions:
-            raise InputError(f"{path}: {key!r} is not an option; see warp-corot simulate --help")
+            likely = "".join(f", {near!r} is" for near in get_close_matches(name, actions, 1))
+            raise InputError(f"{path}: {key!r} is not an option{likely}; see warp-corot simulate --help")
         if name in FORMS and isinstance(value, list):
             curves += [_load(name, entry, path) for entry in value if isinstance(entry, dict)]
             value = [entry for entry in value if not isinstance(entry, dict)]
