@@ -35,7 +35,7 @@ from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.subtree import GROUP_NODES, SLOT_STRIDE, group_slots, group_sources
 
 from .forces import leaf_stress, mat10, near_forces, shared_forces
-from .repair import WARP, LeftOut, append, is_mostly_left_out, list_of, reserve, scatter_one_by_one
+from .repair import WARP, LeftOut, append, is_mostly_left_out, list_of, reserve, scatter_in_warp, scatter_one_by_one
 
 wp.set_module_options({"enable_backward": False})
 
@@ -234,6 +234,52 @@ def scatter_subtrees_own(
             append(left_out, list_of(s // BLOCK), reserved, subtrees.first[s], mask, subtrees.code.shape[0] - s)
 
     return scatter_subtrees_own
+
+
+@functools.cache
+def scatter_subtrees_in_warps(shape: int, grouped: bool, uniform: bool, tolerance: float | None = None) -> wp.Kernel:
+    """As ``scatter_subtrees_own``, and each warp does the leaves that it left out itself, a thread a leaf.
+
+    That saves a launch and the list, and pays in bodies of up to some millions of elements. Launch with block_dim
+    BLOCK.
+    """
+    load, add = memory_of(shape, grouped)
+    forces = near_forces(shape, uniform, tolerance)
+    resident = RESIDENT[shape] if uniform and tolerance is None else min(RESIDENT)
+
+    @unique_kernel(
+        grid_stride=False,
+        launch_bounds=(BLOCK, resident),
+    )
+    def scatter_subtrees_in_warps(
+        # In
+        elements: ForestElements,
+        subtrees: Subtrees,
+        material: IsotropicMaterial,
+        u: wp.array[wp.vec4],
+        # In and out
+        f: wp.array[wp.vec4],
+        flagged: wp.array[wp.uint8],
+    ):
+        s = wp.tid()
+        before = int(flagged[s])
+        code = subtrees.code[s]
+        h = 0.5 * subtrees.size[(code & LEVEL_MASK) // 3]
+        mirror = mirror_sign(code)
+        q = subtrees.frames[code >> FRAME_SHIFT]
+        x = load(subtrees, s, u)
+        # Asked only now: the bits and the displacements are on their way at once.
+        mostly = is_mostly_left_out(before)
+        mask = int(255)
+        if not mostly:
+            leaf = wp.where(wp.static(uniform), 0, subtrees.first[s])
+            g, mask = forces(x, q, h, mirror, material.mu, material.lam, leaf)
+            add(subtrees, s, g, f)
+        to_come = subtrees.code.shape[0] - s
+        mask = scatter_in_warp(elements, subtrees.first[s], mask, mostly, to_come, material, u, f)
+        flagged[s] = wp.uint8(mask)
+
+    return scatter_subtrees_in_warps
 
 
 @functools.cache

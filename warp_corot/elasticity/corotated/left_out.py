@@ -43,9 +43,11 @@ class LeftOutLeaves:
         self._device = device
 
     @classmethod
-    def of(cls, plan: Plan, device: wp.Device) -> LeftOutLeaves:
+    def of(cls, plan: Plan, device: wp.Device, *, in_warps: bool = False) -> LeftOutLeaves:
+        """The lists of a plan, without those of own rotations where warps do these leaves themselves."""
         own = [batch.count for batch in plan.batches if batch.sharing is Sharing.OWN]
-        return cls([*own, len(plan.flat)], [batch for batch in plan.batches if batch.sharing is Sharing.ROOT], device)
+        own = [] if in_warps else [*own, len(plan.flat)]
+        return cls(own, [batch for batch in plan.batches if batch.sharing is Sharing.ROOT], device)
 
     @staticmethod
     def load(device: wp.Device) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 
 import warp as wp
@@ -14,12 +14,30 @@ from warp_corot.elasticity.paths.clusters import ChangingClusterScatter, Cluster
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
-from warp_corot.kernels.subtrees.cuda import BLOCK, FLAT, Stretch, scatter_stretches, scatter_subtrees_own
+from warp_corot.kernels.subtrees.cuda import (
+    BLOCK,
+    FLAT,
+    Stretch,
+    scatter_stretches,
+    scatter_subtrees_in_warps,
+    scatter_subtrees_own,
+)
 from warp_corot.kernels.subtrees.repair import LeftOut
 
 #: Leaves of a uniform forest from which subtrees have a launch: fewer are sooner done in clusters, above all where some
 #: are turned over (H200: 73,728 take 6.0 us at rest and 6.3 under their weight, by subtrees 9.6 and 14.4).
 UNIFORM_LEAVES = 1 << 18
+
+
+#: Leaves in subtrees below which each warp does what it leaves out itself. H200, without inverted leaves, with one, and
+#: with some in a twentieth of the subtrees: 26.5, 26.6 and 38.7 us for 1.57 million leaves, by a list 28.8, 33.5 and
+#: 39.7; 166, 166 and 270 for 12.6 million, by a list 162, 168 and 210.
+IN_WARPS_LEAVES = 1 << 22
+
+
+def does_in_warps(batches: Sequence[Batch]) -> bool:
+    """Whether warps do what they leave out of these batches themselves."""
+    return 8 * sum(batch.count for batch in batches) < IN_WARPS_LEAVES
 
 
 class OwnLaunches:
@@ -71,8 +89,11 @@ class OwnLaunches:
         flat = None if self._clusters is not None else plan.flat
         self._rows, self._blocks = ([], 0) if self._is_single else _stretches(batches, flat)
         self._stretches = wp.array(self._rows, dtype=Stretch, device=self._device) if self._rows else None
-        #: Number of subtrees and single leaves of each launch, with gaps; some of them may be left out.
+        self._in_warps = self._is_single and does_in_warps(batches)
+        #: Number of subtrees and single leaves of each launch that may leave some out, with gaps.
         self.places = [batch.count for batch in batches] if self._is_single else [self._blocks * BLOCK]
+        if self._in_warps:
+            self.places = []
 
     @property
     def in_clusters(self) -> tuple[ClusterScatter, tuple[Batch, ...]] | None:
@@ -120,8 +141,13 @@ class OwnLaunches:
 
     def _launch(self, batch: Batch, u: wp.array, f: wp.array, left_out: LeftOut) -> None:
         material = self._material
-        kernel = scatter_subtrees_own(batch.shape, True, material.stride == 0, True, self._tolerance)
-        inputs, outputs = [self._elements, batch.subtrees, material, u], [f, batch.flagged, left_out]
+        uniform = material.stride == 0
+        inputs, outputs = [self._elements, batch.subtrees, material, u], [f, batch.flagged]
+        if self._in_warps:
+            kernel = scatter_subtrees_in_warps(batch.shape, True, uniform, self._tolerance)
+        else:
+            kernel = scatter_subtrees_own(batch.shape, True, uniform, True, self._tolerance)
+            outputs.append(left_out)
         wp.launch(kernel, batch.count, inputs=inputs, outputs=outputs, device=self._device, block_dim=BLOCK)
 
 

@@ -38,7 +38,7 @@ from .elements import (
     rotated_material,
 )
 from .left_out import LeftOutLeaves
-from .own_launches import OwnLaunches
+from .own_launches import OwnLaunches, does_in_warps
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
@@ -112,6 +112,8 @@ class SubtreeField(CorotatedField):
     def follow(self) -> None:
         super().follow()
         plan = self.plan
+        #: Whether warps do what they leave out themselves.
+        self._in_warps = self._listed and plan.counts is None and does_in_warps(plan.batches)
         self._rotations = wp.empty(0, dtype=wp.mat33, device=self.device)
         self._no_unit = wp.empty(0, dtype=wp.int32, device=self.device)
         if plan.units is not None:
@@ -127,7 +129,7 @@ class SubtreeField(CorotatedField):
                 self._own_launches = OwnLaunches(plan, *given)
                 self._left_out = LeftOutLeaves(self._own_launches.places, [], self.device)
                 return
-            self._left_out = LeftOutLeaves.of(plan, self.device)
+            self._left_out = LeftOutLeaves.of(plan, self.device, in_warps=self._in_warps)
         self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]
         self._materials = [self._material(batch) for batch in plan.batches]
         self._flat_rotated = Kept(rotated_material)
@@ -185,6 +187,8 @@ class SubtreeField(CorotatedField):
     def _kernel(self, shape: int, grouped: bool, sharing: Sharing) -> wp.Kernel:
         given = sharing is Sharing.ABOVE
         if self.device.is_cuda:
+            if sharing is Sharing.OWN and self._in_warps:
+                return subtree_cuda.scatter_subtrees_in_warps(shape, grouped, self._uniform, self.model.tolerance)
             if sharing is Sharing.OWN:
                 return subtree_cuda.scatter_subtrees_own(
                     shape, grouped, self._uniform, self._listed, self.model.tolerance
@@ -223,7 +227,8 @@ class SubtreeField(CorotatedField):
             else:
                 unit = self._no_unit if batch.unit is None else batch.unit
                 inputs = [batch.subtrees, discretization.mu, discretization.lam, u, self._rotations, unit]
-            outputs.append(LeftOutLeaves.NONE if self._left_out is None else self._left_out.list_of(batch))
+            if not (own and self._in_warps):
+                outputs.append(LeftOutLeaves.NONE if self._left_out is None else self._left_out.list_of(batch))
         else:
             threads = -(-batch.count // LANES)
             inputs = [batch.subtrees, batch.count, material(), u]
