@@ -41,6 +41,24 @@ def test_every_element_is_counted_once_and_every_node_moved_once(make, ranks):
         assert np.isin(dealt.groups[needed], dealt.groups[~needed]).sum() == 0
 
 
+def test_contact_on_several_cards_is_refused():
+    with pytest.raises(wc.InputError, match="several cards"):
+        check_supported([], [], wc.SymplecticEuler(), {"obstacles": [wc.Ground()]}, cards=2)
+    check_supported([], [], wc.SymplecticEuler(), {"obstacles": [wc.Ground()]}, cards=1)
+
+
+def test_surfaces_of_parts_are_those_of_the_body():
+    body = wc.SoftBody(jittered(), wc.Isotropic(1e3, 0.3, 1000.0), device="cpu")
+    dealt, triangles, found = Partition.of(body.mesh, 3), body.surface_triangles, set()
+    for rank in range(3):
+        part = Part(body, dealt, rank)
+        faces, elements = part.surface_faces
+        np.testing.assert_array_equal(part.numbers.nodes[faces], triangles[part.surface_here])
+        assert all(set(face) <= set(tet) for face, tet in zip(faces, part.mesh.tets[elements], strict=True))
+        found |= set(part.surface_here.tolist())
+    assert found == set(range(len(triangles)))
+
+
 def test_slow_ranks_get_less():
     mesh = wc.TetForest.box(level=12)
     sizes = np.bincount(Partition.of(mesh, 2, [1.0, 3.0]).rank_of_element)

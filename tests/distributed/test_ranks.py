@@ -24,7 +24,7 @@ def runs(tmp_path_factory):
     before: list[str] = []
     for size in SIZES:
         done = on_ranks(size, str(Path(ranked.__file__)), str(folder / f"{size}.npz"), SHORT.get(size, ALL), *before)
-        before = [str(folder / f"{size}.checkpoint.npz")]
+        before = [str(folder / "1.npz")]
         assert done.returncode == 0, done.stderr
         with np.load(folder / f"{size}.npz") as archive:
             found[size] = dict(archive)
@@ -87,10 +87,11 @@ def test_costs_of_all_ranks_are_measured(runs):
         assert (runs[size]["costs"] > 0.0).all()
 
 
-def test_a_checkpoint_goes_on_with_any_number_of_ranks(runs):
-    for size in SIZES:
+@pytest.mark.parametrize("case", ["forest", "touched"])
+def test_a_checkpoint_goes_on_with_any_number_of_ranks(runs, case):
+    for size in (1, *sizes_of(case)):
         found = runs[size]
-        np.testing.assert_array_equal(found["loaded.x"], found["saved.x"])
+        np.testing.assert_array_equal(found[f"{case}.loaded.x"], found[f"{case}.saved.x"])
         if size > 1:
-            np.testing.assert_array_equal(found["others.x"], runs[1]["saved.x"])
-            np.testing.assert_array_equal(found["others.numbers"], runs[1]["loaded.numbers"])
+            np.testing.assert_array_equal(found[f"{case}.others.x"], runs[1][f"{case}.saved.x"])
+            np.testing.assert_array_equal(found[f"{case}.others.numbers"], runs[1][f"{case}.loaded.numbers"])

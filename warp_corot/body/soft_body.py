@@ -207,7 +207,12 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
     def surface_triangles(self) -> npt.NDArray[np.int32]:
         """The boundary faces of the tetrahedra, on which contact acts: nodes within a world, int32 [F, 3],
         counter-clockwise seen from outside."""
-        return boundary_faces(self.mesh.tets, self.mesh.points)[0]
+        return self.surface_faces[0]
+
+    @property
+    def surface_faces(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+        """``surface_triangles``, and the element of each, int32 [F]."""
+        return boundary_faces(self.mesh.tets, self.mesh.points)
 
     def _check_touched(self) -> None:
         if not self.state.is_touched:

@@ -11,7 +11,6 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.kernels.contact.motion import Surface
-from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -45,7 +44,7 @@ class Skin:
     def of(cls, body: SoftBody) -> Skin:
         """The surface of a body's present mesh."""
         tets = body.mesh.tets
-        faces, parents = boundary_faces(tets, body.mesh.points)
+        faces, parents = body.surface_faces
         nodes, places = np.unique(faces, return_inverse=True)
         triangles = places.reshape(-1, 3).astype(np.int32)
         fourth = tets[parents].sum(axis=1) - faces.sum(axis=1)

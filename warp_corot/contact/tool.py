@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -151,6 +152,12 @@ class Tool:
         if self._bound is not None:
             raise InputError("a tool is in two simulations; make another one of its shape")
         self._bound = (obstacles, number)
+
+    def released(self) -> Tool:
+        """The same tool in no simulation."""
+        found = copy.copy(self)
+        found._bound = None
+        return found
 
     def fastest(self) -> float:
         """The highest speed of any of its points [m/s]."""

@@ -56,24 +56,31 @@ class CardExchange:
 
     def launch(self, nodal: wp.array) -> None:
         """Launch that ghosts get their values, in a nodal array of float32, vec3 or vec4; may be recorded."""
+        self._pack(nodal)
+        self._move(nodal)
+
+    def _pack(self, nodal: wp.array) -> None:
+        nodes, out = self._sent[0], self._rooms[nodal.dtype][0]
+        wp.launch(kernels.GATHER[nodal.dtype], len(nodes), [nodes, nodal], [out], device=self._device)
+
+    def _move(self, nodal: wp.array) -> None:
         import nccl.core as nccl
 
-        stream = wp.get_stream(self._device)
-        (sent, to), (received, by) = self._sent, self._received
+        stream, (received, by), to = wp.get_stream(self._device), self._received, self._sent[1]
         out, given = self._rooms[nodal.dtype]
-        gather, scatter = kernels.GATHER[nodal.dtype], kernels.SCATTER[nodal.dtype]
-        wp.launch(gather, len(sent), [sent, nodal], [out], device=self._device)
         with nccl.group():
             for rank, start, end in to:
                 self._nccl.send(_floats(out, start, end), rank, stream=stream)
             for rank, start, end in by:
                 self._nccl.recv(_floats(given, start, end), rank, stream=stream)
-        wp.launch(scatter, len(received), [received, given], [nodal], device=self._device)
+        wp.launch(kernels.SCATTER[nodal.dtype], len(received), [received, given], [nodal], device=self._device)
 
     def begin(self, nodal: wp.array) -> None:
         """Launch the same beside what follows."""
+        # NCCL's blocks are large: they must stand in line before smaller ones fill the card.
+        self._pack(nodal)
         with wp.ScopedStream(self.aside):
-            self.launch(nodal)
+            self._move(nodal)
         self.is_under_way = True
 
     def end(self) -> None:

@@ -15,6 +15,8 @@ from warp_corot.errors import InputError
 from warp_corot.io.checkpoint.archive import save_checkpoint
 
 from .following import Following
+from .of_parts import SimulationOfParts
+from .touch_checkpoint import gathered_contact, resume_contact
 
 if TYPE_CHECKING:
     from warp_corot.simulation.simulation import Simulation
@@ -35,7 +37,11 @@ class _Values:
 
 
 def save(
-    path: str | PathLike[str], bodies: tuple[SoftBody, ...], parts: Simulation, following: list[Following], comm: Any
+    path: str | PathLike[str],
+    bodies: tuple[SoftBody, ...],
+    parts: SimulationOfParts,
+    following: list[Following],
+    comm: Any,
 ) -> None:
     """Write a checkpoint on rank 0; all ranks must call, with bodies in which all nodes are up to date.
 
@@ -56,6 +62,9 @@ def save(
         if k is not None:
             values = following[k].whole_values(values)
         kept[name] = _Values(values)
+    contact = None
+    if parts.contact is not None:
+        contact = gathered_contact(bodies[0], parts, following[0], comm)
     guard, failed = parts.guard.state, None
     if comm.rank == 0:
         told = SimpleNamespace(
@@ -65,7 +74,7 @@ def save(
             bodies=bodies,
             kept=kept,
             guard=SimpleNamespace(state=guard),
-            contact=None,
+            contact=contact,
             grasps=(),
         )
         try:
@@ -88,7 +97,7 @@ def body_of(name: str, parts: Simulation) -> int | None:
     return None
 
 
-def resume(path: str | PathLike[str], loaded: Simulation, parts: Simulation, following: list[Following]) -> None:
+def resume(path: str | PathLike[str], loaded: Simulation, parts: SimulationOfParts, following: list[Following]) -> None:
     """Resume a simulation of parts from a saved one.
 
     Args:
@@ -105,6 +114,8 @@ def resume(path: str | PathLike[str], loaded: Simulation, parts: Simulation, fol
         array.assign(values)
     parts.steps_before_reset, parts.time_before_reset = loaded.steps_before_reset, loaded.time_before_reset
     parts.stable_dt = loaded.stable_dt
+    if loaded.contact is not None:
+        resume_contact(loaded.contact, parts, following[0])
     with np.load(path, allow_pickle=False) as archive:
         parts.guard.resume(**{name: archive[f"guard.{name}"] for name in GUARD})
     wp.synchronize_device(parts.device)

@@ -44,6 +44,8 @@ class Following:
         self._number = np.full(worlds * count, -1, np.int32)
         self._number[self.own_nodes] = np.flatnonzero(own)
         self._trajectories: list[Trajectory] = []
+        #: Triangles of the surface around this rank's nodes; None before anything can be touched.
+        self._triangles: Places | None = None
 
     def take_over(self) -> None:
         """Copy users' changes to the part: the state, supports, loads and keyframes."""
@@ -72,11 +74,11 @@ class Following:
     def _publish_touch(self) -> None:
         """Give the whole body the contact forces of the nodes that this rank moves, and pressures around them."""
         whole, part = self.whole.state, self.part.state
-        if not whole.is_touched:
+        if self._triangles is None:
             whole.make_contact_forces()
             count = self.whole.worlds * len(self.whole.surface_triangles)
             whole.contact_pressures = wp.zeros(count, dtype=wp.float32, device=self.whole.device)
-            here, _ = self.part.surface_here
+            here = self.part.surface_here
             shift = np.arange(self.whole.worlds, dtype=np.int32)[:, None]
             everywhere = (here + len(self.whole.surface_triangles) * shift).ravel()
             own = np.arange(len(everywhere), dtype=np.int32)
@@ -84,10 +86,14 @@ class Following:
         self._own.to_whole(part.contact_forces, whole.contact_forces)
         self._triangles.to_whole(part.contact_pressures, whole.contact_pressures)
 
+    def take_contact_forces(self) -> None:
+        """Copy contact forces of the last step to the part."""
+        self._own.to_part(self.whole.state.contact_forces, self.part.state.contact_forces)
+
     def collect_touch(self) -> None:
         """Bring contact forces and pressures together on all ranks."""
         state = self.whole.state
-        if not state.is_touched:
+        if self._triangles is None:
             return
         state.contact_forces.assign(self._comm.bcast(self.gather(state.contact_forces), root=0))
         found = state.contact_pressures.numpy()

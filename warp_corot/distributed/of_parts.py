@@ -88,7 +88,7 @@ def compile_once(comm: Any, parts: Sequence[Part], **options: Any) -> None:
     if here.rank == 0 and free:
         with warnings.catch_warnings(), suppress(UnstableError, InputError):
             warnings.simplefilter("ignore")
-            tried = on_one.Simulation(parts, **(options | {"obstacles": _of_their_own(options.get("obstacles", ()))}))
+            tried = on_one.Simulation(parts, **(options | {"obstacles": of_their_own(options.get("obstacles", ()))}))
             tried.advance_steps(1 if tried.integrator.is_implicit else TRIED_STEPS)
             tried.energy()
         for part in parts:
@@ -97,10 +97,10 @@ def compile_once(comm: Any, parts: Sequence[Part], **options: Any) -> None:
     here.Free()
 
 
-def _of_their_own(obstacles: Obstacle | Sequence[Obstacle]) -> list[Obstacle]:
+def of_their_own(obstacles: Obstacle | Sequence[Obstacle]) -> list[Obstacle]:
     """The same obstacles for another simulation."""
     given = [obstacles] if isinstance(obstacles, Shape | Tool) else list(obstacles)
-    return [copy.copy(each) for each in given]
+    return [each.released() if isinstance(each, Tool) else copy.copy(each) for each in given]
 
 
 def settled_model(model: Model, body: SoftBody) -> Model:

@@ -57,7 +57,7 @@ class Part(SoftBody):
             nodes, elements, partition.rank_of_node[nodes], partition.rank_of_element[elements] == rank
         )
         self._whole = whole
-        self._is_own = np.tile(self.numbers.owner == rank, whole.worlds)
+        self.is_own = np.tile(self.numbers.owner == rank, whole.worlds)
         material = part_of_material(whole.material, elements, len(whole.mesh.tets))
         super().__init__(mesh, material, worlds=whole.worlds, device=device or whole.device)
         self.discretization.smallest_volume = whole.discretization.smallest_volume
@@ -65,24 +65,29 @@ class Part(SoftBody):
     @property
     def masses(self) -> npt.NDArray[np.float64]:
         """Lumped masses of the nodes that this rank moves [kg], float64 [worlds * n]; zero for ghosts."""
-        return np.where(self._is_own, super().masses, 0.0)
+        return np.where(self.is_own, super().masses, 0.0)
 
     @property
-    def surface_triangles(self) -> Ints:
+    def surface_faces(self) -> tuple[Ints, Ints]:
         """The triangles of the whole body's surface around the nodes that this rank moves, int32 [f, 3], in the order
-        that they have there."""
-        return self.surface_here[1]
+        that they have there; and the element of each, [f]."""
+        return self._surface[1:]
+
+    @property
+    def surface_here(self) -> Ints:
+        """Which triangles of the whole body's surface these are, int32 [f]."""
+        return self._surface[0]
 
     @functools.cached_property
-    def surface_here(self) -> tuple[Ints, Ints]:
-        """Which triangles of the whole body's surface these are, int32 [f], and their nodes in the part, [f, 3]."""
-        triangles = self._whole.surface_triangles
+    def _surface(self) -> tuple[Ints, Ints, Ints]:
+        triangles, parents = self._whole.surface_faces
         number = np.full(self._whole.world_node_count, -1, np.int32)
-        own = self._is_own[: len(self.numbers.nodes)]
+        own = self.is_own[: len(self.numbers.nodes)]
         number[self.numbers.nodes[own]] = 1
         here = np.flatnonzero((number[triangles] >= 0).any(axis=1)).astype(np.int32)
         number[self.numbers.nodes] = np.arange(len(self.numbers.nodes), dtype=np.int32)
-        return here, number[triangles[here]]
+        elements = np.searchsorted(self.numbers.elements, parents[here]).astype(np.int32)
+        return here, number[triangles[here]], elements
 
 
 def part_of_mesh(mesh: Mesh, kept: npt.NDArray[np.bool_], partition: Partition) -> tuple[Mesh, Ints]:

@@ -18,12 +18,13 @@ DIAGONAL = "diagonal"
 
 
 def check_supported(
-    bodies: Sequence[SoftBody], models: Sequence[Model], integrator: Integrator, others: dict[str, Any]
+    bodies: Sequence[SoftBody], models: Sequence[Model], integrator: Integrator, others: dict[str, Any], cards: int = 0
 ) -> None:
     """Check that a simulation can be made on several ranks.
 
     Args:
         bodies, models, integrator: As for ``Simulation``.
+        cards: How many cards compute.
         others: Its other arguments, by name.
 
     Raises:
@@ -42,6 +43,8 @@ def check_supported(
             f"the preconditioner {integrator.preconditioner!r} does not work on several ranks yet; "  # type: ignore[attr-defined]
             f"it must be None or {DIAGONAL!r}"
         )
+    if cards > 1 and (contact or others.get("obstacles")):
+        raise InputError("contact does not work on several cards yet; take ranks on the CPU, or one card")
     if integrator.is_implicit and (contact or others.get("obstacles")):
         raise InputError(
             f"contact under {type(integrator).__name__} does not work on several ranks yet; the integrator must be "

@@ -28,7 +28,7 @@ from warp_corot.solvers.implicit.schemes import ImplicitIntegrator
 from . import checkpoint, mpi
 from .following import Following
 from .gathering import register
-from .of_parts import SimulationOfParts, compile_once, part_of, settled_model
+from .of_parts import SimulationOfParts, compile_once, of_their_own, part_of, settled_model
 from .ranks import MpiRanks
 from .refusals import DIAGONAL, check_supported
 
@@ -76,12 +76,13 @@ class Simulation:
         self.bodies = checked_bodies(bodies)
         models = checked_models(Corotated() if model is None else model, len(self.bodies))
         integrator = checked_integrator(SymplecticEuler() if integrator is None else integrator)
-        check_supported(self.bodies, models, integrator, others)
+        here = None if device is None else checked_device(device)
+        cards = comm.size if (here or self.bodies[0].device).is_cuda else 0
+        check_supported(self.bodies, models, integrator, others, cards)
         if isinstance(integrator, ImplicitIntegrator):
             integrator = dataclasses.replace(integrator, preconditioner=DIAGONAL)
         models = tuple(settled_model(m, body) for m, body in zip(models, self.bodies, strict=True))
         self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
-        here = None if device is None else checked_device(device)
         parts = [part_of(body, m, comm, costs, here) for body, m in zip(self.bodies, models, strict=True)]
         self._following = [Following(body, part, comm) for body, part in zip(self.bodies, parts, strict=True)]
         for each in self._following:
@@ -276,8 +277,6 @@ class Simulation:
         Raises:
             InputError: On all ranks, if rank 0 cannot write to the folder.
         """
-        if self._parts.contact is not None:
-            raise InputError("save does not work with contact on several ranks yet")
         self._take_over()
         self.collect()
         checkpoint.save(path, self.bodies, self._parts, self._following, self._comm)
@@ -296,15 +295,17 @@ class Simulation:
             InputError: As for ``warp_corot.Simulation.load``, or a run that does not work on several ranks.
         """
         loaded = on_one.Simulation.load(path, device=device)
+        touching: dict[str, Any] = {}
         if loaded.contact is not None:
-            raise InputError("a checkpoint with contact does not work on several ranks yet; load it on one process")
-        check_supported(loaded.bodies, loaded.models, loaded.integrator, {"remesh": any(loaded.remesh)})
+            touching = {"obstacles": of_their_own(loaded.contact.obstacles.given), "contact": loaded.contact.options}
+        check_supported(loaded.bodies, loaded.models, loaded.integrator, {"remesh": any(loaded.remesh), **touching})
         made = cls(
             loaded.bodies,
             model=loaded.models,
             integrator=loaded.integrator,
             gravity=loaded.gravity,
             deterministic=loaded.deterministic,
+            **touching,
         )
         checkpoint.resume(path, loaded, made._parts, made._following)
         return made

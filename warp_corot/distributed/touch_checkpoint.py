@@ -1,0 +1,113 @@
+"""Contact in checkpoints of several ranks: the contact of whole bodies, from that of the ranks' parts and back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.contacts import Contacts
+from warp_corot.solvers.system import System
+
+from .following import Following
+from .of_parts import SimulationOfParts, of_their_own
+
+Ints = npt.NDArray[np.intp]
+
+
+def gathered_contact(body: SoftBody, parts: SimulationOfParts, following: Following, comm: Any) -> Contacts | None:
+    """What contact of the whole body continues from, on rank 0; None elsewhere. All ranks must call.
+
+    Args:
+        body: The whole body, with contact forces of all nodes.
+        parts: This rank's simulation of its part.
+        following: The body's.
+        comm: The ranks.
+    """
+    here = parts.contact
+    assert here is not None
+    assert here.rigid is not None
+    touches = here.rigid.touches
+    own, of_nodes, of_triangles = _places(here, following)
+    mine = (
+        of_nodes[own],
+        here.rigid.anchors.numpy()[:, own],
+        of_triangles,
+        *(array.numpy()[:, : len(of_triangles)] for array in (touches.normal, touches.force)),
+    )
+    given = comm.gather(mine, root=0)
+    if given is None:
+        return None
+    forces = wp.clone(body.state.contact_forces)
+    system = System([body], (), parts.pace, parts.gravity)
+    whole = Contacts(system, of_their_own(here.obstacles.given), here.options, stable_dt=parts.stable_dt)
+    assert whole.rigid is not None
+    body.state.contact_forces.assign(forces)
+    anchors, normal, force = (
+        array.numpy() for array in (whole.rigid.anchors, whole.rigid.touches.normal, whole.rigid.touches.force)
+    )
+    for nodes, their_anchors, triangles, their_normal, their_force in given:
+        anchors[:, nodes] = their_anchors
+        if normal.size:
+            normal[:, triangles], force[:, triangles] = their_normal, their_force
+    whole.rigid.anchors.assign(anchors)
+    whole.rigid.touches.normal.assign(normal)
+    whole.rigid.touches.force.assign(force)
+    _take_common(whole, here)
+    return whole
+
+
+def resume_contact(loaded: Contacts, parts: SimulationOfParts, following: Following) -> None:
+    """Continue from the contact of the whole body.
+
+    Args:
+        loaded: That contact.
+        parts: This rank's simulation of its part.
+        following: The body's.
+    """
+    here = parts.contact
+    assert here is not None
+    assert here.rigid is not None
+    assert loaded.rigid is not None
+    _own, of_nodes, of_triangles = _places(here, following)
+    anchors = here.rigid.anchors.numpy()
+    used = of_nodes >= 0
+    anchors[:, used] = loaded.rigid.anchors.numpy()[:, of_nodes[used]]
+    here.rigid.anchors.assign(anchors)
+    for name in ("normal", "force"):
+        array = getattr(here.rigid.touches, name)
+        values = array.numpy()
+        if values.size:
+            values[:, : len(of_triangles)] = getattr(loaded.rigid.touches, name).numpy()[:, of_triangles]
+            array.assign(values)
+    _take_common(here, loaded)
+    following.take_contact_forces()
+    here.search.forget()
+
+
+def _places(here: Contacts, following: Following) -> tuple[npt.NDArray[np.bool_], Ints, Ints]:
+    """Which places of this rank's surface have nodes that it moves; the place of each among those of the whole body,
+    -1 where there is none; and the same of triangles, world after world."""
+    whole, numbers, skin = following.whole, following.part.numbers, here.surface.parts[0]
+    triangles = whole.surface_triangles
+    nodes = np.unique(triangles)
+    found = np.full(here.surface.count, -1, np.intp)
+    own = np.zeros(here.surface.count, bool)
+    for world in range(whole.worlds):
+        places = slice(skin.start + world * skin.nodes, skin.start + world * skin.nodes + len(skin.skin.nodes))
+        found[places] = world * len(nodes) + np.searchsorted(nodes, numbers.nodes[skin.skin.nodes])
+        own[places] = following.part.is_own[skin.skin.nodes]
+    here_of_whole = following.part.surface_here
+    shift = len(triangles) * np.arange(whole.worlds)[:, None]
+    return own, found, (here_of_whole + shift).ravel().astype(np.intp)
+
+
+def _take_common(to: Contacts, other: Contacts) -> None:
+    """What is the same on all ranks: where obstacles are, what they feel, and how far contacts may come nearer."""
+    to.law.tolerance, to.law.recovery = other.law.tolerance, other.law.recovery
+    for name in ("now", "later", "target"):
+        getattr(to.obstacles.motions, name).assign(getattr(other.obstacles.motions, name).numpy())
+    to.obstacles.wrenches.assign(other.obstacles.wrenches.numpy())
