@@ -75,14 +75,14 @@ def saved_and_loaded(results: Path, before: list[str], case: str) -> dict[str, n
     import warp_corot.distributed as wd
 
     sim = wd.Simulation(CASES[case](), deterministic=True, obstacles=obstacles_of(case))
-    sim.advance(0.03)
+    sim.advance(0.02)
     mine = results.with_suffix(f".{case}.npz")
     sim.save(mine)
-    sim.advance(0.01)
+    sim.advance(0.02)
     found = {"saved.x": wd.gather(sim.body.positions)}
     for name, path in (("loaded", mine), *(("others", Path(other).with_suffix(f".{case}.npz")) for other in before)):
         again = wd.Simulation.load(path)
-        again.advance(0.01)
+        again.advance(0.02)
         found |= {f"{name}.x": wd.gather(again.body.positions), f"{name}.numbers": np.array([again.steps, again.time])}
     return {f"{case}.{key}": value for key, value in found.items()}
 
