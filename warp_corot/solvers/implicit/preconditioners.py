@@ -14,9 +14,10 @@ from .multigrid import Multigrid
 from .operator import Preconditioner
 from .tangent import TangentOperator
 
-#: Where elements have their dilatation at nodes, they are preconditioned by plain ones, compressible since these lock.
-#: As the two differ, better smoothing saves no iterations there.
-AT_NODES: dict[str, Any] = {"degree": 2, "rise": 0, "most_lambda": 4.0}
+#: Elements that share their dilatation, preconditioned by plain ones that are compressible, since these lock.
+PLAIN: dict[str, Any] = {"most_lambda": 4.0}
+#: The same where they share it at nodes. As the two differ, better smoothing saves no iterations there.
+AT_NODES: dict[str, Any] = {"degree": 2, "rise": 0, **PLAIN}
 #: Of a short cycle on the CPU: sweeps, and the nodes of a level that is not made coarser.
 SHORT: dict[str, Any] = {"sweeps": 1, "few_nodes": 24}
 
@@ -24,12 +25,13 @@ SHORT: dict[str, Any] = {"sweeps": 1, "few_nodes": 24}
 def _multigrid(operator: TangentOperator, short_cycles: bool) -> Multigrid:
     stiffening = 0.0 if operator.viscosity is None else operator.viscosity.seconds
     shares = operator.field.shares_dilatation
-    # Where a product costs as much as a cycle, fewer iterations are worth longer ones; so are fewer launches on CUDA.
-    short = SHORT if short_cycles and operator.device.is_cpu else {}
-    options: dict[str, Any] = dict(short)
     members = operator.field.find_members
-    if shares and members is None:
-        options |= AT_NODES
+    options: dict[str, Any] = {}
+    if short_cycles and operator.device.is_cpu:
+        # Solves that begin near the answer take few iterations, which are worth less than what they cost.
+        options, members = SHORT | (PLAIN if shares else {}), None
+    elif shares and members is None:
+        options = AT_NODES
     is_turned = not operator.field.is_linear
     return Multigrid(operator.body, is_turned=is_turned, stiffening=stiffening, members=members, **options)
 
