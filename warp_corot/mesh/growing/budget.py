@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 #: What share of the number asked for is aimed at and is enough; after how many sizes of cubes any is.
 NEAR, NEAR_ENOUGH = 0.985, 0.905
-MOST_CUBES = 3
+MOST_CUBES = 4
 #: Along flat sides nothing is bisected; more sizes are tried then, which takes little time.
 MOST_CUBES_OF_BOXES = 7
 #: With between so many elements a size of cubes is given up early that comes to between these shares of them.
