@@ -25,8 +25,6 @@ from .swept import SweptLevel
 
 #: The largest coarsest level that is inverted [nodes].
 MOST_DENSE = 64
-#: Up to how many times mu lambda may be where the cycle takes matrices in half precision.
-MOST_HALF = 64.0
 #: By how much degrees are smaller where the second level has more than half of the finest one's nodes.
 STEPS_LESS = 2
 #: The smoother's degree or sweeps on a coarsest level that is not inverted, for example of a grid of many cubes.
@@ -59,7 +57,7 @@ class Multigrid:
         stiffening: Viscous over elastic stress at one strain [s], as in the operator's D.
         most_lambda: Lambda is at most this many times mu.
         members: Returns the groups of elements, among those below a number, that share their dilatation; None: none do.
-        half: Whether the cycle takes matrices in half precision; None: on CUDA, unless lambda is many times mu.
+        half: Whether the cycle takes matrices in half precision; only where lambda is less than some 64 times mu.
         sweeps: Smoothing by so many sweeps of Gauss and Seidel; on the CPU. Zero: Chebyshev's iteration.
 
     Attributes:
@@ -82,7 +80,7 @@ class Multigrid:
         stiffening: float = 0.0,
         most_lambda: float = np.inf,
         members: Callable[[int], Members] | None = None,
-        half: bool | None = None,
+        half: bool = False,
         sweeps: int = 0,
     ):
         if stride not in (1, 2, 3):
@@ -93,7 +91,7 @@ class Multigrid:
         self.is_turned, self.stride, self.degree, self.stiffening = is_turned, stride, degree, stiffening
         self.most_lambda, self.rise, self.few_nodes = most_lambda, rise, few_nodes
         self._find_members = members
-        self._is_half, self.sweeps = self._takes_half() if half is None else half, sweeps
+        self._is_half, self.sweeps = half, sweeps
         self.revision, self._version = -1, -1
         self.follow()
 
@@ -191,13 +189,6 @@ class Multigrid:
             self._transfers.append(Transfer(fine, coarse, finder.midpoints(count, fine.count)))
             self.levels.append(coarse)
         self._coarsest = DenseInverse(self.levels[-1]) if counts[-1] <= MOST_DENSE else None
-
-    def _takes_half(self) -> bool:
-        """Rounding is a share of lambda, and must stay small against mu."""
-        if self.device.is_cpu:
-            return False
-        mu, lam = self.discretization.mu.numpy(), self.discretization.lam.numpy()
-        return bool(np.all(np.minimum(lam, self.most_lambda * mu) <= MOST_HALF * mu))
 
     def _level(self, found: Pattern, counts: list[int]) -> Level:
         """A level with its smoother; the coarsest one's is only used where it is not inverted."""
