@@ -130,12 +130,12 @@ def main() -> int:
         numbers[body.name] = found_of(body, numbers.get(body.name, {}), options)
         print(f"({time.perf_counter() - started:.0f} s)", file=sys.stderr, flush=True)
         if options.json:
-            options.json.write_text(json.dumps(numbers, indent=1))
+            options.json.write_text(json.dumps(numbers, indent=1), encoding="utf-8")
     rows = [Row(body.name, numbers[body.name]) for body in chosen]
     before = json.loads(options.before.read_text(encoding="utf-8")) if options.before else None
     text = f"{totals(rows, options.tets)}\n\n{table(rows, before)}\n"
     if options.output:
-        options.output.write_text(text)
+        options.output.write_text(text, encoding="utf-8")
     print(text)
     return 0
 
