@@ -17,9 +17,7 @@ CORNER = wp.constant(0.999)
 BLUR = wp.constant(1.0e-3)
 
 #: Triangles that are deeper in an obstacle than this share of its thickness are skewered and slide off frictionless.
-#: They leave it on the side on which they were, if the nearest side is turned from that by more than this cosine, and
-#: the way out is no more than so many times as long: inside, the nearest side may be another one at every step.
-SKEWERED, TURNED, LONGER = wp.constant(0.1), wp.constant(0.5), wp.constant(1.5)
+SKEWERED = wp.constant(0.1)
 #: Share of the last step's push from which rounds begin: with more, nodes around an obstacle are held off by what lies
 #: between them, and bodies seem stiffer. Friction begins with all of it: what slips to bring it back would add up.
 WARMTH = wp.constant(0.5)
@@ -81,8 +79,6 @@ def find_touch(
 ):
     was = touches.force[o, t]
     side = touches.normal[o, t]
-    before = touches.shares[o, t]
-    was_near = before[0] + before[1] + before[2] > 0.0
     touches.shares[o, t] = wp.vec3()
     touches.force[o, t] = wp.vec3()
     touches.acts[o, t] = 0
@@ -106,10 +102,6 @@ def find_touch(
         # The axis has come through since the last step.
         n = -n
         gap = -2.0 * shapes.size[o][0] - gap
-    elif was_near and gap < -SKEWERED * shapes.thickness[o] and wp.dot(n, side) < TURNED:
-        beyond, _out = distance_to(shapes, o, pose, point_of(w, a, b, c) - LONGER * gap * side, size + far)
-        if beyond > 0.0:
-            n = side
     if gap > far or wp.max(w) > CORNER:
         return
     touches.shares[o, t] = w
