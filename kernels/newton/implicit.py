@@ -134,13 +134,16 @@ def begin_particles(
     inertia: wp.array[wp.mat33],
     b: wp.array[wp.vec4],
     d: wp.array[wp.vec4],
+    fall: wp.array[wp.vec4],
 ):
-    """Inertia, right side and first motion of particles. Nothing moves in worlds that have failed."""
+    """Inertia, right side and first motion of particles, and the guess of how gravity changes that. Nothing moves in
+    worlds that have failed."""
     i = wp.tid()
     k = entry[i]
     free[k] = 0.0
     right = wp.vec3()
     motion = wp.vec3()
+    falls = wp.vec3()
     if trouble[place_of(world[i], trouble.shape[0])] == SOUND and (flags[i] & ACTIVE) != 0:
         motion = dt * qd[i]
         if inverse_mass[i] > 0.0:
@@ -149,10 +152,12 @@ def begin_particles(
             inertia[k] = (m * (1.0 / dt + damping) / dt) * wp.identity(3, dtype=wp.float32)
             g = gravity[place_of(world[i], gravity.shape[0])]
             right = (m / dt) * qd[i] + load_node(f, i) + m * g
-            # That of free fall, which a solve to a share of large forces would not find.
-            motion = (motion + (dt * dt) * g) / (1.0 + dt * damping)
+            # A solve to a share of large forces would not find that a body falls freely.
+            falls = (dt * dt / (1.0 + dt * damping)) * g
+            motion = motion / (1.0 + dt * damping)
     store_node(b, k, right)
     store_node(d, k, motion)
+    store_node(fall, k, falls)
 
 
 @wp.kernel(enable_backward=False)
@@ -177,6 +182,7 @@ def begin_bodies(
     inertia: wp.array[wp.mat33],
     b: wp.array[wp.vec4],
     d: wp.array[wp.vec4],
+    fall: wp.array[wp.vec4],
 ):
     """The same of bodies, as if nothing but soft bodies, gravity and ``body_f`` acted on them.
 
@@ -189,6 +195,7 @@ def begin_bodies(
     angular = wp.vec3()
     right = wp.vec3()
     right_angular = wp.vec3()
+    falls = wp.vec3()
     free[k] = 0.0
     free[k + 1] = 0.0
     if trouble[place_of(world[i], trouble.shape[0])] == SOUND and moves != 0:
@@ -201,7 +208,7 @@ def begin_bodies(
             right = linear / (w * dt * dt) + wp.spatial_top(body_f[i])
             g = gravity[place_of(world[i], gravity.shape[0])]
             right += g / w
-            linear += (dt * dt) * g
+            falls = (dt * dt) * g
             if wp.determinant(inverse_inertia[i]) > 0.0:
                 turn = wp.quat_to_matrix(wp.transform_get_rotation(q[i]))
                 free[k + 1] = 1.0
@@ -209,8 +216,10 @@ def begin_bodies(
                 right_angular = inertia[k + 1] * angular + wp.spatial_bottom(body_f[i])
     store_node(b, k, right)
     store_node(d, k, linear)
+    store_node(fall, k, falls)
     store_node(b, k + 1, right_angular)
     store_node(d, k + 1, angular)
+    store_node(fall, k + 1, wp.vec3())
 
 
 @wp.kernel(enable_backward=False)

@@ -75,7 +75,7 @@ def saved_and_loaded(results: Path, before: list[str], case: str) -> dict[str, n
     import warp_corot.distributed as wd
 
     sim = wd.Simulation(CASES[case](), deterministic=True, obstacles=obstacles_of(case))
-    sim.advance(0.02)
+    sim.advance(0.03)
     mine = results.with_suffix(f".{case}.npz")
     sim.save(mine)
     sim.advance(0.02)

@@ -94,9 +94,9 @@ class ImplicitSteps(Steps):
             self._add_wrenches(share, given.body_f)
 
     def _launch_unknowns(self, substep: Step, of_bodies: newton.State, given: newton.State) -> None:
-        """Launch the right side, the inertia and the first motions."""
+        """Launch the right side, the inertia, the first motions and a guess of their change."""
         model, now, dt, operator = self.model, substep.state_in, substep.dt, self._operator
-        outputs = [operator.free, operator.inertia, self._b, self._d]
+        outputs = [operator.free, operator.inertia, self._b, self._d, self._change]
         inputs = [dt, self.damping, model.gravity, model.particle_inv_mass, model.particle_flags]
         inputs += [model.particle_world, self._f, now.particle_qd, self.report.trouble, self._unknowns.particle]
         self._launch(kernels.begin_particles, model.particle_count, inputs, outputs)
@@ -130,12 +130,13 @@ class ImplicitSteps(Steps):
         self._r.zero_()
         links.add_forces(self._r)
         self._launch(kernels.find_residual, count, [operator.free, self._b, self._product], [self._r])
-        self._solver.launch(operator.preconditioner, self._r, self._change, like=self._b)
+        self._solver.launch(operator.preconditioner, self._r, self._change, guessed=True, like=self._b)
         if links.count:
             operator.apply(self._change, self._product, linked=False)
             self._search.launch(self._rest, self._product, self._change, self._d)
         else:
             self._launch(add_vectors, count, [self._change], [self._d])
+        self._change.zero_()
         links.update(self._d)
         inputs = [self._solver.iterations, ROUNDS]
         outputs = [self._rounds, self._iterations, self._going]

@@ -225,13 +225,14 @@ class Guard:
     @property
     def state(self) -> dict[str, Floats]:
         """What a run needs besides the present state to continue."""
-        counted = np.full((8, self.worlds), np.nan)
+        counted = np.full((9, self.worlds), np.nan)
         before = self._reference
         if before is not None and not self._has_changed():
             now = self._find(whole=False)
             supports = before.supports - now.supports
             counted[:6] = before.exact, before.gravitational, supports, self._loads_since, self._height, self._loads
-            counted[6:] = before.untimely, now.supports_absolute - self._absolute_base
+            counted[6:8] = before.untimely, now.supports_absolute - self._absolute_base
+            counted[8] = before.step
         times = np.broadcast_to([[self._counted_at], [self._window_at]], (2, self.worlds))
         lately = np.array([self._lately, self._lately_before, *times])
         drift = np.array([self._drift, self._ringing])
@@ -257,6 +258,8 @@ class Guard:
             exact, gravitational, supports, self._loads_since, self._height, self._loads = self._counted[:6]
             untimely, self._absolute_base = self._counted[6], -self._counted[7]
             found = replace(found, exact=exact, gravitational=gravitational, supports=supports, untimely=untimely)
+            if len(self._counted) > 8:  # older archives do not have it
+                found = replace(found, step=float(self._counted[8, 0]))
         else:
             self._loads, self._height = np.zeros(self.worlds), found.gravitational
             self._loads_since = np.zeros(self.worlds)
