@@ -17,7 +17,7 @@ CORNER = wp.constant(0.999)
 BLUR = wp.constant(1.0e-3)
 
 #: Triangles that are deeper in an obstacle than this share of its thickness are skewered and slide off frictionless.
-SKEWERED = wp.constant(0.1)
+SKEWERED = wp.constant(0.25)
 #: Share of the last step's push from which rounds begin: with more, nodes around an obstacle are held off by what lies
 #: between them, and bodies seem stiffer. Friction begins with all of it: what slips to bring it back would add up.
 WARMTH = wp.constant(0.5)

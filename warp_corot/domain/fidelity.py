@@ -91,8 +91,8 @@ class Fidelity:
         if self.pieces < self.input_pieces - self.lost_pieces:
             found.append(
                 f"the body has {self.input_pieces} pieces and the mesh {self.pieces}: pieces closer to one another "
-                "than a tetrahedron have grown together; more tetrahedra would help, or a file or object of its own for "
-                "each piece, which then is a body of its own"
+                "than a tetrahedron have grown together; more tetrahedra would help, or a file or object of its own "
+                "for each piece, which then is a body of its own"
             )
         if self.lost_labels:
             found.append(
