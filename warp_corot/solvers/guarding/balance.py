@@ -44,7 +44,6 @@ class Energies:
         supports: Work of all moving supports, and of the world's constraints, since the beginning [J].
         supports_absolute: The sum of its absolute values [J].
         reach: The largest displacement [m].
-        step: Length of the next step [s], which ``exact`` and ``untimely`` depend on.
     """
 
     kinetic: Floats
@@ -56,7 +55,6 @@ class Energies:
     supports: Floats
     supports_absolute: Floats
     reach: Floats
-    step: float
 
 
 @dataclass(frozen=True)
@@ -180,7 +178,6 @@ class Balance:
             supports=done,
             supports_absolute=numbers[int(kernels.WORK_ABSOLUTE)] + total[:, int(kernels.WORKED_ABSOLUTE)],
             reach=total[:, int(kernels.REACH)],
-            step=float(numbers[int(kernels.LENGTH)]),
         )
         bad_step = ranks.least(min(int(numbers[int(kernels.BAD_STEP)]), NEVER))
         return Report(

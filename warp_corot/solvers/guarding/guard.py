@@ -33,12 +33,6 @@ LITTLE = 0.1
 STRICT = 0.02
 #: The tolerated error of fast vibrations if the step can be made shorter: a shorter step would keep the error.
 RINGING = 0.01
-#: Fast vibrations that a user gave may make this many times the error that they made at first, up to this share of the
-#: energy.
-GIVEN, MOST_GIVEN = 1.5, 0.1
-#: When the step changes, so does the energy that symplectic Euler keeps, by a term in the forces at that time. Those at
-#: the beginning and at the end of a run stand for them; this share of the change is their error.
-RETIMED = 0.3
 #: If the simulation chooses the step, energy from nowhere counts for a third after this time [s]: it cannot be undone
 #: by then, and a permanently short step would not make up for it.
 MEMORY = 10.0
@@ -108,8 +102,6 @@ class Guard:
         self._counted: Floats | None = None
         self.gain = self.surplus = self.untimely = np.inf
         self._floor: Floats | None = None
-        #: ``untimely`` of the states that a user gave, the most of them, over the square of the step [J/s^2].
-        self._ringing = np.zeros(self.worlds)
 
     def forget(self) -> None:
         """Let the next state count as good, because it does not follow from the last one."""
@@ -225,25 +217,20 @@ class Guard:
     @property
     def state(self) -> dict[str, Floats]:
         """What a run needs besides the present state to continue."""
-        counted = np.full((9, self.worlds), np.nan)
+        counted = np.full((8, self.worlds), np.nan)
         before = self._reference
         if before is not None and not self._has_changed():
             now = self._find(whole=False)
             supports = before.supports - now.supports
             counted[:6] = before.exact, before.gravitational, supports, self._loads_since, self._height, self._loads
-            counted[6:8] = before.untimely, now.supports_absolute - self._absolute_base
-            counted[8] = before.step
+            counted[6:] = before.untimely, now.supports_absolute - self._absolute_base
         times = np.broadcast_to([[self._counted_at], [self._window_at]], (2, self.worlds))
         lately = np.array([self._lately, self._lately_before, *times])
-        drift = np.array([self._drift, self._ringing])
-        return {"scale": self._scale, "drift": drift, "lately": lately, "counted": counted}
+        return {"scale": self._scale, "drift": self._drift, "lately": lately, "counted": counted}
 
     def resume(self, *, scale: Floats, drift: Floats, lately: Floats, counted: Floats) -> None:
         """Continue from what ``state`` gave."""
-        self._scale = np.array(scale, float)
-        # Older archives have the first row only.
-        rows = np.atleast_2d(np.array(drift, float))
-        self._drift, self._ringing = rows[0], rows[1] if len(rows) > 1 else np.zeros(self.worlds)
+        self._scale, self._drift = np.array(scale, float), np.array(drift, float)
         self._lately, self._lately_before = np.array(lately[0], float), np.array(lately[1], float)
         self._counted_at, self._window_at = float(lately[2, 0]), float(lately[3, 0])
         self.system.pace.forget()
@@ -258,12 +245,9 @@ class Guard:
             exact, gravitational, supports, self._loads_since, self._height, self._loads = self._counted[:6]
             untimely, self._absolute_base = self._counted[6], -self._counted[7]
             found = replace(found, exact=exact, gravitational=gravitational, supports=supports, untimely=untimely)
-            if len(self._counted) > 8:  # older archives do not have it
-                found = replace(found, step=float(self._counted[8, 0]))
         else:
             self._loads, self._height = np.zeros(self.worlds), found.gravitational
             self._loads_since = np.zeros(self.worlds)
-            self._ringing = np.maximum(self._ringing, np.nan_to_num(found.untimely, posinf=0.0) / found.step**2)
         # A user may correct a bad world later.
         known = np.where(np.isfinite(found.exact), np.abs(found.exact), 0.0)
         self._scale = np.maximum(self._scale, known)
@@ -296,8 +280,7 @@ class Guard:
         self.order()
         self.system.pace.launch_orders(self._copies.changed)
         self._balance.launch(whole=whole, at=at, seconds=seconds, accounts=accounts)
-        found = self._balance.wait().energies
-        return found if seconds is None else replace(found, step=float(seconds[0]))
+        return self._balance.wait().energies
 
     def _has_changed(self) -> bool:
         self.order()
@@ -342,19 +325,6 @@ class Guard:
         moved = np.abs(self._height - found.gravitational) + np.abs(self._loads + loads)
         return given, np.maximum(self._scale, moved + found.supports_absolute - self._absolute_base), loads
 
-    def _retimed(self, found: Energies) -> Floats:
-        """By how much ``exact`` has grown because the step has changed [J]: so much less is in the term in the square
-        of the step."""
-        before = self._reference
-        assert before is not None
-        squares = found.untimely / found.step**2 + before.untimely / before.step**2
-        return 0.5 * (before.step**2 - found.step**2) * squares
-
-    def _ringing_beyond(self, found: Energies, scale: Floats) -> Floats:
-        """The error of fast vibrations beyond what is tolerated of vibrations that a user gave [J]."""
-        given = np.minimum(GIVEN * self._ringing * found.step**2, MOST_GIVEN * scale)
-        return np.maximum(found.untimely - given, 0.0)
-
     def _from_nowhere(self, found: Energies, whole: bool, leave: float, lenient: bool) -> Fault | None:
         if not self._balance.is_closed:
             return None
@@ -365,13 +335,11 @@ class Guard:
         gain = found.kinetic - given
         bad = ~(gain <= (MOTION if whole else LITTLE) * self._leave * scale + self._floor)
         if whole:
-            retimed = self._retimed(found)
-            more = found.exact - given - retimed
-            drift = np.maximum(self._drift + more, 0.0)
-            gain = np.maximum(np.maximum(gain, more), drift)
-            bad |= ~(more <= GAIN * leave * scale + self._floor + RETIMED * np.abs(retimed))
+            drift = np.maximum(self._drift + found.exact - given, 0.0)
+            gain = np.maximum(np.maximum(gain, found.exact - given), drift)
+            bad |= ~(found.exact - given <= GAIN * leave * scale + self._floor)
             if leave < self._leave:
-                bad |= ~(self._ringing_beyond(found, scale) <= RINGING * self._leave * scale + self._floor)
+                bad |= ~(found.untimely <= RINGING * self._leave * scale + self._floor)
             if not lenient:
                 bad |= ~(drift <= DRIFT * self._leave * scale + 10.0 * self._floor)
         if not bad.any():
@@ -393,23 +361,20 @@ class Guard:
             now = self.system.pace.time
             left = math.exp(min(self._counted_at - now, 0.0) / MEMORY)
             self._counted_at = now
-            retimed = self._retimed(found)
-            self._drift = np.maximum(self._drift + found.exact - given - retimed, 0.0)
+            self._drift = np.maximum(self._drift + found.exact - given, 0.0)
             # At the time of the displacements, since that energy is the same whatever the next step is. What was lost
             # may come back.
             more = found.exact + found.untimely - given - before.untimely
             self._lately = np.where(self._lately > 0.0, left, 1.0) * self._lately + more
             known = 1.0 / np.maximum(self._scale, 1e-300) / self._leave
-            gain = found.exact - given - retimed - RETIMED * np.abs(retimed)
-            self.gain = float(np.max(np.maximum(gain - self._floor, 0.0) * known))
+            self.gain = float(np.max(np.maximum(found.exact - given - self._floor, 0.0) * known))
             shares = np.maximum(self._lately - 10.0 * self._floor, 0.0) * known
             most = int(np.argmax(shares))
             self.surplus, self.trend = float(shares[most]), None
             if not 0.0 <= now - self._window_at < WINDOW:
                 self.trend = float((self._lately - self._lately_before)[most] * known[most])
                 self._window_at, self._lately_before = now, self._lately
-            late = self._ringing_beyond(found, self._scale) - self._floor
-            self.untimely = float(np.max(np.maximum(late, 0.0) * known))
+            self.untimely = float(np.max(np.maximum(found.untimely - self._floor, 0.0) * known))
         else:
             self.gain = self.surplus = self.untimely = 0.0
             self.trend = None
