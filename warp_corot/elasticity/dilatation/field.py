@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -63,7 +62,8 @@ class DilatationField(ForceField):
         self._all, self._still = (wp.empty(0, dtype=kind, device=self.device) for kind in (wp.int32, wp.vec4))
         self._others = Others(discretization, self.plan, of)
         #: Whether the law's own launches add the forces of subtrees and of groups, or those in clusters theirs.
-        self._joined, self._clustered = False, cast("ClusteredGroups | None", None)
+        self._joined = False
+        self._clustered: ClusteredGroups | None = None
         self.join_launches()
         self._make_room()
 
