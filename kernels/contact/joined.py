@@ -27,7 +27,7 @@ STIFF = wp.constant(4.0)
 
 @wp.struct
 class Joined:
-    """What an implicit step knows of places, [S], and of pairs, [P]; entries are those of one vector of all bodies."""
+    """The places [S] and pairs [P] of an implicit step. Entries number the nodes of all bodies in one vector."""
 
     entry: wp.array[wp.int32]  # [S]
     start: wp.array[wp.vec3]  # [S] where the step begins [m]

@@ -258,7 +258,7 @@ def add_row_products(
 
 @functools.cache
 def add_held(Elements: type, of: Dilatation) -> wp.Kernel:
-    """y += K p of the elements that are held from turning over; a thread a group, most of which have none."""
+    """y += K p of the elements that are held from turning over. Each thread does one group; most groups have none."""
     measure, holding = of.measure, of.holding
 
     @unique_kernel()

@@ -128,8 +128,8 @@ def row_differences(
     packed: wp.array[wp.uint16],
     x: wp.array[wp.vec4],
 ) -> wp.vec3:
-    """The sum of a row's blocks times the differences of x from the row's own, of which each of ``lanes`` neighbouring
-    threads on CUDA has a part; see ``pack_rows``."""
+    """Multiply each block of a row by the difference between its x and the row's own x, and add these up. On CUDA each
+    of ``lanes`` neighbouring threads returns a part of the sum; see ``pack_rows``."""
     ...
 
 
