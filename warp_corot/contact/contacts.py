@@ -278,7 +278,8 @@ class Contacts:
         surface, device = self.surface, self.device
         count, obstacles = surface.count, self.obstacles.count
         self._lanes = 1 if device.is_cpu else WARP
-        most = max(part.nodes for part in surface.parts)
+        # Ranks add these arrays up, so they must be of one size.
+        most = int(self.system.ranks.most(float(max(part.nodes for part in surface.parts))))
         warps = 1 if device.is_cpu else max(min(most // WARP, MOST_WARPS), 1)
         self._parts = wp.zeros((obstacles, self.system.worlds, warps), dtype=wp.spatial_vectord, device=device)
         self._pressures = wp.zeros(count, dtype=wp.vec3, device=device)
