@@ -20,6 +20,7 @@ from typing import Any
 
 LAWS = ["corotated", "corotated, rotations 3 up", "linear", "StVK", "neo-Hookean", "corotated, whole step"]
 MAPS = ["falling", "twisted by pi", "stretched to 1.8", "squeezed to 0.5"]
+FIBRES, ONE = ["transversely isotropic"], ["one leaf turned over"]
 #: The parts of the table: their names, and the options of states.py.
 PARTS = {
     f"{name}, Poisson's ratio {poisson}": ["--poisson", poisson, *options]
@@ -28,12 +29,16 @@ PARTS = {
         "beams and notched beams": ["--bodies", "beam", "notch", "--levels", "6", "12", "18", "--organs"],
         "cubes": ["--bodies", "cube", "--levels", "12", "18", "--organs"],
         "worlds": ["--bodies", "beams", "balls", "--levels", "6", "--organs", "1"],
+        "the graded ball": ["--bodies", "graded", "--levels", "6", "--organs", "--laws", "corotated", "neo-Hookean"],
         "the finest beam": ["--bodies", "beam", "--levels", "21", "--organs", "--states", *MAPS],
         **{
             f"organs of {count} elements": ["--bodies", "ball", "bunny", "--levels", "6", "--organs", count]
             for count in ("20000", "100000", "1000000")
         },
     }.items()
+} | {
+    "fibres": ["--bodies", "beam", "cube", "--levels", "18", "--organs", "--laws", *FIBRES, "--states", *MAPS],
+    "fibres, the finest cube": ["--bodies", "cube", "--levels", "21", "--organs", "--laws", *FIBRES, "--states", *ONE],
 }
 
 
@@ -75,7 +80,7 @@ def main() -> int:
     lock, running = context.Lock(), {}
     with tempfile.TemporaryDirectory() as folder:
         for number, name in enumerate(options.parts):
-            given = [*PARTS[name], "--device", options.device, "--rounds", str(options.rounds), "--laws", *LAWS]
+            given = ["--device", options.device, "--rounds", str(options.rounds), "--laws", *LAWS, *PARTS[name]]
             if options.json is not None:
                 given += ["--json", str(options.json / f"states_{number}.json")]
             path = f"{folder}/{number}.txt"

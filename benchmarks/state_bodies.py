@@ -39,6 +39,8 @@ BAD = 0.1
 
 #: Cube levels of organs, as on the command line.
 ORGAN_LEVEL = 7
+#: Root cubes across the graded ball.
+GRADED_CUBES = 16
 
 
 #: Makes a state of a body: its description, and displacements [N, 3].
@@ -174,6 +176,16 @@ def organ(name: str, count: int, worlds: int = 1) -> Subject:
     held = y < y.min() + 0.1 * np.ptp(y)
     title = f"{name} {len(mesh.tets)}" if worlds == 1 else f"{worlds} {name}s {len(mesh.tets)}"
     return Subject(title, mesh, held, states, lambda: organ(name, count // 8, worlds), worlds=worlds)
+
+
+def graded_ball(level: int) -> Subject:
+    """A ball of 10 cm, its lowest tenth fixed, with leaves of this level at its surface and larger ones inside."""
+    mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.05), 0.1001 / GRADED_CUBES, max_level=level)
+    y = mesh.points[:, 1]
+    states = ("under its weight", "a tenth of subtrees bad")
+    return Subject(
+        f"graded ball {len(mesh.tets)}", mesh, y < y.min() + 0.1 * np.ptp(y), states, lambda: graded_ball(level - 3)
+    )
 
 
 # --- states by physics ------------------------------------------------------------------------------------------------

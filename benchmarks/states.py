@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 from measure import Case, Parser, Result, checked, finish, machine, measure, number, parser, percent, table, tell
-from state_bodies import MAKERS, MATERIAL, State, Subject, beam, cube, notched_beam, organ
+from state_bodies import MAKERS, MATERIAL, State, Subject, beam, cube, graded_ball, notched_beam, organ
 from state_cases import DEFAULT, GENERAL, LEAF, Row, rows_of
 
 import warp_corot as wc
@@ -30,11 +30,13 @@ import warp_corot as wc
 LEVELS = {"cuda": [6, 9, 12, 15, 18], "cpu": [6, 12]}
 ORGANS = {"cuda": [20_000, 100_000, 1_000_000], "cpu": [20_000]}
 ROUNDS = {"cuda": 9, "cpu": 5}
-BODIES = ("beam", "beams", "notch", "cube", "ball", "bunny", "balls")
+BODIES = ("beam", "beams", "notch", "cube", "ball", "bunny", "balls", "graded")
 #: Number of copies of the level-6 beam that are stepped together.
 WORLDS = {"cuda": 1024, "cpu": 16}
 #: Number of copies of a ball that are stepped together, and approximate number of elements of each.
 BALLS = {"cuda": (64, 10_000), "cpu": (4, 1_000)}
+#: Level of the graded ball of 3 million elements.
+GRADED_LEVEL = 12
 #: Of larger meshes, a random sample of this size is examined.
 LOOKED_AT = 200_000
 
@@ -61,6 +63,9 @@ def made(options: Any, where: str) -> Iterator[Subject]:
                 yield make(level)
     if "beams" in options.bodies:
         yield beam(options.levels[0], WORLDS[where])
+    if "graded" in options.bodies and where == "cuda" and not options.quick:
+        tell("building the graded ball")
+        yield graded_ball(GRADED_LEVEL)
     if "balls" in options.bodies and options.organs:
         worlds, count = BALLS[where]
         yield organ("ball", count, worlds)
