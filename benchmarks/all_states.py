@@ -20,7 +20,7 @@ from typing import Any
 
 LAWS = ["corotated", "corotated, rotations 3 up", "linear", "StVK", "neo-Hookean", "corotated, whole step"]
 MAPS = ["falling", "twisted by pi", "stretched to 1.8", "squeezed to 0.5"]
-FIBRES, ONE = ["transversely isotropic"], ["one leaf turned over"]
+FIBRES, ONE, LOADED = ["transversely isotropic"], ["one leaf turned over"], ["under its weight"]
 #: The parts of the table: their names, and the options of states.py.
 PARTS = {
     f"{name}, Poisson's ratio {poisson}": ["--poisson", poisson, *options]
@@ -29,7 +29,7 @@ PARTS = {
         "beams and notched beams": ["--bodies", "beam", "notch", "--levels", "6", "12", "18", "--organs"],
         "cubes": ["--bodies", "cube", "--levels", "12", "18", "--organs"],
         "worlds": ["--bodies", "beams", "balls", "--levels", "6", "--organs", "1"],
-        "the graded ball": ["--bodies", "graded", "--levels", "6", "--organs", "--laws", "corotated", "neo-Hookean"],
+        "the graded ball": ["--bodies", "graded", "--levels", "6", "--organs", "--laws", LAWS[0], "--states", *LOADED],
         "the finest beam": ["--bodies", "beam", "--levels", "21", "--organs", "--states", *MAPS],
         **{
             f"organs of {count} elements": ["--bodies", "ball", "bunny", "--levels", "6", "--organs", count]
